@@ -1,0 +1,152 @@
+"""
+Options: declared once as dataclass fields, read from ROS parameter files.
+
+Each stage keeps its own frozen options dataclass beside the function that it tunes.  A field made
+with `option` carries its description, unit and range; ROS parameters, the parameter file and the
+documentation all come from those fields.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from starcal_ros.errors import OptionError
+
+OptionValue = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
+OptionsT = TypeVar('OptionsT')
+
+
+def option(
+    default: OptionValue,
+    description: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    length: int | None = None,
+) -> Any:
+    """
+    A dataclass field with what a ROS parameter descriptor needs.
+
+    ``low`` and ``high`` are inclusive and hold for each element of a list; ``choices`` too.
+    """
+    return dataclasses.field(
+        default=default,
+        metadata={
+            'description': description,
+            'low': low,
+            'high': high,
+            'choices': choices,
+            'length': length,
+        },
+    )
+
+
+def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
+    """
+    The value in the field's own type.
+
+    Raises
+    ------
+    OptionError
+        Naming the option, the value and what was expected.
+    """
+    default, meta = field.default, field.metadata
+
+    def refuse(expected: str) -> OptionError:
+        return OptionError(f'{field.name}: {value!r} is not {expected}')
+
+    def number(item: object) -> float:
+        if isinstance(item, bool) or not isinstance(item, (int, float)):
+            raise refuse('a number')
+        if not math.isfinite(item):
+            raise refuse('finite')
+        low, high = meta['low'], meta['high']
+        if (low is not None and item < low) or (high is not None and item > high):
+            raise refuse(f'within {low} to {high}')
+        return item
+
+    def text(item: object) -> str:
+        if not isinstance(item, str):
+            raise refuse('a text')
+        if meta['choices'] and item not in meta['choices']:
+            raise refuse('one of ' + ', '.join(meta['choices']))
+        return item
+
+    if isinstance(default, bool):
+        if not isinstance(value, bool):
+            raise refuse('true or false')
+        return value
+    if isinstance(default, int):
+        whole = number(value)
+        if whole != int(whole):
+            raise refuse('a whole number')
+        return int(whole)
+    if isinstance(default, float):
+        return float(number(value))
+    if isinstance(default, str):
+        return text(value)
+    if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
+        raise refuse('a list')
+    items = list(value)
+    if meta['length'] is not None and len(items) != meta['length']:
+        raise refuse(f'a list of {meta["length"]}')
+    of_text = meta['choices'] or (default and isinstance(default[0], str))
+    if of_text:
+        return tuple(text(item) for item in items)
+    return tuple(float(number(item)) for item in items)
+
+
+def names_of(*option_classes: type[Any]) -> set[str]:
+    """Every option name of the given dataclasses."""
+    return {f.name for cls in option_classes for f in dataclasses.fields(cls)}
+
+
+def from_mapping(cls: type[OptionsT], values: Mapping[str, object]) -> OptionsT:
+    """
+    An options dataclass from those entries of a mapping that it has fields for.
+
+    Raises
+    ------
+    OptionError
+        For a value of the wrong type or out of range.
+    """
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    return cls(**{f.name: check_value(f, values[f.name]) for f in fields if f.name in values})
+
+
+def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]:
+    """
+    The parameters of a ROS 2 parameter file that apply to any of the named nodes.
+
+    Sections apply as in ROS: ``/**`` to all, then a node's own name, later ones winning.
+
+    Raises
+    ------
+    OptionError
+        When the file cannot be read or is not a ROS parameter file.
+    """
+    try:
+        content = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise OptionError(f'{path}: cannot be read: {error.strerror}') from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        line = str(error).replace('\n', ' ')
+        raise OptionError(f'{path}: not YAML: {line}') from error
+    if not isinstance(content, dict):
+        raise OptionError(f'{path}: not a ROS parameter file (no node sections)')
+    values: dict[str, object] = {}
+    known = {'/**', *nodes, *('/' + n for n in nodes), *('/**/' + n for n in nodes)}
+    for section, body in content.items():
+        if section not in known:
+            continue
+        if not isinstance(body, dict) or not isinstance(body.get('ros__parameters'), dict):
+            raise OptionError(f'{path}: section {section!r} has no ros__parameters')
+        values.update(body['ros__parameters'])
+    return values

@@ -1,0 +1,288 @@
+"""
+The frozen records that pass between the stages: images -> observations -> calibration.
+
+Arrays in records are never changed after construction.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.camera import PARAMETER_NAMES, CameraModel
+
+Floats = NDArray[np.float64]
+
+ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
+CALIBRATION_PARAMETER_NAMES = PARAMETER_NAMES + ALIGNMENT_NAMES
+
+IMAGE_REFUSALS: Mapping[str, str] = {
+    'bad_encoding': 'the pixel encoding is not one of mono8, mono16, 8UC1, 16UC1',
+    'bad_layout': 'size, row step and data of the image message do not fit each other',
+    'wrong_size': 'the image is not of the size of the prior camera',
+    'bad_attitude': 'the attitude about the image is not finite or not of unit length',
+    'no_attitude': 'no attitude sample on both sides of the image',
+    'attitude_gap': 'the attitude samples about the image are too far apart',
+    'out_of_order': 'the image is stamped before, or at, one already taken',
+    'no_stars': 'too few star-like sources in the image',
+    'no_match': 'no rotation of the predicted stars explains the sources in the image',
+    'too_few_stars': 'fewer stars were measured well than an image needs',
+}
+"""Why an image can be refused: stable name -> meaning."""
+
+STAR_REFUSALS: Mapping[str, str] = {
+    'not_detected': 'predicted inside the image but no source stands there',
+    'border': 'the measuring window leaves the image',
+    'blend': 'another catalog star or source is in the measuring window',
+    'saturated': 'a pixel of the star is saturated',
+    'too_few_pixels': 'too few pixels stand above the noise',
+    'elongated': 'not the shape of a star: smear, cosmic ray, hot pixel or galaxy',
+    'faint': 'signal-to-noise below the limit',
+    'ambiguous': 'two sources claim the star, or two stars the source',
+}
+"""Why a single predicted star can be left out: stable name -> meaning."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """
+    One image as its camera gave it.
+
+    ``time_ns`` is the middle of the exposure; ``pixels`` is (height, width) uint8 or uint16 in
+    native byte order.
+    """
+
+    time_ns: int
+    pixels: NDArray[np.uint8] | NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class AttitudeSample:
+    """One star-tracker attitude: takes star-tracker coordinates to ICRF; (4,) xyzw, unit."""
+
+    time_ns: int
+    icrf_from_star_tracker_xyzw: Floats
+
+
+@dataclass(frozen=True)
+class CameraGeometry:
+    """
+    The camera and how it sits on the star tracker: the prior, or a calibration in force.
+
+    ``star_tracker_from_camera_xyzw`` is (4,): the orientation of the camera in the star tracker
+    frame, as the wire has it.
+    """
+
+    camera: CameraModel
+    star_tracker_from_camera_xyzw: Floats
+
+
+@dataclass(frozen=True)
+class StarObservations:
+    """
+    The stars measured and identified in one image, or why it was refused.
+
+    Attributes
+    ----------
+    time_ns : int
+        Middle of the exposure.
+    width, height : int
+        Image size, px.
+    refusal, detail : str
+        Empty, or a name of `IMAGE_REFUSALS` and what was found.
+    icrf_from_star_tracker_xyzw : (4,)
+        Star tracker attitude at ``time_ns``; identity where there is none.
+    attitude_gap_s : float
+        Time between the two samples about the image; -1 where there is none.
+    catalog_id : (n,) int64
+    direction_icrf : (n, 3)
+        Apparent unit directions, ICRF axes.
+    magnitude : (n,) float32
+    measured_px : (n, 2)
+        (u, v) of each star.
+    covariance_px2 : (n, 3)
+        uu, uv, vv of ``measured_px``.
+    flux_dn, snr : (n,) float32
+    refused_stars : mapping
+        Name of `STAR_REFUSALS` -> number of predicted stars left out for it.
+    background_dn, noise_dn : float
+        Median background and 1-sigma noise of one pixel.
+    psf_sigma_px : float
+        Gaussian width of the stars; 0 where not known.
+    catalog_digest : str
+        Which catalog the identifiers refer to.
+    """
+
+    time_ns: int
+    width: int
+    height: int
+    refusal: str
+    detail: str
+    icrf_from_star_tracker_xyzw: Floats
+    attitude_gap_s: float
+    catalog_id: NDArray[np.int64]
+    direction_icrf: Floats
+    magnitude: NDArray[np.float32]
+    measured_px: Floats
+    covariance_px2: Floats
+    flux_dn: NDArray[np.float32]
+    snr: NDArray[np.float32]
+    refused_stars: Mapping[str, int]
+    background_dn: float
+    noise_dn: float
+    psf_sigma_px: float
+    catalog_digest: str
+
+    def __len__(self) -> int:
+        """Return the number of stars."""
+        return len(self.catalog_id)
+
+    def select(self, keep: NDArray[np.bool_]) -> StarObservations:
+        """Return the same image with only the stars of an (n,) mask."""
+        return dataclasses.replace(self, **{name: getattr(self, name)[keep] for name in STAR_COLUMNS})
+
+
+STAR_COLUMNS = (
+    'catalog_id',
+    'direction_icrf',
+    'magnitude',
+    'measured_px',
+    'covariance_px2',
+    'flux_dn',
+    'snr',
+)
+"""The fields of `StarObservations` that hold one row per star."""
+
+
+def refused_image(
+    time_ns: int, width: int, height: int, refusal: str, detail: str, **known: object
+) -> StarObservations:
+    """Observations without stars: the record of an image that cannot be used."""
+    empty = StarObservations(
+        time_ns=time_ns,
+        width=width,
+        height=height,
+        refusal=refusal,
+        detail=detail,
+        icrf_from_star_tracker_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+        attitude_gap_s=-1.0,
+        catalog_id=np.empty(0, np.int64),
+        direction_icrf=np.empty((0, 3)),
+        magnitude=np.empty(0, np.float32),
+        measured_px=np.empty((0, 2)),
+        covariance_px2=np.empty((0, 3)),
+        flux_dn=np.empty(0, np.float32),
+        snr=np.empty(0, np.float32),
+        refused_stars={},
+        background_dn=0.0,
+        noise_dn=0.0,
+        psf_sigma_px=0.0,
+        catalog_digest='',
+    )
+    return dataclasses.replace(empty, **known)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """What a calibration is made from: usable images in time order, and counts of the others."""
+
+    images: tuple[StarObservations, ...] = ()
+    refused: Mapping[str, int] = dataclasses.field(default_factory=dict)
+
+    @property
+    def star_count(self) -> int:
+        """Number of star observations."""
+        return sum(len(image) for image in self.images)
+
+    def add(self, observations: StarObservations) -> Ensemble:
+        """Return the ensemble with one more image, kept or counted by its reason."""
+        if observations.refusal:
+            count = self.refused.get(observations.refusal, 0) + 1
+            return Ensemble(self.images, {**self.refused, observations.refusal: count})
+        return Ensemble((*self.images, observations), self.refused)
+
+
+@dataclass(frozen=True)
+class EnsembleStatus:
+    """
+    What has been collected and what a calibration from it would be worth.
+
+    ``coverage`` is (rows, cols) star observations per focal-plane cell;
+    ``predicted_sigma`` is 1-sigma per ``parameter_names``, inf where not observable.
+    """
+
+    time_ns: int
+    images: int
+    stars: int
+    min_images: int
+    min_stars: int
+    refused: Mapping[str, int]
+    coverage: NDArray[np.int64]
+    parameter_names: tuple[str, ...]
+    predicted_sigma: Floats
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """
+    One calibration with its covariance, statistics and provenance.
+
+    Attributes
+    ----------
+    time_ns : int
+        Stamp of the last image used.
+    geometry : CameraGeometry
+        The estimated camera and alignment.
+    covariance : (13, 13)
+        Of `CALIBRATION_PARAMETER_NAMES`; the alignment angles (rad) are passive small rotations
+        in the camera frame; zero rows where a parameter was held.
+    method : str
+    estimated : tuple of str
+        Which camera parameters were estimated.
+    residual_rms_px : float
+        Per axis, over the stars used.
+    variance_factor : float
+        chi^2 per degree of freedom with the centroid covariances as given.
+    images_used, stars_used, stars_rejected : int
+    images_refused : mapping
+        Reason -> count.
+    alignment_scatter_arcsec : float
+        RMS per axis of the per-image alignments about their mean; 0 for one common alignment.
+    zero_skew_cost_px : float
+        Worst pixel error of the zero-skew fit that ``camera_info`` carries.
+    iterations, termination
+        What the solver reported.
+    accepted, reasons
+        The verdict of the gate.
+    provenance : mapping of str to str
+    """
+
+    time_ns: int
+    geometry: CameraGeometry
+    covariance: Floats
+    method: str
+    estimated: tuple[str, ...]
+    residual_rms_px: float
+    variance_factor: float
+    images_used: int
+    images_refused: Mapping[str, int]
+    stars_used: int
+    stars_rejected: int
+    alignment_scatter_arcsec: float
+    zero_skew_cost_px: float
+    iterations: int
+    termination: str
+    accepted: bool
+    reasons: tuple[str, ...]
+    parent_frame: str
+    child_frame: str
+    provenance: Mapping[str, str]
+
+    @property
+    def sigma(self) -> Floats:
+        """1-sigma of `CALIBRATION_PARAMETER_NAMES`, (13,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
