@@ -1,0 +1,392 @@
+"""
+The products of a calibration: ``calibration.json`` and ``camera_info.yaml``, both ways.
+
+Numbers are written with the shortest digits that read back to the same double, so a calibration
+that was written and read is equal to the last bit.  Files are replaced whole or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TypeVar
+from urllib.parse import unquote
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from starcal_ros.camera import DISTORTION_NAMES, INTRINSIC_NAMES, CameraModel, zero_skew_fit
+from starcal_ros.errors import ProductError
+from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, Calibration, CameraGeometry
+
+Floats = NDArray[np.float64]
+T = TypeVar('T')
+
+SCHEMA = 1
+CALIBRATION_FILE = 'calibration.json'
+CAMERA_INFO_FILE = 'camera_info.yaml'
+
+# plumb_bob's order of coefficients, by our names; ROS puts k3 last.
+_PLUMB_BOB = ('k1', 'k2', 'p1', 'p2', 'k3')
+
+
+def write_calibration(calibration: Calibration, path: Path) -> None:
+    """
+    Write ``calibration.json``.
+
+    A number that is not finite is written as null, since JSON has no other word for it, and reads
+    back as NaN.
+
+    Raises
+    ------
+    ProductError
+        When the file cannot be written.
+    """
+    text = json.dumps(_calibration_content(calibration), indent=1, allow_nan=False)
+    write_atomically(path, text + '\n')
+
+
+def read_calibration(path: Path) -> Calibration:
+    """
+    The calibration in a ``calibration.json``, equal to the one that was written.
+
+    Raises
+    ------
+    ProductError
+        Naming the file and the key that is missing or wrong.
+    """
+    try:
+        content = json.loads(_read_text(path))
+    except ValueError as error:
+        raise ProductError(f'{path}: not JSON: {error}') from error
+    if not isinstance(content, dict):
+        raise ProductError(f'{path}: not a calibration (no JSON object)')
+    if content.get('schema') != SCHEMA:
+        raise ProductError(f'{path}: schema {content.get("schema")!r} is not {SCHEMA}')
+    try:
+        return _calibration_from_content(_Reader(path, content))
+    except ValueError as error:  # CameraModel's own checks
+        raise ProductError(f'{path}: {error}') from error
+
+
+def write_camera_info(camera: CameraModel, path: Path, camera_name: str = 'camera') -> None:
+    """
+    Write a ROS camera YAML as camera_info_manager reads it, with the zero-skew fit of the camera.
+
+    Readers of ``CameraInfo`` ignore K[0,1] without a word, so it is 0 and the other parameters
+    make up for it as well as they can (`zero_skew_fit`).
+
+    Raises
+    ------
+    ProductError
+        When the file cannot be written.
+    """
+    fitted, _ = zero_skew_fit(camera)
+    fx, _, fy, cx, cy = fitted.intrinsics.tolist()
+    distortion = dict(zip(DISTORTION_NAMES, fitted.distortion.tolist(), strict=True))
+    content = {
+        'image_width': fitted.width,
+        'image_height': fitted.height,
+        'camera_name': camera_name,
+        'camera_matrix': _matrix(3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        'distortion_model': 'plumb_bob',
+        'distortion_coefficients': _matrix(1, 5, [distortion[name] for name in _PLUMB_BOB]),
+        'rectification_matrix': _matrix(3, 3, np.eye(3).ravel().tolist()),
+        'projection_matrix': _matrix(
+            3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+        ),
+    }
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
+    write_atomically(path, text)
+
+
+def read_camera_info(location: str | Path) -> CameraModel:
+    """
+    The camera in a ROS camera YAML; K[0,1], where a file has one, is its skew.
+
+    Parameters
+    ----------
+    location : str or Path
+        A path, or a ``file://`` or ``package://`` URL.
+
+    Raises
+    ------
+    ProductError
+        Naming the file and the key that is missing, wrong or not supported.
+    """
+    path = resolve_url(location) if isinstance(location, str) else location
+    try:
+        content = yaml.safe_load(_read_text(path))
+    except yaml.YAMLError as error:
+        raise ProductError(f'{path}: not YAML: {" ".join(str(error).split())}') from error
+    if not isinstance(content, dict):
+        raise ProductError(f'{path}: not a camera YAML (no keys)')
+    reader = _Reader(path, content)
+    width, height = (reader.get(f'image_{side}', _whole) for side in ('width', 'height'))
+    K = reader.get('camera_matrix.data', _numbers(9))
+    fx, skew, cx, zero, fy, cy = K[:6]
+    if zero != 0.0 or K[6:] != [0.0, 0.0, 1.0]:
+        raise ProductError(f'{path}: camera_matrix.data: {K} is not [fx s cx 0 fy cy 0 0 1]')
+    model = content.get('distortion_model', 'plumb_bob')
+    if model != 'plumb_bob':
+        raise ProductError(f'{path}: distortion_model: {model!r} is not plumb_bob')
+    D = reader.get('distortion_coefficients.data', _numbers(4, 5))
+    distortion = dict(zip(_PLUMB_BOB, [*D, 0.0][:5], strict=True))
+    parameters = [fx, skew, fy, cx, cy, *(distortion[name] for name in DISTORTION_NAMES)]
+    try:
+        return CameraModel(width, height, np.array(parameters))
+    except ValueError as error:
+        raise ProductError(f'{path}: {error}') from error
+
+
+def resolve_url(url: str) -> Path:
+    """
+    The path that a ``file://`` or ``package://`` URL, or a plain path, names.
+
+    Packages are looked for as ament does, in ``share/<package>`` of each prefix of
+    AMENT_PREFIX_PATH, but without ROS.
+
+    Raises
+    ------
+    ProductError
+        For another scheme, an empty URL or a package that no prefix has.
+    """
+    scheme, separator, rest = url.partition('://')
+    if not separator:
+        if not url:
+            raise ProductError('the camera YAML is not named (empty URL)')
+        return Path(url)
+    if scheme == 'file':
+        return _as_written_or_decoded(Path(rest))
+    if scheme != 'package':
+        raise ProductError(f'{url}: only file:// and package:// URLs can be read')
+    package, _, inside = rest.partition('/')
+    if not re.fullmatch(r'\w+', package) or not inside:
+        raise ProductError(f'{url}: not package://<package>/<path>')
+    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        share = Path(prefix, 'share', package)
+        if prefix and share.is_dir():
+            return _as_written_or_decoded(share / inside)
+    raise ProductError(f'{url}: package {package} is not in AMENT_PREFIX_PATH')
+
+
+def _as_written_or_decoded(path: Path) -> Path:
+    """The path; ROS does not decode %20 in its URLs but others do, so both are taken."""
+    return path if path.exists() else Path(unquote(str(path)))
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """
+    Replace a text file whole: readers see the old one or the new one, never a part.
+
+    Raises
+    ------
+    ProductError
+        When the file cannot be written; the old one then stands as it was.
+    """
+    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
+    try:
+        with part.open('w', encoding='utf-8') as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise ProductError(f'{path}: cannot be written: {error.strerror}') from error
+
+
+def _calibration_content(calibration: Calibration) -> dict[str, object]:
+    """The JSON object of a calibration: the interface document's keys, then this package's."""
+    geometry, camera = calibration.geometry, calibration.geometry.camera
+    covariance = _json_rows(calibration.covariance)
+    intrinsics, distortion = _json_row(camera.intrinsics), _json_row(camera.distortion)
+    return {
+        'schema': SCHEMA,
+        'intrinsics': dict(zip(INTRINSIC_NAMES, intrinsics, strict=True)),
+        'distortion': dict(zip(DISTORTION_NAMES, distortion, strict=True)),
+        'alignment': {
+            'parent': calibration.parent_frame,
+            'child': calibration.child_frame,
+            'quaternion_xyzw': _json_row(geometry.star_tracker_from_camera_xyzw),
+        },
+        'parameter_names': list(CALIBRATION_PARAMETER_NAMES),
+        'covariance': covariance,
+        'alignment_covariance_rad2': [row[10:] for row in covariance[10:]],
+        'method': calibration.method,
+        'estimated': list(calibration.estimated),
+        'residual_rms_px': _json_number(calibration.residual_rms_px),
+        'images_used': int(calibration.images_used),
+        'images_refused': {k: int(n) for k, n in calibration.images_refused.items()},
+        'stars_used': int(calibration.stars_used),
+        'stars_rejected': int(calibration.stars_rejected),
+        'accepted': bool(calibration.accepted),
+        'reasons': list(calibration.reasons),
+        'provenance': dict(calibration.provenance),
+        'time_ns': int(calibration.time_ns),
+        'image': {'width': camera.width, 'height': camera.height},
+        'variance_factor': _json_number(calibration.variance_factor),
+        'alignment_scatter_arcsec': _json_number(calibration.alignment_scatter_arcsec),
+        'zero_skew_cost_px': _json_number(calibration.zero_skew_cost_px),
+        'iterations': int(calibration.iterations),
+        'termination': calibration.termination,
+    }
+
+
+def _calibration_from_content(reader: _Reader) -> Calibration:
+    """The record of a JSON object; `alignment_covariance_rad2` repeats a block and is not read."""
+    names = reader.get('parameter_names', _texts)
+    if names != CALIBRATION_PARAMETER_NAMES:
+        expected = ', '.join(CALIBRATION_PARAMETER_NAMES)
+        raise ProductError(f'{reader.path}: parameter_names are not {expected}')
+    parameters = [
+        *(reader.get(f'intrinsics.{name}', _number) for name in INTRINSIC_NAMES),
+        *(reader.get(f'distortion.{name}', _number) for name in DISTORTION_NAMES),
+    ]
+    width, height = (reader.get(f'image.{side}', _whole) for side in ('width', 'height'))
+    count = len(CALIBRATION_PARAMETER_NAMES)
+    covariance = np.array(reader.get('covariance', _list_of(_numbers(count, null=True))))
+    if covariance.shape != (count, count):
+        raise ProductError(f'{reader.path}: covariance is not {count} x {count}')
+    quaternion = np.array(reader.get('alignment.quaternion_xyzw', _numbers(4)))
+    return Calibration(
+        time_ns=reader.get('time_ns', _whole),
+        geometry=CameraGeometry(CameraModel(width, height, np.array(parameters)), quaternion),
+        covariance=covariance,
+        method=reader.get('method', _text),
+        estimated=reader.get('estimated', _texts),
+        residual_rms_px=reader.get('residual_rms_px', _number_or_null),
+        variance_factor=reader.get('variance_factor', _number_or_null),
+        images_used=reader.get('images_used', _whole),
+        images_refused=reader.get('images_refused', _mapping_of(_whole)),
+        stars_used=reader.get('stars_used', _whole),
+        stars_rejected=reader.get('stars_rejected', _whole),
+        alignment_scatter_arcsec=reader.get('alignment_scatter_arcsec', _number_or_null),
+        zero_skew_cost_px=reader.get('zero_skew_cost_px', _number_or_null),
+        iterations=reader.get('iterations', _whole),
+        termination=reader.get('termination', _text),
+        accepted=reader.get('accepted', _true_or_false),
+        reasons=reader.get('reasons', _texts),
+        parent_frame=reader.get('alignment.parent', _text),
+        child_frame=reader.get('alignment.child', _text),
+        provenance=reader.get('provenance', _mapping_of(_text)),
+    )
+
+
+class _Reader:
+    """Checked look-ups in a nested mapping from a file; every error names file and key."""
+
+    def __init__(self, path: Path, content: Mapping[str, object]) -> None:
+        self.path = path
+        self._content = content
+
+    def get(self, dotted_key: str, kind: Callable[[object], T]) -> T:
+        """The value at a key, as `kind` returns it; `kind` raises ValueError('what is expected')."""
+        value: object = self._content
+        for key in dotted_key.split('.'):
+            if not isinstance(value, dict) or key not in value:
+                raise ProductError(f'{self.path}: key {dotted_key!r} is missing')
+            value = value[key]
+        try:
+            return kind(value)
+        except ValueError as error:
+            shown = repr(value)
+            shown = shown if len(shown) <= 60 else shown[:57] + '...'
+            raise ProductError(f'{self.path}: {dotted_key}: {shown} is not {error}') from error
+
+
+def _number(value: object) -> float:
+    """A finite number; a text too, since YAML 1.1 takes ``1e-5`` without a point for one."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        raise ValueError('a number')
+    try:
+        number = float(value)
+    except (ValueError, OverflowError):
+        raise ValueError('a number') from None
+    if not math.isfinite(number):
+        raise ValueError('a finite number')
+    return number
+
+
+def _number_or_null(value: object) -> float:
+    return math.nan if value is None else _number(value)
+
+
+def _whole(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError('a whole number')
+    return value
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise ValueError('a text')
+    return value
+
+
+def _true_or_false(value: object) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError('true or false')
+    return value
+
+
+def _list_of(kind: Callable[[object], T]) -> Callable[[object], list[T]]:
+    def items(value: object) -> list[T]:
+        if not isinstance(value, list):
+            raise ValueError('a list')
+        return [kind(item) for item in value]
+
+    return items
+
+
+def _texts(value: object) -> tuple[str, ...]:
+    return tuple(_list_of(_text)(value))
+
+
+def _numbers(*counts: int, null: bool = False) -> Callable[[object], list[float]]:
+    def numbers(value: object) -> list[float]:
+        items = _list_of(_number_or_null if null else _number)(value)
+        if len(items) not in counts:
+            raise ValueError(' or '.join(map(str, counts)) + ' numbers')
+        return items
+
+    return numbers
+
+
+def _mapping_of(kind: Callable[[object], T]) -> Callable[[object], dict[str, T]]:
+    def mapping(value: object) -> dict[str, T]:
+        if not isinstance(value, dict):
+            raise ValueError('a mapping')
+        return {_text(key): kind(item) for key, item in value.items()}
+
+    return mapping
+
+
+def _json_number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _json_row(values: Floats) -> list[float | None]:
+    return [_json_number(value) for value in np.asarray(values).tolist()]
+
+
+def _json_rows(values: Floats) -> list[list[float | None]]:
+    return [_json_row(row) for row in values]
+
+
+def _matrix(rows: int, cols: int, data: list[float]) -> dict[str, object]:
+    return {'rows': rows, 'cols': cols, 'data': data}
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding='utf-8')
+    except OSError as error:
+        raise ProductError(f'{path}: cannot be read: {error.strerror}') from error
+    except UnicodeDecodeError as error:
+        raise ProductError(f'{path}: not a text file') from error

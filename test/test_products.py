@@ -1,0 +1,357 @@
+"""calibration.json and camera_info.yaml: exact round trips, hand-written files, one-line errors."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, zero_skew_fit
+from starcal_ros.errors import ProductError
+from starcal_ros.products import (
+    read_calibration,
+    read_camera_info,
+    resolve_url,
+    write_atomically,
+    write_calibration,
+    write_camera_info,
+)
+from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, Calibration, CameraGeometry
+
+PARAMETERS = np.array(
+    [3641.5121868491606, -0.74, 3642.3, 647.5, 511.5, -0.0512, 0.1167, 0.01, 5.1e-4, 3.2e-5]
+)
+CAMERA = CameraModel(1296, 1024, PARAMETERS)
+
+ROS_YAML = """\
+image_width: 640
+image_height: 480
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [500.0, 0.5, 319.5, 0, 501, 239.5, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [500, 0, 319.5, 0, 0, 501, 239.5, 0, 0, 0, 1, 0]
+"""
+
+
+def calibration_of(
+    parameters: np.ndarray = PARAMETERS,
+    covariance: np.ndarray | None = None,
+    quaternion: tuple[float, ...] = (0.1, -0.2, 0.3, 0.9273618495495703),
+    **changes: object,
+) -> Calibration:
+    """A calibration with every field filled."""
+    if covariance is None:
+        covariance = np.random.default_rng(1).normal(size=(13, 13)) / 3
+    record = Calibration(
+        time_ns=1786160159999999999,
+        geometry=CameraGeometry(CameraModel(1296, 1024, parameters), np.array(quaternion)),
+        covariance=covariance,
+        method='hierarchical',
+        estimated=('fx', 'fy', 'k1'),
+        residual_rms_px=0.1 + 0.2,
+        variance_factor=1 / 3,
+        images_used=15,
+        images_refused={'no_attitude': 2, 'no_stars': 1},
+        stars_used=1234,
+        stars_rejected=5,
+        alignment_scatter_arcsec=19.7,
+        zero_skew_cost_px=0.21,
+        iterations=7,
+        termination='relative step',
+        accepted=True,
+        reasons=(),
+        parent_frame='star_tracker',
+        child_frame='camera',
+        provenance={'version': '1.0.0', 'note': 'quote " and µ'},
+    )
+    return dataclasses.replace(record, **changes)
+
+
+def assert_same(a: Calibration, b: Calibration) -> None:
+    """Field by field, to the last bit."""
+    for field in dataclasses.fields(Calibration):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if field.name == 'geometry':
+            assert (x.camera.width, x.camera.height) == (y.camera.width, y.camera.height)
+            assert x.camera.parameters.tobytes() == y.camera.parameters.tobytes()
+            q_x, q_y = x.star_tracker_from_camera_xyzw, y.star_tracker_from_camera_xyzw
+            assert q_x.tobytes() == q_y.tobytes()
+        elif field.name == 'covariance':
+            assert x.tobytes() == y.tobytes() and x.shape == y.shape
+        else:
+            assert x == y and type(x) is type(y), field.name
+
+
+def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    for changes in ({}, {'accepted': False, 'reasons': ('too few stars', 'weak: k3')}):
+        calibration = calibration_of(**changes)
+        write_calibration(calibration, tmp_path / 'calibration.json')
+        assert_same(calibration, read_calibration(tmp_path / 'calibration.json'))
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    focal=st.tuples(st.floats(1e-300, 1e300), st.floats(1e-300, 1e300)),
+    others=st.lists(finite, min_size=8, max_size=8),
+    covariance=st.lists(finite, min_size=169, max_size=169),
+    quaternion=st.tuples(finite, finite, finite, finite),
+    number=finite,
+)
+def test_any_finite_number_comes_back(
+    tmp_path: Path,
+    focal: tuple[float, float],
+    others: list[float],
+    covariance: list[float],
+    quaternion: tuple[float, ...],
+    number: float,
+) -> None:
+    parameters = np.array([focal[0], others[0], focal[1], *others[1:]])
+    calibration = calibration_of(
+        parameters, np.array(covariance).reshape(13, 13), quaternion, residual_rms_px=number
+    )
+    write_calibration(calibration, tmp_path / 'c.json')
+    assert_same(calibration, read_calibration(tmp_path / 'c.json'))
+
+
+def test_numbers_that_are_not_finite_are_null_and_come_back_nan(tmp_path: Path) -> None:
+    covariance = np.eye(13)
+    covariance[3, 3] = np.inf
+    path = tmp_path / 'c.json'
+    write_calibration(calibration_of(covariance=covariance, variance_factor=math.nan), path)
+    content = json.loads(path.read_text(), parse_constant=pytest.fail)  # strict JSON
+    assert content['covariance'][3][3] is None
+    back = read_calibration(path)
+    assert math.isnan(back.covariance[3, 3]) and math.isnan(back.variance_factor)
+
+
+def test_json_has_the_keys_of_the_interface_document(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    calibration = calibration_of()
+    write_calibration(calibration, path)
+    content = json.loads(path.read_text())
+    assert content['schema'] == 1
+    assert list(content['intrinsics']) == ['fx', 'skew', 'fy', 'cx', 'cy']
+    assert list(content['distortion']) == ['k1', 'k2', 'k3', 'p1', 'p2']
+    assert content['alignment']['parent'] == 'star_tracker'
+    assert content['alignment']['child'] == 'camera'
+    assert len(content['alignment']['quaternion_xyzw']) == 4
+    assert tuple(content['parameter_names']) == CALIBRATION_PARAMETER_NAMES
+    assert content['alignment_covariance_rad2'] == calibration.covariance[10:, 10:].tolist()
+    assert {
+        'method', 'estimated', 'residual_rms_px', 'images_used', 'images_refused', 'stars_used',
+        'stars_rejected', 'accepted', 'reasons', 'provenance', 'time_ns', 'variance_factor',
+        'alignment_scatter_arcsec', 'zero_skew_cost_px', 'iterations', 'termination',
+    } <= set(content)  # fmt: skip
+    assert content['image'] == {'width': 1296, 'height': 1024}
+
+
+@pytest.mark.parametrize(
+    ('change', 'says'),
+    [
+        (lambda c: c.update(schema=2), 'schema 2 is not 1'),
+        (lambda c: c.pop('covariance'), "key 'covariance' is missing"),
+        (lambda c: c['intrinsics'].pop('fy'), "key 'intrinsics.fy' is missing"),
+        (lambda c: c['intrinsics'].update(fx=-1.0), 'not positive'),
+        (lambda c: c['distortion'].update(k1='a'), "distortion.k1: 'a' is not a number"),
+        (lambda c: c['distortion'].update(k1=None), 'distortion.k1: None is not a number'),
+        (lambda c: c['covariance'].pop(), 'covariance is not 13 x 13'),
+        (lambda c: c['covariance'][0].pop(), 'covariance: .* is not 13 numbers'),
+        (lambda c: c.update(parameter_names=['fx']), 'parameter_names are not fx, skew'),
+        (lambda c: c.update(stars_used=1.5), 'stars_used: 1.5 is not a whole number'),
+        (lambda c: c.update(accepted=1), 'accepted: 1 is not true or false'),
+        (lambda c: c.update(reasons='none'), "reasons: 'none' is not a list"),
+        (lambda c: c.update(provenance=[]), r'provenance: \[\] is not a mapping'),
+        (lambda c: c['alignment'].update(parent=3), 'alignment.parent: 3 is not a text'),
+        (lambda c: c.update(intrinsics=3), "key 'intrinsics.fx' is missing"),
+    ],
+)
+def test_a_damaged_calibration_is_refused_by_file_and_key(tmp_path, change, says) -> None:
+    path = tmp_path / 'c.json'
+    write_calibration(calibration_of(), path)
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(ProductError, match=says) as caught:
+        read_calibration(path)
+    assert str(path) in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('content', [b'', b'{', b'[]', b'\xff\xfe\x00', b'3'])
+def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / 'c.json'
+    path.write_bytes(content)
+    for read in (read_calibration, read_camera_info):
+        with pytest.raises(ProductError, match='not') as caught:
+            read(path)
+        assert str(path) in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    for read in (read_calibration, read_camera_info):
+        with pytest.raises(ProductError, match='none.*cannot be read: No such file'):
+            read(tmp_path / 'none')
+        with pytest.raises(ProductError, match='cannot be read: Is a directory'):
+            read(tmp_path)
+    with pytest.raises(ProductError, match='cannot be written'):
+        write_calibration(calibration_of(), tmp_path / 'none' / 'c.json')
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path, monkeypatch) -> None:
+    path = tmp_path / 'c.json'
+    write_atomically(path, 'old')
+
+    def full(_: int) -> None:
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr('os.fsync', full)
+    with pytest.raises(ProductError, match='No space left'):
+        write_atomically(path, 'new')
+    assert path.read_text() == 'old'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_camera_without_skew_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    camera = CAMERA.replace(skew=0.0)
+    write_camera_info(camera, tmp_path / 'camera_info.yaml')
+    back = read_camera_info(tmp_path / 'camera_info.yaml')
+    assert (back.width, back.height) == (1296, 1024)
+    assert back.parameters.tobytes() == camera.parameters.tobytes()
+
+
+def test_camera_info_carries_the_zero_skew_fit(tmp_path: Path) -> None:
+    path = tmp_path / 'camera_info.yaml'
+    write_camera_info(CAMERA, path, 'opnav')
+    back = read_camera_info(path)
+    fitted, worst_px = zero_skew_fit(CAMERA)
+    assert back.parameters.tobytes() == fitted.parameters.tobytes()
+    assert back.parameters[1] == 0.0
+    grid = pixel_grid(CAMERA, 25, 25)
+    error = np.linalg.norm(project(back, line_of_sight(CAMERA, grid)) - grid, axis=-1).max()
+    assert error == pytest.approx(worst_px, rel=1e-9)  # the same grid, rounding only
+
+
+def test_camera_info_is_what_camera_info_manager_reads(tmp_path: Path) -> None:
+    path = tmp_path / 'camera_info.yaml'
+    write_camera_info(CAMERA, path, 'opnav')
+    content = yaml.safe_load(path.read_text())
+    assert list(content) == [
+        'image_width', 'image_height', 'camera_name', 'camera_matrix', 'distortion_model',
+        'distortion_coefficients', 'rectification_matrix', 'projection_matrix',
+    ]  # fmt: skip
+    fitted, _ = zero_skew_fit(CAMERA)
+    fx, _, fy, cx, cy, k1, k2, k3, p1, p2 = fitted.parameters.tolist()
+    assert content['camera_name'] == 'opnav'
+    assert content['camera_matrix'] == {'rows': 3, 'cols': 3, 'data': [fx, 0, cx, 0, fy, cy, 0, 0, 1]}
+    assert content['distortion_coefficients'] == {'rows': 1, 'cols': 5, 'data': [k1, k2, p1, p2, k3]}
+    assert content['rectification_matrix']['data'] == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    assert content['projection_matrix'] == {
+        'rows': 3, 'cols': 4, 'data': [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
+    }  # fmt: skip
+    # Each key on a line of its own: ROS's Python parsers split nothing, people's greps do.
+    assert all(len(line) < 400 for line in path.read_text().splitlines())
+
+
+def test_hand_written_ros_yaml(tmp_path: Path) -> None:
+    path = tmp_path / 'left.yaml'
+    path.write_text(ROS_YAML)
+    expected = [500.0, 0.5, 501.0, 319.5, 239.5, -0.1, 1e-2, 0.003, 1e-5, -2e-4]
+    for location in (path, str(path), f'file://{path}'):
+        camera = read_camera_info(location)
+        assert (camera.width, camera.height) == (640, 480)
+        assert camera.parameters.tolist() == expected
+    path.write_text(ROS_YAML.replace(', 0.003]', ']').replace('cols: 5', 'cols: 4'))
+    assert read_camera_info(path).parameters.tolist() == [*expected[:7], 0.0, *expected[8:]]
+    # Files older than the key are plumb_bob, as camera_calibration_parsers takes them.
+    path.write_text(ROS_YAML.replace('distortion_model: plumb_bob\n', ''))
+    assert read_camera_info(path).parameters.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'says'),
+    [
+        ('plumb_bob', 'equidistant', "distortion_model: 'equidistant' is not plumb_bob"),
+        ('plumb_bob', 'rational_polynomial', "'rational_polynomial' is not plumb_bob"),
+        ('plumb_bob', '[1]', r'distortion_model: \[1\] is not plumb_bob'),
+        ('image_width: 640', '', "key 'image_width' is missing"),
+        ('image_height: 480', 'image_height: tall', "image_height: 'tall' is not a whole number"),
+        ('image_height: 480', 'image_height: 0', '640 x 0 is not an image'),
+        ('0, 501, 239.5, 0, 0, 1]', '0, 501]', 'camera_matrix.data: .* is not 9 numbers'),
+        ('[500.0, 0.5', '[0, 0.5', 'not positive'),
+        ('[500.0, 0.5', '[.nan, 0.5', 'camera_matrix.data: .* is not a finite number'),
+        ('239.5, 0, 0, 1]', '239.5, 0, 0, 2]', 'camera_matrix.data: .* is not'),
+        ('[-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]', '[]', 'data: .* is not 4 or 5 numbers'),
+        ('-0.1, 1e-2', 'true, 1e-2', 'distortion_coefficients.data: .* is not a number'),
+        ('-0.1, 1e-2', 'big, 1e-2', 'distortion_coefficients.data: .* is not a number'),
+        ('camera_matrix', 'matrix', "key 'camera_matrix.data' is missing"),
+        ('image_width: 640', 'image_width: [', 'not YAML'),
+    ],
+)
+def test_a_bad_camera_yaml_is_refused_by_file_and_key(tmp_path, old, new, says) -> None:
+    path = tmp_path / 'left.yaml'
+    path.write_text(ROS_YAML.replace(old, new))
+    with pytest.raises(ProductError, match=says) as caught:
+        read_camera_info(path)
+    assert str(path) in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_package_urls_follow_ament_prefixes(tmp_path, monkeypatch) -> None:
+    first, second = tmp_path / 'first', tmp_path / 'second'
+    (first / 'share' / 'other').mkdir(parents=True)
+    (second / 'share' / 'my_cameras' / 'config').mkdir(parents=True)
+    file = second / 'share' / 'my_cameras' / 'config' / 'a camera.yaml'
+    file.write_text(ROS_YAML)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{first}::{second}')
+    assert resolve_url('package://my_cameras/config/a camera.yaml') == file
+    assert resolve_url('package://my_cameras/config/a%20camera.yaml') == file
+    assert read_camera_info('package://my_cameras/config/a camera.yaml').width == 640
+    with pytest.raises(ProductError, match='package absent is not in AMENT_PREFIX_PATH'):
+        resolve_url('package://absent/a.yaml')
+    monkeypatch.delenv('AMENT_PREFIX_PATH')
+    with pytest.raises(ProductError, match='package my_cameras is not in'):
+        resolve_url('package://my_cameras/config/a.yaml')
+
+
+@pytest.mark.parametrize(
+    ('url', 'says'),
+    [
+        ('', 'empty'),
+        ('http://example.org/a.yaml', 'only file:// and package://'),
+        ('package://', 'not package://<package>/<path>'),
+        ('package://name', 'not package://<package>/<path>'),
+        ('package://../a', 'not package://<package>/<path>'),
+    ],
+)
+def test_urls_that_cannot_be_read(url: str, says: str) -> None:
+    with pytest.raises(ProductError, match=says):
+        resolve_url(url)
+
+
+def test_file_urls_with_and_without_percent_encoding(tmp_path: Path) -> None:
+    for name, url_name in (('a b.yaml', 'a%20b.yaml'), ('100%25.yaml', '100%25.yaml')):
+        (tmp_path / name).write_text(ROS_YAML)
+        assert resolve_url(f'file://{tmp_path}/{url_name}') == tmp_path / name
