@@ -1,0 +1,502 @@
+"""
+Records to ROS messages and back, without ROS.
+
+The functions that read take any object with the fields of the message: those that rclpy takes from
+the graph and those that rosbags decodes from a file alike.  The functions that build are given
+``make``, which returns a message of a type from its fields; sequences of numbers are handed to it
+as flat numpy arrays of the field's own type.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.camera import CameraModel, zero_skew_fit
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import ImageRefused
+from starcal_ros.records import (
+    CALIBRATION_PARAMETER_NAMES,
+    Calibration,
+    CameraGeometry,
+    EnsembleStatus,
+    Image,
+    StarObservations,
+    refused_image,
+)
+
+Floats = NDArray[np.float64]
+Message = Any  # a message class of rclpy or of rosbags: they share field names and nothing else
+
+IMAGE_TYPE = 'sensor_msgs/msg/Image'
+ATTITUDE_TYPE = 'geometry_msgs/msg/QuaternionStamped'
+VELOCITY_TYPE = 'geometry_msgs/msg/TwistStamped'
+CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
+ALIGNMENT_TYPE = 'geometry_msgs/msg/TransformStamped'
+OBSERVATIONS_TYPE = 'starcal/msg/StarObservations'
+CALIBRATION_TYPE = 'starcal/msg/Calibration'
+STATUS_TYPE = 'starcal/msg/EnsembleStatus'
+
+_PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
+
+
+class Make(Protocol):
+    """Builds a message of a type, ``'pkg/msg/Name'``, from its fields."""
+
+    def __call__(self, type_name: str, /, **fields: object) -> Message:
+        """Return the message."""
+
+
+def stamp_ns(stamp: Message) -> int:
+    """Nanoseconds of a builtin_interfaces/Time, exactly."""
+    return int(stamp.sec) * NANOSECONDS_PER_SECOND + int(stamp.nanosec)
+
+
+def offset_ns(seconds: float) -> int:
+    """Whole nanoseconds of an offset in seconds."""
+    return round(seconds * NANOSECONDS_PER_SECOND)
+
+
+def make_header(time_ns: int, frame_id: str, make: Make) -> Message:
+    """Return a std_msgs/Header of a time in nanoseconds."""
+    sec, nanosec = divmod(time_ns, NANOSECONDS_PER_SECOND)
+    stamp = make('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
+    return make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)
+
+
+def decode_image(
+    encoding: str,
+    width: int,
+    height: int,
+    step: int,
+    is_bigendian: bool,
+    data: object,
+    time_ns: int,
+) -> Image:
+    """
+    Pixels of an image message in native byte order, without its row padding.
+
+    No copy where the message holds them so already.
+
+    Parameters
+    ----------
+    encoding, width, height, step, is_bigendian, data
+        As in sensor_msgs/Image; ``data`` is anything with a buffer of bytes.
+    time_ns : int
+        Middle of the exposure.
+
+    Raises
+    ------
+    ImageRefused
+        ``bad_encoding`` or ``bad_layout``.
+    """
+    pixel_bytes = _PIXEL_BYTES.get(encoding)
+    if pixel_bytes is None:
+        raise ImageRefused(
+            'bad_encoding', f'{encoding[:40]!r} is not one of {", ".join(_PIXEL_BYTES)}'
+        )
+    # An empty buffer has no shape that frombuffer would take.
+    flat = np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)  # type: ignore
+    row_bytes = width * pixel_bytes
+    if width < 1 or height < 1:
+        raise ImageRefused('bad_layout', f'{width} x {height} is not an image')
+    if step < row_bytes:
+        raise ImageRefused('bad_layout', f'step {step} is less than a row of {row_bytes} bytes')
+    if flat.size != step * height:
+        raise ImageRefused(
+            'bad_layout',
+            f'{flat.size} bytes of data, not {step * height} for {height} rows',
+        )
+    dtype = np.dtype(np.uint8 if pixel_bytes == 1 else '>u2' if is_bigendian else '<u2')
+    # Strides rather than a slice: a step need not be a whole number of 16-bit pixels.
+    rows: NDArray[Any] = np.ndarray(
+        (height, width), dtype, buffer=flat, strides=(step, pixel_bytes)
+    )
+    pixels: NDArray[Any] = np.ascontiguousarray(rows, dtype.newbyteorder('='))
+    pixels.setflags(write=False)
+    return Image(time_ns, pixels)
+
+
+def image_from_message(message: Message, stamp_offset_s: float = 0.0) -> Image:
+    """
+    Image of a sensor_msgs/Image, its time shifted to the middle of the exposure.
+
+    Raises
+    ------
+    ImageRefused
+        ``bad_encoding`` or ``bad_layout``.
+    """
+    return decode_image(
+        message.encoding,
+        message.width,
+        message.height,
+        message.step,
+        bool(message.is_bigendian),
+        message.data,
+        stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s),
+    )
+
+
+def refused_from_message(
+    message: Message, stamp_offset_s: float, refused: ImageRefused
+) -> StarObservations:
+    """Return the observations of a sensor_msgs/Image that cannot be used."""
+    return refused_image(
+        stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s),
+        int(message.width),
+        int(message.height),
+        refused.reason,
+        refused.detail,
+    )
+
+
+def image_to_message(image: Image, frame_id: str, make: Make) -> Message:
+    """Return a sensor_msgs/Image, mono8 or mono16 in the byte order of this machine."""
+    pixels = np.ascontiguousarray(image.pixels)
+    height, width = pixels.shape
+    return make(
+        IMAGE_TYPE,
+        header=make_header(image.time_ns, frame_id, make),
+        height=height,
+        width=width,
+        encoding='mono8' if pixels.itemsize == 1 else 'mono16',
+        is_bigendian=int(sys.byteorder == 'big'),
+        step=width * pixels.itemsize,
+        data=pixels.reshape(-1).view(np.uint8),
+    )
+
+
+def color_image_to_message(
+    time_ns: int, bgr: NDArray[np.uint8], frame_id: str, make: Make
+) -> Message:
+    """Return a sensor_msgs/Image bgr8 of a (height, width, 3) picture."""
+    height, width, _ = bgr.shape
+    return make(
+        IMAGE_TYPE,
+        header=make_header(time_ns, frame_id, make),
+        height=height,
+        width=width,
+        encoding='bgr8',
+        is_bigendian=0,
+        step=width * 3,
+        data=np.ascontiguousarray(bgr).reshape(-1),
+    )
+
+
+def attitude_from_message(message: Message) -> tuple[int, Floats]:
+    """Stamp and (4,) xyzw of a geometry_msgs/QuaternionStamped, as on the wire and unchecked."""
+    return stamp_ns(message.header.stamp), _quaternion_from_message(message.quaternion)
+
+
+def attitude_to_message(
+    time_ns: int, quaternion_xyzw: Floats, frame_id: str, make: Make
+) -> Message:
+    """Return a geometry_msgs/QuaternionStamped; ``frame_id`` is the inertial frame."""
+    return make(
+        ATTITUDE_TYPE,
+        header=make_header(time_ns, frame_id, make),
+        quaternion=_quaternion_to_message(quaternion_xyzw, make),
+    )
+
+
+def velocity_from_message(message: Message) -> tuple[int, Floats]:
+    """Stamp and (3,) m/s of a geometry_msgs/TwistStamped."""
+    linear = message.twist.linear
+    return stamp_ns(message.header.stamp), np.array([linear.x, linear.y, linear.z], np.float64)
+
+
+def velocity_to_message(time_ns: int, velocity_m_s: Floats, frame_id: str, make: Make) -> Message:
+    """Return a geometry_msgs/TwistStamped without rotation."""
+    return make(
+        VELOCITY_TYPE,
+        header=make_header(time_ns, frame_id, make),
+        twist=make(
+            'geometry_msgs/msg/Twist',
+            linear=_vector_to_message(velocity_m_s, make),
+            angular=_vector_to_message(np.zeros(3), make),
+        ),
+    )
+
+
+def observations_to_message(record: StarObservations, frame_id: str, make: Make) -> Message:
+    """Return a starcal/StarObservations; ``frame_id`` is the camera's."""
+    return make(
+        OBSERVATIONS_TYPE,
+        header=make_header(record.time_ns, frame_id, make),
+        width=record.width,
+        height=record.height,
+        refusal=record.refusal,
+        detail=record.detail,
+        attitude=_quaternion_to_message(record.icrf_from_star_tracker_xyzw, make),
+        attitude_gap_s=float(record.attitude_gap_s),
+        catalog_id=_flat(record.catalog_id, np.int64),
+        direction_icrf=_flat(record.direction_icrf, np.float64),
+        magnitude=_flat(record.magnitude, np.float32),
+        measured_px=_flat(record.measured_px, np.float64),
+        covariance_px2=_flat(record.covariance_px2, np.float64),
+        flux_dn=_flat(record.flux_dn, np.float32),
+        snr=_flat(record.snr, np.float32),
+        refused_star_reasons=list(record.refused_stars),
+        refused_star_counts=_flat(list(record.refused_stars.values()), np.uint32),
+        background_dn=float(record.background_dn),
+        noise_dn=float(record.noise_dn),
+        psf_sigma_px=float(record.psf_sigma_px),
+        catalog_digest=record.catalog_digest,
+    )
+
+
+def observations_from_message(message: Message) -> StarObservations:
+    """
+    Observations of a starcal/StarObservations.
+
+    Raises
+    ------
+    ValueError
+        When the arrays of the message do not fit each other or hold what no star has.
+    """
+    catalog_id = np.array(message.catalog_id, np.int64)
+    n = len(catalog_id)
+    record = StarObservations(
+        time_ns=stamp_ns(message.header.stamp),
+        width=int(message.width),
+        height=int(message.height),
+        refusal=str(message.refusal),
+        detail=str(message.detail),
+        icrf_from_star_tracker_xyzw=_quaternion_from_message(message.attitude),
+        attitude_gap_s=float(message.attitude_gap_s),
+        catalog_id=catalog_id,
+        direction_icrf=_shaped('direction_icrf', message.direction_icrf, (n, 3)),
+        magnitude=_shaped('magnitude', message.magnitude, (n,)).astype(np.float32),
+        measured_px=_shaped('measured_px', message.measured_px, (n, 2)),
+        covariance_px2=_shaped('covariance_px2', message.covariance_px2, (n, 3)),
+        flux_dn=_shaped('flux_dn', message.flux_dn, (n,)).astype(np.float32),
+        snr=_shaped('snr', message.snr, (n,)).astype(np.float32),
+        refused_stars=_counts(message.refused_star_reasons, message.refused_star_counts),
+        background_dn=float(message.background_dn),
+        noise_dn=float(message.noise_dn),
+        psf_sigma_px=float(message.psf_sigma_px),
+        catalog_digest=str(message.catalog_digest),
+    )
+    for name in (
+        'direction_icrf',
+        'measured_px',
+        'covariance_px2',
+        'icrf_from_star_tracker_xyzw',
+    ):
+        if not np.isfinite(getattr(record, name)).all():
+            raise ValueError(f'{name}: not finite')
+    uu, uv, vv = record.covariance_px2.T
+    if not ((uu > 0) & (uu * vv > uv * uv)).all():
+        raise ValueError('covariance_px2: not positive definite')
+    return record
+
+
+def status_to_message(status: EnsembleStatus, frame_id: str, make: Make) -> Message:
+    """Return a starcal/EnsembleStatus; ``frame_id`` is the camera's."""
+    rows, cols = status.coverage.shape
+    return make(
+        STATUS_TYPE,
+        header=make_header(status.time_ns, frame_id, make),
+        images=status.images,
+        stars=status.stars,
+        min_images=status.min_images,
+        min_stars=status.min_stars,
+        refused_reasons=list(status.refused),
+        refused_counts=_flat(list(status.refused.values()), np.uint32),
+        coverage_rows=rows,
+        coverage_cols=cols,
+        coverage=_flat(status.coverage, np.uint32),
+        parameter_names=list(status.parameter_names),
+        predicted_sigma=_flat(status.predicted_sigma, np.float64),
+    )
+
+
+def status_from_message(message: Message) -> EnsembleStatus:
+    """
+    Ensemble status of a starcal/EnsembleStatus.
+
+    Raises
+    ------
+    ValueError
+        When the arrays of the message do not fit each other.
+    """
+    shape = int(message.coverage_rows), int(message.coverage_cols)
+    names = tuple(str(name) for name in message.parameter_names)
+    return EnsembleStatus(
+        time_ns=stamp_ns(message.header.stamp),
+        images=int(message.images),
+        stars=int(message.stars),
+        min_images=int(message.min_images),
+        min_stars=int(message.min_stars),
+        refused=_counts(message.refused_reasons, message.refused_counts),
+        coverage=_shaped('coverage', message.coverage, shape).astype(np.int64),
+        parameter_names=names,
+        predicted_sigma=_shaped('predicted_sigma', message.predicted_sigma, (len(names),)),
+    )
+
+
+def calibration_to_message(calibration: Calibration, make: Make) -> Message:
+    """Return a starcal/Calibration, every number as the record has it."""
+    camera = calibration.geometry.camera
+    fx, skew, fy, cx, cy = (float(value) for value in camera.intrinsics)
+    return make(
+        CALIBRATION_TYPE,
+        header=make_header(calibration.time_ns, calibration.child_frame, make),
+        accepted=calibration.accepted,
+        reasons=list(calibration.reasons),
+        width=camera.width,
+        height=camera.height,
+        fx=fx,
+        skew=skew,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        distortion=_flat(camera.distortion, np.float64),
+        parent_frame=calibration.parent_frame,
+        alignment=_quaternion_to_message(calibration.geometry.star_tracker_from_camera_xyzw, make),
+        parameter_names=list(CALIBRATION_PARAMETER_NAMES),
+        covariance=_flat(calibration.covariance, np.float64),
+        method=calibration.method,
+        estimated=list(calibration.estimated),
+        residual_rms_px=float(calibration.residual_rms_px),
+        variance_factor=float(calibration.variance_factor),
+        images_used=calibration.images_used,
+        stars_used=calibration.stars_used,
+        stars_rejected=calibration.stars_rejected,
+        refused_reasons=list(calibration.images_refused),
+        refused_counts=_flat(list(calibration.images_refused.values()), np.uint32),
+        alignment_scatter_arcsec=float(calibration.alignment_scatter_arcsec),
+        zero_skew_cost_px=float(calibration.zero_skew_cost_px),
+        iterations=calibration.iterations,
+        termination=calibration.termination,
+        provenance_keys=list(calibration.provenance),
+        provenance_values=list(calibration.provenance.values()),
+    )
+
+
+def calibration_from_message(message: Message) -> Calibration:
+    """
+    Calibration of a starcal/Calibration.
+
+    Raises
+    ------
+    ValueError
+        When the message does not hold a camera: an empty one, say.
+    """
+    names = tuple(str(name) for name in message.parameter_names)
+    if names != CALIBRATION_PARAMETER_NAMES:
+        raise ValueError(f'parameter_names: {", ".join(names) or "none"} are not the thirteen')
+    intrinsics = [message.fx, message.skew, message.fy, message.cx, message.cy]
+    camera = CameraModel(
+        int(message.width), int(message.height), np.r_[intrinsics, message.distortion]
+    )
+    alignment = _quaternion_from_message(message.alignment)
+    if not abs(np.linalg.norm(alignment) - 1.0) < 1e-6:  # what rounding to a text could leave
+        raise ValueError(f'alignment: {alignment.tolist()} is not a unit quaternion')
+    provenance = zip(message.provenance_keys, message.provenance_values, strict=True)
+    return Calibration(
+        time_ns=stamp_ns(message.header.stamp),
+        geometry=CameraGeometry(camera, alignment),
+        covariance=_shaped('covariance', message.covariance, (len(names), len(names))),
+        method=str(message.method),
+        estimated=tuple(str(name) for name in message.estimated),
+        residual_rms_px=float(message.residual_rms_px),
+        variance_factor=float(message.variance_factor),
+        images_used=int(message.images_used),
+        images_refused=_counts(message.refused_reasons, message.refused_counts),
+        stars_used=int(message.stars_used),
+        stars_rejected=int(message.stars_rejected),
+        alignment_scatter_arcsec=float(message.alignment_scatter_arcsec),
+        zero_skew_cost_px=float(message.zero_skew_cost_px),
+        iterations=int(message.iterations),
+        termination=str(message.termination),
+        accepted=bool(message.accepted),
+        reasons=tuple(str(reason) for reason in message.reasons),
+        parent_frame=str(message.parent_frame),
+        child_frame=str(message.header.frame_id),
+        provenance={str(key): str(value) for key, value in provenance},
+    )
+
+
+def camera_info_to_message(calibration: Calibration, make: Make) -> Message:
+    """
+    Return a sensor_msgs/CameraInfo: the best camera without skew, as ``plumb_bob``.
+
+    Skew does not fit: readers of camera_info take K[0,1] as 0 without a word.
+    """
+    camera, _ = zero_skew_fit(calibration.geometry.camera)
+    fx, _, fy, cx, cy = camera.intrinsics
+    k1, k2, k3, p1, p2 = camera.distortion
+    return make(
+        CAMERA_INFO_TYPE,
+        header=make_header(calibration.time_ns, calibration.child_frame, make),
+        height=camera.height,
+        width=camera.width,
+        distortion_model='plumb_bob',
+        d=np.array([k1, k2, p1, p2, k3]),
+        k=np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        r=np.eye(3).ravel(),
+        p=np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        binning_x=0,
+        binning_y=0,
+        roi=make(
+            'sensor_msgs/msg/RegionOfInterest',
+            x_offset=0,
+            y_offset=0,
+            height=0,
+            width=0,
+            do_rectify=False,
+        ),
+    )
+
+
+def alignment_to_message(calibration: Calibration, make: Make) -> Message:
+    """Return a geometry_msgs/TransformStamped: the camera frame in the star tracker frame."""
+    return make(
+        ALIGNMENT_TYPE,
+        header=make_header(calibration.time_ns, calibration.parent_frame, make),
+        child_frame_id=calibration.child_frame,
+        transform=make(
+            'geometry_msgs/msg/Transform',
+            translation=_vector_to_message(np.zeros(3), make),
+            rotation=_quaternion_to_message(
+                calibration.geometry.star_tracker_from_camera_xyzw, make
+            ),
+        ),
+    )
+
+
+def _quaternion_to_message(xyzw: Floats, make: Make) -> Message:
+    x, y, z, w = (float(value) for value in xyzw)
+    return make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w)
+
+
+def _quaternion_from_message(quaternion: Message) -> Floats:
+    return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], np.float64)
+
+
+def _vector_to_message(xyz: Floats, make: Make) -> Message:
+    x, y, z = (float(value) for value in xyz)
+    return make('geometry_msgs/msg/Vector3', x=x, y=y, z=z)
+
+
+def _flat(values: object, dtype: type[np.generic]) -> NDArray[Any]:
+    # Flat and contiguous: rclpy serialises a nested array as garbage without an error.
+    return np.ascontiguousarray(values, dtype).reshape(-1)
+
+
+def _shaped(name: str, values: object, shape: tuple[int, ...]) -> Floats:
+    flat = np.array(values, np.float64)
+    if flat.size != np.prod(shape):
+        raise ValueError(f'{name}: {flat.size} numbers, not {" x ".join(map(str, shape))}')
+    return flat.reshape(shape)
+
+
+def _counts(reasons: Sequence[str], counts: Sequence[int]) -> Mapping[str, int]:
+    if len(reasons) != len(counts):
+        raise ValueError(f'{len(reasons)} reasons but {len(counts)} counts')
+    return {str(reason): int(count) for reason, count in zip(reasons, counts, strict=True)}
