@@ -37,13 +37,7 @@ from rosbags.typesys.store import Typestore
 from starcal_ros import messages
 from starcal_ros.attitude import AttitudeHistory, AttitudeOptions, attitude_sample
 from starcal_ros.errors import BagError, ImageRefused
-from starcal_ros.records import (
-    Calibration,
-    EnsembleStatus,
-    Image,
-    StarObservations,
-    refused_image,
-)
+from starcal_ros.records import Calibration, EnsembleStatus, Image, StarObservations, refused_image
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -164,9 +158,7 @@ def choose_topic(paths: Iterable[Path | str], type_name: str, asked: str = '') -
 
 
 def read_raw(
-    paths: Iterable[Path | str],
-    only: Iterable[str] | None = None,
-    on_damage: Damage = log_damage,
+    paths: Iterable[Path | str], only: Iterable[str] | None = None, on_damage: Damage = log_damage
 ) -> Iterator[RawMessage]:
     """Messages as they were recorded, in the order of the file; of some topics or of all."""
     wanted = None if only is None else frozenset(only)
@@ -330,12 +322,7 @@ class BagWriter:
         self._write(topic, messages.CALIBRATION_TYPE, calibration.time_ns, message, latched=True)
 
     def _write(
-        self,
-        topic: str,
-        type_name: str,
-        time_ns: int,
-        message: object,
-        latched: bool = False,
+        self, topic: str, type_name: str, time_ns: int, message: object, latched: bool = False
     ) -> None:
         channel = self._channels.get(topic) or self._open(topic, type_name, latched)
         if channel.type_name != type_name:
@@ -343,11 +330,7 @@ class BagWriter:
         data = bytes(_typestore().serialize_cdr(message, type_name))
         try:
             self._writer.add_message(
-                channel.number,
-                time_ns,
-                data,
-                publish_time=time_ns,
-                sequence=self._counts[topic],
+                channel.number, time_ns, data, publish_time=time_ns, sequence=self._counts[topic]
             )
         except OSError as error:
             raise BagError(f'{self.file}: cannot be written: {error.strerror}') from error
@@ -419,11 +402,7 @@ def _typestore() -> Typestore:
     """ROS's own types and starcal's."""
     store = get_typestore(Stores.ROS2_JAZZY)
     folder = _definitions_folder()
-    for type_name in (
-        messages.OBSERVATIONS_TYPE,
-        messages.STATUS_TYPE,
-        messages.CALIBRATION_TYPE,
-    ):
+    for type_name in (messages.OBSERVATIONS_TYPE, messages.STATUS_TYPE, messages.CALIBRATION_TYPE):
         text = (folder / f'{type_name.rpartition("/")[2]}.msg').read_text()
         store.register(get_types_from_msg(text, type_name))
     return store
@@ -478,10 +457,7 @@ def _files_of_folder(folder: Path) -> list[Path]:
         names = [str(name) for name in information['relative_file_paths']]
         compression = str(information.get('compression_mode') or '')
     except (OSError, yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError):
-        names, compression = (
-            [],
-            '',
-        )  # lost or cut off with the recorder: the files speak
+        names, compression = ([], '')  # lost or cut off with the recorder: the files speak
     if compression:
         raise BagError(
             f'{folder}: compressed by {compression.lower()}: ros2 bag convert can undo it'

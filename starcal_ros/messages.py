@@ -108,8 +108,7 @@ def decode_image(
         raise ImageRefused('bad_layout', f'step {step} is less than a row of {row_bytes} bytes')
     if flat.size != step * height:
         raise ImageRefused(
-            'bad_layout',
-            f'{flat.size} bytes of data, not {step * height} for {height} rows',
+            'bad_layout', f'{flat.size} bytes of data, not {step * height} for {height} rows'
         )
     dtype = np.dtype(np.uint8 if pixel_bytes == 1 else '>u2' if is_bigendian else '<u2')
     # Strides rather than a slice: a step need not be a whole number of 16-bit pixels.
@@ -281,12 +280,7 @@ def observations_from_message(message: Message) -> StarObservations:
         psf_sigma_px=float(message.psf_sigma_px),
         catalog_digest=str(message.catalog_digest),
     )
-    for name in (
-        'direction_icrf',
-        'measured_px',
-        'covariance_px2',
-        'icrf_from_star_tracker_xyzw',
-    ):
+    for name in ('direction_icrf', 'measured_px', 'covariance_px2', 'icrf_from_star_tracker_xyzw'):
         if not np.isfinite(getattr(record, name)).all():
             raise ValueError(f'{name}: not finite')
     uu, uv, vv = record.covariance_px2.T
