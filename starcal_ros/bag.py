@@ -23,7 +23,7 @@ from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import yaml
-from mcap.exceptions import McapError
+from mcap.exceptions import EndOfFile, McapError, RecordLengthLimitExceeded
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, McapRecord, Schema, Statistics
@@ -535,9 +535,9 @@ def _records(file: Path, on_damage: Damage) -> Iterator[McapRecord]:
             OverflowError,
             MemoryError,
         ) as error:
-            reason = 'cut off' if stream.tell() >= size else 'damaged'
+            cut = isinstance(error, (EndOfFile, RecordLengthLimitExceeded))
             tell(
-                f'{file}: {reason} after byte {read_to} of {size}'
+                f'{file}: {"cut off" if cut else "damaged"} after byte {read_to} of {size}'
                 f' ({type(error).__name__}); what stands before it was read'
             )
 
