@@ -535,7 +535,8 @@ def _records(file: Path, on_damage: Damage) -> Iterator[McapRecord]:
             OverflowError,
             MemoryError,
         ) as error:
-            cut = isinstance(error, (EndOfFile, RecordLengthLimitExceeded))
+            at_end = isinstance(error, (EndOfFile, RecordLengthLimitExceeded))
+            cut = at_end or stream.tell() >= size
             tell(
                 f'{file}: {"cut off" if cut else "damaged"} after byte {read_to} of {size}'
                 f' ({type(error).__name__}); what stands before it was read'
