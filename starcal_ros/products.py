@@ -7,22 +7,22 @@ that was written and read is equal to the last bit.  Files are replaced whole or
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 import json
 import math
 import os
-import re
-from collections.abc import Callable, Mapping
 from pathlib import Path
+import re
 from typing import TypeVar
 from urllib.parse import unquote
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
+import yaml
 
-from starcal_ros.camera import DISTORTION_NAMES, INTRINSIC_NAMES, CameraModel, zero_skew_fit
+from starcal_ros.camera import CameraModel, DISTORTION_NAMES, INTRINSIC_NAMES, zero_skew_fit
 from starcal_ros.errors import ProductError
-from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, Calibration, CameraGeometry
+from starcal_ros.records import Calibration, CALIBRATION_PARAMETER_NAMES, CameraGeometry
 
 Floats = NDArray[np.float64]
 T = TypeVar('T')
@@ -175,6 +175,14 @@ def resolve_url(url: str) -> Path:
     raise ProductError(f'{url}: package {package} is not in AMENT_PREFIX_PATH')
 
 
+def with_camera_url_from(values: Mapping[str, object], params: Path) -> dict[str, object]:
+    """Parameters of a file; a `camera_info_url` that is no URL is relative to that file."""
+    url = values.get('camera_info_url')
+    if isinstance(url, str) and url and '://' not in url:
+        return {**values, 'camera_info_url': str(params.parent / url)}
+    return dict(values)
+
+
 def _as_written_or_decoded(path: Path) -> Path:
     """The path; ROS does not decode %20 in its URLs but others do, so both are taken."""
     return path if path.exists() else Path(unquote(str(path)))
@@ -286,7 +294,7 @@ class _Reader:
         self._content = content
 
     def get(self, dotted_key: str, kind: Callable[[object], T]) -> T:
-        """The value at a key, as `kind` returns it; `kind` raises ValueError('what is expected')."""
+        """Value at a key, as `kind` returns it; `kind` raises ValueError('what is expected')."""
         value: object = self._content
         for key in dotted_key.split('.'):
             if not isinstance(value, dict) or key not in value:

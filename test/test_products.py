@@ -1,4 +1,4 @@
-"""calibration.json and camera_info.yaml: exact round trips, hand-written files, one-line errors."""
+"""Files calibration.json and camera_info.yaml: round trips, hand-written files, errors."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import json
 import math
 from pathlib import Path
 
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 import yaml
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, zero_skew_fit
 from starcal_ros.errors import ProductError
@@ -23,7 +23,7 @@ from starcal_ros.products import (
     write_calibration,
     write_camera_info,
 )
-from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, Calibration, CameraGeometry
+from starcal_ros.records import Calibration, CALIBRATION_PARAMETER_NAMES, CameraGeometry
 
 PARAMETERS = np.array(
     [3641.5121868491606, -0.74, 3642.3, 647.5, 511.5, -0.0512, 0.1167, 0.01, 5.1e-4, 3.2e-5]
@@ -113,7 +113,9 @@ def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
     focal=st.tuples(st.floats(1e-300, 1e300), st.floats(1e-300, 1e300)),
     others=st.lists(finite, min_size=8, max_size=8),
@@ -266,8 +268,16 @@ def test_camera_info_is_what_camera_info_manager_reads(tmp_path: Path) -> None:
     fitted, _ = zero_skew_fit(CAMERA)
     fx, _, fy, cx, cy, k1, k2, k3, p1, p2 = fitted.parameters.tolist()
     assert content['camera_name'] == 'opnav'
-    assert content['camera_matrix'] == {'rows': 3, 'cols': 3, 'data': [fx, 0, cx, 0, fy, cy, 0, 0, 1]}
-    assert content['distortion_coefficients'] == {'rows': 1, 'cols': 5, 'data': [k1, k2, p1, p2, k3]}
+    assert content['camera_matrix'] == {
+        'rows': 3,
+        'cols': 3,
+        'data': [fx, 0, cx, 0, fy, cy, 0, 0, 1],
+    }
+    assert content['distortion_coefficients'] == {
+        'rows': 1,
+        'cols': 5,
+        'data': [k1, k2, p1, p2, k3],
+    }
     assert content['rectification_matrix']['data'] == [1, 0, 0, 0, 1, 0, 0, 0, 1]
     assert content['projection_matrix'] == {
         'rows': 3, 'cols': 4, 'data': [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
