@@ -1,0 +1,100 @@
+"""The gate: whether a candidate calibration may come into force, and if not, every reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.camera import line_of_sight, pixel_grid, project
+from starcal_ros.options import option
+from starcal_ros.records import CameraGeometry
+
+
+@dataclass(frozen=True)
+class GateOptions:
+    """Limits that a calibration must keep to come into force."""
+
+    max_residual_rms_px: float = option(
+        1.0, 'largest residual per axis over the stars used, px', low=0.0, high=100.0
+    )
+    max_rejected_fraction: float = option(
+        0.25, 'largest fraction of stars left out as outliers', low=0.0, high=1.0
+    )
+    min_coverage: float = option(
+        0.3, 'least fraction of the focal-plane cells that hold a star', low=0.0, high=1.0
+    )
+    max_line_of_sight_sigma_px: float = option(
+        0.5, 'largest 1-sigma of the distortion map over the detector, px', low=0.0, high=100.0
+    )
+    max_change_px: float = option(
+        50.0, 'largest change of the camera against the prior over the detector, px', low=0.0, high=1e5
+    )
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What the gate looks at: a solution and its statistics, ``coverage`` (rows, cols) counts."""
+
+    geometry: CameraGeometry
+    prior: CameraGeometry
+    covariance: NDArray[np.float64]
+    residual_rms_px: float
+    stars_used: int
+    stars_rejected: int
+    coverage: NDArray[np.int64]
+    map_sigma_px: float
+    termination: str
+
+
+def camera_change_px(before: CameraGeometry, after: CameraGeometry) -> float:
+    """
+    Largest distance over the detector between the images of one direction in two cameras, px.
+
+    Infinite where a pixel of the first camera has no line of sight, or the second does not see it.
+    """
+    directions = line_of_sight(before.camera, pixel_grid(before.camera, 15, 12))
+    moved = project(after.camera, directions) - project(before.camera, directions)
+    largest = float(np.linalg.norm(moved, axis=-1).max())
+    return largest if np.isfinite(largest) else np.inf
+
+
+def judge(candidate: Candidate, options: GateOptions) -> tuple[str, ...]:
+    """Every reason against a candidate, one sentence each; empty when it may come into force."""
+    reasons = []
+    if candidate.termination != 'converged':
+        reasons.append(f'the solver did not converge ({candidate.termination})')
+    values = np.r_[candidate.geometry.camera.parameters, np.diag(candidate.covariance)]
+    if not np.isfinite(values).all() or (np.diag(candidate.covariance) < 0).any():
+        reasons.append('a parameter or its variance is not a finite number')
+    if candidate.residual_rms_px > options.max_residual_rms_px:
+        reasons.append(
+            f'residual {candidate.residual_rms_px:.3f} px per axis is over the limit of '
+            f'{options.max_residual_rms_px:g} px (max_residual_rms_px)'
+        )
+    total = candidate.stars_used + candidate.stars_rejected
+    if candidate.stars_rejected > options.max_rejected_fraction * total:
+        reasons.append(
+            f'{candidate.stars_rejected} of {total} stars are outliers, more than a fraction of '
+            f'{options.max_rejected_fraction:g} (max_rejected_fraction)'
+        )
+    covered = float((candidate.coverage > 0).mean())
+    if covered < options.min_coverage:
+        reasons.append(
+            f'stars cover {100 * covered:.0f} % of the detector, under the limit of '
+            f'{100 * options.min_coverage:.0f} % (min_coverage)'
+        )
+    if not candidate.map_sigma_px <= options.max_line_of_sight_sigma_px:
+        reasons.append(
+            f'the distortion map is uncertain by {candidate.map_sigma_px:.3f} px at its worst, over '
+            f'the limit of {options.max_line_of_sight_sigma_px:g} px (max_line_of_sight_sigma_px)'
+        )
+    change_px = camera_change_px(candidate.prior, candidate.geometry)
+    if not change_px <= options.max_change_px:
+        reasons.append(
+            f'the camera would change by {change_px:.1f} px at its worst, over the limit of '
+            f'{options.max_change_px:g} px (max_change_px)'
+        )
+    return tuple(reasons)
+

@@ -1,0 +1,444 @@
+"""
+Which star is which: prediction, acquisition and matching.
+
+Catalog stars are predicted into the image, the common shift and roll that the prior alignment may
+be off by is found by a vote of bright sources against bright predictions, the match is checked
+against chance, and the predictions are refined until every star can be measured in its own window.
+An image that no match explains is refused, never matched wrongly.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from scipy.stats import poisson
+
+from starcal_ros.astrometry import apparent_directions
+from starcal_ros.camera import field_radius_rad, line_of_sight, project, project_jacobians
+from starcal_ros.catalog import StarCatalog, cone
+from starcal_ros.centroiding import (
+    Centroids,
+    CentroidOptions,
+    ImageModel,
+    Pixels,
+    Sources,
+    detect,
+    measure_background,
+    measure_stars,
+    model_image,
+)
+from starcal_ros.errors import ImageRefused
+from starcal_ros.options import option
+from starcal_ros.records import CameraGeometry, Image, StarObservations
+
+Floats = NDArray[np.float64]
+
+_VOTERS = 100  # brightest predictions and sources that vote: their pairs fill one histogram at once
+_CHANCE = 1e-9  # greatest probability that a match is accepted by chance
+
+
+@dataclass(frozen=True)
+class IdentificationOptions:
+    """How stars are predicted and matched."""
+
+    magnitude_limit: float = option(
+        9.0, 'faintest catalog star that is looked for, V magnitude', low=0.0, high=20.0
+    )
+    acquisition_radius_deg: float = option(
+        1.5, 'largest alignment error that is searched, degrees', low=0.05, high=5.0
+    )
+    acquisition_roll_deg: float = option(
+        5.0, 'largest roll error that is searched, degrees', low=0.0, high=20.0
+    )
+    min_stars_per_image: int = option(
+        8, 'fewest measured stars with which an image is used', low=3, high=1000
+    )
+    max_blend_px: float = option(
+        0.05, 'largest pull of a neighbour in the catalog on a centroid, px', low=0.0, high=1.0
+    )
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """
+    Catalog stars in and about the image.
+
+    ``catalog_index`` (n,) rows of the catalog, brightest first; ``direction_icrf`` (n, 3) apparent;
+    ``direction_camera`` (n, 3); ``xy_px`` (n, 2).
+    """
+
+    catalog_index: NDArray[np.int64]
+    direction_icrf: Floats
+    direction_camera: Floats
+    xy_px: Floats
+
+
+def predict(
+    geometry: CameraGeometry,
+    icrf_from_star_tracker_xyzw: Floats,
+    time_ns: int,
+    catalog: StarCatalog,
+    options: IdentificationOptions,
+    velocity_m_s: Floats | None = None,
+) -> Prediction:
+    """
+    Apparent catalog stars where attitude, alignment and camera put them.
+
+    Stars outside the image are kept as far as acquisition may bring them in.
+    """
+    camera = geometry.camera
+    icrf_from_camera = Rotation.from_quat(icrf_from_star_tracker_xyzw) * Rotation.from_quat(
+        geometry.star_tracker_from_camera_xyzw
+    )
+    margin_px = np.radians(options.acquisition_radius_deg) * camera.parameters[0]
+    boresight_icrf = icrf_from_camera.apply([0.0, 0.0, 1.0])
+    radius_rad = field_radius_rad(camera, margin_px)
+    index = cone(catalog, boresight_icrf, radius_rad, options.magnitude_limit)
+    index = index[np.argsort(catalog.magnitude[index], kind='stable')]
+    direction_icrf = apparent_directions(catalog.select(index), time_ns, velocity_m_s)
+    direction_camera = icrf_from_camera.inv().apply(direction_icrf)
+    xy_px = project(camera, direction_camera)
+    with np.errstate(invalid='ignore'):
+        # A distortion polynomial folds over far outside: only what the inverse leads back is real.
+        near = _in_image(xy_px, camera.width, camera.height, margin_px)
+    near[near] &= np.einsum(
+        'ij,ij->i', line_of_sight(camera, xy_px[near]), direction_camera[near]
+    ) > np.cos(1e-6)
+    return Prediction(index[near], direction_icrf[near], direction_camera[near], xy_px[near])
+
+
+def _in_image(xy_px: Floats, width: int, height: int, margin_px: float = 0.0) -> NDArray[np.bool_]:
+    """Return (n,) whether pixels lie in the image widened by a margin."""
+    u, v, m = xy_px[:, 0], xy_px[:, 1], margin_px
+    return (u > -m) & (u < width - 1 + m) & (v > -m) & (v < height - 1 + m)
+
+
+def acquire(
+    prediction: Prediction,
+    sources: Sources,
+    geometry: CameraGeometry,
+    options: IdentificationOptions,
+) -> Rotation:
+    """
+    Small rotation of the camera frame that brings the predictions onto the sources.
+
+    A vote: for each roll within the limit, the pixel offsets of all pairs of bright sources and
+    bright predictions are counted in cells; true pairs share one cell, false ones spread.
+
+    Raises
+    ------
+    ImageRefused
+        ``no_match`` when the best cell holds no more than chance would put there.
+    """
+    camera = geometry.camera
+    width, height = camera.width, camera.height
+    half_diagonal_px = 0.5 * np.hypot(width, height)
+    reach_px = np.radians(options.acquisition_radius_deg) * camera.parameters[0]
+    # Wide enough for what the prior focal length and the roll step leave at the edge.
+    cell_px = max(3.0, 0.008 * half_diagonal_px)
+    centre = np.array([(width - 1) / 2, (height - 1) / 2])
+    stars = prediction.xy_px[:_VOTERS] - centre
+    seen = sources.xy_px[:_VOTERS] - centre
+    half_cells = int(np.ceil(reach_px / cell_px)) + 1
+    cells = 2 * half_cells + 1
+    roll_step = cell_px / half_diagonal_px
+    roll_steps = int(np.ceil(np.radians(options.acquisition_roll_deg) / roll_step))
+
+    best_count, best_roll, best_cell = -1, 0.0, (0, 0)
+    # Nearest to zero first: of equal votes the smallest turn wins.
+    for step in sorted(range(-roll_steps, roll_steps + 1), key=abs):
+        roll = step * roll_step
+        offset = seen[:, None] - _turn(stars, roll)[None]
+        cell = np.floor(offset / cell_px).astype(np.int64).reshape(-1, 2) + half_cells
+        inside = ((cell >= 0) & (cell < cells)).all(axis=1)
+        flat = cell[inside, 1] * cells + cell[inside, 0]
+        votes = np.bincount(flat, minlength=cells * cells).reshape(cells, cells)
+        blocks = votes[:-1, :-1] + votes[1:, :-1] + votes[:-1, 1:] + votes[1:, 1:]
+        k = int(blocks.argmax())
+        if blocks.flat[k] > best_count:
+            best_count = int(blocks.flat[k])
+            best_roll, best_cell = roll, (k // (cells - 1), k % (cells - 1))
+    low = (np.array([best_cell[1], best_cell[0]]) - half_cells) * cell_px
+    offset = seen[:, None] - _turn(stars, best_roll)[None]
+    in_block = ((offset >= low) & (offset < low + 2 * cell_px)).all(axis=2)
+    expected = (
+        len(stars) * len(seen) * (2 * cell_px) ** 2 / ((width + 2 * reach_px) * (height + 2 * reach_px))
+    )
+    trials = (2 * roll_steps + 1) * cells * cells
+    if best_count < 4 or poisson.sf(best_count - 1, expected) * trials > 1e-2:
+        raise ImageRefused(
+            'no_match', f'{best_count} of {min(len(stars), len(seen))} bright stars agree, as by chance'
+        )
+    shift_px = np.median(offset[in_block], axis=0)
+    roll_turn = Rotation.from_rotvec([0.0, 0.0, best_roll])
+    middle = line_of_sight(camera, np.stack([centre, centre + shift_px]))
+    axis = np.cross(middle[0], middle[1])
+    return Rotation.from_rotvec(axis) * roll_turn
+
+
+def _turn(xy_px: Floats, angle_rad: float) -> Floats:
+    """Points (n, 2) turned about the origin from +u towards +v."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return xy_px @ np.array([[c, s], [-s, c]])
+
+
+def _pairs(predicted_px: Floats, sources_px: Floats, radius_px: float) -> NDArray[np.int64]:
+    """
+    Pairs (k, 2) of prediction and source that are each other's nearest within a radius.
+
+    Only mutual nearest neighbours count, so no source and no star is used twice.
+    """
+    if len(predicted_px) == 0 or len(sources_px) == 0:
+        return np.empty((0, 2), np.int64)
+    distance, source = cKDTree(sources_px).query(predicted_px, distance_upper_bound=radius_px)
+    star = np.nonzero(np.isfinite(distance))[0]
+    _, back = cKDTree(predicted_px).query(sources_px[source[star]])
+    mutual = back == star
+    return np.stack([star[mutual], source[star[mutual]]], axis=-1)
+
+
+def _refine_rotation(
+    prediction: Prediction,
+    sources: Sources,
+    geometry: CameraGeometry,
+    start: Rotation,
+    stars: NDArray[np.int64],
+) -> tuple[Floats, NDArray[np.int64]]:
+    """
+    Predicted pixels (n, 2) after rotation and focal scale fit the sources, and their pairs (k, 2).
+
+    Robust Gauss-Newton on the small rotation and one common scale, the radius of matching closing
+    in; only ``stars`` (rows of the prediction) and the sources take part.
+    """
+    camera = geometry.camera
+    rotation, scale = start, 1.0
+    pairs = np.empty((0, 2), np.int64)
+    centre = camera.parameters[3:5]
+    widest = max(8.0, 0.012 * np.hypot(camera.width, camera.height))
+    for radius_px in (widest, widest, widest, widest / 2, widest / 2, widest / 3, widest / 3):
+        directions = rotation.apply(prediction.direction_camera)
+        xy = (project(camera, directions) - centre) * scale + centre
+        pairs = _pairs(xy[stars], sources.xy_px, radius_px)
+        if len(pairs) < 4:
+            break
+        star = stars[pairs[:, 0]]
+        residual = sources.xy_px[pairs[:, 1]] - xy[star]
+        _, _, J_rotation = project_jacobians(camera, directions[star])
+        J = np.concatenate([scale * J_rotation, (xy[star] - centre)[:, :, None]], axis=-1)
+        size = np.linalg.norm(residual, axis=1)
+        weight = 1.0 / (1.0 + (size / max(float(np.median(size)), 0.3)) ** 2)
+        root = np.sqrt(weight)[:, None]
+        step = np.linalg.lstsq(
+            (J * root[:, :, None]).reshape(-1, 4), (residual * root).ravel(), rcond=1e-10
+        )[0]
+        rotation = Rotation.from_rotvec(-step[:3]) * rotation
+        scale = float(np.clip(scale * (1.0 + step[3]), 0.75, 1.3))
+    directions = rotation.apply(prediction.direction_camera)
+    xy = (project(camera, directions) - centre) * scale + centre
+    return xy, pairs
+
+
+def _warp_powers(n: int) -> list[tuple[int, int]]:
+    """Powers of u and v in the correction that n stars can carry."""
+    degree = 5 if n >= 150 else 3 if n >= 36 else 1 if n >= 12 else 0
+    return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+
+
+def _fit_warp(
+    predicted_px: Floats, measured_px: Floats, sigma_px: Floats, at_px: Floats, half_px: float
+) -> tuple[Floats, float]:
+    """
+    Smooth correction (k, 2) at pixels ``at_px`` from predicted to measured, and its robust scatter.
+
+    A polynomial in u and v, of a degree that the number of stars carries (at most 5: the prior
+    distortion may be quite unknown), fitted robustly.  Only predictions are corrected by it.
+    """
+    n = len(predicted_px)
+    powers = _warp_powers(n)
+
+    def basis(xy: Floats) -> Floats:
+        u, v = ((xy - half_px) / half_px).T
+        return np.stack([u**i * v**j for i, j in powers], axis=-1)
+
+    A = basis(predicted_px)
+    residual = measured_px - predicted_px
+    coefficients = np.median(residual, axis=0)[None] * (np.arange(len(powers)) == 0)[:, None]
+    scatter = 1.0
+    for _ in range(8):
+        left = residual - A @ coefficients
+        size = np.linalg.norm(left, axis=1)
+        scatter = max(1.4826 * float(np.median(size)) / 1.1774, 0.01)  # Rayleigh median: 1.1774 sigma
+        spread = np.hypot(sigma_px, scatter)
+        weight = 1.0 / spread / (1.0 + (size / (2.0 * spread)) ** 2)
+        coefficients = np.linalg.lstsq(A * weight[:, None], residual * weight[:, None], rcond=1e-10)[0]
+    return basis(at_px) @ coefficients, scatter
+
+
+def blended(
+    xy_px: Floats, magnitude: NDArray[np.float32], psf_sigma_px: float, max_pull_px: float
+) -> NDArray[np.bool_]:
+    """
+    Return (n,) whether a neighbour among the stars pulls a centroid by more than a limit.
+
+    A star of relative flux q at distance d pulls a Gaussian fit by about
+    ``q d exp(-d^2 / 4 sigma^2)``.
+    """
+    tree = cKDTree(xy_px)
+    pairs = tree.query_pairs(8.0 * psf_sigma_px, output_type='ndarray')
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    distance = np.linalg.norm(xy_px[both[:, 0]] - xy_px[both[:, 1]], axis=1)
+    ratio = 10.0 ** (0.4 * (magnitude[both[:, 0]].astype(np.float64) - magnitude[both[:, 1]]))
+    pull = np.minimum(ratio, 1.0) * distance * np.exp(-((distance / psf_sigma_px) ** 2) / 4.0)
+    # A brighter neighbour takes the window for itself wherever it reaches into it.
+    pull = np.where((ratio > 0.5) & (distance < 5.0 * psf_sigma_px), np.inf, pull)
+    result = np.zeros(len(xy_px), bool)
+    result[both[pull > max_pull_px, 0]] = True
+    return result
+
+
+def observe_stars(
+    image: Image,
+    icrf_from_star_tracker_xyzw: Floats,
+    attitude_gap_s: float,
+    geometry: CameraGeometry,
+    catalog: StarCatalog,
+    centroid_options: CentroidOptions,
+    options: IdentificationOptions,
+    velocity_m_s: Floats | None = None,
+) -> StarObservations:
+    """
+    The measured and identified stars of one image.
+
+    Raises
+    ------
+    ImageRefused
+        ``no_stars``, ``no_match`` or ``too_few_stars``.
+    """
+    camera = geometry.camera
+    background = measure_background(image.pixels)
+    sources = detect(image.pixels, background, centroid_options)
+    if len(sources.snr) < 4:
+        raise ImageRefused('no_stars', f'{len(sources.snr)} star-like sources')
+    prediction = predict(
+        geometry, icrf_from_star_tracker_xyzw, image.time_ns, catalog, options, velocity_m_s
+    )
+    if len(prediction.catalog_index) < 4:
+        raise ImageRefused('no_match', f'{len(prediction.catalog_index)} catalog stars in the field')
+    turn = acquire(prediction, sources, geometry, options)
+    predicted_px = _match(prediction, sources, geometry, turn)
+
+    model = model_image(image.pixels, background, sources, centroid_options)
+    inside = np.nonzero(_in_image(predicted_px, camera.width, camera.height))[0]
+    index = prediction.catalog_index[inside]
+    predicted_px = predicted_px[inside]
+    magnitude = catalog.magnitude[index]
+    centroids = measure_stars(image.pixels, predicted_px, model, centroid_options)
+    refusal = _refuse(predicted_px, magnitude, centroids, model, camera.width, options)
+    good = refusal == ''
+    if np.count_nonzero(good) < options.min_stars_per_image:
+        raise ImageRefused(
+            'too_few_stars',
+            f'{np.count_nonzero(good)} stars measured well, {options.min_stars_per_image} needed',
+        )
+    return StarObservations(
+        time_ns=image.time_ns,
+        width=camera.width,
+        height=camera.height,
+        refusal='',
+        detail='',
+        icrf_from_star_tracker_xyzw=icrf_from_star_tracker_xyzw,
+        attitude_gap_s=attitude_gap_s,
+        catalog_id=catalog.id[index][good],
+        direction_icrf=prediction.direction_icrf[inside][good],
+        magnitude=magnitude[good].astype(np.float32),
+        measured_px=centroids.xy_px[good],
+        covariance_px2=centroids.covariance_px2[good],
+        flux_dn=centroids.flux_dn[good].astype(np.float32),
+        snr=centroids.snr[good].astype(np.float32),
+        refused_stars=dict(sorted(Counter(refusal[~good].tolist()).items())),
+        background_dn=background.level_dn,
+        noise_dn=background.noise_dn,
+        psf_sigma_px=model.psf_sigma_px,
+        catalog_digest=catalog.digest,
+    )
+
+
+def _match(
+    prediction: Prediction, sources: Sources, geometry: CameraGeometry, turn: Rotation
+) -> Floats:
+    """
+    Predicted pixels (n, 2) refined onto the sources, once the match is beyond chance.
+
+    Raises
+    ------
+    ImageRefused
+        ``no_match`` when the refined predictions meet no more sources than chance explains.
+    """
+    camera = geometry.camera
+    # As many predictions as sources and the other way round: the fainter surplus matches nothing.
+    bright = np.arange(min(len(prediction.xy_px), 4 * len(sources.snr), 400))
+    seen = Sources(sources.xy_px[: 4 * len(bright)], sources.snr[: 4 * len(bright)])
+    xy, pairs = _refine_rotation(prediction, seen, geometry, turn, bright)
+    half_px = 0.5 * max(camera.width, camera.height)
+    for radius_px in (max(4.0, 0.003 * half_px * 2), 3.0, 2.0):
+        if len(pairs) < 4:
+            break
+        correction, _ = _fit_warp(
+            xy[bright[pairs[:, 0]]],
+            seen.xy_px[pairs[:, 1]],
+            np.full(len(pairs), 0.2),
+            xy,
+            half_px,
+        )
+        pairs = _pairs((xy + correction)[bright], seen.xy_px, radius_px)
+    if len(pairs) >= 4:
+        xy = xy + correction
+    inside = _in_image(xy[bright], camera.width, camera.height)
+    radius_px = 2.0
+    matched = len(_pairs(xy[bright][inside], seen.xy_px, radius_px))
+    density = len(seen.snr) / (camera.width * camera.height)
+    tried = int(np.count_nonzero(inside))
+    expected = tried * -np.expm1(-density * np.pi * radius_px**2)
+    # Rotation, scale and warp were fitted to the pairs: two parameters can buy one pair.
+    bought = 2 + len(_warp_powers(len(pairs)))
+    if matched < 6 or poisson.sf(matched - 1 - bought, expected) > _CHANCE:
+        raise ImageRefused(
+            'no_match',
+            f'{matched} of {tried} predicted stars meet a source, {expected:.0f} would by chance',
+        )
+    return xy
+
+
+def _refuse(
+    predicted_px: Floats,
+    magnitude: NDArray[np.float32],
+    centroids: Centroids,
+    model: ImageModel,
+    width: int,
+    options: IdentificationOptions,
+) -> NDArray[np.str_]:
+    """
+    Refusal names (n,): those of the centroids, then blends, then stars off their place.
+
+    The measured stars themselves give the smooth correction against which a place is judged.
+    """
+    refusal = centroids.refusal.copy()
+    psf_sigma_px = model.psf_sigma_px or 1.0
+    blend = blended(predicted_px, magnitude, psf_sigma_px, options.max_blend_px)
+    refusal[blend & (refusal == '')] = 'blend'
+    good = np.nonzero(refusal == '')[0]
+    if len(good) < 4:
+        return refusal
+    sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
+    correction, scatter_px = _fit_warp(
+        predicted_px[good], centroids.xy_px[good], sigma_px[good], predicted_px[good], 0.5 * width
+    )
+    off_px = np.linalg.norm(centroids.xy_px[good] - predicted_px[good] - correction, axis=1)
+    limit_px = np.maximum(5.0 * np.hypot(sigma_px[good], 0.5 * scatter_px), 0.3)
+    refusal[good[off_px > np.minimum(limit_px, 2.0)]] = 'ambiguous'
+    return refusal

@@ -1,0 +1,213 @@
+"""
+Levenberg-Marquardt on bordered block-diagonal normal equations (Eqs. 20-26).
+
+Knows no cameras and no stars.  The unknowns are p shared ones s and m blocks b_k of q each, and
+the normal matrix is an arrow::
+
+    N = [ A    B_1' ... B_m' ]        A (p, p)
+        [ B_1  C_1           ]        B (m, q, p)
+        [ ...        ...     ]        C (m, q, q)
+        [ B_m            C_m ]
+
+so a step costs one pass over the blocks (Schur complement) and memory is linear in m:
+with C~ and A~ damped, ``S = A~ - sum B_k' C~_k^-1 B_k``.  With m = 0 it is plain
+Levenberg-Marquardt.  The cost that accepts a step is the one whose gradient made it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+StateT = TypeVar('StateT')
+
+_MAX_ITERATIONS = 100
+_STEP_TOLERANCE = 1e-9  # of a parameter's own 1-sigma scale: nobody can tell such a difference
+_COST_TOLERANCE = 1e-13  # relative; under 100 roundings of a cost summed in double precision
+_LAMBDA_START = 1e-3  # (paper, step 4)
+_LAMBDA_MAX = 1e12
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """
+    Cost ``F = sum of squares / 2`` (or its robust kind), its normal matrix and downhill vector.
+
+    ``A`` (p, p), ``a`` (p,); ``B`` (m, q, p); ``C`` (m, q, q), ``c`` (m, q); the gradient of the
+    cost is ``-[a; c]``.
+    """
+
+    cost: float
+    A: Floats
+    a: Floats
+    B: Floats
+    C: Floats
+    c: Floats
+
+
+@dataclass(frozen=True)
+class Solution(Generic[StateT]):
+    """
+    Where the search ended and why.
+
+    ``termination`` is ``converged``, ``no_descent`` (damped to the limit without a lower cost)
+    or ``iteration_limit``; only the first is success.
+    """
+
+    state: StateT
+    normal: NormalEquations
+    iterations: int
+    termination: str
+
+    @property
+    def converged(self) -> bool:
+        """Whether a minimum was reached."""
+        return self.termination == 'converged'
+
+
+class NotObservable(ArithmeticError):
+    """The normal matrix is singular: the data do not determine all unknowns."""
+
+
+def _factor(matrix: Floats) -> tuple[Floats, Floats]:
+    """
+    Scale (..., n) and inverse (..., n, n) of the unit-diagonal form of positive matrices.
+
+    ``inverse(matrix) = scale * inverse * scale``: scaled so, parameters of any unit are alike.
+    """
+    diagonal = np.einsum('...ii->...i', matrix)
+    if not (diagonal > 0).all():
+        raise NotObservable('an unknown has no data')
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = matrix * scale[..., :, None] * scale[..., None, :]
+    try:
+        # The factorisation is the check that the matrix is positive definite.
+        lower = np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError as error:
+        raise NotObservable('the unknowns cannot be told apart') from error
+    if np.einsum('...ii->...i', lower).min(initial=1.0) < 1e-7:
+        raise NotObservable('the unknowns cannot be told apart')
+    inverse = np.linalg.inv(lower)
+    return scale, np.swapaxes(inverse, -1, -2) @ inverse
+
+
+def _inverse(matrix: Floats) -> Floats:
+    """Inverse of positive definite matrices (..., n, n)."""
+    scale, inverse = _factor(matrix)
+    return np.asarray(scale[..., :, None] * inverse * scale[..., None, :])
+
+
+def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats]:
+    """
+    Step (p,) and (m, q) of ``(N + damping diag N) step = [a; c]`` by block elimination (Eq. 25).
+
+    Raises
+    ------
+    NotObservable
+        When the matrix is not positive definite.
+    """
+    p = len(normal.a)
+    A = normal.A + damping * np.diag(np.diag(normal.A))
+    if len(normal.C) == 0:
+        return _inverse(A) @ normal.a, np.empty_like(normal.c)
+    q = normal.C.shape[-1]
+    C = normal.C * (1.0 + damping * np.eye(q))
+    C_inverse = _inverse(C)
+    W = C_inverse @ normal.B
+    w = np.einsum('mij,mj->mi', C_inverse, normal.c)
+    flat_B = normal.B.reshape(-1, p)
+    S = A - flat_B.T @ W.reshape(-1, p)
+    shared = _inverse(S) @ (normal.a - flat_B.T @ w.ravel())
+    return shared, w - W @ shared
+
+
+def covariance(normal: NormalEquations) -> tuple[Floats, Floats, Floats]:
+    """
+    Blocks of the inverse of the normal matrix.
+
+    Returns
+    -------
+    shared : (p, p)
+    cross : (m, q, p)
+        Between each block and the shared unknowns.
+    blocks : (m, q, q)
+        Of each block with itself.
+
+    Raises
+    ------
+    NotObservable
+        When the matrix is not positive definite.
+    """
+    p = len(normal.a)
+    if len(normal.C) == 0:
+        return _inverse(normal.A), np.empty_like(normal.B), np.empty_like(normal.C)
+    C_inverse = _inverse(normal.C)
+    W = C_inverse @ normal.B
+    shared = _inverse(normal.A - normal.B.reshape(-1, p).T @ W.reshape(-1, p))
+    cross = -W @ shared
+    return shared, cross, C_inverse - cross @ np.swapaxes(W, -1, -2)
+
+
+def levenberg_marquardt(
+    state: StateT,
+    evaluate: Callable[[StateT], NormalEquations],
+    move: Callable[[StateT, Floats, Floats], StateT],
+) -> Solution[StateT]:
+    """
+    Minimum of the cost from a start.
+
+    Parameters
+    ----------
+    state
+        Where to start; any type.
+    evaluate
+        Cost and normal equations at a state; a cost that is not finite refuses the state.
+    move
+        A new state from a state, a shared step (p,) and block steps (m, q).
+
+    Notes
+    -----
+    Marquardt's damping in the paper's form (Eq. 25), scaled by the diagonal.  A step is judged by
+    the actual over the predicted reduction of the cost (Nielsen's rule for the damping).
+    The search has converged when the undamped step is below ``1e-9`` of the 1-sigma scale in every
+    unknown, or no step lowers the cost by more than its rounding.
+
+    Raises
+    ------
+    NotObservable
+        When the data do not determine all unknowns.
+    """
+    normal = evaluate(state)
+    if not np.isfinite(normal.cost):
+        raise NotObservable('the start does not explain the data: the cost is not finite')
+    damping, growth = _LAMBDA_START, 2.0
+    for iteration in range(1, _MAX_ITERATIONS + 1):
+        shared, blocks = solve_arrow(normal, damping)
+        scaled = max(
+            np.abs(shared * np.sqrt(np.diag(normal.A))).max(initial=0.0),
+            np.abs(blocks * np.sqrt(np.einsum('mii->mi', normal.C))).max(initial=0.0),
+        )
+        # Half the reduction the linear model promises: step' (damping D step + [a; c]) / 2.
+        promised = 0.5 * (
+            shared @ (damping * np.diag(normal.A) * shared + normal.a)
+            + (blocks * (damping * np.einsum('mii->mi', normal.C) * blocks + normal.c)).sum()
+        )
+        if scaled < _STEP_TOLERANCE or promised < _COST_TOLERANCE * normal.cost:
+            return Solution(state, normal, iteration, 'converged')
+        candidate = move(state, shared, blocks)
+        candidate_normal = evaluate(candidate)
+        gain = (normal.cost - candidate_normal.cost) / promised
+        if np.isfinite(candidate_normal.cost) and gain > 1e-4:
+            state, normal = candidate, candidate_normal
+            damping *= max(0.1, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
+            damping, growth = max(damping, 1e-15), 2.0
+        else:
+            damping, growth = damping * growth, growth * 2.0
+            if damping > _LAMBDA_MAX:
+                return Solution(state, normal, iteration, 'no_descent')
+    return Solution(state, normal, _MAX_ITERATIONS, 'iteration_limit')

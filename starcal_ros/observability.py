@@ -1,0 +1,159 @@
+"""What an ensemble can tell: information, predicted sigmas, focal-plane coverage, line-of-sight map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.calibration import CalibrationOptions
+from starcal_ros.camera import (
+    PARAMETER_NAMES,
+    CameraModel,
+    line_of_sight,
+    pixel_grid,
+    project_jacobians,
+)
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.measurement import CAMERA, ROTATION, arrange, normal_blocks, star_table
+from starcal_ros.records import (
+    ALIGNMENT_NAMES,
+    CameraGeometry,
+    Ensemble,
+    EnsembleStatus,
+    StarObservations,
+)
+
+Floats = NDArray[np.float64]
+
+COVERAGE_ROWS, COVERAGE_COLS = 8, 10  # cells of 2 degrees on the paper's camera
+
+
+def coverage(ensemble: Ensemble, camera: CameraModel) -> NDArray[np.int64]:
+    """Star observations in each focal-plane cell, (8, 10)."""
+    pixels = star_table(ensemble.images).measured_px
+    counts, _, _ = np.histogram2d(
+        pixels[:, 1],
+        pixels[:, 0],
+        bins=(COVERAGE_ROWS, COVERAGE_COLS),
+        range=((-0.5, camera.height - 0.5), (-0.5, camera.width - 0.5)),
+    )
+    return counts.astype(np.int64)
+
+
+def image_information(
+    images: tuple[StarObservations, ...], prior: CameraGeometry, options: CalibrationOptions
+) -> Floats:
+    """
+    Information (m, k, k) of each image on the k estimated camera parameters.
+
+    The rotation of each image is free and eliminated (Schur complement), as in ``per_image``; an
+    image with fewer than two stars tells nothing.
+    """
+    table = star_table(images)
+    free = np.sort([PARAMETER_NAMES.index(name) for name in options.estimate])
+    rotations = (
+        Rotation.from_quat(prior.star_tracker_from_camera_xyzw).inv()
+        * Rotation.from_quat(np.array([i.icrf_from_star_tracker_xyzw for i in images])).inv()
+    )
+    _, blocks = normal_blocks(
+        arrange(table, np.ones(len(table), bool), 0.0),
+        prior.camera.parameters,
+        rotations.as_matrix(),
+    )
+    A = blocks[:, CAMERA, CAMERA][:, free][:, :, free]
+    B = blocks[:, ROTATION, CAMERA][:, :, free]
+    C = blocks[:, ROTATION, ROTATION]
+    seen = np.array([len(image) >= 2 for image in images])
+    information = np.zeros_like(A)
+    if seen.any():
+        information[seen] = A[seen] - B[seen].transpose(0, 2, 1) @ np.linalg.solve(C[seen], B[seen])
+    return information
+
+
+def predicted_sigma(
+    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
+) -> Floats:
+    """
+    1-sigma (k,) of the estimated camera parameters, in `PARAMETER_NAMES` order, before solving.
+
+    From the centroid covariances at the prior geometry; infinite where not observable yet.
+    """
+    count = len(options.estimate)
+    if not ensemble.images:
+        return np.full(count, np.inf)
+    information = image_information(ensemble.images, prior, options).sum(axis=0)
+    diagonal = np.diag(information)
+    if (diagonal <= 0).any():
+        return np.full(count, np.inf)
+    scale = 1.0 / np.sqrt(diagonal)
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
+    if values[0] < 1e-12:
+        return np.full(count, np.inf)
+    return np.asarray(scale * np.sqrt((vectors**2 / values).sum(axis=1)))
+
+
+def ensemble_status(
+    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
+) -> EnsembleStatus:
+    """What has been collected and what a calibration from it would be worth."""
+    names = tuple(name for name in PARAMETER_NAMES if name in options.estimate)
+    alignment = np.full(3, np.inf)
+    if ensemble.images:
+        # The attitude noise of the images, averaged: the star field within an image adds little.
+        alignment = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
+        alignment = np.full(3, np.sqrt(np.mean(alignment**2) / len(ensemble.images)))
+    return EnsembleStatus(
+        time_ns=ensemble.images[-1].time_ns if ensemble.images else 0,
+        images=len(ensemble.images),
+        stars=ensemble.star_count,
+        min_images=options.min_images,
+        min_stars=options.min_stars,
+        refused=dict(ensemble.refused),
+        coverage=coverage(ensemble, prior.camera),
+        parameter_names=names + ALIGNMENT_NAMES,
+        predicted_sigma=np.concatenate([predicted_sigma(ensemble, prior, options), alignment]),
+    )
+
+
+def keep_most_informative(
+    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
+) -> Ensemble:
+    """
+    The ensemble without its least informative images, down to ``max_images``.
+
+    One by one the image goes whose information weighs least against that of all:
+    ``trace(total^-1 information_k)``.
+    """
+    images = ensemble.images
+    while len(images) > options.max_images:
+        information = image_information(images, prior, options)
+        total = information.sum(axis=0)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))
+        inverse = np.linalg.pinv(total * scale[:, None] * scale[None, :], hermitian=True)
+        worth = np.einsum('ij,mji->m', inverse * scale[:, None] * scale[None, :], information)
+        least = int(worth.argmin())
+        images = images[:least] + images[least + 1 :]
+    return replace(ensemble, images=images)
+
+
+def line_of_sight_sigma_arcsec(
+    camera: CameraModel, covariance: Floats, columns: int = 25, rows: int = 20
+) -> Floats:
+    """
+    1-sigma (rows, columns) of the line of sight of pixels in the star tracker frame, arcsec.
+
+    Root of the summed variance of the two angles, from the (13, 13) covariance of camera and
+    alignment.
+    """
+    directions = line_of_sight(camera, pixel_grid(camera, columns, rows))
+    _, J_parameters, J_rotation = project_jacobians(camera, directions)
+    # A fixed pixel: what moves its direction is minus what would move its image.
+    across, along = np.linalg.inv(J_rotation[:, :, :2]), np.concatenate(
+        [J_parameters, J_rotation], axis=-1
+    )
+    J = across @ along
+    variance = np.einsum('nij,jk,nik->n', J, covariance, J)
+    return np.asarray(np.sqrt(variance).reshape(rows, columns) / ARCSECOND_RAD)

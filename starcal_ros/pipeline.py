@@ -1,0 +1,371 @@
+"""The whole flow as straight functions: what the nodes and the tool both call."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros import bag, products
+from starcal_ros.acceptance import Candidate, GateOptions, judge
+from starcal_ros.attitude import AttitudeHistory, AttitudeOptions
+from starcal_ros.calibration import CalibrationOptions, Estimate, estimate_calibration
+from starcal_ros.camera import zero_skew_fit
+from starcal_ros.catalog import StarCatalog, load_catalog
+from starcal_ros.centroiding import CentroidOptions
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import ImageRefused, OptionError
+from starcal_ros.identification import IdentificationOptions, observe_stars
+from starcal_ros.observability import coverage, keep_most_informative, line_of_sight_sigma_arcsec
+from starcal_ros.observability import ensemble_status as _ensemble_status
+from starcal_ros.options import check_value, from_mapping, names_of, option
+from starcal_ros.records import (
+    Calibration,
+    CameraGeometry,
+    Ensemble,
+    EnsembleStatus,
+    Image,
+    StarObservations,
+    refused_image,
+)
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SetupOptions:
+    """Prior camera and alignment, frames, and the files that go with the camera."""
+
+    camera_info_url: str = option(
+        '', 'prior camera: a ROS camera YAML, file:// or package:// URL or a path'
+    )
+    prior_alignment: tuple[float, ...] = option(
+        (0.0, 0.0, 0.0, 1.0),
+        'prior orientation of the camera in the star tracker frame, quaternion x, y, z, w',
+        low=-1.0,
+        high=1.0,
+        length=4,
+    )
+    star_tracker_frame: str = option('star_tracker', 'name of the star tracker frame')
+    camera_frame: str = option('camera', 'name of the camera optical frame')
+    catalog: str = option('', 'star catalog file; empty: the bundled one')
+    dark_frame: str = option(
+        '', 'dark frame, a PNG or TIFF of the camera\'s size and depth, subtracted; empty: none'
+    )
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Options of every stage, and what they name, loaded."""
+
+    frames: SetupOptions
+    attitude: AttitudeOptions
+    centroid: CentroidOptions
+    identification: IdentificationOptions
+    calibration: CalibrationOptions
+    gate: GateOptions
+    prior: CameraGeometry
+    catalog: StarCatalog
+    dark: NDArray[np.uint8] | NDArray[np.uint16] | None
+
+
+OPTION_CLASSES = (
+    SetupOptions,
+    AttitudeOptions,
+    CentroidOptions,
+    IdentificationOptions,
+    CalibrationOptions,
+    GateOptions,
+)
+
+
+def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Setup:
+    """
+    Checked options with prior camera, catalog and dark frame loaded.
+
+    ``others`` are option classes of the caller whose names the mapping may hold as well.
+
+    Raises
+    ------
+    OptionError
+        For a name nobody knows or a bad value.
+    ProductError, CatalogError
+        When the prior camera or the catalog cannot be read.
+    """
+    known = names_of(*OPTION_CLASSES, *others)
+    for name in values:
+        if name not in known and name != 'use_sim_time':
+            raise OptionError(f'{name}: no such parameter')
+    frames = from_mapping(SetupOptions, values)
+    if not frames.camera_info_url:
+        raise OptionError('camera_info_url: the prior camera must be given')
+    camera = products.read_camera_info(frames.camera_info_url)
+    quaternion = np.array(frames.prior_alignment)
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1.0) > 1e-3:
+        raise OptionError(f'prior_alignment: {list(frames.prior_alignment)} is not a unit quaternion')
+    identification = from_mapping(IdentificationOptions, values)
+    path = Path(frames.catalog) if frames.catalog else None
+    return Setup(
+        frames=frames,
+        attitude=from_mapping(AttitudeOptions, values),
+        centroid=from_mapping(CentroidOptions, values),
+        identification=identification,
+        calibration=from_mapping(CalibrationOptions, values),
+        gate=from_mapping(GateOptions, values),
+        prior=CameraGeometry(camera, quaternion / norm),
+        catalog=load_catalog(path, identification.magnitude_limit),
+        dark=_read_dark(frames.dark_frame, camera.width, camera.height),
+    )
+
+
+def _read_dark(path: str, width: int, height: int) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
+    if not path:
+        return None
+    dark = cv2.imread(path.removeprefix('file://'), cv2.IMREAD_UNCHANGED)
+    if dark is None:
+        raise OptionError(f'dark_frame: {path} is not an image file')
+    if dark.shape != (height, width) or dark.dtype not in (np.uint8, np.uint16):
+        raise OptionError(
+            f'dark_frame: {path} is {dark.dtype} of shape {dark.shape}, '
+            f'not one channel of {width} x {height}'
+        )
+    return dark.astype(np.uint8) if dark.dtype == np.uint8 else dark.astype(np.uint16)
+
+
+def observe(
+    image: Image,
+    attitudes: AttitudeHistory,
+    setup: Setup,
+    geometry: CameraGeometry,
+    velocity_m_s: Floats | None = None,
+) -> StarObservations:
+    """
+    The stars of one image, or the record of why it is refused; never raises for a bad image.
+
+    ``geometry`` is what the stars are predicted with: the prior or a calibration in force.
+    ``velocity_m_s`` (3,) is the observer's barycentric velocity, ICRF axes; None: the Earth's.
+    """
+    camera = geometry.camera
+    height, width = image.pixels.shape
+    try:
+        if (width, height) != (camera.width, camera.height):
+            raise ImageRefused(
+                'wrong_size', f'{width} x {height}, the camera has {camera.width} x {camera.height}'
+            )
+        quaternion, gap_s = attitudes.at(image.time_ns, setup.attitude.max_attitude_gap_s)
+    except ImageRefused as refused:
+        return refused_image(image.time_ns, width, height, refused.reason, refused.detail)
+    try:
+        return observe_stars(
+            _without_dark(image, setup.dark),
+            quaternion,
+            gap_s,
+            geometry,
+            setup.catalog,
+            setup.centroid,
+            setup.identification,
+            velocity_m_s,
+        )
+    except ImageRefused as refused:
+        return refused_image(
+            image.time_ns,
+            width,
+            height,
+            refused.reason,
+            refused.detail,
+            icrf_from_star_tracker_xyzw=quaternion,
+            attitude_gap_s=gap_s,
+            catalog_digest=setup.catalog.digest,
+        )
+
+
+def _without_dark(
+    image: Image, dark: NDArray[np.uint8] | NDArray[np.uint16] | None
+) -> Image:
+    """The image less the dark frame, kept positive by the dark frame's own median."""
+    if dark is None:
+        return image
+    if dark.dtype != image.pixels.dtype:
+        raise ImageRefused(
+            'bad_encoding', f'{image.pixels.dtype} image, the dark frame is {dark.dtype}'
+        )
+    # Noise below the dark level must not be cut off at zero: it would bias the background.
+    pedestal = int(np.median(dark))
+    level = image.pixels.astype(np.int32) - dark + pedestal
+    limit = np.iinfo(image.pixels.dtype).max
+    return Image(image.time_ns, np.clip(level, 0, limit).astype(image.pixels.dtype))
+
+
+def observe_bag(
+    paths: Sequence[Path], image_topic: str, attitude_topic: str, setup: Setup
+) -> Iterator[StarObservations]:
+    """
+    Observations of every image of a bag, in the order of the bag; one image in memory at a time.
+
+    Raises
+    ------
+    BagError
+        When the bag cannot be read or a topic is not in it.
+    """
+    attitudes = bag.read_attitudes(paths, attitude_topic, setup.attitude)
+    latest_ns: int | None = None
+    for image in bag.read_images(paths, image_topic, setup.attitude.stamp_offset_s):
+        if isinstance(image, StarObservations):
+            yield image
+        elif latest_ns is not None and image.time_ns <= latest_ns:
+            yield out_of_order(image, latest_ns)
+        else:
+            latest_ns = image.time_ns
+            yield observe(image, attitudes, setup, setup.prior)
+
+
+def out_of_order(image: Image, latest_ns: int) -> StarObservations:
+    """Record of an image refused because a later one, or itself, has been taken already."""
+    height, width = image.pixels.shape
+    late_s = (latest_ns - image.time_ns) * 1e-9
+    return refused_image(
+        image.time_ns, width, height, 'out_of_order', f'{late_s:.6f} s before the last image'
+    )
+
+
+def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:
+    """Return the ensemble with one more image; at ``max_images`` the least informative goes."""
+    return keep_most_informative(ensemble.add(observations), setup.prior, setup.calibration)
+
+
+def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
+    """What has been collected and what a calibration from it would be worth."""
+    return _ensemble_status(ensemble, setup.prior, setup.calibration)
+
+
+def solve(
+    ensemble: Ensemble,
+    setup: Setup,
+    method: str = '',
+    estimate: Sequence[str] = (),
+    inputs: Mapping[str, str] | None = None,
+) -> Calibration:
+    """
+    A calibration of the ensemble with the verdict of the gate and its provenance.
+
+    ``method`` and ``estimate`` override the options where not empty; ``inputs`` names what the
+    observations came from, for the provenance.
+
+    Raises
+    ------
+    TooFewObservations
+        When the ensemble cannot carry it; the text says what is missing.
+    OptionError
+        For a method or parameter name that is none.
+    """
+    options = setup.calibration
+    override: dict[str, object] = {}
+    if method:
+        override['method'] = method
+    if estimate:
+        override['estimate'] = tuple(estimate)
+    for field in dataclasses.fields(options):
+        if field.name in override:
+            check_value(field, override[field.name])
+    options = dataclasses.replace(options, **override)  # type: ignore[arg-type]
+    return _calibration(
+        estimate_calibration(ensemble, setup.prior, options), ensemble, setup, options, inputs or {}
+    )
+
+
+def _calibration(
+    result: Estimate,
+    ensemble: Ensemble,
+    setup: Setup,
+    options: CalibrationOptions,
+    inputs: Mapping[str, str],
+) -> Calibration:
+    """Statistics, verdict and provenance of an estimate."""
+    kept = result.kept
+    rms_px = float(np.sqrt(np.mean(result.residual_px[kept] ** 2)))
+    only_camera = result.covariance.copy()
+    # Pointing is common to all pixels: the gate looks at the shape of the map.
+    only_camera[10:] = only_camera[:, 10:] = 0.0
+    camera = result.geometry.camera
+    map_arcsec = line_of_sight_sigma_arcsec(camera, only_camera)
+    reasons = judge(
+        Candidate(
+            geometry=result.geometry,
+            prior=setup.prior,
+            covariance=result.covariance,
+            residual_rms_px=rms_px,
+            stars_used=int(kept.sum()),
+            stars_rejected=int((~kept).sum()),
+            coverage=coverage(ensemble, camera),
+            map_sigma_px=float(map_arcsec.max()) * ARCSECOND_RAD * float(camera.parameters[0]),
+            termination=result.termination,
+        ),
+        setup.gate,
+    )
+    return Calibration(
+        time_ns=max(image.time_ns for image in ensemble.images),
+        geometry=result.geometry,
+        covariance=result.covariance,
+        method=options.method,
+        estimated=options.estimate,
+        residual_rms_px=rms_px,
+        variance_factor=result.variance_factor,
+        images_used=len(ensemble.images),
+        images_refused=dict(ensemble.refused),
+        stars_used=int(kept.sum()),
+        stars_rejected=int((~kept).sum()),
+        alignment_scatter_arcsec=result.alignment_scatter_arcsec,
+        zero_skew_cost_px=zero_skew_fit(camera)[1],
+        iterations=result.iterations,
+        termination=result.termination,
+        accepted=not reasons,
+        reasons=reasons,
+        parent_frame=setup.frames.star_tracker_frame,
+        child_frame=setup.frames.camera_frame,
+        provenance=_provenance(setup, options, ensemble, inputs),
+    )
+
+
+def _provenance(
+    setup: Setup, options: CalibrationOptions, ensemble: Ensemble, inputs: Mapping[str, str]
+) -> dict[str, str]:
+    """Where a calibration comes from, enough to repeat it."""
+    groups = (
+        setup.frames,
+        setup.attitude,
+        setup.centroid,
+        setup.identification,
+        options,
+        setup.gate,
+    )
+    chosen = {name: value for group in groups for name, value in dataclasses.asdict(group).items()}
+    prior = np.r_[setup.prior.camera.parameters, setup.prior.star_tracker_from_camera_xyzw]
+    digest = hashlib.sha256()
+    for image in ensemble.images:
+        for column in (image.catalog_id, image.measured_px, image.covariance_px2):
+            digest.update(np.ascontiguousarray(column).tobytes())
+    return {
+        'software': f'starcal {software_version()}',
+        'catalog': setup.catalog.digest,
+        'options': json.dumps(chosen, sort_keys=True),
+        'prior': json.dumps(prior.tolist()),
+        'observations_sha256': digest.hexdigest(),
+        **{f'input {name}': value for name, value in inputs.items()},
+    }
+
+
+def software_version() -> str:
+    """Version of the installed package; 'unknown' where it runs from a bare source tree."""
+    try:
+        return importlib.metadata.version('starcal_ros')
+    except importlib.metadata.PackageNotFoundError:
+        return 'unknown'
