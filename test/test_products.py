@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
@@ -58,7 +59,7 @@ def calibration_of(
     parameters: np.ndarray = PARAMETERS,
     covariance: np.ndarray | None = None,
     quaternion: tuple[float, ...] = (0.1, -0.2, 0.3, 0.9273618495495703),
-    **changes: object,
+    **changes: Any,
 ) -> Calibration:
     """A calibration with every field filled."""
     if covariance is None:
@@ -104,7 +105,11 @@ def assert_same(a: Calibration, b: Calibration) -> None:
 
 
 def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
-    for changes in ({}, {'accepted': False, 'reasons': ('too few stars', 'weak: k3')}):
+    cases: tuple[dict[str, Any], ...] = (
+        {},
+        {'accepted': False, 'reasons': ('too few stars', 'weak: k3')},
+    )
+    for changes in cases:
         calibration = calibration_of(**changes)
         write_calibration(calibration, tmp_path / 'calibration.json')
         assert_same(calibration, read_calibration(tmp_path / 'calibration.json'))
