@@ -1,0 +1,62 @@
+"""Options of the ROS nodes: here without ROS, because the tool reads the same files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from starcal_ros.options import option
+
+
+@dataclass(frozen=True)
+class NodeOptions:
+    """What the lifecycle nodes share."""
+
+    autostart: bool = option(True, 'configure and activate at start, without a manager')
+
+
+@dataclass(frozen=True)
+class ObserverOptions:
+    """How the star observer takes its inputs."""
+
+    image_reliability: str = option(
+        'reliable',
+        'reliability asked of the image publisher (best_effort loses large images)',
+        choices=('reliable', 'best_effort'),
+    )
+    image_queue: int = option(20, 'images held while the one before is measured', low=1, high=1000)
+    attitude_timeout_s: float = option(
+        5.0, 'longest time an image waits for the attitude after it, s of wall clock', low=0.0
+    )
+    attitude_history_s: float = option(
+        3600.0, 'how long attitude samples are kept for images still to come, s', low=1.0
+    )
+
+
+@dataclass(frozen=True)
+class CalibratorOptions:
+    """What the calibrator does with a new calibration beside publishing it."""
+
+    set_camera_info_service: str = option(
+        '', 'sensor_msgs/SetCameraInfo service to hand each new calibration to; empty: none'
+    )
+
+
+@dataclass(frozen=True)
+class PlayerOptions:
+    """How a bag is played."""
+
+    bag: str = option('', 'an .mcap file or a bag folder')
+    rate: float = option(
+        1.0, 'times real time; 0: as fast as the stars are observed', low=0.0, high=1e6
+    )
+    loop: bool = option(False, 'start again at the end')
+    wait_for_subscribers_s: float = option(
+        10.0, 'longest wait for somebody to listen to the images and attitudes, s', low=0.0
+    )
+    images_in_flight: int = option(
+        4, 'images sent ahead of their observations where a star observer listens', low=1
+    )
+
+
+NODE_OPTION_CLASSES = (NodeOptions, ObserverOptions, CalibratorOptions)
+"""One parameter file serves both nodes and the tool: each passes over what is not its own."""

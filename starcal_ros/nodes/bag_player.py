@@ -1,0 +1,187 @@
+"""The bag player: the messages of an MCAP bag on the graph, byte for byte."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import sys
+import threading
+import time
+from typing import Any
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.exceptions import ROSInterruptException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from starcal.msg import StarObservations as ObservationsMessage
+from starcal_ros import bag, messages
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import BagError, StarcalError
+from starcal_ros.node_options import PlayerOptions
+from starcal_ros.nodes.conversions import message_class
+from starcal_ros.nodes.lifecycle import end_quietly, one_line
+from starcal_ros.nodes.parameters import OptionParameters
+from starcal_ros.options import from_mapping
+
+NAME = 'bag_player'
+# A writer that overtakes its readers by more than its history loses messages, reliable or not.
+_IMAGE_DEPTH, _OTHER_DEPTH = 10, 1000
+_UNACKED = {True: _IMAGE_DEPTH // 2, False: _OTHER_DEPTH // 2}
+_SMALL_PER_S = 2000.0  # what a Python reader takes beside its other work
+_ACK_S = 30.0
+_LATCHED_TYPES = (messages.CALIBRATION_TYPE, messages.STATUS_TYPE, messages.CAMERA_INFO_TYPE)
+
+
+class BagPlayer(Node):
+    """Publishes the messages of a bag in its order, with their stamps, at a rate."""
+
+    def __init__(self) -> None:
+        super().__init__(NAME)
+        self.own = from_mapping(PlayerOptions, OptionParameters(self, [PlayerOptions]).values())
+        if not self.own.bag:
+            raise BagError('bag: the bag to play must be given')
+        self._topics = bag.topics([self.own.bag])
+        self._players = {}
+        for topic in self._topics:
+            try:
+                kind = message_class(topic.type_name)
+            except ImportError:
+                text = f'{topic.name}: {topic.type_name} is not installed here: skipped'
+                self.get_logger().warning(text)
+                continue
+            self._players[topic.name] = self.create_publisher(kind, topic.name, _offer(topic))
+        if not self._players:
+            raise BagError(f'{self.own.bag}: no topic in it can be played here')
+        self._images = {t.name for t in self._topics if t.type_name == messages.IMAGE_TYPE}
+        self._unacked = dict.fromkeys(self._players, 0)
+        self._observed = threading.Condition()
+        self._observed_count = 0
+        self._paced = True
+        self._observations = self.create_subscription(
+            ObservationsMessage, 'observations', self._on_observations, QoSProfile(depth=1000)
+        )
+
+    def play(self) -> int:
+        """Play the bag; 0 when every reader has acknowledged every message."""
+        self._wait_for_subscribers()
+        while True:
+            self._play_once()
+            if not self.own.loop:
+                break
+        if all(player.wait_for_all_acked(_timeout()) for player in self._players.values()):
+            return 0
+        self.get_logger().error('a subscriber did not acknowledge all messages')
+        return 1
+
+    def _play_once(self) -> None:
+        start_s, first_ns = time.monotonic(), None
+        sent_images, small_s = 0, time.monotonic()
+        with self._observed:
+            self._observed_count = 0
+        for raw in bag.read_raw([self.own.bag], self._players, self._on_damage):
+            if first_ns is None:
+                first_ns = raw.log_time_ns
+            if self.own.rate:
+                since_s = (raw.log_time_ns - first_ns) / NANOSECONDS_PER_SECOND
+                _sleep_until(start_s + since_s / self.own.rate)
+            is_image = raw.topic in self._images
+            if is_image:
+                self._wait_for_observations(sent_images)
+                sent_images += 1
+            else:
+                small_s = max(small_s + 1.0 / _SMALL_PER_S, time.monotonic() - 0.05)
+                _sleep_until(small_s)
+            player = self._players[raw.topic]
+            player.publish(raw.data)
+            self._unacked[raw.topic] += 1
+            if self._unacked[raw.topic] >= _UNACKED[is_image]:
+                player.wait_for_all_acked(_timeout())
+                self._unacked[raw.topic] = 0
+            if not self.context.ok():
+                raise ExternalShutdownException
+
+    def _wait_for_subscribers(self) -> None:
+        """Wait until somebody listens to every image and attitude topic, or long enough."""
+        inputs = (messages.IMAGE_TYPE, messages.ATTITUDE_TYPE)
+        needed = [t.name for t in self._topics if t.type_name in inputs] or list(self._players)
+        deadline_s = time.monotonic() + self.own.wait_for_subscribers_s
+        while missing := [n for n in needed if not self._players[n].get_subscription_count()]:
+            if time.monotonic() > deadline_s:
+                self.get_logger().warning(f'nobody listens to {", ".join(missing)}: played anyway')
+                return
+            _sleep_until(time.monotonic() + 0.02)  # rclpy has no wait for a matched reader
+
+    def _wait_for_observations(self, sent: int) -> None:
+        """Wait while a star observer has more images before it than it may."""
+        if not self._paced or not self.count_publishers(self._observations.topic_name):
+            return
+        with self._observed:
+            while sent - self._observed_count >= self.own.images_in_flight:
+                before = self._observed_count
+                if not self._observed.wait(_ACK_S) and self._observed_count == before:
+                    self.get_logger().warning('no observations come: images are no longer paced')
+                    self._paced = False
+                    return
+
+    def _on_observations(self, _message: Any) -> None:
+        with self._observed:
+            self._observed_count += 1
+            self._observed.notify()
+
+    def _on_damage(self, text: str) -> None:
+        self.get_logger().warning(text)
+
+
+def _offer(topic: bag.Topic) -> QoSProfile:
+    if topic.type_name in _LATCHED_TYPES:
+        return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    return QoSProfile(
+        depth=_IMAGE_DEPTH if topic.type_name == messages.IMAGE_TYPE else _OTHER_DEPTH
+    )
+
+
+def _timeout() -> Duration:
+    return Duration(seconds=_ACK_S)
+
+
+def _sleep_until(moment_s: float) -> None:
+    left_s = moment_s - time.monotonic()
+    if left_s > 0:
+        time.sleep(left_s)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """
+    Play a bag; exit status 0 when all is acknowledged, 1 when not, 2 for a bad bag or parameter.
+
+    A signal ends it with 0.
+    """
+    player = None
+    executor = None
+    try:
+        rclpy.init(args=None if args is None else [NAME, *args])
+        player = BagPlayer()
+        executor = SingleThreadedExecutor()
+        executor.add_node(player)
+        threading.Thread(target=executor.spin, daemon=True).start()
+        return player.play()
+    except StarcalError as error:
+        print(f'{NAME}: {one_line(error)}', file=sys.stderr)
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException, ROSInterruptException):
+        return 0
+    except Exception as error:
+        if player is not None and not rclpy.ok():
+            return 0
+        print(f'{NAME}: {one_line(error)}', file=sys.stderr)
+        return 2
+    finally:
+        if executor is not None:
+            executor.shutdown(timeout_sec=1.0)
+        end_quietly(player)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,121 @@
+"""
+The client of ``starcal demo``: waits for the nodes, lets them collect, asks for the calibration.
+
+Speaks to its parent in lines on standard output: ``ready`` when the nodes listen, then
+``collected N`` as images arrive, at last ``result MESSAGE`` or ``failed MESSAGE``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import functools
+from pathlib import Path
+import sys
+import time
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_srvs.srv import Trigger
+
+from starcal.msg import Calibration, EnsembleStatus
+from starcal_ros.messages import calibration_from_message
+from starcal_ros.products import write_calibration
+
+_LATCHED = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+
+class DemoClient(Node):
+    """Keeps the newest status and calibration, and the one service client."""
+
+    def __init__(self) -> None:
+        super().__init__('starcal_demo')
+        self.status: EnsembleStatus | None = None
+        self.calibration: Calibration | None = None
+        self.create_subscription(EnsembleStatus, 'ensemble_status', self._on_status, _LATCHED)
+        self.create_subscription(Calibration, 'calibration', self._on_calibration, _LATCHED)
+        self.calibrate = self.create_client(Trigger, 'calibrator/calibrate')
+
+    def _on_status(self, message: EnsembleStatus) -> None:
+        self.status = message
+
+    def _on_calibration(self, message: Calibration) -> None:
+        self.calibration = message
+
+    def images_seen(self) -> int:
+        """Images that the calibrator has taken or counted as refused."""
+        status = self.status
+        return 0 if status is None else int(status.images) + sum(status.refused_counts)
+
+    def has_seen(self, count: int) -> bool:
+        """Whether that many images have come."""
+        return self.images_seen() >= count
+
+    def spin_until(self, happened: Callable[[], bool], timeout_s: float) -> bool:
+        """Whether it happened in time."""
+        deadline = time.monotonic() + timeout_s
+        while not happened():
+            if time.monotonic() > deadline:
+                return False
+            rclpy.spin_once(self, timeout_sec=0.1)
+        return True
+
+
+def run(client: DemoClient, args: argparse.Namespace) -> int:
+    """The whole exchange; returns the exit status: 0 accepted, 3 refused, 2 no result."""
+    listening = (args.image_topic, args.attitude_topic, 'observations')
+
+    def ready() -> bool:
+        return client.calibrate.service_is_ready() and all(
+            client.count_subscribers(topic) for topic in listening
+        )
+
+    if not client.spin_until(ready, args.timeout):
+        silent = ', '.join(t for t in listening if not client.count_subscribers(t)) or 'no service'
+        print(f'failed the nodes did not come up: {silent}', flush=True)
+        return 2
+    print('ready', flush=True)
+    for count in range(1, args.images + 1):
+        if not client.spin_until(functools.partial(client.has_seen, count), args.timeout):
+            print(f'failed only {client.images_seen()} of {args.images} images came', flush=True)
+            return 2
+        print(f'collected {count}', flush=True)
+    future = client.calibrate.call_async(Trigger.Request())
+    if not client.spin_until(future.done, args.timeout):
+        print('failed the calibrator did not answer', flush=True)
+        return 2
+    answer = future.result()
+    if answer.success and client.spin_until(lambda: client.calibration is not None, args.timeout):
+        write_calibration(calibration_from_message(client.calibration), args.output)
+    print(f'result {answer.message}', flush=True)
+    return 0 if answer.success else 3
+
+
+def main() -> int:
+    """Run the client."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument('--images', type=int, required=True, help='how many to wait for')
+    parser.add_argument('--image-topic', required=True)
+    parser.add_argument('--attitude-topic', required=True)
+    parser.add_argument('--output', type=Path, required=True, help='calibration.json to write')
+    parser.add_argument('--timeout', type=float, default=30.0, help='of each step, s')
+    args = parser.parse_args()
+    rclpy.init()
+    client = DemoClient()
+    try:
+        return run(client, args)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 130
+    finally:
+        client.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

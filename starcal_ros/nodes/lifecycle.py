@@ -1,0 +1,265 @@
+"""A lifecycle node that starts itself, outlives errors of its callbacks and tells its health."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import functools
+import signal
+import sys
+import threading
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import rclpy
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.exceptions import ROSInterruptException
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
+
+from starcal_ros.errors import StarcalError
+from starcal_ros.node_options import NODE_OPTION_CLASSES
+from starcal_ros.nodes.parameters import OptionParameters
+from starcal_ros.pipeline import OPTION_CLASSES
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+Health = tuple[bytes, str, dict[str, object]]
+
+_THREADS = 6  # images, attitudes, services, solve, status, one spare: none waits for another
+
+
+class StarcalNode(LifecycleNode):
+    """
+    What the lifecycle nodes share.
+
+    A node of this kind fills in `configure`, `activate`, `deactivate`, `cleanup` and `health`.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.options = OptionParameters(self, (*OPTION_CLASSES, *NODE_OPTION_CLASSES))
+        for unknown in self.options.unknown():
+            self.get_logger().warning(f'{unknown}: not a parameter of starcal')
+        self.failure = ''  # why the last transition failed, one line
+        self._errors = 0
+        self._level: bytes | None = None
+        self._diagnostics_lock = threading.Lock()
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._diagnostics_timer = self.create_timer(
+            1.0, self.publish_health, callback_group=MutuallyExclusiveCallbackGroup()
+        )
+        self._answer_invalid_transitions()
+
+    def configure(self) -> None:
+        """Read parameters and files, make the publishers; StarcalError when they are no good."""
+        raise NotImplementedError
+
+    def activate(self) -> None:
+        """Start to listen."""
+        raise NotImplementedError
+
+    def deactivate(self) -> None:
+        """Stop listening; safe to call twice."""
+        raise NotImplementedError
+
+    def cleanup(self) -> None:
+        """Let go of what `configure` made; safe to call twice."""
+        raise NotImplementedError
+
+    def health(self) -> Health:
+        """Level, a sentence, and numbers by name, of the active node."""
+        raise NotImplementedError
+
+    @property
+    def is_active(self) -> bool:
+        """Whether the node is in the state active."""
+        return bool(self._state_machine.current_state[1] == 'active')
+
+    def guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
+        """Return the callback with its errors logged and counted: one bad message ends nothing."""
+
+        @functools.wraps(callback)
+        def run(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except Exception as error:
+                self.count_error(error)
+
+        return run
+
+    def count_error(self, error: Exception) -> None:
+        """Log an error that was not foreseen and count it for the diagnostics."""
+        self._errors += 1
+        where = error.__traceback__
+        while where is not None and where.tb_next is not None:
+            where = where.tb_next
+        code = where.tb_frame.f_code if where is not None else None
+        place = f' in {code.co_name}, line {where.tb_lineno}' if code and where else ''
+        self.get_logger().error(f'{type(error).__name__}: {one_line(error)}{place}')
+
+    def publish_health(self) -> None:
+        """Publish the diagnostics now."""
+        if not self.context.ok():
+            return
+        level, text, numbers = self._health()
+        status = DiagnosticStatus(
+            level=level,
+            name=f'starcal: {self.get_name()}',
+            message=text,
+            hardware_id=self.get_fully_qualified_name(),
+            values=[KeyValue(key=key, value=str(value)) for key, value in numbers.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        with self._diagnostics_lock:
+            self._level = level
+            self._diagnostics.publish(message)
+
+    def publish_health_change(self) -> None:
+        """Publish the diagnostics if their level is not the one published last."""
+        if self._health()[0] != self._level:
+            self.publish_health()
+
+    def _health(self) -> Health:
+        if self.is_active:
+            level, text, numbers = self.health()
+        else:
+            state = self._state_machine.current_state[1]
+            level, text, numbers = WARN, self.failure or f'not active: {state}', {}
+            if self.failure:
+                level = ERROR
+        return level, text, {**numbers, 'callback_errors': self._errors}
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Configure; a bad parameter or file leaves the node unconfigured."""
+        self.options.frozen = True
+        outcome = self._transition(self.configure, state, super().on_configure)
+        if outcome != TransitionCallbackReturn.SUCCESS:
+            self.options.frozen = False
+        return outcome
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Activate: publishers first, then subscriptions."""
+        outcome = super().on_activate(state)
+        return self._transition(self.activate, state, lambda _: outcome)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Deactivate: subscriptions first, then publishers."""
+        return self._transition(self.deactivate, state, super().on_deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Clean up; parameters can be changed again."""
+        outcome = self._transition(self.cleanup, state, super().on_cleanup)
+        self.options.frozen = False
+        return outcome
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Shut down from whatever state."""
+        self.deactivate()
+        return self._transition(self.cleanup, state, super().on_shutdown)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Return to unconfigured after a transition that failed halfway."""
+        self.deactivate()
+        self.cleanup()
+        self.options.frozen = False
+        return TransitionCallbackReturn.SUCCESS
+
+    def _transition(
+        self, step: Callable[[], None], state: LifecycleState, base: Callable[[Any], Any]
+    ) -> TransitionCallbackReturn:
+        # Jazzy swallows what a transition raises without a word: it has to be said here.
+        try:
+            step()
+        except StarcalError as error:
+            self.failure = one_line(error)
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self.failure = f'{type(error).__name__}: {one_line(error)}'
+            self.count_error(error)
+            return TransitionCallbackReturn.ERROR
+        self.failure = ''
+        return base(state)
+
+    def _answer_invalid_transitions(self) -> None:
+        """Answer a transition that the state does not allow with false; Jazzy's rclpy raises."""
+        service = self._service_change_state
+        change_state = service.callback
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                response = change_state(request, response)
+            except Exception as error:
+                self.get_logger().error(f'transition refused: {one_line(error)}')
+                response.success = False
+            if not response.success and self.failure:
+                self.get_logger().error(self.failure)
+            return response
+
+        service.callback = answer
+
+
+def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | None) -> int:
+    """
+    Exit status of a lifecycle node that was run until it was told to end.
+
+    0 after SIGINT or SIGTERM; 2 for bad parameters or files, with one line that names them.
+    """
+    node = None
+    try:
+        rclpy.init(args=None if args is None else [name, *args])
+        node = make_node()
+        executor = MultiThreadedExecutor(_THREADS)
+        executor.add_node(node)
+        if node.options.values()['autostart'] and not _start(node):
+            print(f'{name}: {node.failure}', file=sys.stderr)
+            return 2
+        _spin(node, executor)
+    except StarcalError as error:
+        print(f'{name}: {one_line(error)}', file=sys.stderr)
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException, ROSInterruptException):
+        pass
+    except Exception as error:
+        print(f'{name}: {one_line(error)}', file=sys.stderr)
+        return 2
+    finally:
+        _end(node)
+    return 0
+
+
+def end_quietly(node: Node | None) -> None:
+    """Destroy a node and leave ROS; a second signal does not interrupt it."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    if node is not None:
+        node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def _end(node: StarcalNode | None) -> None:
+    if node is not None:
+        node.deactivate()
+        node.cleanup()
+    end_quietly(node)
+
+
+def _start(node: StarcalNode) -> bool:
+    success = TransitionCallbackReturn.SUCCESS
+    return bool(node.trigger_configure() == success and node.trigger_activate() == success)
+
+
+def _spin(node: StarcalNode, executor: MultiThreadedExecutor) -> None:
+    while node.context.ok():
+        try:
+            executor.spin_once(timeout_sec=1.0)
+        except (KeyboardInterrupt, ExternalShutdownException):
+            return
+        except Exception as error:
+            if node.context.ok():  # at shutdown handles vanish under the executor
+                node.count_error(error)
+
+
+def one_line(error: Exception) -> str:
+    """Text of an error without line breaks."""
+    return ' '.join(str(error).split())

@@ -1,0 +1,248 @@
+"""The star observer: images and attitudes in, star observations out."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Sequence
+import sys
+import threading
+from typing import Any
+
+from geometry_msgs.msg import QuaternionStamped, TwistStamped
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image as ImageMessage
+
+from starcal.msg import Calibration as CalibrationMessage
+from starcal.msg import StarObservations as ObservationsMessage
+from starcal_ros import messages, pipeline
+from starcal_ros.annotation import annotate
+from starcal_ros.attitude import attitude_sample, AttitudeHistory
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import ImageRefused
+from starcal_ros.node_options import ObserverOptions
+from starcal_ros.nodes.conversions import make_message
+from starcal_ros.nodes.image_queue import ImageQueue, Waiting
+from starcal_ros.nodes.lifecycle import Health, OK, run, StarcalNode, WARN
+from starcal_ros.options import from_mapping
+from starcal_ros.records import AttitudeSample, Image, refused_image, StarObservations
+
+NAME = 'star_observer'
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# Ten seconds of a fast star tracker; a bag played at speed sends them in bursts.
+_SAMPLES = QoSProfile(depth=2000)
+
+
+class StarObserver(StarcalNode):
+    """
+    Measures the stars of every image, in order of arrival, in one thread of its own.
+
+    Callbacks only take: the thread that measures alone owns the attitude history.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(NAME)
+        self._listeners: list[Any] = []
+        self._publishers_made: list[Any] = []
+        self._worker: threading.Thread | None = None
+        self._queue: ImageQueue | None = None
+        self._counts: Counter[str] = Counter()
+        self._last_refusal = ''
+
+    def configure(self) -> None:
+        """Load prior camera and catalog, make the publishers."""
+        values = self.options.values()
+        self._own = from_mapping(ObserverOptions, values)
+        self._setup = pipeline.load_setup(values, self.options.classes)
+        self._geometry = self._setup.prior
+        self._observations = self.create_lifecycle_publisher(
+            ObservationsMessage, 'observations', QoSProfile(depth=100)
+        )
+        self._annotated = self.create_lifecycle_publisher(
+            ImageMessage, 'annotated_image', QoSProfile(depth=2)
+        )
+        self._publishers_made = [self._observations, self._annotated]
+
+    def activate(self) -> None:
+        """Start to take images and attitudes, and the thread that measures."""
+        self._attitudes = AttitudeHistory(self._own.attitude_history_s)
+        self._new_attitudes: deque[tuple[int, AttitudeSample | None]] = deque()
+        self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
+        self._latest_ns: int | None = None
+        self._counts.clear()
+        self._last_refusal = ''
+        self._queue = ImageQueue(
+            self._own.image_queue, self._own.attitude_timeout_s, self._attitude_has_come
+        )
+        self._worker = threading.Thread(target=self._measure_all, name='measure')
+        self._worker.start()
+        best_effort = self._own.image_reliability == 'best_effort'
+        images = QoSProfile(
+            depth=self._own.image_queue,
+            reliability=(
+                ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+            ),
+        )
+        for kind, topic, callback, qos in (
+            (CalibrationMessage, 'calibration', self._on_calibration, LATCHED),
+            (TwistStamped, 'velocity', self._on_velocity, _SAMPLES),
+            (QuaternionStamped, 'attitude', self._on_attitude, _SAMPLES),
+            (ImageMessage, 'image', self._on_image, images),
+        ):
+            listener = self.create_subscription(
+                kind,
+                topic,
+                self.guarded(callback),
+                qos,
+                callback_group=MutuallyExclusiveCallbackGroup(),
+            )
+            self._listeners.append(listener)
+
+    def deactivate(self) -> None:
+        """Stop listening; what still waits in the queue is let go."""
+        while self._listeners:
+            self.destroy_subscription(self._listeners.pop())
+        if self._queue is not None and self._worker is not None:
+            if len(self._queue):
+                self.get_logger().warning(f'{len(self._queue)} images were waiting at the end')
+            self._queue.close()
+            self._worker.join()
+        self._worker = None
+
+    def cleanup(self) -> None:
+        """Let go of the publishers."""
+        while self._publishers_made:
+            self.destroy_lifecycle_publisher(self._publishers_made.pop())
+
+    def health(self) -> Health:
+        """Counts of images by what became of them."""
+        numbers: dict[str, object] = {
+            'images': sum(self._counts.values()),
+            'images_used': self._counts[''],
+            'images_waiting': len(self._queue or ()),
+            'attitudes': len(self._attitudes),
+            **{f'refused_{reason}': n for reason, n in sorted(self._counts.items()) if reason},
+        }
+        if self._last_refusal:
+            return WARN, f'last image refused: {self._last_refusal}', numbers
+        if not self._counts:
+            return OK, 'waiting for images', numbers
+        return OK, 'observing', numbers
+
+    def _on_image(self, message: Any) -> None:
+        time_ns = messages.stamp_ns(message.header.stamp)
+        time_ns += messages.offset_ns(self._setup.attitude.stamp_offset_s)
+        if self._queue is not None:
+            self._queue.put(time_ns, message.width, message.height, message)
+
+    def _on_attitude(self, message: Any) -> None:
+        time_ns, quaternion = messages.attitude_from_message(message)
+        direction = self._setup.attitude.attitude_direction
+        self._new_attitudes.append((time_ns, attitude_sample(time_ns, quaternion, direction)))
+        if self._queue is not None:
+            self._queue.wake()
+
+    def _on_velocity(self, message: Any) -> None:
+        self._velocities.append(messages.velocity_from_message(message))
+
+    def _on_calibration(self, message: Any) -> None:
+        geometry = messages.calibration_from_message(message).geometry
+        prior = self._setup.prior.camera
+        if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
+            raise ValueError('calibration: of another image size than the prior camera')
+        self._geometry = geometry
+        self.get_logger().info('stars are predicted with the calibration in force')
+
+    def _attitude_has_come(self, time_ns: int) -> bool:
+        """Whether the samples about an image are there, or a later one shows they will not be."""
+        while self._new_attitudes:
+            self._attitudes.add(*self._new_attitudes.popleft())
+        latest_ns = self._attitudes.latest_ns
+        if latest_ns is None or latest_ns < time_ns:
+            return False
+        gap_s = self._setup.attitude.max_attitude_gap_s
+        if latest_ns > time_ns + messages.offset_ns(gap_s):
+            return True
+        try:
+            self._attitudes.at(time_ns, gap_s)
+        except ImageRefused:
+            return False
+        return True
+
+    def _measure_all(self) -> None:
+        assert self._queue is not None  # made before the thread
+        while (waiting := self._queue.take()) is not None:
+            try:
+                self._measure(waiting)
+            except Exception as error:
+                self.count_error(error)
+                detail = f'{type(error).__name__}: {error}'
+                self._publish(self._refused(waiting, 'internal_error', detail))
+            self.publish_health_change()
+
+    def _measure(self, waiting: Waiting) -> None:
+        self._attitude_has_come(waiting.time_ns)
+        if waiting.message is None:
+            detail = f'{self._own.image_queue} images were waiting'
+            self._publish(self._refused(waiting, 'overrun', detail))
+            return
+        try:
+            image = messages.image_from_message(
+                waiting.message, self._setup.attitude.stamp_offset_s
+            )
+        except ImageRefused as refused:
+            self._publish(self._refused(waiting, refused.reason, refused.detail))
+            return
+        geometry = self._geometry
+        if self._latest_ns is not None and image.time_ns <= self._latest_ns:
+            observations = pipeline.out_of_order(image, self._latest_ns)
+        else:
+            self._latest_ns = image.time_ns
+            observations = pipeline.observe(
+                image, self._attitudes, self._setup, geometry, self._velocity_at(image.time_ns)
+            )
+        self._publish(observations)
+        if self._annotated.get_subscription_count():
+            self._publish_annotated(image, observations)
+
+    def _velocity_at(self, time_ns: int) -> Any:
+        """The last velocity at or before an image, else the first after it; None without any."""
+        samples = list(self._velocities)
+        before = [velocity for stamp_ns, velocity in samples if stamp_ns <= time_ns]
+        if before:
+            return before[-1]
+        return samples[0][1] if samples else None
+
+    def _refused(self, waiting: Waiting, reason: str, detail: str) -> StarObservations:
+        return refused_image(waiting.time_ns, waiting.width, waiting.height, reason, detail)
+
+    def _publish(self, observations: StarObservations) -> None:
+        frame_id = self._setup.frames.camera_frame
+        self._observations.publish(
+            messages.observations_to_message(observations, frame_id, make_message)
+        )
+        self._counts[observations.refusal] += 1
+        self._last_refusal = (
+            observations.refusal and f'{observations.refusal}: {observations.detail}'
+        )
+        if observations.refusal:
+            seconds = observations.time_ns / NANOSECONDS_PER_SECOND
+            self.get_logger().warning(f'image at {seconds:.3f} s refused: {self._last_refusal}')
+        else:
+            self.get_logger().debug(f'{len(observations)} stars')
+
+    def _publish_annotated(self, image: Image, observations: StarObservations) -> None:
+        picture = annotate(image, observations, self._geometry)
+        frame_id = self._setup.frames.camera_frame
+        self._annotated.publish(
+            messages.color_image_to_message(image.time_ns, picture, frame_id, make_message)
+        )
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the star observer until it is told to end; exit status 2 for bad parameters."""
+    return run(StarObserver, NAME, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
