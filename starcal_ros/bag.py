@@ -8,36 +8,36 @@ read up to the damage, and a chunk whose checksum fails is left out; either is s
 
 from __future__ import annotations
 
-import functools
-import logging
-import os
-import re
-import struct
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+import functools
+import logging
+import os
 from pathlib import Path
+import re
+import struct
+import sys
 from types import TracebackType
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import Any, IO, NamedTuple, TYPE_CHECKING
 
-import numpy as np
-import yaml
 from mcap.exceptions import EndOfFile, McapError, RecordLengthLimitExceeded
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, McapRecord, Schema, Statistics
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.stream_reader import get_chunk_data_stream, StreamReader
 from mcap.writer import CompressionType, Writer
+import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
+import yaml
 
 from starcal_ros import messages
-from starcal_ros.attitude import AttitudeHistory, AttitudeOptions, attitude_sample
+from starcal_ros.attitude import attitude_sample, AttitudeHistory, AttitudeOptions
 from starcal_ros.errors import BagError, ImageRefused
-from starcal_ros.records import Calibration, EnsembleStatus, Image, StarObservations, refused_image
+from starcal_ros.records import Calibration, EnsembleStatus, Image, refused_image, StarObservations
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -116,7 +116,7 @@ def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple
             # What a damaged summary raises has no common base.
             try:
                 summary = make_reader(stream).get_summary()
-            except Exception:  # noqa: BLE001
+            except Exception:
                 summary = None
         if summary is not None and summary.statistics is not None:
             for number, count in summary.statistics.channel_message_counts.items():
@@ -512,7 +512,7 @@ def _records(file: Path, on_damage: Damage) -> Iterator[McapRecord]:
     with file.open('rb') as stream:
         size = os.fstat(stream.fileno()).st_size
         reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size)
-        # Damage shows as whatever the bytes after it are taken for: the errors have no common base.
+        # Damage shows as whatever the bytes after it are taken for: no common base of errors.
         try:
             for record in reader.records:
                 read_to = stream.tell()
@@ -524,7 +524,7 @@ def _records(file: Path, on_damage: Damage) -> Iterator[McapRecord]:
                 for inner in found:
                     seen += isinstance(inner, McapMessage)
                     yield inner
-                # A chunk whose kind was flipped is skipped as an unknown record: only a count tells.
+                # A chunk whose kind was flipped is skipped as unknown: only a count tells.
                 if isinstance(record, Statistics) and record.message_count != seen and not told:
                     tell(f'{file}: damaged: {seen} of {record.message_count} messages found')
         except (
@@ -547,7 +547,7 @@ def _chunk_records(file: Path, end: int, chunk: Chunk, on_damage: Damage) -> Ite
     """Records of a chunk, or none where its checksum or its compression is wrong."""
     try:
         stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-    except Exception as error:  # noqa: BLE001  zstd's, lz4's and checksum errors share no base
+    except Exception as error:
         on_damage(f'{file}: the chunk that ends at byte {end} is damaged and left out: {error}')
         return
     while stream.count < length:
@@ -563,7 +563,7 @@ def _chunk_records(file: Path, end: int, chunk: Chunk, on_damage: Damage) -> Ite
 
 
 def _qos_profile(latched: bool) -> dict[str, object]:
-    """A publisher's offer in the words of rosbag2: reliable, and kept for late readers if latched."""
+    """Reliable, and kept for late readers if latched: an offer in the words of rosbag2."""
 
     def forever() -> dict[str, int]:
         return {'sec': 9223372036, 'nsec': 854775807}

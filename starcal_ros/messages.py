@@ -9,8 +9,8 @@ as flat numpy arrays of the field's own type.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
+import sys
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,13 +20,13 @@ from starcal_ros.camera import CameraModel, zero_skew_fit
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.records import (
-    CALIBRATION_PARAMETER_NAMES,
     Calibration,
+    CALIBRATION_PARAMETER_NAMES,
     CameraGeometry,
     EnsembleStatus,
     Image,
-    StarObservations,
     refused_image,
+    StarObservations,
 )
 
 Floats = NDArray[np.float64]
@@ -74,7 +74,7 @@ def decode_image(
     height: int,
     step: int,
     is_bigendian: bool,
-    data: object,
+    data: Any,
     time_ns: int,
 ) -> Image:
     """
@@ -100,7 +100,7 @@ def decode_image(
             'bad_encoding', f'{encoding[:40]!r} is not one of {", ".join(_PIXEL_BYTES)}'
         )
     # An empty buffer has no shape that frombuffer would take.
-    flat = np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)  # type: ignore
+    flat = np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
     row_bytes = width * pixel_bytes
     if width < 1 or height < 1:
         raise ImageRefused('bad_layout', f'{width} x {height} is not an image')

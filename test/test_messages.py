@@ -20,8 +20,8 @@ from starcal_ros.records import (
     CameraGeometry,
     EnsembleStatus,
     Image,
-    StarObservations,
     refused_image,
+    StarObservations,
 )
 
 TIME_NS = 1_700_000_000_123_456_789
