@@ -186,7 +186,7 @@ def scenario(name: str, seed: int = 1) -> Scenario:
             name,
             seed,
             size=(640, 512),
-            detector=Detector(electrons_per_dn=8.0, offset_dn=32.0, zero_point_electrons=5e5),
+            detector=Detector(electrons_per_dn=8.0, offset_dn=32.0, zero_point_electrons=2e5),
             star_tracker_sigma_arcsec=(10.0, 10.0, 40.0),
             pointing=Inertial(_TINY_FIELDS),
             cadence_s=4.0,
