@@ -1,4 +1,9 @@
-"""Options of the ROS nodes: here without ROS, because the tool reads the same files."""
+"""
+Options of the nodes alone, declared where code without ROS can see them.
+
+One parameter file serves the nodes and the tool: the tool has no use for these, but it must tell
+a node's parameter from a misspelt one.
+"""
 
 from __future__ import annotations
 
@@ -59,4 +64,4 @@ class PlayerOptions:
 
 
 NODE_OPTION_CLASSES = (NodeOptions, ObserverOptions, CalibratorOptions)
-"""One parameter file serves both nodes and the tool: each passes over what is not its own."""
+"""What a parameter file may hold beside the options of the stages."""
