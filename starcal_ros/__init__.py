@@ -7,7 +7,7 @@ DOI 10.1007/s40295-016-0091-3.  Equation numbers in the docstrings are that pape
 
 Conventions, everywhere in this package:
 
-- Frames: ``icrf`` (inertial), ``star_tracker``, ``camera`` (+x right, +y down, +z out of the lens).
+- Frames: ``icrf`` (inertial), ``star_tracker``, ``camera`` (+x right, +y down, +z out).
 - ``b_from_a`` takes coordinates in frame a to coordinates in frame b.
 - Quaternions are scalar-last (x, y, z, w).
 - Small angles are passive rotations in the camera frame:

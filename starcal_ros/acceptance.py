@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from starcal_ros.camera import line_of_sight, pixel_grid, project
+from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry
 
@@ -25,11 +26,23 @@ class GateOptions:
     min_coverage: float = option(
         0.3, 'least fraction of the focal-plane cells that hold a star', low=0.0, high=1.0
     )
-    max_line_of_sight_sigma_px: float = option(
-        0.5, 'largest 1-sigma of the distortion map over the detector, px', low=0.0, high=100.0
+    max_map_sigma_px: float = option(
+        0.5,
+        'largest 1-sigma of the distortion map over the detector, common turn removed, px',
+        low=0.0,
+        high=100.0,
     )
     max_change_px: float = option(
-        50.0, 'largest change of the camera against the prior over the detector, px', low=0.0, high=1e5
+        50.0,
+        'largest change of the distortion map against the prior, common turn removed, px',
+        low=0.0,
+        high=1e5,
+    )
+    max_turn_deg: float = option(
+        2.0,
+        'largest turn of the lines of sight in the star tracker frame against the prior, degrees',
+        low=0.0,
+        high=180.0,
     )
 
 
@@ -48,16 +61,30 @@ class Candidate:
     termination: str
 
 
-def camera_change_px(before: CameraGeometry, after: CameraGeometry) -> float:
+def change(before: CameraGeometry, after: CameraGeometry) -> tuple[float, float]:
     """
-    Largest distance over the detector between the images of one direction in two cameras, px.
+    How far the lines of sight of the pixels moved in the star tracker frame.
 
-    Infinite where a pixel of the first camera has no line of sight, or the second does not see it.
+    Returns
+    -------
+    turn_rad : float
+        The rotation common to all pixels.
+    shape_px : float
+        The largest movement of a pixel that is left.  Both are infinite where a pixel has no line
+        of sight any more.
     """
-    directions = line_of_sight(before.camera, pixel_grid(before.camera, 15, 12))
-    moved = project(after.camera, directions) - project(before.camera, directions)
-    largest = float(np.linalg.norm(moved, axis=-1).max())
-    return largest if np.isfinite(largest) else np.inf
+    pixels = pixel_grid(before.camera, 15, 12)
+    old, new = (
+        Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).apply(
+            line_of_sight(geometry.camera, pixels)
+        )
+        for geometry in (before, after)
+    )
+    if not (np.isfinite(old).all() and np.isfinite(new).all()):
+        return np.inf, np.inf
+    turn, _ = Rotation.align_vectors(new, old)
+    left_rad = np.linalg.norm(new - turn.apply(old), axis=1).max()
+    return float(turn.magnitude()), float(left_rad * after.camera.parameters[0])
 
 
 def judge(candidate: Candidate, options: GateOptions) -> tuple[str, ...]:
@@ -85,16 +112,20 @@ def judge(candidate: Candidate, options: GateOptions) -> tuple[str, ...]:
             f'stars cover {100 * covered:.0f} % of the detector, under the limit of '
             f'{100 * options.min_coverage:.0f} % (min_coverage)'
         )
-    if not candidate.map_sigma_px <= options.max_line_of_sight_sigma_px:
+    if not candidate.map_sigma_px <= options.max_map_sigma_px:
         reasons.append(
-            f'the distortion map is uncertain by {candidate.map_sigma_px:.3f} px at its worst, over '
-            f'the limit of {options.max_line_of_sight_sigma_px:g} px (max_line_of_sight_sigma_px)'
+            f'the distortion map is uncertain by {candidate.map_sigma_px:.3f} px at its worst, '
+            f'over the limit of {options.max_map_sigma_px:g} px (max_map_sigma_px)'
         )
-    change_px = camera_change_px(candidate.prior, candidate.geometry)
-    if not change_px <= options.max_change_px:
+    turn_rad, shape_px = change(candidate.prior, candidate.geometry)
+    if not shape_px <= options.max_change_px:
         reasons.append(
-            f'the camera would change by {change_px:.1f} px at its worst, over the limit of '
-            f'{options.max_change_px:g} px (max_change_px)'
+            f'the distortion map would change by {shape_px:.1f} px at its worst, '
+            f'over the limit of {options.max_change_px:g} px (max_change_px)'
+        )
+    if not np.degrees(turn_rad) <= options.max_turn_deg:
+        reasons.append(
+            f'the lines of sight would turn by {np.degrees(turn_rad):.3f} degrees, '
+            f'over the limit of {options.max_turn_deg:g} degrees (max_turn_deg)'
         )
     return tuple(reasons)
-

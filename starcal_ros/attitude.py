@@ -37,7 +37,9 @@ class AttitudeOptions:
     )
 
 
-def attitude_sample(time_ns: int, quaternion_xyzw: Floats, direction: str) -> AttitudeSample | None:
+def attitude_sample(
+    time_ns: int, quaternion_xyzw: Floats, direction: str
+) -> AttitudeSample | None:
     """
     A checked sample in the project's own direction, or None where it is not a rotation.
 
@@ -122,9 +124,13 @@ class AttitudeHistory:
         if gap_s > max_gap_s:
             if good_after - good_before > 1:
                 raise ImageRefused('bad_attitude', 'the samples about the image are not valid')
-            raise ImageRefused('attitude_gap', f'{gap_s:.3f} s between samples, over {max_gap_s:g} s')
+            raise ImageRefused(
+                'attitude_gap', f'{gap_s:.3f} s between samples, over {max_gap_s:g} s'
+            )
         before, after = self._samples[good_before], self._samples[good_after]
-        assert before is not None and after is not None  # by the search above; for the type checker
+        assert (
+            before is not None and after is not None
+        )  # by the search above; for the type checker
         # Times relative to the first sample: seconds since 1970 would lose 0.1 us in a double.
         path = Slerp(
             [0.0, gap_s],

@@ -16,36 +16,35 @@ camera_from_star_tracker and T_k = star_tracker_from_icrf as measured.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
+from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.least_squares import (
+    covariance,
+    levenberg_marquardt,
     NormalEquations,
     NotObservable,
     Solution,
-    covariance,
-    levenberg_marquardt,
 )
 from starcal_ros.measurement import (
-    CAMERA,
-    RESIDUAL,
-    ROTATION,
-    Measurements,
-    StarTable,
     arrange,
+    CAMERA,
+    Measurements,
     normal_blocks,
+    RESIDUAL,
     residuals_px,
+    ROTATION,
     squared_sigmas,
     star_table,
+    StarTable,
 )
 from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Ensemble
@@ -55,7 +54,11 @@ Mask = NDArray[np.bool_]
 
 METHODS = ('hierarchical', 'per_image', 'single')
 
-_ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: normal noise loses 5 % of its weight, outliers all
+_ROBUST_SCALE = (
+    3.0  # of the Cauchy loss, in sigma: normal noise loses 5 % of its weight, outliers all
+)
+_START_FLOOR_PX = 0.05  # until the residuals tell: of the order of what is left in good images
+_STARS_PER_GROUP = 40  # whose median squared residual is known to 25 %
 _SNOOPING_ROUNDS = 10  # the set of rejected stars settles in two or three
 
 
@@ -63,7 +66,9 @@ _SNOOPING_ROUNDS = 10  # the set of rejected stars settles in two or three
 class CalibrationOptions:
     """What is estimated, and how."""
 
-    method: str = option('per_image', 'how the attitudes of the images are treated', choices=METHODS)
+    method: str = option(
+        'per_image', 'how the attitudes of the images are treated', choices=METHODS
+    )
     estimate: tuple[str, ...] = option(
         ('fx', 'skew', 'fy', 'k1', 'k2', 'k3', 'p1', 'p2'),
         'camera parameters that are estimated; the others are held at the prior',
@@ -86,7 +91,10 @@ class CalibrationOptions:
         400, 'most images kept; beyond it those that add least information go', low=3, high=100000
     )
     outlier_sigma: float = option(
-        4.5, 'length of a residual, in its sigma, from which a star is left out', low=3.0, high=20.0
+        4.5,
+        'length of a residual, in its sigma, from which a star is left out',
+        low=3.0,
+        high=20.0,
     )
 
 
@@ -110,12 +118,35 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class CentroidVariance:
+    """
+    What the residuals say of the centroid covariances C: they are ``scale C + floor_px2 I``.
+
+    The floor stands for what a centroid does not know of: the real shape of the PSF, the catalog,
+    the air.  The scale is a wrong detector gain, or the excess of faint stars over their bound.
+    """
+
+    scale: float
+    floor_px2: float
+
+    def of(self, covariance_px2: Floats) -> Floats:
+        """Covariances (n, 3) uu, uv, vv as the residuals have them."""
+        return self.scale * covariance_px2 + self.floor_px2 * np.array([1.0, 0.0, 1.0])
+
+    def is_close_to(self, other: CentroidVariance) -> bool:
+        """Whether a weight changes by under 1 %, which moves no estimate by 0.001 sigma."""
+        return math.isclose(self.scale, other.scale, rel_tol=0.01) and math.isclose(
+            self.floor_px2, other.floor_px2, rel_tol=0.01, abs_tol=1e-8
+        )
+
+
+@dataclass(frozen=True)
 class Estimate:
     """
     A solved calibration, before products.
 
-    ``covariance`` (13, 13); ``kept`` (n,) stars used; ``floor_px2`` the variance added to every
-    centroid; ``variance_factor`` chi^2 per degree of freedom of the centroid covariances as given;
+    ``covariance`` (13, 13); ``kept`` (n,) stars used; ``variance`` how the centroid covariances
+    were corrected; ``variance_factor`` chi^2 per degree of freedom of them as given;
     ``residual_px`` (n, 2) of all stars; ``alignment_scatter_arcsec`` of the images.
     """
 
@@ -125,7 +156,7 @@ class Estimate:
     table: StarTable
     kept: Mask
     residual_px: Floats
-    floor_px2: float
+    variance: CentroidVariance
     variance_factor: float
     alignment_scatter_arcsec: float
     iterations: int
@@ -206,31 +237,29 @@ def _search(
 ) -> Estimate:
     """Robust search, then least squares with snooping; see `estimate_calibration`."""
     everything = np.ones(len(table), bool)
-    start_floor_px2 = 0.05**2
-    solution = _minimise(problem, state, arrange(table, everything, start_floor_px2), _ROBUST_SCALE)
+    start = CentroidVariance(1.0, _START_FLOOR_PX**2)
+    solution = _minimise(
+        problem, state, arrange(table, everything, start.of(table.covariance_px2)), _ROBUST_SCALE
+    )
     iterations = solution.iterations
     residual_px = _residuals(solution.state, table)
-    floor_px2 = _robust_floor(residual_px, table.covariance_px2)
-    kept = squared_sigmas(residual_px, table.covariance_px2, floor_px2) < options.outlier_sigma**2
+    variance = estimate_variance(residual_px, table.covariance_px2, everything, 1.0)
+    kept = _fitting(residual_px, variance.of(table.covariance_px2), options)
     for _ in range(_SNOOPING_ROUNDS):
-        solution = _minimise(problem, solution.state, arrange(table, kept, floor_px2), np.inf)
+        covariance_px2 = variance.of(table.covariance_px2)
+        solution = _minimise(problem, solution.state, arrange(table, kept, covariance_px2), np.inf)
         iterations += solution.iterations
         residual_px = _residuals(solution.state, table)
-        dof = _degrees_of_freedom(problem, table, kept)
-        floor_before = floor_px2
-        floor_px2 = _floor(residual_px[kept], table.covariance_px2[kept], dof)
-        kept_before = kept
-        kept = squared_sigmas(residual_px, table.covariance_px2, floor_px2) < options.outlier_sigma**2
-        # A hundredth of the floor moves the estimate by less than a thousandth of a sigma.
-        settled = abs(floor_px2 - floor_before) <= 0.01 * floor_px2
-        if settled and np.array_equal(kept, kept_before):
+        kept_before, variance_before = kept, variance
+        freedom = _degrees_of_freedom(problem, table, kept) / (2 * np.count_nonzero(kept))
+        variance = estimate_variance(residual_px, table.covariance_px2, kept, freedom)
+        kept = _fitting(residual_px, variance.of(table.covariance_px2), options)
+        if np.array_equal(kept, kept_before) and variance.is_close_to(variance_before):
             break
-    kept = kept_before
+    kept, variance = kept_before, variance_before
     dof = _degrees_of_freedom(problem, table, kept)
-    chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept], 0.0).sum()
-    chi2_used = squared_sigmas(residual_px[kept], table.covariance_px2[kept], floor_before).sum()
-    factor = min(chi2_used / dof, 1.0) if floor_before == 0.0 else 1.0
-    geometry, cov, scatter_arcsec = _result(problem, solution, prior, factor)
+    chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()
+    geometry, cov, scatter_arcsec = _result(problem, solution, prior)
     return Estimate(
         geometry=geometry,
         covariance=cov,
@@ -238,12 +267,17 @@ def _search(
         table=table,
         kept=kept,
         residual_px=residual_px,
-        floor_px2=floor_before,
+        variance=variance,
         variance_factor=float(chi2_given / dof),
         alignment_scatter_arcsec=scatter_arcsec,
         iterations=iterations,
         termination=solution.termination,
     )
+
+
+def _fitting(residual_px: Floats, covariance_px2: Floats, options: CalibrationOptions) -> Mask:
+    """Return (n,) whether a residual is no outlier."""
+    return np.asarray(squared_sigmas(residual_px, covariance_px2) < options.outlier_sigma**2)
 
 
 def _residuals(state: State, table: StarTable) -> Floats:
@@ -263,34 +297,37 @@ def _degrees_of_freedom(problem: Problem, table: StarTable, kept: Mask) -> int:
     return dof
 
 
-def _floor(residual_px: Floats, covariance_px2: Floats, dof: int) -> float:
+def estimate_variance(
+    residual_px: Floats, covariance_px2: Floats, kept: Mask, freedom: float
+) -> CentroidVariance:
     """
-    Variance to add to each axis so that chi^2 equals its degrees of freedom; 0 when below.
+    Scale and floor that make the centroid covariances those of the residuals.
 
-    It stands for what the centroid covariances do not know of: the real shape of the PSF, the
-    catalog, the air.
+    The kept stars are ranked by their own variance and cut into groups; the median squared
+    residual of a group, which outliers do not move, is its variance; scale and floor are the
+    non-negative line through the groups.  ``freedom`` is the share of the residuals' degrees of
+    freedom that the fit has left them.
     """
-
-    def excess(floor_px2: float) -> float:
-        return float(squared_sigmas(residual_px, covariance_px2, floor_px2).sum()) - dof
-
-    if excess(0.0) <= 0.0:
-        return 0.0
-    upper = float((residual_px**2).sum()) / dof
-    return float(brentq(excess, 0.0, 2.0 * upper, xtol=1e-12, rtol=1e-6))
-
-
-def _robust_floor(residual_px: Floats, covariance_px2: Floats) -> float:
-    """Variance to add so that the median squared residual is that of a normal distribution."""
-    median = float(chi2.median(2))
-
-    def excess(floor_px2: float) -> float:
-        return float(np.median(squared_sigmas(residual_px, covariance_px2, floor_px2))) - median
-
-    if excess(0.0) <= 0.0:
-        return 0.0
-    upper = float(np.median((residual_px**2).sum(axis=1))) + 1e-12
-    return float(brentq(excess, 0.0, 10.0 * upper, xtol=1e-12, rtol=1e-6))
+    own = 0.5 * (covariance_px2[kept, 0] + covariance_px2[kept, 2])
+    squared = (residual_px[kept] ** 2).sum(axis=1)
+    groups = int(np.clip(len(own) // _STARS_PER_GROUP, 1, 12))
+    parts = np.array_split(np.argsort(own, kind='stable'), groups)
+    mean_own = np.array([own[part].mean() for part in parts])
+    # The median of a squared Rayleigh deviate is 2 ln 2 variances per axis.
+    found = np.array([np.median(squared[part]) for part in parts]) / (2 * math.log(2.0) * freedom)
+    if groups < 3 or mean_own[-1] < 2.0 * mean_own[0]:
+        # Scale and floor cannot be told apart: a floor when there is an excess, else a scale.
+        excess = float((found - mean_own).mean())
+        if excess >= 0.0:
+            return CentroidVariance(1.0, excess)
+        return CentroidVariance(float(np.clip((found / mean_own).mean(), 0.1, 1.0)), 0.0)
+    scale, floor_px2 = 1.0, 0.0
+    for _ in range(5):
+        weight = 1.0 / np.maximum(scale * mean_own + floor_px2, 1e-12)
+        A = np.stack([mean_own, np.ones(groups)], axis=-1) * weight[:, None]
+        (scale, floor_px2), _ = nnls(A, found * weight)
+        scale = max(float(scale), 0.1)
+    return CentroidVariance(scale, float(floor_px2))
 
 
 def _minimise(
@@ -318,7 +355,9 @@ def _assemble(problem: Problem, state: State, cost: float, blocks: Floats) -> No
         total = blocks.sum(axis=0)
         shared = np.concatenate([free, np.arange(ROTATION.start, ROTATION.stop)])
         empty = np.empty((0, 3, f + 3)), np.empty((0, 3, 3)), np.empty((0, 3))
-        return NormalEquations(cost, total[np.ix_(shared, shared)], total[shared, RESIDUAL], *empty)
+        return NormalEquations(
+            cost, total[np.ix_(shared, shared)], total[shared, RESIDUAL], *empty
+        )
     A = blocks[:, CAMERA, CAMERA].sum(axis=0)[np.ix_(free, free)]
     a = blocks[:, CAMERA, RESIDUAL].sum(axis=0)[free]
     B = blocks[:, ROTATION, CAMERA][:, :, free]
@@ -352,7 +391,9 @@ def _attitude_errors(problem: Problem, state: State) -> tuple[Floats, Floats]:
     The derivative by the common alignment is the negative of it.
     """
     star_tracker_from_camera = state.camera_from_star_tracker.inv()
-    error = star_tracker_from_camera * state.camera_from_icrf * problem.star_tracker_from_icrf.inv()
+    error = (
+        star_tracker_from_camera * state.camera_from_icrf * problem.star_tracker_from_icrf.inv()
+    )
     eta = -error.as_rotvec()
     # d Log: the inverse Jacobian of SO(3) to first order, exact to eta^2 / 12 (1e-9 at 20 arcsec).
     half = 0.5 * _cross_matrix(eta)
@@ -385,9 +426,9 @@ def _move(problem: Problem, state: State, shared: Floats, blocks: Floats) -> Sta
 
 
 def _result(
-    problem: Problem, solution: Solution[State], prior: CameraGeometry, variance_factor: float
+    problem: Problem, solution: Solution[State], prior: CameraGeometry
 ) -> tuple[CameraGeometry, Floats, float]:
-    """Geometry, its (13, 13) covariance and the scatter of the alignments of the images, arcsec."""
+    """Geometry, its (13, 13) covariance and the scatter of the images' alignments, arcsec."""
     state = solution.state
     shared, cross, within = covariance(solution.normal)
     m, f = len(cross), len(problem.free)
@@ -410,12 +451,16 @@ def _result(
         mean_cross = np.einsum('m,mij->ij', weight, cross[used])
         own = np.linalg.inv(solution.normal.C[used])
         F = np.linalg.solve(shared, mean_cross.T).T
-        mean = np.einsum('m,mij->ij', weight**2, own * variance_factor + tracker)
-        mean += variance_factor * F @ shared @ F.T
-        block = np.block([[variance_factor * shared, variance_factor * mean_cross.T],
-                          [variance_factor * mean_cross, mean]])
+        mean = np.einsum('m,mij->ij', weight**2, own + tracker)
+        mean += F @ shared @ F.T
+        block = np.block(
+            [
+                [shared, mean_cross.T],
+                [mean_cross, mean],
+            ]
+        )
     else:
-        block = variance_factor * shared
+        block = shared
         if problem.method == 'hierarchical' and m:
             errors, _ = _attitude_errors(problem, state)
             eta = errors * problem.star_tracker_sigma_rad

@@ -27,7 +27,9 @@ INTRINSIC_NAMES = ('fx', 'skew', 'fy', 'cx', 'cy')
 DISTORTION_NAMES = ('k1', 'k2', 'k3', 'p1', 'p2')
 PARAMETER_NAMES = INTRINSIC_NAMES + DISTORTION_NAMES
 
-_INVERSE_STEPS = 50  # Newton squares the error at each step: 6 do in the field, the rest is for far corners
+_INVERSE_STEPS = (
+    50  # Newton squares the error at each step: 6 do in the field, the rest is for far corners
+)
 _INVERSE_TOLERANCE = 1e-14  # of the ideal image plane: 4e-11 px at a focal length of 4000 px
 
 
@@ -135,7 +137,9 @@ def project(camera: CameraModel, directions_camera: Floats) -> Floats:
     return project_parameters(camera.parameters, np.asarray(directions_camera, np.float64))
 
 
-def project_jacobians(camera: CameraModel, directions_camera: Floats) -> tuple[Floats, Floats, Floats]:
+def project_jacobians(
+    camera: CameraModel, directions_camera: Floats
+) -> tuple[Floats, Floats, Floats]:
     """
     Pixels and their derivatives by camera parameters and by a small rotation.
 
@@ -283,7 +287,7 @@ def zero_skew_fit(camera: CameraModel) -> tuple[CameraModel, float]:
     valid = np.isfinite(directions[:, 0])
     target, directions = target[valid], directions[valid]
     fitted = camera.replace(skew=0.0)
-    # The principal point enters linearly and the rest nearly so: Gauss-Newton settles in a few steps.
+    # The principal point enters linearly, the rest nearly so: Gauss-Newton settles in a few steps.
     for _ in range(10):
         pixels, J, _ = project_jacobians(fitted, directions)
         J = J[..., free].reshape(-1, len(free))

@@ -30,7 +30,9 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 _MESH_PX = 32  # stars cover few of its 1024 pixels, glare and vignetting vary slowly over it
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
-_DETECTION_SIGMA_PX = 1.0  # matched filter of detection; 0.7 to 1.5 px stars lose under 10 % of S/N
+_DETECTION_SIGMA_PX = (
+    1.0  # matched filter of detection; 0.7 to 1.5 px stars lose under 10 % of S/N
+)
 _HOT_PEAK_RATIO = 4.0  # peak over filtered peak: 6.3 for one lit pixel, 2.7 for a 0.7 px star
 _MIN_PSF_SIGMA_PX = 0.45
 _MAX_PSF_SIGMA_PX = 4.0
@@ -57,7 +59,15 @@ class CentroidOptions:
         4, 'least number of pixels above that threshold in the mask', low=1, high=100
     )
     saturation_dn: float = option(
-        0.0, 'pixel value from which a star counts as saturated, DN; 0: found from the image', low=0.0
+        0.0,
+        'pixel value from which a star counts as saturated, DN; 0: found from the image',
+        low=0.0,
+    )
+    max_saturated_pixels: int = option(
+        0,
+        'most saturated pixels of a star that is used; the PSF fit leaves them out',
+        low=0,
+        high=20,
     )
     gain_e_per_dn: float = option(
         0.0, 'detector gain, electrons per DN; 0: found from the image', low=0.0
@@ -131,8 +141,8 @@ def measure_background(pixels: Pixels) -> Background:
     rows, cols = max(1, height // _MESH_PX), max(1, width // _MESH_PX)
     cell_v, cell_u = height // rows, width // cols
     cells = pixels[: rows * cell_v, : cols * cell_u].reshape(rows, cell_v, cols, cell_u)
-    cells = np.ascontiguousarray(cells[:, ::2, :, ::2].transpose(0, 2, 1, 3))
-    samples = cells.reshape(rows * cols, -1).astype(np.float32)
+    every_other = np.ascontiguousarray(cells[:, ::2, :, ::2].transpose(0, 2, 1, 3))
+    samples = every_other.reshape(rows * cols, -1).astype(np.float32)
     samples.sort(axis=1)
     count = samples.shape[1]
     median = samples[:, count // 2]
@@ -143,7 +153,9 @@ def measure_background(pixels: Pixels) -> Background:
     kept = np.maximum(inside.sum(axis=1), 1)
     mean = (samples * inside).sum(axis=1) / kept
     variance = ((samples - mean[:, None]) ** 2 * inside).sum(axis=1) / kept
-    noise = np.sqrt(np.maximum(variance / 0.9733, 1.0 / 12.0))  # 0.9733: variance left within 3 sigma
+    noise = np.sqrt(
+        np.maximum(variance / 0.9733, 1.0 / 12.0)
+    )  # 0.9733: variance left within 3 sigma
     level_mesh = _smooth_mesh(mean.reshape(rows, cols))
     noise_mesh = _smooth_mesh(noise.reshape(rows, cols).astype(np.float32))
     return Background(
@@ -227,7 +239,8 @@ def _parabola_vertex(
 ) -> NDArray[np.float32]:
     """Place of the maximum of the parabola through three equidistant values, in their step."""
     curvature = 2 * centre - before - after
-    return np.clip(0.5 * (after - before) / np.maximum(curvature, 1e-12), -0.5, 0.5)
+    vertex = 0.5 * (after - before) / np.maximum(curvature, np.float32(1e-12))
+    return np.asarray(np.clip(vertex, -0.5, 0.5), np.float32)
 
 
 def _stamps(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Floats:
@@ -283,7 +296,11 @@ def _profile(centre: Floats, sigma: Floats, offsets: Floats) -> tuple[Floats, Fl
 
 
 def fit_psf(
-    stamps: Floats, sigma_px: float, noise_dn: Floats, pixel_noise: PixelNoise
+    stamps: Floats,
+    sigma_px: float,
+    noise_dn: Floats,
+    pixel_noise: PixelNoise,
+    saturation_dn: float = np.inf,
 ) -> PsfFit:
     """
     Weighted least-squares fit of the pixel-integrated Gaussian to every stamp at once.
@@ -298,6 +315,8 @@ def fit_psf(
         Background noise at each star.
     pixel_noise : PixelNoise
         How the noise grows with signal.
+    saturation_dn : float
+        Pixels at or above this say nothing of the star and take no part.
 
     Notes
     -----
@@ -305,7 +324,7 @@ def fit_psf(
     data does not bias them; a step in position is at most half a pixel.
     """
     n, w, _ = stamps.shape
-    offsets = np.arange(w) - (w - 1) / 2.0
+    offsets = np.arange(w, dtype=np.float64) - (w - 1) / 2.0
     sigma = np.full(n, sigma_px)
     border = np.concatenate(
         [stamps[:, 0], stamps[:, -1], stamps[:, 1:-1, 0], stamps[:, 1:-1, -1]], axis=1
@@ -315,6 +334,7 @@ def fit_psf(
     flux = (stamps[:, w // 2, w // 2] - background) / peak_fraction
     parameters = np.stack([np.zeros(n), np.zeros(n), flux, background], axis=-1)
     data = stamps.reshape(n, w * w)
+    valid = (data < saturation_dn).astype(np.float64)
     J = np.empty((n, w * w, 7))
     normal = np.empty((n, 4, 4))
     residual = np.empty_like(data)
@@ -331,7 +351,7 @@ def fit_psf(
         J[:, :, 3] = 1.0
         residual = data - background[:, None] - flux_column * shape
         variance = pixel_noise.variance(flux_column * shape, noise_dn[:, None])
-        weighted = J[:, :, :4] / variance[:, :, None]
+        weighted = J[:, :, :4] * (valid / variance)[:, :, None]
         normal = weighted.transpose(0, 2, 1) @ J[:, :, :4]
         scale = 1.0 / np.sqrt(np.maximum(np.einsum('nii->ni', normal), 1e-300))
         gradient = np.einsum('npi,np->ni', weighted, residual)
@@ -349,7 +369,7 @@ def fit_psf(
     J[:, :, 4] = half * (py[:, :, None] * px2[:, None, :]).reshape(n, -1)
     J[:, :, 5] = half * (py2[:, :, None] * px[:, None, :]).reshape(n, -1)
     J[:, :, 6] = flux_column * sigma_px**2 * (py1[:, :, None] * px1[:, None, :]).reshape(n, -1)
-    weighted = J / variance[:, :, None]
+    weighted = J * (valid / variance)[:, :, None]
     full = weighted.transpose(0, 2, 1) @ J
     full_scale = 1.0 / np.sqrt(np.maximum(np.einsum('nii->ni', full), 1e-300))
     full_inverse = np.linalg.inv(
@@ -358,11 +378,12 @@ def fit_psf(
     full_inverse = full_scale[:, :, None] * full_inverse * full_scale[:, None, :]
     shape_change = np.einsum('nij,npj,np->ni', full_inverse[:, 4:], weighted, residual)
     shape_sigma = np.sqrt(np.maximum(np.einsum('nii->ni', full_inverse)[:, 4:], 0.0))
-    normalised = residual / np.sqrt(variance)
+    normalised = valid * residual / np.sqrt(variance)
     return PsfFit(
         parameters=parameters,
         covariance=covariance,
-        reduced_chi2=np.einsum('np,np->n', normalised, normalised) / max(w * w - 4, 1),
+        reduced_chi2=np.einsum('np,np->n', normalised, normalised)
+        / np.maximum(valid.sum(axis=1) - 4, 1),
         worst_pixel_sigma=np.abs(normalised).max(axis=1, initial=0.0),
         shape_change=shape_change,
         shape_sigma=shape_sigma,
@@ -447,7 +468,7 @@ def _isolated(xy_px: Floats, distance_px: float) -> Floats:
         return xy_px
     separation = np.linalg.norm(xy_px[:, None] - xy_px[None], axis=-1)
     np.fill_diagonal(separation, np.inf)
-    return xy_px[separation.min(axis=1) > distance_px]
+    return np.asarray(xy_px[separation.min(axis=1) > distance_px])
 
 
 def _estimate_noise(stamps: Floats, sigma_px: float, noise_dn: Floats, gain: float) -> PixelNoise:
@@ -459,7 +480,7 @@ def _estimate_noise(stamps: Floats, sigma_px: float, noise_dn: Floats, gain: flo
     is given (not 0) is kept.
     """
     estimate = PixelNoise(gain or 1.0, 0.02)
-    offsets = np.arange(stamps.shape[1]) - (stamps.shape[1] - 1) / 2.0
+    offsets = np.arange(stamps.shape[1], dtype=np.float64) - (stamps.shape[1] - 1) / 2.0
     sigma = np.full(len(stamps), sigma_px)
     for _ in range(3):
         fit = fit_psf(stamps, sigma_px, noise_dn, estimate)
@@ -469,7 +490,7 @@ def _estimate_noise(stamps: Floats, sigma_px: float, noise_dn: Floats, gain: flo
         residual = stamps - level[:, None, None] - signal
         noise2 = np.broadcast_to(noise_dn[:, None, None] ** 2, signal.shape)
         lit = signal > noise_dn[:, None, None]
-        s, excess, noise2 = signal[lit], (residual**2 - noise2)[lit], noise2[lit]
+        s, noise2 = signal[lit], noise2[lit]
         variance = noise2 + s / estimate.gain_e_per_dn + (estimate.psf_error * s) ** 2
         keep = np.abs(residual[lit]) < 5.0 * np.sqrt(variance)
         # 4 parameters of each star are fitted: its lit residuals are smaller by that much.
@@ -481,7 +502,10 @@ def _estimate_noise(stamps: Floats, sigma_px: float, noise_dn: Floats, gain: flo
         b = target / variance
         if gain:
             b, A = b - A[:, 0] / gain, A[:, 1:]
-            per_signal, per_signal2 = 1.0 / gain, max(float(A[:, 0] @ b / (A[:, 0] @ A[:, 0])), 0.0)
+            per_signal, per_signal2 = (
+                1.0 / gain,
+                max(float(A[:, 0] @ b / (A[:, 0] @ A[:, 0])), 0.0),
+            )
         else:
             per_signal, per_signal2 = np.linalg.lstsq(A, b, rcond=None)[0]
             if per_signal2 < 0.0:
@@ -489,7 +513,8 @@ def _estimate_noise(stamps: Floats, sigma_px: float, noise_dn: Floats, gain: flo
             elif per_signal < 0.0:
                 per_signal, per_signal2 = 0.0, float(A[:, 1] @ b / (A[:, 1] @ A[:, 1]))
         estimate = PixelNoise(
-            1.0 / float(np.clip(per_signal, 1e-4, 1e4)), float(np.sqrt(np.clip(per_signal2, 0, 0.25)))
+            1.0 / float(np.clip(per_signal, 1e-4, 1e4)),
+            float(np.sqrt(np.clip(per_signal2, 0, 0.25))),
         )
     return estimate
 
@@ -525,7 +550,7 @@ def _measure_by_psf(
     centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
     stamps = _stamps(pixels, centre, radius)
     noise_dn = sample_mesh(model.background.noise_mesh, shape, centre.astype(np.float64))
-    fit = fit_psf(stamps, model.psf_sigma_px, noise_dn, model.pixel_noise)
+    fit = fit_psf(stamps, model.psf_sigma_px, noise_dn, model.pixel_noise, model.saturation_dn)
     x, y, flux, _ = fit.parameters.T
     covariance = fit.covariance
     snr = flux / np.sqrt(covariance[:, 2, 2])
@@ -535,9 +560,10 @@ def _measure_by_psf(
     misshapen = ((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1)
     # 81 pixels of normal noise pass 5 sigma once in 20,000 stars.
     misshapen |= fit.worst_pixel_sigma > 5.0
+    saturated = (stamps >= model.saturation_dn).sum(axis=(1, 2))
     wandered = np.maximum(np.abs(x), np.abs(y)) > 1.5
     for bad, reason in (
-        (stamps.max(axis=(1, 2)) >= model.saturation_dn, 'saturated'),
+        (saturated > options.max_saturated_pixels, 'saturated'),
         ((snr < options.min_snr) | ~np.isfinite(snr), 'faint'),
         (wandered, 'not_detected'),
         (misshapen, 'elongated'),
@@ -587,19 +613,20 @@ def _measure_by_moments(
     total = np.maximum(flux, 1e-12)
     x = (weight * offsets[None, None, :]).sum(axis=(1, 2)) / total
     y = (weight * offsets[None, :, None]).sum(axis=(1, 2)) / total
-    variance = np.where(
-        mask, model.pixel_noise.variance(signal, noise_dn[:, None, None]), 0.0
-    )
+    variance = np.where(mask, model.pixel_noise.variance(signal, noise_dn[:, None, None]), 0.0)
     dx = offsets[None, None, :] - x[:, None, None]
     dy = offsets[None, :, None] - y[:, None, None]
-    covariance = np.stack(
-        [
-            (variance * dx * dx).sum(axis=(1, 2)),
-            (variance * dx * dy).sum(axis=(1, 2)),
-            (variance * dy * dy).sum(axis=(1, 2)),
-        ],
-        axis=-1,
-    ) / (total**2)[:, None]
+    covariance = (
+        np.stack(
+            [
+                (variance * dx * dx).sum(axis=(1, 2)),
+                (variance * dx * dy).sum(axis=(1, 2)),
+                (variance * dy * dy).sum(axis=(1, 2)),
+            ],
+            axis=-1,
+        )
+        / (total**2)[:, None]
+    )
     # A mask of one pixel would claim no error at all: no centroid is known better than its pixel.
     count = mask.sum(axis=(1, 2))
     snr = flux / np.sqrt(np.maximum(variance.sum(axis=(1, 2)), 1e-12))

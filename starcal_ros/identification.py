@@ -20,17 +20,16 @@ from scipy.stats import poisson
 
 from starcal_ros.astrometry import apparent_directions
 from starcal_ros.camera import field_radius_rad, line_of_sight, project, project_jacobians
-from starcal_ros.catalog import StarCatalog, cone
+from starcal_ros.catalog import cone, StarCatalog
 from starcal_ros.centroiding import (
-    Centroids,
     CentroidOptions,
-    ImageModel,
-    Pixels,
-    Sources,
+    Centroids,
     detect,
+    ImageModel,
     measure_background,
     measure_stars,
     model_image,
+    Sources,
 )
 from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
@@ -38,7 +37,9 @@ from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 Floats = NDArray[np.float64]
 
-_VOTERS = 100  # brightest predictions and sources that vote: their pairs fill one histogram at once
+_VOTERS = (
+    100  # brightest predictions and sources that vote: their pairs fill one histogram at once
+)
 _CHANCE = 1e-9  # greatest probability that a match is accepted by chance
 
 
@@ -68,8 +69,8 @@ class Prediction:
     """
     Catalog stars in and about the image.
 
-    ``catalog_index`` (n,) rows of the catalog, brightest first; ``direction_icrf`` (n, 3) apparent;
-    ``direction_camera`` (n, 3); ``xy_px`` (n, 2).
+    ``catalog_index`` (n,) rows of the catalog, brightest first; ``direction_icrf`` (n, 3),
+    apparent;    ``direction_camera`` (n, 3); ``xy_px`` (n, 2).
     """
 
     catalog_index: NDArray[np.int64]
@@ -167,12 +168,16 @@ def acquire(
     offset = seen[:, None] - _turn(stars, best_roll)[None]
     in_block = ((offset >= low) & (offset < low + 2 * cell_px)).all(axis=2)
     expected = (
-        len(stars) * len(seen) * (2 * cell_px) ** 2 / ((width + 2 * reach_px) * (height + 2 * reach_px))
+        len(stars)
+        * len(seen)
+        * (2 * cell_px) ** 2
+        / ((width + 2 * reach_px) * (height + 2 * reach_px))
     )
     trials = (2 * roll_steps + 1) * cells * cells
     if best_count < 4 or poisson.sf(best_count - 1, expected) * trials > 1e-2:
         raise ImageRefused(
-            'no_match', f'{best_count} of {min(len(stars), len(seen))} bright stars agree, as by chance'
+            'no_match',
+            f'{best_count} of {min(len(stars), len(seen))} bright stars agree, as by chance',
         )
     shift_px = np.median(offset[in_block], axis=0)
     roll_turn = Rotation.from_rotvec([0.0, 0.0, best_roll])
@@ -184,7 +189,7 @@ def acquire(
 def _turn(xy_px: Floats, angle_rad: float) -> Floats:
     """Points (n, 2) turned about the origin from +u towards +v."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return xy_px @ np.array([[c, s], [-s, c]])
+    return np.asarray(xy_px @ np.array([[c, s], [-s, c]]))
 
 
 def _pairs(predicted_px: Floats, sources_px: Floats, radius_px: float) -> NDArray[np.int64]:
@@ -217,7 +222,7 @@ def _refine_rotation(
     """
     camera = geometry.camera
     rotation, scale = start, 1.0
-    pairs = np.empty((0, 2), np.int64)
+    pairs: NDArray[np.int64] = np.empty((0, 2), np.int64)
     centre = camera.parameters[3:5]
     widest = max(8.0, 0.012 * np.hypot(camera.width, camera.height))
     for radius_px in (widest, widest, widest, widest / 2, widest / 2, widest / 3, widest / 3):
@@ -253,7 +258,7 @@ def _fit_warp(
     predicted_px: Floats, measured_px: Floats, sigma_px: Floats, at_px: Floats, half_px: float
 ) -> tuple[Floats, float]:
     """
-    Smooth correction (k, 2) at pixels ``at_px`` from predicted to measured, and its robust scatter.
+    Smooth correction (k, 2) at ``at_px`` from predicted to measured, and its robust scatter.
 
     A polynomial in u and v, of a degree that the number of stars carries (at most 5: the prior
     distortion may be quite unknown), fitted robustly.  Only predictions are corrected by it.
@@ -272,15 +277,19 @@ def _fit_warp(
     for _ in range(8):
         left = residual - A @ coefficients
         size = np.linalg.norm(left, axis=1)
-        scatter = max(1.4826 * float(np.median(size)) / 1.1774, 0.01)  # Rayleigh median: 1.1774 sigma
+        scatter = max(
+            1.4826 * float(np.median(size)) / 1.1774, 0.01
+        )  # Rayleigh median: 1.1774 sigma
         spread = np.hypot(sigma_px, scatter)
         weight = 1.0 / spread / (1.0 + (size / (2.0 * spread)) ** 2)
-        coefficients = np.linalg.lstsq(A * weight[:, None], residual * weight[:, None], rcond=1e-10)[0]
+        coefficients = np.linalg.lstsq(
+            A * weight[:, None], residual * weight[:, None], rcond=1e-10
+        )[0]
     return basis(at_px) @ coefficients, scatter
 
 
 def blended(
-    xy_px: Floats, magnitude: NDArray[np.float32], psf_sigma_px: float, max_pull_px: float
+    xy_px: Floats, magnitude: Floats, psf_sigma_px: float, max_pull_px: float
 ) -> NDArray[np.bool_]:
     """
     Return (n,) whether a neighbour among the stars pulls a centroid by more than a limit.
@@ -292,7 +301,7 @@ def blended(
     pairs = tree.query_pairs(8.0 * psf_sigma_px, output_type='ndarray')
     both = np.concatenate([pairs, pairs[:, ::-1]])
     distance = np.linalg.norm(xy_px[both[:, 0]] - xy_px[both[:, 1]], axis=1)
-    ratio = 10.0 ** (0.4 * (magnitude[both[:, 0]].astype(np.float64) - magnitude[both[:, 1]]))
+    ratio = 10.0 ** (0.4 * (magnitude[both[:, 0]] - magnitude[both[:, 1]]))
     pull = np.minimum(ratio, 1.0) * distance * np.exp(-((distance / psf_sigma_px) ** 2) / 4.0)
     # A brighter neighbour takes the window for itself wherever it reaches into it.
     pull = np.where((ratio > 0.5) & (distance < 5.0 * psf_sigma_px), np.inf, pull)
@@ -328,7 +337,9 @@ def observe_stars(
         geometry, icrf_from_star_tracker_xyzw, image.time_ns, catalog, options, velocity_m_s
     )
     if len(prediction.catalog_index) < 4:
-        raise ImageRefused('no_match', f'{len(prediction.catalog_index)} catalog stars in the field')
+        raise ImageRefused(
+            'no_match', f'{len(prediction.catalog_index)} catalog stars in the field'
+        )
     turn = acquire(prediction, sources, geometry, options)
     predicted_px = _match(prediction, sources, geometry, turn)
 
@@ -416,7 +427,7 @@ def _match(
 
 def _refuse(
     predicted_px: Floats,
-    magnitude: NDArray[np.float32],
+    magnitude: Floats,
     centroids: Centroids,
     model: ImageModel,
     width: int,

@@ -91,17 +91,16 @@ def whitening(covariance_px2: Floats) -> Floats:
     return np.stack([1.0 / root_uu, -slope / root_vv, 1.0 / root_vv])
 
 
-def arrange(table: StarTable, keep: NDArray[np.bool_], floor_px2: float) -> Measurements:
+def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -> Measurements:
     """
-    Lay out the kept stars, (n,) mask, with a variance added to each axis of each centroid.
+    Lay out the kept stars, (n,) mask, whitened by covariances (n, 3).
 
     Images of like size share a chunk, so that little is padded.
     """
     order = np.nonzero(keep)[0]
     counts = np.bincount(table.image[order], minlength=table.image_count)
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    covariance = table.covariance_px2 + floor_px2 * np.array([1.0, 0.0, 1.0])
-    whitener = whitening(covariance)
+    whitener = whitening(covariance_px2)
     images = np.argsort(counts, kind='stable')
     images = images[counts[images] > 0]
     chunks = []
@@ -118,9 +117,7 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], floor_px2: float) -> Meas
         chunks.append(
             _Chunk(
                 image=chosen,
-                direction_icrf=np.ascontiguousarray(
-                    table.direction_icrf[row].transpose(0, 2, 1)
-                ),
+                direction_icrf=np.ascontiguousarray(table.direction_icrf[row].transpose(0, 2, 1)),
                 measured_px=np.ascontiguousarray(table.measured_px[row].transpose(2, 0, 1)),
                 whitener=np.where(real, whitener[:, row], 0.0),
             )
@@ -239,14 +236,12 @@ def _whitened_columns(
 
 def residuals_px(table: StarTable, parameters: Floats, camera_from_icrf: Floats) -> Floats:
     """Measured minus predicted pixels (n, 2) of every star of the table."""
-    direction_camera = np.einsum(
-        'nij,nj->ni', camera_from_icrf[table.image], table.direction_icrf
-    )
+    direction_camera = np.einsum('nij,nj->ni', camera_from_icrf[table.image], table.direction_icrf)
     return np.asarray(table.measured_px - project_parameters(parameters, direction_camera))
 
 
-def squared_sigmas(residual_px: Floats, covariance_px2: Floats, floor_px2: float) -> Floats:
-    """Squared Mahalanobis length (n,) of residuals (n, 2) with a variance added to each axis."""
-    wuu, wvu, wvv = whitening(covariance_px2 + floor_px2 * np.array([1.0, 0.0, 1.0]))
+def squared_sigmas(residual_px: Floats, covariance_px2: Floats) -> Floats:
+    """Squared Mahalanobis length (n,) of residuals (n, 2) under covariances (n, 3)."""
+    wuu, wvu, wvv = whitening(covariance_px2)
     u, v = residual_px.T
     return np.asarray((wuu * u) ** 2 + (wvu * u + wvv * v) ** 2)

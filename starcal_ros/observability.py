@@ -1,4 +1,4 @@
-"""What an ensemble can tell: information, predicted sigmas, focal-plane coverage, line-of-sight map."""
+"""What an ensemble can tell: information, predicted sigmas, coverage, line-of-sight map."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.calibration import CalibrationOptions
 from starcal_ros.camera import (
-    PARAMETER_NAMES,
     CameraModel,
     line_of_sight,
+    PARAMETER_NAMES,
     pixel_grid,
     project_jacobians,
 )
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.measurement import CAMERA, ROTATION, arrange, normal_blocks, star_table
+from starcal_ros.measurement import arrange, CAMERA, normal_blocks, ROTATION, star_table
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     CameraGeometry,
@@ -59,7 +59,7 @@ def image_information(
         * Rotation.from_quat(np.array([i.icrf_from_star_tracker_xyzw for i in images])).inv()
     )
     _, blocks = normal_blocks(
-        arrange(table, np.ones(len(table), bool), 0.0),
+        arrange(table, np.ones(len(table), bool), table.covariance_px2),
         prior.camera.parameters,
         rotations.as_matrix(),
     )
@@ -69,7 +69,9 @@ def image_information(
     seen = np.array([len(image) >= 2 for image in images])
     information = np.zeros_like(A)
     if seen.any():
-        information[seen] = A[seen] - B[seen].transpose(0, 2, 1) @ np.linalg.solve(C[seen], B[seen])
+        information[seen] = A[seen] - B[seen].transpose(0, 2, 1) @ np.linalg.solve(
+            C[seen], B[seen]
+        )
     return information
 
 
@@ -103,8 +105,8 @@ def ensemble_status(
     alignment = np.full(3, np.inf)
     if ensemble.images:
         # The attitude noise of the images, averaged: the star field within an image adds little.
-        alignment = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
-        alignment = np.full(3, np.sqrt(np.mean(alignment**2) / len(ensemble.images)))
+        tracker = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
+        alignment = np.full(3, np.sqrt(np.mean(tracker**2) / len(ensemble.images)))
     return EnsembleStatus(
         time_ns=ensemble.images[-1].time_ns if ensemble.images else 0,
         images=len(ensemble.images),
@@ -148,12 +150,38 @@ def line_of_sight_sigma_arcsec(
     Root of the summed variance of the two angles, from the (13, 13) covariance of camera and
     alignment.
     """
-    directions = line_of_sight(camera, pixel_grid(camera, columns, rows))
-    _, J_parameters, J_rotation = project_jacobians(camera, directions)
-    # A fixed pixel: what moves its direction is minus what would move its image.
-    across, along = np.linalg.inv(J_rotation[:, :, :2]), np.concatenate(
-        [J_parameters, J_rotation], axis=-1
-    )
-    J = across @ along
+    _, J = _line_of_sight_jacobian(camera, columns, rows)
     variance = np.einsum('nij,jk,nik->n', J, covariance, J)
     return np.asarray(np.sqrt(variance).reshape(rows, columns) / ARCSECOND_RAD)
+
+
+def map_sigma_px(camera: CameraModel, covariance: Floats, columns: int = 25) -> Floats:
+    """
+    1-sigma (columns * columns,) of the shape of the distortion map at a grid of pixels, px.
+
+    What a turn common to all pixels can take up (pointing, and most of a moved principal point) is
+    removed: it belongs to the alignment.
+    """
+    directions, J = _line_of_sight_jacobian(camera, columns, columns)
+    J = J[:, :, :10].reshape(-1, 10)
+    turns = np.stack([np.cross(axis, directions) for axis in np.eye(3)], axis=-1)
+    Q, _ = np.linalg.qr(turns.reshape(-1, 3))
+    J = (J - Q @ (Q.T @ J)).reshape(-1, 3, 10)
+    variance = np.einsum('nij,jk,nik->n', J, covariance[:10, :10], J)
+    return np.asarray(np.sqrt(variance) * camera.parameters[0])
+
+
+def _line_of_sight_jacobian(camera: CameraModel, columns: int, rows: int) -> tuple[Floats, Floats]:
+    """
+    Lines of sight (n, 3) of a grid of pixels, and their derivatives (n, 3, 13).
+
+    By the camera parameters and the alignment angles, in the camera frame.  For a fixed pixel:
+    a direction moves so as to undo what the parameter does to its image.
+    """
+    directions = line_of_sight(camera, pixel_grid(camera, columns, rows))
+    _, J_parameters, J_rotation = project_jacobians(camera, directions)
+    # A turn about the line of sight itself moves nothing: the pseudo-inverse leaves it out.
+    angles = np.linalg.pinv(J_rotation) @ J_parameters
+    angles = np.concatenate([angles, np.broadcast_to(np.eye(3), (len(angles), 3, 3))], axis=-1)
+    moved = np.cross(directions[:, None, :], np.swapaxes(angles, 1, 2))
+    return directions, -np.swapaxes(moved, 1, 2)

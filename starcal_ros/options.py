@@ -8,9 +8,9 @@ documentation all come from those fields.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import dataclasses
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -97,7 +97,7 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
     items = list(value)
     if meta['length'] is not None and len(items) != meta['length']:
         raise refuse(f'a list of {meta["length"]}')
-    of_text = meta['choices'] or (default and isinstance(default[0], str))
+    of_text = meta['choices'] or (isinstance(default, tuple) and isinstance(default[0], str))
     if of_text:
         return tuple(text(item) for item in items)
     return tuple(float(number(item)) for item in items)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 import dataclasses
+from dataclasses import dataclass
 import hashlib
 import importlib.metadata
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -19,12 +19,11 @@ from starcal_ros.acceptance import Candidate, GateOptions, judge
 from starcal_ros.attitude import AttitudeHistory, AttitudeOptions
 from starcal_ros.calibration import CalibrationOptions, Estimate, estimate_calibration
 from starcal_ros.camera import zero_skew_fit
-from starcal_ros.catalog import StarCatalog, load_catalog
+from starcal_ros.catalog import load_catalog, StarCatalog
 from starcal_ros.centroiding import CentroidOptions
-from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused, OptionError
 from starcal_ros.identification import IdentificationOptions, observe_stars
-from starcal_ros.observability import coverage, keep_most_informative, line_of_sight_sigma_arcsec
+from starcal_ros.observability import coverage, keep_most_informative, map_sigma_px
 from starcal_ros.observability import ensemble_status as _ensemble_status
 from starcal_ros.options import check_value, from_mapping, names_of, option
 from starcal_ros.records import (
@@ -33,8 +32,8 @@ from starcal_ros.records import (
     Ensemble,
     EnsembleStatus,
     Image,
-    StarObservations,
     refused_image,
+    StarObservations,
 )
 
 Floats = NDArray[np.float64]
@@ -58,7 +57,7 @@ class SetupOptions:
     camera_frame: str = option('camera', 'name of the camera optical frame')
     catalog: str = option('', 'star catalog file; empty: the bundled one')
     dark_frame: str = option(
-        '', 'dark frame, a PNG or TIFF of the camera\'s size and depth, subtracted; empty: none'
+        '', "dark frame, a PNG or TIFF of the camera's size and depth, subtracted; empty: none"
     )
 
 
@@ -111,7 +110,9 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
     quaternion = np.array(frames.prior_alignment)
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1.0) > 1e-3:
-        raise OptionError(f'prior_alignment: {list(frames.prior_alignment)} is not a unit quaternion')
+        raise OptionError(
+            f'prior_alignment: {list(frames.prior_alignment)} is not a unit quaternion'
+        )
     identification = from_mapping(IdentificationOptions, values)
     path = Path(frames.catalog) if frames.catalog else None
     return Setup(
@@ -127,7 +128,9 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
     )
 
 
-def _read_dark(path: str, width: int, height: int) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
+def _read_dark(
+    path: str, width: int, height: int
+) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
     if not path:
         return None
     dark = cv2.imread(path.removeprefix('file://'), cv2.IMREAD_UNCHANGED)
@@ -159,7 +162,8 @@ def observe(
     try:
         if (width, height) != (camera.width, camera.height):
             raise ImageRefused(
-                'wrong_size', f'{width} x {height}, the camera has {camera.width} x {camera.height}'
+                'wrong_size',
+                f'{width} x {height}, the camera has {camera.width} x {camera.height}',
             )
         quaternion, gap_s = attitudes.at(image.time_ns, setup.attitude.max_attitude_gap_s)
     except ImageRefused as refused:
@@ -188,9 +192,7 @@ def observe(
         )
 
 
-def _without_dark(
-    image: Image, dark: NDArray[np.uint8] | NDArray[np.uint16] | None
-) -> Image:
+def _without_dark(image: Image, dark: NDArray[np.uint8] | NDArray[np.uint16] | None) -> Image:
     """The image less the dark frame, kept positive by the dark frame's own median."""
     if dark is None:
         return image
@@ -201,8 +203,9 @@ def _without_dark(
     # Noise below the dark level must not be cut off at zero: it would bias the background.
     pedestal = int(np.median(dark))
     level = image.pixels.astype(np.int32) - dark + pedestal
-    limit = np.iinfo(image.pixels.dtype).max
-    return Image(image.time_ns, np.clip(level, 0, limit).astype(image.pixels.dtype))
+    if image.pixels.dtype == np.uint8:
+        return Image(image.time_ns, np.clip(level, 0, 255).astype(np.uint8))
+    return Image(image.time_ns, np.clip(level, 0, 65535).astype(np.uint16))
 
 
 def observe_bag(
@@ -278,7 +281,11 @@ def solve(
             check_value(field, override[field.name])
     options = dataclasses.replace(options, **override)  # type: ignore[arg-type]
     return _calibration(
-        estimate_calibration(ensemble, setup.prior, options), ensemble, setup, options, inputs or {}
+        estimate_calibration(ensemble, setup.prior, options),
+        ensemble,
+        setup,
+        options,
+        inputs or {},
     )
 
 
@@ -292,11 +299,7 @@ def _calibration(
     """Statistics, verdict and provenance of an estimate."""
     kept = result.kept
     rms_px = float(np.sqrt(np.mean(result.residual_px[kept] ** 2)))
-    only_camera = result.covariance.copy()
-    # Pointing is common to all pixels: the gate looks at the shape of the map.
-    only_camera[10:] = only_camera[:, 10:] = 0.0
     camera = result.geometry.camera
-    map_arcsec = line_of_sight_sigma_arcsec(camera, only_camera)
     reasons = judge(
         Candidate(
             geometry=result.geometry,
@@ -306,7 +309,7 @@ def _calibration(
             stars_used=int(kept.sum()),
             stars_rejected=int((~kept).sum()),
             coverage=coverage(ensemble, camera),
-            map_sigma_px=float(map_arcsec.max()) * ARCSECOND_RAD * float(camera.parameters[0]),
+            map_sigma_px=float(map_sigma_px(camera, result.covariance).max()),
             termination=result.termination,
         ),
         setup.gate,

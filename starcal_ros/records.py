@@ -6,14 +6,14 @@ Arrays in records are never changed after construction.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.camera import PARAMETER_NAMES, CameraModel
+from starcal_ros.camera import CameraModel, PARAMETER_NAMES
 
 Floats = NDArray[np.float64]
 
@@ -143,7 +143,9 @@ class StarObservations:
 
     def select(self, keep: NDArray[np.bool_]) -> StarObservations:
         """Return the same image with only the stars of an (n,) mask."""
-        return dataclasses.replace(self, **{name: getattr(self, name)[keep] for name in STAR_COLUMNS})
+        return dataclasses.replace(
+            self, **{name: getattr(self, name)[keep] for name in STAR_COLUMNS}
+        )
 
 
 STAR_COLUMNS = (
