@@ -109,6 +109,14 @@ def is_stamped(venv: Path, stamp: str, expected: str) -> bool:
         return False
 
 
+def stamped_folder(venv: Path, stamp: str) -> str:
+    """Return the folder for which a step was completed, empty if it was not."""
+    try:
+        return (venv / stamp).read_text().partition(' ')[2].rstrip('\n')
+    except OSError:
+        return ''
+
+
 def write_stamp(venv: Path, stamp: str, value: str) -> None:
     """Record that a step is complete; the stamp appears whole or not at all."""
     unfinished = venv / f'{stamp}.new'
@@ -124,11 +132,12 @@ def leave_environment() -> None:
 
 
 def install_wheels(venv: Path, requirements: list[Path]) -> None:
-    """Install the pinned wheels, into the environment there is if it is complete and fits."""
-    complete = (venv / WHEELS_STAMP).exists()
+    """Install the pinned wheels, into the environment there is if it was complete and fits."""
+    same_python = (venv / 'bin/python').resolve() == Path(sys.executable).resolve()
+    usable = same_python and stamped_folder(venv, WHEELS_STAMP) == str(venv)
     for stamp in (WHEELS_STAMP, PACKAGE_STAMP):
         (venv / stamp).unlink(missing_ok=True)
-    if not (complete and packages_of(venv).is_dir()):
+    if not usable:
         if venv.exists() and not (venv / 'pyvenv.cfg').exists():
             sys.exit(f'{shown(venv)} is there and is no virtual environment: not touched')
         say(f'making {shown(venv)} with {sys.executable}')
