@@ -1,0 +1,166 @@
+"""Shared by the tests on the real graph: a ROS domain of their own, node processes, a client."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import os
+from pathlib import Path
+import signal
+import socket
+import subprocess
+import sys
+import time
+from typing import Any
+
+import pytest
+
+START_S = 30.0  # a node imports and starts in 2 s; two busy cores make that much of it
+NODES = 'starcal_ros.nodes.'
+
+
+def free_domain() -> int:
+    """A ROS domain in which nobody on this machine takes part."""
+    for k in range(100):
+        domain = 1 + (os.getpid() + k) % 100
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                # The first participant of a domain holds this port (RTPS 9.6.1.1).
+                probe.bind(('', 7410 + 250 * domain))
+            except OSError:
+                continue
+            return domain
+    raise RuntimeError('no free ROS domain on this machine')
+
+
+os.environ['ROS_DOMAIN_ID'] = str(free_domain())
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+
+class NodeProcess:
+    """A node as a process of its own; what it says is kept in a file."""
+
+    def __init__(self, name: str, log: Path, arguments: list[str]) -> None:
+        self.name = name
+        self._log = log
+        with log.open('wb') as output:
+            self.process = subprocess.Popen(
+                [sys.executable, '-m', NODES + name, *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+            )
+
+    def said(self) -> str:
+        """All that it has written so far."""
+        return self._log.read_text(errors='replace')
+
+    def wait(self, timeout_s: float = START_S) -> int:
+        """Exit status, when it ends by itself."""
+        return self.process.wait(timeout_s)
+
+    def stop(self, number: int = signal.SIGINT) -> int:
+        """Exit status after a signal; kills it when it does not listen."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        try:
+            return self.process.wait(START_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            raise
+
+
+StartNode = Callable[..., NodeProcess]
+
+
+@pytest.fixture
+def start_node(tmp_path: Path) -> Iterator[StartNode]:
+    """Start node processes by module name; they are stopped when the test ends."""
+    started: list[NodeProcess] = []
+
+    def start(name: str, *arguments: str, ros: tuple[str, ...] = ()) -> NodeProcess:
+        ros_arguments = ['--ros-args', *ros] if ros else []
+        log = tmp_path / f'{name}{len(started)}.log'
+        started.append(NodeProcess(name, log, [*arguments, *ros_arguments]))
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.stop()
+
+
+@pytest.fixture(scope='session')
+def tiny_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small simulated bag: a folder with camera.yaml, params.yaml and truth.json in it."""
+    simulation = pytest.importorskip('starcal_ros.simulation')
+    synthetic = pytest.importorskip('starcal_ros.synthetic')
+    folder = tmp_path_factory.mktemp('bags') / 'tiny'
+    simulation.write_bag(synthetic.scenario('tiny'), folder)
+    return folder
+
+
+class Client:
+    """A bare rclpy node that waits on conditions, never for a time."""
+
+    def __init__(self) -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self.node = rclpy.create_node('client', context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def until(self, condition: Callable[[], object], timeout_s: float = START_S) -> None:
+        """Spin until a condition holds; fail where it does not within the time."""
+        deadline_s = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline_s, 'the condition did not come to hold'
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def call(self, kind: Any, name: str, timeout_s: float = 60.0, **fields: Any) -> Any:
+        """Answer of a service."""
+        client = self.node.create_client(kind, name)
+        try:
+            self.until(client.service_is_ready, timeout_s)
+            future = client.call_async(kind.Request(**fields))
+            self.until(future.done, timeout_s)
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def collect(self, kind: Any, topic: str, qos: Any = 1000) -> list[Any]:
+        """A list that grows with the messages of a topic."""
+        found: list[Any] = []
+        self.node.create_subscription(kind, topic, found.append, qos)
+        return found
+
+    def latched(self, kind: Any, topic: str) -> list[Any]:
+        """A list of what a latched topic holds, read by a subscriber that comes late."""
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        return self.collect(kind, topic, qos)
+
+    def publisher(self, kind: Any, topic: str, depth: int = 1000) -> Any:
+        """A publisher that somebody listens to already."""
+        publisher = self.node.create_publisher(kind, topic, depth)
+        self.until(publisher.get_subscription_count)
+        return publisher
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+
+@pytest.fixture
+def client() -> Iterator[Client]:
+    """A client on the graph for one test."""
+    pytest.importorskip('rclpy')
+    pytest.importorskip('starcal.msg')
+    one = Client()
+    yield one
+    one.close()
