@@ -1,0 +1,239 @@
+"""The whole flow, bag to products, from outside the process and against the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+import yaml
+
+from starcal_ros import demo, simulation, synthetic
+from starcal_ros.bag import read_attitudes, read_images
+from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.products import read_calibration, read_camera_info
+from starcal_ros.records import Calibration, CameraGeometry, Image
+
+ROOT = Path(__file__).parents[1]
+TINY = ROOT / 'bags' / 'tiny'
+INDEPENDENT = ROOT.parent / 'shared' / 'independent'
+
+
+def starcal(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the tool as a user does."""
+    return subprocess.run(
+        [sys.executable, '-m', 'starcal_ros.cli', *map(str, arguments)],
+        capture_output=True, text=True, cwd=ROOT, check=False,
+    )  # fmt: skip
+
+
+def read_truth(path: Path) -> CameraGeometry:
+    return simulation.true_geometry(json.loads(path.read_text()))
+
+
+def normalised_error(calibration: Calibration, truth: CameraGeometry) -> tuple[float, int]:
+    """Squared error of all that was estimated in the metric of its covariance, and how many."""
+    free = [k for k, name in enumerate(PARAMETER_NAMES) if name in calibration.estimated]
+    error = np.r_[
+        (calibration.geometry.camera.parameters - truth.camera.parameters)[free],
+        demo.alignment_difference_rad(calibration.geometry, truth),
+    ]
+    rows = [*free, 10, 11, 12]
+    covariance = calibration.covariance[np.ix_(rows, rows)]
+    sigma = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(sigma, sigma)
+    whitened = np.linalg.solve(np.linalg.cholesky(correlation), error / sigma)
+    return float(whitened @ whitened), len(rows)
+
+
+def assert_close_to_truth(calibration: Calibration, truth: CameraGeometry) -> None:
+    """Each parameter within 5 of its own sigmas, all of them together within 5 of theirs."""
+    prior_is_not_asked = calibration.geometry  # the comparison table wants one
+    comparison = demo.compare(calibration, truth, prior_is_not_asked)
+    assert comparison.worst_sigmas < 5, '\n'.join(comparison.lines)
+    chi2, count = normalised_error(calibration, truth)
+    assert chi2 < count + 5 * np.sqrt(2 * count)  # five standard deviations of chi^2
+
+
+def map_error_arcsec(calibration: Calibration, truth: CameraGeometry) -> float:
+    """RMS over the detector of the line-of-sight error after the best common rotation."""
+    grid = pixel_grid(truth.camera, 25, 25)
+    estimate = line_of_sight(calibration.geometry.camera, grid)
+    true = line_of_sight(truth.camera, grid)
+    rotation, _ = Rotation.align_vectors(true, estimate)
+    error = np.linalg.norm(rotation.apply(estimate) - true, axis=1)
+    return float(np.sqrt(np.mean(error**2)) / ARCSECOND_RAD)
+
+
+@pytest.fixture(scope='module')
+def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The products of the tiny bag."""
+    folder = tmp_path_factory.mktemp('tiny')
+    done = starcal('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ''
+    assert 'accepted' in done.stdout
+    return folder
+
+
+def test_the_tiny_bag_gives_the_truth(tiny_run: Path) -> None:
+    calibration = read_calibration(tiny_run / 'calibration.json')
+    truth = read_truth(TINY / 'truth.json')
+    assert calibration.accepted and calibration.reasons == ()
+    assert calibration.images_used == 10 and calibration.images_refused == {}
+    assert_close_to_truth(calibration, truth)
+    # The prior is 1 px of distortion and 150" of alignment off; a tenth of that must not stay.
+    prior = CameraGeometry(
+        read_camera_info(TINY / 'camera.yaml'), calibration.geometry.star_tracker_from_camera_xyzw
+    )
+    before = dataclasses.replace(calibration, geometry=prior)
+    assert map_error_arcsec(calibration, truth) < 0.2 * map_error_arcsec(before, truth)
+
+
+def test_camera_info_is_the_calibration_without_skew(tiny_run: Path) -> None:
+    calibration = read_calibration(tiny_run / 'calibration.json')
+    camera = read_camera_info(tiny_run / 'camera_info.yaml')
+    assert camera.parameters[1] == 0.0
+    grid = pixel_grid(camera, 25, 25)
+    error_px = project(camera, line_of_sight(calibration.geometry.camera, grid)) - grid
+    worst_px = np.linalg.norm(error_px, axis=-1).max()
+    assert worst_px == pytest.approx(calibration.zero_skew_cost_px, rel=1e-6)
+
+
+def test_recorded_observations_give_the_same_calibration(tiny_run: Path, tmp_path: Path) -> None:
+    bag = tiny_run / 'observations.mcap'
+    done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
+    assert done.returncode == 0, done.stderr
+    first, second = (
+        read_calibration(folder / 'calibration.json') for folder in (tiny_run, tmp_path)
+    )
+    assert np.array_equal(first.covariance, second.covariance)
+    for name in ('geometry', 'covariance', 'provenance'):  # compared above and below, or differs
+        second = dataclasses.replace(second, **{name: getattr(first, name)})
+    assert first == second
+    content = [json.loads((f / 'calibration.json').read_text()) for f in (tiny_run, tmp_path)]
+    for key in ('intrinsics', 'distortion', 'alignment'):
+        assert content[0][key] == content[1][key]
+
+
+def test_observations_can_be_calibrated_in_place(tiny_run: Path, tmp_path: Path) -> None:
+    bag = tmp_path / 'observations.mcap'
+    bag.write_bytes((tiny_run / 'observations.mcap').read_bytes())
+    for _ in range(2):
+        done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
+        assert done.returncode == 0, done.stderr
+
+
+def test_the_gate_refuses_with_status_3_and_writes_the_products(tmp_path: Path) -> None:
+    content = yaml.safe_load((TINY / 'params.yaml').read_text())
+    values = content['/**']['ros__parameters']
+    values |= {'camera_info_url': str(TINY / 'camera.yaml'), 'max_residual_rms_px': 1e-3}
+    params = tmp_path / 'params.yaml'
+    params.write_text(yaml.safe_dump(content))
+    done = starcal('calibrate', TINY, '--params', params, '-o', tmp_path / 'out')
+    assert done.returncode == 3
+    assert done.stderr == ''
+    assert 'max_residual_rms_px' in done.stdout
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert not calibration.accepted
+    assert 'max_residual_rms_px' in calibration.reasons[0]
+    assert (tmp_path / 'out' / 'camera_info.yaml').is_file()
+
+
+def test_the_tiny_bag_is_small_and_says_what_it_is() -> None:
+    assert sum(file.stat().st_size for file in TINY.iterdir()) < 2_000_000
+    truth = json.loads((TINY / 'truth.json').read_text())
+    made = synthetic.scenario('tiny', truth['seed'])
+    assert truth['k_true'] == made.truth.camera.intrinsics.tolist()
+    assert truth['d_true'] == made.truth.camera.distortion.tolist()
+    geometry = simulation.true_geometry(truth)
+    angles_rad = demo.alignment_difference_rad(geometry, made.truth)
+    assert np.abs(angles_rad).max() < 1e-14  # there and back through a matrix
+    assert read_camera_info(TINY / 'camera.yaml').parameters.tolist() == [
+        *truth['k_prior'],
+        *truth['d_prior'],
+    ]
+
+
+def test_bright_stars_of_the_bag_stand_where_truth_and_attitude_say() -> None:
+    """Conventions of bag and truth file by a formula of this test's own, matrix by matrix."""
+    truth = json.loads((TINY / 'truth.json').read_text())
+    fx, skew, fy, cx, cy = truth['k_true']
+    k1, k2, k3, p1, p2 = truth['d_true']
+    made = synthetic.scenario('tiny', truth['seed'])
+    attitudes = read_attitudes([TINY], simulation.ATTITUDE_TOPIC)
+    for index, image in enumerate(read_images([TINY], simulation.IMAGE_TOPIC)):
+        assert isinstance(image, Image)
+        shown = synthetic.scene(made, index)
+        xyzw, _ = attitudes.at(image.time_ns, 1.0)
+        icrf_from_tracker = Rotation.from_quat(xyzw).as_matrix()
+        e = shown.direction_icrf @ (np.array(truth['A_true']) @ icrf_from_tracker.T).T
+        x, y = e[:, 0] / e[:, 2], e[:, 1] / e[:, 2]
+        r2 = x**2 + y**2
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        xd = radial * x + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+        yd = radial * y + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+        u, v = fx * xd + skew * yd + cx, fy * yd + cy
+        inside = (u > 8) & (u < truth['width'] - 9) & (v > 8) & (v < truth['height'] - 9)
+        bright = np.flatnonzero(inside)[np.argsort(shown.magnitude[inside])[:5]]
+        for k in bright:
+            i, j = round(v[k]), round(u[k])
+            stamp = image.pixels[i - 5 : i + 6, j - 5 : j + 6].astype(float)
+            row, column = np.unravel_index(stamp.argmax(), stamp.shape)
+            # 40" about the tracker's z axis and 10" about the others are 0.4 px at most.
+            assert abs(row - 5) <= 2 and abs(column - 5) <= 2
+
+
+def test_eight_bit_images_give_the_truth(tmp_path: Path) -> None:
+    scenario = synthetic.scenario('tiny', 3)
+    detector = dataclasses.replace(
+        scenario.detector, bits=8, electrons_per_dn=16.0, offset_dn=10.0
+    )
+    scenario = dataclasses.replace(scenario, detector=detector)
+    made = simulation.write_bag(scenario, tmp_path / 'bag')
+    done = starcal('calibrate', made.bag, '--params', made.params, '-o', tmp_path / 'out')
+    assert done.returncode == 0, done.stderr
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert_close_to_truth(calibration, read_truth(made.truth))
+
+
+def test_a_zenith_campaign_gives_the_truth(tmp_path: Path) -> None:
+    scenario = dataclasses.replace(synthetic.scenario('small', 2), image_count=12)
+    made = simulation.write_bag(scenario, tmp_path / 'bag.mcap')
+    done = starcal('calibrate', made.bag, '--params', made.params, '-o', tmp_path / 'out')
+    assert done.returncode == 0, done.stderr
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert_close_to_truth(calibration, read_truth(made.truth))
+
+
+@pytest.mark.skipif(not INDEPENDENT.is_dir(), reason='the independent bag is not here')
+def test_a_bag_of_another_simulator_gives_the_truth(tmp_path: Path) -> None:
+    truth = json.loads((INDEPENDENT / 'small_101.json').read_text())
+    k, d = truth['k_prior'], truth['d_prior']
+    K = [k[0], k[1], k[3], 0.0, k[2], k[4], 0.0, 0.0, 1.0]
+    camera = {
+        'image_width': truth['width'],
+        'image_height': truth['height'],
+        'camera_matrix': {'rows': 3, 'cols': 3, 'data': K},
+        'distortion_model': 'plumb_bob',
+        'distortion_coefficients': {'rows': 1, 'cols': 5, 'data': [*d[:2], d[3], d[4], d[2]]},
+    }
+    (tmp_path / 'camera.yaml').write_text(yaml.safe_dump(camera))
+    values = {
+        'camera_info_url': 'camera.yaml',
+        'prior_alignment': Rotation.from_matrix(np.array(truth['A_prior']).T).as_quat().tolist(),
+        'star_tracker_sigma_arcsec': [truth['sigma_st_arcsec']] * 3,
+    }
+    params = tmp_path / 'params.yaml'
+    params.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
+    bag = INDEPENDENT / truth['bag']
+    done = starcal('calibrate', bag, '--params', params, '-o', tmp_path / 'out')
+    assert done.returncode == 0, done.stderr
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert_close_to_truth(calibration, simulation.true_geometry(truth))
