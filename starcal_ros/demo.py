@@ -93,6 +93,7 @@ def run(
     write_atomically(params, yaml.safe_dump(content, sort_keys=False))
     environment = {**os.environ, **_own_domain()}
     with contextlib.ExitStack() as stack:
+        stack.enter_context(_ended_like_interrupted())
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         result = scratch / 'calibration.json'
         nodes: dict[str, Process] = {}
@@ -168,6 +169,16 @@ def _lines(client: Process, nodes: dict[str, Process]) -> Iterator[str]:
             yield line.decode(errors='replace').strip()
         elif any(node.poll() for node in nodes.values()):
             return  # status 0 is the player's end, which is no accident
+
+
+@contextlib.contextmanager
+def _ended_like_interrupted() -> Iterator[None]:
+    """Let a polite kill take the way of Ctrl-C, so that it stops the nodes too."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _stop(process: Process) -> None:

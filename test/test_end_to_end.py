@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -210,6 +212,60 @@ def test_a_zenith_campaign_gives_the_truth(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
     assert_close_to_truth(calibration, read_truth(made.truth))
+
+
+def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path: Path) -> None:
+    whole = (TINY / 'tiny_0.mcap').read_bytes()
+    bag = tmp_path / 'cut.mcap'
+    bag.write_bytes(whole[: len(whole) * 7 // 10])
+    done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count('\n') == 1 and 'cut off' in done.stderr  # said, once
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert 3 <= calibration.images_used < 10
+    assert_close_to_truth(calibration, read_truth(TINY / 'truth.json'))
+
+
+def test_a_flipped_bit_is_noticed_and_does_no_harm(tmp_path: Path) -> None:
+    content = bytearray((TINY / 'tiny_0.mcap').read_bytes())
+    content[len(content) * 9 // 10] ^= 4
+    bag = tmp_path / 'flipped.mcap'
+    bag.write_bytes(content)
+    done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+    assert done.returncode == 0, done.stderr
+    assert 'damaged' in done.stderr and 'Traceback' not in done.stderr
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert_close_to_truth(calibration, read_truth(TINY / 'truth.json'))
+
+
+def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_run: Path) -> None:
+    pytest.importorskip('starcal.msg', reason='the interfaces are not built here')
+    done = starcal('demo', '-o', tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert 'sigma' in done.stdout and 'alignment z' in done.stdout
+    # The nodes and the tool give the same calibration from the same bag.
+    nodes = read_calibration(tmp_path / 'calibration.json')
+    tool = read_calibration(tiny_run / 'calibration.json')
+    assert nodes.stars_used == tool.stars_used
+    # The nodes predict with the newest attitude; where a stamp is the same, so is everything.
+    sigma = np.where(tool.sigma > 0, tool.sigma, 1.0)
+    change = nodes.geometry.camera.parameters - tool.geometry.camera.parameters
+    assert np.abs(change / sigma[:10]).max() < 1e-6
+
+
+def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path: Path) -> None:
+    psutil = pytest.importorskip('psutil')
+    pytest.importorskip('starcal.msg', reason='the interfaces are not built here')
+    command = [sys.executable, '-m', 'starcal_ros.cli', 'demo', '-o', str(tmp_path)]
+    tool = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while not (tmp_path / 'demo_client.log').exists():
+        time.sleep(0.05)
+    children = psutil.Process(tool.pid).children(recursive=True)
+    assert len(children) == 3
+    tool.send_signal(signal.SIGTERM)
+    _, err = tool.communicate(timeout=60)
+    assert (tool.returncode, err) == (130, 'starcal: interrupted\n')
+    assert not any(child.is_running() for child in children)
 
 
 @pytest.mark.skipif(not INDEPENDENT.is_dir(), reason='the independent bag is not here')
