@@ -59,8 +59,11 @@ class IdentificationOptions:
     min_stars_per_image: int = option(
         8, 'fewest measured stars with which an image is used', low=3, high=1000
     )
-    max_blend_px: float = option(
-        0.05, 'largest pull of a neighbour in the catalog on a centroid, px', low=0.0, high=1.0
+    max_blend_sigma: float = option(
+        0.3,
+        'largest pull of a neighbour in the catalog on a centroid, in sigma of the centroid',
+        low=0.0,
+        high=100.0,
     )
 
 
@@ -289,10 +292,10 @@ def _fit_warp(
 
 
 def blended(
-    xy_px: Floats, magnitude: Floats, psf_sigma_px: float, max_pull_px: float
+    xy_px: Floats, magnitude: Floats, psf_sigma_px: float, max_pull_px: Floats
 ) -> NDArray[np.bool_]:
     """
-    Return (n,) whether a neighbour among the stars pulls a centroid by more than a limit.
+    Return (n,) whether a neighbour among the stars pulls a centroid by more than its limit (n,).
 
     A star of relative flux q at distance d pulls a Gaussian fit by about
     ``q d exp(-d^2 / 4 sigma^2)``.
@@ -306,7 +309,7 @@ def blended(
     # A brighter neighbour takes the window for itself wherever it reaches into it.
     pull = np.where((ratio > 0.5) & (distance < 5.0 * psf_sigma_px), np.inf, pull)
     result = np.zeros(len(xy_px), bool)
-    result[both[pull > max_pull_px, 0]] = True
+    result[both[pull > max_pull_px[both[:, 0]], 0]] = True
     return result
 
 
@@ -440,12 +443,12 @@ def _refuse(
     """
     refusal = centroids.refusal.copy()
     psf_sigma_px = model.psf_sigma_px or 1.0
-    blend = blended(predicted_px, magnitude, psf_sigma_px, options.max_blend_px)
+    sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
+    blend = blended(predicted_px, magnitude, psf_sigma_px, options.max_blend_sigma * sigma_px)
     refusal[blend & (refusal == '')] = 'blend'
     good = np.nonzero(refusal == '')[0]
     if len(good) < 4:
         return refusal
-    sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
     correction, scatter_px = _fit_warp(
         predicted_px[good], centroids.xy_px[good], sigma_px[good], predicted_px[good], 0.5 * width
     )
