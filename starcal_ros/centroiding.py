@@ -16,6 +16,7 @@ Gaussian, as a fraction) come from the options or from the residuals of the brig
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import cv2
 import numpy as np
@@ -36,6 +37,7 @@ _DETECTION_SIGMA_PX = (
 _HOT_PEAK_RATIO = 4.0  # peak over filtered peak: 6.3 for one lit pixel, 2.7 for a 0.7 px star
 _MIN_PSF_SIGMA_PX = 0.45
 _MAX_PSF_SIGMA_PX = 4.0
+_FIT_STEPS = 12  # stars settle in three to five; what has not by then is no star
 
 
 @dataclass(frozen=True)
@@ -203,7 +205,7 @@ def detect(pixels: Pixels, background: Background, options: CentroidOptions) -> 
     """
     height, width = pixels.shape
     level = cv2.resize(background.level_mesh, (width, height), interpolation=cv2.INTER_LINEAR)
-    image = cv2.subtract(pixels, level, dtype=cv2.CV_32F)
+    image = np.subtract(pixels, level, dtype=np.float32)
     filtered = cv2.GaussianBlur(image, (0, 0), _DETECTION_SIGMA_PX, borderType=cv2.BORDER_REFLECT)
     # A Gaussian filter of sigma s leaves white noise at 1 / (2 s sqrt(pi)) of its strength.
     noise_left = 1.0 / (2.0 * _DETECTION_SIGMA_PX * np.sqrt(np.pi))
@@ -277,21 +279,19 @@ class PsfFit:
     shape_sigma: Floats
 
 
-def _profile(centre: Floats, sigma: Floats, offsets: Floats) -> tuple[Floats, Floats, Floats]:
+def _profile(centre: Floats, sigma_px: float, offsets: Floats) -> tuple[Floats, Floats, Floats]:
     """
     Pixel-integrated Gaussian along one axis with its first and second derivative by the centre.
 
-    ``centre``, ``sigma`` (n,); ``offsets`` (w,) pixel centres; each result is (n, w).
+    ``centre`` (n,); ``offsets`` (w,) pixel centres; each result is (n, w).
     The derivative by sigma^2 is half of the second one by the centre (heat equation).
     """
-    upper = (offsets + 0.5 - centre[:, None]) / sigma[:, None]
-    lower = (offsets - 0.5 - centre[:, None]) / sigma[:, None]
-    normal = 1.0 / np.sqrt(2.0 * np.pi)
-    pdf_upper = normal * np.exp(-0.5 * upper**2)
-    pdf_lower = normal * np.exp(-0.5 * lower**2)
-    value = ndtr(upper) - ndtr(lower)
-    first = (pdf_lower - pdf_upper) / sigma[:, None]
-    second = (lower * pdf_lower - upper * pdf_upper) / sigma[:, None] ** 2
+    edges = np.concatenate([offsets - 0.5, offsets[-1:] + 0.5])
+    t = (edges - centre[:, None]) / sigma_px
+    density = np.exp(-0.5 * t**2) / math.sqrt(2.0 * math.pi)
+    value = np.diff(ndtr(t), axis=1)
+    first = -np.diff(density, axis=1) / sigma_px
+    second = -np.diff(t * density, axis=1) / sigma_px**2
     return value, first, second
 
 
@@ -321,11 +321,12 @@ def fit_psf(
     Notes
     -----
     Gauss-Newton with the weights renewed from the model at each step, so that the noise of the
-    data does not bias them; a step in position is at most half a pixel.
+    data does not bias them; a step in position is at most half a pixel.  Stars that have settled
+    to a thousandth of their sigma are left alone.
     """
     n, w, _ = stamps.shape
-    offsets = np.arange(w, dtype=np.float64) - (w - 1) / 2.0
-    sigma = np.full(n, sigma_px)
+    data = stamps.reshape(n, w * w)
+    valid = data < saturation_dn
     border = np.concatenate(
         [stamps[:, 0], stamps[:, -1], stamps[:, 1:-1, 0], stamps[:, 1:-1, -1]], axis=1
     )
@@ -333,61 +334,83 @@ def fit_psf(
     peak_fraction = (2 * ndtr(0.5 / sigma_px) - 1) ** 2
     flux = (stamps[:, w // 2, w // 2] - background) / peak_fraction
     parameters = np.stack([np.zeros(n), np.zeros(n), flux, background], axis=-1)
-    data = stamps.reshape(n, w * w)
-    valid = (data < saturation_dn).astype(np.float64)
-    J = np.empty((n, w * w, 7))
-    normal = np.empty((n, 4, 4))
-    residual = np.empty_like(data)
-    variance = np.empty_like(data)
-    for step_number in range(12):
-        x, y, flux, background = parameters.T
-        px, px1, px2 = _profile(x, sigma, offsets)
-        py, py1, py2 = _profile(y, sigma, offsets)
-        shape = (py[:, :, None] * px[:, None, :]).reshape(n, -1)
-        flux_column = flux[:, None]
-        J[:, :, 0] = flux_column * (py[:, :, None] * px1[:, None, :]).reshape(n, -1)
-        J[:, :, 1] = flux_column * (py1[:, :, None] * px[:, None, :]).reshape(n, -1)
-        J[:, :, 2] = shape
-        J[:, :, 3] = 1.0
-        residual = data - background[:, None] - flux_column * shape
-        variance = pixel_noise.variance(flux_column * shape, noise_dn[:, None])
-        weighted = J[:, :, :4] * (valid / variance)[:, :, None]
-        normal = weighted.transpose(0, 2, 1) @ J[:, :, :4]
-        scale = 1.0 / np.sqrt(np.maximum(np.einsum('nii->ni', normal), 1e-300))
-        gradient = np.einsum('npi,np->ni', weighted, residual)
-        scaled = normal * scale[:, :, None] * scale[:, None, :] + 1e-9 * np.eye(4)
-        step = scale * np.linalg.solve(scaled, (scale * gradient)[:, :, None])[:, :, 0]
+    active = np.arange(n)
+    for _ in range(_FIT_STEPS):
+        at = parameters[active]
+        J = _psf_columns(at, sigma_px, w, 4)
+        signal = at[:, 2, None] * J[:, 2]
+        weight = valid[active] / pixel_noise.variance(signal, noise_dn[active, None])
+        step, covariance = _weighted_step(J, weight, data[active] - at[:, 3, None] - signal)
         step[:, :2] = np.clip(step[:, :2], -0.5, 0.5)
-        if step_number == 11 or np.abs(step[:, :2]).max(initial=0.0) < 1e-7:
+        at = at + step
+        at[:, :2] = np.clip(at[:, :2], -w / 2, w / 2)
+        parameters[active] = at
+        moving = np.abs(step[:, :2]) > 1e-3 * np.sqrt(np.einsum('nii->ni', covariance)[:, :2])
+        active = active[moving.any(axis=1)]
+        if len(active) == 0:
             break
-        parameters = parameters + step
-        parameters[:, :2] = np.clip(parameters[:, :2], -w / 2, w / 2)
 
-    covariance = scale[:, :, None] * np.linalg.inv(scaled) * scale[:, None, :]
     # Second moments: one linear step from the solution, in units of the PSF variance.
-    half = 0.5 * flux_column * sigma_px**2
-    J[:, :, 4] = half * (py[:, :, None] * px2[:, None, :]).reshape(n, -1)
-    J[:, :, 5] = half * (py2[:, :, None] * px[:, None, :]).reshape(n, -1)
-    J[:, :, 6] = flux_column * sigma_px**2 * (py1[:, :, None] * px1[:, None, :]).reshape(n, -1)
-    weighted = J * (valid / variance)[:, :, None]
-    full = weighted.transpose(0, 2, 1) @ J
-    full_scale = 1.0 / np.sqrt(np.maximum(np.einsum('nii->ni', full), 1e-300))
-    full_inverse = np.linalg.inv(
-        full * full_scale[:, :, None] * full_scale[:, None, :] + 1e-9 * np.eye(7)
-    )
-    full_inverse = full_scale[:, :, None] * full_inverse * full_scale[:, None, :]
-    shape_change = np.einsum('nij,npj,np->ni', full_inverse[:, 4:], weighted, residual)
-    shape_sigma = np.sqrt(np.maximum(np.einsum('nii->ni', full_inverse)[:, 4:], 0.0))
-    normalised = valid * residual / np.sqrt(variance)
+    J = _psf_columns(parameters, sigma_px, w, 7)
+    signal = parameters[:, 2, None] * J[:, 2]
+    weight = valid / pixel_noise.variance(signal, noise_dn[:, None])
+    residual = data - parameters[:, 3, None] - signal
+    _, covariance = _weighted_step(J[:, :4], weight, residual)
+    shape_step, shape_covariance = _weighted_step(J, weight, residual)
+    normalised2 = weight * residual**2
     return PsfFit(
         parameters=parameters,
         covariance=covariance,
-        reduced_chi2=np.einsum('np,np->n', normalised, normalised)
-        / np.maximum(valid.sum(axis=1) - 4, 1),
-        worst_pixel_sigma=np.abs(normalised).max(axis=1, initial=0.0),
-        shape_change=shape_change,
-        shape_sigma=shape_sigma,
+        reduced_chi2=normalised2.sum(axis=1) / np.maximum(valid.sum(axis=1) - 4, 1),
+        worst_pixel_sigma=np.sqrt(normalised2.max(axis=1, initial=0.0)),
+        shape_change=shape_step[:, 4:],
+        shape_sigma=np.sqrt(np.einsum('nii->ni', shape_covariance)[:, 4:]),
     )
+
+
+def _psf_columns(parameters: Floats, sigma_px: float, width: int, count: int) -> Floats:
+    """
+    Derivatives (n, count, width * width) of a stamp by x, y, flux, background.
+
+    And, with count 7, by the second moments xx, yy, xy as fractions of the PSF's variance.
+    """
+    offsets = np.arange(width, dtype=np.float64) - (width - 1) / 2.0
+    x, y, flux, _ = parameters.T
+    px, px1, px2 = _profile(x, sigma_px, offsets)
+    py, py1, py2 = _profile(y, sigma_px, offsets)
+    J = np.empty((len(x), count, width, width))
+
+    def put(column: int, along_y: Floats, along_x: Floats) -> None:
+        np.multiply(along_y[:, :, None], along_x[:, None, :], out=J[:, column])
+
+    flux = flux[:, None]
+    put(0, py, flux * px1)
+    put(1, py1, flux * px)
+    put(2, py, px)
+    J[:, 3] = 1.0
+    if count == 7:
+        half_variance = 0.5 * sigma_px**2
+        put(4, py, half_variance * flux * px2)
+        put(5, py2, half_variance * flux * px)
+        put(6, py1, 2 * half_variance * flux * px1)
+    return J.reshape(len(x), count, width * width)
+
+
+def _weighted_step(J: Floats, weight: Floats, residual: Floats) -> tuple[Floats, Floats]:
+    """
+    Weighted least-squares step (n, k) and covariance (n, k, k) of many small problems.
+
+    ``J`` is (n, k, p), ``weight`` and ``residual`` (n, p).  The normal matrices are scaled to a
+    unit diagonal, and a trace of it keeps a stamp without light solvable.
+    """
+    k = J.shape[1]
+    weighted = J * weight[:, None, :]
+    normal = weighted @ J.transpose(0, 2, 1)
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum('nii->ni', normal), 1e-12))
+    scaled = normal * scale[:, :, None] * scale[:, None, :] + 1e-9 * np.eye(k)
+    covariance = np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :]
+    gradient = (weighted @ residual[:, :, None])[:, :, 0]
+    return (covariance @ gradient[:, :, None])[:, :, 0], covariance
 
 
 @dataclass(frozen=True)
@@ -481,11 +504,10 @@ def _estimate_noise(stamps: Floats, sigma_px: float, noise_dn: Floats, gain: flo
     """
     estimate = PixelNoise(gain or 1.0, 0.02)
     offsets = np.arange(stamps.shape[1], dtype=np.float64) - (stamps.shape[1] - 1) / 2.0
-    sigma = np.full(len(stamps), sigma_px)
     for _ in range(3):
         fit = fit_psf(stamps, sigma_px, noise_dn, estimate)
         x, y, flux, level = fit.parameters.T
-        px, py = _profile(x, sigma, offsets)[0], _profile(y, sigma, offsets)[0]
+        px, py = _profile(x, sigma_px, offsets)[0], _profile(y, sigma_px, offsets)[0]
         signal = flux[:, None, None] * py[:, :, None] * px[:, None, :]
         residual = stamps - level[:, None, None] - signal
         noise2 = np.broadcast_to(noise_dn[:, None, None] ** 2, signal.shape)
