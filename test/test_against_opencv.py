@@ -35,7 +35,7 @@ def directions(seed: int, half_width: float, n: int = 200) -> np.ndarray:
     """Unit directions (n, 3) in the camera frame over a square about the axis."""
     xy = np.random.default_rng(seed).uniform(-half_width, half_width, (n, 2))
     e = np.concatenate([xy, np.ones((n, 1))], axis=1)
-    return e / np.linalg.norm(e, axis=1)[:, None]
+    return np.asarray(e / np.linalg.norm(e, axis=1)[:, None])
 
 
 FIELDS = [(7291.0, NARROW, 0.2), (1500.0, WIDE, 0.9)]

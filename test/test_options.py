@@ -1,0 +1,176 @@
+"""Options: every type and limit, with texts that name the option and the value; YAML files."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from starcal_ros.errors import OptionError
+from starcal_ros.options import from_mapping, names_of, option, read_parameter_file
+from starcal_ros.pipeline import OPTION_CLASSES
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One option of each type."""
+
+    yes: bool = option(False, 'a switch')
+    count: int = option(3, 'a number of things', low=1, high=10)
+    size_px: float = option(1.5, 'a size, px', low=0.5)
+    free: float = option(0.0, 'any number')
+    kind: str = option('a', 'one of a few', choices=('a', 'b'))
+    name: str = option('', 'any text')
+    axes: tuple[float, ...] = option((1.0, 2.0, 3.0), 'three numbers', low=0.0, length=3)
+    parts: tuple[str, ...] = option(('u', 'v'), 'some of a few', choices=('u', 'v', 'w'))
+    words: tuple[str, ...] = option(('some',), 'any texts')
+
+
+@pytest.mark.parametrize(
+    ('values', 'expected'),
+    [
+        ({}, Sample()),
+        ({'yes': True}, Sample(yes=True)),
+        ({'count': 10}, Sample(count=10)),
+        ({'count': 7.0}, Sample(count=7)),
+        ({'size_px': 2}, Sample(size_px=2.0)),
+        ({'size_px': 0.5}, Sample(size_px=0.5)),
+        ({'kind': 'b'}, Sample(kind='b')),
+        ({'name': '/a b'}, Sample(name='/a b')),
+        ({'axes': [0, 1, 2.5]}, Sample(axes=(0.0, 1.0, 2.5))),
+        ({'axes': np.array([4.0, 5.0, 6.0])}, Sample(axes=(4.0, 5.0, 6.0))),
+        ({'parts': ['w']}, Sample(parts=('w',))),
+        ({'parts': []}, Sample(parts=())),
+        ({'words': ['x', 'y']}, Sample(words=('x', 'y'))),
+        ({'of_another_stage': 1}, Sample()),
+    ],
+)
+def test_good_values(values: dict[str, object], expected: Sample) -> None:
+    made = from_mapping(Sample, values)
+    assert made == expected
+    for field in dataclasses.fields(Sample):
+        # 7.0 for a whole number becomes one, 2 for a size a float: later code need not ask.
+        assert type(getattr(made, field.name)) is type(field.default)
+
+
+@pytest.mark.parametrize(
+    ('values', 'text'),
+    [
+        ({'yes': 1}, 'yes: 1 is not true or false'),
+        ({'yes': 'true'}, "yes: 'true' is not true or false"),
+        ({'count': True}, 'count: True is not a number'),
+        ({'count': 2.5}, 'count: 2.5 is not a whole number'),
+        ({'count': 0}, 'count: 0 is not within 1 to 10'),
+        ({'count': 11}, 'count: 11 is not within 1 to 10'),
+        ({'count': '5'}, "count: '5' is not a number"),
+        ({'count': None}, 'count: None is not a number'),
+        ({'count': math.nan}, 'count: nan is not finite'),
+        ({'size_px': math.inf}, 'size_px: inf is not finite'),
+        ({'size_px': 0.49}, 'size_px: 0.49 is not within 0.5 to None'),
+        ({'size_px': False}, 'size_px: False is not a number'),
+        ({'size_px': [1.0]}, 'size_px: [1.0] is not a number'),
+        ({'kind': 'c'}, "kind: 'c' is not one of a, b"),
+        ({'kind': 1}, 'kind: 1 is not a text'),
+        ({'name': 3.0}, 'name: 3.0 is not a text'),
+        ({'axes': [1.0, 2.0]}, 'axes: [1.0, 2.0] is not a list of 3'),
+        ({'axes': 1.0}, 'axes: 1.0 is not a list'),
+        ({'axes': 'abc'}, "axes: 'abc' is not a list"),
+        ({'axes': [1.0, 2.0, -1.0]}, 'axes: [1.0, 2.0, -1.0] is not within 0.0 to None'),
+        ({'axes': [1.0, 2.0, math.nan]}, 'axes: [1.0, 2.0, nan] is not finite'),
+        ({'axes': [1.0, 2.0, True]}, 'axes: [1.0, 2.0, True] is not a number'),
+        ({'parts': ['u', 'x']}, "parts: ['u', 'x'] is not one of u, v, w"),
+        ({'parts': 'u'}, "parts: 'u' is not a list"),
+        ({'parts': [1]}, 'parts: [1] is not a text'),
+        ({'words': [2]}, 'words: [2] is not a text'),
+    ],
+)
+def test_bad_values(values: dict[str, object], text: str) -> None:
+    with pytest.raises(OptionError) as refused:
+        from_mapping(Sample, values)
+    assert str(refused.value) == text
+
+
+@pytest.mark.parametrize('options_class', OPTION_CLASSES)
+def test_every_default_is_a_value_that_its_own_option_takes(options_class: type) -> None:
+    defaults = {f.name: f.default for f in dataclasses.fields(options_class)}
+    assert from_mapping(options_class, defaults) == options_class()
+    for field in dataclasses.fields(options_class):
+        assert field.metadata['description'], field.name
+
+
+def test_no_two_stages_share_a_name() -> None:
+    # One flat file holds the options of all stages.
+    count = sum(len(dataclasses.fields(c)) for c in OPTION_CLASSES)
+    assert len(names_of(*OPTION_CLASSES)) == count
+
+
+def parameter_file(folder: Path, text: str) -> Path:
+    path = folder / 'params.yaml'
+    path.write_text(text)
+    return path
+
+
+def test_the_sections_of_the_named_nodes_and_of_all_are_read(tmp_path: Path) -> None:
+    path = parameter_file(
+        tmp_path,
+        """
+/**:
+  ros__parameters: {a: 1, b: 1, c: 1, d: 1}
+observer:
+  ros__parameters: {b: 2}
+/calibrator:
+  ros__parameters: {c: [3, 4]}
+/**/observer:
+  ros__parameters: {d: text}
+somebody_else:
+  ros__parameters: {a: 9, e: 9}
+/space/observer:
+  ros__parameters: {a: 9}
+""",
+    )
+    values = read_parameter_file(path, ('observer', 'calibrator'))
+    assert values == {'a': 1, 'b': 2, 'c': [3, 4], 'd': 'text'}
+    assert read_parameter_file(path, ('nobody',)) == {'a': 1, 'b': 1, 'c': 1, 'd': 1}
+
+
+def test_the_later_section_wins_as_in_ros(tmp_path: Path) -> None:
+    # rclpy of Jazzy says so of this very file: a is 2, not the more specific 1.
+    path = parameter_file(
+        tmp_path, 'foo:\n  ros__parameters: {a: 1}\n/**:\n  ros__parameters: {a: 2}\n'
+    )
+    assert read_parameter_file(path, ('foo',)) == {'a': 2}
+
+
+@pytest.mark.parametrize(
+    ('text', 'says'),
+    [
+        ('a: [1, 2', 'not YAML'),
+        ('a: b: c', 'not YAML'),
+        ('', 'not a ROS parameter file'),
+        ('- 1\n- 2\n', 'not a ROS parameter file'),
+        ('foo:\n  a: 1\n', "section 'foo' has no ros__parameters"),
+        ('foo: 3\n', "section 'foo' has no ros__parameters"),
+        ('/**:\n  ros__parameters: [1]\n', "section '/**' has no ros__parameters"),
+    ],
+)
+def test_a_file_that_is_none(tmp_path: Path, text: str, says: str) -> None:
+    path = parameter_file(tmp_path, text)
+    with pytest.raises(OptionError) as refused:
+        read_parameter_file(path, ('foo',))
+    assert str(refused.value).startswith(f'{path}: ') and says in str(refused.value)
+    assert '\n' not in str(refused.value)
+
+
+def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+    missing = tmp_path / 'missing.yaml'
+    with pytest.raises(OptionError, match='missing.yaml: cannot be read: No such file'):
+        read_parameter_file(missing, ('foo',))
+    with pytest.raises(OptionError, match='cannot be read: Is a directory'):
+        read_parameter_file(tmp_path, ('foo',))
+    (tmp_path / 'latin.yaml').write_bytes(b'foo: \xff\xfe\n')
+    with pytest.raises(OptionError, match='latin.yaml: not YAML'):
+        read_parameter_file(tmp_path / 'latin.yaml', ('foo',))
