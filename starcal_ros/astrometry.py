@@ -145,7 +145,7 @@ def apparent_directions(
     Unit vectors (n, 3), axes of the ICRS, along which an observer sees catalog stars.
 
     Proper motion, parallax, bending of light by the Sun and stellar aberration are applied; the
-    radial velocity is taken as zero.  0.1 ms and 0.3 ms per thousand stars.
+    radial velocity is taken as zero.  0.05 ms, and 0.1 ms per thousand stars.
 
     Parameters
     ----------

@@ -449,13 +449,17 @@ def integer_columns(
 
 
 def write_catalog(columns: dict[str, NDArray[np.generic]], path: Path) -> None:
-    """Write the file; numpy dates the members of the archive 1980, so the bytes stay the same."""
+    """
+    Write the file.
+
+    The same stars give the same bytes, since numpy dates the members of the archive 1980; but
+    Python 3.10 numbers the archive's version otherwise than 3.11 on.  The digest is of the stars.
+    """
     np.savez_compressed(
         path,
-        allow_pickle=False,
         format=np.array(CATALOG_FORMAT),
         digest=np.array(column_digest(columns)),
-        **columns,
+        **columns,  # type: ignore[arg-type]  # no column is named allow_pickle
     )
 
 
