@@ -214,6 +214,21 @@ def test_a_zenith_campaign_gives_the_truth(tmp_path: Path) -> None:
     assert_close_to_truth(calibration, read_truth(made.truth))
 
 
+def test_a_launch_shift_of_a_degree_is_found(tmp_path: Path) -> None:
+    scenario = synthetic.scenario('tiny', 4)
+    mounting = Rotation.from_quat(scenario.prior.star_tracker_from_camera_xyzw)
+    shift = Rotation.from_rotvec(np.radians([0.8, -0.7, 0.6]))  # 1.2 degrees; 1.5 is the limit
+    prior = dataclasses.replace(
+        scenario.prior, star_tracker_from_camera_xyzw=(mounting * shift).as_quat()
+    )
+    made = simulation.write_bag(dataclasses.replace(scenario, prior=prior), tmp_path / 'bag')
+    done = starcal('calibrate', made.bag, '--params', made.params, '-o', tmp_path / 'out')
+    assert done.returncode == 0, done.stdout + done.stderr
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    assert calibration.images_used == 10
+    assert_close_to_truth(calibration, read_truth(made.truth))
+
+
 def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path: Path) -> None:
     whole = (TINY / 'tiny_0.mcap').read_bytes()
     bag = tmp_path / 'cut.mcap'
