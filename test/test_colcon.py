@@ -18,16 +18,8 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
 ROOT = Path(__file__).resolve().parent.parent
-BUILT = (
-    'CMakeLists.txt',
-    'package.xml',
-    'setup.cfg',
-    'msg',
-    'srv',
-    'starcal_ros',
-    'launch',
-    'config',
-)
+BUILT = ('CMakeLists.txt', 'package.xml', 'setup.cfg', 'msg', 'srv', 'starcal_ros')
+INSTALLED = ('launch', 'config', 'bags/tiny')
 NODE_ANSWERS_WITHIN_S = 30.0
 NODE_STOPS_WITHIN_S = 15.0
 
@@ -53,12 +45,12 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     workspace = tmp_path_factory.mktemp('workspace')
     package = workspace / 'src' / 'starcal'
     package.mkdir(parents=True)
-    for path in filter(Path.exists, (ROOT / name for name in BUILT)):
-        if path.is_dir():
+    for name in filter(lambda name: (ROOT / name).exists(), BUILT + INSTALLED):
+        if (ROOT / name).is_dir():
             ignore = shutil.ignore_patterns('__pycache__')
-            shutil.copytree(path, package / path.name, ignore=ignore)
+            shutil.copytree(ROOT / name, package / name, ignore=ignore)
         else:
-            shutil.copy(path, package)
+            shutil.copy(ROOT / name, package)
     colcon = [sys.executable, '-m', 'colcon', 'build', '--base-paths', 'src', '--cmake-args']
     definitions = ['-DBUILD_TESTING=OFF', f'-DPython3_EXECUTABLE={sys.executable}']
     underlay = {'AMENT_PREFIX_PATH': sys.prefix, 'CMAKE_PREFIX_PATH': sys.prefix}
@@ -93,9 +85,9 @@ def test_everything_is_installed_that_the_package_reads(workspace: Path) -> None
     prefix = workspace / 'install' / 'starcal'
     executables = {path.name for path in (prefix / 'lib' / 'starcal').iterdir()}
     assert executables == {'starcal', 'star_observer', 'calibrator', 'bag_player'}
-    for folder in ('launch', 'config'):
-        copied = {path.name for path in (ROOT / folder).iterdir()} - {'__pycache__'}
-        assert {path.name for path in (prefix / 'share' / 'starcal' / folder).iterdir()} == copied
+    for folder in INSTALLED:
+        there = {path.name for path in (prefix / 'share/starcal' / folder).iterdir()}
+        assert there == {path.name for path in (ROOT / folder).iterdir()} - {'__pycache__'}
     sources = next(prefix.glob('lib/python3.*/site-packages/starcal_ros'))
     for path in (ROOT / 'starcal_ros' / 'data').iterdir():
         if path.is_file():

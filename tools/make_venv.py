@@ -89,15 +89,18 @@ def python_name() -> str:
 def package_inputs() -> list[Path]:
     """List the files of this package that are compiled or copied into the environment."""
     names = ('CMakeLists.txt', 'package.xml', 'setup.py', 'setup.cfg')
-    interfaces = [*ROOT.glob('msg/*.msg'), *ROOT.glob('srv/*.srv')]
-    return [*(ROOT / name for name in names), *sorted(interfaces)]
+    folders = ('msg', 'srv', 'launch', 'config', 'bags/tiny')
+    installed = (path for folder in folders for path in (ROOT / folder).rglob('*'))
+    return [*(ROOT / name for name in names), *sorted(p for p in installed if p.is_file())]
 
 
 def digest(paths: list[Path], start: str) -> str:
     """Return one digest of the names and the contents of files."""
     total = hashlib.sha256(start.encode())
     for path in paths:
-        total.update(f'\n{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}'.encode())
+        total.update(
+            f'\n{path.relative_to(ROOT)} {hashlib.sha256(path.read_bytes()).hexdigest()}'.encode()
+        )
     return total.hexdigest()
 
 
@@ -170,8 +173,9 @@ def install_package(venv: Path) -> None:
     build = venv / 'build-starcal'
     manifest = build / 'install_manifest.txt'
     if manifest.exists():  # so that an interface that is gone from the sources goes here too
-        for name in manifest.read_text().splitlines():
-            Path(name).unlink(missing_ok=True)
+        for path in map(Path, manifest.read_text().splitlines()):
+            if path.parent.resolve().is_relative_to(venv.resolve()):  # never through a link
+                path.unlink(missing_ok=True)
     shutil.rmtree(build, ignore_errors=True)
     build.mkdir()
 
@@ -192,10 +196,6 @@ def install_package(venv: Path) -> None:
     # CMake has copied the sources, as it must in a ROS workspace; here they are to be live.
     for copied in packages_of(venv).glob('starcal_ros*'):
         shutil.rmtree(copied)
-    for name in ('launch', 'config'):
-        if (ROOT / name).is_dir():
-            shutil.rmtree(venv / 'share/starcal' / name)
-            (venv / 'share/starcal' / name).symlink_to(ROOT / name)
     # Lets ament_index find this package and its files without sourcing anything.
     underlay = "import os, sys; os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)\n"
     (packages_of(venv) / 'starcal_underlay.pth').write_text(underlay)
