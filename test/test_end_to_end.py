@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 from pathlib import Path
 import signal
@@ -25,6 +26,12 @@ from starcal_ros.records import Calibration, CameraGeometry, Image
 ROOT = Path(__file__).parents[1]
 TINY = ROOT / 'bags' / 'tiny'
 INDEPENDENT = ROOT.parent / 'shared' / 'independent'
+
+
+needs_interfaces = pytest.mark.skipif(
+    importlib.util.find_spec('rclpy') is None or importlib.util.find_spec('starcal') is None,
+    reason='needs rclpy and the built interfaces',
+)
 
 
 def starcal(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -253,8 +260,8 @@ def test_a_flipped_bit_is_noticed_and_does_no_harm(tmp_path: Path) -> None:
     assert_close_to_truth(calibration, read_truth(TINY / 'truth.json'))
 
 
+@needs_interfaces
 def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_run: Path) -> None:
-    pytest.importorskip('starcal.msg', reason='the interfaces are not built here')
     done = starcal('demo', '-o', tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert 'sigma' in done.stdout and 'alignment z' in done.stdout
@@ -268,9 +275,9 @@ def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_run: Path) -> 
     assert np.abs(change / sigma[:10]).max() < 1e-6
 
 
+@needs_interfaces
 def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path: Path) -> None:
     psutil = pytest.importorskip('psutil')
-    pytest.importorskip('starcal.msg', reason='the interfaces are not built here')
     command = [sys.executable, '-m', 'starcal_ros.cli', 'demo', '-o', str(tmp_path)]
     tool = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while not (tmp_path / 'demo_client.log').exists():
