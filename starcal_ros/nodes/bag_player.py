@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import contextlib
 import sys
 import threading
 import time
@@ -27,7 +28,8 @@ from starcal_ros.options import from_mapping
 
 NAME = 'bag_player'
 # A writer that overtakes its readers by more than its history loses messages, reliable or not.
-_IMAGE_DEPTH, _OTHER_DEPTH = 10, 1000
+# Images are acknowledged in 10 ms, small messages with the next heartbeat only: after 3 s.
+_IMAGE_DEPTH, _OTHER_DEPTH = 10, 20_000
 _UNACKED = {True: _IMAGE_DEPTH // 2, False: _OTHER_DEPTH // 2}
 _SMALL_PER_S = 2000.0  # what a Python reader takes beside its other work
 _ACK_S = 30.0
@@ -142,6 +144,13 @@ def _offer(topic: bag.Topic) -> QoSProfile:
     )
 
 
+def _listen(player: BagPlayer) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(player)
+    with contextlib.suppress(ExternalShutdownException):
+        executor.spin()
+
+
 def _timeout() -> Duration:
     return Duration(seconds=_ACK_S)
 
@@ -159,13 +168,12 @@ def main(args: Sequence[str] | None = None) -> int:
     A signal ends it with 0.
     """
     player = None
-    executor = None
+    listener = None
     try:
         rclpy.init(args=None if args is None else [NAME, *args])
         player = BagPlayer()
-        executor = SingleThreadedExecutor()
-        executor.add_node(player)
-        threading.Thread(target=executor.spin, daemon=True).start()
+        listener = threading.Thread(target=_listen, args=[player])
+        listener.start()
         return player.play()
     except StarcalError as error:
         print(f'{NAME}: {one_line(error)}', file=sys.stderr)
@@ -178,8 +186,9 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f'{NAME}: {one_line(error)}', file=sys.stderr)
         return 2
     finally:
-        if executor is not None:
-            executor.shutdown(timeout_sec=1.0)
+        rclpy.try_shutdown()
+        if listener is not None:
+            listener.join()
         end_quietly(player)
 
 
