@@ -10,7 +10,9 @@ An image that no match explains is refused, never matched wrongly.
 from __future__ import annotations
 
 from collections import Counter
+import dataclasses
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +24,16 @@ from starcal_ros.astrometry import apparent_directions
 from starcal_ros.camera import field_radius_rad, line_of_sight, project, project_jacobians
 from starcal_ros.catalog import cone, StarCatalog
 from starcal_ros.centroiding import (
+    Background,
     CentroidOptions,
     Centroids,
     detect,
+    detect_near,
     ImageModel,
     measure_background,
     measure_stars,
     model_image,
+    Pixels,
     Sources,
 )
 from starcal_ros.errors import ImageRefused
@@ -37,6 +42,8 @@ from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 Floats = NDArray[np.float64]
 
+_TRACKED = 200  # brightest predictions that are looked for in windows of their own
+_TRACKED_ROLL_RAD = 0.01  # a star tracker is off by less about any axis once aligned
 _VOTERS = (
     100  # brightest predictions and sources that vote: their pairs fill one histogram at once
 )
@@ -55,6 +62,12 @@ class IdentificationOptions:
     )
     acquisition_roll_deg: float = option(
         5.0, 'largest roll error that is searched, degrees', low=0.0, high=20.0
+    )
+    search_radius_px: int = option(
+        12,
+        'half width of the window in which a predicted star is first looked for, px',
+        low=3,
+        high=100,
     )
     min_stars_per_image: int = option(
         8, 'fewest measured stars with which an image is used', low=3, high=1000
@@ -126,10 +139,13 @@ def acquire(
     prediction: Prediction,
     sources: Sources,
     geometry: CameraGeometry,
-    options: IdentificationOptions,
+    reach_px: float,
+    roll_rad: float,
 ) -> Rotation:
     """
     Small rotation of the camera frame that brings the predictions onto the sources.
+
+    They may be off by up to ``reach_px``, and rolled by up to ``roll_rad``.
 
     A vote: for each roll within the limit, the pixel offsets of all pairs of bright sources and
     bright predictions are counted in cells; true pairs share one cell, false ones spread.
@@ -142,16 +158,16 @@ def acquire(
     camera = geometry.camera
     width, height = camera.width, camera.height
     half_diagonal_px = 0.5 * np.hypot(width, height)
-    reach_px = np.radians(options.acquisition_radius_deg) * camera.parameters[0]
-    # Wide enough for what the prior focal length and the roll step leave at the edge.
-    cell_px = max(3.0, 0.008 * half_diagonal_px)
+    # Wide enough for what the prior focal length and the roll step leave at the edge, but a small
+    # part of what is searched: a cell as large as the search would count everything.
+    cell_px = min(max(3.0, 0.008 * half_diagonal_px), reach_px / 4)
     centre = np.array([(width - 1) / 2, (height - 1) / 2])
     stars = prediction.xy_px[:_VOTERS] - centre
     seen = sources.xy_px[:_VOTERS] - centre
     half_cells = int(np.ceil(reach_px / cell_px)) + 1
     cells = 2 * half_cells + 1
     roll_step = cell_px / half_diagonal_px
-    roll_steps = int(np.ceil(np.radians(options.acquisition_roll_deg) / roll_step))
+    roll_steps = int(np.ceil(roll_rad / roll_step))
 
     best_count, best_roll, best_cell = -1, 0.0, (0, 0)
     # Nearest to zero first: of equal votes the smallest turn wins.
@@ -170,12 +186,7 @@ def acquire(
     low = (np.array([best_cell[1], best_cell[0]]) - half_cells) * cell_px
     offset = seen[:, None] - _turn(stars, best_roll)[None]
     in_block = ((offset >= low) & (offset < low + 2 * cell_px)).all(axis=2)
-    expected = (
-        len(stars)
-        * len(seen)
-        * (2 * cell_px) ** 2
-        / ((width + 2 * reach_px) * (height + 2 * reach_px))
-    )
+    expected = len(stars) * len(seen) * (2 * cell_px) ** 2 / sources.searched_px2
     trials = (2 * roll_steps + 1) * cells * cells
     if best_count < 4 or poisson.sf(best_count - 1, expected) * trials > 1e-2:
         raise ImageRefused(
@@ -333,9 +344,6 @@ def observe_stars(
     """
     camera = geometry.camera
     background = measure_background(image.pixels)
-    sources = detect(image.pixels, background, centroid_options)
-    if len(sources.snr) < 4:
-        raise ImageRefused('no_stars', f'{len(sources.snr)} star-like sources')
     prediction = predict(
         geometry, icrf_from_star_tracker_xyzw, image.time_ns, catalog, options, velocity_m_s
     )
@@ -343,10 +351,14 @@ def observe_stars(
         raise ImageRefused(
             'no_match', f'{len(prediction.catalog_index)} catalog stars in the field'
         )
-    turn = acquire(prediction, sources, geometry, options)
-    predicted_px = _match(prediction, sources, geometry, turn)
-
+    predicted_px, sources = _find(
+        image.pixels, background, prediction, geometry, centroid_options, options
+    )
     model = model_image(image.pixels, background, sources, centroid_options)
+    if model.psf_sigma_px == 0:
+        # The brightest stars may all be saturated: fainter ones tell the PSF.
+        sources = detect(image.pixels, background, centroid_options)
+        model = model_image(image.pixels, background, sources, centroid_options)
     inside = np.nonzero(_in_image(predicted_px, camera.width, camera.height))[0]
     index = prediction.catalog_index[inside]
     predicted_px = predicted_px[inside]
@@ -382,6 +394,73 @@ def observe_stars(
     )
 
 
+def tracked(base: CameraGeometry, observations: StarObservations) -> CameraGeometry:
+    """
+    The geometry with which to predict the next image: the base, aligned as this image shows.
+
+    What launch has turned is found once, by the search of a whole image; from then on stars are
+    looked for where they are.  A refused image leaves the base.  Measurements do not depend on it.
+    """
+    if observations.refusal:
+        return base
+    camera_from_icrf, _ = Rotation.align_vectors(
+        line_of_sight(base.camera, observations.measured_px),
+        observations.direction_icrf,
+        weights=observations.snr.astype(np.float64),
+    )
+    icrf_from_star_tracker = Rotation.from_quat(observations.icrf_from_star_tracker_xyzw)
+    star_tracker_from_camera = icrf_from_star_tracker.inv() * camera_from_icrf.inv()
+    return CameraGeometry(base.camera, star_tracker_from_camera.as_quat())
+
+
+def _find(
+    pixels: Pixels,
+    background: Background,
+    prediction: Prediction,
+    geometry: CameraGeometry,
+    centroid_options: CentroidOptions,
+    options: IdentificationOptions,
+) -> tuple[Floats, Sources]:
+    """
+    Predicted pixels (n, 2) refined onto the sources of the image, and those sources.
+
+    First the brighter stars are looked for next to their predictions; only when those do not make
+    a match is the whole image searched, and the whole error that launch may have caused.
+
+    Raises
+    ------
+    ImageRefused
+        ``no_stars`` or ``no_match``.
+    """
+    camera = geometry.camera
+    inside = _in_image(prediction.xy_px, camera.width, camera.height)
+    near = detect_near(
+        pixels,
+        background,
+        prediction.xy_px[inside][:_TRACKED],
+        options.search_radius_px,
+        centroid_options,
+    )
+    try:
+        turn = acquire(
+            prediction, near, geometry, float(options.search_radius_px), _TRACKED_ROLL_RAD
+        )
+        return _match(prediction, near, geometry, turn), near
+    except ImageRefused:
+        pass
+    sources = detect(pixels, background, centroid_options)
+    if len(sources.snr) < 4:
+        raise ImageRefused('no_stars', f'{len(sources.snr)} star-like sources')
+    turn = acquire(
+        prediction,
+        sources,
+        geometry,
+        math.radians(options.acquisition_radius_deg) * float(camera.parameters[0]),
+        math.radians(options.acquisition_roll_deg),
+    )
+    return _match(prediction, sources, geometry, turn), sources
+
+
 def _match(
     prediction: Prediction, sources: Sources, geometry: CameraGeometry, turn: Rotation
 ) -> Floats:
@@ -396,7 +475,8 @@ def _match(
     camera = geometry.camera
     # As many predictions as sources and the other way round: the fainter surplus matches nothing.
     bright = np.arange(min(len(prediction.xy_px), 4 * len(sources.snr), 400))
-    seen = Sources(sources.xy_px[: 4 * len(bright)], sources.snr[: 4 * len(bright)])
+    first = 4 * len(bright)
+    seen = dataclasses.replace(sources, xy_px=sources.xy_px[:first], snr=sources.snr[:first])
     xy, pairs = _refine_rotation(prediction, seen, geometry, turn, bright)
     half_px = 0.5 * max(camera.width, camera.height)
     for radius_px in (max(4.0, 0.003 * half_px * 2), 3.0, 2.0):
@@ -415,7 +495,7 @@ def _match(
     inside = _in_image(xy[bright], camera.width, camera.height)
     radius_px = 2.0
     matched = len(_pairs(xy[bright][inside], seen.xy_px, radius_px))
-    density = len(seen.snr) / (camera.width * camera.height)
+    density = len(seen.snr) / sources.searched_px2
     tried = int(np.count_nonzero(inside))
     expected = tried * -np.expm1(-density * np.pi * radius_px**2)
     # Rotation, scale and warp were fitted to the pairs: two parameters can buy one pair.

@@ -22,7 +22,7 @@ from starcal_ros.camera import zero_skew_fit
 from starcal_ros.catalog import load_catalog, StarCatalog
 from starcal_ros.centroiding import CentroidOptions
 from starcal_ros.errors import ImageRefused, OptionError
-from starcal_ros.identification import IdentificationOptions, observe_stars
+from starcal_ros.identification import IdentificationOptions, observe_stars, tracked
 from starcal_ros.observability import coverage, keep_most_informative, map_sigma_px
 from starcal_ros.observability import ensemble_status as _ensemble_status
 from starcal_ros.options import check_value, from_mapping, names_of, option
@@ -221,6 +221,7 @@ def observe_bag(
     """
     attitudes = bag.read_attitudes(paths, attitude_topic, setup.attitude)
     latest_ns: int | None = None
+    geometry = setup.prior
     for image in bag.read_images(paths, image_topic, setup.attitude.stamp_offset_s):
         if isinstance(image, StarObservations):
             yield image
@@ -228,7 +229,9 @@ def observe_bag(
             yield out_of_order(image, latest_ns)
         else:
             latest_ns = image.time_ns
-            yield observe(image, attitudes, setup, setup.prior)
+            observations = observe(image, attitudes, setup, geometry)
+            geometry = tracked(setup.prior, observations)
+            yield observations
 
 
 def out_of_order(image: Image, latest_ns: int) -> StarObservations:
