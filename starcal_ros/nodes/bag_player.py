@@ -60,10 +60,13 @@ class BagPlayer(Node):
         self._unacked = dict.fromkeys(self._players, 0)
         self._observed = threading.Condition()
         self._observed_count = 0
-        self._paced = True
-        self._observations = self.create_subscription(
-            ObservationsMessage, 'observations', self._on_observations, QoSProfile(depth=1000)
-        )
+        # A bag that holds observations would be paced by its own, and take itself for a listener.
+        types = {topic.type_name for topic in self._topics}
+        self._paced = bool(self._images) and messages.OBSERVATIONS_TYPE not in types
+        if self._paced:
+            self._observations = self.create_subscription(
+                ObservationsMessage, 'observations', self._on_observations, QoSProfile(depth=1000)
+            )
 
     def play(self) -> int:
         """Play the bag; 0 when every reader has acknowledged every message."""
