@@ -20,6 +20,7 @@ from starcal_ros.annotation import annotate
 from starcal_ros.attitude import attitude_sample, AttitudeHistory
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
+from starcal_ros.identification import tracked
 from starcal_ros.node_options import ObserverOptions
 from starcal_ros.nodes.conversions import make_message
 from starcal_ros.nodes.image_queue import ImageQueue, Waiting
@@ -54,7 +55,7 @@ class StarObserver(StarcalNode):
         values = self.options.values()
         self._own = from_mapping(ObserverOptions, values)
         self._setup = pipeline.load_setup(values, self.options.classes)
-        self._geometry = self._setup.prior
+        self._geometry = self._tracked = self._setup.prior
         self._observations = self.create_lifecycle_publisher(
             ObservationsMessage, 'observations', QoSProfile(depth=100)
         )
@@ -150,7 +151,7 @@ class StarObserver(StarcalNode):
         prior = self._setup.prior.camera
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
             raise ValueError('calibration: of another image size than the prior camera')
-        self._geometry = geometry
+        self._geometry = self._tracked = geometry
         self.get_logger().info('stars are predicted with the calibration in force')
 
     def _attitude_has_come(self, time_ns: int) -> bool:
@@ -193,14 +194,18 @@ class StarObserver(StarcalNode):
         except ImageRefused as refused:
             self._publish(self._refused(waiting, refused.reason, refused.detail))
             return
-        geometry = self._geometry
         if self._latest_ns is not None and image.time_ns <= self._latest_ns:
             observations = pipeline.out_of_order(image, self._latest_ns)
         else:
             self._latest_ns = image.time_ns
             observations = pipeline.observe(
-                image, self._attitudes, self._setup, geometry, self._velocity_at(image.time_ns)
+                image,
+                self._attitudes,
+                self._setup,
+                self._tracked,
+                self._velocity_at(image.time_ns),
             )
+            self._tracked = tracked(self._geometry, observations)
         self._publish(observations)
         if self._annotated.get_subscription_count():
             self._publish_annotated(image, observations)
@@ -232,7 +237,7 @@ class StarObserver(StarcalNode):
             self.get_logger().debug(f'{len(observations)} stars')
 
     def _publish_annotated(self, image: Image, observations: StarObservations) -> None:
-        picture = annotate(image, observations, self._geometry)
+        picture = annotate(image, observations, self._tracked)
         frame_id = self._setup.frames.camera_frame
         self._annotated.publish(
             messages.color_image_to_message(image.time_ns, picture, frame_id, make_message)
