@@ -29,6 +29,7 @@ StateT = TypeVar('StateT')
 _MAX_ITERATIONS = 100
 _STEP_TOLERANCE = 1e-9  # of a parameter's own 1-sigma scale: nobody can tell such a difference
 _COST_TOLERANCE = 1e-13  # relative; under 100 roundings of a cost summed in double precision
+_SCHUR_TOLERANCE = 1e-12  # a sum of a million products keeps twelve digits
 _LAMBDA_START = 1e-3  # (paper, step 4)
 _LAMBDA_MAX = 1e12
 
@@ -102,6 +103,21 @@ def _inverse(matrix: Floats) -> Floats:
     return np.asarray(scale[..., :, None] * inverse * scale[..., None, :])
 
 
+def _schur_complement(A: Floats, flat_B: Floats, W: Floats) -> Floats:
+    """
+    ``A - B' C^-1 B`` (p, p): what the blocks leave of the shared unknowns.
+
+    Raises
+    ------
+    NotObservable
+        When of an unknown only rounding is left.
+    """
+    S = A - flat_B.T @ W.reshape(-1, A.shape[0])
+    if (np.diag(S) < _SCHUR_TOLERANCE * np.diag(A)).any():
+        raise NotObservable('the blocks explain a shared unknown')
+    return np.asarray(S)
+
+
 def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats]:
     """
     Step (p,) and (m, q) of ``(N + damping diag N) step = [a; c]`` by block elimination (Eq. 25).
@@ -121,8 +137,7 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
     W = C_inverse @ normal.B
     w = np.einsum('mij,mj->mi', C_inverse, normal.c)
     flat_B = normal.B.reshape(-1, p)
-    S = A - flat_B.T @ W.reshape(-1, p)
-    shared = _inverse(S) @ (normal.a - flat_B.T @ w.ravel())
+    shared = _inverse(_schur_complement(A, flat_B, W)) @ (normal.a - flat_B.T @ w.ravel())
     return shared, w - W @ shared
 
 
@@ -148,7 +163,7 @@ def covariance(normal: NormalEquations) -> tuple[Floats, Floats, Floats]:
         return _inverse(normal.A), np.empty_like(normal.B), np.empty_like(normal.C)
     C_inverse = _inverse(normal.C)
     W = C_inverse @ normal.B
-    shared = _inverse(normal.A - normal.B.reshape(-1, p).T @ W.reshape(-1, p))
+    shared = _inverse(_schur_complement(normal.A, normal.B.reshape(-1, p), W))
     cross = -W @ shared
     return shared, cross, C_inverse - cross @ np.swapaxes(W, -1, -2)
 
@@ -197,7 +212,9 @@ def levenberg_marquardt(
             shared @ (damping * np.diag(normal.A) * shared + normal.a)
             + (blocks * (damping * np.einsum('mii->mi', normal.C) * blocks + normal.c)).sum()
         )
-        if scaled < _STEP_TOLERANCE or promised < _COST_TOLERANCE * normal.cost:
+        # Damping shortens a step: what matters is how far it would go without.
+        reach = 1.0 + damping
+        if scaled * reach < _STEP_TOLERANCE or promised * reach < _COST_TOLERANCE * normal.cost:
             return Solution(state, normal, iteration, 'converged')
         candidate = move(state, shared, blocks)
         candidate_normal = evaluate(candidate)

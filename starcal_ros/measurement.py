@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 CAMERA = slice(0, 10)
 ROTATION = slice(10, 13)
 RESIDUAL = 13
-_CHUNK_STARS = 2048  # columns of one chunk stay in the second-level cache
+_CHUNK_STARS = 8192  # measured: calls into numpy cost more below, the cache more above
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,10 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
     chunks = []
     first = 0
     while first < len(images):
-        last = first + 1
-        while last < len(images) and (last + 1 - first) * counts[images[last]] <= _CHUNK_STARS:
-            last += 1
+        # No image is padded by more than half, and none alone is too large for a chunk.
+        like = counts[images] <= 1.5 * counts[images[first]] + 8
+        fits = np.arange(1, len(images) - first + 1) * counts[images[first:]] <= _CHUNK_STARS
+        last = first + max(1, int(np.count_nonzero(like[first:] & fits)))
         chosen = images[first:last]
         width = counts[chosen[-1]]
         slot = np.arange(width)
@@ -155,83 +156,110 @@ def normal_blocks(
     """
     blocks = np.zeros((measurements.image_count, 14, 14))
     cost = 0.0
+    largest = max((chunk.measured_px[0].size for chunk in measurements.chunks), default=0)
+    # Fresh pages for every chunk would cost as much as the arithmetic on them.
+    J_memory, copy_memory = np.empty(28 * largest), np.empty(28 * largest)
     for chunk in measurements.chunks:
-        J, s = _whitened_columns(chunk, parameters, camera_from_icrf[chunk.image])
-        if J is None:
+        m, n = chunk.measured_px[0].shape
+        J = J_memory[: 28 * m * n].reshape(m, 14, 2 * n)
+        if not _whitened_columns(chunk, parameters, camera_from_icrf[chunk.image], J):
             return np.inf, blocks
         if np.isfinite(loss_scale):
+            s = J[:, RESIDUAL, :n] ** 2 + J[:, RESIDUAL, n:] ** 2
             c2 = loss_scale**2
             cost += 0.5 * c2 * float(np.log1p(s / c2).sum())
             root_weight = 1.0 / np.sqrt(1.0 + s / c2)
             J *= np.concatenate([root_weight, root_weight], axis=-1)[:, None, :]
-        else:
-            cost += 0.5 * float(s.sum())
-        blocks[chunk.image] = J @ J.transpose(0, 2, 1)
+        # numpy takes A @ A.T to a routine for symmetric products, which for 14 rows is half as
+        # fast as the general one: it must not see that both factors are the same.
+        copy = copy_memory[: 28 * m * n].reshape(m, 14, 2 * n)
+        copy[...] = J
+        blocks[chunk.image] = copy @ J.transpose(0, 2, 1)
+    if not np.isfinite(loss_scale):
+        cost = 0.5 * float(blocks[:, RESIDUAL, RESIDUAL].sum())
     return cost, blocks
 
 
 def _whitened_columns(
-    chunk: _Chunk, parameters: Floats, camera_from_icrf: Floats
-) -> tuple[Floats | None, Floats]:
+    chunk: _Chunk, parameters: Floats, camera_from_icrf: Floats, J: Floats
+) -> bool:
     """
-    Whitened derivatives and residuals (m, 14, 2n) of a chunk, and squared residuals (m, n).
+    Write the whitened derivatives and residuals of a chunk into J, (m, 14, 2n).
 
-    The first n of the last axis are the u rows, the others the v rows.  None when a star is
-    behind the camera.  The columns are those of `camera.project_jacobians`, written one by one
-    where the matrix product wants them.
+    The first n of the last axis are the u rows, the others the v rows.  False when a star is
+    behind the camera.  The columns are those of `camera.project_jacobians`, whitened as they are
+    made and in place: most of the time of a calibration is spent here, in memory traffic.
     """
     e = camera_from_icrf @ chunk.direction_icrf
     z = e[:, 2]
     if z.min() <= 0:
-        return None, z
+        return False
     fx, skew, fy, cx, cy, k1, k2, k3, p1, p2 = parameters
-    x, y = e[:, 0] / z, e[:, 1] / z
+    n = z.shape[1]
+    U, V = J[:, :, :n], J[:, :, n:]
+    scratch = np.empty_like(z)
+    multiply = np.multiply
+    wuu, wvu, wvv = chunk.whitener
+    # Whitened rows by the distorted image plane: u = uu x' + uv y', v = vu x' + vv y'.
+    uu, uv, vu, vv = wuu * fx, wuu * skew, wvu * fx, wvu * skew + wvv * fy
+
+    def put(column: int, dx: Floats, dy: Floats) -> None:
+        multiply(uu, dx, out=U[:, column])
+        multiply(uv, dy, out=scratch)
+        U[:, column] += scratch
+        multiply(vu, dx, out=V[:, column])
+        multiply(vv, dy, out=scratch)
+        V[:, column] += scratch
+
+    z_inverse = 1.0 / z
+    x, y = e[:, 0] * z_inverse, e[:, 1] * z_inverse
     xx, yy, xy = x * x, y * y, x * y
     r2 = xx + yy
-    r4 = r2 * r2
-    r6 = r4 * r2
-    g = 1.0 + k1 * r2 + k2 * r4 + k3 * r6
-    xy2 = 2.0 * xy
-    r2_xx = r2 + 2.0 * xx
-    r2_yy = r2 + 2.0 * yy
-    xd = g * x + p1 * xy2 + p2 * r2_xx
-    yd = g * y + p1 * r2_yy + p2 * xy2
-    g2 = 2.0 * (k1 + 2.0 * k2 * r2 + 3.0 * k3 * r4)
-    cross = xy * g2 + 2.0 * (p1 * x + p2 * y)
-    x_x = g + xx * g2 + 2.0 * p1 * y + 6.0 * p2 * x
-    y_y = g + yy * g2 + 6.0 * p1 * y + 2.0 * p2 * x
-    u_x, u_y = fx * x_x + skew * cross, fx * cross + skew * y_y
-    v_x, v_y = fy * cross, fy * y_y
+    xy_2, r2_2xx, r2_2yy = 2.0 * xy, r2 + 2.0 * xx, r2 + 2.0 * yy
+    put(8, xy_2, r2_2yy)
+    put(9, r2_2xx, xy_2)
+    put(5, x, y)
+    for W in (U, V):
+        W[:, 5] *= r2
+        multiply(W[:, 5], r2, out=W[:, 6])
+        multiply(W[:, 6], r2, out=W[:, 7])
 
-    wuu, wvu, wvv = chunk.whitener
-    m, n = z.shape
-    J = np.empty((m, 14, 2 * n))
-
-    def put(column: int, du: Floats, dv: Floats) -> None:
-        np.multiply(wuu, du, out=J[:, column, :n])
-        J[:, column, n:] = wvu * du + wvv * dv
-
-    def put_distortion(column: int, dx: Floats, dy: Floats) -> None:
-        put(column, fx * dx + skew * dy, fy * dy)
-
-    J[:, 0, :n], J[:, 0, n:] = wuu * xd, wvu * xd
-    J[:, 1, :n], J[:, 1, n:] = wuu * yd, wvu * yd
-    J[:, 2, :n], J[:, 2, n:] = 0.0, wvv * yd
-    J[:, 3, :n], J[:, 3, n:] = wuu, wvu
-    J[:, 4, :n], J[:, 4, n:] = 0.0, wvv
-    put_distortion(5, r2 * x, r2 * y)
-    put_distortion(6, r4 * x, r4 * y)
-    put_distortion(7, r6 * x, r6 * y)
-    put_distortion(8, xy2, r2_yy)
-    put_distortion(9, r2_xx, xy2)
+    g = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    g_r2 = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)))
+    xd = g * x + p1 * xy_2 + p2 * r2_2xx
+    yd = g * y + p1 * r2_2yy + p2 * xy_2
+    cross = xy * g_r2 + (2.0 * p1) * x + (2.0 * p2) * y
+    x_x = xx * g_r2 + g + (2.0 * p1) * y + (6.0 * p2) * x
+    y_y = yy * g_r2 + g + (6.0 * p1) * y + (2.0 * p2) * x
     one_xx, one_yy = 1.0 + xx, 1.0 + yy
-    put(10, u_x * xy + u_y * one_yy, v_x * xy + v_y * one_yy)
-    put(11, -u_x * one_xx - u_y * xy, -v_x * one_xx - v_y * xy)
-    put(12, u_x * y - u_y * x, v_x * y - v_y * x)
+    for W, by_x, by_y in (
+        (U, uu * x_x + uv * cross, uu * cross + uv * y_y),
+        (V, vu * x_x + vv * cross, vu * cross + vv * y_y),
+    ):
+        multiply(by_x, xy, out=W[:, 10])
+        multiply(by_y, one_yy, out=scratch)
+        W[:, 10] += scratch
+        multiply(by_x, one_xx, out=W[:, 11])
+        multiply(by_y, xy, out=scratch)
+        W[:, 11] += scratch
+        np.negative(W[:, 11], out=W[:, 11])
+        multiply(by_x, y, out=W[:, 12])
+        multiply(by_y, x, out=scratch)
+        W[:, 12] -= scratch
+
+    multiply(wuu, xd, out=U[:, 0])
+    multiply(wvu, xd, out=V[:, 0])
+    multiply(wuu, yd, out=U[:, 1])
+    multiply(wvu, yd, out=V[:, 1])
+    U[:, 2], U[:, 3], U[:, 4] = 0.0, wuu, 0.0
+    multiply(wvv, yd, out=V[:, 2])
+    V[:, 3], V[:, 4] = wvu, wvv
     u, v = chunk.measured_px
-    put(RESIDUAL, u - (fx * xd + skew * yd + cx), v - (fy * yd + cy))
-    s = J[:, RESIDUAL, :n] ** 2 + J[:, RESIDUAL, n:] ** 2
-    return J, s
+    residual_u = u - cx - fx * xd - skew * yd
+    residual_v = v - cy - fy * yd
+    multiply(wuu, residual_u, out=U[:, RESIDUAL])
+    V[:, RESIDUAL] = wvu * residual_u + wvv * residual_v
+    return True
 
 
 def residuals_px(table: StarTable, parameters: Floats, camera_from_icrf: Floats) -> Floats:
