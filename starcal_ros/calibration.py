@@ -244,7 +244,7 @@ def _search(
     iterations = solution.iterations
     residual_px = _residuals(solution.state, table)
     variance = estimate_variance(residual_px, table.covariance_px2, everything, 1.0)
-    kept = _fitting(residual_px, variance.of(table.covariance_px2), options)
+    kept = _fitting(residual_px, table, variance, options)
     for _ in range(_SNOOPING_ROUNDS):
         covariance_px2 = variance.of(table.covariance_px2)
         solution = _minimise(problem, solution.state, arrange(table, kept, covariance_px2), np.inf)
@@ -253,7 +253,7 @@ def _search(
         kept_before, variance_before = kept, variance
         freedom = _degrees_of_freedom(problem, table, kept) / (2 * np.count_nonzero(kept))
         variance = estimate_variance(residual_px, table.covariance_px2, kept, freedom)
-        kept = _fitting(residual_px, variance.of(table.covariance_px2), options)
+        kept = _fitting(residual_px, table, variance, options)
         if np.array_equal(kept, kept_before) and variance.is_close_to(variance_before):
             break
     kept, variance = kept_before, variance_before
@@ -275,9 +275,15 @@ def _search(
     )
 
 
-def _fitting(residual_px: Floats, covariance_px2: Floats, options: CalibrationOptions) -> Mask:
-    """Return (n,) whether a residual is no outlier."""
-    return np.asarray(squared_sigmas(residual_px, covariance_px2) < options.outlier_sigma**2)
+def _fitting(
+    residual_px: Floats, table: StarTable, variance: CentroidVariance, options: CalibrationOptions
+) -> Mask:
+    """Return (n,) whether a star is no outlier, in an image that has enough of such."""
+    length2 = squared_sigmas(residual_px, variance.of(table.covariance_px2))
+    fits = length2 < options.outlier_sigma**2
+    # The rotation of an image fits any one star, and two as good as any.
+    left = np.bincount(table.image[fits], minlength=table.image_count)
+    return np.asarray(fits & (left[table.image] >= 3))
 
 
 def _residuals(state: State, table: StarTable) -> Floats:

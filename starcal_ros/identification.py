@@ -399,7 +399,7 @@ def tracked(base: CameraGeometry, observations: StarObservations) -> CameraGeome
     The geometry with which to predict the next image: the base, aligned as this image shows.
 
     What launch has turned is found once, by the search of a whole image; from then on stars are
-    looked for where they are.  A refused image leaves the base.  Measurements do not depend on it.
+    looked for where they are.  A refused image leaves the base.
     """
     if observations.refusal:
         return base

@@ -331,12 +331,7 @@ def test_images_of_very_unlike_star_counts(method: str) -> None:
     assert_true_to_its_covariance(errors, 11)
 
 
-LONE_STAR = pytest.mark.xfail(reason='a rotation of its own fits one wrong star: rank two')
-
-
-@pytest.mark.parametrize(
-    'method', [pytest.param(m, marks=LONE_STAR if m == 'per_image' else ()) for m in METHODS]
-)
+@pytest.mark.parametrize('method', METHODS)
 def test_an_image_that_loses_all_its_stars_spoils_nothing(method: str) -> None:
     noisy = with_noise(clean(), 1, tracker_of(method))
     wrong = noisy.images[4]
