@@ -1,0 +1,444 @@
+"""Centroids of rendered stars: the Cramer-Rao bound, true covariances, no bias, good refusals."""
+
+from __future__ import annotations
+
+from collections import Counter
+import dataclasses
+
+import numpy as np
+import pytest
+
+from starcal_ros.centroiding import (
+    CentroidOptions,
+    Centroids,
+    detect,
+    fit_psf,
+    ImageModel,
+    measure_background,
+    measure_stars,
+    model_image,
+    PixelNoise,
+    sample_mesh,
+    saturation_level,
+)
+from starcal_ros.records import STAR_REFUSALS
+from starcal_ros.synthetic import centroid_bound, Detector, expose, star_electrons
+
+SHAPE = (512, 640)
+QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
+PSF, MOMENT = CentroidOptions(), CentroidOptions(centroid='moment')
+
+
+def star_grid(seed: int, spacing: int = 24, shape: tuple[int, int] = SHAPE) -> np.ndarray:
+    """Places (n, 2) a spacing apart, each anywhere in its pixel."""
+    v, u = np.mgrid[spacing : shape[0] - spacing : spacing, spacing : shape[1] - spacing : spacing]
+    phase = np.random.default_rng([seed, 0]).uniform(-0.5, 0.5, (u.size, 2))
+    return np.asarray(np.stack([u.ravel(), v.ravel()], axis=-1) + phase)
+
+
+def unlike_fluxes(seed: int, n: int) -> np.ndarray:
+    """Electrons (n,) of stars over four magnitudes."""
+    return np.asarray(300.0 * 50.0 ** np.random.default_rng([seed, 2]).uniform(size=n))
+
+
+def exposed(
+    seed: int, xy: np.ndarray, flux: np.ndarray, detector: Detector, more: float | np.ndarray = 0.0
+) -> np.ndarray:
+    """An image of stars of a flux (n,) in electrons, with more light added."""
+    mean = star_electrons(xy, np.asarray(flux, float), detector.psf_sigma_px, SHAPE)
+    return expose(
+        mean + detector.background_electrons + more, detector, np.random.default_rng([seed, 1])
+    )
+
+
+def modelled(pixels: np.ndarray, options: CentroidOptions = PSF) -> ImageModel:
+    background = measure_background(pixels)
+    return model_image(pixels, background, detect(pixels, background, options), options)
+
+
+def measured(pixels: np.ndarray, xy: np.ndarray, options: CentroidOptions = PSF) -> Centroids:
+    return measure_stars(pixels, xy, modelled(pixels, options), options)
+
+
+def field(
+    seed: int, detector: Detector, options: CentroidOptions = PSF
+) -> tuple[np.ndarray, Centroids, np.ndarray, np.ndarray]:
+    """Errors (n, 2), centroids, bound variances (n, 2), snr (n,) of one image of unlike stars."""
+    xy = star_grid(seed)
+    # The same contrast for any width: the area of the PSF.
+    area = (detector.psf_sigma_px / 0.95) ** 2
+    flux = area * unlike_fluxes(seed, len(xy))
+    found = measured(exposed(seed, xy, flux, detector), xy, options)
+    bound, snr = centroid_bound(xy, flux, detector, SHAPE)
+    return found.xy_px - xy, found, bound[:, [0, 1], [0, 1]], snr
+
+
+@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3, 2.0])
+@pytest.mark.parametrize('bits', [8, 12])
+def test_the_fit_reaches_the_cramer_rao_bound(psf_sigma_px: float, bits: int) -> None:
+    detector = dataclasses.replace(QUIET, psf_sigma_px=psf_sigma_px)
+    if bits == 8:  # the same stars on 256 steps: 16000 electrons peak at 3100
+        detector = dataclasses.replace(detector, bits=8, electrons_per_dn=20.0, offset_dn=12.0)
+    over_bound, over_sigma, refused = [], [], Counter[str]()
+    for seed in range(6):
+        error, found, bound, snr = field(seed, detector)
+        bright = snr > 10
+        good = bright & (found.refusal == '')
+        refused.update(found.refusal[bright & ~good].tolist())
+        over_bound.append(error[good] ** 2 / bound[good])
+        over_sigma.append(error[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
+    stars = sum(map(len, over_bound))
+    assert stars > 2000 and refused.total() < 0.005 * stars, refused
+    # Two coordinates of 2400 stars: the ratios are known to 1 %; three of those below 1.
+    ratio = np.sqrt(np.concatenate(over_bound).mean())
+    assert 0.97 < ratio < 1.05
+    # The gain found from the image is up to 15 % high for the sharpest PSF, sigma 5 % low; for the
+    # widest some of the noise of faint pixels passes for an error of the PSF, sigma 6 % high.
+    truth = np.sqrt(np.concatenate(over_sigma).mean())
+    assert 0.93 < truth < 1.07
+
+
+def test_the_covariance_is_true_where_the_gain_is_given() -> None:
+    options = CentroidOptions(gain_e_per_dn=QUIET.electrons_per_dn)
+    squared = []
+    for seed in range(6):
+        error, found, _, snr = field(seed, QUIET, options)
+        good = (snr > 10) & (found.refusal == '')
+        squared.append(error[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
+    # Known to 1 %.
+    assert np.sqrt(np.concatenate(squared).mean()) == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3, 2.0])
+def test_no_bias_with_the_phase_in_the_pixel(psf_sigma_px: float) -> None:
+    # So bright (16 bit) that a single centroid is good to 1.5e-3 sigma.
+    detector = dataclasses.replace(
+        QUIET, psf_sigma_px=psf_sigma_px, bits=16, electrons_per_dn=10.0, offset_dn=500.0
+    )
+    error, phase = [], []
+    for seed in range(4):
+        xy = star_grid(10 + seed)
+        found = measured(exposed(seed, xy, np.full(len(xy), 4e5), detector), xy)
+        good = found.refusal == ''
+        assert good.mean() > 0.99
+        error.append((found.xy_px - xy)[good])
+        phase.append((xy - np.rint(xy))[good])
+    bins = np.digitize(np.concatenate(phase).ravel(), np.linspace(-0.5, 0.5, 11)) - 1
+    bias = np.bincount(bins, np.concatenate(error).ravel()) / np.bincount(bins)
+    # 330 centroids in each of ten bins: means good to 2e-4 px.
+    assert len(bias) == 10 and np.abs(bias).max() < 0.002
+
+
+def test_moments_are_pulled_to_the_middle_of_the_pixel() -> None:
+    # The paper's method cuts the wings off, at 3 px and at its threshold.
+    detector = dataclasses.replace(QUIET, bits=16, electrons_per_dn=10.0, offset_dn=500.0)
+    for flux, bias_px in ((4e5, 0.03), (8e3, 0.08)):
+        xy = star_grid(20)
+        found = measured(exposed(20, xy, np.full(len(xy), flux), detector), xy, MOMENT)
+        good = found.refusal == ''
+        assert good.mean() > 0.95
+        error = (found.xy_px - xy)[good]
+        phase = (xy - np.rint(xy))[good]
+        bins = np.digitize(phase.ravel(), np.linspace(-0.5, 0.5, 11)) - 1
+        bias = np.bincount(bins, error.ravel()) / np.bincount(bins)
+        assert np.abs(bias).max() < bias_px
+        assert np.sqrt((error**2).mean()) < 1.5 * bias_px
+
+
+def test_moments_are_worse_than_the_fit_but_no_more_than_twice() -> None:
+    rms = {}
+    for name, options in (('psf', PSF), ('moment', MOMENT)):
+        squared = []
+        for seed in range(3):
+            error, found, _, snr = field(seed, QUIET, options)
+            squared.append(error[(found.refusal == '') & (snr > 20)] ** 2)
+        rms[name] = np.sqrt(np.concatenate(squared).mean())
+    assert rms['psf'] < rms['moment'] < 2.0 * rms['psf']
+
+
+def test_background_and_noise_under_stars_and_a_gradient() -> None:
+    xy = star_grid(3)
+    flux = unlike_fluxes(3, len(xy))
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    glow = 0.15 * u + 0.1 * v  # electrons: 24 DN across, 13 DN down
+    pixels = exposed(3, xy, flux, QUIET, glow)
+    background = measure_background(pixels)
+    places = np.stack([u[::37, ::41].ravel(), v[::37, ::41].ravel()], axis=-1).astype(float)
+    glow_there = 0.15 * places[:, 0] + 0.1 * places[:, 1]
+    level_dn = QUIET.offset_dn + (glow_there + QUIET.background_electrons) / 4.0
+    noise_dn = np.sqrt(QUIET.noise_electrons**2 + glow_there) / 4.0
+    level = sample_mesh(background.level_mesh, SHAPE, places) - level_dn
+    noise = sample_mesh(background.noise_mesh, SHAPE, places) / noise_dn
+    inner = (np.abs(places - [320, 256]) < [280, 216]).all(axis=1)
+    # A cell of 256 samples knows its mean to 0.06 sigma; wings of stars lift it by as much more.
+    assert np.abs(level[inner]).max() < 0.5 * noise_dn.max()
+    assert np.abs(level[inner].mean()) < 0.2 * noise_dn.mean()
+    # The gradient itself, 1.4 DN across a cell, adds 2 % to the spread; wings of stars the rest.
+    assert 0.95 < np.median(noise[inner]) < 1.10
+    assert background.noise_dn == pytest.approx(np.median(noise_dn), rel=0.10)
+
+
+@pytest.mark.parametrize('read_noise', [2.0, 8.0, 40.0])
+def test_noise_of_a_dark_image(read_noise: float) -> None:
+    detector = dataclasses.replace(QUIET, read_noise_electrons=read_noise)
+    pixels = expose(np.full(SHAPE, 4.5), detector, np.random.default_rng(4))
+    background = measure_background(pixels)
+    # A fourth of 327,680 pixels: 0.25 %; half a rounding step more where steps are coarse.
+    assert background.noise_dn == pytest.approx(pixels.std(), rel=0.02)
+    assert background.level_dn == pytest.approx(pixels.mean(), abs=0.03 * background.noise_dn)
+
+
+def test_a_constant_image_has_the_noise_of_its_rounding() -> None:
+    background = measure_background(np.full(SHAPE, 77, np.uint8))
+    assert background.level_dn == 77
+    assert background.noise_dn == pytest.approx(np.sqrt(1 / 12))
+    assert len(detect(np.full(SHAPE, 77, np.uint8), background, PSF).snr) == 0
+
+
+@pytest.mark.parametrize('shape', [(5, 7), (31, 33), (64, 40), (100, 1000)])
+def test_images_of_any_size(shape: tuple[int, int]) -> None:
+    pixels = np.random.default_rng(5).normal(100, 3, shape).astype(np.uint16)
+    background = measure_background(pixels)
+    assert background.level_dn == pytest.approx(99.5, abs=2.0)
+    sources = detect(pixels, background, PSF)
+    model = model_image(pixels, background, sources, PSF)
+    assert model.psf_sigma_px == 0.0  # no stars to tell
+
+
+def test_all_stars_above_eight_sigma_are_detected() -> None:
+    found_all, total = 0, 0
+    for seed in range(5):
+        xy = star_grid(seed)
+        flux = np.random.default_rng([seed, 2]).uniform(150, 1500, len(xy))
+        pixels = exposed(seed, xy, flux, QUIET)
+        sources = detect(pixels, measure_background(pixels), PSF)
+        _, snr = centroid_bound(xy, flux, QUIET, SHAPE)
+        distance = np.linalg.norm(xy[snr > 8][:, None] - sources.xy_px[None], axis=2)
+        found_all += int((distance.min(axis=1) < 1.0).sum())
+        total += len(distance)
+        near = distance.min(axis=1)
+        # At the faint end 0.2 px is one sigma of what a star of 8 sigma can say.
+        assert np.sqrt(np.mean(near[near < 1.0] ** 2)) < 0.25
+    # 8 less 5 is three sigma: one in 700, and most of these stars are brighter.
+    assert total > 1500 and found_all > 0.998 * total
+
+
+@pytest.mark.parametrize(('threshold', 'images'), [(3.5, 3), (5.0, 20)])
+def test_noise_alone_gives_no_more_detections_than_it_should(
+    threshold: float, images: int
+) -> None:
+    # Local maxima of a Gaussian field above t sigma: (2 pi)^-3/2 L t exp(-t^2 / 2) per pixel with
+    # L = 1 / (2 s^2) of the filter: 80 per image at 3.5 sigma, 0.2 at 5.
+    density = (2 * np.pi) ** -1.5 * 0.5 * threshold * np.exp(-0.5 * threshold**2)
+    expected = density * SHAPE[0] * SHAPE[1] * images
+    detector = dataclasses.replace(QUIET, electrons_per_dn=1.0, offset_dn=100.0)
+    count = 0
+    for seed in range(images):
+        pixels = expose(np.full(SHAPE, 4.5), detector, np.random.default_rng([seed, 6]))
+        options = CentroidOptions(detection_sigma=threshold)
+        count += len(detect(pixels, measure_background(pixels), options).snr)
+    # Poisson; the noise, 1 % off, changes the count by 12 % at 3.5 sigma and 25 % at 5.
+    assert count < 1.25 * expected + 3 * np.sqrt(expected)
+    assert count > 0.75 * expected - 3 * np.sqrt(expected)
+
+
+@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3])
+def test_gain_and_width_are_found_from_the_image(psf_sigma_px: float) -> None:
+    detector = dataclasses.replace(QUIET, psf_sigma_px=psf_sigma_px)
+    gains, widths = [], []
+    for seed in range(6):
+        xy = star_grid(seed)
+        flux = unlike_fluxes(seed, len(xy))
+        model = modelled(exposed(seed, xy, flux, detector))
+        gains.append(model.pixel_noise.gain_e_per_dn)
+        widths.append(model.psf_sigma_px)
+    assert np.mean(gains) == pytest.approx(4.0, rel=0.20)
+    assert np.mean(widths) == pytest.approx(psf_sigma_px, rel=0.005)
+
+
+def test_a_given_gain_is_kept() -> None:
+    xy = star_grid(1)
+    pixels = exposed(1, xy, np.full(len(xy), 8000.0), QUIET)
+    model = modelled(pixels, CentroidOptions(gain_e_per_dn=3.3))
+    assert model.pixel_noise.gain_e_per_dn == pytest.approx(3.3)
+
+
+def one_star(
+    at: tuple[float, float] = (300.3, 200.6), flux: float = 8000.0, more: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """An image of the grid with the star nearest to a place moved there, and its place (1, 2)."""
+    place = np.array([at])
+    xy = star_grid(7)
+    xy = xy[np.linalg.norm(xy - place, axis=1) > 24]
+    fluxes = np.r_[np.full(len(xy), 4000.0), flux]
+    more_light = np.zeros(SHAPE) if more is None else more
+    return exposed(7, np.concatenate([xy, place]), fluxes, QUIET, more_light), place
+
+
+both_methods = pytest.mark.parametrize('options', [PSF, MOMENT], ids=['psf', 'moment'])
+
+
+@both_methods
+def test_an_ordinary_star_is_measured(options: CentroidOptions) -> None:
+    pixels, place = one_star()
+    found = measured(pixels, place, options)
+    assert found.refusal[0] == ''
+    assert np.abs(found.xy_px - place).max() < 0.1
+    # A moment mask misses some of the wings.
+    assert found.flux_dn[0] == pytest.approx(2000.0, rel=0.12)
+    # The prediction need not be right to the pixel.
+    off = measured(pixels, place + np.array([0.9, -0.8]), options)
+    np.testing.assert_allclose(off.xy_px, found.xy_px, rtol=0, atol=0.01)
+
+
+@both_methods
+def test_a_saturated_star_is_refused(options: CentroidOptions) -> None:
+    pixels, place = one_star(flux=3e5)
+    assert pixels.max() == 4095
+    assert measured(pixels, place, options).refusal[0] == 'saturated'
+
+
+def test_a_saturated_star_can_be_measured_by_what_is_left_of_it() -> None:
+    pixels, place = one_star(flux=2e5)
+    options = CentroidOptions(max_saturated_pixels=9)
+    found = measured(pixels, place, options)
+    saturated = (pixels[195:206, 295:306] >= 0.98 * 4095).sum()
+    assert 1 <= saturated <= 9
+    assert found.refusal[0] == ''
+    # Full flux, and a place as good as its own covariance says.
+    assert found.flux_dn[0] == pytest.approx(5e4, rel=0.03)
+    sigma = np.sqrt(found.covariance_px2[0, [0, 2]])
+    assert (np.abs(found.xy_px - place)[0] < 4 * sigma + 0.005).all()
+
+
+@pytest.mark.parametrize(
+    ('dtype', 'peak', 'count', 'expected'),
+    [
+        (np.uint8, 255, 1, 0.98 * 255),
+        (np.uint8, 254, 1, 255.0),
+        (np.uint8, 200, 4, 0.98 * 200),
+        (np.uint16, 4095, 1, 0.98 * 4095),
+        (np.uint16, 16383, 1, 0.98 * 16383),
+        (np.uint16, 65535, 1, 0.98 * 65535),
+        (np.uint16, 3000, 1, 3001.0),
+        (np.uint16, 3000, 3, 3001.0),
+        (np.uint16, 3000, 4, 0.98 * 3000),
+    ],
+)
+def test_the_saturation_level(dtype: type, peak: int, count: int, expected: float) -> None:
+    pixels: np.ndarray = np.random.default_rng(8).integers(20, 60, SHAPE).astype(dtype)
+    pixels.flat[:count] = peak
+    assert saturation_level(pixels, PSF) == pytest.approx(expected)
+    assert saturation_level(pixels, CentroidOptions(saturation_dn=123.0)) == 123.0
+
+
+@both_methods
+def test_a_star_at_the_border_is_refused(options: CentroidOptions) -> None:
+    pixels, _ = one_star()
+    height, width = SHAPE
+    edge = np.array(
+        [
+            [1.0, 200.0], [width - 2.0, 200.0], [300.0, 1.0], [300.0, height - 2.0],
+            [-50.0, 10.0], [1e9, 1e9], [np.nan, 5.0],
+        ]
+    )  # fmt: skip
+    assert (measured(pixels, edge, options).refusal == 'border').all()
+
+
+@both_methods
+def test_where_no_star_is_none_is_measured(options: CentroidOptions) -> None:
+    pixels, _ = one_star()
+    # Between the stars of the grid.
+    empty = star_grid(7)[5:200] + 12.0
+    found = measured(pixels, empty, options)
+    refused = Counter(found.refusal.tolist())
+    # The moments count what stands above their threshold alone: one in 200 is noise.
+    assert refused[''] <= (0 if options is PSF else 2), refused
+    assert set(refused) <= {'', *STAR_REFUSALS}
+
+
+@pytest.mark.parametrize(
+    'options',
+    [PSF, pytest.param(MOMENT, marks=pytest.mark.xfail(raises=ValueError, reason='reshape'))],
+)
+def test_no_star_asked_for_none_measured(options: CentroidOptions) -> None:
+    pixels, _ = one_star()
+    found = measured(pixels, np.empty((0, 2)), options)
+    assert found.xy_px.shape == (0, 2) and found.covariance_px2.shape == (0, 3)
+    assert len(found.refusal) == 0
+
+
+def test_lit_single_pixels_are_no_sources() -> None:
+    hot = np.zeros(SHAPE)
+    rng = np.random.default_rng(9)
+    hot.flat[rng.choice(hot.size, 200, replace=False)] = rng.uniform(300, 6000, 200)
+    pixels = expose(hot + QUIET.background_electrons, QUIET, rng)
+    sources = detect(pixels, measure_background(pixels), PSF)
+    # Two of them side by side may pass for a source.
+    assert len(sources.snr) <= 2
+
+
+@pytest.mark.parametrize('offset', [(1, 0), (1, 1), (2, -1)])
+def test_a_star_with_a_hot_pixel_in_it_is_refused(offset: tuple[int, int]) -> None:
+    hot = np.zeros(SHAPE)
+    hot[201 + offset[1], 300 + offset[0]] = 1500.0
+    pixels, place = one_star(more=hot)
+    assert measured(pixels, place).refusal[0] == 'elongated'
+
+
+def test_a_star_with_a_cosmic_ray_through_it_is_refused() -> None:
+    track = np.zeros(SHAPE)
+    for k in range(-5, 6):
+        track[200 + k // 2, 300 + k] = 700.0
+    pixels, place = one_star(more=track)
+    assert measured(pixels, place).refusal[0] == 'elongated'
+
+
+@both_methods
+def test_a_smeared_star_is_refused(options: CentroidOptions) -> None:
+    # Four exposures on a line of 4 px: sigma 1.8 px along it.
+    line = np.array([[299.0, 200.0], [300.0, 200.4], [301.0, 200.8], [302.0, 201.2]])
+    light = star_electrons(line, np.full(4, 2500.0), QUIET.psf_sigma_px, SHAPE)
+    pixels, _ = one_star(at=(400.0, 400.0), more=light)
+    # The grid has a star of its own there or not: ask where the line is brightest.
+    xy = np.array([[300.5, 200.6]])
+    assert measured(pixels, xy, options).refusal[0] in ('elongated', 'blend')
+
+
+def test_stars_that_all_are_elongated_alike_are_measured() -> None:
+    # A lens with astigmatism, 10 % more variance along u: every star, so none is suspect.
+    xy = star_grid(11)
+    half = np.array([0.3, 0.0])
+    pairs = np.concatenate([xy + half, xy - half])
+    pixels = exposed(11, pairs, np.full(len(pairs), 4000.0), QUIET)
+    found = measured(pixels, xy)
+    assert (found.refusal == '').mean() > 0.98
+    # A symmetric change of shape moves no centroid.
+    assert np.abs((found.xy_px - xy)[found.refusal == ''].mean(axis=0)).max() < 0.005
+
+
+def test_without_enough_bright_stars_the_width_is_not_known() -> None:
+    xy = star_grid(12)[:3]
+    pixels = exposed(12, xy, np.full(3, 8000.0), QUIET)
+    model = modelled(pixels)
+    assert model.psf_sigma_px == 0.0
+    found = measure_stars(pixels, xy, model, PSF)
+    assert (found.refusal == '').all() and np.abs(found.xy_px - xy).max() < 0.2
+
+
+def test_the_fit_itself_is_exact_on_its_own_model() -> None:
+    rng = np.random.default_rng(13)
+    centre = rng.uniform(-0.7, 0.7, (50, 2))
+    flux, level = rng.uniform(500, 5000, 50), rng.uniform(0, 100, 50)
+    stamps = np.array(
+        [
+            star_electrons(c[None] + 5, np.array([f]), 1.1, (11, 11)) + b
+            for c, f, b in zip(centre, flux, level, strict=True)
+        ]
+    )
+    fit = fit_psf(stamps, 1.1, np.full(50, 2.0), PixelNoise(4.0, 0.0))
+    expected = np.concatenate([centre, flux[:, None], level[:, None]], axis=1)
+    # The iteration ends on steps of 1e-7 px; the stamp cut off at 5 px matters to neither.
+    np.testing.assert_allclose(fit.parameters, expected, rtol=1e-6, atol=1e-6)
+    assert fit.reduced_chi2.max() < 1e-9
+    assert np.abs(fit.shape_change).max() < 1e-6
