@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 import sys
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +34,7 @@ Floats = NDArray[np.float64]
 Message = Any  # a message class of rclpy or of rosbags: they share field names and nothing else
 
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
+COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 ATTITUDE_TYPE = 'geometry_msgs/msg/QuaternionStamped'
 VELOCITY_TYPE = 'geometry_msgs/msg/TwistStamped'
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
@@ -41,6 +43,7 @@ OBSERVATIONS_TYPE = 'starcal/msg/StarObservations'
 CALIBRATION_TYPE = 'starcal/msg/Calibration'
 STATUS_TYPE = 'starcal/msg/EnsembleStatus'
 
+_PNG_MAGIC = b'\x89PNG\r\n\x1a\n'
 _PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 
 
@@ -120,15 +123,41 @@ def decode_image(
     return Image(time_ns, pixels)
 
 
+def decode_png(data: Any, time_ns: int) -> Image:
+    """
+    Pixels of a PNG of one channel, 8 or 16 bit.
+
+    Raises
+    ------
+    ImageRefused
+        ``bad_encoding`` for what is no such PNG; ``bad_layout`` for one that cannot be decoded.
+    """
+    # A JPEG would decode too, but what it does to a star of two pixels is no measurement.
+    if bytes(data[: len(_PNG_MAGIC)]) != _PNG_MAGIC:
+        raise ImageRefused('bad_encoding', 'the compressed image is not a PNG')
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise ImageRefused('bad_layout', f'{len(data)} bytes of PNG cannot be decoded')
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
+        raise ImageRefused(
+            'bad_encoding', f'the PNG is {pixels.dtype} of shape {pixels.shape}, not one channel'
+        )
+    pixels.setflags(write=False)
+    return Image(time_ns, pixels)  # type: ignore[arg-type]
+
+
 def image_from_message(message: Message, stamp_offset_s: float = 0.0) -> Image:
     """
-    Image of a sensor_msgs/Image, its time shifted to the middle of the exposure.
+    Image of a sensor_msgs/Image or CompressedImage, its time shifted to the middle of exposure.
 
     Raises
     ------
     ImageRefused
         ``bad_encoding`` or ``bad_layout``.
     """
+    if not hasattr(message, 'encoding'):
+        time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
+        return decode_png(message.data, time_ns)
     return decode_image(
         message.encoding,
         message.width,
@@ -143,11 +172,11 @@ def image_from_message(message: Message, stamp_offset_s: float = 0.0) -> Image:
 def refused_from_message(
     message: Message, stamp_offset_s: float, refused: ImageRefused
 ) -> StarObservations:
-    """Return the observations of a sensor_msgs/Image that cannot be used."""
+    """Return the observations of an image message that cannot be used."""
     return refused_image(
         stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s),
-        int(message.width),
-        int(message.height),
+        int(getattr(message, 'width', 0)),  # a compressed image does not say
+        int(getattr(message, 'height', 0)),
         refused.reason,
         refused.detail,
     )

@@ -23,6 +23,12 @@ class NodeOptions:
 class ObserverOptions:
     """How the star observer takes its inputs."""
 
+    image_transport: str = option(
+        'raw',
+        'raw: sensor_msgs/Image on image; compressed: PNG as sensor_msgs/CompressedImage on'
+        ' image/compressed',
+        choices=('raw', 'compressed'),
+    )
     image_reliability: str = option(
         'reliable',
         'reliability asked of the image publisher (best_effort loses large images)',

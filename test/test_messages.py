@@ -8,6 +8,7 @@ import sys
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -96,6 +97,31 @@ def test_image_refusals(change: dict[str, Any], reason: str, detail: str) -> Non
     assert refused.value.reason == reason
     assert detail in refused.value.detail
     assert len(refused.value.detail) < 200
+
+
+@pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
+def test_png(dtype: Any) -> None:
+    pixels = RAMP.astype(dtype)
+    data = array.array('B', cv2.imencode('.png', pixels)[1].tobytes())
+    header = messages.make_header(TIME_NS, '', plain)
+    image = messages.image_from_message(SimpleNamespace(header=header, data=data), 1e-9)
+    assert image.time_ns == TIME_NS + 1
+    np.testing.assert_array_equal(image.pixels, pixels, strict=True)
+
+
+@pytest.mark.parametrize(
+    ('data', 'reason'),
+    [
+        (b'', 'bad_encoding'),
+        (cv2.imencode('.jpg', RAMP.astype(np.uint8))[1].tobytes(), 'bad_encoding'),
+        (cv2.imencode('.png', np.zeros((2, 2, 3), np.uint8))[1].tobytes(), 'bad_encoding'),
+        (cv2.imencode('.png', RAMP)[1].tobytes()[:20], 'bad_layout'),
+    ],
+)
+def test_png_refusals(data: bytes, reason: str) -> None:
+    with pytest.raises(ImageRefused) as refused:
+        messages.decode_png(array.array('B', data), TIME_NS)
+    assert refused.value.reason == reason
 
 
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
@@ -257,7 +283,6 @@ def test_empty_calibration_is_refused() -> None:
 
 def test_camera_info_projects_like_the_calibration() -> None:
     """What a ROS reader makes of camera_info is the camera, to the cost the calibration names."""
-    cv2 = pytest.importorskip('cv2')
     record = calibration()
     message = messages.camera_info_to_message(record, make_message)
     assert message.distortion_model == 'plumb_bob'

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from typing import Any, TYPE_CHECKING
 
+import cv2
 import numpy as np
 import pytest
 
@@ -27,7 +28,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
@@ -81,6 +82,8 @@ def test_nodes_and_tool_give_the_same_calibration(
 ) -> None:
     for name in BOTH:
         start_node(name, ros=(*parameters(tiny_bag), *REMAPS))
+    # The player waits for the observer, but the calibrator must not miss the first image.
+    client.until(lambda: client.node.count_subscribers('/observations'))
     play(start_node, tiny_bag)
     status = client.latched(EnsembleStatus, 'ensemble_status')
     images = json.loads((tiny_bag / 'truth.json').read_text())['images']
@@ -208,6 +211,36 @@ def test_image_waits_for_its_attitude(
         attitudes.publish(sample.data)
     client.until(lambda: answers)
     assert answers[0].refusal == '' and len(answers[0].catalog_id) > 50
+
+
+def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    """A PNG on image/compressed gives the observations that the raw image gives, remaps too."""
+    raw_observer = start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
+    start_node(
+        'star_observer',
+        ros=(
+            *(*parameters(tiny_bag, 'image_transport:=compressed'), *REMAPS),
+            *('-r', 'observations:=of_png', '-r', '__node:=png_observer'),
+        ),
+    )
+    raw: list[Any] = client.collect(StarObservations, 'observations')
+    png: list[Any] = client.collect(StarObservations, 'of_png')
+    images = client.publisher(Image, '/opnav/image_raw', 10)
+    compressed = client.publisher(CompressedImage, '/opnav/image_raw/compressed', 10)
+    attitudes = client.publisher(QuaternionStamped, '/star_tracker/attitude')
+    client.until(lambda: attitudes.get_subscription_count() == 2)
+    first = next(iter(bag.read_images([tiny_bag], '/opnav/image_raw')))
+    assert isinstance(first, ImageRecord)
+    message = CompressedImage(format='mono16; png compressed')
+    message.header = messages.make_header(first.time_ns, 'camera', make_message)
+    message.data = array.array('B', cv2.imencode('.png', first.pixels)[1].tobytes())
+    compressed.publish(message)
+    images.publish(messages.image_to_message(first, 'camera', make_message))
+    for sample in bag.read_raw([tiny_bag], ['/star_tracker/attitude']):
+        attitudes.publish(sample.data)
+    client.until(lambda: raw and png)
+    assert raw[0].refusal == '' and raw[0] == png[0]
+    assert raw_observer.process.poll() is None
 
 
 def test_overrun_is_answered(client: Client, start_node: StartNode, tiny_bag: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 from geometry_msgs.msg import QuaternionStamped, TwistStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
@@ -88,7 +89,7 @@ class StarObserver(StarcalNode):
             (CalibrationMessage, 'calibration', self._on_calibration, LATCHED),
             (TwistStamped, 'velocity', self._on_velocity, _SAMPLES),
             (QuaternionStamped, 'attitude', self._on_attitude, _SAMPLES),
-            (ImageMessage, 'image', self._on_image, images),
+            (*self._image_input(), self._on_image, images),
         ):
             listener = self.create_subscription(
                 kind,
@@ -98,6 +99,12 @@ class StarObserver(StarcalNode):
                 callback_group=MutuallyExclusiveCallbackGroup(),
             )
             self._listeners.append(listener)
+
+    def _image_input(self) -> tuple[Any, str]:
+        if self._own.image_transport == 'raw':
+            return ImageMessage, 'image'
+        # As image_transport names it: a remap of `image` carries over.
+        return CompressedImage, self.resolve_topic_name('image') + '/compressed'
 
     def deactivate(self) -> None:
         """Stop listening; what still waits in the queue is let go."""
@@ -117,16 +124,17 @@ class StarObserver(StarcalNode):
 
     def health(self) -> Health:
         """Counts of images by what became of them."""
+        counts = dict(self._counts)  # the thread that measures goes on counting
         numbers: dict[str, object] = {
-            'images': sum(self._counts.values()),
-            'images_used': self._counts[''],
+            'images': sum(counts.values()),
+            'images_used': counts.get('', 0),
             'images_waiting': len(self._queue or ()),
             'attitudes': len(self._attitudes),
-            **{f'refused_{reason}': n for reason, n in sorted(self._counts.items()) if reason},
+            **{f'refused_{reason}': n for reason, n in sorted(counts.items()) if reason},
         }
         if self._last_refusal:
             return WARN, f'last image refused: {self._last_refusal}', numbers
-        if not self._counts:
+        if not counts:
             return OK, 'waiting for images', numbers
         return OK, 'observing', numbers
 
@@ -134,7 +142,8 @@ class StarObserver(StarcalNode):
         time_ns = messages.stamp_ns(message.header.stamp)
         time_ns += messages.offset_ns(self._setup.attitude.stamp_offset_s)
         if self._queue is not None:
-            self._queue.put(time_ns, message.width, message.height, message)
+            width, height = getattr(message, 'width', 0), getattr(message, 'height', 0)
+            self._queue.put(time_ns, width, height, message)
 
     def _on_attitude(self, message: Any) -> None:
         time_ns, quaternion = messages.attitude_from_message(message)
