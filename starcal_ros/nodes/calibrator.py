@@ -49,7 +49,6 @@ class Calibrator(StarcalNode):
         self._before: tuple[Calibration, ...] = ()
         self._last_answer = ''
         self._last_failed = False
-        self._status_due = threading.Event()
 
     def configure(self) -> None:
         """Load prior camera and options, make the latched publishers."""
@@ -98,13 +97,14 @@ class Calibrator(StarcalNode):
         ):
             service = self.create_service(kind, name, self._answered(answer), callback_group=group)
             self._listeners.append((self.destroy_service, service))
-        self._status_timer = self.create_timer(
-            0.05,
-            self.guarded(self._publish_status),
-            callback_group=MutuallyExclusiveCallbackGroup(),
+        # In a thread of its own, and once for a burst: the newest status stands for all.
+        self._status_due = self.create_guard_condition(
+            self.guarded(self._publish_status), callback_group=MutuallyExclusiveCallbackGroup()
         )
-        self._listeners.append((self.destroy_timer, self._status_timer))
-        self._status_due.set()
+        self._listeners.append((self.destroy_guard_condition, self._status_due))
+        self._status_due.trigger()
+        if self._in_force is not None:
+            self._publish_calibration(self._in_force)
 
     def deactivate(self) -> None:
         """Stop collecting and answering."""
@@ -143,13 +143,9 @@ class Calibrator(StarcalNode):
             if self._ensemble is not ensemble:  # emptied meanwhile: it starts with this image
                 grown = Ensemble().add(observations)
             self._ensemble = grown
-        self._status_due.set()
+        self._status_due.trigger()
 
     def _publish_status(self) -> None:
-        # In a thread of its own: when images come in bursts the newest status stands for all.
-        if not self._status_due.is_set():
-            return
-        self._status_due.clear()
         with self._lock:
             ensemble = self._ensemble
         status = pipeline.ensemble_status(ensemble, self._setup)
@@ -172,7 +168,7 @@ class Calibrator(StarcalNode):
         with self._lock:
             images = len(self._ensemble.images)
             self._ensemble = Ensemble()
-        self._status_due.set()
+        self._status_due.trigger()
         response.success = True
         response.message = f'{images} images dropped; the calibration in force stays'
         return response

@@ -46,7 +46,7 @@ class StarcalNode(LifecycleNode):
         self._diagnostics_lock = threading.Lock()
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._diagnostics_timer = self.create_timer(
-            1.0, self.publish_health, callback_group=MutuallyExclusiveCallbackGroup()
+            1.0, self.guarded(self.publish_health), callback_group=MutuallyExclusiveCallbackGroup()
         )
         self._answer_invalid_transitions()
 

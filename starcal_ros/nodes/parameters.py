@@ -7,7 +7,7 @@ import dataclasses
 import sys
 from typing import Any
 
-from rcl_interfaces.msg import (  # type: ignore[import-untyped]
+from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
