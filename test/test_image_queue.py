@@ -1,0 +1,67 @@
+"""The image queue: order, waiting, overrun, end."""
+
+from __future__ import annotations
+
+import threading
+
+from starcal_ros.nodes.image_queue import ImageQueue, Waiting
+
+
+def put(queue: ImageQueue, *stamps: int) -> None:
+    """Put images of these stamps."""
+    for stamp in stamps:
+        queue.put(stamp, 8, 8, f'image {stamp}')
+
+
+def take(queue: ImageQueue) -> Waiting:
+    """Take an image that must be there."""
+    taken = queue.take()
+    assert taken is not None
+    return taken
+
+
+def test_order_is_of_arrival() -> None:
+    queue = ImageQueue(5, 10.0, lambda _: True)
+    put(queue, 3, 1, 2)
+    assert [take(queue).time_ns for _ in range(3)] == [3, 1, 2]
+
+
+def test_surplus_keeps_its_place_without_pixels() -> None:
+    queue = ImageQueue(2, 10.0, lambda _: True)
+    put(queue, 1, 2, 3)
+    assert len(queue) == 3
+    assert [take(queue).message for _ in range(2)] == ['image 1', 'image 2']
+    put(queue, 4)
+    assert [take(queue).message for _ in range(2)] == [None, 'image 4']
+
+
+def test_an_image_waits_until_it_is_ready() -> None:
+    ready = threading.Event()
+    queue = ImageQueue(2, 60.0, lambda _: ready.is_set())
+    taken: list[Waiting] = []
+    thread = threading.Thread(target=lambda: taken.append(take(queue)))
+    thread.start()
+    put(queue, 1)
+    thread.join(0.1)
+    assert not taken
+    ready.set()
+    queue.wake()
+    thread.join(10.0)
+    assert [w.time_ns for w in taken] == [1]
+
+
+def test_an_image_waits_no_longer_than_its_time() -> None:
+    queue = ImageQueue(2, 0.01, lambda _: False)
+    put(queue, 1)
+    assert take(queue).time_ns == 1
+
+
+def test_close_ends_the_waiting() -> None:
+    queue = ImageQueue(2, 60.0, lambda _: False)
+    put(queue, 1)
+    found: list[object] = []
+    thread = threading.Thread(target=lambda: found.append(queue.take()))
+    thread.start()
+    queue.close()
+    thread.join(10.0)
+    assert found == [None]
