@@ -1,0 +1,166 @@
+"""
+Draw the pictures of the README and the documents: ``python docs/make_images.py [DIR]``.
+
+The package computes everything shown from the simulated campaign `small`, seed 1, so the pictures
+can be made again after a change and the numbers in them are those of the run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+import tempfile
+
+import cv2
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+import yaml
+
+from starcal_ros import pipeline, products, simulation, synthetic
+from starcal_ros.annotation import annotate
+from starcal_ros.attitude import AttitudeHistory
+from starcal_ros.camera import CameraModel, distort, pixel_grid
+from starcal_ros.observability import coverage
+from starcal_ros.options import read_parameter_file
+from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
+from starcal_ros.synthetic import Scenario
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+FOLDER = Path(__file__).parent / 'images'
+SHOWN_IMAGE = 12
+CLOSE_UP_FIRST, CLOSE_UP_SIZE = (826, 520), (270, 212)  # a part with bright and faint stars
+
+
+def setup_of(scenario: Scenario) -> pipeline.Setup:
+    """What `starcal calibrate` would start on a simulated campaign with."""
+    with tempfile.TemporaryDirectory() as folder:
+        camera, params = Path(folder, 'camera.yaml'), Path(folder, 'params.yaml')
+        products.write_camera_info(scenario.prior.camera, camera)
+        params.write_text(yaml.safe_dump(simulation.parameters(scenario, str(camera))))
+        return pipeline.load_setup(read_parameter_file(params, ()))
+
+
+def observe(
+    scenario: Scenario, setup: pipeline.Setup, image: Image, index: int
+) -> StarObservations:
+    """The stars of one simulated image."""
+    attitudes = AttitudeHistory()
+    for sample in synthetic.attitude_samples(scenario, index):
+        attitudes.add(sample.time_ns, sample)
+    return pipeline.observe(image, attitudes, setup, setup.prior)
+
+
+def part_of(
+    image: Image,
+    observations: StarObservations,
+    geometry: CameraGeometry,
+    first: tuple[int, int],
+    size: tuple[int, int],
+    width: int,
+) -> Picture:
+    """Annotated part of an image, from a first pixel (u, v), drawn some pixels wide."""
+    scale = width / size[0]
+    shape = (width, round(size[1] * scale))
+
+    def drawn(xy_px: Floats) -> Floats:
+        return (xy_px - first + 0.5) * scale - 0.5
+
+    u, v = first
+    pixels = image.pixels[v : v + size[1], u : u + size[0]]
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
+    measured = drawn(observations.measured_px)
+    inside = np.asarray(((measured > 0) & (measured < np.array(shape) - 1)).all(axis=1))
+    shown = dataclasses.replace(observations.select(inside), measured_px=measured[inside])
+    if not inside.all():
+        shown = dataclasses.replace(shown, refused_stars={})  # counted over the whole image
+    fx, skew, fy = scale * geometry.camera.intrinsics[:3]
+    cx, cy = drawn(geometry.camera.intrinsics[3:])
+    camera = geometry.camera.replace(fx=fx, skew=skew, fy=fy, cx=cx, cy=cy)
+    return annotate(
+        Image(image.time_ns, cv2.resize(pixels, shape, interpolation=way).astype(np.uint16)),
+        shown,
+        dataclasses.replace(geometry, camera=camera),
+    )
+
+
+def star_field(
+    image: Image, observations: StarObservations, prior: CameraGeometry, file: Path
+) -> None:
+    """A whole image with its matches, and beside it an enlarged part."""
+    size = (prior.camera.width, prior.camera.height)
+    whole = part_of(image, observations, prior, (0, 0), size, 810)
+    close = part_of(image, observations, prior, CLOSE_UP_FIRST, CLOSE_UP_SIZE, 810)
+    scale = 810 / size[0]
+    corners = [
+        tuple(round(scale * (a + b)) for a, b in zip(CLOSE_UP_FIRST, more, strict=True))
+        for more in ((0, 0), CLOSE_UP_SIZE)
+    ]
+    cv2.rectangle(whole, corners[0], corners[1], (255, 255, 255), 1)
+    height = min(len(whole), len(close))
+    gap = np.full((height, 10, 3), 255, np.uint8)
+    picture = np.hstack([whole[:height], gap, close[:height]])
+    # Sixteen steps of brightness: noise compresses badly, and nobody sees the difference.
+    cv2.imwrite(str(file), picture // 16 * 17, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+def focal_plane(ensemble: Ensemble, setup: pipeline.Setup, file: Path) -> None:
+    """The distortion found, and where the stars stood that it was found from."""
+    calibration = pipeline.solve(ensemble, setup)
+    camera = calibration.geometry.camera
+    figure = Figure(figsize=(11, 4.6), layout='constrained')
+    left, right = figure.subplots(1, 2)
+
+    grid = pixel_grid(camera, 60, 48)
+    shift = _distortion_px(camera, grid)
+    u, v, length = (a.reshape(48, 60) for a in (*grid.T, np.hypot(*shift.T)))
+    lines = left.contour(u, v, length, levels=(0.25, 0.5, 1.0, 1.5, 2.0), cmap='viridis')
+    left.clabel(lines, fmt='%g px')
+    coarse = pixel_grid(camera, 14, 11)
+    arrows = _distortion_px(camera, coarse)
+    left.quiver(*coarse.T, *arrows.T, angles='xy', color='0.4', width=0.003)
+    left.set_title('distortion found')
+
+    counts = coverage(ensemble, camera)
+    extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
+    cells = right.imshow(counts, extent=extent, cmap='Blues', vmin=0)
+    stars = np.concatenate([observed.measured_px for observed in ensemble.images])
+    right.plot(*stars.T, '.', color='0.2', markersize=0.8)
+    figure.colorbar(cells, ax=right, shrink=0.85, label='star observations in a cell')
+    right.set_title(f'{calibration.stars_used} stars in {calibration.images_used} images')
+    for axes in (left, right):
+        axes.set(xlim=extent[:2], ylim=extent[2:], aspect='equal', xlabel='u, px', ylabel='v, px')
+    figure.savefig(file, dpi=90, metadata={'Software': None})
+
+
+def _distortion_px(camera: CameraModel, pixels: Floats) -> Floats:
+    """How far the distortion moves what an ideal lens would show at some pixels, px."""
+    fx, skew, fy, cx, cy = camera.intrinsics
+    y = (pixels[:, 1] - cy) / fy
+    x = (pixels[:, 0] - cx - skew * y) / fx
+    xd, yd = distort(np.stack([x, y], axis=-1), camera.distortion).T
+    return np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1) - pixels
+
+
+def main() -> None:
+    """Draw all pictures."""
+    parser = argparse.ArgumentParser(description='Draw the pictures of the documents.')
+    parser.add_argument('folder', nargs='?', type=Path, default=FOLDER, metavar='DIR')
+    folder = parser.parse_args().folder
+    folder.mkdir(parents=True, exist_ok=True)
+    scenario = synthetic.scenario('small')
+    setup = setup_of(scenario)
+    ensemble = Ensemble()
+    for index, image in enumerate(synthetic.images(scenario)):
+        observations = observe(scenario, setup, image, index)
+        ensemble = ensemble.add(observations)
+        if index == SHOWN_IMAGE:
+            star_field(image, observations, setup.prior, folder / 'star_field.png')
+    focal_plane(ensemble, setup, folder / 'focal_plane.png')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,87 @@
+"""
+Write the tables of docs/icd.md from the code: ``python -m docs.make_tables [--check]``.
+
+Parameters come from the options dataclasses, reasons of refusal from the records.  With --check
+nothing is written; the exit status is 1 where a table is not as the code has it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+import dataclasses
+from pathlib import Path
+import re
+import sys
+from typing import Any
+
+from starcal_ros.node_options import (
+    CalibratorOptions,
+    NodeOptions,
+    ObserverOptions,
+    PlayerOptions,
+)
+from starcal_ros.pipeline import OPTION_CLASSES
+from starcal_ros.records import IMAGE_REFUSALS, STAR_REFUSALS
+from tools.write_parameters import allowed, as_yaml
+
+FILE = Path(__file__).parent / 'icd.md'
+
+
+def parameter_table(*option_classes: type[Any]) -> str:
+    """Every parameter of some dataclasses, a row each."""
+    rows = ['| parameter | default | allowed | what it is |', '|---|---|---|---|']
+    for options in option_classes:
+        for field in dataclasses.fields(options):
+            cells = (
+                f'`{field.name}`',
+                f'`{as_yaml(field.default)}`',
+                allowed(field).removeprefix('; ').replace('|', ','),
+                field.metadata['description'],
+            )
+            rows.append('| ' + ' | '.join(cells) + ' |')
+    return '\n'.join(rows)
+
+
+def reason_table(reasons: Mapping[str, str]) -> str:
+    """Names of reasons and what they mean."""
+    rows = [f'| `{name}` | {meaning} |' for name, meaning in reasons.items()]
+    return '\n'.join(['| reason | meaning |', '|---|---|', *rows])
+
+
+TABLES = {
+    'parameters of both nodes and the tool': parameter_table(*OPTION_CLASSES, NodeOptions),
+    'parameters of star_observer': parameter_table(ObserverOptions),
+    'parameters of calibrator': parameter_table(CalibratorOptions),
+    'parameters of bag_player': parameter_table(PlayerOptions),
+    'reasons to refuse an image': reason_table(IMAGE_REFUSALS),
+    'reasons to leave out a star': reason_table(STAR_REFUSALS),
+}
+
+
+def with_tables(text: str) -> str:
+    """Return a document with what stands between the marks of each table written anew."""
+    for name, table in TABLES.items():
+        marks = re.compile(f'(<!-- {name} -->\n).*?(<!-- end -->)', re.DOTALL)
+        if len(marks.findall(text)) != 1:
+            raise SystemExit(f'{FILE.name}: expected one table marked <!-- {name} -->')
+        text = marks.sub(lambda found, table=table: found[1] + table + '\n' + found[2], text)  # type: ignore[misc]
+    return text
+
+
+def main() -> int:
+    """Write the tables, or say whether they are up to date."""
+    parser = argparse.ArgumentParser(description='Write the tables of docs/icd.md.')
+    parser.add_argument('--check', action='store_true', help='only look')
+    check = parser.parse_args().check
+    before = FILE.read_text()
+    after = with_tables(before)
+    if check and after != before:
+        print(f'{FILE.name} is not as the code has it: run python -m docs.make_tables')
+        return 1
+    FILE.write_text(after)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
