@@ -112,22 +112,34 @@ def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple
     types: dict[str, str] = {}
     counts: Counter[str] = Counter()
     for file in mcap_files(paths):
-        with file.open('rb') as stream:
-            # What a damaged summary raises has no common base.
-            try:
-                summary = make_reader(stream).get_summary()
-            except Exception:
-                summary = None
-        if summary is not None and summary.statistics is not None:
+        for topic in _summary(file) or _counted(file, on_damage):
+            types[topic.name] = topic.type_name
+            counts[topic.name] += topic.count
+    return tuple(Topic(name, types[name], counts[name]) for name in sorted(counts))
+
+
+def _summary(file: Path) -> list[Topic]:
+    """Topics by the summary of a file; none where it has no counts or they are damaged."""
+    found = []
+    with file.open('rb') as stream:
+        # What a damaged summary raises has no common base.
+        try:
+            summary = make_reader(stream).get_summary()
+            if summary is None or summary.statistics is None:
+                return []
             for number, count in summary.statistics.channel_message_counts.items():
                 channel = summary.channels[number]
-                types[channel.topic] = summary.schemas[channel.schema_id].name
-                counts[channel.topic] += count
-        else:
-            for raw in _read_file(file, None, on_damage):
-                types[raw.topic] = raw.type_name
-                counts[raw.topic] += 1
-    return tuple(Topic(name, types[name], counts[name]) for name in sorted(counts))
+                if count and channel.message_encoding == 'cdr':
+                    schema = summary.schemas[channel.schema_id]
+                    found.append(Topic(channel.topic, schema.name, count))
+        except Exception:
+            return []
+    return found
+
+
+def _counted(file: Path, on_damage: Damage) -> list[Topic]:
+    counts = Counter((raw.topic, raw.type_name) for raw in _read_file(file, None, on_damage))
+    return [Topic(name, type_name, count) for (name, type_name), count in counts.items()]
 
 
 def choose_topic(paths: Iterable[Path | str], type_name: str, asked: str = '') -> str:

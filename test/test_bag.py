@@ -280,14 +280,15 @@ def test_random_bytes_never_crash(tmp_path: Path, folder: Path) -> None:
         bag.topics([file], said.append)
 
 
-def test_other_writers(tmp_path: Path) -> None:
+@pytest.mark.parametrize('indexed', [False, True])
+def test_other_writers(tmp_path: Path, indexed: bool) -> None:
     """A file without chunks or summary is read, a channel that is not ROS 2 is passed over."""
     file = tmp_path / 'plain.mcap'
     store = bag._typestore()
     message = messages.image_to_message(Image(5, np.ones((2, 2), np.uint8)), '', bag.make_message)
     with file.open('wb') as stream:
         writer = Writer(
-            stream, use_chunking=False, use_statistics=False, compression=CompressionType.NONE
+            stream, use_chunking=indexed, use_statistics=indexed, compression=CompressionType.NONE
         )
         writer.start()
         definition, _ = store.generate_msgdef(messages.IMAGE_TYPE, ros_version=2)
