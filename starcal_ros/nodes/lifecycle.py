@@ -141,7 +141,11 @@ class StarcalNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Activate: publishers first, then subscriptions."""
         outcome = super().on_activate(state)
-        return self._transition(self.activate, state, lambda _: outcome)
+        outcome = self._transition(self.activate, state, lambda _: outcome)
+        if outcome == TransitionCallbackReturn.FAILURE:
+            self.deactivate()
+            super().on_deactivate(state)
+        return outcome
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Deactivate: subscriptions first, then publishers."""
