@@ -18,6 +18,7 @@ import pytest
 
 from starcal_ros import pipeline
 from starcal_ros.node_options import NODE_OPTION_CLASSES, PlayerOptions
+from starcal_ros.options import read_parameter_file
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').glob('*.md'), *ROOT.glob('bags/*/*.md')])
@@ -163,6 +164,17 @@ def test_the_calibration_of_the_readme_runs(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     for name in ('calibration.json', 'camera_info.yaml', 'observations.mcap'):
         assert (tmp_path / 'out' / name).is_file()
+
+
+def test_the_parameter_file_of_the_readme_is_one(tmp_path: Path) -> None:
+    (text,) = re.findall(r'^```yaml\n(.*?)^```', (ROOT / 'README.md').read_text(), re.S | re.M)
+    params = tmp_path / 'params.yaml'
+    params.write_text(text)
+    values = read_parameter_file(params, ('star_observer', 'calibrator'))
+    assert values['camera_info_url'] == 'camera.yaml'
+    camera = ROOT / 'bags' / 'tiny' / 'camera.yaml'
+    setup = pipeline.load_setup({**values, 'camera_info_url': str(camera)}, OPTIONS)
+    assert setup.prior.camera.width > 0
 
 
 @pytest.mark.parametrize('target', MAKE_TARGETS)
