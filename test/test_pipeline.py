@@ -1,0 +1,394 @@
+"""The flow as one: what it is set up with, what it refuses, and what it says of its result."""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ros import pipeline, products
+from starcal_ros.attitude import attitude_sample, AttitudeHistory
+from starcal_ros.calibration import CalibrationOptions
+from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import CatalogError, OptionError, ProductError, TooFewObservations
+from starcal_ros.node_options import NODE_OPTION_CLASSES
+from starcal_ros.records import Ensemble, Image
+from starcal_ros.synthetic import (
+    attitude_samples,
+    Detector,
+    render,
+    scenario,
+    scene,
+    star_electrons,
+    true_observations,
+)
+
+SCENARIO = scenario('tiny', seed=7)
+TRUTH = SCENARIO.truth
+S = 1_000_000_000
+
+
+@pytest.fixture(scope='module')
+def camera_yaml(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp('prior') / 'camera.yaml'
+    products.write_camera_info(SCENARIO.prior.camera, path)
+    return path
+
+
+def values(camera_yaml: Path, **others: object) -> dict[str, object]:
+    """A parameter file's content that is complete."""
+    return {
+        'camera_info_url': str(camera_yaml),
+        'prior_alignment': SCENARIO.prior.star_tracker_from_camera_xyzw.tolist(),
+        'star_tracker_sigma_arcsec': [10.0, 10.0, 40.0],
+        **others,
+    }
+
+
+@pytest.fixture(scope='module')
+def setup(camera_yaml: Path) -> pipeline.Setup:
+    return pipeline.load_setup(values(camera_yaml))
+
+
+@functools.cache
+def ensemble() -> Ensemble:
+    return true_observations(SCENARIO)
+
+
+@functools.cache
+def image(index: int = 1) -> Image:
+    return render(SCENARIO, scene(SCENARIO, index), index)
+
+
+def attitudes(index: int = 1) -> AttitudeHistory:
+    held = AttitudeHistory()
+    for sample in attitude_samples(SCENARIO, index):
+        held.add(sample.time_ns, sample)
+    return held
+
+
+def test_a_setup_holds_what_the_parameters_say(camera_yaml: Path) -> None:
+    made = pipeline.load_setup(
+        values(
+            camera_yaml,
+            centroid='moment',
+            method='single',
+            estimate=['fx', 'fy'],
+            max_attitude_gap_s=7,
+            magnitude_limit=6.0,
+            max_residual_rms_px=0.3,
+            camera_frame='left_eye',
+            use_sim_time=True,
+        )
+    )
+    assert made.centroid.centroid == 'moment'
+    assert made.calibration.method == 'single'
+    assert made.calibration.estimate == ('fx', 'fy')
+    assert made.attitude.max_attitude_gap_s == 7.0
+    assert made.gate.max_residual_rms_px == 0.3
+    assert made.frames.camera_frame == 'left_eye'
+    assert made.catalog.magnitude.max() <= 6.0
+    assert made.dark is None
+    np.testing.assert_array_equal(made.prior.camera.parameters, SCENARIO.prior.camera.parameters)
+
+
+def test_a_rounded_alignment_is_made_unit(camera_yaml: Path) -> None:
+    q = np.round(SCENARIO.prior.star_tracker_from_camera_xyzw, 4)
+    made = pipeline.load_setup(values(camera_yaml, prior_alignment=q.tolist()))
+    assert np.linalg.norm(made.prior.star_tracker_from_camera_xyzw) == pytest.approx(1, abs=1e-15)
+
+
+def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> None:
+    both = values(camera_yaml, autostart=False)
+    pipeline.load_setup(both, NODE_OPTION_CLASSES)
+    with pytest.raises(OptionError, match='autostart: no such parameter'):
+        pipeline.load_setup(both)
+
+
+@pytest.mark.parametrize(
+    ('wrong', 'says'),
+    [
+        ({'max_residual_rms': 1.0}, 'max_residual_rms: no such parameter'),
+        ({'camera_info_url': ''}, 'camera_info_url: the prior camera must be given'),
+        (
+            {'prior_alignment': [0.0, 0.0, 0.0, 0.9]},
+            'prior_alignment: .* is not a unit quaternion',
+        ),
+        (
+            {'prior_alignment': [0.0, 0.0, 0.0, 0.0]},
+            'prior_alignment: .* is not a unit quaternion',
+        ),
+        ({'prior_alignment': [0.0, 0.0, 1.0]}, 'prior_alignment: .* is not a list of 4'),
+        ({'method': 'best'}, "method: 'best' is not one of hierarchical, per_image, single"),
+        ({'estimate': ['fx', 'fz']}, 'estimate: .* is not one of fx, skew'),
+        ({'min_images': 2.5}, 'min_images: 2.5 is not a whole number'),
+        (
+            {'dark_frame': '/no/such/dark.png'},
+            'dark_frame: /no/such/dark.png is not an image file',
+        ),
+    ],
+)
+def test_a_wrong_parameter_is_named(
+    camera_yaml: Path, wrong: dict[str, object], says: str
+) -> None:
+    with pytest.raises(OptionError, match=says):
+        pipeline.load_setup(values(camera_yaml, **wrong))
+
+
+def test_a_wrong_file_is_named(camera_yaml: Path, tmp_path: Path) -> None:
+    with pytest.raises(ProductError, match='missing.yaml'):
+        pipeline.load_setup(values(tmp_path / 'missing.yaml'))
+    (tmp_path / 'stars.csv').write_text('these are no stars')
+    for name in ('stars.csv', 'missing.csv'):
+        with pytest.raises(CatalogError, match=name):
+            pipeline.load_setup(values(camera_yaml, catalog=str(tmp_path / name)))
+
+
+def test_stars_are_observed(setup: pipeline.Setup) -> None:
+    found = pipeline.observe(image(), attitudes(), setup, setup.prior)
+    assert found.refusal == '' and len(found) > 100
+    assert found.attitude_gap_s == 0.5
+    assert found.time_ns == image().time_ns
+    one = scene(SCENARIO, 1)
+    attitude_error = (
+        Rotation.from_quat(found.icrf_from_star_tracker_xyzw).inv()
+        * Rotation.from_quat(one.icrf_from_star_tracker_xyzw)
+    ).magnitude()
+    # One error for all samples of an image, which do not move: the interpolation adds nothing.
+    assert attitude_error < 1e-9
+
+
+def test_an_image_of_another_size_is_refused(setup: pipeline.Setup) -> None:
+    small = Image(image().time_ns, image().pixels[:-2].copy())
+    found = pipeline.observe(small, attitudes(), setup, setup.prior)
+    assert (found.refusal, found.detail) == ('wrong_size', '640 x 510, the camera has 640 x 512')
+    assert (found.width, found.height) == (640, 510)
+    assert len(found) == 0
+
+
+def test_an_image_without_attitude_is_refused(setup: pipeline.Setup) -> None:
+    samples = attitude_samples(SCENARIO, 1)
+    wide = AttitudeHistory()
+    for sign in (-5, 5):
+        time_ns = image().time_ns + sign * S
+        wide.add(time_ns, attitude_sample(time_ns, np.array([0, 0, 0, 1.0]), 'st_to_inertial'))
+    half = AttitudeHistory()
+    half.add(samples[0].time_ns, samples[0])
+    spoilt = AttitudeHistory()
+    spoilt.add(image().time_ns, None)
+    for held, reason in (
+        (AttitudeHistory(), 'no_attitude'),
+        (half, 'no_attitude'),
+        (wide, 'attitude_gap'),
+        (spoilt, 'bad_attitude'),
+    ):
+        found = pipeline.observe(image(), held, setup, setup.prior)
+        assert found.refusal == reason and found.detail
+        assert found.attitude_gap_s == -1.0
+
+
+def test_an_image_that_nothing_explains_keeps_its_attitude(setup: pipeline.Setup) -> None:
+    dark = Image(image().time_ns, np.full_like(image().pixels, 40))
+    found = pipeline.observe(dark, attitudes(), setup, setup.prior)
+    assert found.refusal == 'no_stars'
+    assert found.attitude_gap_s == 0.5
+    assert found.catalog_digest == setup.catalog.digest
+    assert abs(found.icrf_from_star_tracker_xyzw[3]) < 1.0
+
+
+def test_out_of_order_images_say_by_how_much() -> None:
+    found = pipeline.out_of_order(image(), image().time_ns + S // 4)
+    assert found.refusal == 'out_of_order'
+    assert found.detail == '0.250000 s before the last image'
+
+
+def write_png(path: Path, pixels: np.ndarray) -> str:
+    assert cv2.imwrite(str(path), pixels)
+    return str(path)
+
+
+def test_a_dark_frame_takes_a_pattern_away(camera_yaml: Path, tmp_path: Path) -> None:
+    # Every second row 30 DN up, and hot pixels in many stars.
+    rng = np.random.default_rng(9)
+    pattern = np.full((512, 640), 40.0)
+    pattern[::2] += 30.0
+    pattern.flat[rng.choice(pattern.size, 3000, replace=False)] += 300.0
+    one = scene(SCENARIO, 1)
+    light = star_electrons(one.pixel_px, one.flux_electrons, 0.95, (512, 640)) / 8.0
+    noise = rng.normal(0, 1.2, pattern.shape)
+    pixels = np.clip(np.rint(pattern + light + noise), 0, 4095).astype(np.uint16)
+    dark = np.rint(pattern).astype(np.uint16)
+    one_image = Image(image().time_ns, pixels)
+    without = pipeline.load_setup(values(camera_yaml))
+    url = write_png(tmp_path / 'dark.png', dark)
+    with_dark = pipeline.load_setup(values(camera_yaml, dark_frame='file://' + url))
+    np.testing.assert_array_equal(with_dark.dark, dark)
+    spoilt = pipeline.observe(one_image, attitudes(), without, without.prior)
+    found = pipeline.observe(one_image, attitudes(), with_dark, with_dark.prior)
+    assert found.refusal == '' and len(found) > max(150, 2 * len(spoilt))
+    # The noise of the image alone is left, and nothing is cut off at zero below the dark level.
+    assert found.noise_dn == pytest.approx(1.2, rel=0.1)
+    assert found.background_dn == pytest.approx(np.median(dark), abs=0.3)
+    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
+    off_px = found.measured_px - np.array([place[number] for number in found.catalog_id])
+    sigma_px = np.sqrt(found.covariance_px2[:, [0, 2]])
+    assert np.sqrt(np.mean((off_px / sigma_px) ** 2)) < 1.3
+
+
+def test_a_dark_frame_of_a_byte(camera_yaml: Path, tmp_path: Path) -> None:
+    url = write_png(tmp_path / 'dark.png', np.full((512, 640), 7, np.uint8))
+    made = pipeline.load_setup(values(camera_yaml, dark_frame=url))
+    assert made.dark is not None and made.dark.dtype == np.uint8
+    found = pipeline.observe(image(), attitudes(), made, made.prior)
+    assert found.refusal == 'bad_encoding'
+    assert found.detail == 'uint16 image, the dark frame is uint8'
+    one = scene(SCENARIO, 1)
+    light = star_electrons(one.pixel_px, one.flux_electrons, 0.95, (512, 640)) / 100.0
+    noise = np.random.default_rng(1).normal(0, 1.0, light.shape)
+    pixels = np.clip(np.rint(light + 7 + noise), 0, 255).astype(np.uint8)
+    byte = pipeline.observe(Image(image().time_ns, pixels), attitudes(), made, made.prior)
+    assert byte.refusal == '' and byte.background_dn == pytest.approx(7.0, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    'pixels',
+    [
+        np.zeros((512, 639), np.uint16),
+        np.zeros((512, 640, 3), np.uint8),
+        np.zeros((512, 640), np.float32),
+    ],
+)
+def test_a_dark_frame_that_does_not_fit(
+    camera_yaml: Path, tmp_path: Path, pixels: np.ndarray
+) -> None:
+    suffix = 'tiff' if pixels.dtype == np.float32 else 'png'
+    url = write_png(tmp_path / f'dark.{suffix}', pixels)
+    with pytest.raises(OptionError, match='not one channel of 640 x 512'):
+        pipeline.load_setup(values(camera_yaml, dark_frame=url))
+
+
+def test_refused_images_are_counted(setup: pipeline.Setup) -> None:
+    collected = Ensemble()
+    for observations in (
+        ensemble().images[0],
+        pipeline.out_of_order(image(), image().time_ns),
+        ensemble().images[1],
+        pipeline.out_of_order(image(), image().time_ns),
+    ):
+        collected = pipeline.add_to_ensemble(collected, observations, setup)
+    assert collected.images == ensemble().images[:2]
+    assert collected.refused == {'out_of_order': 2}
+    status = pipeline.ensemble_status(collected, setup)
+    assert (status.images, status.refused) == (2, {'out_of_order': 2})
+
+
+def test_at_the_limit_an_image_goes_for_each_that_comes(camera_yaml: Path) -> None:
+    limited = pipeline.load_setup(values(camera_yaml, max_images=4))
+    collected = Ensemble()
+    for observations in ensemble().images:
+        collected = pipeline.add_to_ensemble(collected, observations, limited)
+    assert len(collected.images) == 4
+    stars = sorted(len(i) for i in ensemble().images)
+    assert min(len(i) for i in collected.images) > stars[2]
+
+
+def test_a_solution_with_its_statistics(setup: pipeline.Setup) -> None:
+    found = pipeline.solve(ensemble(), setup)
+    assert found.accepted and found.reasons == ()
+    assert found.termination == 'converged'
+    assert found.method == CalibrationOptions().method
+    assert found.estimated == CalibrationOptions().estimate
+    assert found.images_used == 10 and found.stars_rejected <= 4
+    assert found.stars_used + found.stars_rejected == ensemble().star_count
+    assert found.time_ns == ensemble().images[-1].time_ns
+    assert found.variance_factor == pytest.approx(1.0, abs=0.1)
+    assert (found.parent_frame, found.child_frame) == ('star_tracker', 'camera')
+    # Skew of 0.1 px or so, sheared over half the height.
+    assert 0 < found.zero_skew_cost_px < 0.2
+    error = found.geometry.camera.parameters - TRUTH.camera.parameters
+    free = [PARAMETER_NAMES.index(name) for name in found.estimated]
+    assert np.abs(error[free] / found.sigma[free]).max() < 5
+    turn = (
+        Rotation.from_quat(found.geometry.star_tracker_from_camera_xyzw).inv()
+        * Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw)
+    ).magnitude()
+    # Ten images of 10, 10 and 40 arcsec: 13 in the mean, and 50 for a principal point that is
+    # held at its nominal place, where it is in truth too.
+    assert turn / ARCSECOND_RAD < 50
+
+
+def test_method_and_names_can_be_said_for_one_solution(setup: pipeline.Setup) -> None:
+    found = pipeline.solve(ensemble(), setup, method='single', estimate=['fx', 'fy', 'k1'])
+    assert (found.method, found.estimated) == ('single', ('fx', 'fy', 'k1'))
+    prior, after = setup.prior.camera.parameters, found.geometry.camera.parameters
+    changed = [n for n, a, b in zip(PARAMETER_NAMES, prior, after, strict=True) if a != b]
+    assert changed == ['fx', 'fy', 'k1']
+    options = json.loads(found.provenance['options'])
+    assert options['method'] == 'single' and options['estimate'] == ['fx', 'fy', 'k1']
+    assert setup.calibration.method == CalibrationOptions().method
+    with pytest.raises(OptionError, match="method: 'best' is not one of"):
+        pipeline.solve(ensemble(), setup, method='best')
+    with pytest.raises(OptionError, match='estimate: .* is not one of fx, skew'):
+        pipeline.solve(ensemble(), setup, estimate=['fz'])
+
+
+def test_too_few_images_cannot_be_solved(setup: pipeline.Setup) -> None:
+    with pytest.raises(TooFewObservations, match='1 more images are needed'):
+        pipeline.solve(Ensemble(ensemble().images[:2]), setup)
+
+
+def test_a_bad_solution_is_refused_and_says_why(camera_yaml: Path) -> None:
+    strict = pipeline.load_setup(values(camera_yaml, max_map_sigma_px=1e-6))
+    found = pipeline.solve(ensemble(), strict)
+    assert not found.accepted
+    assert len(found.reasons) == 1 and 'max_map_sigma_px' in found.reasons[0]
+
+
+def test_provenance_tells_all_that_went_in(setup: pipeline.Setup, camera_yaml: Path) -> None:
+    first = pipeline.solve(ensemble(), setup, inputs={'bag': 'abc'}).provenance
+    assert first['software'].startswith('starcal ')
+    assert first['catalog'] == setup.catalog.digest
+    assert first['input bag'] == 'abc'
+    prior = json.loads(first['prior'])
+    assert prior[:10] == setup.prior.camera.parameters.tolist()
+    assert prior[10:] == setup.prior.star_tracker_from_camera_xyzw.tolist()
+    # From the options in it the setup can be made again.
+    options = json.loads(first['options'])
+    again = pipeline.load_setup(options)
+    second = pipeline.solve(ensemble(), again, inputs={'bag': 'abc'})
+    assert second.provenance == first
+    other = Ensemble(ensemble().images[::-1])
+    digest = pipeline.solve(other, setup).provenance['observations_sha256']
+    assert digest != first['observations_sha256']
+
+
+def test_equal_inputs_give_equal_numbers(setup: pipeline.Setup) -> None:
+    one, other = (pipeline.solve(ensemble(), setup) for _ in range(2))
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+    np.testing.assert_array_equal(one.geometry.camera.parameters, other.geometry.camera.parameters)
+    assert one.provenance == other.provenance
+
+
+def test_from_pixels_to_a_calibration_that_is_true(setup: pipeline.Setup) -> None:
+    held = AttitudeHistory()
+    for index in range(10):
+        for sample in attitude_samples(SCENARIO, index):
+            held.add(sample.time_ns, sample)
+    collected = Ensemble()
+    for index in range(10):
+        found = pipeline.observe(image(index), held, setup, setup.prior)
+        collected = pipeline.add_to_ensemble(collected, found, setup)
+    assert len(collected.images) == 10
+    calibration = pipeline.solve(collected, setup)
+    assert calibration.accepted
+    free = [PARAMETER_NAMES.index(name) for name in calibration.estimated]
+    error = (calibration.geometry.camera.parameters - TRUTH.camera.parameters)[free]
+    assert np.abs(error / calibration.sigma[free]).max() < 4.5
+    assert calibration.residual_rms_px < 0.25
+    assert Detector().psf_sigma_px == pytest.approx(collected.images[0].psf_sigma_px, rel=0.02)
