@@ -288,6 +288,23 @@ def test_gross_outliers_are_left_out(method: str, fraction: float) -> None:
 
 
 @each_method
+def test_outliers_that_all_lean_one_way_are_left_out(method: str) -> None:
+    # Two of five stars, all 15 px to the right: a mean is dragged along, a robust loss is not.
+    noisy = with_noise(clean(), 1, tracker_of(method))
+    images, bad = [], []
+    for k, image in enumerate(noisy.images):
+        moved = np.random.default_rng([5, k]).uniform(size=len(image)) < 0.4
+        shift = moved[:, None] * np.array([15.0, 0.0])
+        images.append(dataclasses.replace(image, measured_px=image.measured_px + shift))
+        bad.append(moved)
+    found = estimate_calibration(Ensemble(tuple(images)), PRIOR, options(method))
+    assert not found.kept[np.concatenate(bad)].any()
+    rows = [*FREE, 10, 11, 12]
+    sigma = np.sqrt(np.diag(found.covariance))[rows]
+    assert np.abs(error_of(found, rows) / sigma).max() < 5.0
+
+
+@each_method
 @pytest.mark.parametrize('centroid_scale', [2.0, 0.5])
 def test_centroid_covariances_wrong_by_four_do_no_harm(method: str, centroid_scale: float) -> None:
     errors, factors = [], []
