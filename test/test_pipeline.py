@@ -18,7 +18,7 @@ from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, OptionError, ProductError, TooFewObservations
 from starcal_ros.node_options import NODE_OPTION_CLASSES
-from starcal_ros.records import Ensemble, Image
+from starcal_ros.records import Ensemble, Image, refused_image
 from starcal_ros.synthetic import (
     attitude_samples,
     Detector,
@@ -202,12 +202,6 @@ def test_an_image_that_nothing_explains_keeps_its_attitude(setup: pipeline.Setup
     assert abs(found.icrf_from_star_tracker_xyzw[3]) < 1.0
 
 
-def test_out_of_order_images_say_by_how_much() -> None:
-    found = pipeline.out_of_order(image(), image().time_ns + S // 4)
-    assert found.refusal == 'out_of_order'
-    assert found.detail == '0.250000 s before the last image'
-
-
 def write_png(path: Path, pixels: np.ndarray) -> str:
     assert cv2.imwrite(str(path), pixels)
     return str(path)
@@ -277,9 +271,9 @@ def test_refused_images_are_counted(setup: pipeline.Setup) -> None:
     collected = Ensemble()
     for observations in (
         ensemble().images[0],
-        pipeline.out_of_order(image(), image().time_ns),
+        refused_image(image().time_ns, 640, 512, 'out_of_order', ''),
         ensemble().images[1],
-        pipeline.out_of_order(image(), image().time_ns),
+        refused_image(image().time_ns, 640, 512, 'out_of_order', ''),
     ):
         collected = pipeline.add_to_ensemble(collected, observations, setup)
     assert collected.images == ensemble().images[:2]
