@@ -92,22 +92,31 @@ def judge(candidate: Candidate, options: GateOptions) -> tuple[str, ...]:
     reasons = []
     if candidate.termination != 'converged':
         reasons.append(f'the solver did not converge ({candidate.termination})')
-    values = np.r_[candidate.geometry.camera.parameters, np.diag(candidate.covariance)]
-    if not np.isfinite(values).all() or (np.diag(candidate.covariance) < 0).any():
-        reasons.append('a parameter or its variance is not a finite number')
-    if candidate.residual_rms_px > options.max_residual_rms_px:
+    values = np.concatenate(
+        [
+            candidate.geometry.camera.parameters,
+            candidate.geometry.star_tracker_from_camera_xyzw,
+            candidate.covariance.ravel(),
+        ]
+    )
+    if not np.isfinite(values).all():
+        return (*reasons, 'a parameter or its covariance is not a finite number')
+    if (np.diag(candidate.covariance) < 0).any():
+        reasons.append('a variance is negative')
+    # Written so that NaN is refused: a comparison with it is false.
+    if not candidate.residual_rms_px <= options.max_residual_rms_px:
         reasons.append(
             f'residual {candidate.residual_rms_px:.3f} px per axis is over the limit of '
             f'{options.max_residual_rms_px:g} px (max_residual_rms_px)'
         )
     total = candidate.stars_used + candidate.stars_rejected
-    if candidate.stars_rejected > options.max_rejected_fraction * total:
+    if not candidate.stars_rejected <= options.max_rejected_fraction * total:
         reasons.append(
             f'{candidate.stars_rejected} of {total} stars are outliers, more than a fraction of '
             f'{options.max_rejected_fraction:g} (max_rejected_fraction)'
         )
     covered = float((candidate.coverage > 0).mean())
-    if covered < options.min_coverage:
+    if not covered >= options.min_coverage:
         reasons.append(
             f'stars cover {100 * covered:.0f} % of the detector, under the limit of '
             f'{100 * options.min_coverage:.0f} % (min_coverage)'

@@ -1,45 +1,37 @@
 """
-From an ensemble of observed images to camera, alignment and covariance (Eqs. 10-26).
+From an ensemble of observed images to camera, alignment and covariance.
 
-Three methods share one solver and one set of normal matrices:
-
-- ``per_image`` (the paper's Method 1): every image has its own rotation; the alignments found are
-  averaged as quaternions.
-- ``single`` (Method 2): one rotation for all images, the star tracker taken as perfect.
-- ``hierarchical`` (beyond the paper): one common alignment, and for each image an attitude error
-  of the star tracker's covariance.  The other two are its limits.
-
-With R_k = camera_from_icrf of image k, the attitude error of the hierarchical method is
-``eta_k = -Log(A' R_k T_k')``, a small rotation in the star tracker frame, where A =
-camera_from_star_tracker and T_k = star_tracker_from_icrf as measured.
+A robust search from the prior, then least squares on the stars that fit, with the variances of
+centroids and star tracker estimated again and the misfits left out, until nothing changes.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
+from starcal_ros.adjustment import (
+    attitudes_of_stars_alone,
+    METHODS,
+    minimise,
+    Problem,
+    reduced_information,
+    State,
+)
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.least_squares import (
-    covariance,
-    levenberg_marquardt,
-    NormalEquations,
-    NotObservable,
-    Solution,
-)
+from starcal_ros.least_squares import inverse, NotObservable
 from starcal_ros.measurement import (
     arrange,
     CAMERA,
-    Measurements,
     normal_blocks,
-    RESIDUAL,
     residuals_px,
     ROTATION,
     squared_sigmas,
@@ -48,18 +40,16 @@ from starcal_ros.measurement import (
 )
 from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Ensemble
+from starcal_ros.variance import CentroidVariance, estimate_star_tracker_sigma, estimate_variance
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-METHODS = ('hierarchical', 'per_image', 'single')
-
-_ROBUST_SCALE = (
-    3.0  # of the Cauchy loss, in sigma: normal noise loses 5 % of its weight, outliers all
-)
+_ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
 _START_FLOOR_PX = 0.05  # until the residuals tell: of the order of what is left in good images
-_STARS_PER_GROUP = 40  # whose median squared residual is known to 25 %
-_SNOOPING_ROUNDS = 10  # the set of rejected stars settles in two or three
+_ROUNDS = 10  # the set of rejected stars settles in two or three
+_FEWEST_SIGHTINGS = 3  # of a star, from which it can be told from its images
+_STAR_CHANCE = 1e-7  # that a good star is dropped for the sum of its residuals
 
 
 @dataclass(frozen=True)
@@ -67,7 +57,7 @@ class CalibrationOptions:
     """What is estimated, and how."""
 
     method: str = option(
-        'per_image', 'how the attitudes of the images are treated', choices=METHODS
+        'hierarchical', 'how the attitudes of the images are treated', choices=METHODS
     )
     estimate: tuple[str, ...] = option(
         ('fx', 'skew', 'fy', 'k1', 'k2', 'k3', 'p1', 'p2'),
@@ -96,68 +86,63 @@ class CalibrationOptions:
         low=3.0,
         high=20.0,
     )
-
-
-@dataclass(frozen=True)
-class State:
-    """Where the search stands: camera parameters, alignment and the rotation of every image."""
-
-    parameters: Floats  # (10,)
-    camera_from_star_tracker: Rotation
-    camera_from_icrf: Rotation  # (m,)
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What one search is given; arrays over m images and n stars."""
-
-    method: str
-    free: NDArray[np.int64]  # estimated camera parameters
-    star_tracker_from_icrf: Rotation  # (m,), as measured
-    star_tracker_sigma_rad: Floats  # (3,)
-
-
-@dataclass(frozen=True)
-class CentroidVariance:
-    """
-    What the residuals say of the centroid covariances C: they are ``scale C + floor_px2 I``.
-
-    The floor stands for what a centroid does not know of: the real shape of the PSF, the catalog,
-    the air.  The scale is a wrong detector gain, or the excess of faint stars over their bound.
-    """
-
-    scale: float
-    floor_px2: float
-
-    def of(self, covariance_px2: Floats) -> Floats:
-        """Covariances (n, 3) uu, uv, vv as the residuals have them."""
-        return self.scale * covariance_px2 + self.floor_px2 * np.array([1.0, 0.0, 1.0])
-
-    def is_close_to(self, other: CentroidVariance) -> bool:
-        """Whether a weight changes by under 1 %, which moves no estimate by 0.001 sigma."""
-        return math.isclose(self.scale, other.scale, rel_tol=0.01) and math.isclose(
-            self.floor_px2, other.floor_px2, rel_tol=0.01, abs_tol=1e-8
-        )
+    prior_sigma: tuple[float, ...] = option(
+        (0.0,) * 10,
+        '1-sigma of the prior of fx, skew, fy, cx, cy (px), k1, k2, k3, p1, p2; 0: of one that is'
+        ' estimated, nothing is known; of one that is held, it is taken as exact',
+        low=0.0,
+        length=10,
+    )
+    variance_components: bool = option(
+        True, 'estimate the sigmas of centroids and star tracker again from the residuals'
+    )
 
 
 @dataclass(frozen=True)
 class Estimate:
     """
-    A solved calibration, before products.
+    A solved calibration, before products; m images, n stars.
 
-    ``covariance`` (13, 13); ``kept`` (n,) stars used; ``variance`` how the centroid covariances
-    were corrected; ``variance_factor`` chi^2 per degree of freedom of them as given;
-    ``residual_px`` (n, 2) of all stars; ``alignment_scatter_arcsec`` of the images.
+    Attributes
+    ----------
+    geometry : CameraGeometry
+    covariance : (13, 13)
+    information : (k, k)
+        On the estimated camera parameters, then the alignment where the method has one; the
+        rotations of the images eliminated.
+    state : State
+    table : StarTable
+    kept : (n,) bool
+        Stars used.
+    residual_px : (n, 2)
+        Of all stars.
+    variance : CentroidVariance
+        How the centroid covariances were corrected.
+    variance_factor : float
+        chi^2 per degree of freedom of the centroid covariances as given.
+    star_tracker_sigma_rad : (3,)
+        As given, or as estimated again.
+    misfit_image : (m,) bool
+        Images whose attitude does not fit, or that lost their stars.
+    dropped_catalog_id : (d,) int64
+        Stars that misfit across images and were left out of all.
+    alignment_scatter_arcsec : float
+        RMS per axis of the alignments that the images show, about their mean.
+    iterations, termination
     """
 
     geometry: CameraGeometry
     covariance: Floats
+    information: Floats
     state: State
     table: StarTable
     kept: Mask
     residual_px: Floats
     variance: CentroidVariance
     variance_factor: float
+    star_tracker_sigma_rad: Floats
+    misfit_image: Mask
+    dropped_catalog_id: NDArray[np.int64]
     alignment_scatter_arcsec: float
     iterations: int
     termination: str
@@ -196,9 +181,6 @@ def estimate_calibration(
     """
     Estimate of the camera parameters and the alignment from an ensemble.
 
-    First with a robust loss from the prior; then least squares on the stars that fit, the
-    variance of the centroids re-estimated, until the set of stars no longer changes.
-
     Raises
     ------
     TooFewObservations
@@ -206,20 +188,13 @@ def estimate_calibration(
     """
     check_enough(ensemble, options)
     table = star_table(ensemble.images)
+    problem = _problem(ensemble, prior, options)
     alignment = Rotation.from_quat(prior.star_tracker_from_camera_xyzw).inv()
-    star_tracker_from_icrf = Rotation.from_quat(
-        np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
-    ).inv()
-    free = np.array([PARAMETER_NAMES.index(name) for name in options.estimate], np.int64)
-    problem = Problem(
-        options.method,
-        np.sort(free),
-        star_tracker_from_icrf,
-        np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD,
+    start = State(
+        prior.camera.parameters.copy(), alignment, alignment * problem.star_tracker_from_icrf
     )
-    state = State(prior.camera.parameters.copy(), alignment, alignment * star_tracker_from_icrf)
     try:
-        return _search(problem, state, table, prior, options)
+        return _search(problem, start, table, prior, options)
     except (NotObservable, np.linalg.LinAlgError) as error:
         names = ', '.join(options.estimate)
         raise TooFewObservations(
@@ -228,59 +203,153 @@ def estimate_calibration(
         ) from error
 
 
+def _problem(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Problem:
+    prior_sigma = np.array(options.prior_sigma)
+    return Problem(
+        method=options.method,
+        free=np.sort(np.array([PARAMETER_NAMES.index(n) for n in options.estimate], np.int64)),
+        prior_parameters=prior.camera.parameters,
+        prior_sigma=np.where(prior_sigma > 0, prior_sigma, np.inf),
+        star_tracker_from_icrf=Rotation.from_quat(
+            np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
+        ).inv(),
+        star_tracker_sigma_rad=np.tile(
+            np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD, (len(ensemble.images), 1)
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """What the residuals say: the variances, and what is left out."""
+
+    variance: CentroidVariance
+    tracker_sigma_rad: Floats  # (3,)
+    misfit: Mask  # (m,)
+    kept: Mask  # (n,)
+
+    def agrees_with(self, other: _Verdict) -> bool:
+        """Whether a search with the one would end where a search with the other does."""
+        return (
+            np.array_equal(self.kept, other.kept)
+            and np.array_equal(self.misfit, other.misfit)
+            and self.variance.is_close_to(other.variance)
+            and np.allclose(self.tracker_sigma_rad, other.tracker_sigma_rad, rtol=0.02)
+        )
+
+
 def _search(
     problem: Problem,
-    state: State,
+    start: State,
     table: StarTable,
     prior: CameraGeometry,
     options: CalibrationOptions,
 ) -> Estimate:
-    """Robust search, then least squares with snooping; see `estimate_calibration`."""
+    """Robust search, then least squares with snooping; see the head of the module."""
     everything = np.ones(len(table), bool)
-    start = CentroidVariance(1.0, _START_FLOOR_PX**2)
-    solution = _minimise(
-        problem, state, arrange(table, everything, start.of(table.covariance_px2)), _ROBUST_SCALE
+    given_rad = problem.star_tracker_sigma_rad[0]
+    verdict = _Verdict(
+        CentroidVariance(1.0, _START_FLOOR_PX**2),
+        given_rad,
+        np.zeros(table.image_count, bool),
+        everything,
     )
+    covariance_px2 = verdict.variance.of(table.covariance_px2)
+    solution = minimise(problem, start, arrange(table, everything, covariance_px2), _ROBUST_SCALE)
     iterations = solution.iterations
-    residual_px = _residuals(solution.state, table)
-    variance = estimate_variance(residual_px, table.covariance_px2, everything, 1.0)
-    kept = _fitting(residual_px, table, variance, options)
-    for _ in range(_SNOOPING_ROUNDS):
-        covariance_px2 = variance.of(table.covariance_px2)
-        solution = _minimise(problem, solution.state, arrange(table, kept, covariance_px2), np.inf)
+    after = _judge(problem, solution.state, table, verdict, given_rad, options)
+    for _ in range(_ROUNDS):
+        verdict = after
+        problem = dataclasses.replace(
+            problem,
+            star_tracker_sigma_rad=np.where(
+                verdict.misfit[:, None], np.inf, verdict.tracker_sigma_rad
+            ),
+        )
+        covariance_px2 = verdict.variance.of(table.covariance_px2)
+        measurements = arrange(table, verdict.kept, covariance_px2)
+        solution = minimise(problem, solution.state, measurements)
         iterations += solution.iterations
-        residual_px = _residuals(solution.state, table)
-        kept_before, variance_before = kept, variance
-        freedom = _degrees_of_freedom(problem, table, kept) / (2 * np.count_nonzero(kept))
-        variance = estimate_variance(residual_px, table.covariance_px2, kept, freedom)
-        kept = _fitting(residual_px, table, variance, options)
-        if np.array_equal(kept, kept_before) and variance.is_close_to(variance_before):
+        after = _judge(problem, solution.state, table, verdict, given_rad, options)
+        if after.agrees_with(verdict):
             break
-    kept, variance = kept_before, variance_before
-    dof = _degrees_of_freedom(problem, table, kept)
+    state = solution.state
+    _, blocks = normal_blocks(measurements, state.parameters, state.camera_from_icrf.as_matrix())
+    residual_px = _residuals(state, table)
+    kept = verdict.kept
+    freedom = _freedom(problem, state, blocks, kept, verdict.tracker_sigma_rad)
     chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()
-    geometry, cov, scatter_arcsec = _result(problem, solution, prior)
+    lost = np.bincount(table.image[kept], minlength=table.image_count) == 0
+    geometry, covariance, scatter_arcsec = _result(
+        problem, state, blocks, prior, verdict.tracker_sigma_rad
+    )
+    information = reduced_information(problem, state, blocks)
+    shared = np.concatenate([problem.free, np.arange(10, len(information))])
     return Estimate(
         geometry=geometry,
-        covariance=cov,
-        state=solution.state,
+        covariance=covariance,
+        information=information[np.ix_(shared, shared)],
+        state=state,
         table=table,
         kept=kept,
         residual_px=residual_px,
-        variance=variance,
-        variance_factor=float(chi2_given / dof),
+        variance=verdict.variance,
+        variance_factor=float(chi2_given / (2 * np.count_nonzero(kept) * freedom)),
+        star_tracker_sigma_rad=verdict.tracker_sigma_rad,
+        misfit_image=verdict.misfit | lost,
+        dropped_catalog_id=np.setdiff1d(table.catalog_id, table.catalog_id[kept])
+        if len(table)
+        else table.catalog_id,
         alignment_scatter_arcsec=scatter_arcsec,
         iterations=iterations,
         termination=solution.termination,
     )
 
 
+def _judge(
+    problem: Problem,
+    state: State,
+    table: StarTable,
+    before: _Verdict,
+    given_rad: Floats,
+    options: CalibrationOptions,
+) -> _Verdict:
+    """Variances and misfits from the residuals at a state that the verdict before has led to."""
+    residual_px = _residuals(state, table)
+    measurements = arrange(table, before.kept, before.variance.of(table.covariance_px2))
+    _, blocks = normal_blocks(measurements, state.parameters, state.camera_from_icrf.as_matrix())
+    variance, tracker_sigma_rad = CentroidVariance(1.0, 0.0), given_rad
+    eta_rad, covariance_rad2, seen = attitudes_of_stars_alone(problem, state, blocks)
+    found_rad, misfit = estimate_star_tracker_sigma(eta_rad, covariance_rad2, seen, given_rad)
+    if problem.method == 'single':
+        # One rotation for all has no attitude of an image to judge.
+        misfit = np.zeros_like(misfit)
+    if options.variance_components:
+        freedom = _freedom(problem, state, blocks, before.kept, before.tracker_sigma_rad)
+        variance = estimate_variance(residual_px, table.covariance_px2, before.kept, freedom)
+        if problem.method != 'single':
+            tracker_sigma_rad = found_rad
+    kept = _fitting(residual_px, table, variance, options)
+    return _Verdict(variance, tracker_sigma_rad, misfit, kept)
+
+
 def _fitting(
     residual_px: Floats, table: StarTable, variance: CentroidVariance, options: CalibrationOptions
 ) -> Mask:
-    """Return (n,) whether a star is no outlier, in an image that has enough of such."""
+    """
+    Return (n,) which stars are used.
+
+    Not an outlier; not a star that is one in most of its images, or whose residuals together are
+    too large (a wrong catalog place, a planet); and in an image that has enough of the others.
+    """
     length2 = squared_sigmas(residual_px, variance.of(table.covariance_px2))
     fits = length2 < options.outlier_sigma**2
+    _, star = np.unique(table.catalog_id, return_inverse=True)
+    sightings = np.bincount(star)
+    misses = np.bincount(star, ~fits)
+    summed = np.bincount(star, np.where(fits, length2, 0.0))
+    bad_star = (2 * misses > sightings) | (summed > chi2.isf(_STAR_CHANCE, 2 * sightings))
+    fits &= ~(bad_star & (sightings >= _FEWEST_SIGHTINGS))[star]
     # The rotation of an image fits any one star, and two as good as any.
     left = np.bincount(table.image[fits], minlength=table.image_count)
     return np.asarray(fits & (left[table.image] >= 3))
@@ -290,189 +359,54 @@ def _residuals(state: State, table: StarTable) -> Floats:
     return residuals_px(table, state.parameters, state.camera_from_icrf.as_matrix())
 
 
-def _degrees_of_freedom(problem: Problem, table: StarTable, kept: Mask) -> int:
-    """Residuals less unknowns; the unknowns of the hierarchical method count as data too."""
-    images = len(np.unique(table.image[kept]))
-    unknowns = len(problem.free) + (3 * images if problem.method == 'per_image' else 3)
-    if problem.method == 'hierarchical':
-        # Attitudes far better measured by the stars than by the tracker are free in effect.
-        unknowns += 3 * images - 3
-    dof = 2 * int(np.count_nonzero(kept)) - unknowns
-    if dof <= 0:
+def _freedom(
+    problem: Problem, state: State, blocks: Floats, kept: Mask, tracker_sigma_rad: Floats
+) -> float:
+    """
+    Share of the residuals' degrees of freedom that the fit leaves.
+
+    An attitude that the star tracker holds costs less than three: with P the covariance from the
+    stars and T the star tracker's, trace(T (T + P)^-1).
+    """
+    unknowns = float(len(problem.free))
+    if problem.method == 'single':
+        unknowns += 3
+    else:
+        _, P, seen = attitudes_of_stars_alone(problem, state, blocks)
+        if problem.method == 'per_image':
+            unknowns += 3 * int(np.count_nonzero(seen))
+        else:
+            T = np.diag(tracker_sigma_rad**2)
+            unknowns += float(np.trace(np.linalg.solve(T + P[seen], T), axis1=1, axis2=2).sum())
+    share = 1.0 - unknowns / (2 * max(int(np.count_nonzero(kept)), 1))
+    if share <= 0:
         raise NotObservable('fewer residuals than unknowns')
-    return dof
-
-
-def estimate_variance(
-    residual_px: Floats, covariance_px2: Floats, kept: Mask, freedom: float
-) -> CentroidVariance:
-    """
-    Scale and floor that make the centroid covariances those of the residuals.
-
-    The kept stars are ranked by their own variance and cut into groups; the median squared
-    residual of a group, which outliers do not move, is its variance; scale and floor are the
-    non-negative line through the groups.  ``freedom`` is the share of the residuals' degrees of
-    freedom that the fit has left them.
-    """
-    own = 0.5 * (covariance_px2[kept, 0] + covariance_px2[kept, 2])
-    squared = (residual_px[kept] ** 2).sum(axis=1)
-    groups = int(np.clip(len(own) // _STARS_PER_GROUP, 1, 12))
-    parts = np.array_split(np.argsort(own, kind='stable'), groups)
-    mean_own = np.array([own[part].mean() for part in parts])
-    # The median of a squared Rayleigh deviate is 2 ln 2 variances per axis.
-    found = np.array([np.median(squared[part]) for part in parts]) / (2 * math.log(2.0) * freedom)
-    if groups < 3 or mean_own[-1] < 2.0 * mean_own[0]:
-        # Scale and floor cannot be told apart: a floor when there is an excess, else a scale.
-        excess = float((found - mean_own).mean())
-        if excess >= 0.0:
-            return CentroidVariance(1.0, excess)
-        return CentroidVariance(float(np.clip((found / mean_own).mean(), 0.1, 1.0)), 0.0)
-    scale, floor_px2 = 1.0, 0.0
-    for _ in range(5):
-        weight = 1.0 / np.maximum(scale * mean_own + floor_px2, 1e-12)
-        A = np.stack([mean_own, np.ones(groups)], axis=-1) * weight[:, None]
-        (scale, floor_px2), _ = nnls(A, found * weight)
-        scale = max(float(scale), 0.1)
-    return CentroidVariance(scale, float(floor_px2))
-
-
-def _minimise(
-    problem: Problem, state: State, measurements: Measurements, loss_scale: float
-) -> Solution[State]:
-    """Levenberg-Marquardt with the method's own assembly of the normal equations."""
-
-    def evaluate(at: State) -> NormalEquations:
-        cost, blocks = normal_blocks(
-            measurements, at.parameters, at.camera_from_icrf.as_matrix(), loss_scale
-        )
-        return _assemble(problem, at, cost, blocks)
-
-    def move(at: State, shared: Floats, blocks: Floats) -> State:
-        return _move(problem, at, shared, blocks)
-
-    return levenberg_marquardt(state, evaluate, move)
-
-
-def _assemble(problem: Problem, state: State, cost: float, blocks: Floats) -> NormalEquations:
-    """Normal equations of the method from the (14, 14) matrices of the images."""
-    free = problem.free
-    f = len(free)
-    if problem.method == 'single':
-        total = blocks.sum(axis=0)
-        shared = np.concatenate([free, np.arange(ROTATION.start, ROTATION.stop)])
-        empty = np.empty((0, 3, f + 3)), np.empty((0, 3, 3)), np.empty((0, 3))
-        return NormalEquations(
-            cost, total[np.ix_(shared, shared)], total[shared, RESIDUAL], *empty
-        )
-    A = blocks[:, CAMERA, CAMERA].sum(axis=0)[np.ix_(free, free)]
-    a = blocks[:, CAMERA, RESIDUAL].sum(axis=0)[free]
-    B = blocks[:, ROTATION, CAMERA][:, :, free]
-    C = blocks[:, ROTATION, ROTATION]
-    c = blocks[:, ROTATION, RESIDUAL]
-    if problem.method == 'per_image':
-        # An image whose stars were all left out keeps its rotation: nothing pulls on it.
-        empty_image = C[:, 0, 0] == 0
-        C = np.where(empty_image[:, None, None], np.eye(3), C)
-        return NormalEquations(cost, A, a, B, C, c)
-    residual, J = _attitude_errors(problem, state)
-    information = J.transpose(0, 2, 1) @ J
-    gradient = np.einsum('mji,mj->mi', J, residual)
-    A_full = np.zeros((f + 3, f + 3))
-    A_full[:f, :f] = A
-    A_full[f:, f:] = information.sum(axis=0)
-    return NormalEquations(
-        cost=cost + 0.5 * float((residual**2).sum()),
-        A=A_full,
-        a=np.concatenate([a, gradient.sum(axis=0)]),
-        B=np.concatenate([B, -information], axis=2),
-        C=C + information,
-        c=c - gradient,
-    )
-
-
-def _attitude_errors(problem: Problem, state: State) -> tuple[Floats, Floats]:
-    """
-    Whitened star tracker errors (m, 3), and their derivative (m, 3, 3) by the images' rotations.
-
-    The derivative by the common alignment is the negative of it.
-    """
-    star_tracker_from_camera = state.camera_from_star_tracker.inv()
-    error = (
-        star_tracker_from_camera * state.camera_from_icrf * problem.star_tracker_from_icrf.inv()
-    )
-    eta = -error.as_rotvec()
-    # d Log: the inverse Jacobian of SO(3) to first order, exact to eta^2 / 12 (1e-9 at 20 arcsec).
-    half = 0.5 * _cross_matrix(eta)
-    J = (np.eye(3) + half) @ star_tracker_from_camera.as_matrix()
-    sigma = problem.star_tracker_sigma_rad
-    return eta / sigma, J / sigma[:, None]
-
-
-def _cross_matrix(v: Floats) -> Floats:
-    """Matrices (m, 3, 3) with ``_cross_matrix(v) @ w = v x w``."""
-    x, y, z = v.T
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _move(problem: Problem, state: State, shared: Floats, blocks: Floats) -> State:
-    """Take a step: parameters add, rotations turn (Eq. 11)."""
-    f = len(problem.free)
-    parameters = state.parameters.copy()
-    parameters[problem.free] += shared[:f]
-    alignment = state.camera_from_star_tracker
-    if problem.method == 'per_image':
-        return State(parameters, alignment, Rotation.from_rotvec(-blocks) * state.camera_from_icrf)
-    turn = Rotation.from_rotvec(-shared[f:])
-    alignment = turn * alignment
-    if problem.method == 'single':
-        return State(parameters, alignment, turn * state.camera_from_icrf)
-    return State(parameters, alignment, Rotation.from_rotvec(-blocks) * state.camera_from_icrf)
+    return share
 
 
 def _result(
-    problem: Problem, solution: Solution[State], prior: CameraGeometry
+    problem: Problem,
+    state: State,
+    blocks: Floats,
+    prior: CameraGeometry,
+    tracker_sigma_rad: Floats,
 ) -> tuple[CameraGeometry, Floats, float]:
     """Geometry, its (13, 13) covariance and the scatter of the images' alignments, arcsec."""
-    state = solution.state
-    shared, cross, within = covariance(solution.normal)
-    m, f = len(cross), len(problem.free)
-    estimated = np.concatenate([problem.free, [10, 11, 12]])
-    full = np.zeros((13, 13))
-    scatter_arcsec = 0.0
+    information = reduced_information(problem, state, blocks)
+    shared = _considered_covariance(problem, information)
+    full: Floats = np.zeros((13, 13))
+    full[: len(shared), : len(shared)] = shared
     alignment = state.camera_from_star_tracker
+    scatter_arcsec = 0.0
+    if problem.method != 'single':
+        eta_rad, _, seen = attitudes_of_stars_alone(problem, state, blocks)
+        good = seen & np.isfinite(problem.star_tracker_sigma_rad[:, 0])
+        if good.any():
+            scatter_arcsec = float(np.sqrt(eta_rad[good].var(axis=0).mean())) / ARCSECOND_RAD
     if problem.method == 'per_image':
-        used = solution.normal.B.any(axis=(1, 2))
-        alignments = (state.camera_from_icrf * problem.star_tracker_from_icrf.inv())[used]
-        tracker = np.diag(problem.star_tracker_sigma_rad**2)
-        C = alignments[0].as_matrix()
-        tracker = C @ tracker @ C.T
-        weight = 1.0 / np.trace(within[used] + tracker, axis1=1, axis2=2)
-        alignment = alignments.mean(weight)
-        weight = weight / weight.sum()
-        deviation = (alignments * alignment.inv()).as_rotvec()
-        scatter_arcsec = float(np.sqrt(np.mean(deviation**2))) / ARCSECOND_RAD
-        # The mean of the rotations is linear in theirs: theta_k = own noise_k - F_k * shared.
-        mean_cross = np.einsum('m,mij->ij', weight, cross[used])
-        own = np.linalg.inv(solution.normal.C[used])
-        F = np.linalg.solve(shared, mean_cross.T).T
-        mean = np.einsum('m,mij->ij', weight**2, own + tracker)
-        mean += F @ shared @ F.T
-        block = np.block(
-            [
-                [shared, mean_cross.T],
-                [mean_cross, mean],
-            ]
-        )
-    else:
-        block = shared
-        if problem.method == 'hierarchical' and m:
-            errors, _ = _attitude_errors(problem, state)
-            eta = errors * problem.star_tracker_sigma_rad
-            scatter_arcsec = float(np.sqrt(np.mean(eta**2))) / ARCSECOND_RAD
-    assert block.shape == (f + 3, f + 3)
-    full[np.ix_(estimated, estimated)] = 0.5 * (block + block.T)
+        if not good.any():
+            raise NotObservable('no attitude of an image fits the others')
+        alignment, full = _mean_alignment(problem, state, blocks, good, full, tracker_sigma_rad)
     camera = prior.camera.replace(
         **{PARAMETER_NAMES[i]: float(state.parameters[i]) for i in problem.free}
     )
@@ -480,3 +414,59 @@ def _result(
     # One of the two quaternions of a rotation, so that equal calibrations are equal numbers.
     quaternion = quaternion * math.copysign(1.0, quaternion[3])
     return CameraGeometry(camera, quaternion), full, scatter_arcsec
+
+
+def _considered_covariance(problem: Problem, information: Floats) -> Floats:
+    """
+    Covariance (p, p) of all camera parameters, and the alignment where the information has it.
+
+    A held parameter with a prior sigma is considered: its uncertainty is its own, and what it does
+    to the estimated ones is added to theirs; one without stays at zero.
+    """
+    p = len(information)
+    estimated = np.concatenate([problem.free, np.arange(10, p)])
+    held = np.setdiff1d(np.arange(10), problem.free)
+    held_variance = np.where(
+        np.isfinite(problem.prior_sigma[held]), problem.prior_sigma[held], 0.0
+    )
+    held_variance = held_variance**2
+    noise = inverse(information[np.ix_(estimated, estimated)])
+    to_estimated = -noise @ information[np.ix_(estimated, held)]
+    result = np.zeros((p, p))
+    result[np.ix_(estimated, estimated)] = noise + (to_estimated * held_variance) @ to_estimated.T
+    result[np.ix_(estimated, held)] = to_estimated * held_variance
+    result[np.ix_(held, estimated)] = result[np.ix_(estimated, held)].T
+    result[held, held] = held_variance
+    return 0.5 * (result + result.T)
+
+
+def _mean_alignment(
+    problem: Problem,
+    state: State,
+    blocks: Floats,
+    good: Mask,
+    full: Floats,
+    tracker_sigma_rad: Floats,
+) -> tuple[Rotation, Floats]:
+    """
+    Quaternion mean of the alignments of the images (Markley et al. 2007), completing ``full``.
+
+    SciPy's mean is the dominant eigenvector of sum w q q'; weighted by the covariances of the
+    images.  The mean is linear in the rotations, and those in the camera parameters.
+    """
+    alignments = (state.camera_from_icrf * problem.star_tracker_from_icrf.inv())[good]
+    tracker = np.diag(tracker_sigma_rad**2)
+    C, B = blocks[good][:, ROTATION, ROTATION], blocks[good][:, ROTATION, CAMERA]
+    stars, by_camera = np.linalg.inv(C), np.linalg.solve(C, B)
+    within = stars + by_camera @ full[:10, :10] @ by_camera.transpose(0, 2, 1)
+    weight = 1.0 / np.trace(within + tracker, axis1=1, axis2=2)
+    alignment = alignments.mean(weight)
+    weight = weight / weight.sum()
+    A = alignment.as_matrix()
+    F = np.einsum('m,mij->ij', weight, by_camera)
+    scattered = np.einsum('m,mij->ij', weight**2, stars + A @ tracker @ A.T)
+    full = full.copy()
+    full[10:, 10:] = scattered + F @ full[:10, :10] @ F.T
+    full[10:, :10] = -F @ full[:10, :10]
+    full[:10, 10:] = full[10:, :10].T
+    return alignment, full

@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument('bags', nargs='+', type=Path, metavar='BAG', help='.mcap or folder')
     calibrate.add_argument('--params', type=Path, required=True, metavar='FILE')
     calibrate.add_argument('-o', '--output', type=Path, required=True, metavar='DIR')
-    for what in ('image', 'attitude', 'observations'):
+    for what in ('image', 'attitude', 'velocity', 'observations'):
         calibrate.add_argument(
             f'--{what}-topic', default='', metavar='T', help='the only one of its type if left out'
         )
@@ -154,14 +154,24 @@ def _observations(
     there = bag.topics(args.bags)
     types = {topic.type_name for topic in there}
     counts = {topic.name: topic.count for topic in there}
-    only_recorded = messages.IMAGE_TYPE not in types and messages.OBSERVATIONS_TYPE in types
+    image_types = [t for t in (messages.IMAGE_TYPE, messages.COMPRESSED_TYPE) if t in types]
+    only_recorded = not image_types and messages.OBSERVATIONS_TYPE in types
     if args.observations_topic or (only_recorded and not args.image_topic):
         topic = bag.choose_topic(args.bags, messages.OBSERVATIONS_TYPE, args.observations_topic)
         return bag.read_observations(args.bags, topic), counts[topic]
-    image_topic = bag.choose_topic(args.bags, messages.IMAGE_TYPE, args.image_topic)
+    image_type = next(iter(image_types), messages.IMAGE_TYPE)
+    for kind in image_types:
+        if any(
+            t.type_name == kind and t.name == f'/{args.image_topic.lstrip("/")}' for t in there
+        ):
+            image_type = kind
+    image_topic = bag.choose_topic(args.bags, image_type, args.image_topic)
     attitude_topic = bag.choose_topic(args.bags, messages.ATTITUDE_TYPE, args.attitude_topic)
+    velocity_topic = args.velocity_topic
+    if velocity_topic or messages.VELOCITY_TYPE in types:
+        velocity_topic = bag.choose_topic(args.bags, messages.VELOCITY_TYPE, velocity_topic)
     return (
-        pipeline.observe_bag(args.bags, image_topic, attitude_topic, setup),
+        pipeline.observe_bag(args.bags, image_topic, attitude_topic, setup, velocity_topic),
         counts[image_topic],
     )
 

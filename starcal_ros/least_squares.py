@@ -77,9 +77,9 @@ class NotObservable(ArithmeticError):
 
 def _factor(matrix: Floats) -> tuple[Floats, Floats]:
     """
-    Scale (..., n) and inverse (..., n, n) of the unit-diagonal form of positive matrices.
+    Scale (..., n), and inverse (..., n, n) of the unit-diagonal form of positive matrices.
 
-    ``inverse(matrix) = scale * inverse * scale``: scaled so, parameters of any unit are alike.
+    ``inverse(matrix) = scale * that inverse * scale``: so parameters of any unit are alike.
     """
     diagonal = np.einsum('...ii->...i', matrix)
     if not (diagonal > 0).all():
@@ -93,14 +93,14 @@ def _factor(matrix: Floats) -> tuple[Floats, Floats]:
         raise NotObservable('the unknowns cannot be told apart') from error
     if np.einsum('...ii->...i', lower).min(initial=1.0) < 1e-7:
         raise NotObservable('the unknowns cannot be told apart')
-    inverse = np.linalg.inv(lower)
-    return scale, np.swapaxes(inverse, -1, -2) @ inverse
+    lower_inverse = np.linalg.inv(lower)
+    return scale, np.swapaxes(lower_inverse, -1, -2) @ lower_inverse
 
 
-def _inverse(matrix: Floats) -> Floats:
+def inverse(matrix: Floats) -> Floats:
     """Inverse of positive definite matrices (..., n, n)."""
-    scale, inverse = _factor(matrix)
-    return np.asarray(scale[..., :, None] * inverse * scale[..., None, :])
+    scale, scaled = _factor(matrix)
+    return np.asarray(scale[..., :, None] * scaled * scale[..., None, :])
 
 
 def _schur_complement(A: Floats, flat_B: Floats, W: Floats) -> Floats:
@@ -130,14 +130,14 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
     p = len(normal.a)
     A = normal.A + damping * np.diag(np.diag(normal.A))
     if len(normal.C) == 0:
-        return _inverse(A) @ normal.a, np.empty_like(normal.c)
+        return inverse(A) @ normal.a, np.empty_like(normal.c)
     q = normal.C.shape[-1]
     C = normal.C * (1.0 + damping * np.eye(q))
-    C_inverse = _inverse(C)
+    C_inverse = inverse(C)
     W = C_inverse @ normal.B
     w = np.einsum('mij,mj->mi', C_inverse, normal.c)
     flat_B = normal.B.reshape(-1, p)
-    shared = _inverse(_schur_complement(A, flat_B, W)) @ (normal.a - flat_B.T @ w.ravel())
+    shared = inverse(_schur_complement(A, flat_B, W)) @ (normal.a - flat_B.T @ w.ravel())
     return shared, w - W @ shared
 
 
@@ -160,10 +160,10 @@ def covariance(normal: NormalEquations) -> tuple[Floats, Floats, Floats]:
     """
     p = len(normal.a)
     if len(normal.C) == 0:
-        return _inverse(normal.A), np.empty_like(normal.B), np.empty_like(normal.C)
-    C_inverse = _inverse(normal.C)
+        return inverse(normal.A), np.empty_like(normal.B), np.empty_like(normal.C)
+    C_inverse = inverse(normal.C)
     W = C_inverse @ normal.B
-    shared = _inverse(_schur_complement(normal.A, normal.B.reshape(-1, p), W))
+    shared = inverse(_schur_complement(normal.A, normal.B.reshape(-1, p), W))
     cross = -W @ shared
     return shared, cross, C_inverse - cross @ np.swapaxes(W, -1, -2)
 

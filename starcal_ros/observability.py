@@ -66,7 +66,8 @@ def image_information(
     A = blocks[:, CAMERA, CAMERA][:, free][:, :, free]
     B = blocks[:, ROTATION, CAMERA][:, :, free]
     C = blocks[:, ROTATION, ROTATION]
-    seen = np.array([len(image) >= 2 for image in images])
+    # An image without two stars before the camera tells nothing.
+    seen = np.array([len(image) >= 2 for image in images]) & C.any(axis=(1, 2))
     information = np.zeros_like(A)
     if seen.any():
         information[seen] = A[seen] - B[seen].transpose(0, 2, 1) @ np.linalg.solve(

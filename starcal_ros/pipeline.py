@@ -208,8 +208,56 @@ def _without_dark(image: Image, dark: NDArray[np.uint8] | NDArray[np.uint16] | N
     return Image(image.time_ns, np.clip(level, 0, 65535).astype(np.uint16))
 
 
+@dataclass(frozen=True)
+class Track:
+    """Where a sequence of images stands: what to predict the next with, and the last one used."""
+
+    geometry: CameraGeometry
+    latest_ns: int | None = None
+
+
+def observe_next(
+    image: Image,
+    attitudes: AttitudeHistory,
+    setup: Setup,
+    base: CameraGeometry,
+    track: Track,
+    velocity_m_s: Floats | None = None,
+) -> tuple[StarObservations, Track]:
+    """
+    The stars of the next image of a sequence, and where the sequence stands then.
+
+    ``base`` is the prior or the calibration in force.  An image stamped at or before one that was
+    used is refused; a refused image moves nothing, so that one wrong stamp costs one image.
+    """
+    if track.latest_ns is not None and image.time_ns <= track.latest_ns:
+        height, width = image.pixels.shape
+        late_s = (track.latest_ns - image.time_ns) * 1e-9
+        detail = f'{late_s:.6f} s before the last image used'
+        return refused_image(image.time_ns, width, height, 'out_of_order', detail), track
+    observations = observe(image, attitudes, setup, track.geometry, velocity_m_s)
+    latest_ns = track.latest_ns if observations.refusal else image.time_ns
+    return observations, Track(tracked(base, observations), latest_ns)
+
+
+def velocity_at(samples: Sequence[tuple[int, Floats]], time_ns: int) -> Floats | None:
+    """
+    The last velocity (3,) at or before a time, else the first after it; None without any.
+
+    A spacecraft's velocity changes by under 10 m/s (0.007 arcsec) between the samples of a minute.
+    """
+    before = [velocity for stamp_ns, velocity in samples if stamp_ns <= time_ns]
+    if before:
+        return before[-1]
+    return samples[0][1] if samples else None
+
+
 def observe_bag(
-    paths: Sequence[Path], image_topic: str, attitude_topic: str, setup: Setup
+    paths: Sequence[Path],
+    image_topic: str,
+    attitude_topic: str,
+    setup: Setup,
+    velocity_topic: str = '',
 ) -> Iterator[StarObservations]:
     """
     Observations of every image of a bag, in the order of the bag; one image in memory at a time.
@@ -220,27 +268,20 @@ def observe_bag(
         When the bag cannot be read or a topic is not in it.
     """
     attitudes = bag.read_attitudes(paths, attitude_topic, setup.attitude)
-    latest_ns: int | None = None
-    geometry = setup.prior
+    velocities = (
+        sorted(bag.read_velocities(paths, velocity_topic), key=lambda sample: sample[0])
+        if velocity_topic
+        else []
+    )
+    track = Track(setup.prior)
     for image in bag.read_images(paths, image_topic, setup.attitude.stamp_offset_s):
         if isinstance(image, StarObservations):
             yield image
-        elif latest_ns is not None and image.time_ns <= latest_ns:
-            yield out_of_order(image, latest_ns)
-        else:
-            latest_ns = image.time_ns
-            observations = observe(image, attitudes, setup, geometry)
-            geometry = tracked(setup.prior, observations)
-            yield observations
-
-
-def out_of_order(image: Image, latest_ns: int) -> StarObservations:
-    """Record of an image refused because a later one, or itself, has been taken already."""
-    height, width = image.pixels.shape
-    late_s = (latest_ns - image.time_ns) * 1e-9
-    return refused_image(
-        image.time_ns, width, height, 'out_of_order', f'{late_s:.6f} s before the last image'
-    )
+            continue
+        observations, track = observe_next(
+            image, attitudes, setup, setup.prior, track, velocity_at(velocities, image.time_ns)
+        )
+        yield observations
 
 
 def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:

@@ -31,6 +31,8 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'no_stars': 'too few star-like sources in the image',
     'no_match': 'no rotation of the predicted stars explains the sources in the image',
     'too_few_stars': 'fewer stars were measured well than an image needs',
+    'overrun': 'images came faster than they could be measured',
+    'internal_error': 'the measurement failed unexpectedly; the log of the node has the cause',
 }
 """Why an image can be refused: stable name -> meaning."""
 
@@ -253,7 +255,7 @@ class Calibration:
     images_refused : mapping
         Reason -> count.
     alignment_scatter_arcsec : float
-        RMS per axis of the per-image alignments about their mean; 0 for one common alignment.
+        RMS per axis of the alignments that the images show, about their mean; 0 for ``single``.
     zero_skew_cost_px : float
         Worst pixel error of the zero-skew fit that ``camera_info`` carries.
     iterations, termination

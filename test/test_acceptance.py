@@ -142,16 +142,12 @@ def not_finite(name: str, bad: float) -> Candidate:
     return dataclasses.replace(GOOD, **{name: bad})  # type: ignore[arg-type]
 
 
-PASSES = pytest.mark.xfail(reason='a comparison with NaN is false, and false passes')
-
-
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
 @pytest.mark.parametrize('name', ['covariance diagonal', 'map_sigma_px'])
 def test_what_is_not_finite_is_refused(name: str, bad: float) -> None:
     assert judge(not_finite(name, bad), GateOptions())
 
 
-@PASSES
 @pytest.mark.parametrize('name', ['residual_rms_px', 'covariance', 'quaternion'])
 def test_nothing_that_is_nan_passes(name: str) -> None:
     assert judge(not_finite(name, np.nan), GateOptions())
@@ -165,8 +161,7 @@ def test_a_negative_variance_is_refused() -> None:
     covariance = GOOD.covariance.copy()
     covariance[3, 3] = -1e-9
     candidate = dataclasses.replace(GOOD, covariance=covariance)
-    reason = 'a parameter or its variance is not a finite number'
-    assert judge(candidate, GateOptions()) == (reason,)
+    assert judge(candidate, GateOptions()) == ('a variance is negative',)
 
 
 def test_no_star_at_all_is_refused() -> None:

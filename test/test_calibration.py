@@ -10,19 +10,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from starcal_ros.adjustment import METHODS
 from starcal_ros.calibration import (
     CalibrationOptions,
     check_enough,
     Estimate,
     estimate_calibration,
-    estimate_variance,
-    METHODS,
 )
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.synthetic import BOUND_NAMES, cramer_rao_covariance, scenario, true_observations
+from starcal_ros.variance import estimate_variance
 
 SCENARIO = scenario('tiny', seed=3)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior

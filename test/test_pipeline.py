@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -200,6 +201,23 @@ def test_an_image_that_nothing_explains_keeps_its_attitude(setup: pipeline.Setup
     assert found.attitude_gap_s == 0.5
     assert found.catalog_digest == setup.catalog.digest
     assert abs(found.icrf_from_star_tracker_xyzw[3]) < 1.0
+
+
+def test_out_of_order_images_say_by_how_much(setup: pipeline.Setup) -> None:
+    track = pipeline.Track(setup.prior, image().time_ns + 250_000_000)
+    found, after = pipeline.observe_next(image(), attitudes(), setup, setup.prior, track)
+    assert found.refusal == 'out_of_order'
+    assert found.detail == '0.250000 s before the last image used'
+    assert after == track
+
+
+def test_a_refused_image_does_not_put_those_after_it_out_of_order(setup: pipeline.Setup) -> None:
+    track = pipeline.Track(setup.prior)
+    future = dataclasses.replace(image(), time_ns=image().time_ns + 10**15)
+    refused, track = pipeline.observe_next(future, attitudes(), setup, setup.prior, track)
+    assert refused.refusal == 'no_attitude'
+    found, track = pipeline.observe_next(image(), attitudes(), setup, setup.prior, track)
+    assert found.refusal == '' and track.latest_ns == image().time_ns
 
 
 def write_png(path: Path, pixels: np.ndarray) -> str:

@@ -21,13 +21,18 @@ from starcal_ros.annotation import annotate
 from starcal_ros.attitude import attitude_sample, AttitudeHistory
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification import tracked
 from starcal_ros.node_options import ObserverOptions
 from starcal_ros.nodes.conversions import make_message
 from starcal_ros.nodes.image_queue import ImageQueue, Waiting
 from starcal_ros.nodes.lifecycle import Health, OK, run, StarcalNode, WARN
 from starcal_ros.options import from_mapping
-from starcal_ros.records import AttitudeSample, Image, refused_image, StarObservations
+from starcal_ros.records import (
+    AttitudeSample,
+    CameraGeometry,
+    Image,
+    refused_image,
+    StarObservations,
+)
 
 NAME = 'star_observer'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -56,7 +61,8 @@ class StarObserver(StarcalNode):
         values = self.options.values()
         self._own = from_mapping(ObserverOptions, values)
         self._setup = pipeline.load_setup(values, self.options.classes)
-        self._geometry = self._tracked = self._setup.prior
+        self._geometry = self._setup.prior
+        self._track = pipeline.Track(self._geometry)
         self._observations = self.create_lifecycle_publisher(
             ObservationsMessage, 'observations', QoSProfile(depth=100)
         )
@@ -70,7 +76,6 @@ class StarObserver(StarcalNode):
         self._attitudes = AttitudeHistory(self._own.attitude_history_s)
         self._new_attitudes: deque[tuple[int, AttitudeSample | None]] = deque()
         self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
-        self._latest_ns: int | None = None
         self._counts.clear()
         self._last_refusal = ''
         self._queue = ImageQueue(
@@ -160,7 +165,8 @@ class StarObserver(StarcalNode):
         prior = self._setup.prior.camera
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
             raise ValueError('calibration: of another image size than the prior camera')
-        self._geometry = self._tracked = geometry
+        self._geometry = geometry
+        self._track = pipeline.Track(geometry, self._track.latest_ns)
         self.get_logger().info('stars are predicted with the calibration in force')
 
     def _attitude_has_come(self, time_ns: int) -> bool:
@@ -203,29 +209,18 @@ class StarObserver(StarcalNode):
         except ImageRefused as refused:
             self._publish(self._refused(waiting, refused.reason, refused.detail))
             return
-        if self._latest_ns is not None and image.time_ns <= self._latest_ns:
-            observations = pipeline.out_of_order(image, self._latest_ns)
-        else:
-            self._latest_ns = image.time_ns
-            observations = pipeline.observe(
-                image,
-                self._attitudes,
-                self._setup,
-                self._tracked,
-                self._velocity_at(image.time_ns),
-            )
-            self._tracked = tracked(self._geometry, observations)
+        predicted_with = self._track.geometry
+        observations, self._track = pipeline.observe_next(
+            image,
+            self._attitudes,
+            self._setup,
+            self._geometry,
+            self._track,
+            pipeline.velocity_at(list(self._velocities), image.time_ns),
+        )
         self._publish(observations)
         if self._annotated.get_subscription_count():
-            self._publish_annotated(image, observations)
-
-    def _velocity_at(self, time_ns: int) -> Any:
-        """The last velocity at or before an image, else the first after it; None without any."""
-        samples = list(self._velocities)
-        before = [velocity for stamp_ns, velocity in samples if stamp_ns <= time_ns]
-        if before:
-            return before[-1]
-        return samples[0][1] if samples else None
+            self._publish_annotated(image, observations, predicted_with)
 
     def _refused(self, waiting: Waiting, reason: str, detail: str) -> StarObservations:
         return refused_image(waiting.time_ns, waiting.width, waiting.height, reason, detail)
@@ -245,8 +240,10 @@ class StarObserver(StarcalNode):
         else:
             self.get_logger().debug(f'{len(observations)} stars')
 
-    def _publish_annotated(self, image: Image, observations: StarObservations) -> None:
-        picture = annotate(image, observations, self._tracked)
+    def _publish_annotated(
+        self, image: Image, observations: StarObservations, geometry: CameraGeometry
+    ) -> None:
+        picture = annotate(image, observations, geometry)
         frame_id = self._setup.frames.camera_frame
         self._annotated.publish(
             messages.color_image_to_message(image.time_ns, picture, frame_id, make_message)
