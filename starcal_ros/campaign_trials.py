@@ -112,7 +112,7 @@ def observe(field: StarField, tracker_arcsec: float, outlier_share: float = 0.0)
     reported = (star_tracker_from_camera * field.camera_from_icrf).inv() * error
     measured = field.pixel_px + field.centroid_error_px
     measured += (field.luck < outlier_share)[..., None] * field.outlier_px
-    m, n, _ = measured.shape
+    n = measured.shape[1]
     ones = np.ones(n, np.float32)
     images = [
         StarObservations(
