@@ -297,9 +297,7 @@ def _search(
         variance_factor=float(chi2_given / (2 * np.count_nonzero(kept) * freedom)),
         star_tracker_sigma_rad=verdict.tracker_sigma_rad,
         misfit_image=verdict.misfit | lost,
-        dropped_catalog_id=np.setdiff1d(table.catalog_id, table.catalog_id[kept])
-        if len(table)
-        else table.catalog_id,
+        dropped_catalog_id=_dropped(table, kept),
         alignment_scatter_arcsec=scatter_arcsec,
         iterations=iterations,
         termination=solution.termination,
@@ -353,6 +351,13 @@ def _fitting(
     # The rotation of an image fits any one star, and two as good as any.
     left = np.bincount(table.image[fits], minlength=table.image_count)
     return np.asarray(fits & (left[table.image] >= 3))
+
+
+def _dropped(table: StarTable, kept: Mask) -> NDArray[np.int64]:
+    """Catalog stars that were seen often enough to be told apart, and left out of all images."""
+    catalog_id, star = np.unique(table.catalog_id, return_inverse=True)
+    sightings, uses = np.bincount(star), np.bincount(star, kept)
+    return np.asarray(catalog_id[(sightings >= _FEWEST_SIGHTINGS) & (uses == 0)])
 
 
 def _residuals(state: State, table: StarTable) -> Floats:

@@ -231,9 +231,13 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
         xy = xy - np.nan_to_num(step)
     J = distort_jacobian(xy, camera.distortion)
     determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-    wrong = (np.abs(error).max(axis=-1) > 1e-12 * (1 + np.abs(target).max(axis=-1))) | (
-        determinant <= 0
-    )
+    # Past its summit the distorted radius falls: what lies there is another branch.
+    k1, k2, k3 = camera.distortion[:3]
+    turns = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    summits = turns.real[(np.abs(turns.imag) < 1e-9) & (turns.real > 0)]
+    r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
+    lost = np.abs(error).max(axis=-1) > 1e-12 * (1 + np.abs(target).max(axis=-1))
+    wrong = lost | (determinant <= 0) | (r2 > summits.min(initial=np.inf))
     xy[wrong] = np.nan
     directions = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
     return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
@@ -251,7 +255,8 @@ def field_radius_rad(camera: CameraModel, margin_px: float = 0.0) -> float:
     """
     Greatest angle from the optical axis to the edge of the detector widened by a margin, rad.
 
-    Where the distortion model has no inverse at a corner the pinhole model stands in.
+    Of the model and of the pinhole without its distortion: the latter stands in where the model
+    has no inverse, and both hold for whatever the distortion turns out to be.
     """
     w, h, m = camera.width - 1, camera.height - 1, margin_px
     edge = np.concatenate(

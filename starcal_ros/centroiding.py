@@ -426,6 +426,33 @@ def fit_psf(
     )
 
 
+def neighbour_pull_px(
+    flux_dn: Floats, offset_px: Floats, neighbour_flux_dn: Floats, model: ImageModel
+) -> Floats:
+    """
+    How far (k, 2) the light of a neighbour pulls the fitted place of a star.
+
+    One linear step of the fit, with the light of the neighbour as its residual.
+
+    Parameters
+    ----------
+    flux_dn, neighbour_flux_dn : (k,)
+    offset_px : (k, 2)
+        From the star to its neighbour.
+    """
+    sigma_px = model.psf_sigma_px or 1.0
+    width = 2 * stamp_radius_px(sigma_px) + 1
+    zero = np.zeros(len(flux_dn))
+    J = _psf_columns(np.stack([zero, zero, flux_dn, zero], axis=-1), sigma_px, width, 4)
+    own = flux_dn[:, None] * J[:, 2]
+    at = np.stack([*offset_px.T, neighbour_flux_dn, zero], axis=-1)
+    light = neighbour_flux_dn[:, None] * _psf_columns(at, sigma_px, width, 4)[:, 2]
+    noise_dn = np.full((len(flux_dn), 1), model.background.noise_dn)
+    weight = 1.0 / model.pixel_noise.variance(own + light, noise_dn)
+    step, _ = _weighted_step(J, weight, light)
+    return step[:, :2]
+
+
 def _psf_columns(parameters: Floats, sigma_px: float, width: int, count: int) -> Floats:
     """
     Derivatives (n, count, width * width) of a stamp by x, y, flux, background.
@@ -678,7 +705,7 @@ def _measure_by_moments(
     refusal[~inside] = 'border'
     centre = np.clip(centre, 2 * radius, [shape[1] - 2 * radius - 1, shape[0] - 2 * radius - 1])
     w = 2 * radius + 1
-    best = _stamps(pixels, centre, radius).reshape(n, -1).argmax(axis=1)
+    best = _stamps(pixels, centre, radius).reshape(n, w * w).argmax(axis=1)
     centre = centre + np.stack([best % w - radius, best // w - radius], axis=-1)
 
     stamps = _stamps(pixels, centre, radius)

@@ -99,7 +99,31 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument('--scenario', required=True, metavar='NAME')
     simulate.add_argument('--seed', type=int, default=1, metavar='N')
     simulate.set_defaults(run=_simulate)
+    _add_campaign(commands.add_parser('campaign', help='Monte Carlo studies of calibrations'))
     return parser
+
+
+def _add_campaign(campaign: argparse.ArgumentParser) -> None:
+    campaign.add_argument('study', metavar='STUDY', help='table1, images, terms or coverage')
+    campaign.add_argument('-o', '--output', type=Path, required=True, metavar='DIR')
+    campaign.add_argument('--trials', type=int, metavar='N')
+    campaign.add_argument('--seed', type=int, default=1, metavar='N')
+    for name, kind, metavar, what in (
+        ('images', int, 'M', 'images of a calibration'),
+        ('stars', int, 'N', 'stars of an image'),
+        ('tracker', float, 'ARCSEC', 'star tracker noise about each axis'),
+        ('methods', str, 'METHOD', 'per_image, single, hierarchical'),
+    ):
+        campaign.add_argument(f'--{name}', type=kind, nargs='+', metavar=metavar, help=what)
+    campaign.add_argument(
+        '--tracker-told', type=float, metavar='ARCSEC', help='what the calibration takes it for'
+    )
+    where = campaign.add_mutually_exclusive_group()
+    where.add_argument(
+        '--workers', type=int, metavar='N', help='processes; 0: none but this; all processors'
+    )
+    where.add_argument('--scheduler', default='', metavar='ADDRESS', help='of a Dask cluster')
+    campaign.set_defaults(run=_campaign)
 
 
 def _calibrate(args: argparse.Namespace) -> int:
@@ -232,6 +256,48 @@ def _demo(args: argparse.Namespace) -> int:
         + ('as chance has it' if good else f'over {_DEMO_SIGMAS:g}: something is wrong')
     )
     return EXIT_ACCEPTED if good else EXIT_REFUSED
+
+
+def _campaign(args: argparse.Namespace) -> int:
+    """Run a Monte Carlo study."""
+    # One thread each: trials go side by side, and numbers must not hang on how many there are.
+    os.environ.update(OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1')
+    import dataclasses
+    import time
+
+    from starcal_ros import campaign, campaign_figures, campaign_workers, pipeline, products
+
+    if args.study not in campaign.STUDIES:
+        raise OptionError(f'STUDY: {args.study!r} is not one of {", ".join(campaign.STUDIES)}')
+    what, usual = campaign.STUDIES[args.study]
+    design = dataclasses.replace(
+        usual,
+        trials=usual.trials if args.trials is None else args.trials,
+        seed=args.seed,
+        images=tuple(args.images or usual.images),
+        stars=tuple(args.stars or usual.stars),
+        tracker_arcsec=tuple(args.tracker or usual.tracker_arcsec),
+        methods=tuple(args.methods or usual.methods),
+        told_arcsec=args.tracker_told,
+    )
+    campaign.check(design)
+    workers = campaign_workers.processors() if args.workers is None else args.workers
+    if not 0 <= workers <= 1024:
+        raise OptionError(f'--workers: {workers} is not within 0 to 1024')
+    _make_folder(args.output)
+    start = time.monotonic()
+    with _progress_bar(design.trials, 'trials') as advance:
+        rows = campaign_workers.run_trials(design, workers, args.scheduler, advance)
+    seconds = time.monotonic() - start
+    found = campaign.conclude(design, rows)
+    path = args.output / f'{design.study}.json'
+    software = f'starcal {pipeline.software_version()}'
+    products.write_atomically(path, campaign.content(found, software))
+    path.with_suffix('.png').write_bytes(campaign_figures.png(found))
+    print(f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s')
+    print('\n'.join(campaign.table(found)))
+    print(f'written to {path} and {path.with_suffix(".png").name}')
+    return EXIT_ACCEPTED
 
 
 def _summary(calibration: Calibration, prior: CameraGeometry) -> list[str]:

@@ -33,8 +33,10 @@ from starcal_ros.centroiding import (
     measure_background,
     measure_stars,
     model_image,
+    neighbour_pull_px,
     Pixels,
     Sources,
+    stamp_radius_px,
 )
 from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
@@ -303,24 +305,27 @@ def _fit_warp(
 
 
 def blended(
-    xy_px: Floats, magnitude: Floats, psf_sigma_px: float, max_pull_px: Floats
+    xy_px: Floats, magnitude: Floats, flux_dn: Floats, model: ImageModel, max_pull_px: Floats
 ) -> NDArray[np.bool_]:
     """
-    Return (n,) whether a neighbour among the stars pulls a centroid by more than its limit (n,).
+    Return (n,) whether its neighbours among the stars pull a centroid by more than its limit (n,).
 
-    A star of relative flux q at distance d pulls a Gaussian fit by about
-    ``q d exp(-d^2 / 4 sigma^2)``.
+    ``flux_dn`` (n,) is measured; a neighbour's follows from the difference of the magnitudes.
     """
-    tree = cKDTree(xy_px)
-    pairs = tree.query_pairs(8.0 * psf_sigma_px, output_type='ndarray')
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    distance = np.linalg.norm(xy_px[both[:, 0]] - xy_px[both[:, 1]], axis=1)
-    ratio = 10.0 ** (0.4 * (magnitude[both[:, 0]] - magnitude[both[:, 1]]))
-    pull = np.minimum(ratio, 1.0) * distance * np.exp(-((distance / psf_sigma_px) ** 2) / 4.0)
-    # A brighter neighbour takes the window for itself wherever it reaches into it.
-    pull = np.where((ratio > 0.5) & (distance < 5.0 * psf_sigma_px), np.inf, pull)
-    result = np.zeros(len(xy_px), bool)
-    result[both[pull > max_pull_px[both[:, 0]], 0]] = True
+    sigma_px = model.psf_sigma_px or 1.0
+    reach_px = stamp_radius_px(sigma_px) * math.sqrt(2.0) + 2.0 * sigma_px
+    pairs = cKDTree(xy_px).query_pairs(reach_px, output_type='ndarray')
+    star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    ratio = 10.0 ** (0.4 * (magnitude[star] - magnitude[other]))
+    flux = np.maximum(flux_dn[star], 1.0)
+    offset_px = xy_px[other] - xy_px[star]
+    pull_px = neighbour_pull_px(flux, offset_px, ratio * flux, model)
+    total_px = np.zeros_like(xy_px)
+    np.add.at(total_px, star, pull_px)
+    result = np.linalg.norm(total_px, axis=1) > max_pull_px
+    # A neighbour half as bright takes part of the window for itself: no small pull any more.
+    near = np.linalg.norm(offset_px, axis=1) < 5.0 * sigma_px
+    result[star[near & (ratio > 0.5)]] = True
     return result
 
 
@@ -394,23 +399,23 @@ def observe_stars(
     )
 
 
-def tracked(base: CameraGeometry, observations: StarObservations) -> CameraGeometry:
+def tracked(geometry: CameraGeometry, observations: StarObservations) -> CameraGeometry:
     """
-    The geometry with which to predict the next image: the base, aligned as this image shows.
+    The geometry with which to predict the next image: aligned as this image shows.
 
     What launch has turned is found once, by the search of a whole image; from then on stars are
-    looked for where they are.  A refused image leaves the base.
+    looked for where they are.  A refused image leaves it as it was.
     """
     if observations.refusal:
-        return base
+        return geometry
     camera_from_icrf, _ = Rotation.align_vectors(
-        line_of_sight(base.camera, observations.measured_px),
+        line_of_sight(geometry.camera, observations.measured_px),
         observations.direction_icrf,
         weights=observations.snr.astype(np.float64),
     )
     icrf_from_star_tracker = Rotation.from_quat(observations.icrf_from_star_tracker_xyzw)
     star_tracker_from_camera = icrf_from_star_tracker.inv() * camera_from_icrf.inv()
-    return CameraGeometry(base.camera, star_tracker_from_camera.as_quat())
+    return CameraGeometry(geometry.camera, star_tracker_from_camera.as_quat())
 
 
 def _find(
@@ -522,9 +527,10 @@ def _refuse(
     The measured stars themselves give the smooth correction against which a place is judged.
     """
     refusal = centroids.refusal.copy()
-    psf_sigma_px = model.psf_sigma_px or 1.0
     sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
-    blend = blended(predicted_px, magnitude, psf_sigma_px, options.max_blend_sigma * sigma_px)
+    blend = blended(
+        predicted_px, magnitude, centroids.flux_dn, model, options.max_blend_sigma * sigma_px
+    )
     refusal[blend & (refusal == '')] = 'blend'
     good = np.nonzero(refusal == '')[0]
     if len(good) < 4:

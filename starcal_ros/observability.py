@@ -121,6 +121,38 @@ def ensemble_status(
     )
 
 
+def weakest_direction(information: Floats, names: tuple[str, ...]) -> tuple[Floats, str]:
+    """
+    Singular values of scaled information, and what it tells least of, in words.
+
+    Parameters
+    ----------
+    information : (k, k)
+        On the named parameters.
+
+    Returns
+    -------
+    singular_values : (k,)
+        Of the information scaled to a unit diagonal, largest first: square roots of its
+        eigenvalues.
+    text : str
+        Which parameters can hardly be told apart.
+    """
+    scale = 1.0 / np.sqrt(np.diag(information))
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
+    singular = np.sqrt(np.maximum(values, 0.0))[::-1]
+    direction = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
+    largest = [i for i in np.argsort(-np.abs(direction)) if abs(direction[i]) > 0.3]
+    terms = ', '.join(f'{names[i]} ({direction[i]:+.2f})' for i in largest)
+    if len(largest) < 2:
+        return singular, f'{terms} is known least, and by itself'
+    worse = 1.0 / max(float(singular[-1]), 1e-300)
+    return singular, (
+        f'{terms} can hardly be told apart: together they are known {worse:.0f} times worse than '
+        'each would be alone'
+    )
+
+
 def keep_most_informative(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> Ensemble:

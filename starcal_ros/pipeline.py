@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import hashlib
 import importlib.metadata
 import json
+import math
 from pathlib import Path
 
 import cv2
@@ -18,15 +19,22 @@ from starcal_ros import bag, products
 from starcal_ros.acceptance import Candidate, GateOptions, judge
 from starcal_ros.attitude import AttitudeHistory, AttitudeOptions
 from starcal_ros.calibration import CalibrationOptions, Estimate, estimate_calibration
-from starcal_ros.camera import zero_skew_fit
+from starcal_ros.camera import PARAMETER_NAMES, zero_skew_fit
 from starcal_ros.catalog import load_catalog, StarCatalog
 from starcal_ros.centroiding import CentroidOptions
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused, OptionError
 from starcal_ros.identification import IdentificationOptions, observe_stars, tracked
-from starcal_ros.observability import coverage, keep_most_informative, map_sigma_px
+from starcal_ros.observability import (
+    coverage,
+    keep_most_informative,
+    map_sigma_px,
+    weakest_direction,
+)
 from starcal_ros.observability import ensemble_status as _ensemble_status
 from starcal_ros.options import check_value, from_mapping, names_of, option
 from starcal_ros.records import (
+    ALIGNMENT_NAMES,
     Calibration,
     CameraGeometry,
     Ensemble,
@@ -220,15 +228,15 @@ def observe_next(
     image: Image,
     attitudes: AttitudeHistory,
     setup: Setup,
-    base: CameraGeometry,
     track: Track,
     velocity_m_s: Floats | None = None,
 ) -> tuple[StarObservations, Track]:
     """
     The stars of the next image of a sequence, and where the sequence stands then.
 
-    ``base`` is the prior or the calibration in force.  An image stamped at or before one that was
-    used is refused; a refused image moves nothing, so that one wrong stamp costs one image.
+    A sequence starts with the prior, or with the calibration in force.  An image stamped at or
+    before one that was used is refused; a refused image moves nothing, so that one wrong stamp
+    costs one image.
     """
     if track.latest_ns is not None and image.time_ns <= track.latest_ns:
         height, width = image.pixels.shape
@@ -237,7 +245,7 @@ def observe_next(
         return refused_image(image.time_ns, width, height, 'out_of_order', detail), track
     observations = observe(image, attitudes, setup, track.geometry, velocity_m_s)
     latest_ns = track.latest_ns if observations.refusal else image.time_ns
-    return observations, Track(tracked(base, observations), latest_ns)
+    return observations, Track(tracked(track.geometry, observations), latest_ns)
 
 
 def velocity_at(samples: Sequence[tuple[int, Floats]], time_ns: int) -> Floats | None:
@@ -279,7 +287,7 @@ def observe_bag(
             yield image
             continue
         observations, track = observe_next(
-            image, attitudes, setup, setup.prior, track, velocity_at(velocities, image.time_ns)
+            image, attitudes, setup, track, velocity_at(velocities, image.time_ns)
         )
         yield observations
 
@@ -358,6 +366,10 @@ def _calibration(
         ),
         setup.gate,
     )
+    names = tuple(name for name in PARAMETER_NAMES if name in options.estimate)
+    singular_values, weakest = weakest_direction(
+        result.information, (*names, *ALIGNMENT_NAMES)[: len(result.information)]
+    )
     return Calibration(
         time_ns=max(image.time_ns for image in ensemble.images),
         geometry=result.geometry,
@@ -371,6 +383,19 @@ def _calibration(
         stars_used=int(kept.sum()),
         stars_rejected=int((~kept).sum()),
         alignment_scatter_arcsec=result.alignment_scatter_arcsec,
+        star_tracker_sigma_arcsec=tuple(
+            float(sigma) for sigma in result.star_tracker_sigma_rad / ARCSECOND_RAD
+        ),
+        centroid_scale=result.variance.scale,
+        centroid_floor_px=math.sqrt(result.variance.floor_px2),
+        dropped_catalog_ids=tuple(result.dropped_catalog_id.tolist()),
+        misfit_images_ns=tuple(
+            image.time_ns
+            for image, misfit in zip(ensemble.images, result.misfit_image, strict=True)
+            if misfit
+        ),
+        singular_values=tuple(float(value) for value in singular_values),
+        weakest_direction=weakest,
         zero_skew_cost_px=zero_skew_fit(camera)[1],
         iterations=result.iterations,
         termination=result.termination,

@@ -240,6 +240,15 @@ def _calibration_content(calibration: Calibration) -> dict[str, object]:
         'image': {'width': camera.width, 'height': camera.height},
         'variance_factor': _json_number(calibration.variance_factor),
         'alignment_scatter_arcsec': _json_number(calibration.alignment_scatter_arcsec),
+        'star_tracker_sigma_arcsec': [
+            _json_number(s) for s in calibration.star_tracker_sigma_arcsec
+        ],
+        'centroid_scale': _json_number(calibration.centroid_scale),
+        'centroid_floor_px': _json_number(calibration.centroid_floor_px),
+        'dropped_catalog_ids': [int(i) for i in calibration.dropped_catalog_ids],
+        'misfit_images_ns': [int(t) for t in calibration.misfit_images_ns],
+        'singular_values': [_json_number(s) for s in calibration.singular_values],
+        'weakest_direction': calibration.weakest_direction,
         'zero_skew_cost_px': _json_number(calibration.zero_skew_cost_px),
         'iterations': int(calibration.iterations),
         'termination': calibration.termination,
@@ -275,6 +284,15 @@ def _calibration_from_content(reader: _Reader) -> Calibration:
         stars_used=reader.get('stars_used', _whole),
         stars_rejected=reader.get('stars_rejected', _whole),
         alignment_scatter_arcsec=reader.get('alignment_scatter_arcsec', _number_or_null),
+        star_tracker_sigma_arcsec=tuple(
+            reader.get('star_tracker_sigma_arcsec', _numbers(3, null=True))
+        ),
+        centroid_scale=reader.get('centroid_scale', _number_or_null),
+        centroid_floor_px=reader.get('centroid_floor_px', _number_or_null),
+        dropped_catalog_ids=tuple(reader.get('dropped_catalog_ids', _list_of(_whole))),
+        misfit_images_ns=tuple(reader.get('misfit_images_ns', _list_of(_whole))),
+        singular_values=tuple(reader.get('singular_values', _list_of(_number_or_null))),
+        weakest_direction=reader.get('weakest_direction', _text),
         zero_skew_cost_px=reader.get('zero_skew_cost_px', _number_or_null),
         iterations=reader.get('iterations', _whole),
         termination=reader.get('termination', _text),

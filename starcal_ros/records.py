@@ -256,6 +256,18 @@ class Calibration:
         Reason -> count.
     alignment_scatter_arcsec : float
         RMS per axis of the alignments that the images show, about their mean; 0 for ``single``.
+    star_tracker_sigma_arcsec : tuple of 3 float
+        About the star tracker's axes, as given or as estimated again.
+    centroid_scale, centroid_floor_px : float
+        The centroid covariances C were used as ``scale C + floor^2 I``.
+    dropped_catalog_ids : tuple of int
+        Stars that misfit across images and were left out of all.
+    misfit_images_ns : tuple of int
+        Stamps of images whose attitude does not fit, or that lost their stars.
+    singular_values : tuple of float
+        Of the information on what was estimated, scaled to a unit diagonal, largest first.
+    weakest_direction : str
+        The direction of the smallest, in words.
     zero_skew_cost_px : float
         Worst pixel error of the zero-skew fit that ``camera_info`` carries.
     iterations, termination
@@ -277,6 +289,13 @@ class Calibration:
     stars_used: int
     stars_rejected: int
     alignment_scatter_arcsec: float
+    star_tracker_sigma_arcsec: tuple[float, ...]
+    centroid_scale: float
+    centroid_floor_px: float
+    dropped_catalog_ids: tuple[int, ...]
+    misfit_images_ns: tuple[int, ...]
+    singular_values: tuple[float, ...]
+    weakest_direction: str
     zero_skew_cost_px: float
     iterations: int
     termination: str

@@ -64,19 +64,26 @@ def estimate_variance(
     groups = int(np.clip(len(own) // _STARS_PER_GROUP, 1, 12))
     parts = np.array_split(np.argsort(own, kind='stable'), groups)
     mean_own = np.array([own[part].mean() for part in parts])
-    # The median of a squared Rayleigh deviate is 2 ln 2 variances per axis.
-    found = np.array([np.median(squared[part]) for part in parts]) / (2 * math.log(2.0) * freedom)
+
+    def found(scale: float, floor_px2: float) -> Floats:
+        # Within a group variances differ: the model of them says what the median stands for.
+        model = np.maximum(scale * own + floor_px2, 1e-12)
+        # The median of a squared Rayleigh deviate is 2 ln 2 variances per axis.
+        medians = [np.median(squared[part] / model[part]) * model[part].mean() for part in parts]
+        return np.array(medians) / (2 * math.log(2.0) * freedom)
+
     if groups < 3 or mean_own[-1] < 2.0 * mean_own[0]:
         # Scale and floor cannot be told apart: a floor when there is an excess, else a scale.
-        excess = float((found - mean_own).mean())
+        variance = found(1.0, 0.0)
+        excess = float((variance - mean_own).mean())
         if excess >= 0.0:
             return CentroidVariance(1.0, excess)
-        return CentroidVariance(float(np.clip((found / mean_own).mean(), 0.1, 1.0)), 0.0)
+        return CentroidVariance(float(np.clip((variance / mean_own).mean(), 0.1, 1.0)), 0.0)
     scale, floor_px2 = 1.0, 0.0
-    for _ in range(5):
+    for _ in range(8):
         weight = 1.0 / np.maximum(scale * mean_own + floor_px2, 1e-12)
         A = np.stack([mean_own, np.ones(groups)], axis=-1) * weight[:, None]
-        (scale, floor_px2), _ = nnls(A, found * weight)
+        (scale, floor_px2), _ = nnls(A, found(scale, floor_px2) * weight)
         scale = max(float(scale), 0.1)
     return CentroidVariance(scale, float(floor_px2))
 

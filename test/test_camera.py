@@ -180,7 +180,6 @@ def test_beyond_the_fold_there_is_no_line_of_sight(k1: float) -> None:
     assert (x < 1 / np.sqrt(-3 * k1)).all()  # on the side of the axis
 
 
-@pytest.mark.xfail(reason='the sign of the determinant does not tell the third branch')
 def test_a_pixel_past_the_summit_takes_no_outer_branch() -> None:
     # r (1 - 0.6 r^2 + 0.15 r^4) rises to 0.5515 at r = 0.934, falls to r = 1.236, rises again:
     # beyond 0.5515 only the outer branch is left, where no lens is like its polynomial.

@@ -359,7 +359,7 @@ def test_where_no_star_is_none_is_measured(options: CentroidOptions) -> None:
 
 @pytest.mark.parametrize(
     'options',
-    [PSF, pytest.param(MOMENT, marks=pytest.mark.xfail(raises=ValueError, reason='reshape'))],
+    [PSF, MOMENT],
 )
 def test_no_star_asked_for_none_measured(options: CentroidOptions) -> None:
     pixels, _ = one_star()

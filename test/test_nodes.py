@@ -188,7 +188,7 @@ def test_every_image_gets_one_answer(
     diagnostics = client.collect(DiagnosticArray, '/diagnostics')
     client.until(lambda: diagnostics)
     values = {v.key: v.value for v in diagnostics[0].status[0].values}
-    assert (values['images'], values['refused_bad_layout']) == ('7', '2')
+    assert (values['images'], values['refused_bad_layout']) == ('6', '2')
     assert diagnostics[0].status[0].level == b'\x01'
 
 

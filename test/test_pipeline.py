@@ -205,7 +205,7 @@ def test_an_image_that_nothing_explains_keeps_its_attitude(setup: pipeline.Setup
 
 def test_out_of_order_images_say_by_how_much(setup: pipeline.Setup) -> None:
     track = pipeline.Track(setup.prior, image().time_ns + 250_000_000)
-    found, after = pipeline.observe_next(image(), attitudes(), setup, setup.prior, track)
+    found, after = pipeline.observe_next(image(), attitudes(), setup, track)
     assert found.refusal == 'out_of_order'
     assert found.detail == '0.250000 s before the last image used'
     assert after == track
@@ -214,9 +214,9 @@ def test_out_of_order_images_say_by_how_much(setup: pipeline.Setup) -> None:
 def test_a_refused_image_does_not_put_those_after_it_out_of_order(setup: pipeline.Setup) -> None:
     track = pipeline.Track(setup.prior)
     future = dataclasses.replace(image(), time_ns=image().time_ns + 10**15)
-    refused, track = pipeline.observe_next(future, attitudes(), setup, setup.prior, track)
+    refused, track = pipeline.observe_next(future, attitudes(), setup, track)
     assert refused.refusal == 'no_attitude'
-    found, track = pipeline.observe_next(image(), attitudes(), setup, setup.prior, track)
+    found, track = pipeline.observe_next(image(), attitudes(), setup, track)
     assert found.refusal == '' and track.latest_ns == image().time_ns
 
 

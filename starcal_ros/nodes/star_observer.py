@@ -61,8 +61,7 @@ class StarObserver(StarcalNode):
         values = self.options.values()
         self._own = from_mapping(ObserverOptions, values)
         self._setup = pipeline.load_setup(values, self.options.classes)
-        self._geometry = self._setup.prior
-        self._track = pipeline.Track(self._geometry)
+        self._track = pipeline.Track(self._setup.prior)
         self._observations = self.create_lifecycle_publisher(
             ObservationsMessage, 'observations', QoSProfile(depth=100)
         )
@@ -165,7 +164,6 @@ class StarObserver(StarcalNode):
         prior = self._setup.prior.camera
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
             raise ValueError('calibration: of another image size than the prior camera')
-        self._geometry = geometry
         self._track = pipeline.Track(geometry, self._track.latest_ns)
         self.get_logger().info('stars are predicted with the calibration in force')
 
@@ -214,7 +212,6 @@ class StarObserver(StarcalNode):
             image,
             self._attitudes,
             self._setup,
-            self._geometry,
             self._track,
             pipeline.velocity_at(list(self._velocities), image.time_ns),
         )
