@@ -17,6 +17,7 @@ test: setup
 	$(RUN)/python -m pytest
 
 bench: setup
+	@$(RUN)/python -m pip install --quiet --requirement requirements/bench.txt
 	$(RUN)/python -m bench
 
 lint: setup

@@ -1,0 +1,42 @@
+"""``python -m bench [NAME...]``: run all benches, or those named, and print their tables."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+from pathlib import Path
+import platform
+import time
+
+from bench import NAMES
+
+
+def main() -> None:
+    """Run what was asked for."""
+    parser = argparse.ArgumentParser(prog='python -m bench', description='Measure starcal.')
+    parser.add_argument('names', nargs='*', metavar='NAME', help=', '.join(NAMES))
+    parser.add_argument('--quick', action='store_true', help='small sizes, a few seconds each')
+    parser.add_argument('--json', type=Path, metavar='FILE', help='write the tables there too')
+    args = parser.parse_args()
+    for name in args.names:
+        if name not in NAMES:
+            parser.error(f'{name!r} is not one of {", ".join(NAMES)}')
+    load = os.getloadavg()[0]
+    print(
+        f'{platform.machine()}, {os.cpu_count()} cores, load {load:.1f}: a time on a busy machine'
+    )
+    print('is too long; ratios are of runs that took turns.\n')
+    found = {}
+    for name in args.names or NAMES:
+        start_s = time.perf_counter()
+        tables = importlib.import_module(f'bench.{name}').run(args.quick)
+        print(f'({name}: {time.perf_counter() - start_s:.0f} s)\n', flush=True)
+        found[name] = [table.content() for table in tables]
+    if args.json:
+        args.json.write_text(json.dumps(found, indent=1) + '\n')
+
+
+if __name__ == '__main__':
+    main()

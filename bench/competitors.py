@@ -1,0 +1,276 @@
+"""
+One least-squares problem of stars as several solvers take it: ours, Ceres, SciPy, OpenCV.
+
+Method 1 (`per_image`): eight camera parameters (the principal point is held) and the rotation of
+every image.  The others get the analytic derivatives of `camera.project_jacobians`: SciPy for all
+stars at once, Ceres, which calls Python for every image, image by image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.sparse import csr_matrix
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.adjustment import minimise, Problem, State
+from starcal_ros.calibration import CalibrationOptions, estimate_calibration
+from starcal_ros.camera import PARAMETER_NAMES, project_jacobians, project_parameters
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.measurement import arrange, star_table, StarTable
+from starcal_ros.records import CameraGeometry, Ensemble
+from starcal_ros.synthetic import BOUND_NAMES, scenario, true_observations
+
+Floats = NDArray[np.float64]
+
+FREE = np.sort(np.array([PARAMETER_NAMES.index(name) for name in BOUND_NAMES]))
+SIGMA_PX = 0.1
+TOLERANCE = 1e-12
+_MAGNITUDE_LIMIT = 6.65  # leaves about 80 stars in an image
+
+
+@dataclass(frozen=True)
+class Case:
+    """One set of data and where every solver starts; n stars in m images."""
+
+    ensemble: Ensemble
+    prior: CameraGeometry
+    table: StarTable
+    problem: Problem
+    start: State
+
+    @property
+    def rows_of_images(self) -> list[slice]:
+        """Rows of the table, image by image."""
+        ends = np.cumsum([len(image) for image in self.ensemble.images])
+        return [slice(int(a), int(b)) for a, b in zip(np.r_[0, ends[:-1]], ends, strict=True)]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Where a solver ended: parameters (10,), rotations (m, 3, 3), and its count of iterations."""
+
+    parameters: Floats
+    camera_from_icrf: Floats
+    iterations: int
+
+
+def make_ensemble(images: int) -> tuple[Ensemble, CameraGeometry]:
+    """Observations of a campaign over one night's turn of the sky, and the prior to start from."""
+    base = scenario('paper')
+    campaign = dataclasses.replace(
+        base,
+        image_count=images,
+        cadence_s=86000.0 / images,
+        magnitude_limit=_MAGNITUDE_LIMIT,
+        truth=dataclasses.replace(base.truth, camera=base.truth.camera.replace(skew=0.0)),
+    )
+    return true_observations(campaign, centroid_sigma_px=SIGMA_PX), base.prior
+
+
+def make_case(ensemble: Ensemble, prior: CameraGeometry) -> Case:
+    """The ensemble as the solvers take it."""
+    m = len(ensemble.images)
+    star_tracker_from_icrf = Rotation.from_quat(
+        np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
+    ).inv()
+    problem = Problem(
+        method='per_image',
+        free=FREE,
+        prior_parameters=prior.camera.parameters,
+        prior_sigma=np.full(10, np.inf),
+        star_tracker_from_icrf=star_tracker_from_icrf,
+        star_tracker_sigma_rad=np.full((m, 3), 20.0 * ARCSECOND_RAD),
+    )
+    alignment = Rotation.from_quat(prior.star_tracker_from_camera_xyzw).inv()
+    start = State(prior.camera.parameters.copy(), alignment, alignment * star_tracker_from_icrf)
+    return Case(ensemble, prior, star_table(ensemble.images), problem, start)
+
+
+def solve_starcal(case: Case) -> Answer:
+    """Plain Levenberg-Marquardt of the package."""
+    keep = np.ones(len(case.table), bool)
+    measurements = arrange(case.table, keep, case.table.covariance_px2)
+    solution = minimise(case.problem, case.start, measurements)
+    assert solution.converged
+    rotations = solution.state.camera_from_icrf.as_matrix()
+    return Answer(solution.state.parameters, rotations, solution.iterations)
+
+
+def estimate_starcal(case: Case) -> Answer:
+    """The whole estimate: robust search, snooping, variances, covariance."""
+    options = CalibrationOptions(method='per_image', star_tracker_sigma_arcsec=(20.0,) * 3)
+    found = estimate_calibration(case.ensemble, case.prior, options)
+    rotations = found.state.camera_from_icrf.as_matrix()
+    return Answer(found.state.parameters, rotations, found.iterations)
+
+
+def _turn_jacobian(theta: Floats) -> tuple[Floats, Floats]:
+    """
+    Rotations (..., 3, 3) by passive angles (..., 3), and the small rotation (..., 3, 3) by them.
+
+    ``exp(-[theta + d]) = exp(-[L d]) exp(-[theta])``, L the left Jacobian of SO(3) at -theta.
+    """
+    angle2 = np.maximum((theta**2).sum(axis=-1), 1e-24)[..., None, None]
+    angle = np.sqrt(angle2)
+    x, y, z = np.moveaxis(-theta, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    K = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    K2 = K @ K
+    # 1 - cos as a square: no digits are lost at the small angles of these data.
+    versine = 2.0 * np.sin(0.5 * angle) ** 2 / angle2
+    turn = np.eye(3) + np.sin(angle) / angle * K + versine * K2
+    cubic = np.where(angle2 < 1e-8, 1.0 / 6.0, (angle - np.sin(angle)) / (angle * angle2))
+    return turn, np.eye(3) + versine * K + cubic * K2
+
+
+def solve_scipy(case: Case) -> Answer:
+    """SciPy's trust region with a sparse analytic Jacobian."""
+    table, m = case.table, case.table.image_count
+    f, n = len(FREE), len(table)
+    base = np.einsum(
+        'nij,nj->ni', case.start.camera_from_icrf.as_matrix()[table.image], table.direction_icrf
+    )
+    columns = np.empty((n, 2, f + 3), np.int32)
+    columns[..., :f] = np.arange(f)
+    columns[..., f:] = (f + 3 * table.image[:, None] + np.arange(3))[:, None]
+    rows = np.arange(0, (f + 3) * (2 * n) + 1, f + 3)
+
+    def parameters_of(x: Floats) -> Floats:
+        parameters = case.start.parameters.copy()
+        parameters[FREE] = x[:f]
+        return parameters
+
+    def residuals(x: Floats) -> Floats:
+        turn, _ = _turn_jacobian(x[f:].reshape(m, 3))
+        directions = np.einsum('nij,nj->ni', turn[table.image], base)
+        predicted = project_parameters(parameters_of(x), directions)
+        return np.asarray((predicted - table.measured_px).ravel() / SIGMA_PX)
+
+    def jacobian(x: Floats) -> csr_matrix:
+        turn, L = _turn_jacobian(x[f:].reshape(m, 3))
+        directions = np.einsum('nij,nj->ni', turn[table.image], base)
+        camera = dataclasses.replace(case.prior.camera, parameters=parameters_of(x))
+        _, J_parameters, J_rotation = project_jacobians(camera, directions)
+        J = np.concatenate([J_parameters[..., FREE], J_rotation @ L[table.image]], axis=-1)
+        J /= SIGMA_PX
+        return csr_matrix((J.ravel(), columns.ravel(), rows), (2 * n, f + 3 * m))
+
+    found = least_squares(
+        residuals,
+        np.concatenate([case.start.parameters[FREE], np.zeros(3 * m)]),
+        jacobian,
+        method='trf',
+        x_scale='jac',
+        ftol=TOLERANCE,
+        xtol=TOLERANCE,
+        gtol=TOLERANCE,
+        tr_options={'atol': 1e-9, 'btol': 1e-9},  # its steps are inexact else: 6 in place of 4
+    )
+    turn, _ = _turn_jacobian(found.x[f:].reshape(m, 3))
+    rotations = turn @ case.start.camera_from_icrf.as_matrix()
+    return Answer(parameters_of(found.x), rotations, found.njev)
+
+
+def solve_ceres(case: Case) -> Answer:
+    """Ceres with one analytic residual block of an image, eliminating the images' rotations."""
+    import pyceres
+
+    table, prior = case.table, case.prior.camera
+    held = case.start.parameters
+    rotations = case.start.camera_from_icrf.as_matrix()
+
+    class Stars(pyceres.CostFunction):  # type: ignore[misc]
+        """The stars of one image."""
+
+        def __init__(self, stars: slice, rotation: Floats) -> None:
+            super().__init__()
+            self.base = table.direction_icrf[stars] @ rotation.T
+            self.measured_px = table.measured_px[stars]
+            self.set_num_residuals(self.measured_px.size)
+            self.set_parameter_block_sizes([len(FREE), 3])
+
+        def Evaluate(self, blocks: Any, residuals: Floats, jacobians: Any) -> bool:
+            """Write residuals in sigma, and derivatives where they are asked for."""
+            parameters = held.copy()
+            parameters[FREE] = blocks[0]
+            turn, L = _turn_jacobian(blocks[1])
+            directions = self.base @ turn.T
+            if jacobians is None:
+                predicted_px = project_parameters(parameters, directions)
+            else:
+                camera = dataclasses.replace(prior, parameters=parameters)
+                predicted_px, J_parameters, J_rotation = project_jacobians(camera, directions)
+                if jacobians[0] is not None:
+                    jacobians[0][:] = J_parameters[..., FREE].ravel() / SIGMA_PX
+                if jacobians[1] is not None:
+                    jacobians[1][:] = (J_rotation @ L).ravel() / SIGMA_PX
+            residuals[:] = (predicted_px - self.measured_px).ravel() / SIGMA_PX
+            return True
+
+    problem = pyceres.Problem()
+    shared = held[FREE].copy()
+    angles = np.zeros((table.image_count, 3))
+    costs = [
+        Stars(stars, rotation)
+        for stars, rotation in zip(case.rows_of_images, rotations, strict=True)
+    ]
+    for cost, angle in zip(costs, angles, strict=True):
+        problem.add_residual_block(cost, None, [shared, angle])
+    options = pyceres.SolverOptions()
+    options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
+    options.function_tolerance = options.parameter_tolerance = TOLERANCE
+    options.gradient_tolerance = TOLERANCE
+    options.logging_type = pyceres.LoggingType.SILENT
+    options.num_threads = 1  # the callbacks are Python: more threads wait for each other
+    summary = pyceres.SolverSummary()
+    pyceres.solve(options, problem, summary)
+    parameters = held.copy()
+    parameters[FREE] = shared
+    turn, _ = _turn_jacobian(angles)
+    iterations = summary.num_successful_steps + summary.num_unsuccessful_steps
+    return Answer(parameters, turn @ rotations, iterations)
+
+
+def solve_opencv(case: Case) -> Answer:
+    """
+    OpenCV's calibration of a camera from points in space.
+
+    A star stands at two depths, as its calibration places the camera as well as turns it: at one
+    depth a shift would be as good as a rotation.  Its points are of single precision.
+    """
+    table, prior = case.table, case.prior.camera
+    start = case.start.camera_from_icrf.as_matrix()
+    points, pixels = [], []
+    for stars, rotation in zip(case.rows_of_images, start, strict=True):
+        near = table.direction_icrf[stars] @ rotation.T
+        points.append(np.concatenate([near, 2.0 * near]).astype(np.float32))
+        pixels.append(np.concatenate([table.measured_px[stars]] * 2).astype(np.float32))
+    k1, k2, k3, p1, p2 = prior.distortion
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT
+    _, K, D, turns, _, _, _, _ = cv2.calibrateCameraExtended(
+        points,
+        pixels,
+        (prior.width, prior.height),
+        np.array(
+            [
+                [prior.intrinsics[0], 0, prior.intrinsics[3]],
+                [0, prior.intrinsics[2], prior.intrinsics[4]],
+                [0, 0, 1],
+            ]
+        ),
+        np.array([k1, k2, p1, p2, k3]),
+        flags=flags,
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, TOLERANCE),
+    )
+    k1, k2, p1, p2, k3 = D.ravel()[:5]
+    parameters = np.array([K[0, 0], 0.0, K[1, 1], K[0, 2], K[1, 2], k1, k2, k3, p1, p2])
+    turn = Rotation.from_rotvec(np.array(turns).reshape(-1, 3)).as_matrix()
+    return Answer(parameters, turn @ start, 0)

@@ -1,0 +1,62 @@
+"""What a bench found, as an aligned table for people and as plain values for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+Cell = str | int | float | bool | None
+
+
+@dataclass
+class Table:
+    """Rows of cells under a title; numbers keep their precision until they are printed."""
+
+    title: str
+    columns: Sequence[str]
+    rows: list[tuple[Cell, ...]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def add(self, *cells: Cell) -> None:
+        """Append a row."""
+        self.rows.append(cells)
+
+    def text(self) -> str:
+        """Aligned columns: words to the left, numbers to the right."""
+        shown = [list(self.columns), *([_shown(cell) for cell in row] for row in self.rows)]
+        widths = [max(len(row[k]) for row in shown) for k in range(len(self.columns))]
+        words = [
+            all(isinstance(row[k], str | bool | None) for row in self.rows)
+            for k in range(len(self.columns))
+        ]
+        lines = [self.title]
+        for row in shown:
+            cells = [
+                cell.ljust(width) if left else cell.rjust(width)
+                for cell, width, left in zip(row, widths, words, strict=True)
+            ]
+            lines.append('  ' + '  '.join(cells).rstrip())
+        return '\n'.join([*lines, *(f'  {note}' for note in self.notes), ''])
+
+    def content(self) -> dict[str, object]:
+        """The same as a JSON object."""
+        rows = [dict(zip(self.columns, row, strict=True)) for row in self.rows]
+        return {'title': self.title, 'rows': rows, 'notes': self.notes}
+
+
+def verdict(ratio: float, target: float) -> str:
+    """How a measured ratio stands to the least that is wanted."""
+    return f'>= {target:g}: ' + ('met' if ratio >= target else 'MISSED')
+
+
+def _shown(cell: Cell) -> str:
+    if cell is None:
+        return '-'
+    if isinstance(cell, bool):
+        return 'yes' if cell else 'no'
+    if isinstance(cell, float):
+        if cell != 0 and not 1e-3 <= abs(cell) < 1e5:
+            return f'{cell:.1e}'
+        digits = 0 if abs(cell) >= 100 else 1 if abs(cell) >= 10 else 2 if abs(cell) >= 1 else 3
+        return f'{cell:.{digits}f}'
+    return f'{cell:,}' if isinstance(cell, int) else cell
