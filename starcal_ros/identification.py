@@ -49,6 +49,7 @@ _TRACKED_ROLL_RAD = 0.01  # a star tracker is off by less about any axis once al
 _VOTERS = (
     100  # brightest predictions and sources that vote: their pairs fill one histogram at once
 )
+_PULL_UNCERTAINTY = 0.25  # of a neighbour's light: stars of unlike colour differ so from their V
 _CHANCE = 1e-9  # greatest probability that a match is accepted by chance
 
 
@@ -76,7 +77,7 @@ class IdentificationOptions:
     )
     max_blend_sigma: float = option(
         0.3,
-        'largest pull of a neighbour in the catalog on a centroid, in sigma of the centroid',
+        'largest error left of the pull of catalog neighbours on a centroid, in its sigma',
         low=0.0,
         high=100.0,
     )
@@ -304,11 +305,11 @@ def _fit_warp(
     return basis(at_px) @ coefficients, scatter
 
 
-def blended(
-    xy_px: Floats, magnitude: Floats, flux_dn: Floats, model: ImageModel, max_pull_px: Floats
-) -> NDArray[np.bool_]:
+def neighbour_pulls(
+    xy_px: Floats, magnitude: Floats, flux_dn: Floats, model: ImageModel
+) -> tuple[Floats, NDArray[np.bool_]]:
     """
-    Return (n,) whether its neighbours among the stars pull a centroid by more than its limit (n,).
+    How far (n, 2) the neighbours of each star pull its centroid, and (n,) whether one swamps it.
 
     ``flux_dn`` (n,) is measured; a neighbour's follows from the difference of the magnitudes.
     """
@@ -319,14 +320,41 @@ def blended(
     ratio = 10.0 ** (0.4 * (magnitude[star] - magnitude[other]))
     flux = np.maximum(flux_dn[star], 1.0)
     offset_px = xy_px[other] - xy_px[star]
-    pull_px = neighbour_pull_px(flux, offset_px, ratio * flux, model)
     total_px = np.zeros_like(xy_px)
-    np.add.at(total_px, star, pull_px)
-    result = np.linalg.norm(total_px, axis=1) > max_pull_px
+    np.add.at(total_px, star, neighbour_pull_px(flux, offset_px, ratio * flux, model))
     # A neighbour half as bright takes part of the window for itself: no small pull any more.
     near = np.linalg.norm(offset_px, axis=1) < 5.0 * sigma_px
-    result[star[near & (ratio > 0.5)]] = True
-    return result
+    swamped = np.zeros(len(xy_px), bool)
+    swamped[star[near & (ratio > 0.5)]] = True
+    return total_px, swamped
+
+
+def _separate(
+    predicted_px: Floats,
+    magnitude: Floats,
+    centroids: Centroids,
+    model: ImageModel,
+    options: IdentificationOptions,
+) -> Centroids:
+    """
+    Centroids freed from the light of their neighbours in the catalog, or refused as blends.
+
+    The pull is taken off, and what it may be wrong by is added to the covariance; where that is
+    more than ``max_blend_sigma`` the star is of no use.
+    """
+    pull_px, swamped = neighbour_pulls(predicted_px, magnitude, centroids.flux_dn, model)
+    uncertain_px = _PULL_UNCERTAINTY * pull_px
+    sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
+    beyond = np.linalg.norm(uncertain_px, axis=1) > options.max_blend_sigma * sigma_px
+    refusal = centroids.refusal.copy()
+    refusal[(swamped | beyond) & (refusal == '')] = 'blend'
+    u, v = uncertain_px.T
+    return dataclasses.replace(
+        centroids,
+        xy_px=centroids.xy_px - pull_px,
+        covariance_px2=centroids.covariance_px2 + np.stack([u * u, u * v, v * v], axis=-1),
+        refusal=refusal,
+    )
 
 
 def observe_stars(
@@ -369,7 +397,8 @@ def observe_stars(
     predicted_px = predicted_px[inside]
     magnitude = catalog.magnitude[index]
     centroids = measure_stars(image.pixels, predicted_px, model, centroid_options)
-    refusal = _refuse(predicted_px, magnitude, centroids, model, camera.width, options)
+    centroids = _separate(predicted_px, magnitude, centroids, model, options)
+    refusal = _refuse_displaced(predicted_px, centroids, camera.width)
     good = refusal == ''
     if np.count_nonzero(good) < options.min_stars_per_image:
         raise ImageRefused(
@@ -513,25 +542,14 @@ def _match(
     return xy
 
 
-def _refuse(
-    predicted_px: Floats,
-    magnitude: Floats,
-    centroids: Centroids,
-    model: ImageModel,
-    width: int,
-    options: IdentificationOptions,
-) -> NDArray[np.str_]:
+def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.str_]:
     """
-    Refusal names (n,): those of the centroids, then blends, then stars off their place.
+    Refusal names (n,): those of the centroids, and of stars off their place.
 
     The measured stars themselves give the smooth correction against which a place is judged.
     """
     refusal = centroids.refusal.copy()
     sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
-    blend = blended(
-        predicted_px, magnitude, centroids.flux_dn, model, options.max_blend_sigma * sigma_px
-    )
-    refusal[blend & (refusal == '')] = 'blend'
     good = np.nonzero(refusal == '')[0]
     if len(good) < 4:
         return refusal

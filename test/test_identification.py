@@ -20,8 +20,8 @@ from starcal_ros.centroiding import (
 )
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification import (
-    blended,
     IdentificationOptions,
+    neighbour_pulls,
     observe_stars,
     predict,
     tracked,
@@ -252,52 +252,54 @@ def image_model(noise_dn: float) -> ImageModel:
     return ImageModel(background, SIGMA_PX, noise, 4095.0, np.zeros(3), np.zeros(3))
 
 
-def is_blended(
-    flux_dn: float, ratio: float, distance_px: float, noise_dn: float, limit_px: float
-) -> bool:
+def pulls(
+    flux_dn: float, ratio: float, distance_px: float, noise_dn: float
+) -> tuple[np.ndarray, np.ndarray]:
     pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
     magnitude = np.array([5.0, 5.0 - 2.5 * np.log10(ratio)])
-    flux = flux_dn * np.array([1.0, ratio])
-    return bool(blended(pair, magnitude, flux, image_model(noise_dn), np.full(2, limit_px))[0])
+    return neighbour_pulls(
+        pair, magnitude, flux_dn * np.array([1.0, ratio]), image_model(noise_dn)
+    )
 
 
 @pytest.mark.parametrize('ratio', [0.01, 0.05, 0.2])
 @pytest.mark.parametrize('distance_sigma', [1.0, 1.5, 2.0, 2.5, 3.0, 3.5])
-def test_a_blend_is_judged_by_its_pull_on_a_faint_star(
-    ratio: float, distance_sigma: float
-) -> None:
-    # One linear step for a fit of many: 15 % apart at most where the background makes the noise.
+def test_the_pull_of_a_neighbour_is_that_of_the_fit(ratio: float, distance_sigma: float) -> None:
+    # One linear step for a fit of many: 25 % apart at most where the background makes the noise.
     distance_px = distance_sigma * SIGMA_PX
     pull_px, _ = pull_of_a_neighbour(400.0, ratio, distance_px, noise_dn=100.0)
-    assert is_blended(400.0, ratio, distance_px, 100.0, pull_px / 1.25)
-    assert not is_blended(400.0, ratio, distance_px, 100.0, pull_px * 1.25)
+    found, _ = pulls(400.0, ratio, distance_px, 100.0)
+    assert found[0, 0] == pytest.approx(pull_px, rel=0.25)
+    assert abs(found[0, 1]) < 1e-9
 
 
-def test_no_blend_that_is_let_pass_pulls_by_more_than_a_sigma() -> None:
+def test_what_is_left_of_a_pull_that_is_let_pass_is_under_a_sigma() -> None:
     worst = 0.0
     for flux_dn in (500.0, 2000.0, 5000.0):
-        for ratio in (0.01, 0.03, 0.1, 0.2, 0.3):
+        for ratio in (0.01, 0.03, 0.1, 0.2, 0.3, 0.45):
             for distance_px in np.arange(1.0, 8.0, 0.5).tolist():
                 pull_px, sigma_px = pull_of_a_neighbour(flux_dn, ratio, distance_px, 2.1)
-                limit_px = OPTIONS.max_blend_sigma * sigma_px
-                if not is_blended(flux_dn, ratio, distance_px, 2.1, limit_px):
-                    worst = max(worst, pull_px / sigma_px)
+                found, swamped = pulls(flux_dn, ratio, distance_px, 2.1)
+                beyond = 0.25 * found[0, 0] > OPTIONS.max_blend_sigma * sigma_px
+                if not (swamped[0] or beyond):
+                    worst = max(worst, abs(pull_px - found[0, 0]) / sigma_px)
     assert worst < 1.0
 
 
-def test_only_the_fainter_of_two_unlike_stars_is_a_blend() -> None:
+def test_only_the_fainter_of_two_unlike_stars_is_swamped() -> None:
     pair = np.array([[100.0, 100.0], [104.0, 100.0], [300.0, 300.0]])
     flux = np.array([5000.0, 50.0, 800.0])
-    found = blended(pair, np.array([4.0, 9.0, 6.0]), flux, image_model(2.1), np.full(3, 0.1))
-    np.testing.assert_array_equal(found, [False, True, False])
+    pull_px, swamped = neighbour_pulls(pair, np.array([4.0, 9.0, 6.0]), flux, image_model(2.1))
+    np.testing.assert_array_equal(swamped, [False, True, False])
+    assert 0 < pull_px[0, 0] < 0.05 and not pull_px[2].any()
 
 
-def test_no_neighbours_no_blends() -> None:
+def test_no_neighbours_no_pulls() -> None:
     model = image_model(2.1)
-    none = blended(np.empty((0, 2)), np.empty(0), np.empty(0), model, np.empty(0))
-    assert none.shape == (0,)
+    pull_px, swamped = neighbour_pulls(np.empty((0, 2)), np.empty(0), np.empty(0), model)
+    assert pull_px.shape == (0, 2) and swamped.shape == (0,)
     alone = np.array([[5.0, 5.0]])
-    assert not blended(alone, np.array([3.0]), np.array([90.0]), model, np.array([0.0])).any()
+    assert not neighbour_pulls(alone, np.array([3.0]), np.array([90.0]), model)[0].any()
 
 
 def test_stars_with_an_unknown_companion_are_told_by_their_shape() -> None:
