@@ -1,0 +1,51 @@
+"""Simulated frames and the set-up that measures them, as `starcal calibrate` would start."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+import tempfile
+
+import yaml
+
+from starcal_ros import pipeline, products, simulation, synthetic
+from starcal_ros.attitude import AttitudeHistory
+from starcal_ros.options import read_parameter_file
+from starcal_ros.records import AttitudeSample, Image
+from starcal_ros.synthetic import Scenario
+
+
+def write_set_up(scenario: Scenario, folder: Path, **values: object) -> Path:
+    """Prior camera and parameter file of a scenario in a folder; returns the latter."""
+    camera, params = folder / 'camera.yaml', folder / 'params.yaml'
+    products.write_camera_info(scenario.prior.camera, camera)
+    content = simulation.parameters(scenario, f'file://{camera}')
+    content['/**']['ros__parameters'].update(values)  # type: ignore[index]
+    params.write_text(yaml.safe_dump(content))
+    return params
+
+
+def load_set_up(scenario: Scenario, **values: object) -> pipeline.Setup:
+    """The options of a scenario with its prior camera and catalog loaded."""
+    with tempfile.TemporaryDirectory() as folder:
+        params = write_set_up(scenario, Path(folder), **values)
+        return pipeline.load_setup(read_parameter_file(params, ()))
+
+
+def paper_scenario(magnitude_limit: float) -> Scenario:
+    """Frames of 2592 x 2048 that show the stars down to a magnitude."""
+    return dataclasses.replace(synthetic.scenario('paper'), magnitude_limit=magnitude_limit)
+
+
+def render_frame(scenario: Scenario, index: int) -> tuple[Image, list[AttitudeSample]]:
+    """A frame and the star tracker's samples about it."""
+    image = synthetic.render(scenario, synthetic.scene(scenario, index), index)
+    return image, list(synthetic.attitude_samples(scenario, index))
+
+
+def history(samples: list[AttitudeSample]) -> AttitudeHistory:
+    """The samples as the pipeline takes them."""
+    attitudes = AttitudeHistory()
+    for sample in samples:
+        attitudes.add(sample.time_ns, sample)
+    return attitudes

@@ -1,0 +1,92 @@
+"""
+The stars of one frame: `pipeline.observe` against the detectors of sep and photutils.
+
+Those two only detect and centroid; ours also predicts, identifies, fits the PSF and judges every
+star.  All take the same mono16 frame of 2592 x 2048.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+import importlib.util
+import statistics
+import time
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bench.frames import history, load_set_up, paper_scenario, render_frame
+from bench.table import Table
+from starcal_ros import pipeline
+from starcal_ros.centroiding import Pixels
+from starcal_ros.identification import tracked
+
+MAGNITUDE_LIMIT = 7.45  # leaves about 120 stars
+DETECTION_SIGMA = 5.0
+ACQUISITION_DEG = 1.2
+
+
+def run(quick: bool) -> list[Table]:
+    """Time each way on one frame, in turns."""
+    scenario = paper_scenario(MAGNITUDE_LIMIT)
+    setup = load_set_up(scenario, magnitude_limit=MAGNITUDE_LIMIT)
+    image, samples = render_frame(scenario, 0)
+    attitudes = history(samples)
+    first = pipeline.observe(image, attitudes, setup, setup.prior)
+    aligned = tracked(setup.prior, first)
+    prior = Rotation.from_quat(setup.prior.star_tracker_from_camera_xyzw)
+    turn = Rotation.from_rotvec(np.radians(ACQUISITION_DEG) * np.array([0.6, -0.8, 0.0]))
+    shifted = dataclasses.replace(
+        setup.prior, star_tracker_from_camera_xyzw=(prior * turn).as_quat()
+    )
+    ways: dict[str, Callable[[], int]] = {
+        'starcal, tracking': lambda: len(pipeline.observe(image, attitudes, setup, aligned)),
+        f'starcal, alignment {ACQUISITION_DEG} deg off': lambda: len(
+            pipeline.observe(image, attitudes, setup, shifted)
+        ),
+    }
+    if importlib.util.find_spec('sep'):
+        ways['sep Background + extract'] = lambda: _sep(image.pixels)
+    if importlib.util.find_spec('photutils'):
+        psf_fwhm_px = 2.355 * scenario.detector.psf_sigma_px
+        ways['photutils DAOStarFinder'] = lambda: _photutils(image.pixels, psf_fwhm_px)
+    took_ms: dict[str, list[float]] = {name: [] for name in ways}
+    stars: dict[str, int] = {}
+    for _ in range(2 if quick else 7):
+        for name, measure in ways.items():
+            start_s = time.perf_counter()
+            stars[name] = measure()
+            took_ms[name].append(1e3 * (time.perf_counter() - start_s))
+    height, width = image.pixels.shape
+    table = Table(
+        f'Stars of one frame of {width} x {height}, mono16, in one thread of Python',
+        ('way', 'stars', 'least ms', 'median ms', 'by tracking'),
+        notes=['by tracking: its least time over that of ours, tracking.'],
+    )
+    ours_ms = min(took_ms['starcal, tracking'])
+    for name, ms in took_ms.items():
+        table.add(name, stars[name], min(ms), statistics.median(ms), f'{min(ms) / ours_ms:.1f}')
+    print(table.text())
+    return [table]
+
+
+def _sep(pixels: Pixels) -> int:
+    """Sources found the way of the documentation of sep."""
+    import sep
+
+    data = pixels.astype(np.float32)
+    background = sep.Background(data)
+    found = sep.extract(data - background, DETECTION_SIGMA, err=background.globalrms)
+    return len(found)
+
+
+def _photutils(pixels: Pixels, psf_fwhm_px: float) -> int:
+    """Sources found the way of the documentation of photutils."""
+    from astropy.stats import sigma_clipped_stats
+    from photutils.detection import DAOStarFinder
+
+    data = pixels.astype(np.float32)
+    _, median, noise = sigma_clipped_stats(data, sigma=3.0)
+    found = DAOStarFinder(threshold=DETECTION_SIGMA * noise, fwhm=psf_fwhm_px)(data - median)
+    return 0 if found is None else len(found)

@@ -1,0 +1,206 @@
+"""
+The star observer as a process on the real graph, fed at a steady rate from another process.
+
+Frames of 2592 x 2048, mono16, reliable: what is lost, how late the observations come, and whether
+the memory of the node stays flat.  A few frames are rendered and sent in turn, each with the
+attitude of its own sky and a stamp that goes on.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+import contextlib
+import importlib.util
+import multiprocessing
+import os
+from pathlib import Path
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any
+
+from bench.frames import paper_scenario, render_frame, write_set_up
+from bench.table import Table
+from starcal_ros.records import AttitudeSample, Image
+
+MAGNITUDE_LIMIT = 9.0  # the default of the node: 300 to 400 stars in a frame
+FRAMES = 6
+START_S = 30.0
+LATE_S = 10.0  # longest that the last observations are waited for
+_FIRST_NS = 1_778_829_600_000_000_000
+_AROUND_NS = 20_000_000  # from an image to the attitude before and the one after it
+
+Frame = tuple[Image, list[AttitudeSample]]
+
+
+def run(quick: bool) -> list[Table]:
+    """Feed the node at 5 and at 10 frames a second."""
+    if not importlib.util.find_spec('rclpy'):
+        print('observer: no rclpy here: left out\n')
+        return []
+    table = Table(
+        'star_observer: 2592 x 2048 mono16, reliable, default Fast DDS, three processes',
+        (
+            *('Hz sent', 'frames', 'observed', 'refused', 'lost', 'stars', 'latency ms'),
+            *('worst ms', 'RSS MB first', 'after 50', 'after all', 'CPU ms/frame'),
+        ),
+        notes=[
+            'latency: from before the image is handed to the publisher until its observations',
+            'are received; median and worst.  CPU: user and system time of the node, all threads.',
+        ],
+    )
+    print('observer: rendering frames', flush=True)
+    scenario = paper_scenario(MAGNITUDE_LIMIT)
+    frames = [render_frame(scenario, index) for index in range(2 if quick else FRAMES)]
+    for rate_hz in (5.0,) if quick else (5.0, 10.0):
+        print(f'observer: {rate_hz:g} frames a second', flush=True)
+        with tempfile.TemporaryDirectory() as folder:
+            params = write_set_up(scenario, Path(folder), magnitude_limit=MAGNITUDE_LIMIT)
+            table.add(rate_hz, *_feed(params, frames, rate_hz, 10 if quick else 120))
+    print(table.text())
+    return [table]
+
+
+def _free_domain() -> int:
+    """A ROS domain in which nobody on this machine takes part."""
+    for domain in range(1 + os.getpid() % 100, 201):
+        with (
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
+            contextlib.suppress(OSError),
+        ):
+            # The first participant of a domain holds this port (RTPS 9.6.1.1).
+            probe.bind(('', 7410 + 250 * domain))
+            return domain
+    raise RuntimeError('no free ROS domain on this machine')
+
+
+@contextlib.contextmanager
+def _observer(params: Path) -> Iterator[int]:
+    """The node's process number; it is stopped at the end."""
+    arguments = ['-m', 'starcal_ros.nodes.star_observer', '--ros-args']
+    arguments += ['--params-file', str(params), '--log-level', 'error']
+    process = subprocess.Popen([sys.executable, *arguments], stdin=subprocess.DEVNULL)
+    try:
+        yield process.pid
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(START_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tuple[Any, ...]:
+    """Send frames and collect observations; the cells of a row after the rate."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    from starcal.msg import StarObservations
+
+    os.environ['ROS_DOMAIN_ID'] = str(_free_domain())
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    arrived: dict[int, tuple[float, str, int]] = {}
+    resident_mb: dict[int, float] = {}
+
+    with _observer(params) as number, rclpy.Context() as context:
+        node = rclpy.create_node('bench', context=context)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+
+        def take(message: Any) -> None:
+            time_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            arrived[time_ns] = (time.monotonic(), message.refusal, len(message.catalog_id))
+            resident_mb[len(arrived)] = _resident_mb(number)
+
+        node.create_subscription(StarObservations, 'observations', take, 1000)
+        spawn = multiprocessing.get_context('spawn')
+        receiver, sender = spawn.Pipe(duplex=False)
+        publisher = spawn.Process(target=_publish, args=(frames, rate_hz, count, sender))
+        publisher.start()
+        start_s, start_cpu_s = time.monotonic(), _processor_s(number)
+        deadline_s = start_s + 2 * START_S + count / rate_hz
+        while not receiver.poll() and time.monotonic() < deadline_s:
+            executor.spin_once(timeout_sec=0.02)
+        if not receiver.poll():
+            publisher.kill()
+            raise RuntimeError('the publisher did not come to its end')
+        sent_s: dict[int, float] = receiver.recv()
+        deadline_s = time.monotonic() + LATE_S
+        while len(arrived) < count and time.monotonic() < deadline_s:
+            executor.spin_once(timeout_sec=0.02)
+        publisher.terminate()  # it stays for the repairs of its last images
+        publisher.join()
+        processor_ms = 1e3 * (_processor_s(number) - start_cpu_s) / len(arrived)
+        executor.shutdown()
+        node.destroy_node()
+    late_ms = [1e3 * (arrived[t][0] - sent_s[t]) for t in sent_s if t in arrived]
+    refusals = Counter(refusal for _, refusal, _ in arrived.values())
+    refused = ', '.join(f'{n} {name}' for name, n in refusals.items() if name) or '0'
+    return (
+        len(sent_s),
+        refusals[''],
+        refused,
+        len(sent_s.keys() - arrived.keys()),
+        int(statistics.median(stars for _, _, stars in arrived.values())),
+        statistics.median(late_ms),
+        max(late_ms),
+        resident_mb[1],
+        resident_mb.get(min(50, count)),
+        resident_mb[len(arrived)],
+        processor_ms,
+    )
+
+
+def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None:
+    """In a process of its own: send the frames at a steady rate and tell when each was sent."""
+    from geometry_msgs.msg import QuaternionStamped
+    import rclpy
+    from sensor_msgs.msg import Image as ImageMessage
+
+    from starcal_ros import messages
+    from starcal_ros.nodes.conversions import make_message
+
+    sent_s: dict[int, float] = {}
+    ready = [
+        (messages.image_to_message(image, 'camera', make_message), attitudes[1])
+        for image, attitudes in frames
+    ]
+    with rclpy.Context() as context:
+        node = rclpy.create_node('feeder', context=context)
+        images = node.create_publisher(ImageMessage, 'image', 10)
+        attitudes = node.create_publisher(QuaternionStamped, 'attitude', 100)
+        while not (images.get_subscription_count() and attitudes.get_subscription_count()):
+            time.sleep(0.05)
+        start_s = time.monotonic() + 2.0  # the reader may see the writer later than it is seen
+        for k in range(count):
+            message, attitude = ready[k % len(ready)]
+            time_ns = _FIRST_NS + round(k / rate_hz * 1e9)
+            message.header = messages.make_header(time_ns, 'camera', make_message)
+            time.sleep(max(0.0, start_s + k / rate_hz - time.monotonic()))
+            xyzw = attitude.icrf_from_star_tracker_xyzw
+            sent_s[time_ns] = time.monotonic()
+            for around_ns in (-_AROUND_NS, _AROUND_NS):
+                stamp_ns = time_ns + around_ns
+                attitudes.publish(
+                    messages.attitude_to_message(stamp_ns, xyzw, 'icrf', make_message)
+                )
+            images.publish(message)
+        pipe.send(sent_s)
+        time.sleep(2 * LATE_S)
+
+
+def _resident_mb(number: int) -> float:
+    pages = int(Path(f'/proc/{number}/statm').read_text().split()[1])
+    return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
+
+
+def _processor_s(number: int) -> float:
+    """User and system time of a process so far."""
+    fields = Path(f'/proc/{number}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
