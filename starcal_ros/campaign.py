@@ -246,10 +246,10 @@ def removal_study(
     Calibrations with fewer and fewer terms, the least prominent going first (paper, Fig. 8).
 
     Starts from all that ``options.estimate`` names.  Removed skew and distortion are zero, a
-    removed focal length or principal point is the prior's.  The next to go is the one whose
-    removal raises chi^2 least by the covariance (Wald: squared distance to the value it is held at
-    over its variance); then all is solved again.  The stars are those that the first calibration
-    has kept: none is called an outlier because a term is missing.
+    removed focal length or principal point is the prior's, and exact.  The next to go is the one
+    whose removal raises chi^2 least by the covariance (Wald: squared distance to the value that it
+    is held at, over its variance); then all is solved again.  The residual is that of the stars
+    that the first calibration has kept, whatever a poorer one makes of them.
 
     Raises
     ------
@@ -271,7 +271,11 @@ def removal_study(
         remaining = tuple(name for name in remaining if name != least)
         if least in _REMOVED_IS_ZERO:
             held = dataclasses.replace(held, camera=held.camera.replace(**{least: 0.0}))
-        options = dataclasses.replace(options, estimate=remaining)
+        exact = tuple(
+            0.0 if name == least else sigma
+            for name, sigma in zip(PARAMETER_NAMES, options.prior_sigma, strict=True)
+        )
+        options = dataclasses.replace(options, estimate=remaining, prior_sigma=exact)
         estimate = estimate_calibration(ensemble, held, options)
         removals.append(
             _removal(least, remaining, wald[least], estimate.residual_px, estimate, full)
@@ -530,7 +534,7 @@ def _terms_summary(rows: Sequence[Row]) -> Iterable[Row]:
         yield {
             **key,
             'trials': len(cell),
-            'usual': usual,
+            'usual': usual or 'none',
             'share': removed.count(usual) / len(cell),
             'residual_std_u_px': _rms(column(cell, 'residual_std_u_px')),
             'residual_std_v_px': _rms(column(cell, 'residual_std_v_px')),
