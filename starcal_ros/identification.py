@@ -24,22 +24,23 @@ from starcal_ros.astrometry import apparent_directions
 from starcal_ros.camera import field_radius_rad, line_of_sight, project, project_jacobians
 from starcal_ros.catalog import cone, StarCatalog
 from starcal_ros.centroiding import (
-    Background,
     CentroidOptions,
     Centroids,
-    detect,
-    detect_near,
     ImageModel,
-    measure_background,
     measure_stars,
     model_image,
-    neighbour_pull_px,
+)
+from starcal_ros.detection import (
+    Background,
+    detect,
+    detect_near,
+    measure_background,
     Pixels,
     Sources,
-    stamp_radius_px,
 )
 from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
+from starcal_ros.psf import neighbour_pull_px, stamp_radius_px
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 Floats = NDArray[np.float64]
@@ -321,7 +322,15 @@ def neighbour_pulls(
     flux = np.maximum(flux_dn[star], 1.0)
     offset_px = xy_px[other] - xy_px[star]
     total_px = np.zeros_like(xy_px)
-    np.add.at(total_px, star, neighbour_pull_px(flux, offset_px, ratio * flux, model))
+    pull_px = neighbour_pull_px(
+        flux,
+        offset_px,
+        ratio * flux,
+        sigma_px,
+        model.background.noise_dn,
+        model.pixel_noise,
+    )
+    np.add.at(total_px, star, pull_px)
     # A neighbour half as bright takes part of the window for itself: no small pull any more.
     near = np.linalg.norm(offset_px, axis=1) < 5.0 * sigma_px
     swamped = np.zeros(len(xy_px), bool)
@@ -390,7 +399,7 @@ def observe_stars(
     model = model_image(image.pixels, background, sources, centroid_options)
     if model.psf_sigma_px == 0:
         # The brightest stars may all be saturated: fainter ones tell the PSF.
-        sources = detect(image.pixels, background, centroid_options)
+        sources = detect(image.pixels, background, centroid_options.detection_sigma)
         model = model_image(image.pixels, background, sources, centroid_options)
     inside = np.nonzero(_in_image(predicted_px, camera.width, camera.height))[0]
     index = prediction.catalog_index[inside]
@@ -473,7 +482,7 @@ def _find(
         background,
         prediction.xy_px[inside][:_TRACKED],
         options.search_radius_px,
-        centroid_options,
+        centroid_options.detection_sigma,
     )
     try:
         turn = acquire(
@@ -482,7 +491,7 @@ def _find(
         return _match(prediction, near, geometry, turn), near
     except ImageRefused:
         pass
-    sources = detect(pixels, background, centroid_options)
+    sources = detect(pixels, background, centroid_options.detection_sigma)
     if len(sources.snr) < 4:
         raise ImageRefused('no_stars', f'{len(sources.snr)} star-like sources')
     turn = acquire(

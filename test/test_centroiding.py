@@ -11,16 +11,13 @@ import pytest
 from starcal_ros.centroiding import (
     CentroidOptions,
     Centroids,
-    detect,
-    fit_psf,
     ImageModel,
-    measure_background,
     measure_stars,
     model_image,
-    PixelNoise,
-    sample_mesh,
     saturation_level,
 )
+from starcal_ros.detection import detect, measure_background, sample_mesh
+from starcal_ros.psf import fit_psf, PixelNoise
 from starcal_ros.records import STAR_REFUSALS
 from starcal_ros.synthetic import centroid_bound, Detector, expose, star_electrons
 
@@ -53,7 +50,9 @@ def exposed(
 
 def modelled(pixels: np.ndarray, options: CentroidOptions = PSF) -> ImageModel:
     background = measure_background(pixels)
-    return model_image(pixels, background, detect(pixels, background, options), options)
+    return model_image(
+        pixels, background, detect(pixels, background, options.detection_sigma), options
+    )
 
 
 def measured(pixels: np.ndarray, xy: np.ndarray, options: CentroidOptions = PSF) -> Centroids:
@@ -192,7 +191,7 @@ def test_a_constant_image_has_the_noise_of_its_rounding() -> None:
     background = measure_background(np.full(SHAPE, 77, np.uint8))
     assert background.level_dn == 77
     assert background.noise_dn == pytest.approx(np.sqrt(1 / 12))
-    assert len(detect(np.full(SHAPE, 77, np.uint8), background, PSF).snr) == 0
+    assert len(detect(np.full(SHAPE, 77, np.uint8), background, PSF.detection_sigma).snr) == 0
 
 
 @pytest.mark.parametrize('shape', [(5, 7), (31, 33), (64, 40), (100, 1000)])
@@ -200,7 +199,7 @@ def test_images_of_any_size(shape: tuple[int, int]) -> None:
     pixels = np.random.default_rng(5).normal(100, 3, shape).astype(np.uint16)
     background = measure_background(pixels)
     assert background.level_dn == pytest.approx(99.5, abs=2.0)
-    sources = detect(pixels, background, PSF)
+    sources = detect(pixels, background, PSF.detection_sigma)
     model = model_image(pixels, background, sources, PSF)
     assert model.psf_sigma_px == 0.0  # no stars to tell
 
@@ -211,7 +210,7 @@ def test_all_stars_above_eight_sigma_are_detected() -> None:
         xy = star_grid(seed)
         flux = np.random.default_rng([seed, 2]).uniform(150, 1500, len(xy))
         pixels = exposed(seed, xy, flux, QUIET)
-        sources = detect(pixels, measure_background(pixels), PSF)
+        sources = detect(pixels, measure_background(pixels), PSF.detection_sigma)
         _, snr = centroid_bound(xy, flux, QUIET, SHAPE)
         distance = np.linalg.norm(xy[snr > 8][:, None] - sources.xy_px[None], axis=2)
         found_all += int((distance.min(axis=1) < 1.0).sum())
@@ -236,7 +235,7 @@ def test_noise_alone_gives_no_more_detections_than_it_should(
     for seed in range(images):
         pixels = expose(np.full(SHAPE, 4.5), detector, np.random.default_rng([seed, 6]))
         options = CentroidOptions(detection_sigma=threshold)
-        count += len(detect(pixels, measure_background(pixels), options).snr)
+        count += len(detect(pixels, measure_background(pixels), options.detection_sigma).snr)
     # Poisson; the noise, 1 % off, changes the count by 12 % at 3.5 sigma and 25 % at 5.
     assert count < 1.25 * expected + 3 * np.sqrt(expected)
     assert count > 0.75 * expected - 3 * np.sqrt(expected)
@@ -373,7 +372,7 @@ def test_lit_single_pixels_are_no_sources() -> None:
     rng = np.random.default_rng(9)
     hot.flat[rng.choice(hot.size, 200, replace=False)] = rng.uniform(300, 6000, 200)
     pixels = expose(hot + QUIET.background_electrons, QUIET, rng)
-    sources = detect(pixels, measure_background(pixels), PSF)
+    sources = detect(pixels, measure_background(pixels), PSF.detection_sigma)
     # Two of them side by side may pass for a source.
     assert len(sources.snr) <= 2
 

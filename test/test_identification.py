@@ -10,14 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.catalog import load_catalog, StarCatalog
-from starcal_ros.centroiding import (
-    Background,
-    CentroidOptions,
-    fit_psf,
-    ImageModel,
-    PixelNoise,
-    stamp_radius_px,
-)
+from starcal_ros.centroiding import CentroidOptions, ImageModel
+from starcal_ros.detection import Background
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification import (
     IdentificationOptions,
@@ -26,6 +20,7 @@ from starcal_ros.identification import (
     predict,
     tracked,
 )
+from starcal_ros.psf import fit_psf, PixelNoise, stamp_radius_px
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.synthetic import Detector, render, scenario, Scene, scene, star_electrons
 

@@ -23,6 +23,8 @@ LADDER = [
     'catalog',
     'astrometry',
     'messages',
+    'detection',
+    'psf',
     'centroiding',
     'identification',
     'measurement',
