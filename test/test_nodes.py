@@ -468,8 +468,9 @@ def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: P
             for j in range(40):
                 writer.write_attitude('/attitude', k * 10**9 + j, np.array([0, 0, 0, 1.0]), 'i')
             writer.write_image('/image', ImageRecord(k * 10**9 + 40, pixels), 'camera')
-    images: list[Any] = client.collect(Image, '/image', 10)
-    attitudes: list[Any] = client.collect(QuaternionStamped, '/attitude')
+    # A listener that is slow to take loses what its own history has no room for.
+    images: list[Any] = client.collect(Image, '/image', 24)
+    attitudes: list[Any] = client.collect(QuaternionStamped, '/attitude', 24 * 40)
     player = start_node('bag_player', ros=('-p', f'bag:={tmp_path / "large"}', '-p', 'rate:=0.0'))
     client.until(lambda: player.process.poll() is not None, 60.0)
     assert player.process.returncode == 0, player.said()
