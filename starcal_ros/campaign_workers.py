@@ -4,20 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
+import itertools
 import logging
 from multiprocessing import resource_tracker
 import os
+import queue
 import signal
 import tempfile
+import threading
+from types import FrameType
 
 import dask
-from distributed import as_completed, Client, LocalCluster
+from distributed import Client, Future, LocalCluster
 
 from starcal_ros.campaign import Design, Row, run_trial
 from starcal_ros.errors import OptionError
 
 LOOPBACK = '127.0.0.1'
 _CONNECT_S = 10.0
+_GLANCE_S = 0.2  # how often to look whether to stop
+_AHEAD = 8  # trials handed out for each thread of the workers
 _SETTINGS = {
     'logging': {'distributed': 'critical'},
     'distributed.worker.daemon': True,  # a worker whose parent was killed does not stay
@@ -64,6 +70,7 @@ def run_trials(
             on_trial()
         return rows
     with contextlib.ExitStack() as stack:
+        stop = stack.enter_context(_interrupts_wait())
         stack.enter_context(dask.config.set(_SETTINGS))
         stack.enter_context(_quiet())
         if scheduler:
@@ -71,21 +78,61 @@ def run_trials(
         else:
             cluster = stack.enter_context(_local_cluster(min(workers, design.trials)))
             client = stack.enter_context(_client(cluster))
-        return _gather(client, design, on_trial)
+        return _gather(client, design, on_trial, stop)
 
 
-def _gather(client: Client, design: Design, on_trial: Callable[[], None]) -> list[Row]:
+def _gather(
+    client: Client, design: Design, on_trial: Callable[[], None], stop: threading.Event
+) -> list[Row]:
+    """Rows of all trials, a few trials ahead of the workers: 100,000 would be slow to give up."""
     rows: list[Row] = []
-    futures = client.map(
-        run_trial, [design] * design.trials, range(design.trials), pure=False, retries=2
-    )
-    done = as_completed(  # type: ignore[no-untyped-call]
-        futures, loop=client.loop, with_results=True
-    )
-    for _, found in done:
-        rows += found
-        on_trial()
+    finished: queue.SimpleQueue[Future[tuple[Row, ...]]] = queue.SimpleQueue()
+    handed_out: set[Future[tuple[Row, ...]]] = set()
+    trials = iter(range(design.trials))
+
+    def hand_out(count: int) -> None:
+        for trial in itertools.islice(trials, count):
+            future = client.submit(run_trial, design, trial, pure=False, retries=2)
+            handed_out.add(future)
+            future.add_done_callback(finished.put)  # type: ignore[no-untyped-call]
+
+    threads = client.nthreads()  # type: ignore[no-untyped-call]
+    hand_out(_AHEAD * max(1, sum(threads.values())))
+    while handed_out:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        with contextlib.suppress(queue.Empty):
+            future = finished.get(timeout=_GLANCE_S)
+            rows += future.result()
+            handed_out.remove(future)
+            on_trial()
+            hand_out(1)
     return rows
+
+
+@contextlib.contextmanager
+def _interrupts_wait() -> Iterator[threading.Event]:
+    """
+    Ctrl-C sets an event; a second one is a `KeyboardInterrupt` at once.
+
+    Raised just anywhere in the client of Dask, the exception can leave a lock behind that its
+    closing waits for without end.
+    """
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        if stop.is_set():
+            signal.default_int_handler(number, frame)
+        stop.set()
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

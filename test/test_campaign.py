@@ -117,7 +117,12 @@ def test_interrupted_leaves_in_one_line(tmp_path: Path) -> None:
     time.sleep(1.0)  # as far as the trials, mostly; what is asserted holds before too
     children = psutil.Process(started.pid).children(recursive=True)
     os.killpg(started.pid, signal.SIGINT)
-    out, err = started.communicate(timeout=60)
+    try:
+        out, err = started.communicate(timeout=60)
+    except subprocess.TimeoutExpired:
+        os.killpg(started.pid, signal.SIGKILL)
+        started.communicate()
+        raise
     assert (started.returncode, out, err) == (130, '', 'starcal: interrupted\n')
     assert not psutil.wait_procs(children, timeout=10)[1]
     assert not list((tmp_path / 'out').iterdir())
