@@ -21,7 +21,7 @@ _STAGES = (
     ('load options, camera, catalog', 'pipeline', 'load_setup'),
     ('read images from the bag', 'bag', 'read_images'),
     ('measure and identify stars', 'pipeline', 'observe'),
-    ('  background', 'centroiding', 'measure_background'),
+    ('  background', 'detection', 'measure_background'),
     ('  prediction', 'identification', 'predict'),
     ('  match', 'identification', '_find'),
     ('  PSF and pixel noise', 'centroiding', 'model_image'),

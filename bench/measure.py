@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from bench.frames import history, load_set_up, paper_scenario, render_frame
 from bench.table import Table
 from starcal_ros import pipeline
-from starcal_ros.centroiding import Pixels
+from starcal_ros.detection import Pixels
 from starcal_ros.identification import tracked
 
 MAGNITUDE_LIMIT = 7.45  # leaves about 120 stars

@@ -27,10 +27,11 @@ from starcal_ros.adjustment import (
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.least_squares import inverse, NotObservable
+from starcal_ros.least_squares import inverse, NotObservable, Solution
 from starcal_ros.measurement import (
     arrange,
     CAMERA,
+    Measurements,
     normal_blocks,
     residuals_px,
     ROTATION,
@@ -255,7 +256,7 @@ def _search(
         everything,
     )
     covariance_px2 = verdict.variance.of(table.covariance_px2)
-    solution = minimise(problem, start, arrange(table, everything, covariance_px2), _ROBUST_SCALE)
+    solution = _robust_search(problem, start, arrange(table, everything, covariance_px2))
     iterations = solution.iterations
     after = _judge(problem, solution.state, table, verdict, given_rad, options)
     for _ in range(_ROUNDS):
@@ -304,6 +305,22 @@ def _search(
     )
 
 
+def _robust_search(problem: Problem, start: State, measurements: Measurements) -> Solution[State]:
+    """
+    Search with the robust loss, every image free of the star tracker.
+
+    A star tracker that is said to be better than it is would bend the camera to its attitudes, and
+    then seem to be right.
+    """
+    if problem.method == 'hierarchical':
+        try:
+            free = dataclasses.replace(problem, method='per_image')
+            return minimise(free, start, measurements, _ROBUST_SCALE)
+        except NotObservable:
+            pass  # so few stars that they need the star tracker
+    return minimise(problem, start, measurements, _ROBUST_SCALE)
+
+
 def _judge(
     problem: Problem,
     state: State,
@@ -317,17 +334,21 @@ def _judge(
     measurements = arrange(table, before.kept, before.variance.of(table.covariance_px2))
     _, blocks = normal_blocks(measurements, state.parameters, state.camera_from_icrf.as_matrix())
     variance, tracker_sigma_rad = CentroidVariance(1.0, 0.0), given_rad
-    eta_rad, covariance_rad2, seen = attitudes_of_stars_alone(problem, state, blocks)
-    found_rad, misfit = estimate_star_tracker_sigma(eta_rad, covariance_rad2, seen, given_rad)
-    if problem.method == 'single':
-        # One rotation for all has no attitude of an image to judge.
-        misfit = np.zeros_like(misfit)
     if options.variance_components:
         freedom = _freedom(problem, state, blocks, before.kept, before.tracker_sigma_rad)
         variance = estimate_variance(residual_px, table.covariance_px2, before.kept, freedom)
-        if problem.method != 'single':
-            tracker_sigma_rad = found_rad
     kept = _fitting(residual_px, table, variance, options)
+    misfit: Mask = np.zeros(table.image_count, bool)
+    # One rotation for all has no attitude of an image to judge.
+    if problem.method != 'single':
+        # By the stars that fit: one that does not turns an image of few by more than the tracker.
+        measurements = arrange(table, kept, variance.of(table.covariance_px2))
+        rotations = state.camera_from_icrf.as_matrix()
+        _, blocks = normal_blocks(measurements, state.parameters, rotations)
+        eta_rad, covariance_rad2, seen = attitudes_of_stars_alone(problem, state, blocks)
+        found_rad, misfit = estimate_star_tracker_sigma(eta_rad, covariance_rad2, seen, given_rad)
+        if options.variance_components:
+            tracker_sigma_rad = found_rad
     return _Verdict(variance, tracker_sigma_rad, misfit, kept)
 
 

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _STARS_PER_GROUP = 40  # whose median squared residual is known to 25 %
-_FEWEST_IMAGES = 6  # from which a star tracker's variance is estimated: it is known to 60 % then
+_FEWEST_IMAGES = 3  # from which their scatter can contradict a sigma, or one of them the others
 _MISFIT_SIGMA = 6.0  # of an attitude: one in 10^8 by chance, and a jump is far larger
 _GIVEN_CHANCE = 0.01  # of contradicting a sigma that is right
 _MEDIAN_OF_SQUARE = 0.4549  # median of chi^2 with one degree of freedom
@@ -99,7 +99,7 @@ def estimate_star_tracker_sigma(
     eta_rad, covariance_rad2, seen : (m, 3), (m, 3, 3), (m,)
         Attitude errors as the stars alone show them (`adjustment.attitudes_of_stars_alone`).
     given_rad : (3,)
-        What the star tracker is said to have; kept where fewer than six images tell otherwise.
+        What the star tracker is said to have; kept where fewer than three images tell otherwise.
 
     Returns
     -------
@@ -115,16 +115,16 @@ def estimate_star_tracker_sigma(
     scatter could hide is an upper limit.
     """
     own = np.einsum('mii->mi', covariance_rad2)
-    if not seen.any():
+    if np.count_nonzero(seen) < _FEWEST_IMAGES:
         return given_rad, np.zeros_like(seen)
     centred = eta_rad - np.median(eta_rad[seen], axis=0)
-    if np.count_nonzero(seen) < _FEWEST_IMAGES:
-        length2 = centred**2 / (given_rad**2 + own)
-        return given_rad, seen & (length2 > _MISFIT_SIGMA**2).any(axis=1)
     spread2 = np.median(centred[seen] ** 2, axis=0) / _MEDIAN_OF_SQUARE
     # The spread of a dozen images may come out small by half: what was given bounds it too.
     usual = np.maximum(np.maximum(spread2, given_rad**2), own)
     misfit = seen & (centred**2 > _MISFIT_SIGMA**2 * usual).any(axis=1)
+    if 3 * np.count_nonzero(misfit) > np.count_nonzero(seen):
+        # No majority that the others could misfit: they scatter more than was thought.
+        misfit = np.zeros_like(seen)
     good = seen & ~misfit
     count = int(np.count_nonzero(good))
     stars = own[good].mean(axis=0)
