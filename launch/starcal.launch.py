@@ -8,8 +8,8 @@ from launch import LaunchDescription
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return both nodes; arguments: params, namespace, image, attitude, velocity."""
-    topics = ('image', 'attitude', 'velocity')
+    """Return both nodes; arguments: params, namespace, image, attitude, velocity, temperature."""
+    topics = ('image', 'attitude', 'velocity', 'temperature')
     arguments = [
         DeclareLaunchArgument('params', description='ROS parameter file, as config/starcal.yaml'),
         DeclareLaunchArgument('namespace', default_value='', description='of both nodes'),

@@ -9,18 +9,22 @@ The three methods of calibration as least-squares problems (Eqs. 10-19, 25).
 With R_k = camera_from_icrf of image k, the attitude error of the star tracker in it is
 ``eta_k = -Log(A' R_k T_k')``, a small rotation in the star tracker frame, where A =
 camera_from_star_tracker and T_k = star_tracker_from_icrf as measured.
+
+Where terms of temperature are estimated (`thermal`), parameters and A are those of the image, and
+the derivatives by what is shared follow by the chain rule, one small matrix for each image.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.least_squares import levenberg_marquardt, NormalEquations, Solution
-from starcal_ros.measurement import CAMERA, Measurements, normal_blocks, RESIDUAL, ROTATION
+from starcal_ros.measurement import Measurements, normal_blocks, RESIDUAL, ROTATION
+from starcal_ros.thermal import parameters_at, parameters_chain, turns, turns_chain
 
 Floats = NDArray[np.float64]
 
@@ -34,6 +38,8 @@ class State:
     parameters: Floats  # (10,)
     camera_from_star_tracker: Rotation
     camera_from_icrf: Rotation  # (m,)
+    focal: Floats = field(default_factory=lambda: np.empty(0))  # (q,) terms of temperature
+    rate: Floats = field(default_factory=lambda: np.empty(0))  # (3,) of the alignment, or (0,)
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,8 @@ class Problem:
         As measured.
     star_tracker_sigma_rad : (m, 3)
         1-sigma of each attitude about the star tracker's axes; infinite: not to be trusted.
+    above_reference_k : (m,)
+        Temperature of each image less the reference; (0,) where no term is estimated.
     """
 
     method: str
@@ -60,6 +68,7 @@ class Problem:
     prior_sigma: Floats
     star_tracker_from_icrf: Rotation
     star_tracker_sigma_rad: Floats
+    above_reference_k: Floats = field(default_factory=lambda: np.empty(0))
 
 
 def minimise(
@@ -77,9 +86,7 @@ def minimise(
     """
 
     def evaluate(state: State) -> NormalEquations:
-        cost, blocks = normal_blocks(
-            measurements, state.parameters, state.camera_from_icrf.as_matrix(), loss_scale
-        )
+        cost, blocks = image_blocks(problem, state, measurements, loss_scale)
         return assemble(problem, state, cost, blocks)
 
     def move(state: State, shared: Floats, blocks: Floats) -> State:
@@ -88,12 +95,55 @@ def minimise(
     return levenberg_marquardt(start, evaluate, move)
 
 
+def image_parameters(problem: Problem, state: State) -> Floats:
+    """Camera parameters: (10,) of all images, or (m, 10) where temperature changes them."""
+    if len(state.focal) == 0:
+        return state.parameters
+    return parameters_at(state.parameters, state.focal, problem.above_reference_k)
+
+
+def image_alignment(problem: Problem, state: State) -> Rotation:
+    """camera_from_star_tracker: of all images, or (m,) where temperature turns it."""
+    if len(state.rate) == 0:
+        return state.camera_from_star_tracker
+    return turns(state.rate, problem.above_reference_k) * state.camera_from_star_tracker
+
+
+def image_blocks(
+    problem: Problem, state: State, measurements: Measurements, loss_scale: float = np.inf
+) -> tuple[float, Floats]:
+    """Cost and the (m, 14, 14) matrices of `measurement.normal_blocks` at a state."""
+    return normal_blocks(
+        measurements,
+        image_parameters(problem, state),
+        state.camera_from_icrf.as_matrix(),
+        loss_scale,
+    )
+
+
+def by_shared(problem: Problem, state: State, blocks: Floats) -> Floats:
+    """
+    Matrices (m, 14 + q, 14 + q) by the camera parameters and q focal terms, angles and residual.
+
+    From those by the parameters of the image; the same where no focal term is estimated.
+    """
+    q = len(state.focal)
+    if q == 0:
+        return blocks
+    E = np.zeros((len(blocks), 14, 14 + q))
+    E[:, :10, : 10 + q] = parameters_chain(
+        state.parameters, state.focal, problem.above_reference_k
+    )
+    E[:, 10:, 10 + q :] = np.eye(4)
+    return np.asarray(E.transpose(0, 2, 1) @ blocks @ E)
+
+
 def assemble(problem: Problem, state: State, cost: float, blocks: Floats) -> NormalEquations:
     """
     Normal equations of a method from the cost and the (m, 14, 14) matrices of the images.
 
-    Shared unknowns: the free camera parameters, then the alignment angles where the method has
-    one alignment; a block is the rotation of an image.
+    Shared unknowns: the free camera parameters, the focal terms, then the alignment angles where
+    the method has one alignment, and their rate; a block is the rotation of an image.
     """
     normal = _with_all_parameters(problem, state, cost, blocks)
     f = len(normal.a) - 10
@@ -113,27 +163,33 @@ def _with_all_parameters(
 ) -> NormalEquations:
     """Normal equations as if all ten camera parameters were free; priors on those that are."""
     has_alignment = problem.method != 'per_image'
-    p = 13 if has_alignment else 10
+    k = 10 + len(state.focal)
+    p = k + (3 + len(state.rate) if has_alignment else 0)
     A, a = np.zeros((p, p)), np.zeros(p)
     B: Floats = np.zeros((0, 3, p))
     C: Floats = np.zeros((0, 3, 3))
     c: Floats = np.zeros((0, 3))
-    total = blocks.sum(axis=0)
+    blocks = by_shared(problem, state, blocks)
+    camera, rotation = slice(0, k), slice(k, k + 3)
     if problem.method == 'single':
-        A[...], a[...] = total[:13, :13], total[:13, RESIDUAL]
+        total = _by_alignment(problem, state, blocks).sum(axis=0)
+        A[...], a[...] = total[:p, :p], total[:p, -1]
     else:
-        A[:10, :10], a[:10] = total[CAMERA, CAMERA], total[CAMERA, RESIDUAL]
+        total = blocks.sum(axis=0)
+        A[camera, camera], a[camera] = total[camera, camera], total[camera, -1]
         B = np.zeros((len(blocks), 3, p))
-        B[:, :, :10] = blocks[:, ROTATION, CAMERA]
-        C, c = blocks[:, ROTATION, ROTATION], blocks[:, ROTATION, RESIDUAL]
+        B[:, :, camera] = blocks[:, rotation, camera]
+        C, c = blocks[:, rotation, rotation], blocks[:, rotation, -1]
     if problem.method == 'hierarchical':
         residual, J = _whitened_attitude_errors(problem, state)
         information = J.transpose(0, 2, 1) @ J
         gradient = np.einsum('mji,mj->mi', J, residual)
         cost += 0.5 * float((residual**2).sum())
-        A[10:, 10:] += information.sum(axis=0)
-        a[10:] += gradient.sum(axis=0)
-        B[:, :, 10:] = -information
+        turn = _turn_chain(problem, state)
+        to_shared = information @ turn
+        A[k:, k:] += (turn.transpose(0, 2, 1) @ to_shared).sum(axis=0)
+        a[k:] += np.einsum('mji,mj->mi', turn, gradient).sum(axis=0)
+        B[:, :, k:] = -to_shared
         C, c = C + information, c - gradient
     # An image on which nothing pulls keeps its rotation.
     pulled = np.asarray(C.any(axis=(1, 2)))
@@ -150,11 +206,30 @@ def _with_all_parameters(
     return NormalEquations(cost, A, a, B, C, c)
 
 
+def _turn_chain(problem: Problem, state: State) -> Floats:
+    """How alignment angles and rate turn the camera of each image: (m, 3, 3) or (m, 3, 6)."""
+    if len(state.rate):
+        return turns_chain(state.rate, problem.above_reference_k)
+    return np.tile(np.eye(3), (len(state.camera_from_icrf), 1, 1))
+
+
+def _by_alignment(problem: Problem, state: State, blocks: Floats) -> Floats:
+    """Matrices of `by_shared` with alignment angles and rate in place of the image's rotation."""
+    if len(state.rate) == 0:
+        return blocks
+    k = 10 + len(state.focal)
+    E = np.zeros((len(blocks), k + 4, k + 7))
+    E[:, :k, :k], E[:, -1, -1] = np.eye(k), 1.0
+    E[:, k:-1, k:-1] = _turn_chain(problem, state)
+    return np.asarray(E.transpose(0, 2, 1) @ blocks @ E)
+
+
 def reduced_information(problem: Problem, state: State, blocks: Floats) -> Floats:
     """
-    Information (p, p) on all ten camera parameters, and the alignment where the method has one.
+    Information (p, p) on all ten camera parameters, and the other unknowns that are shared.
 
-    The rotations of the images are eliminated.
+    Those are focal terms, and alignment with its rate where the method has one; the rotations of
+    the images are eliminated.
     """
     normal = _with_all_parameters(problem, state, 0.0, blocks)
     if len(normal.C) == 0:
@@ -168,12 +243,12 @@ def _whitened_attitude_errors(problem: Problem, state: State) -> tuple[Floats, F
     """
     Star tracker errors (m, 3) in sigma, and their derivative (m, 3, 3) by the images' rotations.
 
-    The derivative by the common alignment is the negative of it.
+    The derivative by the alignment at the temperature of the image is the negative of it.
     """
     eta = attitude_errors(problem, state, state.camera_from_icrf)
     # d Log: the inverse Jacobian of SO(3) to first order, exact to eta^2 / 12 (1e-9 at 20 arcsec).
     half = 0.5 * _cross_matrix(eta)
-    J = (np.eye(3) + half) @ state.camera_from_star_tracker.inv().as_matrix()
+    J = (np.eye(3) + half) @ image_alignment(problem, state).inv().as_matrix()
     sigma = problem.star_tracker_sigma_rad
     return eta / sigma, J / sigma[:, :, None]
 
@@ -182,7 +257,7 @@ def attitude_errors(problem: Problem, state: State, camera_from_icrf: Rotation) 
     """Star tracker errors (m, 3), rad in its frame, when these are the rotations of the images."""
     return -np.asarray(
         (
-            state.camera_from_star_tracker.inv()
+            image_alignment(problem, state).inv()
             * camera_from_icrf
             * problem.star_tracker_from_icrf.inv()
         ).as_rotvec()
@@ -216,8 +291,9 @@ def attitudes_of_stars_alone(
     # Where the star tracker holds the rotation off the stars' minimum, one step leads there.
     step = np.einsum('mij,mj->mi', inverse, blocks[:, ROTATION, RESIDUAL])
     eta = attitude_errors(problem, state, Rotation.from_rotvec(-step) * state.camera_from_icrf)
-    camera_from_star_tracker = state.camera_from_star_tracker.as_matrix()
-    covariance = camera_from_star_tracker.T @ inverse @ camera_from_star_tracker
+    camera_from_star_tracker = image_alignment(problem, state).as_matrix()
+    star_tracker_from_camera = np.swapaxes(camera_from_star_tracker, -1, -2)
+    covariance = star_tracker_from_camera @ inverse @ camera_from_star_tracker
     return np.where(seen[:, None], eta, 0.0), covariance, seen
 
 
@@ -231,13 +307,21 @@ def _cross_matrix(v: Floats) -> Floats:
 
 def _move(problem: Problem, state: State, shared: Floats, blocks: Floats) -> State:
     """Take a step: parameters add, rotations turn (Eq. 11)."""
-    f = len(problem.free)
+    f, q = len(problem.free), len(state.focal)
     parameters = state.parameters.copy()
     parameters[problem.free] += shared[:f]
+    focal, turned = state.focal + shared[f : f + q], shared[f + q :]
     alignment, rotations = state.camera_from_star_tracker, state.camera_from_icrf
     if problem.method == 'per_image':
-        return State(parameters, alignment, Rotation.from_rotvec(-blocks) * rotations)
-    turn = Rotation.from_rotvec(-shared[f:])
-    if problem.method == 'single':
-        return State(parameters, turn * alignment, turn * rotations)
-    return State(parameters, turn * alignment, Rotation.from_rotvec(-blocks) * rotations)
+        rotations = Rotation.from_rotvec(-blocks) * rotations
+        return State(parameters, alignment, rotations, focal, state.rate)
+    turn = Rotation.from_rotvec(-turned[:3])
+    rate = state.rate + turned[3:]
+    moved = State(parameters, turn * alignment, rotations, focal, rate)
+    if problem.method == 'hierarchical':
+        rotations = Rotation.from_rotvec(-blocks) * rotations
+    elif len(rate):
+        rotations = image_alignment(problem, moved) * problem.star_tracker_from_icrf
+    else:
+        rotations = turn * rotations
+    return replace(moved, camera_from_icrf=rotations)

@@ -224,6 +224,14 @@ def read_velocities(
         yield messages.velocity_from_message(_decode(raw))
 
 
+def read_temperatures(
+    paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
+) -> Iterator[tuple[int, float]]:
+    """Stamps and temperatures in degrees Celsius of a topic; NaN where not known."""
+    for raw in read_raw(paths, [topic], on_damage):
+        yield messages.temperature_from_message(_decode(raw))
+
+
 def read_observations(
     paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
 ) -> Iterator[StarObservations]:
@@ -317,6 +325,15 @@ class BagWriter:
         """Write a geometry_msgs/TwistStamped."""
         message = messages.velocity_to_message(time_ns, velocity_m_s, frame_id, make_message)
         self._write(topic, messages.VELOCITY_TYPE, time_ns, message)
+
+    def write_temperature(
+        self, topic: str, time_ns: int, temperature_degc: float, frame_id: str
+    ) -> None:
+        """Write a sensor_msgs/Temperature."""
+        message = messages.temperature_to_message(
+            time_ns, temperature_degc, frame_id, make_message
+        )
+        self._write(topic, messages.TEMPERATURE_TYPE, time_ns, message)
 
     def write_observations(self, topic: str, record: StarObservations, frame_id: str) -> None:
         """Write a starcal/StarObservations."""

@@ -14,10 +14,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.stats import chi2, theilslopes
 
 from starcal_ros.adjustment import (
+    attitude_errors,
     attitudes_of_stars_alone,
+    by_shared,
+    image_blocks,
+    image_parameters,
     METHODS,
     minimise,
     Problem,
@@ -26,21 +30,19 @@ from starcal_ros.adjustment import (
 )
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import TooFewObservations
+from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.least_squares import inverse, NotObservable, Solution
 from starcal_ros.measurement import (
     arrange,
-    CAMERA,
     Measurements,
-    normal_blocks,
     residuals_px,
-    ROTATION,
     squared_sigmas,
     star_table,
     StarTable,
 )
 from starcal_ros.options import option
-from starcal_ros.records import CameraGeometry, Ensemble
+from starcal_ros.records import ALIGNMENT_NAMES, CameraGeometry, Ensemble, Thermal
+from starcal_ros.thermal import weakest_term, why_unsupported
 from starcal_ros.variance import CentroidVariance, estimate_star_tracker_sigma, estimate_variance
 
 Floats = NDArray[np.float64]
@@ -97,6 +99,18 @@ class CalibrationOptions:
     variance_components: bool = option(
         True, 'estimate the sigmas of centroids and star tracker again from the residuals'
     )
+    focal_temperature_order: int = option(
+        0, 'degree of the polynomial of focal length in temperature; 0: none', low=0, high=2
+    )
+    alignment_temperature: bool = option(
+        False, 'alignment linear in temperature; not with the method per_image'
+    )
+    reference_temperature_degc: float = option(
+        20.0,
+        'temperature at which camera and alignment are reported where they change with it, degC',
+        low=-273.15,
+        high=1000.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -109,8 +123,9 @@ class Estimate:
     geometry : CameraGeometry
     covariance : (13, 13)
     information : (k, k)
-        On the estimated camera parameters, then the alignment where the method has one; the
-        rotations of the images eliminated.
+        On the estimated camera parameters and focal terms, then the alignment where the method
+        has one, and its rate; the rotations of the images eliminated.
+    information_names : tuple of k str
     state : State
     table : StarTable
     kept : (n,) bool
@@ -130,11 +145,14 @@ class Estimate:
     alignment_scatter_arcsec : float
         RMS per axis of the alignments that the images show, about their mean.
     iterations, termination
+    thermal : Thermal or None
+        None where no change with temperature was asked for.
     """
 
     geometry: CameraGeometry
     covariance: Floats
     information: Floats
+    information_names: tuple[str, ...]
     state: State
     table: StarTable
     kept: Mask
@@ -147,6 +165,22 @@ class Estimate:
     alignment_scatter_arcsec: float
     iterations: int
     termination: str
+    thermal: Thermal | None
+
+
+def check_options(options: CalibrationOptions) -> None:
+    """
+    Raise `OptionError` for options that do not go together.
+
+    Raises
+    ------
+    OptionError
+        Naming the option.
+    """
+    if options.alignment_temperature and options.method == 'per_image':
+        # Its mean of the images' alignments has no place for a slope: `hierarchical` with a loose
+        # star tracker is the same estimate with one.
+        raise OptionError('alignment_temperature: the method per_image has no common alignment')
 
 
 def check_enough(ensemble: Ensemble, options: CalibrationOptions) -> None:
@@ -182,26 +216,61 @@ def estimate_calibration(
     """
     Estimate of the camera parameters and the alignment from an ensemble.
 
+    Terms of temperature that the images do not carry, or that are no more than chance, are left
+    out one by one; the note of ``thermal`` says which.
+
     Raises
     ------
     TooFewObservations
         When there are too few images or stars, or they do not determine what is to be estimated.
+    OptionError
+        For options that do not go together.
     """
+    check_options(options)
     check_enough(ensemble, options)
     table = star_table(ensemble.images)
     problem = _problem(ensemble, prior, options)
     alignment = Rotation.from_quat(prior.star_tracker_from_camera_xyzw).inv()
-    start = State(
-        prior.camera.parameters.copy(), alignment, alignment * problem.star_tracker_from_icrf
+    order, with_rate = options.focal_temperature_order, options.alignment_temperature
+    left_out = []
+    unsupported = (order or with_rate) and why_unsupported(
+        np.array([image.temperature_degc for image in ensemble.images]), order
     )
-    try:
-        return _search(problem, start, table, prior, options)
-    except (NotObservable, np.linalg.LinAlgError) as error:
-        names = ', '.join(options.estimate)
-        raise TooFewObservations(
-            f'the stars do not determine all of {names} and the alignment: {error}; '
-            'more images, or stars over more of the detector, or fewer parameters are needed'
-        ) from error
+    if unsupported:
+        order, with_rate = 0, False
+        left_out.append(unsupported)
+    while True:
+        start = State(
+            prior.camera.parameters.copy(),
+            alignment,
+            alignment * problem.star_tracker_from_icrf,
+            np.zeros(order),
+            np.zeros(3 if with_rate else 0),
+        )
+        try:
+            estimate, weakest = _search(problem, start, table, prior, options)
+            why = 'within chance'
+        except (NotObservable, np.linalg.LinAlgError) as error:
+            if not (order or with_rate):
+                names = ', '.join(options.estimate)
+                raise TooFewObservations(
+                    f'the stars do not determine all of {names} and the alignment: {error}; '
+                    'more images, or stars over more of the detector, or fewer parameters are '
+                    'needed'
+                ) from error
+            weakest, why = 'focal' if order else 'rate', 'not determined by the images'
+        if weakest == 'focal':
+            left_out.append(f'focal term of degree {order} is {why}')
+            order -= 1
+        elif weakest == 'rate':
+            left_out.append(f'alignment rate is {why}')
+            with_rate = False
+        else:
+            break
+    if estimate.thermal is None or not left_out:
+        return estimate
+    note = 'left out: ' + ', '.join(left_out)
+    return dataclasses.replace(estimate, thermal=dataclasses.replace(estimate.thermal, note=note))
 
 
 def _problem(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Problem:
@@ -217,6 +286,8 @@ def _problem(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOpti
         star_tracker_sigma_rad=np.tile(
             np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD, (len(ensemble.images), 1)
         ),
+        above_reference_k=np.array([image.temperature_degc for image in ensemble.images])
+        - options.reference_temperature_degc,
     )
 
 
@@ -245,8 +316,12 @@ def _search(
     table: StarTable,
     prior: CameraGeometry,
     options: CalibrationOptions,
-) -> Estimate:
-    """Robust search, then least squares with snooping; see the head of the module."""
+) -> tuple[Estimate, str]:
+    """
+    Robust search, then least squares with snooping; see the head of the module.
+
+    With the term of temperature to leave out, if any.
+    """
     everything = np.ones(len(table), bool)
     given_rad = problem.star_tracker_sigma_rad[0]
     verdict = _Verdict(
@@ -275,21 +350,32 @@ def _search(
         if after.agrees_with(verdict):
             break
     state = solution.state
-    _, blocks = normal_blocks(measurements, state.parameters, state.camera_from_icrf.as_matrix())
-    residual_px = _residuals(state, table)
+    _, blocks = image_blocks(problem, state, measurements)
+    residual_px = _residuals(problem, state, table)
     kept = verdict.kept
     freedom = _freedom(problem, state, blocks, kept, verdict.tracker_sigma_rad)
     chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()
     lost = np.bincount(table.image[kept], minlength=table.image_count) == 0
-    geometry, covariance, scatter_arcsec = _result(
+    geometry, full, scatter_arcsec = _result(
         problem, state, blocks, prior, verdict.tracker_sigma_rad
     )
     information = reduced_information(problem, state, blocks)
     shared = np.concatenate([problem.free, np.arange(10, len(information))])
-    return Estimate(
+    k = 10 + len(state.focal)
+    at_reference = np.r_[0:10, k : k + 3]
+    thermal = _thermal(state, full, options)
+    weakest = weakest_term(thermal, full[k + 3 :, k + 3 :]) if thermal else ''
+    names = (
+        *(PARAMETER_NAMES[i] for i in problem.free),
+        *(f'focal_temperature_{i}' for i in range(1, k - 9)),
+        *ALIGNMENT_NAMES,
+        *(f'{name}_temperature' for name in ALIGNMENT_NAMES),
+    )
+    estimate = Estimate(
         geometry=geometry,
-        covariance=covariance,
+        covariance=full[np.ix_(at_reference, at_reference)],
         information=information[np.ix_(shared, shared)],
+        information_names=names[: len(shared)],
         state=state,
         table=table,
         kept=kept,
@@ -302,6 +388,23 @@ def _search(
         alignment_scatter_arcsec=scatter_arcsec,
         iterations=iterations,
         termination=solution.termination,
+        thermal=thermal,
+    )
+    return estimate, weakest
+
+
+def _thermal(state: State, full: Floats, options: CalibrationOptions) -> Thermal | None:
+    """Terms of temperature of a state; None where none was asked for."""
+    if not (options.focal_temperature_order or options.alignment_temperature):
+        return None
+    k = 10 + len(state.focal)
+    sigma = np.sqrt(np.diag(full))
+    return Thermal(
+        reference_degc=options.reference_temperature_degc,
+        focal_per_degc=tuple(state.focal.tolist()),
+        focal_sigma=tuple(sigma[10:k].tolist()),
+        alignment_rate_rad_per_degc=tuple(state.rate.tolist()),
+        alignment_rate_sigma=tuple(sigma[k + 3 :].tolist()),
     )
 
 
@@ -315,10 +418,26 @@ def _robust_search(problem: Problem, start: State, measurements: Measurements) -
     if problem.method == 'hierarchical':
         try:
             free = dataclasses.replace(problem, method='per_image')
-            return minimise(free, start, measurements, _ROBUST_SCALE)
+            solution = minimise(free, start, measurements, _ROBUST_SCALE)
+            return dataclasses.replace(solution, state=_with_slope(problem, solution.state))
         except NotObservable:
             pass  # so few stars that they need the star tracker
     return minimise(problem, start, measurements, _ROBUST_SCALE)
+
+
+def _with_slope(problem: Problem, state: State) -> State:
+    """
+    The state with an alignment rate that its rotations show, where one is estimated.
+
+    Median of the slopes between images: left in, a drift would look like scatter or misfits.
+    """
+    if len(state.rate) == 0:
+        return state
+    eta_rad = attitude_errors(problem, state, state.camera_from_icrf)
+    # The frame turns by what is missing from the star tracker's side.
+    turned = state.camera_from_star_tracker.apply(eta_rad)
+    slopes = [theilslopes(axis, problem.above_reference_k).slope for axis in turned.T]
+    return dataclasses.replace(state, rate=state.rate + np.array(slopes))
 
 
 def _judge(
@@ -330,9 +449,9 @@ def _judge(
     options: CalibrationOptions,
 ) -> _Verdict:
     """Variances and misfits from the residuals at a state that the verdict before has led to."""
-    residual_px = _residuals(state, table)
+    residual_px = _residuals(problem, state, table)
     measurements = arrange(table, before.kept, before.variance.of(table.covariance_px2))
-    _, blocks = normal_blocks(measurements, state.parameters, state.camera_from_icrf.as_matrix())
+    _, blocks = image_blocks(problem, state, measurements)
     variance, tracker_sigma_rad = CentroidVariance(1.0, 0.0), given_rad
     if options.variance_components:
         freedom = _freedom(problem, state, blocks, before.kept, before.tracker_sigma_rad)
@@ -343,10 +462,12 @@ def _judge(
     if problem.method != 'single':
         # By the stars that fit: one that does not turns an image of few by more than the tracker.
         measurements = arrange(table, kept, variance.of(table.covariance_px2))
-        rotations = state.camera_from_icrf.as_matrix()
-        _, blocks = normal_blocks(measurements, state.parameters, rotations)
+        _, blocks = image_blocks(problem, state, measurements)
         eta_rad, covariance_rad2, seen = attitudes_of_stars_alone(problem, state, blocks)
-        found_rad, misfit = estimate_star_tracker_sigma(eta_rad, covariance_rad2, seen, given_rad)
+        fitted = 2 if len(state.rate) else 1  # mean of the attitudes, and slope
+        found_rad, misfit = estimate_star_tracker_sigma(
+            eta_rad, covariance_rad2, seen, given_rad, fitted
+        )
         if options.variance_components:
             tracker_sigma_rad = found_rad
     return _Verdict(variance, tracker_sigma_rad, misfit, kept)
@@ -381,8 +502,10 @@ def _dropped(table: StarTable, kept: Mask) -> NDArray[np.int64]:
     return np.asarray(catalog_id[(sightings >= _FEWEST_SIGHTINGS) & (uses == 0)])
 
 
-def _residuals(state: State, table: StarTable) -> Floats:
-    return residuals_px(table, state.parameters, state.camera_from_icrf.as_matrix())
+def _residuals(problem: Problem, state: State, table: StarTable) -> Floats:
+    return residuals_px(
+        table, image_parameters(problem, state), state.camera_from_icrf.as_matrix()
+    )
 
 
 def _freedom(
@@ -394,7 +517,7 @@ def _freedom(
     An attitude that the star tracker holds costs less than three: with P the covariance from the
     stars and T the star tracker's, trace(T (T + P)^-1).
     """
-    unknowns = float(len(problem.free))
+    unknowns = float(len(problem.free) + len(state.focal) + len(state.rate))
     if problem.method == 'single':
         unknowns += 3
     else:
@@ -417,10 +540,15 @@ def _result(
     prior: CameraGeometry,
     tracker_sigma_rad: Floats,
 ) -> tuple[CameraGeometry, Floats, float]:
-    """Geometry, its (13, 13) covariance and the scatter of the images' alignments, arcsec."""
+    """
+    Geometry, covariance of all that is shared, and the scatter of the images' alignments, arcsec.
+
+    The covariance is of camera, focal terms, alignment and its rate.
+    """
     information = reduced_information(problem, state, blocks)
     shared = _considered_covariance(problem, information)
-    full: Floats = np.zeros((13, 13))
+    size = max(len(shared), 13 + len(state.focal))
+    full: Floats = np.zeros((size, size))
     full[: len(shared), : len(shared)] = shared
     alignment = state.camera_from_star_tracker
     scatter_arcsec = 0.0
@@ -444,7 +572,7 @@ def _result(
 
 def _considered_covariance(problem: Problem, information: Floats) -> Floats:
     """
-    Covariance (p, p) of all camera parameters, and the alignment where the information has it.
+    Covariance (p, p) of all camera parameters, and of what else the information has.
 
     A held parameter with a prior sigma is considered: its uncertainty is its own, and what it does
     to the estimated ones is added to theirs; one without stays at zero.
@@ -482,9 +610,11 @@ def _mean_alignment(
     """
     alignments = (state.camera_from_icrf * problem.star_tracker_from_icrf.inv())[good]
     tracker = np.diag(tracker_sigma_rad**2)
-    C, B = blocks[good][:, ROTATION, ROTATION], blocks[good][:, ROTATION, CAMERA]
+    k = len(full) - 3
+    rows = by_shared(problem, state, blocks)[good][:, k : k + 3]
+    C, B = rows[:, :, k : k + 3], rows[:, :, :k]
     stars, by_camera = np.linalg.inv(C), np.linalg.solve(C, B)
-    within = stars + by_camera @ full[:10, :10] @ by_camera.transpose(0, 2, 1)
+    within = stars + by_camera @ full[:k, :k] @ by_camera.transpose(0, 2, 1)
     weight = 1.0 / np.trace(within + tracker, axis1=1, axis2=2)
     alignment = alignments.mean(weight)
     weight = weight / weight.sum()
@@ -492,7 +622,7 @@ def _mean_alignment(
     F = np.einsum('m,mij->ij', weight, by_camera)
     scattered = np.einsum('m,mij->ij', weight**2, stars + A @ tracker @ A.T)
     full = full.copy()
-    full[10:, 10:] = scattered + F @ full[:10, :10] @ F.T
-    full[10:, :10] = -F @ full[:10, :10]
-    full[:10, 10:] = full[10:, :10].T
+    full[k:, k:] = scattered + F @ full[:k, :k] @ F.T
+    full[k:, :k] = -F @ full[:k, :k]
+    full[:k, k:] = full[k:, :k].T
     return alignment, full

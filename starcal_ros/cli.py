@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument('bags', nargs='+', type=Path, metavar='BAG', help='.mcap or folder')
     calibrate.add_argument('--params', type=Path, required=True, metavar='FILE')
     calibrate.add_argument('-o', '--output', type=Path, required=True, metavar='DIR')
-    for what in ('image', 'attitude', 'velocity', 'observations'):
+    for what in ('image', 'attitude', 'velocity', 'temperature', 'observations'):
         calibrate.add_argument(
             f'--{what}-topic', default='', metavar='T', help='the only one of its type if left out'
         )
@@ -194,8 +194,19 @@ def _observations(
     velocity_topic = args.velocity_topic
     if velocity_topic or messages.VELOCITY_TYPE in types:
         velocity_topic = bag.choose_topic(args.bags, messages.VELOCITY_TYPE, velocity_topic)
+    temperature_topic = args.temperature_topic
+    options = setup.calibration
+    asked = options.focal_temperature_order or options.alignment_temperature
+    thermometers = sum(topic.type_name == messages.TEMPERATURE_TYPE for topic in there)
+    # A spacecraft has many: which one is the camera's matters only where it is made use of.
+    if temperature_topic or thermometers == 1 or (thermometers and asked):
+        temperature_topic = bag.choose_topic(
+            args.bags, messages.TEMPERATURE_TYPE, temperature_topic
+        )
     return (
-        pipeline.observe_bag(args.bags, image_topic, attitude_topic, setup, velocity_topic),
+        pipeline.observe_bag(
+            args.bags, image_topic, attitude_topic, setup, velocity_topic, temperature_topic
+        ),
         counts[image_topic],
     )
 
@@ -307,6 +318,7 @@ def _summary(calibration: Calibration, prior: CameraGeometry) -> list[str]:
     from starcal_ros.camera import PARAMETER_NAMES
     from starcal_ros.constants import ARCSECOND_RAD
     from starcal_ros.demo import alignment_difference_rad
+    from starcal_ros.thermal import summary as thermal_summary
 
     camera, sigma = calibration.geometry.camera, calibration.sigma
     lines = [f'{"parameter":<14}{"value":>16}{"1-sigma":>12}{"from prior":>14}']
@@ -327,6 +339,8 @@ def _summary(calibration: Calibration, prior: CameraGeometry) -> list[str]:
         f'method          {calibration.method}',
         f'solver          {calibration.iterations} iterations, {calibration.termination}',
     ]
+    if calibration.thermal is not None:
+        lines.append(f'temperature     {thermal_summary(calibration.thermal)}')
     verdict = 'accepted' if calibration.accepted else 'refused: ' + '; '.join(calibration.reasons)
     return [*lines, f'verdict         {verdict}']
 

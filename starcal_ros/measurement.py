@@ -138,8 +138,8 @@ def normal_blocks(
 
     Parameters
     ----------
-    parameters : (10,)
-        Camera parameters.
+    parameters : (10,) or (m, 10)
+        Camera parameters of all images, or of each.
     camera_from_icrf : (m, 3, 3)
         Rotation of each image.
     loss_scale : float
@@ -162,7 +162,8 @@ def normal_blocks(
     for chunk in measurements.chunks:
         m, n = chunk.measured_px[0].shape
         J = J_memory[: 28 * m * n].reshape(m, 14, 2 * n)
-        if not _whitened_columns(chunk, parameters, camera_from_icrf[chunk.image], J):
+        own = parameters if parameters.ndim == 1 else parameters[chunk.image].T[..., None]
+        if not _whitened_columns(chunk, own, camera_from_icrf[chunk.image], J):
             return np.inf, blocks
         if np.isfinite(loss_scale):
             s = J[:, RESIDUAL, :n] ** 2 + J[:, RESIDUAL, n:] ** 2
@@ -187,8 +188,10 @@ def _whitened_columns(
     Write the whitened derivatives and residuals of a chunk into J, (m, 14, 2n).
 
     The first n of the last axis are the u rows, the others the v rows.  False when a star is
-    behind the camera.  The columns are those of `camera.project_jacobians`, whitened as they are
-    made and in place: most of the time of a calibration is spent here, in memory traffic.
+    behind the camera.  ``parameters`` is (10,) or (10, m, 1).
+
+    The columns are those of `camera.project_jacobians`, whitened as they are made and in place:
+    most of the time of a calibration is spent here, in memory traffic.
     """
     e = camera_from_icrf @ chunk.direction_icrf
     z = e[:, 2]
@@ -263,9 +266,10 @@ def _whitened_columns(
 
 
 def residuals_px(table: StarTable, parameters: Floats, camera_from_icrf: Floats) -> Floats:
-    """Measured minus predicted pixels (n, 2) of every star of the table."""
+    """Measured minus predicted pixels (n, 2) of every star; parameters (10,) or (m, 10)."""
     direction_camera = np.einsum('nij,nj->ni', camera_from_icrf[table.image], table.direction_icrf)
-    return np.asarray(table.measured_px - project_parameters(parameters, direction_camera))
+    own = parameters if parameters.ndim == 1 else parameters[table.image].T
+    return np.asarray(table.measured_px - project_parameters(own, direction_camera))
 
 
 def squared_sigmas(residual_px: Floats, covariance_px2: Floats) -> Floats:

@@ -10,6 +10,7 @@ as flat numpy arrays of the field's own type.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import math
 import sys
 from typing import Any, Protocol
 
@@ -28,6 +29,7 @@ from starcal_ros.records import (
     Image,
     refused_image,
     StarObservations,
+    Thermal,
 )
 
 Floats = NDArray[np.float64]
@@ -37,6 +39,7 @@ IMAGE_TYPE = 'sensor_msgs/msg/Image'
 COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 ATTITUDE_TYPE = 'geometry_msgs/msg/QuaternionStamped'
 VELOCITY_TYPE = 'geometry_msgs/msg/TwistStamped'
+TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 ALIGNMENT_TYPE = 'geometry_msgs/msg/TransformStamped'
 OBSERVATIONS_TYPE = 'starcal/msg/StarObservations'
@@ -250,6 +253,25 @@ def velocity_to_message(time_ns: int, velocity_m_s: Floats, frame_id: str, make:
     )
 
 
+def temperature_from_message(message: Message) -> tuple[int, float]:
+    """Stamp and degrees Celsius of a sensor_msgs/Temperature; NaN where it is not finite."""
+    temperature_degc = float(message.temperature)
+    known = math.isfinite(temperature_degc)
+    return stamp_ns(message.header.stamp), temperature_degc if known else math.nan
+
+
+def temperature_to_message(
+    time_ns: int, temperature_degc: float, frame_id: str, make: Make
+) -> Message:
+    """Return a sensor_msgs/Temperature; its variance is not known, which ROS writes as 0."""
+    return make(
+        TEMPERATURE_TYPE,
+        header=make_header(time_ns, frame_id, make),
+        temperature=float(temperature_degc),
+        variance=0.0,
+    )
+
+
 def observations_to_message(record: StarObservations, frame_id: str, make: Make) -> Message:
     """Return a starcal/StarObservations; ``frame_id`` is the camera's."""
     return make(
@@ -261,6 +283,7 @@ def observations_to_message(record: StarObservations, frame_id: str, make: Make)
         detail=record.detail,
         attitude=_quaternion_to_message(record.icrf_from_star_tracker_xyzw, make),
         attitude_gap_s=float(record.attitude_gap_s),
+        temperature_degc=float(record.temperature_degc),
         catalog_id=_flat(record.catalog_id, np.int64),
         direction_icrf=_flat(record.direction_icrf, np.float64),
         magnitude=_flat(record.magnitude, np.float32),
@@ -308,6 +331,8 @@ def observations_from_message(message: Message) -> StarObservations:
         noise_dn=float(message.noise_dn),
         psf_sigma_px=float(message.psf_sigma_px),
         catalog_digest=str(message.catalog_digest),
+        # Recordings of before the field was there have none.
+        temperature_degc=float(getattr(message, 'temperature_degc', math.nan)),
     )
     for name in ('direction_icrf', 'measured_px', 'covariance_px2', 'icrf_from_star_tracker_xyzw'):
         if not np.isfinite(getattr(record, name)).all():
@@ -400,6 +425,7 @@ def calibration_to_message(calibration: Calibration, make: Make) -> Message:
         misfit_images_ns=_flat(calibration.misfit_images_ns, np.int64),
         singular_values=_flat(calibration.singular_values, np.float64),
         weakest_direction=calibration.weakest_direction,
+        **_thermal_fields(calibration.thermal),
         zero_skew_cost_px=float(calibration.zero_skew_cost_px),
         iterations=calibration.iterations,
         termination=calibration.termination,
@@ -456,6 +482,42 @@ def calibration_from_message(message: Message) -> Calibration:
         parent_frame=str(message.parent_frame),
         child_frame=str(message.header.frame_id),
         provenance={str(key): str(value) for key, value in provenance},
+        thermal=_thermal_from_message(message),
+    )
+
+
+def _thermal_fields(thermal: Thermal | None) -> dict[str, object]:
+    thermal = thermal or Thermal(math.nan)
+    return {
+        'reference_temperature_degc': float(thermal.reference_degc),
+        'focal_per_degc': _flat(thermal.focal_per_degc, np.float64),
+        'focal_per_degc_sigma': _flat(thermal.focal_sigma, np.float64),
+        'alignment_rate_rad_per_degc': _flat(thermal.alignment_rate_rad_per_degc, np.float64),
+        'alignment_rate_rad_per_degc_sigma': _flat(thermal.alignment_rate_sigma, np.float64),
+        'temperature_note': thermal.note,
+    }
+
+
+def _thermal_from_message(message: Message) -> Thermal | None:
+    reference_degc = float(getattr(message, 'reference_temperature_degc', math.nan))
+    if math.isnan(reference_degc):
+        return None
+    q, axes = len(message.focal_per_degc), len(message.alignment_rate_rad_per_degc)
+    if axes not in (0, 3):
+        raise ValueError(f'alignment_rate_rad_per_degc: {axes} numbers, not 3 or none')
+    focal = _shaped('focal_per_degc', message.focal_per_degc, (q,))
+    focal_sigma = _shaped('focal_per_degc_sigma', message.focal_per_degc_sigma, (q,))
+    rate = _shaped('alignment_rate_rad_per_degc', message.alignment_rate_rad_per_degc, (axes,))
+    rate_sigma = _shaped(
+        'alignment_rate_rad_per_degc_sigma', message.alignment_rate_rad_per_degc_sigma, (axes,)
+    )
+    return Thermal(
+        reference_degc=reference_degc,
+        focal_per_degc=tuple(focal.tolist()),
+        focal_sigma=tuple(focal_sigma.tolist()),
+        alignment_rate_rad_per_degc=tuple(rate.tolist()),
+        alignment_rate_sigma=tuple(rate_sigma.tolist()),
+        note=str(message.temperature_note),
     )
 
 

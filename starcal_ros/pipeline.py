@@ -10,6 +10,7 @@ import importlib.metadata
 import json
 import math
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -18,8 +19,13 @@ from numpy.typing import NDArray
 from starcal_ros import bag, products
 from starcal_ros.acceptance import Candidate, GateOptions, judge
 from starcal_ros.attitude import AttitudeHistory, AttitudeOptions
-from starcal_ros.calibration import CalibrationOptions, Estimate, estimate_calibration
-from starcal_ros.camera import PARAMETER_NAMES, zero_skew_fit
+from starcal_ros.calibration import (
+    CalibrationOptions,
+    check_options,
+    Estimate,
+    estimate_calibration,
+)
+from starcal_ros.camera import zero_skew_fit
 from starcal_ros.catalog import load_catalog, StarCatalog
 from starcal_ros.centroiding import CentroidOptions
 from starcal_ros.constants import ARCSECOND_RAD
@@ -34,7 +40,6 @@ from starcal_ros.observability import (
 from starcal_ros.observability import ensemble_status as _ensemble_status
 from starcal_ros.options import check_value, from_mapping, names_of, option
 from starcal_ros.records import (
-    ALIGNMENT_NAMES,
     Calibration,
     CameraGeometry,
     Ensemble,
@@ -45,6 +50,7 @@ from starcal_ros.records import (
 )
 
 Floats = NDArray[np.float64]
+T = TypeVar('T')
 
 
 @dataclass(frozen=True)
@@ -122,13 +128,15 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
             f'prior_alignment: {list(frames.prior_alignment)} is not a unit quaternion'
         )
     identification = from_mapping(IdentificationOptions, values)
+    calibration = from_mapping(CalibrationOptions, values)
+    check_options(calibration)
     path = Path(frames.catalog) if frames.catalog else None
     return Setup(
         frames=frames,
         attitude=from_mapping(AttitudeOptions, values),
         centroid=from_mapping(CentroidOptions, values),
         identification=identification,
-        calibration=from_mapping(CalibrationOptions, values),
+        calibration=calibration,
         gate=from_mapping(GateOptions, values),
         prior=CameraGeometry(camera, quaternion / norm),
         catalog=load_catalog(path, identification.magnitude_limit),
@@ -230,6 +238,7 @@ def observe_next(
     setup: Setup,
     track: Track,
     velocity_m_s: Floats | None = None,
+    temperature_degc: float = math.nan,
 ) -> tuple[StarObservations, Track]:
     """
     The stars of the next image of a sequence, and where the sequence stands then.
@@ -244,20 +253,22 @@ def observe_next(
         detail = f'{late_s:.6f} s before the last image used'
         return refused_image(image.time_ns, width, height, 'out_of_order', detail), track
     observations = observe(image, attitudes, setup, track.geometry, velocity_m_s)
+    observations = dataclasses.replace(observations, temperature_degc=temperature_degc)
     latest_ns = track.latest_ns if observations.refusal else image.time_ns
     return observations, Track(tracked(track.geometry, observations), latest_ns)
 
 
-def velocity_at(samples: Sequence[tuple[int, Floats]], time_ns: int) -> Floats | None:
+def latest_at(samples: Sequence[tuple[int, T]], time_ns: int, without: T) -> T:
     """
-    The last velocity (3,) at or before a time, else the first after it; None without any.
+    The last sample at or before a time, else the first after it; ``without`` where there is none.
 
-    A spacecraft's velocity changes by under 10 m/s (0.007 arcsec) between the samples of a minute.
+    A spacecraft's velocity changes by under 10 m/s (0.007 arcsec) between the samples of a minute,
+    and a camera's temperature by less than its sensor tells.
     """
-    before = [velocity for stamp_ns, velocity in samples if stamp_ns <= time_ns]
+    before = [sample for stamp_ns, sample in samples if stamp_ns <= time_ns]
     if before:
         return before[-1]
-    return samples[0][1] if samples else None
+    return samples[0][1] if samples else without
 
 
 def observe_bag(
@@ -266,6 +277,7 @@ def observe_bag(
     attitude_topic: str,
     setup: Setup,
     velocity_topic: str = '',
+    temperature_topic: str = '',
 ) -> Iterator[StarObservations]:
     """
     Observations of every image of a bag, in the order of the bag; one image in memory at a time.
@@ -281,13 +293,23 @@ def observe_bag(
         if velocity_topic
         else []
     )
+    temperatures = (
+        sorted(bag.read_temperatures(paths, temperature_topic), key=lambda sample: sample[0])
+        if temperature_topic
+        else []
+    )
     track = Track(setup.prior)
     for image in bag.read_images(paths, image_topic, setup.attitude.stamp_offset_s):
         if isinstance(image, StarObservations):
             yield image
             continue
         observations, track = observe_next(
-            image, attitudes, setup, track, velocity_at(velocities, image.time_ns)
+            image,
+            attitudes,
+            setup,
+            track,
+            latest_at(velocities, image.time_ns, None),
+            latest_at(temperatures, image.time_ns, math.nan),
         )
         yield observations
 
@@ -366,10 +388,7 @@ def _calibration(
         ),
         setup.gate,
     )
-    names = tuple(name for name in PARAMETER_NAMES if name in options.estimate)
-    singular_values, weakest = weakest_direction(
-        result.information, (*names, *ALIGNMENT_NAMES)[: len(result.information)]
-    )
+    singular_values, weakest = weakest_direction(result.information, result.information_names)
     return Calibration(
         time_ns=max(image.time_ns for image in ensemble.images),
         geometry=result.geometry,
@@ -404,6 +423,7 @@ def _calibration(
         parent_frame=setup.frames.star_tracker_frame,
         child_frame=setup.frames.camera_frame,
         provenance=_provenance(setup, options, ensemble, inputs),
+        thermal=result.thermal,
     )
 
 
@@ -425,6 +445,8 @@ def _provenance(
     for image in ensemble.images:
         for column in (image.catalog_id, image.measured_px, image.covariance_px2):
             digest.update(np.ascontiguousarray(column).tobytes())
+        if not math.isnan(image.temperature_degc):
+            digest.update(np.float64(image.temperature_degc).tobytes())
     return {
         'software': f'starcal {software_version()}',
         'catalog': setup.catalog.digest,

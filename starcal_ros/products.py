@@ -22,7 +22,12 @@ import yaml
 
 from starcal_ros.camera import CameraModel, DISTORTION_NAMES, INTRINSIC_NAMES, zero_skew_fit
 from starcal_ros.errors import ProductError
-from starcal_ros.records import Calibration, CALIBRATION_PARAMETER_NAMES, CameraGeometry
+from starcal_ros.records import (
+    Calibration,
+    CALIBRATION_PARAMETER_NAMES,
+    CameraGeometry,
+    Thermal,
+)
 
 Floats = NDArray[np.float64]
 T = TypeVar('T')
@@ -69,7 +74,8 @@ def read_calibration(path: Path) -> Calibration:
     if content.get('schema') != SCHEMA:
         raise ProductError(f'{path}: schema {content.get("schema")!r} is not {SCHEMA}')
     try:
-        return _calibration_from_content(_Reader(path, content))
+        # A calibration of before temperature was there has no such key.
+        return _calibration_from_content(_Reader(path, {'temperature': None, **content}))
     except ValueError as error:  # CameraModel's own checks
         raise ProductError(f'{path}: {error}') from error
 
@@ -252,6 +258,24 @@ def _calibration_content(calibration: Calibration) -> dict[str, object]:
         'zero_skew_cost_px': _json_number(calibration.zero_skew_cost_px),
         'iterations': int(calibration.iterations),
         'termination': calibration.termination,
+        'temperature': _thermal_content(calibration.thermal),
+    }
+
+
+def _thermal_content(thermal: Thermal | None) -> dict[str, object] | None:
+    if thermal is None:
+        return None
+    return {
+        'reference_degc': _json_number(thermal.reference_degc),
+        'focal_per_degc': [_json_number(a) for a in thermal.focal_per_degc],
+        'focal_per_degc_sigma': [_json_number(s) for s in thermal.focal_sigma],
+        'alignment_rate_rad_per_degc': [
+            _json_number(b) for b in thermal.alignment_rate_rad_per_degc
+        ],
+        'alignment_rate_rad_per_degc_sigma': [
+            _json_number(s) for s in thermal.alignment_rate_sigma
+        ],
+        'note': thermal.note,
     }
 
 
@@ -301,6 +325,24 @@ def _calibration_from_content(reader: _Reader) -> Calibration:
         parent_frame=reader.get('alignment.parent', _text),
         child_frame=reader.get('alignment.child', _text),
         provenance=reader.get('provenance', _mapping_of(_text)),
+        thermal=None if reader.get('temperature', _is_null) else _thermal_from(reader),
+    )
+
+
+def _thermal_from(reader: _Reader) -> Thermal:
+    focal = reader.get('temperature.focal_per_degc', _list_of(_number))
+    rate = reader.get('temperature.alignment_rate_rad_per_degc', _numbers(0, 3))
+    focal_sigma = reader.get('temperature.focal_per_degc_sigma', _numbers(len(focal), null=True))
+    rate_sigma = reader.get(
+        'temperature.alignment_rate_rad_per_degc_sigma', _numbers(len(rate), null=True)
+    )
+    return Thermal(
+        reference_degc=reader.get('temperature.reference_degc', _number),
+        focal_per_degc=tuple(focal),
+        focal_sigma=tuple(focal_sigma),
+        alignment_rate_rad_per_degc=tuple(rate),
+        alignment_rate_sigma=tuple(rate_sigma),
+        note=reader.get('temperature.note', _text),
     )
 
 
@@ -347,6 +389,10 @@ def _whole(value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise ValueError('a whole number')
     return value
+
+
+def _is_null(value: object) -> bool:
+    return value is None
 
 
 def _text(value: object) -> str:

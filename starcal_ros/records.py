@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import dataclasses
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,6 +118,8 @@ class StarObservations:
         Gaussian width of the stars; 0 where not known.
     catalog_digest : str
         Which catalog the identifiers refer to.
+    temperature_degc : float
+        Of the camera; NaN where not known.
     """
 
     time_ns: int
@@ -138,6 +141,7 @@ class StarObservations:
     noise_dn: float
     psf_sigma_px: float
     catalog_digest: str
+    temperature_degc: float = math.nan
 
     def __len__(self) -> int:
         """Return the number of stars."""
@@ -231,6 +235,31 @@ class EnsembleStatus:
 
 
 @dataclass(frozen=True)
+class Thermal:
+    """
+    How the camera changes with its temperature, as `thermal` states it.
+
+    Attributes
+    ----------
+    reference_degc : float
+        Camera and alignment of the calibration hold at this temperature.
+    focal_per_degc, focal_sigma : tuple of 0 to 2 float
+        a1 (1/degC) and a2 (1/degC^2), and their 1-sigma.
+    alignment_rate_rad_per_degc, alignment_rate_sigma : tuple of 0 or 3 float
+        Passive small rotation in the camera frame for each degree, and its 1-sigma.
+    note : str
+        What was asked for and left out, and why; may be empty.
+    """
+
+    reference_degc: float
+    focal_per_degc: tuple[float, ...] = ()
+    focal_sigma: tuple[float, ...] = ()
+    alignment_rate_rad_per_degc: tuple[float, ...] = ()
+    alignment_rate_sigma: tuple[float, ...] = ()
+    note: str = ''
+
+
+@dataclass(frozen=True)
 class Calibration:
     """
     One calibration with its covariance, statistics and provenance.
@@ -275,6 +304,8 @@ class Calibration:
     accepted, reasons
         The verdict of the gate.
     provenance : mapping of str to str
+    thermal : Thermal or None
+        None where no change with temperature was asked for.
     """
 
     time_ns: int
@@ -304,6 +335,7 @@ class Calibration:
     parent_frame: str
     child_frame: str
     provenance: Mapping[str, str]
+    thermal: Thermal | None = None
 
     @property
     def sigma(self) -> Floats:

@@ -89,7 +89,7 @@ def estimate_variance(
 
 
 def estimate_star_tracker_sigma(
-    eta_rad: Floats, covariance_rad2: Floats, seen: Mask, given_rad: Floats
+    eta_rad: Floats, covariance_rad2: Floats, seen: Mask, given_rad: Floats, fitted: int = 1
 ) -> tuple[Floats, Mask]:
     """
     1-sigma of the star tracker about its axes, and which attitudes do not fit.
@@ -100,6 +100,8 @@ def estimate_star_tracker_sigma(
         Attitude errors as the stars alone show them (`adjustment.attitudes_of_stars_alone`).
     given_rad : (3,)
         What the star tracker is said to have; kept where fewer than three images tell otherwise.
+    fitted : int
+        Numbers for each axis that were taken from the attitudes: mean, and slope where there is.
 
     Returns
     -------
@@ -115,7 +117,7 @@ def estimate_star_tracker_sigma(
     scatter could hide is an upper limit.
     """
     own = np.einsum('mii->mi', covariance_rad2)
-    if np.count_nonzero(seen) < _FEWEST_IMAGES:
+    if np.count_nonzero(seen) < _FEWEST_IMAGES + fitted - 1:
         return given_rad, np.zeros_like(seen)
     centred = eta_rad - np.median(eta_rad[seen], axis=0)
     spread2 = np.median(centred[seen] ** 2, axis=0) / _MEDIAN_OF_SQUARE
@@ -128,8 +130,9 @@ def estimate_star_tracker_sigma(
     good = seen & ~misfit
     count = int(np.count_nonzero(good))
     stars = own[good].mean(axis=0)
-    found = eta_rad[good].var(axis=0, ddof=1)
-    chance = chi2.cdf((count - 1) * found / (given_rad**2 + stars), count - 1)
+    freedom = count - fitted
+    found = eta_rad[good].var(axis=0, ddof=fitted)
+    chance = chi2.cdf(freedom * found / (given_rad**2 + stars), freedom)
     as_given = (chance > _GIVEN_CHANCE / 2) & (chance < 1 - _GIVEN_CHANCE / 2)
     hidden = stars * math.sqrt(2.0 / count)
     sigma2 = np.where(found - stars > hidden, found - stars, np.minimum(hidden, given_rad**2))

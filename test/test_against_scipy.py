@@ -51,12 +51,13 @@ def numerical(
     """
     All weighted residuals of the method as a function of the steps from where the estimate is.
 
-    Unknowns: free camera parameters, alignment (not per image), rotation of each image (not
-    single); the angles are passive rotations (Eq. 11).
+    Unknowns: free camera parameters, focal terms, alignment and its rate (not per image), rotation
+    of each image (not single); the angles are passive rotations (Eq. 11).
     """
     free = [k for k, name in enumerate(PARAMETER_NAMES) if name in options.estimate]
     f, m = len(free), len(ensemble.images)
     table, state = estimate.table, estimate.state
+    q, axes = len(state.focal), len(state.rate)
     measured = [Rotation.from_quat(i.icrf_from_star_tracker_xyzw).inv() for i in ensemble.images]
     uu, uv, vv = estimate.variance.of(table.covariance_px2).T
     C = np.stack([np.stack([uu, uv], axis=-1), np.stack([uv, vv], axis=-1)], axis=-2)
@@ -65,21 +66,29 @@ def numerical(
     def residuals(step: np.ndarray) -> np.ndarray:
         parameters = state.parameters.copy()
         parameters[free] += step[:f]
-        alignment = state.camera_from_star_tracker
+        at_reference = state.camera_from_star_tracker
         if options.method == 'per_image':
-            turns = step[f:].reshape(m, 3)
+            turns = step[f + q :].reshape(m, 3)
         else:
-            alignment = Rotation.from_rotvec(-step[f : f + 3]) * alignment
-            turns = step[f + 3 :].reshape(-1, 3)
+            at_reference = Rotation.from_rotvec(-step[f + q : f + q + 3]) * at_reference
+            turns = step[f + q + 3 + axes :].reshape(-1, 3)
+        focal = state.focal + step[f : f + q]
+        rate = state.rate + step[f + q + 3 : f + q + 3 + axes]
         out = []
-        for k in range(m):
+        for k, image in enumerate(ensemble.images):
+            own, alignment = parameters.copy(), at_reference
+            dT = image.temperature_degc - options.reference_temperature_degc
+            if q:
+                own[:3] *= 1.0 + focal @ [dT, dT * dT][:q]
+            if axes:
+                alignment = Rotation.from_rotvec(-rate * dT) * alignment
             if options.method == 'single':
                 rotation = alignment * measured[k]
             else:
                 rotation = Rotation.from_rotvec(-turns[k]) * state.camera_from_icrf[k]
             mine = (table.image == k) & estimate.kept
             e = rotation.apply(table.direction_icrf[mine])
-            r = table.measured_px[mine] - predicted_px(parameters, e)
+            r = table.measured_px[mine] - predicted_px(own, e)
             out.append(np.einsum('nij,nj->ni', root_weight[mine], r).ravel())
             if options.method == 'hierarchical':
                 # The error of the tracker: its frame as reported from its frame in truth.
@@ -205,3 +214,53 @@ def test_the_prior_of_the_tracker_is_in_the_cost(ensemble: Ensemble) -> None:
     loose = dataclasses.replace(tight, star_tracker_sigma_arcsec=(3600.0, 3600.0, 3600.0))
     a, b = (estimate_calibration(ensemble, SCENARIO.prior, o).covariance for o in (tight, loose))
     assert a[10, 10] < 1e-3 * b[10, 10]
+
+
+@pytest.mark.parametrize('method', ['single', 'hierarchical'])
+def test_terms_of_temperature_have_the_same_minimum_and_covariance(
+    ensemble: Ensemble, method: str
+) -> None:
+    options = CalibrationOptions(
+        method=method,
+        star_tracker_sigma_arcsec=TRACKER_ARCSEC,
+        focal_temperature_order=2,
+        alignment_temperature=True,
+    )
+    warm = []
+    A = Rotation.from_quat(SCENARIO.truth.star_tracker_from_camera_xyzw).inv()
+    centre_px = SCENARIO.truth.camera.parameters[3:5]
+    for image, dT in zip(ensemble.images, (-30.0, 10.0, -12.0, 25.0, 3.0), strict=True):
+        turn = Rotation.from_rotvec(-np.array([1e-5, -2e-5, 1e-4]) * dT)
+        reported = Rotation.from_quat(image.icrf_from_star_tracker_xyzw) * (A.inv() * turn * A)
+        factor = 1.0 + 5e-5 * dT + 2e-6 * dT**2
+        warm.append(
+            dataclasses.replace(
+                image,
+                # fx, skew and fy together scale the image about the principal point.
+                measured_px=centre_px + factor * (image.measured_px - centre_px),
+                icrf_from_star_tracker_xyzw=reported.as_quat(),
+                temperature_degc=options.reference_temperature_degc + dT,
+            )
+        )
+    estimate = estimate_calibration(Ensemble(tuple(warm)), SCENARIO.prior, options)
+    terms = estimate.thermal
+    assert terms is not None and terms.note == ''
+    residuals, free = numerical(Ensemble(tuple(warm)), estimate, options)
+    f, sigma = len(free), np.sqrt(np.diag(estimate.covariance))
+    thermal_sigma = np.r_[terms.focal_sigma, terms.alignment_rate_sigma]
+    images = np.full(0 if method == 'single' else 3 * len(warm), sigma[10:].min())
+    unit = np.r_[sigma[free], thermal_sigma[:2], sigma[10:], thermal_sigma[2:], images]
+    J = jacobian(residuals, unit) * unit
+    dense = np.linalg.inv(J.T @ J)
+    # One Gauss-Newton step of the dense problem goes nowhere: the same minimum.
+    step = dense @ (J.T @ residuals(np.zeros(len(unit)))) / np.sqrt(np.diag(dense))
+    assert np.abs(step).max() < 1e-4
+    dense *= np.outer(unit, unit)
+    rows = [*range(f), f + 2, f + 3, f + 4]
+    ours = estimate.covariance[np.ix_([*free, 10, 11, 12], [*free, 10, 11, 12])]
+    scale = np.sqrt(np.diag(dense))
+    difference = (ours - dense[np.ix_(rows, rows)]) / np.outer(scale[rows], scale[rows])
+    # As above; the series of the turn ends at a twelfth of its square, (3e-3)^2.
+    assert np.abs(difference).max() < 1e-5
+    rows = [f, f + 1, f + 5, f + 6, f + 7]
+    np.testing.assert_allclose(thermal_sigma, scale[rows], rtol=1e-5)

@@ -38,6 +38,7 @@ def write_bag(path: Path, images: int = 6, size: int = 600, **options: Any) -> P
             record = refused_image(time_ns, size + 2, size, 'no_stars', str(k))
             writer.write_observations('/observations', record, 'camera')
             writer.write_velocity('/velocity', time_ns, np.array([k, 2.0, 3e4]), 'icrf')
+            writer.write_temperature('/temperature', time_ns, 20.0 - k, 'camera')
     return path
 
 
@@ -75,6 +76,8 @@ def test_round_trip(tmp_path: Path, compression: str, name: str) -> None:
     velocities = list(bag.read_velocities([path], '/velocity'))
     assert velocities[5][0] == START_NS + 5 * SECOND_NS
     np.testing.assert_array_equal(velocities[5][1], [5.0, 2.0, 3e4])
+    temperatures = list(bag.read_temperatures([path], '/temperature'))
+    assert temperatures[5] == (START_NS + 5 * SECOND_NS, 15.0)
 
 
 def test_same_records_same_bytes(tmp_path: Path, folder: Path) -> None:
@@ -92,7 +95,7 @@ def stamped(reader: AnyReader, data: bytes, type_name: str) -> Any:
 def test_read_by_rosbags(folder: Path) -> None:
     """An independent reader finds every message, its type and its stamp."""
     with AnyReader([folder]) as reader:
-        assert reader.message_count == 30
+        assert reader.message_count == 36
         image = next(c for c in reader.connections if c.topic == '/image')
         assert image.msgtype == 'sensor_msgs/msg/Image'
         found = [
@@ -125,7 +128,7 @@ def test_what_rosbag2_needs(folder: Path) -> None:
     assert '&' not in text, 'references are legal YAML that few write'
     information = yaml.safe_load(text)['rosbag2_bagfile_information']
     assert information['version'] == 9
-    assert information['message_count'] == 30
+    assert information['message_count'] == 36
     assert information['starting_time'] == {'nanoseconds_since_epoch': START_NS - 100}
     assert information['duration'] == {'nanoseconds': 5 * SECOND_NS + 200}
     assert information['relative_file_paths'] == ['six_0.mcap']

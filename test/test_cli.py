@@ -284,6 +284,25 @@ def test_several_image_topics_must_be_named(run: Run, tmp_path: Path) -> None:
     assert_refused(result, '/left, /right')
 
 
+def test_a_temperature_topic_must_be_there(
+    run: Run, tmp_path: Path, params: Callable[..., Path]
+) -> None:
+    files = ('--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+    result = run('calibrate', TINY, *files, '--temperature-topic', '/box')
+    assert_refused(result, '/box', 'sensor_msgs/msg/Temperature')
+    two = tmp_path / 'two.mcap'
+    with BagWriter(two) as writer:
+        writer.write_image('/image', Image(5, np.zeros((512, 640), np.uint8)), 'camera')
+        writer.write_attitude('/att', 5, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+        for topic in ('/lens', '/box'):
+            writer.write_temperature(topic, 5, 20.0, 'camera')
+    # Two thermometers: which one, is asked only where it matters.
+    assert_refused(run('calibrate', two, *files), 'too few observations')
+    asks = params(focal_temperature_order=1)
+    result = run('calibrate', two, '--params', asks, '-o', tmp_path / 'out')
+    assert_refused(result, 'several topics of type sensor_msgs/msg/Temperature', '/box, /lens')
+
+
 def test_interrupt_is_one_line(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt

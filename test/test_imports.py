@@ -28,6 +28,7 @@ LADDER = [
     'centroiding',
     'identification',
     'measurement',
+    'thermal',
     'least_squares',
     'adjustment',
     'variance',

@@ -23,6 +23,7 @@ from starcal_ros.records import (
     Image,
     refused_image,
     StarObservations,
+    Thermal,
 )
 
 TIME_NS = 1_700_000_000_123_456_789
@@ -158,6 +159,15 @@ def test_attitude_and_velocity_round_trip() -> None:
     np.testing.assert_array_equal(velocity, [1.0, -2.0, 3e4])
 
 
+@pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
+def test_temperature_round_trip(make: Any) -> None:
+    message = messages.temperature_to_message(7, -12.5, 'camera', make)
+    assert messages.temperature_from_message(message) == (7, -12.5)
+    # A sensor that has failed says inf or NaN: not known.
+    message = messages.temperature_to_message(7, np.inf, 'camera', make)
+    assert np.isnan(messages.temperature_from_message(message)[1])
+
+
 def observations(n: int = 5) -> StarObservations:
     """Observations of n stars with a different number in every place."""
     random = np.random.default_rng(3)
@@ -178,6 +188,7 @@ def observations(n: int = 5) -> StarObservations:
         noise_dn=3.25,
         psf_sigma_px=0.95,
         catalog_digest='abc',
+        temperature_degc=-12.3,
     )
 
 
@@ -213,6 +224,9 @@ def calibration() -> Calibration:
         parent_frame='st',
         child_frame='cam',
         provenance={'catalog': 'x', 'version': '1'},
+        thermal=Thermal(
+            21.5, (4e-5, -6e-7), (1e-6, 2e-8), (1e-5, 2e-5, 3e-5), (1e-6, 2e-6, 3e-6), 'a word'
+        ),
     )
 
 
@@ -222,6 +236,8 @@ def assert_same(a: Any, b: Any) -> None:
         x, y = getattr(a, field.name), getattr(b, field.name)
         if dataclasses.is_dataclass(x):
             assert_same(x, y)
+        elif isinstance(x, float) and np.isnan(x):
+            assert np.isnan(y), field.name
         elif isinstance(x, np.ndarray):
             assert x.dtype == y.dtype, field.name
             np.testing.assert_array_equal(x, y, err_msg=field.name, strict=True)
@@ -243,10 +259,12 @@ def test_records_round_trip(make: Any) -> None:
         refused,
         messages.observations_from_message(messages.observations_to_message(refused, 'cam', make)),
     )
-    result = calibration()
-    assert_same(
-        result, messages.calibration_from_message(messages.calibration_to_message(result, make))
-    )
+    for terms in (calibration().thermal, None, Thermal(20.0, note='left out')):
+        result = dataclasses.replace(calibration(), thermal=terms)
+        assert_same(
+            result,
+            messages.calibration_from_message(messages.calibration_to_message(result, make)),
+        )
     status = EnsembleStatus(
         time_ns=TIME_NS,
         images=3,
@@ -278,6 +296,30 @@ def test_bad_observations_are_refused(field: str, value: Any, text: str) -> None
     setattr(message, field, value)
     with pytest.raises(ValueError, match=text):
         messages.observations_from_message(message)
+
+
+def test_recordings_of_before_temperature_are_read() -> None:
+    message = messages.observations_to_message(observations(), 'cam', plain)
+    del message.temperature_degc
+    assert np.isnan(messages.observations_from_message(message).temperature_degc)
+    message = messages.calibration_to_message(calibration(), plain)
+    del message.reference_temperature_degc
+    assert messages.calibration_from_message(message).thermal is None
+
+
+@pytest.mark.parametrize(
+    ('field', 'text'),
+    [
+        ('focal_per_degc_sigma', 'focal_per_degc_sigma: 1 numbers, not 2'),
+        ('alignment_rate_rad_per_degc', 'alignment_rate_rad_per_degc: 1 numbers, not 3 or none'),
+        ('alignment_rate_rad_per_degc_sigma', '1 numbers, not 3'),
+    ],
+)
+def test_bad_terms_of_temperature_are_refused(field: str, text: str) -> None:
+    message = messages.calibration_to_message(calibration(), plain)
+    setattr(message, field, np.zeros(1))
+    with pytest.raises(ValueError, match=text):
+        messages.calibration_from_message(message)
 
 
 def test_empty_calibration_is_refused() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros import pipeline, products
+from starcal_ros import bag, pipeline, products
 from starcal_ros.attitude import attitude_sample, AttitudeHistory
 from starcal_ros.calibration import CalibrationOptions
 from starcal_ros.camera import PARAMETER_NAMES
@@ -218,6 +218,46 @@ def test_a_refused_image_does_not_put_those_after_it_out_of_order(setup: pipelin
     assert refused.refusal == 'no_attitude'
     found, track = pipeline.observe_next(image(), attitudes(), setup, track)
     assert found.refusal == '' and track.latest_ns == image().time_ns
+
+
+def test_the_last_sample_at_or_before_an_image_counts() -> None:
+    samples = [(10, 'a'), (20, 'b'), (30, 'c')]
+    for time_ns, sample in ((5, 'a'), (10, 'a'), (29, 'b'), (30, 'c'), (99, 'c')):
+        assert pipeline.latest_at(samples, time_ns, 'none') == sample
+    assert pipeline.latest_at([], 5, 'none') == 'none'
+
+
+def test_a_bag_with_temperatures_to_a_calibration_with_terms(
+    camera_yaml: Path, tmp_path: Path
+) -> None:
+    with bag.BagWriter(tmp_path / 'warm') as writer:
+        for index in range(4):
+            for sample in attitude_samples(SCENARIO, index):
+                quaternion = sample.icrf_from_star_tracker_xyzw
+                writer.write_attitude('/attitude', sample.time_ns, quaternion, 'icrf')
+            one = image(index)
+            writer.write_temperature('/box', one.time_ns - S, 10.0 + 5.0 * index, 'camera')
+            writer.write_temperature('/box', one.time_ns + 1, 99.0, 'camera')
+            writer.write_image('/image', one, 'camera')
+    warm = pipeline.load_setup(
+        values(camera_yaml, focal_temperature_order=1, alignment_temperature=True)
+    )
+    paths = [tmp_path / 'warm']
+    found = list(pipeline.observe_bag(paths, '/image', '/attitude', warm, '', '/box'))
+    assert [one.temperature_degc for one in found] == [10.0, 15.0, 20.0, 25.0]
+    plain = list(pipeline.observe_bag(paths, '/image', '/attitude', warm))
+    assert all(np.isnan(one.temperature_degc) for one in plain)
+    # The simulated camera does not change with temperature, and that is what is found.
+    terms = pipeline.solve(Ensemble(tuple(found)), warm).thermal
+    assert terms is not None and terms.reference_degc == 20.0
+    assert 'within chance' in terms.note
+    terms = pipeline.solve(Ensemble(tuple(plain)), warm).thermal
+    assert terms is not None and terms.note == 'left out: 4 of 4 images have no temperature'
+
+
+def test_options_that_do_not_go_together(camera_yaml: Path) -> None:
+    with pytest.raises(OptionError, match='alignment_temperature: the method per_image'):
+        pipeline.load_setup(values(camera_yaml, method='per_image', alignment_temperature=True))
 
 
 def write_png(path: Path, pixels: np.ndarray) -> str:

@@ -24,12 +24,18 @@ from starcal_ros.products import (
     write_calibration,
     write_camera_info,
 )
-from starcal_ros.records import Calibration, CALIBRATION_PARAMETER_NAMES, CameraGeometry
+from starcal_ros.records import (
+    Calibration,
+    CALIBRATION_PARAMETER_NAMES,
+    CameraGeometry,
+    Thermal,
+)
 
 PARAMETERS = np.array(
     [3641.5121868491606, -0.74, 3642.3, 647.5, 511.5, -0.0512, 0.1167, 0.01, 5.1e-4, 3.2e-5]
 )
 CAMERA = CameraModel(1296, 1024, PARAMETERS)
+THERMAL = Thermal(21.5, (4e-5, -6e-7), (1e-6, 2e-8), (1e-5, 0.0, -3e-5), (1e-6,) * 3, 'a word')
 
 ROS_YAML = """\
 image_width: 640
@@ -115,6 +121,8 @@ def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     cases: tuple[dict[str, Any], ...] = (
         {},
         {'accepted': False, 'reasons': ('too few stars', 'weak: k3')},
+        {'thermal': THERMAL},
+        {'thermal': Thermal(20.0, note='left out: everything')},
     )
     for changes in cases:
         calibration = calibration_of(**changes)
@@ -181,6 +189,21 @@ def test_json_has_the_keys_of_the_interface_document(tmp_path: Path) -> None:
         'alignment_scatter_arcsec', 'zero_skew_cost_px', 'iterations', 'termination',
     } <= set(content)  # fmt: skip
     assert content['image'] == {'width': 1296, 'height': 1024}
+    assert content['temperature'] is None
+    write_calibration(dataclasses.replace(calibration, thermal=THERMAL), path)
+    assert list(json.loads(path.read_text())['temperature']) == [
+        'reference_degc', 'focal_per_degc', 'focal_per_degc_sigma',
+        'alignment_rate_rad_per_degc', 'alignment_rate_rad_per_degc_sigma', 'note',
+    ]  # fmt: skip
+
+
+def test_a_file_of_before_temperature_is_read(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    write_calibration(calibration_of(), path)
+    content = json.loads(path.read_text())
+    del content['temperature']
+    path.write_text(json.dumps(content))
+    assert_same(calibration_of(), read_calibration(path))
 
 
 @pytest.mark.parametrize(
@@ -201,11 +224,16 @@ def test_json_has_the_keys_of_the_interface_document(tmp_path: Path) -> None:
         (lambda c: c.update(provenance=[]), r'provenance: \[\] is not a mapping'),
         (lambda c: c['alignment'].update(parent=3), 'alignment.parent: 3 is not a text'),
         (lambda c: c.update(intrinsics=3), "key 'intrinsics.fx' is missing"),
+        (lambda c: c.update(temperature={}), "key 'temperature.focal_per_degc' is missing"),
+        (
+            lambda c: c['temperature'].update(alignment_rate_rad_per_degc=[1.0]),
+            'temperature.alignment_rate_rad_per_degc: .* is not 0 or 3 numbers',
+        ),
     ],
 )
 def test_a_damaged_calibration_is_refused_by_file_and_key(tmp_path, change, says) -> None:
     path = tmp_path / 'c.json'
-    write_calibration(calibration_of(), path)
+    write_calibration(calibration_of(thermal=THERMAL), path)
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Sequence
+import math
 import sys
 import threading
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 from geometry_msgs.msg import QuaternionStamped, TwistStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import CompressedImage, Temperature
 from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
@@ -75,6 +76,7 @@ class StarObserver(StarcalNode):
         self._attitudes = AttitudeHistory(self._own.attitude_history_s)
         self._new_attitudes: deque[tuple[int, AttitudeSample | None]] = deque()
         self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
+        self._temperatures: deque[tuple[int, float]] = deque(maxlen=_SAMPLES.depth)
         self._counts.clear()
         self._last_refusal = ''
         self._queue = ImageQueue(
@@ -92,6 +94,7 @@ class StarObserver(StarcalNode):
         for kind, topic, callback, qos in (
             (CalibrationMessage, 'calibration', self._on_calibration, LATCHED),
             (TwistStamped, 'velocity', self._on_velocity, _SAMPLES),
+            (Temperature, 'temperature', self._on_temperature, _SAMPLES),
             (QuaternionStamped, 'attitude', self._on_attitude, _SAMPLES),
             (*self._image_input(), self._on_image, images),
         ):
@@ -159,6 +162,9 @@ class StarObserver(StarcalNode):
     def _on_velocity(self, message: Any) -> None:
         self._velocities.append(messages.velocity_from_message(message))
 
+    def _on_temperature(self, message: Any) -> None:
+        self._temperatures.append(messages.temperature_from_message(message))
+
     def _on_calibration(self, message: Any) -> None:
         geometry = messages.calibration_from_message(message).geometry
         prior = self._setup.prior.camera
@@ -213,7 +219,8 @@ class StarObserver(StarcalNode):
             self._attitudes,
             self._setup,
             self._track,
-            pipeline.velocity_at(list(self._velocities), image.time_ns),
+            pipeline.latest_at(list(self._velocities), image.time_ns, None),
+            pipeline.latest_at(list(self._temperatures), image.time_ns, math.nan),
         )
         self._publish(observations)
         if self._annotated.get_subscription_count():
