@@ -136,6 +136,8 @@ def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tupl
             executor.spin_once(timeout_sec=0.02)
         publisher.terminate()  # it stays for the repairs of its last images
         publisher.join()
+        if not arrived:
+            raise RuntimeError('the star observer has not answered')
         processor_ms = 1e3 * (_processor_s(number) - start_cpu_s) / len(arrived)
         executor.shutdown()
         node.destroy_node()
@@ -171,10 +173,13 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
         (messages.image_to_message(image, 'camera', make_message), attitudes[1])
         for image, attitudes in frames
     ]
-    with rclpy.Context() as context:
-        node = rclpy.create_node('feeder', context=context)
-        images = node.create_publisher(ImageMessage, 'image', 10)
-        attitudes = node.create_publisher(QuaternionStamped, 'attitude', 100)
+    # Camera and star tracker are participants of their own, as on a spacecraft: Fast DDS delays a
+    # small message by up to its heartbeat, 3 s, when its participant sends a large one just after.
+    with rclpy.Context() as camera_context, rclpy.Context() as tracker_context:
+        camera = rclpy.create_node('camera', context=camera_context)
+        tracker = rclpy.create_node('star_tracker', context=tracker_context)
+        images = camera.create_publisher(ImageMessage, 'image', 10)
+        attitudes = tracker.create_publisher(QuaternionStamped, 'attitude', 100)
         while not (images.get_subscription_count() and attitudes.get_subscription_count()):
             time.sleep(0.05)
         start_s = time.monotonic() + 2.0  # the reader may see the writer later than it is seen
