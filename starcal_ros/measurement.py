@@ -158,10 +158,11 @@ def normal_blocks(
     cost = 0.0
     largest = max((chunk.measured_px[0].size for chunk in measurements.chunks), default=0)
     # Fresh pages for every chunk would cost as much as the arithmetic on them.
-    J_memory, copy_memory = np.empty(28 * largest), np.empty(28 * largest)
+    memory = np.empty(30 * largest)
     for chunk in measurements.chunks:
         m, n = chunk.measured_px[0].shape
-        J = J_memory[: 28 * m * n].reshape(m, 14, 2 * n)
+        J_and_zero = memory[: 30 * m * n].reshape(m, 15, 2 * n)
+        J = J_and_zero[:, :14]
         own = parameters if parameters.ndim == 1 else parameters[chunk.image].T[..., None]
         if not _whitened_columns(chunk, own, camera_from_icrf[chunk.image], J):
             return np.inf, blocks
@@ -172,10 +173,9 @@ def normal_blocks(
             root_weight = 1.0 / np.sqrt(1.0 + s / c2)
             J *= np.concatenate([root_weight, root_weight], axis=-1)[:, None, :]
         # numpy takes A @ A.T to a routine for symmetric products, which for 14 rows is half as
-        # fast as the general one: it must not see that both factors are the same.
-        copy = copy_memory[: 28 * m * n].reshape(m, 14, 2 * n)
-        copy[...] = J
-        blocks[chunk.image] = copy @ J.transpose(0, 2, 1)
+        # fast as the general one: a row of zeros makes the factors differ.
+        J_and_zero[:, 14] = 0.0
+        blocks[chunk.image] = (J @ J_and_zero.transpose(0, 2, 1))[:, :, :14]
     if not np.isfinite(loss_scale):
         cost = 0.5 * float(blocks[:, RESIDUAL, RESIDUAL].sum())
     return cost, blocks
