@@ -66,8 +66,8 @@ class _Chunk:
 
     image: NDArray[np.int64]  # (m,)
     direction_icrf: Floats  # (m, 3, n)
-    measured_px: Floats  # (2, m, n)
-    whitener: Floats  # (3, m, n): lower triangle of the inverse Cholesky factor, uu, vu, vv
+    measured_px: Floats  # (2, m n)
+    whitener: Floats  # (3, m n): upper triangle, uu, uv, vv
 
 
 @dataclass(frozen=True)
@@ -76,19 +76,20 @@ class Measurements:
 
     chunks: tuple[_Chunk, ...]
     image_count: int
+    # Of every pass: fresh pages for each would cost as much as the arithmetic on them.
+    derivatives: Floats
 
 
 def whitening(covariance_px2: Floats) -> Floats:
     """
-    Inverse Cholesky factors (3, n) of covariances (n, 3): uu, vu, vv of the lower triangle.
+    Upper triangular whiteners (3, n) of covariances (n, 3): uu, uv, vv.
 
-    With r the residual, ``(uu r_u, vu r_u + vv r_v)`` has unit covariance.
+    With r the residual, ``(uu r_u + uv r_v, vv r_v)`` has unit covariance.
     """
     uu, uv, vv = covariance_px2.T
-    root_uu = np.sqrt(uu)
-    slope = uv / uu
-    root_vv = np.sqrt(vv - slope * uv)
-    return np.stack([1.0 / root_uu, -slope / root_vv, 1.0 / root_vv])
+    slope = uv / vv
+    root_uu = np.sqrt(uu - slope * uv)
+    return np.stack([1.0 / root_uu, -slope / root_uu, 1.0 / np.sqrt(vv)])
 
 
 def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -> Measurements:
@@ -100,7 +101,10 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
     order = np.nonzero(keep)[0]
     counts = np.bincount(table.image[order], minlength=table.image_count)
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    whitener = whitening(covariance_px2)
+    # Together, a star is one line of memory to fetch.
+    columns = np.concatenate(
+        [table.direction_icrf, table.measured_px, whitening(covariance_px2).T], axis=1
+    )
     images = np.argsort(counts, kind='stable')
     images = images[counts[images] > 0]
     chunks = []
@@ -115,16 +119,13 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
         slot = np.arange(width)
         real = slot[None, :] < counts[chosen, None]
         row = order[starts[chosen, None] + np.where(real, slot[None, :], 0)]
-        chunks.append(
-            _Chunk(
-                image=chosen,
-                direction_icrf=np.ascontiguousarray(table.direction_icrf[row].transpose(0, 2, 1)),
-                measured_px=np.ascontiguousarray(table.measured_px[row].transpose(2, 0, 1)),
-                whitener=np.where(real, whitener[:, row], 0.0),
-            )
-        )
+        field = np.ascontiguousarray(np.take(columns, row.ravel(), axis=0).T)
+        field[5:] *= real.ravel()
+        direction_icrf = field[:3].reshape(3, *row.shape).transpose(1, 0, 2)
+        chunks.append(_Chunk(chosen, direction_icrf, field[3:5], field[5:]))
         first = last
-    return Measurements(tuple(chunks), table.image_count)
+    largest = max((chunk.measured_px[0].size for chunk in chunks), default=0)
+    return Measurements(tuple(chunks), table.image_count, np.empty(30 * largest))
 
 
 def normal_blocks(
@@ -156,26 +157,24 @@ def normal_blocks(
     """
     blocks = np.zeros((measurements.image_count, 14, 14))
     cost = 0.0
-    largest = max((chunk.measured_px[0].size for chunk in measurements.chunks), default=0)
-    # Fresh pages for every chunk would cost as much as the arithmetic on them.
-    memory = np.empty(30 * largest)
     for chunk in measurements.chunks:
-        m, n = chunk.measured_px[0].shape
-        J_and_zero = memory[: 30 * m * n].reshape(m, 15, 2 * n)
-        J = J_and_zero[:, :14]
-        own = parameters if parameters.ndim == 1 else parameters[chunk.image].T[..., None]
+        m, _, n = chunk.direction_icrf.shape
+        J = measurements.derivatives[: 30 * m * n].reshape(2, 15, m * n)
+        own = parameters
+        if parameters.ndim > 1:
+            own = np.repeat(parameters[chunk.image], n, axis=0).T
         if not _whitened_columns(chunk, own, camera_from_icrf[chunk.image], J):
             return np.inf, blocks
         if np.isfinite(loss_scale):
-            s = J[:, RESIDUAL, :n] ** 2 + J[:, RESIDUAL, n:] ** 2
+            s = J[0, RESIDUAL] ** 2 + J[1, RESIDUAL] ** 2
             c2 = loss_scale**2
             cost += 0.5 * c2 * float(np.log1p(s / c2).sum())
-            root_weight = 1.0 / np.sqrt(1.0 + s / c2)
-            J *= np.concatenate([root_weight, root_weight], axis=-1)[:, None, :]
+            J[:, :14] *= 1.0 / np.sqrt(1.0 + s / c2)
         # numpy takes A @ A.T to a routine for symmetric products, which for 14 rows is half as
-        # fast as the general one: a row of zeros makes the factors differ.
-        J_and_zero[:, 14] = 0.0
-        blocks[chunk.image] = (J @ J_and_zero.transpose(0, 2, 1))[:, :, :14]
+        # fast as the general one: with a row more it does not see that both factors are the same.
+        by_image = J.reshape(2, 15, m, n).transpose(0, 2, 1, 3)
+        product = by_image[:, :, :14] @ by_image.transpose(0, 1, 3, 2)
+        blocks[chunk.image] = (product[0] + product[1])[..., :14]
     if not np.isfinite(loss_scale):
         cost = 0.5 * float(blocks[:, RESIDUAL, RESIDUAL].sum())
     return cost, blocks
@@ -185,37 +184,34 @@ def _whitened_columns(
     chunk: _Chunk, parameters: Floats, camera_from_icrf: Floats, J: Floats
 ) -> bool:
     """
-    Write the whitened derivatives and residuals of a chunk into J, (m, 14, 2n).
+    Write the whitened derivatives and residuals of a chunk into J, (2, 15, m n); the last is zero.
 
-    The first n of the last axis are the u rows, the others the v rows.  False when a star is
-    behind the camera.  ``parameters`` is (10,) or (10, m, 1).
+    The first axis is the u and the v rows.  False when a star is behind the camera.
+    ``parameters`` is (10,) or (10, m n).
 
     The columns are those of `camera.project_jacobians`, whitened as they are made and in place:
     most of the time of a calibration is spent here, in memory traffic.
     """
-    e = camera_from_icrf @ chunk.direction_icrf
-    z = e[:, 2]
-    if z.min() <= 0:
+    m, _, n = chunk.direction_icrf.shape
+    e = np.empty((3, m, n))
+    np.matmul(camera_from_icrf, chunk.direction_icrf, out=e.transpose(1, 0, 2))
+    e_x, e_y, e_z = e.reshape(3, m * n)
+    if e_z.min() <= 0:
         return False
     fx, skew, fy, cx, cy, k1, k2, k3, p1, p2 = parameters
-    n = z.shape[1]
-    U, V = J[:, :, :n], J[:, :, n:]
-    scratch = np.empty_like(z)
+    U, V = J
+    scratch = np.empty_like(e_z)
     multiply = np.multiply
-    wuu, wvu, wvv = chunk.whitener
-    # Whitened rows by the distorted image plane: u = uu x' + uv y', v = vu x' + vv y'.
-    uu, uv, vu, vv = wuu * fx, wuu * skew, wvu * fx, wvu * skew + wvv * fy
+    wuu, wuv, wvv = chunk.whitener
+    # Whitened rows by the distorted image plane: u = uu x' + uv y', v = vv y'.
+    uu, uv, vv = wuu * fx, wuu * skew + wuv * fy, wvv * fy
 
     def put(column: int, dx: Floats, dy: Floats) -> None:
-        multiply(uu, dx, out=U[:, column])
-        multiply(uv, dy, out=scratch)
-        U[:, column] += scratch
-        multiply(vu, dx, out=V[:, column])
-        multiply(vv, dy, out=scratch)
-        V[:, column] += scratch
+        multiply(uu, dx, out=U[column])
+        U[column] += multiply(uv, dy, out=scratch)
+        multiply(vv, dy, out=V[column])
 
-    z_inverse = 1.0 / z
-    x, y = e[:, 0] * z_inverse, e[:, 1] * z_inverse
+    x, y = e_x / e_z, e_y / e_z
     xx, yy, xy = x * x, y * y, x * y
     r2 = xx + yy
     xy_2, r2_2xx, r2_2yy = 2.0 * xy, r2 + 2.0 * xx, r2 + 2.0 * yy
@@ -223,9 +219,9 @@ def _whitened_columns(
     put(9, r2_2xx, xy_2)
     put(5, x, y)
     for W in (U, V):
-        W[:, 5] *= r2
-        multiply(W[:, 5], r2, out=W[:, 6])
-        multiply(W[:, 6], r2, out=W[:, 7])
+        W[5] *= r2
+        multiply(W[5], r2, out=W[6])
+        multiply(W[6], r2, out=W[7])
 
     g = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     g_r2 = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)))
@@ -237,31 +233,29 @@ def _whitened_columns(
     one_xx, one_yy = 1.0 + xx, 1.0 + yy
     for W, by_x, by_y in (
         (U, uu * x_x + uv * cross, uu * cross + uv * y_y),
-        (V, vu * x_x + vv * cross, vu * cross + vv * y_y),
+        (V, vv * cross, vv * y_y),
     ):
-        multiply(by_x, xy, out=W[:, 10])
-        multiply(by_y, one_yy, out=scratch)
-        W[:, 10] += scratch
-        multiply(by_x, one_xx, out=W[:, 11])
-        multiply(by_y, xy, out=scratch)
-        W[:, 11] += scratch
-        np.negative(W[:, 11], out=W[:, 11])
-        multiply(by_x, y, out=W[:, 12])
-        multiply(by_y, x, out=scratch)
-        W[:, 12] -= scratch
+        multiply(by_x, xy, out=W[10])
+        W[10] += multiply(by_y, one_yy, out=scratch)
+        multiply(by_x, one_xx, out=W[11])
+        W[11] += multiply(by_y, xy, out=scratch)
+        np.negative(W[11], out=W[11])
+        multiply(by_x, y, out=W[12])
+        W[12] -= multiply(by_y, x, out=scratch)
 
-    multiply(wuu, xd, out=U[:, 0])
-    multiply(wvu, xd, out=V[:, 0])
-    multiply(wuu, yd, out=U[:, 1])
-    multiply(wvu, yd, out=V[:, 1])
-    U[:, 2], U[:, 3], U[:, 4] = 0.0, wuu, 0.0
-    multiply(wvv, yd, out=V[:, 2])
-    V[:, 3], V[:, 4] = wvu, wvv
+    multiply(wuu, xd, out=U[0])
+    multiply(wuu, yd, out=U[1])
+    multiply(wuv, yd, out=U[2])
+    U[3], U[4] = wuu, wuv
+    V[:2], V[3] = 0.0, 0.0
+    multiply(wvv, yd, out=V[2])
+    V[4] = wvv
     u, v = chunk.measured_px
     residual_u = u - cx - fx * xd - skew * yd
     residual_v = v - cy - fy * yd
-    multiply(wuu, residual_u, out=U[:, RESIDUAL])
-    V[:, RESIDUAL] = wvu * residual_u + wvv * residual_v
+    U[RESIDUAL] = wuu * residual_u + wuv * residual_v
+    multiply(wvv, residual_v, out=V[RESIDUAL])
+    J[:, 14] = 0.0
     return True
 
 
@@ -274,6 +268,6 @@ def residuals_px(table: StarTable, parameters: Floats, camera_from_icrf: Floats)
 
 def squared_sigmas(residual_px: Floats, covariance_px2: Floats) -> Floats:
     """Squared Mahalanobis length (n,) of residuals (n, 2) under covariances (n, 3)."""
-    wuu, wvu, wvv = whitening(covariance_px2)
+    wuu, wuv, wvv = whitening(covariance_px2)
     u, v = residual_px.T
-    return np.asarray((wuu * u) ** 2 + (wvu * u + wvv * v) ** 2)
+    return np.asarray((wuu * u + wuv * v) ** 2 + (wvv * v) ** 2)

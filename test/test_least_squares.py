@@ -161,8 +161,9 @@ def test_it_finds_the_minimum_that_scipy_finds() -> None:
     # SciPy's numerical derivatives carry it to 1e-6 sigma or so.
     assert np.abs((solution.state - reference.x) / sigma).max() < 1e-4
     assert solution.normal.cost == pytest.approx(reference.cost, rel=1e-11)
-    # The gradient is gone, in units in which 1-sigma steps change the cost by one half.
-    assert np.abs(solution.normal.a * sigma[:2]).max() < 1e-6
+    # The gradient is gone, in units in which 1-sigma steps change the cost by one half: a step
+    # that promises less than 1e-13 of the cost, here 5e-6 sigma, is not taken any more.
+    assert np.abs(solution.normal.a * sigma[:2]).max() < 1e-5
 
 
 def test_the_units_of_the_unknowns_do_not_matter() -> None:
