@@ -36,7 +36,7 @@ class ObserverOptions:
     )
     image_queue: int = option(20, 'images held while the one before is measured', low=1, high=1000)
     attitude_timeout_s: float = option(
-        5.0, 'longest time an image waits for the attitude after it, s of wall clock', low=0.0
+        10.0, 'longest time an image waits for the attitude after it, s of wall clock', low=0.0
     )
     attitude_history_s: float = option(
         3600.0, 'how long attitude samples are kept for images still to come, s', low=1.0
