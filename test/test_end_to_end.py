@@ -26,6 +26,7 @@ from starcal_ros.records import Calibration, CameraGeometry, Image
 ROOT = Path(__file__).parents[1]
 TINY = ROOT / 'bags' / 'tiny'
 INDEPENDENT = ROOT.parent / 'shared' / 'independent'
+REAL_SKY = ROOT.parent / 'shared' / 'realsky' / 'granasat'
 
 
 needs_interfaces = pytest.mark.skipif(
@@ -315,3 +316,21 @@ def test_a_bag_of_another_simulator_gives_the_truth(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
     assert_close_to_truth(calibration, simulation.true_geometry(truth))
+
+
+@pytest.mark.skipif(not REAL_SKY.is_dir(), reason='the bag of the real sky is not here')
+def test_a_real_sky_calibrates_and_its_wrong_attitudes_are_refused(tmp_path: Path) -> None:
+    params = ROOT / 'config' / 'examples' / 'realsky.yaml'
+    done = starcal(
+        'calibrate', REAL_SKY, '--params', params, '-o', tmp_path,
+        '--image-topic', '/opnav/image_raw', '--attitude-topic', '/star_tracker/attitude',
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    calibration = read_calibration(tmp_path / 'calibration.json')
+    assert calibration.images_used == 9
+    assert dict(calibration.images_refused) == {'no_match': 2}
+    # 1020 stars at 0.127 px when written; an independent fit of these frames left 0.113 px.
+    assert calibration.stars_used >= 900
+    assert calibration.residual_rms_px <= 0.14
+    # The independent fit: fx 2659.2, fy 2657.6, without refraction and with other stars.
+    assert np.abs(calibration.geometry.camera.parameters[[0, 2]] - [2659.2, 2657.6]).max() < 2.0
