@@ -349,6 +349,20 @@ def _search(
         after = _judge(problem, solution.state, table, verdict, given_rad, options)
         if after.agrees_with(verdict):
             break
+    return _estimate(problem, solution, measurements, table, verdict, prior, options, iterations)
+
+
+def _estimate(
+    problem: Problem,
+    solution: Solution[State],
+    measurements: Measurements,
+    table: StarTable,
+    verdict: _Verdict,
+    prior: CameraGeometry,
+    options: CalibrationOptions,
+    iterations: int,
+) -> tuple[Estimate, str]:
+    """What a search has found, and the term of temperature to leave out, if any."""
     state = solution.state
     _, blocks = image_blocks(problem, state, measurements)
     residual_px = _residuals(problem, state, table)

@@ -315,11 +315,17 @@ def _cells(design: Design, field: StarField) -> Iterable[tuple[Row, StarField]]:
         yield {'images': images, 'stars': stars}, field.part(0, images, stars)
 
 
-def _solve(ensemble: Ensemble, field: StarField, options: CalibrationOptions) -> Estimate | None:
-    try:
-        return estimate_calibration(ensemble, field.prior, options)
-    except TooFewObservations:
-        return None
+def _solutions(
+    design: Design, ensemble: Ensemble, field: StarField, tracker_arcsec: float
+) -> Iterable[tuple[str, Estimate]]:
+    """Each method with its estimate; not those whose images do not carry one."""
+    for method in design.methods:
+        options = calibration_options(method, design.told(tracker_arcsec))
+        try:
+            estimate = estimate_calibration(ensemble, field.prior, options)
+        except TooFewObservations:
+            continue
+        yield method, estimate
 
 
 def _score(estimate: Estimate, truth: CameraGeometry) -> Row:
@@ -344,11 +350,7 @@ def _table1_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
             own['hierarchical'] = map_bound_px(camera, best)
             pointing = pointing_bound_arcsec(camera, best)
             ensemble = observe(part, tracker)
-            for method in design.methods:
-                options = calibration_options(method, design.told(tracker))
-                estimate = _solve(ensemble, field, options)
-                if estimate is None:
-                    continue
+            for method, estimate in _solutions(design, ensemble, field, tracker):
                 yield {
                     **cell,
                     'tracker_arcsec': tracker,
@@ -373,11 +375,7 @@ def _images_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
         for tracker in design.tracker_arcsec:
             least = map_bound_px(camera, bound('hierarchical', blocks, tracker))
             ensemble = observe(part, tracker)
-            for method in design.methods:
-                options = calibration_options(method, design.told(tracker))
-                estimate = _solve(ensemble, field, options)
-                if estimate is None:
-                    continue
+            for method, estimate in _solutions(design, ensemble, field, tracker):
                 yield {
                     **cell,
                     'tracker_arcsec': tracker,
@@ -428,11 +426,7 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
         for tracker, share in itertools.product(design.tracker_arcsec, (0.0, OUTLIER_SHARE)):
             least = map_bound_px(camera, bound('hierarchical', blocks, tracker))
             ensemble = observe(part, tracker, share)
-            for method in design.methods:
-                options = calibration_options(method, design.told(tracker))
-                estimate = _solve(ensemble, field, options)
-                if estimate is None:
-                    continue
+            for method, estimate in _solutions(design, ensemble, field, tracker):
                 sigma = np.sqrt(np.diag(estimate.covariance))[ESTIMATED]
                 error = errors(estimate.geometry, field.truth)[ESTIMATED]
                 yield {
