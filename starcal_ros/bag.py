@@ -1,32 +1,25 @@
 """
 MCAP bags to records and back, without ROS.
 
-Reading streams: one chunk of the file is in memory at a time.  A bag that a crash has cut off is
-read up to the damage, and a chunk whose checksum fails is left out; either is said once, to
-``on_damage``.  Writing gives the same bytes for the same records.
+Reading streams: one chunk of the file is in memory at a time.  Of a damaged bag, what is sound is
+read; where it is damaged and what was lost is said once, to ``on_damage``.  Writing gives the same
+bytes for the same records.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 import functools
 import logging
 import os
 from pathlib import Path
 import re
-import struct
 import sys
 from types import TracebackType
 from typing import Any, IO, NamedTuple, TYPE_CHECKING
 
-from mcap.exceptions import EndOfFile, McapError, RecordLengthLimitExceeded
-from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, McapRecord, Schema, Statistics
-from mcap.records import Message as McapMessage
-from mcap.stream_reader import get_chunk_data_stream, StreamReader
 from mcap.writer import CompressionType, Writer
 import numpy as np
 from numpy.typing import NDArray
@@ -37,15 +30,14 @@ import yaml
 from starcal_ros import messages
 from starcal_ros.attitude import attitude_sample, AttitudeHistory, AttitudeOptions
 from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.mcap_records import Damage, MAGIC, RawMessage, read_messages, read_summary
 from starcal_ros.records import Calibration, EnsembleStatus, Image, refused_image, StarObservations
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 Floats = NDArray[np.float64]
-Damage = Callable[[str], None]
 
-_MAGIC = b'\x89MCAP0\r\n'
 _CHUNK_BYTES = 4 << 20  # an image or two: what a crash can cost, and what a reader holds
 
 
@@ -62,17 +54,6 @@ class Topic:
     name: str
     type_name: str
     count: int
-
-
-@dataclass(frozen=True)
-class RawMessage:
-    """One message as the bag holds it: ``data`` is serialised CDR, header included."""
-
-    topic: str
-    type_name: str
-    definition: str
-    log_time_ns: int
-    data: bytes
 
 
 def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
@@ -95,10 +76,10 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
     for file in files:
         try:
             with file.open('rb') as stream:
-                magic = stream.read(len(_MAGIC))
+                magic = stream.read(len(MAGIC))
         except OSError as error:
             raise BagError(f'{file}: cannot be read: {error.strerror}') from error
-        if magic != _MAGIC:
+        if magic != MAGIC:
             raise BagError(f'{file}: not an MCAP bag')
     return files
 
@@ -119,26 +100,20 @@ def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple
 
 
 def _summary(file: Path) -> list[Topic]:
-    """Topics by the summary of a file; none where it has no counts or they are damaged."""
+    """Topics by the summary of a file; none where it has no counts or is damaged."""
+    summary = read_summary(file)
+    if summary is None or summary.statistics is None:
+        return []
     found = []
-    with file.open('rb') as stream:
-        # What a damaged summary raises has no common base.
-        try:
-            summary = make_reader(stream).get_summary()
-            if summary is None or summary.statistics is None:
-                return []
-            for number, count in summary.statistics.channel_message_counts.items():
-                channel = summary.channels[number]
-                if count and channel.message_encoding == 'cdr':
-                    schema = summary.schemas[channel.schema_id]
-                    found.append(Topic(channel.topic, schema.name, count))
-        except Exception:
-            return []
+    for number, count in summary.statistics.channel_message_counts.items():
+        channel = summary.channels[number]
+        if count and channel.message_encoding == 'cdr':
+            found.append(Topic(channel.topic, summary.schemas[channel.schema_id].name, count))
     return found
 
 
 def _counted(file: Path, on_damage: Damage) -> list[Topic]:
-    counts = Counter((raw.topic, raw.type_name) for raw in _read_file(file, None, on_damage))
+    counts = Counter((raw.topic, raw.type_name) for raw in read_messages(file, None, on_damage))
     return [Topic(name, type_name, count) for (name, type_name), count in counts.items()]
 
 
@@ -175,7 +150,7 @@ def read_raw(
     """Messages as they were recorded, in the order of the file; of some topics or of all."""
     wanted = None if only is None else frozenset(only)
     for file in mcap_files(paths):
-        yield from _read_file(file, wanted, on_damage)
+        yield from read_messages(file, wanted, on_damage)
 
 
 def read_images(
@@ -206,12 +181,8 @@ def read_attitudes(
     """All attitude samples of a topic; those that are no rotations are remembered as such."""
     options = options or AttitudeOptions()
     history = AttitudeHistory()
-    for raw in read_raw(paths, [topic], on_damage):
-        try:
-            time_ns, quaternion = messages.attitude_from_message(_decode(raw))
-        except BagError as error:
-            on_damage(str(error))
-            continue
+    for message in _decoded(paths, topic, on_damage):
+        time_ns, quaternion = messages.attitude_from_message(message)
         history.add(time_ns, attitude_sample(time_ns, quaternion, options.attitude_direction))
     return history
 
@@ -220,16 +191,16 @@ def read_velocities(
     paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
 ) -> Iterator[tuple[int, Floats]]:
     """Stamps and velocities (3,) in m/s of a topic."""
-    for raw in read_raw(paths, [topic], on_damage):
-        yield messages.velocity_from_message(_decode(raw))
+    for message in _decoded(paths, topic, on_damage):
+        yield messages.velocity_from_message(message)
 
 
 def read_temperatures(
     paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
 ) -> Iterator[tuple[int, float]]:
     """Stamps and temperatures in degrees Celsius of a topic; NaN where not known."""
-    for raw in read_raw(paths, [topic], on_damage):
-        yield messages.temperature_from_message(_decode(raw))
+    for message in _decoded(paths, topic, on_damage):
+        yield messages.temperature_from_message(message)
 
 
 def read_observations(
@@ -469,6 +440,17 @@ def _decode(raw: RawMessage) -> messages.Message:
         ) from error
 
 
+def _decoded(
+    paths: Iterable[Path | str], topic: str, on_damage: Damage
+) -> Iterator[messages.Message]:
+    """Messages of a topic; bytes that are none of its type are said and passed over."""
+    for raw in read_raw(paths, [topic], on_damage):
+        try:
+            yield _decode(raw)
+        except BagError as error:
+            on_damage(str(error))
+
+
 @functools.lru_cache(maxsize=16)
 def _typestore_with(type_name: str, definition: str) -> Typestore:
     """A store that knows a type as the bag defines it: another version may have written it."""
@@ -505,90 +487,6 @@ def _files_of_folder(folder: Path) -> list[Path]:
 def _natural(path: Path) -> list[tuple[int, str]]:
     # rosbag2 counts its files without leading zeros: bag_10 comes after bag_9.
     return [(int(part) if part.isdigit() else -1, part) for part in re.split(r'(\d+)', path.name)]
-
-
-def _read_file(
-    file: Path, wanted: frozenset[str] | None, on_damage: Damage
-) -> Iterator[RawMessage]:
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    for record in _records(file, on_damage):
-        if isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, Channel):
-            channels[record.id] = record
-        elif isinstance(record, McapMessage):
-            channel = channels.get(record.channel_id)
-            schema = schemas.get(channel.schema_id) if channel else None
-            if channel is None or schema is None or channel.message_encoding != 'cdr':
-                continue  # its channel went with a damaged chunk, or it is not ROS 2's
-            if wanted is None or channel.topic in wanted:
-                definition = schema.data.decode(errors='replace')
-                yield RawMessage(
-                    channel.topic, schema.name, definition, record.log_time, record.data
-                )
-
-
-def _records(file: Path, on_damage: Damage) -> Iterator[McapRecord]:
-    """Records of a file in its order, those in chunks too, as far as they are sound."""
-    read_to, seen = 0, 0
-    told: list[str] = []
-
-    def tell(text: str) -> None:
-        told.append(text)
-        on_damage(text)
-
-    with file.open('rb') as stream:
-        size = os.fstat(stream.fileno()).st_size
-        reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size)
-        # Damage shows as whatever the bytes after it are taken for: no common base of errors.
-        try:
-            for record in reader.records:
-                read_to = stream.tell()
-                found = (
-                    _chunk_records(file, read_to, record, tell)
-                    if isinstance(record, Chunk)
-                    else (record,)
-                )
-                for inner in found:
-                    seen += isinstance(inner, McapMessage)
-                    yield inner
-                # A chunk whose kind was flipped is skipped as unknown: only a count tells.
-                if isinstance(record, Statistics) and record.message_count != seen and not told:
-                    tell(f'{file}: damaged: {seen} of {record.message_count} messages found')
-        except (
-            McapError,
-            ValueError,
-            struct.error,
-            KeyError,
-            OverflowError,
-            MemoryError,
-        ) as error:
-            at_end = isinstance(error, (EndOfFile, RecordLengthLimitExceeded))
-            cut = at_end or stream.tell() >= size
-            tell(
-                f'{file}: {"cut off" if cut else "damaged"} after byte {read_to} of {size}'
-                f' ({type(error).__name__}); what stands before it was read'
-            )
-
-
-def _chunk_records(file: Path, end: int, chunk: Chunk, on_damage: Damage) -> Iterator[McapRecord]:
-    """Records of a chunk, or none where its checksum or its compression is wrong."""
-    try:
-        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-    except Exception as error:
-        on_damage(f'{file}: the chunk that ends at byte {end} is damaged and left out: {error}')
-        return
-    while stream.count < length:
-        opcode, size = stream.read1(), stream.read8()
-        if opcode == Opcode.MESSAGE:
-            yield McapMessage.read(stream, size)
-        elif opcode == Opcode.CHANNEL:
-            yield Channel.read(stream)
-        elif opcode == Opcode.SCHEMA:
-            yield Schema.read(stream)
-        else:
-            stream.read(size)
 
 
 def _qos_profile(latched: bool) -> dict[str, object]:

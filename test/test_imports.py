@@ -37,6 +37,7 @@ LADDER = [
     'acceptance',
     'archive',
     'synthetic',
+    'mcap_records',
     'bag',
     'products',
     'annotation',
