@@ -126,6 +126,9 @@ class Estimate:
         On the estimated camera parameters and focal terms, then the alignment where the method
         has one, and its rate; the rotations of the images eliminated.
     information_names : tuple of k str
+    shared_covariance : (s, s)
+        Of the ten camera parameters, focal terms, alignment and its rate.
+    shared_names : tuple of s str
     state : State
     table : StarTable
     kept : (n,) bool
@@ -153,6 +156,8 @@ class Estimate:
     covariance: Floats
     information: Floats
     information_names: tuple[str, ...]
+    shared_covariance: Floats
+    shared_names: tuple[str, ...]
     state: State
     table: StarTable
     kept: Mask
@@ -380,7 +385,7 @@ def _estimate(
     thermal = _thermal(state, full, options)
     weakest = weakest_term(thermal, full[k + 3 :, k + 3 :]) if thermal else ''
     names = (
-        *(PARAMETER_NAMES[i] for i in problem.free),
+        *PARAMETER_NAMES,
         *(f'focal_temperature_{i}' for i in range(1, k - 9)),
         *ALIGNMENT_NAMES,
         *(f'{name}_temperature' for name in ALIGNMENT_NAMES),
@@ -389,7 +394,9 @@ def _estimate(
         geometry=geometry,
         covariance=full[np.ix_(at_reference, at_reference)],
         information=information[np.ix_(shared, shared)],
-        information_names=names[: len(shared)],
+        information_names=tuple(names[i] for i in shared),
+        shared_covariance=full,
+        shared_names=names[: len(full)],
         state=state,
         table=table,
         kept=kept,

@@ -25,6 +25,8 @@ from starcal_ros.records import (
     Calibration,
     CALIBRATION_PARAMETER_NAMES,
     CameraGeometry,
+    Correlation,
+    DetectorMaps,
     EnsembleStatus,
     Image,
     refused_image,
@@ -426,6 +428,8 @@ def calibration_to_message(calibration: Calibration, make: Make) -> Message:
         singular_values=_flat(calibration.singular_values, np.float64),
         weakest_direction=calibration.weakest_direction,
         **_thermal_fields(calibration.thermal),
+        **_maps_fields(calibration.maps),
+        **_correlation_fields(calibration.correlation),
         zero_skew_cost_px=float(calibration.zero_skew_cost_px),
         iterations=calibration.iterations,
         termination=calibration.termination,
@@ -483,7 +487,52 @@ def calibration_from_message(message: Message) -> Calibration:
         child_frame=str(message.header.frame_id),
         provenance={str(key): str(value) for key, value in provenance},
         thermal=_thermal_from_message(message),
+        maps=_maps_from_message(message),
+        correlation=_correlation_from_message(message),
     )
+
+
+def _maps_fields(maps: DetectorMaps | None) -> dict[str, object]:
+    maps = maps or DetectorMaps(np.empty((0, 0), np.int64), np.empty((0, 0)), np.empty((0, 0)))
+    coverage_rows, coverage_cols = maps.stars.shape
+    map_rows, map_cols = maps.line_of_sight_sigma_arcsec.shape
+    return {
+        'coverage_rows': coverage_rows,
+        'coverage_cols': coverage_cols,
+        'coverage': _flat(maps.stars, np.uint32),
+        'map_rows': map_rows,
+        'map_cols': map_cols,
+        'line_of_sight_sigma_arcsec': _flat(maps.line_of_sight_sigma_arcsec, np.float64),
+        'shape_sigma_arcsec': _flat(maps.shape_sigma_arcsec, np.float64),
+    }
+
+
+def _maps_from_message(message: Message) -> DetectorMaps | None:
+    if not getattr(message, 'coverage_rows', 0):
+        return None
+    cells = (int(message.coverage_rows), int(message.coverage_cols))
+    grid = (int(message.map_rows), int(message.map_cols))
+    return DetectorMaps(
+        _shaped('coverage', message.coverage, cells).astype(np.int64),
+        _shaped('line_of_sight_sigma_arcsec', message.line_of_sight_sigma_arcsec, grid),
+        _shaped('shape_sigma_arcsec', message.shape_sigma_arcsec, grid),
+    )
+
+
+def _correlation_fields(correlation: Correlation | None) -> dict[str, object]:
+    correlation = correlation or Correlation((), np.empty((0, 0)))
+    return {
+        'correlation_names': list(correlation.names),
+        'correlation': _flat(correlation.matrix, np.float64),
+    }
+
+
+def _correlation_from_message(message: Message) -> Correlation | None:
+    names = tuple(str(name) for name in getattr(message, 'correlation_names', ()))
+    if not names:
+        return None
+    matrix = _shaped('correlation', message.correlation, (len(names), len(names)))
+    return Correlation(names, matrix)
 
 
 def _thermal_fields(thermal: Thermal | None) -> dict[str, object]:

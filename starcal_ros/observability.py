@@ -21,6 +21,8 @@ from starcal_ros.measurement import arrange, CAMERA, normal_blocks, ROTATION, st
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     CameraGeometry,
+    Correlation,
+    DetectorMaps,
     Ensemble,
     EnsembleStatus,
     StarObservations,
@@ -29,11 +31,16 @@ from starcal_ros.records import (
 Floats = NDArray[np.float64]
 
 COVERAGE_ROWS, COVERAGE_COLS = 8, 10  # cells of 2 degrees on the paper's camera
+MAP_ROWS, MAP_COLS = 16, 20  # of a smooth surface of degree seven
 
 
 def coverage(ensemble: Ensemble, camera: CameraModel) -> NDArray[np.int64]:
     """Star observations in each focal-plane cell, (8, 10)."""
-    pixels = star_table(ensemble.images).measured_px
+    return stars_in_cells(star_table(ensemble.images).measured_px, camera)
+
+
+def stars_in_cells(pixels: Floats, camera: CameraModel) -> NDArray[np.int64]:
+    """Pixels (n, 2) in each focal-plane cell, (8, 10)."""
     counts, _, _ = np.histogram2d(
         pixels[:, 1],
         pixels[:, 0],
@@ -189,19 +196,44 @@ def line_of_sight_sigma_arcsec(
 
 
 def map_sigma_px(camera: CameraModel, covariance: Floats, columns: int = 25) -> Floats:
+    """1-sigma (columns * columns,) of `shape_sigma_rad`, in pixels at the centre."""
+    sigma_rad = shape_sigma_rad(camera, covariance, columns, columns)
+    return np.asarray(sigma_rad.ravel() * camera.parameters[0])
+
+
+def shape_sigma_rad(
+    camera: CameraModel, covariance: Floats, columns: int = 25, rows: int = 20
+) -> Floats:
     """
-    1-sigma (columns * columns,) of the shape of the distortion map at a grid of pixels, px.
+    1-sigma (rows, columns) of the shape of the distortion map at a grid of pixels, rad.
 
     What a turn common to all pixels can take up (pointing, and most of a moved principal point) is
     removed: it belongs to the alignment.
     """
-    directions, J = _line_of_sight_jacobian(camera, columns, columns)
+    directions, J = _line_of_sight_jacobian(camera, columns, rows)
     J = J[:, :, :10].reshape(-1, 10)
     turns = np.stack([np.cross(axis, directions) for axis in np.eye(3)], axis=-1)
     Q, _ = np.linalg.qr(turns.reshape(-1, 3))
     J = (J - Q @ (Q.T @ J)).reshape(-1, 3, 10)
     variance = np.einsum('nij,jk,nik->n', J, covariance[:10, :10], J)
-    return np.asarray(np.sqrt(variance) * camera.parameters[0])
+    return np.asarray(np.sqrt(variance).reshape(rows, columns))
+
+
+def detector_maps(camera: CameraModel, covariance: Floats, pixels: Floats) -> DetectorMaps:
+    """Maps of a camera with a covariance (13, 13) that is from stars at pixels (n, 2)."""
+    return DetectorMaps(
+        stars_in_cells(pixels, camera),
+        line_of_sight_sigma_arcsec(camera, covariance, MAP_COLS, MAP_ROWS),
+        shape_sigma_rad(camera, covariance, MAP_COLS, MAP_ROWS) / ARCSECOND_RAD,
+    )
+
+
+def correlation(covariance: Floats, names: tuple[str, ...]) -> Correlation:
+    """Correlations of the named numbers of a covariance (k, k), those left out that have none."""
+    sigma = np.sqrt(np.diag(covariance))
+    known = np.nonzero(sigma > 0)[0]
+    matrix = covariance[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])
+    return Correlation(tuple(names[i] for i in known), matrix)
 
 
 def _line_of_sight_jacobian(camera: CameraModel, columns: int, rows: int) -> tuple[Floats, Floats]:

@@ -32,7 +32,9 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused, OptionError
 from starcal_ros.identification import IdentificationOptions, observe_stars, tracked
 from starcal_ros.observability import (
+    correlation,
     coverage,
+    detector_maps,
     keep_most_informative,
     map_sigma_px,
     weakest_direction,
@@ -424,6 +426,8 @@ def _calibration(
         child_frame=setup.frames.camera_frame,
         provenance=_provenance(setup, options, ensemble, inputs),
         thermal=result.thermal,
+        maps=detector_maps(camera, result.covariance, result.table.measured_px[kept]),
+        correlation=correlation(result.shared_covariance, result.shared_names),
     )
 
 

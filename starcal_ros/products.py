@@ -26,6 +26,8 @@ from starcal_ros.records import (
     Calibration,
     CALIBRATION_PARAMETER_NAMES,
     CameraGeometry,
+    Correlation,
+    DetectorMaps,
     Thermal,
 )
 
@@ -35,6 +37,8 @@ T = TypeVar('T')
 SCHEMA = 1
 CALIBRATION_FILE = 'calibration.json'
 CAMERA_INFO_FILE = 'camera_info.yaml'
+
+_LATER_KEYS = {'temperature': None, 'maps': None, 'correlation': None}
 
 # plumb_bob's order of coefficients, by our names; ROS puts k3 last.
 _PLUMB_BOB = ('k1', 'k2', 'p1', 'p2', 'k3')
@@ -53,6 +57,8 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
         When the file cannot be written.
     """
     text = json.dumps(_calibration_content(calibration), indent=1, allow_nan=False)
+    # A row of a grid on a line; within a text there is no line break to be taken for one of these.
+    text = re.sub(r'\[\n([^][{}"]+)\n *\]', lambda row: f'[{" ".join(row[1].split())}]', text)
     write_atomically(path, text + '\n')
 
 
@@ -74,8 +80,8 @@ def read_calibration(path: Path) -> Calibration:
     if content.get('schema') != SCHEMA:
         raise ProductError(f'{path}: schema {content.get("schema")!r} is not {SCHEMA}')
     try:
-        # A calibration of before temperature was there has no such key.
-        return _calibration_from_content(_Reader(path, {'temperature': None, **content}))
+        # A calibration of before they were there has no such keys.
+        return _calibration_from_content(_Reader(path, {**_LATER_KEYS, **content}))
     except ValueError as error:  # CameraModel's own checks
         raise ProductError(f'{path}: {error}') from error
 
@@ -259,7 +265,25 @@ def _calibration_content(calibration: Calibration) -> dict[str, object]:
         'iterations': int(calibration.iterations),
         'termination': calibration.termination,
         'temperature': _thermal_content(calibration.thermal),
+        'maps': _maps_content(calibration.maps),
+        'correlation': _correlation_content(calibration.correlation),
     }
+
+
+def _maps_content(maps: DetectorMaps | None) -> dict[str, object] | None:
+    if maps is None:
+        return None
+    return {
+        'stars': maps.stars.tolist(),
+        'line_of_sight_sigma_arcsec': _json_rows(maps.line_of_sight_sigma_arcsec),
+        'shape_sigma_arcsec': _json_rows(maps.shape_sigma_arcsec),
+    }
+
+
+def _correlation_content(correlation: Correlation | None) -> dict[str, object] | None:
+    if correlation is None:
+        return None
+    return {'names': list(correlation.names), 'matrix': _json_rows(correlation.matrix)}
 
 
 def _thermal_content(thermal: Thermal | None) -> dict[str, object] | None:
@@ -326,7 +350,25 @@ def _calibration_from_content(reader: _Reader) -> Calibration:
         child_frame=reader.get('alignment.child', _text),
         provenance=reader.get('provenance', _mapping_of(_text)),
         thermal=None if reader.get('temperature', _is_null) else _thermal_from(reader),
+        maps=None if reader.get('maps', _is_null) else _maps_from(reader),
+        correlation=None if reader.get('correlation', _is_null) else _correlation_from(reader),
     )
+
+
+def _maps_from(reader: _Reader) -> DetectorMaps:
+    return DetectorMaps(
+        np.array(reader.get('maps.stars', _grid_of(_whole)), np.int64),
+        np.array(reader.get('maps.line_of_sight_sigma_arcsec', _grid_of(_number_or_null))),
+        np.array(reader.get('maps.shape_sigma_arcsec', _grid_of(_number_or_null))),
+    )
+
+
+def _correlation_from(reader: _Reader) -> Correlation:
+    names = reader.get('correlation.names', _texts)
+    matrix = np.array(reader.get('correlation.matrix', _grid_of(_number_or_null)))
+    if matrix.shape != (len(names), len(names)):
+        raise ProductError(f'{reader.path}: correlation.matrix is not of the size of its names')
+    return Correlation(names, matrix)
 
 
 def _thermal_from(reader: _Reader) -> Thermal:
@@ -414,6 +456,16 @@ def _list_of(kind: Callable[[object], T]) -> Callable[[object], list[T]]:
         return [kind(item) for item in value]
 
     return items
+
+
+def _grid_of(kind: Callable[[object], T]) -> Callable[[object], list[list[T]]]:
+    def grid(value: object) -> list[list[T]]:
+        rows = _list_of(_list_of(kind))(value)
+        if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
+            raise ValueError('a grid of rows alike')
+        return rows
+
+    return grid
 
 
 def _texts(value: object) -> tuple[str, ...]:

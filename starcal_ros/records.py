@@ -260,6 +260,39 @@ class Thermal:
 
 
 @dataclass(frozen=True)
+class DetectorMaps:
+    """
+    What a calibration is worth over the detector; the first row is that of the least v.
+
+    Attributes
+    ----------
+    stars : (rows, cols) int64
+        Star observations used, in equal cells that cover the detector.
+    line_of_sight_sigma_arcsec : (rows, cols)
+        1-sigma of the line of sight of a pixel in the star tracker frame, camera and alignment
+        together, at a regular grid of pixels from corner to corner.
+    shape_sigma_arcsec : (rows, cols)
+        The same of the camera alone, after the turn that is common to all those pixels.
+    """
+
+    stars: NDArray[np.int64]
+    line_of_sight_sigma_arcsec: Floats
+    shape_sigma_arcsec: Floats
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """
+    Correlations (k, k) of the k named numbers that are not known exactly.
+
+    Camera parameters that were estimated or considered, focal terms, alignment angles and rate.
+    """
+
+    names: tuple[str, ...]
+    matrix: Floats
+
+
+@dataclass(frozen=True)
 class Calibration:
     """
     One calibration with its covariance, statistics and provenance.
@@ -306,6 +339,9 @@ class Calibration:
     provenance : mapping of str to str
     thermal : Thermal or None
         None where no change with temperature was asked for.
+    maps : DetectorMaps or None
+    correlation : Correlation or None
+        None where whoever has made the calibration does not tell.
     """
 
     time_ns: int
@@ -336,6 +372,8 @@ class Calibration:
     child_frame: str
     provenance: Mapping[str, str]
     thermal: Thermal | None = None
+    maps: DetectorMaps | None = None
+    correlation: Correlation | None = None
 
     @property
     def sigma(self) -> Floats:

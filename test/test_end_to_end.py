@@ -121,15 +121,10 @@ def test_recorded_observations_give_the_same_calibration(tiny_run: Path, tmp_pat
     done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
     assert done.returncode == 0, done.stderr
     first, second = (
-        read_calibration(folder / 'calibration.json') for folder in (tiny_run, tmp_path)
+        json.loads((folder / 'calibration.json').read_text()) for folder in (tiny_run, tmp_path)
     )
-    assert np.array_equal(first.covariance, second.covariance)
-    for name in ('geometry', 'covariance', 'provenance'):  # compared above and below, or differs
-        second = dataclasses.replace(second, **{name: getattr(first, name)})
+    second['provenance'] = first['provenance']  # the one names images, the other observations
     assert first == second
-    content = [json.loads((f / 'calibration.json').read_text()) for f in (tiny_run, tmp_path)]
-    for key in ('intrinsics', 'distortion', 'alignment'):
-        assert content[0][key] == content[1][key]
 
 
 def test_observations_can_be_calibrated_in_place(tiny_run: Path, tmp_path: Path) -> None:

@@ -19,6 +19,8 @@ from starcal_ros.errors import ImageRefused
 from starcal_ros.records import (
     Calibration,
     CameraGeometry,
+    Correlation,
+    DetectorMaps,
     EnsembleStatus,
     Image,
     refused_image,
@@ -227,6 +229,12 @@ def calibration() -> Calibration:
         thermal=Thermal(
             21.5, (4e-5, -6e-7), (1e-6, 2e-8), (1e-5, 2e-5, 3e-5), (1e-6, 2e-6, 3e-6), 'a word'
         ),
+        maps=DetectorMaps(
+            np.arange(6).reshape(2, 3),
+            np.arange(12.0).reshape(4, 3) / 7,
+            np.sqrt(np.arange(12.0)).reshape(4, 3),
+        ),
+        correlation=Correlation(('fx', 'fy'), np.array([[1.0, 1 / 3], [1 / 3, 1.0]])),
     )
 
 
@@ -265,6 +273,10 @@ def test_records_round_trip(make: Any) -> None:
             result,
             messages.calibration_from_message(messages.calibration_to_message(result, make)),
         )
+    silent = dataclasses.replace(calibration(), maps=None, correlation=None)
+    assert_same(
+        silent, messages.calibration_from_message(messages.calibration_to_message(silent, make))
+    )
     status = EnsembleStatus(
         time_ns=TIME_NS,
         images=3,
@@ -303,8 +315,25 @@ def test_recordings_of_before_temperature_are_read() -> None:
     del message.temperature_degc
     assert np.isnan(messages.observations_from_message(message).temperature_degc)
     message = messages.calibration_to_message(calibration(), plain)
-    del message.reference_temperature_degc
-    assert messages.calibration_from_message(message).thermal is None
+    del message.reference_temperature_degc, message.coverage_rows, message.correlation_names
+    found = messages.calibration_from_message(message)
+    assert found.thermal is None and found.maps is None and found.correlation is None
+
+
+@pytest.mark.parametrize(
+    ('field', 'text'),
+    [
+        ('coverage', 'coverage: 1 numbers, not 2 x 3'),
+        ('line_of_sight_sigma_arcsec', 'line_of_sight_sigma_arcsec: 1 numbers, not 4 x 3'),
+        ('shape_sigma_arcsec', 'shape_sigma_arcsec: 1 numbers, not 4 x 3'),
+        ('correlation', 'correlation: 1 numbers, not 2 x 2'),
+    ],
+)
+def test_grids_of_another_size_are_refused(field: str, text: str) -> None:
+    message = messages.calibration_to_message(calibration(), plain)
+    setattr(message, field, np.zeros(1))
+    with pytest.raises(ValueError, match=text):
+        messages.calibration_from_message(message)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,13 @@ from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, OptionError, ProductError, TooFewObservations
 from starcal_ros.node_options import NODE_OPTION_CLASSES
-from starcal_ros.records import Ensemble, Image, refused_image
+from starcal_ros.records import (
+    ALIGNMENT_NAMES,
+    CALIBRATION_PARAMETER_NAMES,
+    Ensemble,
+    Image,
+    refused_image,
+)
 from starcal_ros.synthetic import (
     attitude_samples,
     Detector,
@@ -373,6 +379,28 @@ def test_a_solution_with_its_statistics(setup: pipeline.Setup) -> None:
     # Ten images of 10, 10 and 40 arcsec: 13 in the mean, and 50 for a principal point that is
     # held at its nominal place, where it is in truth too.
     assert turn / ARCSECOND_RAD < 50
+
+
+def test_a_solution_is_mapped_over_the_detector(setup: pipeline.Setup) -> None:
+    found = pipeline.solve(ensemble(), setup)
+    maps, correlation = found.maps, found.correlation
+    assert maps is not None and correlation is not None
+    assert maps.stars.shape == (8, 10) and maps.stars.sum() == found.stars_used
+    whole, shape = maps.line_of_sight_sigma_arcsec, maps.shape_sigma_arcsec
+    assert whole.shape == shape.shape == (16, 20)
+    # The centre is as good as the alignment: pitch and yaw of the 13 x 13 covariance; the two
+    # middle rows and columns are half a cell off it.
+    pitch_yaw_arcsec = np.hypot(*found.sigma[10:12]) / ARCSECOND_RAD
+    np.testing.assert_allclose(whole[7:9, 9:11], pitch_yaw_arcsec, rtol=0.05)
+    assert (shape < whole).all() and whole.argmin() not in (0, 19, 300, 319)
+    assert correlation.names == (*found.estimated, *ALIGNMENT_NAMES)
+    np.testing.assert_allclose(np.diag(correlation.matrix), 1.0, rtol=1e-12)
+    rows = [CALIBRATION_PARAMETER_NAMES.index(name) for name in correlation.names]
+    np.testing.assert_allclose(
+        correlation.matrix * np.outer(found.sigma[rows], found.sigma[rows]),
+        found.covariance[np.ix_(rows, rows)],
+        rtol=1e-9,
+    )
 
 
 def test_method_and_names_can_be_said_for_one_solution(setup: pipeline.Setup) -> None:

@@ -28,6 +28,8 @@ from starcal_ros.records import (
     Calibration,
     CALIBRATION_PARAMETER_NAMES,
     CameraGeometry,
+    Correlation,
+    DetectorMaps,
     Thermal,
 )
 
@@ -35,6 +37,12 @@ PARAMETERS = np.array(
     [3641.5121868491606, -0.74, 3642.3, 647.5, 511.5, -0.0512, 0.1167, 0.01, 5.1e-4, 3.2e-5]
 )
 CAMERA = CameraModel(1296, 1024, PARAMETERS)
+MAPS = DetectorMaps(
+    np.arange(6).reshape(2, 3),
+    np.arange(12.0).reshape(4, 3) / 7,
+    np.arange(12.0).reshape(3, 4) / 3,
+)
+CORRELATION = Correlation(('fx', 'pitch'), np.array([[1.0, -1 / 3], [-1 / 3, 1.0]]))
 THERMAL = Thermal(21.5, (4e-5, -6e-7), (1e-6, 2e-8), (1e-5, 0.0, -3e-5), (1e-6,) * 3, 'a word')
 
 ROS_YAML = """\
@@ -111,6 +119,14 @@ def assert_same(a: Calibration, b: Calibration) -> None:
             assert x.camera.parameters.tobytes() == y.camera.parameters.tobytes()
             q_x, q_y = x.star_tracker_from_camera_xyzw, y.star_tracker_from_camera_xyzw
             assert q_x.tobytes() == q_y.tobytes()
+        elif field.name == 'maps' and x is not None:
+            for name in ('stars', 'line_of_sight_sigma_arcsec', 'shape_sigma_arcsec'):
+                one, other = getattr(x, name), getattr(y, name)
+                assert one.dtype == other.dtype and one.shape == other.shape
+                assert one.tobytes() == other.tobytes()
+        elif field.name == 'correlation' and x is not None:
+            assert x.names == y.names and x.matrix.shape == y.matrix.shape
+            assert x.matrix.tobytes() == y.matrix.tobytes()
         elif field.name == 'covariance':
             assert x.tobytes() == y.tobytes() and x.shape == y.shape
         else:
@@ -123,6 +139,7 @@ def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
         {'accepted': False, 'reasons': ('too few stars', 'weak: k3')},
         {'thermal': THERMAL},
         {'thermal': Thermal(20.0, note='left out: everything')},
+        {'maps': MAPS, 'correlation': CORRELATION},
     )
     for changes in cases:
         calibration = calibration_of(**changes)
@@ -189,7 +206,7 @@ def test_json_has_the_keys_of_the_interface_document(tmp_path: Path) -> None:
         'alignment_scatter_arcsec', 'zero_skew_cost_px', 'iterations', 'termination',
     } <= set(content)  # fmt: skip
     assert content['image'] == {'width': 1296, 'height': 1024}
-    assert content['temperature'] is None
+    assert content['temperature'] is content['maps'] is content['correlation'] is None
     write_calibration(dataclasses.replace(calibration, thermal=THERMAL), path)
     assert list(json.loads(path.read_text())['temperature']) == [
         'reference_degc', 'focal_per_degc', 'focal_per_degc_sigma',
@@ -197,11 +214,19 @@ def test_json_has_the_keys_of_the_interface_document(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+def test_a_row_of_a_grid_is_a_line(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    written = calibration_of(maps=MAPS, provenance={'note': 'a [\n 1,\n 2\n ] in a text'})
+    write_calibration(written, path)
+    assert '   [0, 1, 2],\n   [3, 4, 5]\n' in path.read_text()
+    assert_same(written, read_calibration(path))
+
+
 def test_a_file_of_before_temperature_is_read(tmp_path: Path) -> None:
     path = tmp_path / 'c.json'
     write_calibration(calibration_of(), path)
     content = json.loads(path.read_text())
-    del content['temperature']
+    del content['temperature'], content['maps'], content['correlation']
     path.write_text(json.dumps(content))
     assert_same(calibration_of(), read_calibration(path))
 
@@ -229,11 +254,15 @@ def test_a_file_of_before_temperature_is_read(tmp_path: Path) -> None:
             lambda c: c['temperature'].update(alignment_rate_rad_per_degc=[1.0]),
             'temperature.alignment_rate_rad_per_degc: .* is not 0 or 3 numbers',
         ),
+        (lambda c: c['maps'].pop('stars'), "key 'maps.stars' is missing"),
+        (lambda c: c['maps']['stars'][0].pop(), 'maps.stars: .* is not a grid of rows alike'),
+        (lambda c: c['correlation']['matrix'].pop(), 'correlation.matrix is not of the size'),
     ],
 )
 def test_a_damaged_calibration_is_refused_by_file_and_key(tmp_path, change, says) -> None:
     path = tmp_path / 'c.json'
-    write_calibration(calibration_of(thermal=THERMAL), path)
+    record = calibration_of(thermal=THERMAL, maps=MAPS, correlation=CORRELATION)
+    write_calibration(record, path)
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))

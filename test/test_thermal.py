@@ -16,7 +16,13 @@ from starcal_ros.calibration import CalibrationOptions, Estimate, estimate_calib
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
-from starcal_ros.records import CameraGeometry, Ensemble, StarObservations, Thermal
+from starcal_ros.records import (
+    ALIGNMENT_NAMES,
+    CameraGeometry,
+    Ensemble,
+    StarObservations,
+    Thermal,
+)
 from starcal_ros.synthetic import scenario, true_observations
 
 SCENARIO = scenario('tiny', seed=3)
@@ -161,6 +167,14 @@ def test_without_noise_the_truth_comes_back(method: str, order: int) -> None:
         assert np.abs(rate_found - RATE_RAD).max() * dT * fx < 1e-6
     assert np.abs(estimate.residual_px).max() < 1e-7
     assert len(estimate.information) == len(estimate.information_names)
+    # Each name has its own row: the sigmas of the terms are those of the whole covariance.
+    sigma = dict(
+        zip(estimate.shared_names, np.sqrt(np.diag(estimate.shared_covariance)), strict=True)
+    )
+    degrees = range(1, order + 1)
+    assert terms.focal_sigma == tuple(sigma[f'focal_temperature_{k}'] for k in degrees)
+    rate_names = [f'{name}_temperature' for name in ALIGNMENT_NAMES if method != 'per_image']
+    assert terms.alignment_rate_sigma == tuple(sigma[name] for name in rate_names)
 
 
 @pytest.mark.parametrize('method', METHODS)
