@@ -72,11 +72,24 @@ def part_of(
     u, v = first
     pixels = image.pixels[v : v + size[1], u : u + size[0]]
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
-    measured = drawn(observations.measured_px)
-    inside = np.asarray(((measured > 0) & (measured < np.array(shape) - 1)).all(axis=1))
-    shown = dataclasses.replace(observations.select(inside), measured_px=measured[inside])
-    if not inside.all():
-        shown = dataclasses.replace(shown, refused_stars={})  # counted over the whole image
+
+    def inside(xy_px: Floats) -> NDArray[np.bool_]:
+        return np.asarray(((xy_px > 0) & (xy_px < np.array(shape) - 1)).all(axis=1))
+
+    measured, refused = drawn(observations.measured_px), drawn(observations.refused_px)
+    left_out = inside(refused)
+    reason = observations.refused_reason[left_out]
+    shown = dataclasses.replace(
+        observations.select(inside(measured)),
+        measured_px=measured[inside(measured)],
+        refused_catalog_id=observations.refused_catalog_id[left_out],
+        refused_px=refused[left_out].astype(np.float32),
+        refused_reason=reason,
+        refused_stars={
+            name: int(np.count_nonzero(reason == code))
+            for code, name in enumerate(observations.refused_stars)
+        },
+    )
     fx, skew, fy = scale * geometry.camera.intrinsics[:3]
     cx, cy = drawn(geometry.camera.intrinsics[3:])
     camera = geometry.camera.replace(fx=fx, skew=skew, fy=fy, cx=cx, cy=cy)

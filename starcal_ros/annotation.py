@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -12,39 +15,65 @@ from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
+Color = tuple[int, int, int]  # blue, green, red
 
-_PREDICTED = (255, 160, 0)  # blue, BGR
+_PREDICTED = (255, 160, 0)  # blue
 _MEASURED = (80, 220, 80)  # green
 _TEXT = (255, 255, 255)
-_REFUSED = (60, 60, 255)  # red
+_BANNER = (40, 40, 200)  # red
+_PANEL = (30, 30, 30)
 _SHIFT = 4  # OpenCV draws in sixteenths of a pixel
+
+
+@dataclass(frozen=True)
+class Mark:
+    """How the stars of one reason are drawn: an OpenCV marker type, its colour and its size."""
+
+    shape: int
+    color: Color
+    size: float = 12.0  # per mille of the longer side of the picture
+
+
+# Shape and colour both differ, for those who do not see one of them.  What the sky or the limits
+# explain is pale; what says something of camera or catalog stands out.
+STAR_MARKS: Mapping[str, Mark] = {
+    'not_detected': Mark(cv2.MARKER_TRIANGLE_DOWN, (190, 190, 190)),
+    'border': Mark(cv2.MARKER_SQUARE, (190, 190, 190)),
+    'blend': Mark(cv2.MARKER_SQUARE, (255, 80, 220)),
+    'saturated': Mark(cv2.MARKER_TRIANGLE_UP, (0, 230, 255)),
+    'too_few_pixels': Mark(cv2.MARKER_TRIANGLE_UP, (190, 190, 190)),
+    'elongated': Mark(cv2.MARKER_TILTED_CROSS, (0, 150, 255)),
+    'faint': Mark(cv2.MARKER_DIAMOND, (150, 150, 150), 6.0),  # the most by far
+    'ambiguous': Mark(cv2.MARKER_STAR, (80, 80, 255)),
+}
+"""Name of `STAR_REFUSALS` -> its mark."""
+
+_UNKNOWN = Mark(cv2.MARKER_STAR, _TEXT)  # a reason of another version
 
 
 def annotate(image: Image, observations: StarObservations, geometry: CameraGeometry) -> Picture:
     """
-    Picture (height, width, 3) BGR: predicted places as crosses, measured stars as circles.
+    Picture (height, width, 3) BGR of what became of the stars of an image.
 
-    The counts of stars and of what was left out, by reason, or the refusal of the image, stand
-    in the corner.  ``geometry`` is what the stars are predicted with.
+    Crosses stand at the predicted and circles at the measured places of the stars used; those left
+    out carry the mark of their reason, which the legend names with its count.  An image refused as
+    a whole says so in a banner.  ``geometry`` is what the stars are predicted with.
     """
-    picture = cv2.cvtColor(stretch(image.pixels), cv2.COLOR_GRAY2BGR)
+    picture = np.asarray(cv2.cvtColor(stretch(image.pixels), cv2.COLOR_GRAY2BGR), np.uint8)
     size = max(image.pixels.shape) / 1000.0
     width = max(1, round(size))
+    for reason, places in observations.refused_places().items():
+        for uv in places:
+            _draw_mark(picture, STAR_MARKS.get(reason, _UNKNOWN), _pixel(uv), size)
     for uv in predicted_px(observations, geometry):
-        cv2.drawMarker(picture, _pixel(uv), _PREDICTED, cv2.MARKER_CROSS, round(12 * size), width)
+        _draw_mark(picture, Mark(cv2.MARKER_CROSS, _PREDICTED), _pixel(uv), size)
     for uv, snr in zip(observations.measured_px, observations.snr, strict=True):
         radius = (5 + 2 * np.log10(max(float(snr), 1.0))) * size
         center, radius = _fixed_point(uv), int(radius * (1 << _SHIFT))
         cv2.circle(picture, center, radius, _MEASURED, width, cv2.LINE_AA, _SHIFT)
-    for k, (text, color) in enumerate(_legend(observations)):
-        place = (round(10 * size), round((k + 1) * 24 * size))
-        # Dark below light: readable over stars and sky alike.
-        for shade, stroke in (((0, 0, 0), 3 * width), (color, width)):
-            cv2.putText(
-                picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.7 * size, shade, stroke,
-                cv2.LINE_AA,
-            )  # fmt: skip
-    return np.asarray(picture, np.uint8)
+    top = _draw_banner(picture, observations, size)
+    _draw_legend(picture, observations, size, top)
+    return picture
 
 
 def predicted_px(observations: StarObservations, geometry: CameraGeometry) -> Floats:
@@ -69,19 +98,82 @@ def stretch(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]
     return np.asarray(table[pixels])
 
 
-def _legend(observations: StarObservations) -> list[tuple[str, tuple[int, int, int]]]:
-    if observations.refusal:
-        return [(f'{observations.refusal}: {observations.detail}', _REFUSED)]
-    lines = [(f'{len(observations)} stars', _TEXT)]
-    lines += [
-        (f'{count} {reason.replace("_", " ")}', _REFUSED)
+def _draw_mark(picture: Picture, mark: Mark, place: tuple[int, int], size: float) -> None:
+    width, length = max(1, round(size)), max(3, round(mark.size * size))
+    cv2.drawMarker(picture, place, mark.color, mark.shape, length, width)
+
+
+def _draw_banner(picture: Picture, observations: StarObservations, size: float) -> int:
+    """Draw the refusal of the image over its whole width; the first free row below."""
+    if not observations.refusal:
+        return 0
+    scale, line = 0.8 * size, round(32 * size)
+    words = f'REFUSED {observations.refusal}: {observations.detail}'.split()
+    rows = list(_wrapped(words, scale, picture.shape[1] - round(20 * size)))
+    bottom = line * len(rows) + round(10 * size)
+    cv2.rectangle(picture, (0, 0), (picture.shape[1], bottom), _BANNER, cv2.FILLED)
+    for k, row in enumerate(rows):
+        _write(picture, row, (round(10 * size), line * (k + 1)), scale, _TEXT)
+    return bottom
+
+
+def _wrapped(words: list[str], scale: float, room_px: int) -> Iterator[str]:
+    """Words in lines of a width."""
+    row = ''
+    for word in words:
+        longer = f'{row} {word}'.strip()
+        if row and _width_px(longer, scale) > room_px:
+            yield row
+            longer = word
+        row = longer
+    yield row
+
+
+def _draw_legend(
+    picture: Picture, observations: StarObservations, size: float, top_px: int
+) -> None:
+    """Draw each mark of the picture with its meaning and count, on a dark panel."""
+    lines = [
+        (STAR_MARKS.get(reason, _UNKNOWN), f'{count} {reason.replace("_", " ")}')
         for reason, count in sorted(observations.refused_stars.items())
         if count
     ]
-    return lines
+    if not observations.refusal:
+        used = f'{len(observations)} stars: predicted, measured'
+        lines.insert(0, (Mark(cv2.MARKER_CROSS, _PREDICTED), used))
+    if not lines:
+        return
+    scale, line = 0.6 * size, round(24 * size)
+    widest = max(_width_px(text, scale) for _, text in lines)
+    corner = (round(40 * size) + widest, top_px + line * len(lines) + round(10 * size))
+    panel = picture[top_px : corner[1], : corner[0]]
+    panel[:] = (0.35 * panel + 0.65 * np.array(_PANEL)).astype(np.uint8)
+    for k, (mark, text) in enumerate(lines):
+        base = top_px + line * (k + 1)
+        place = (round(16 * size), base - round(6 * size))
+        _draw_mark(picture, mark, place, size)
+        if mark.color == _PREDICTED:
+            width = max(1, round(size))
+            cv2.circle(picture, place, round(8 * size), _MEASURED, width, cv2.LINE_AA)
+        _write(picture, text, (round(32 * size), base), scale, _TEXT)
 
 
-def _pixel(uv: Floats) -> tuple[int, int]:
+def _width_px(text: str, scale: float) -> int:
+    thickness = max(1, round(2 * scale))
+    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
+    return width
+
+
+def _write(
+    picture: Picture, text: str, place: tuple[int, int], scale: float, color: Color
+) -> None:
+    thickness = max(1, round(2 * scale))
+    cv2.putText(
+        picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, color, thickness, cv2.LINE_AA
+    )  # fmt: skip
+
+
+def _pixel(uv: NDArray[np.floating]) -> tuple[int, int]:
     # Predictions far outside would overflow OpenCV's integers.
     u, v = np.clip(np.nan_to_num(uv, nan=-1e4), -1e4, 1e5)
     return round(float(u)), round(float(v))

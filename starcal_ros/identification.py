@@ -9,7 +9,6 @@ An image that no match explains is refused, never matched wrongly.
 
 from __future__ import annotations
 
-from collections import Counter
 import dataclasses
 from dataclasses import dataclass
 import math
@@ -377,12 +376,15 @@ def observe_stars(
     velocity_m_s: Floats | None = None,
 ) -> StarObservations:
     """
-    The measured and identified stars of one image.
+    The measured and identified stars of one image, with those that were left out, and why.
+
+    With too few measured well it is a refused image, ``too_few_stars``, that still says what
+    became of each star.
 
     Raises
     ------
     ImageRefused
-        ``no_stars``, ``no_match`` or ``too_few_stars``.
+        ``no_stars`` or ``no_match``.
     """
     camera = geometry.camera
     background = measure_background(image.pixels)
@@ -409,17 +411,18 @@ def observe_stars(
     centroids = _separate(predicted_px, magnitude, centroids, model, options)
     refusal = _refuse_displaced(predicted_px, centroids, camera.width)
     good = refusal == ''
-    if np.count_nonzero(good) < options.min_stars_per_image:
-        raise ImageRefused(
-            'too_few_stars',
-            f'{np.count_nonzero(good)} stars measured well, {options.min_stars_per_image} needed',
-        )
+    left_out = ~good
+    names, code, counts = np.unique(refusal[left_out], return_inverse=True, return_counts=True)
+    few = np.count_nonzero(good) < options.min_stars_per_image
+    detail = f'{np.count_nonzero(good)} stars measured well, {options.min_stars_per_image} needed'
+    if few:
+        good = np.zeros_like(good)
     return StarObservations(
         time_ns=image.time_ns,
         width=camera.width,
         height=camera.height,
-        refusal='',
-        detail='',
+        refusal='too_few_stars' if few else '',
+        detail=detail if few else '',
         icrf_from_star_tracker_xyzw=icrf_from_star_tracker_xyzw,
         attitude_gap_s=attitude_gap_s,
         catalog_id=catalog.id[index][good],
@@ -429,7 +432,10 @@ def observe_stars(
         covariance_px2=centroids.covariance_px2[good],
         flux_dn=centroids.flux_dn[good].astype(np.float32),
         snr=centroids.snr[good].astype(np.float32),
-        refused_stars=dict(sorted(Counter(refusal[~good].tolist()).items())),
+        refused_stars=dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        refused_catalog_id=catalog.id[index][left_out],
+        refused_px=predicted_px[left_out].astype(np.float32),
+        refused_reason=code.astype(np.uint8),
         background_dn=background.level_dn,
         noise_dn=background.noise_dn,
         psf_sigma_px=model.psf_sigma_px,

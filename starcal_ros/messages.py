@@ -295,6 +295,9 @@ def observations_to_message(record: StarObservations, frame_id: str, make: Make)
         snr=_flat(record.snr, np.float32),
         refused_star_reasons=list(record.refused_stars),
         refused_star_counts=_flat(list(record.refused_stars.values()), np.uint32),
+        refused_star_id=_flat(record.refused_catalog_id, np.int64),
+        refused_star_px=_flat(record.refused_px, np.float32),
+        refused_star_reason=_flat(record.refused_reason, np.uint8),
         background_dn=float(record.background_dn),
         noise_dn=float(record.noise_dn),
         psf_sigma_px=float(record.psf_sigma_px),
@@ -335,14 +338,40 @@ def observations_from_message(message: Message) -> StarObservations:
         catalog_digest=str(message.catalog_digest),
         # Recordings of before the field was there have none.
         temperature_degc=float(getattr(message, 'temperature_degc', math.nan)),
+        **_refused_stars(message),
     )
-    for name in ('direction_icrf', 'measured_px', 'covariance_px2', 'icrf_from_star_tracker_xyzw'):
+    for name in (
+        'direction_icrf',
+        'measured_px',
+        'covariance_px2',
+        'icrf_from_star_tracker_xyzw',
+        'refused_px',
+    ):
         if not np.isfinite(getattr(record, name)).all():
             raise ValueError(f'{name}: not finite')
     uu, uv, vv = record.covariance_px2.T
     if not ((uu > 0) & (uu * vv > uv * uv)).all():
         raise ValueError('covariance_px2: not positive definite')
     return record
+
+
+def _refused_stars(message: Message) -> dict[str, Any]:
+    """Fields of the record about single refused stars."""
+    # Recordings of before the fields were there have none.
+    catalog_id = np.array(getattr(message, 'refused_star_id', ()), np.int64)
+    m = len(catalog_id)
+    reason = _shaped('refused_star_reason', getattr(message, 'refused_star_reason', ()), (m,))
+    if (reason >= len(message.refused_star_reasons)).any():
+        raise ValueError(
+            f'refused_star_reason: {int(reason.max())} is none of '
+            f'{len(message.refused_star_reasons)} reasons'
+        )
+    places = _shaped('refused_star_px', getattr(message, 'refused_star_px', ()), (m, 2))
+    return {
+        'refused_catalog_id': catalog_id,
+        'refused_px': places.astype(np.float32),
+        'refused_reason': reason.astype(np.uint8),
+    }
 
 
 def status_to_message(status: EnsembleStatus, frame_id: str, make: Make) -> Message:

@@ -112,6 +112,12 @@ class StarObservations:
     flux_dn, snr : (n,) float32
     refused_stars : mapping
         Name of `STAR_REFUSALS` -> number of predicted stars left out for it.
+    refused_catalog_id : (m,) int64
+        Those stars; empty in recordings of before their places were kept.
+    refused_px : (m, 2) float32
+        (u, v) where each should stand by the match of the others; to be shown, not measured with.
+    refused_reason : (m,) uint8
+        Which key of ``refused_stars``, counted from 0 in its order.
     background_dn, noise_dn : float
         Median background and 1-sigma noise of one pixel.
     psf_sigma_px : float
@@ -142,10 +148,26 @@ class StarObservations:
     psf_sigma_px: float
     catalog_digest: str
     temperature_degc: float = math.nan
+    refused_catalog_id: NDArray[np.int64] = dataclasses.field(
+        default_factory=lambda: np.empty(0, np.int64)
+    )
+    refused_px: NDArray[np.float32] = dataclasses.field(
+        default_factory=lambda: np.empty((0, 2), np.float32)
+    )
+    refused_reason: NDArray[np.uint8] = dataclasses.field(
+        default_factory=lambda: np.empty(0, np.uint8)
+    )
 
     def __len__(self) -> int:
         """Return the number of stars."""
         return len(self.catalog_id)
+
+    def refused_places(self) -> dict[str, NDArray[np.float32]]:
+        """Places (k, 2) of the refused stars by the name of their reason, px."""
+        return {
+            name: self.refused_px[self.refused_reason == code]
+            for code, name in enumerate(self.refused_stars)
+        }
 
     def select(self, keep: NDArray[np.bool_]) -> StarObservations:
         """Return the same image with only the stars of an (n,) mask."""

@@ -8,9 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from starcal_ros.annotation import annotate, predicted_px, stretch
+from starcal_ros.annotation import annotate, predicted_px, STAR_MARKS, stretch
 from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.records import (
+    CameraGeometry,
+    Image,
+    refused_image,
+    STAR_REFUSALS,
+    StarObservations,
+)
 
 PIXELS = np.array([[30.0, 40.0], [150.25, 99.5]])
 GEOMETRY = CameraGeometry(
@@ -79,3 +85,36 @@ def test_predictions_far_outside_are_drawn_over() -> None:
         two_stars(), direction_icrf=np.array([[0, 0, -1.0], [1, 0, 1e-9]])
     )
     assert annotate(Image(0, np.zeros((120, 200), np.uint8)), behind, GEOMETRY).any()
+
+
+def test_every_reason_has_a_mark_of_its_own() -> None:
+    assert set(STAR_MARKS) == set(STAR_REFUSALS)
+    assert len({(mark.shape, mark.color) for mark in STAR_MARKS.values()}) == len(STAR_MARKS)
+
+
+def test_refused_stars_are_marked_by_reason() -> None:
+    """Each stands at its place in the colour of its reason, which the legend shows again."""
+    shown = dataclasses.replace(
+        refused_image(0, 1000, 600, '', ''),
+        refused_stars={'blend': 1, 'of another version': 1, 'saturated': 0},
+        refused_catalog_id=np.array([5, 6]),
+        refused_px=np.array([[700.0, 400.0], [800.0, 500.0]], np.float32),
+        refused_reason=np.array([0, 1], np.uint8),
+    )
+    picture = annotate(Image(0, np.zeros((600, 1000), np.uint8)), shown, GEOMETRY)
+    v, u = np.nonzero((picture == STAR_MARKS['blend'].color).all(axis=2))
+    at_star = (np.abs(u - 700) < 10) & (np.abs(v - 400) < 10)
+    in_legend = (u < 30) & (v < 100)
+    assert at_star.any() and in_legend.any() and (at_star | in_legend).all()
+    assert (picture[490:510, 790:810] == 255).all(axis=2).any()
+    assert not (picture == STAR_MARKS['saturated'].color).all(axis=2).any()
+
+
+def test_a_long_refusal_is_wrapped() -> None:
+    image = Image(0, np.zeros((120, 200), np.uint8))
+    short, long = (
+        annotate(image, refused_image(0, 200, 120, 'no_match', text), GEOMETRY)
+        for text in ('three', 'of a detail that needs lines and lines ' * 3)
+    )
+    red = [(picture[:, -1] == (40, 40, 200)).all(axis=1).sum() for picture in (short, long)]
+    assert red[1] > red[0] > 0

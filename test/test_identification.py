@@ -203,10 +203,26 @@ def test_a_mirrored_image_matches_nothing() -> None:
 
 def test_too_few_stars_are_refused() -> None:
     one, image = shown(0)
+    used = observed(image, one.icrf_from_star_tracker_xyzw)
     greedy = dataclasses.replace(OPTIONS, min_stars_per_image=1000)
-    with pytest.raises(ImageRefused, match='stars measured well, 1000 needed') as refusal:
-        observed(image, one.icrf_from_star_tracker_xyzw, options=greedy)
-    assert refusal.value.reason == 'too_few_stars'
+    refused = observed(image, one.icrf_from_star_tracker_xyzw, options=greedy)
+    assert (refused.refusal, len(refused)) == ('too_few_stars', 0)
+    assert f'{len(used)} stars measured well, 1000 needed' in refused.detail
+    # What became of the others is told all the same.
+    assert refused.refused_stars == used.refused_stars
+    np.testing.assert_array_equal(refused.refused_px, used.refused_px)
+
+
+def test_refused_stars_are_told_with_their_places() -> None:
+    one, image = shown(0)
+    found = observed(image, one.icrf_from_star_tracker_xyzw)
+    assert not set(found.refused_catalog_id) & set(found.catalog_id)
+    counted = {reason: len(places) for reason, places in found.refused_places().items()}
+    assert counted == found.refused_stars and {'blend', 'faint'} <= set(counted)
+    where = {star: k for k, star in enumerate(one.catalog_id)}
+    true_px = one.pixel_px[[where[star] for star in found.refused_catalog_id]]
+    # The match refines the predictions to a fraction of the pixel in which a star is looked for.
+    assert np.abs(found.refused_px - true_px).max() < 0.5
 
 
 def test_the_geometry_is_tracked_from_image_to_image() -> None:

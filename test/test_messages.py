@@ -191,6 +191,9 @@ def observations(n: int = 5) -> StarObservations:
         psf_sigma_px=0.95,
         catalog_digest='abc',
         temperature_degc=-12.3,
+        refused_catalog_id=np.array([2**62 + 20, -5, 7, 8], np.int64),
+        refused_px=random.uniform(0, 1000, (4, 2)).astype(np.float32),
+        refused_reason=np.array([0, 1, 0, 0], np.uint8),
     )
 
 
@@ -300,6 +303,9 @@ def test_records_round_trip(make: Any) -> None:
         ('measured_px', np.full(10, np.nan), 'measured_px: not finite'),
         ('covariance_px2', np.zeros(15), 'not positive definite'),
         ('refused_star_counts', np.zeros(1, np.uint32), '2 reasons but 1 counts'),
+        ('refused_star_px', np.zeros(7), 'refused_star_px: 7 numbers, not 4 x 2'),
+        ('refused_star_px', np.full(8, np.inf), 'refused_px: not finite'),
+        ('refused_star_reason', np.full(4, 2), 'refused_star_reason: 2 is none of 2 reasons'),
     ],
 )
 def test_bad_observations_are_refused(field: str, value: Any, text: str) -> None:
@@ -310,10 +316,23 @@ def test_bad_observations_are_refused(field: str, value: Any, text: str) -> None
         messages.observations_from_message(message)
 
 
-def test_recordings_of_before_temperature_are_read() -> None:
+def test_refused_stars_are_found_by_reason() -> None:
+    record = observations()
+    places = record.refused_places()
+    assert list(places) == ['blend', 'saturated']
+    np.testing.assert_array_equal(places['blend'], record.refused_px[[0, 2, 3]])
+    np.testing.assert_array_equal(places['saturated'], record.refused_px[[1]])
+
+
+def test_older_recordings_are_read() -> None:
+    """Fields that were added since are as if nothing was known."""
     message = messages.observations_to_message(observations(), 'cam', plain)
     del message.temperature_degc
-    assert np.isnan(messages.observations_from_message(message).temperature_degc)
+    del message.refused_star_id, message.refused_star_px, message.refused_star_reason
+    record = messages.observations_from_message(message)
+    assert np.isnan(record.temperature_degc)
+    assert record.refused_stars == {'blend': 3, 'saturated': 1}
+    assert record.refused_px.shape == (0, 2)
     message = messages.calibration_to_message(calibration(), plain)
     del message.reference_temperature_degc, message.coverage_rows, message.correlation_names
     found = messages.calibration_from_message(message)
