@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 import functools
+import io
 import logging
 import os
 from pathlib import Path
@@ -260,9 +261,22 @@ class BagWriter:
             self._stream = self.file.open('wb')
         except OSError as error:
             raise BagError(f'{self.file}: cannot be written: {error.strerror}') from error
-        self._writer = Writer(self._stream, _CHUNK_BYTES, self._compression)
-        self._writer.start('ros2', library='starcal')
+        self._start(self._stream)
         return self
+
+    def _start(self, stream: IO[bytes]) -> None:
+        self._writer = Writer(stream, _CHUNK_BYTES, self._compression)
+        self._writer.start('ros2', library='starcal')
+
+    @classmethod
+    def one_observation(cls, topic: str, record: StarObservations, frame_id: str) -> bytes:
+        """The bytes of a whole bag that holds a single starcal/StarObservations."""
+        stream = io.BytesIO()
+        writer = cls('one.mcap')
+        writer._start(stream)
+        writer.write_observations(topic, record, frame_id)
+        writer._writer.finish()
+        return stream.getvalue()
 
     def __exit__(
         self,
@@ -339,12 +353,11 @@ class BagWriter:
         self._last_ns = max(self._last_ns, time_ns)
 
     def _open(self, topic: str, type_name: str, latched: bool) -> _Channel:
-        store = _typestore()
-        definition, _ = store.generate_msgdef(type_name, ros_version=2)
+        definition, type_hash = _described(type_name)
         schema_id = self._writer.register_schema(type_name, 'ros2msg', definition.encode())
         metadata = {
             'offered_qos_profiles': yaml.safe_dump([_qos_profile(latched)], sort_keys=False),
-            'topic_type_hash': store.hash_rihs01(type_name),
+            'topic_type_hash': type_hash,
         }
         number = self._writer.register_channel(topic, 'cdr', schema_id, metadata)
         self._channels[topic] = _Channel(number, type_name, latched)
@@ -406,6 +419,13 @@ def _typestore() -> Typestore:
         text = (folder / f'{type_name.rpartition("/")[2]}.msg').read_text()
         store.register(get_types_from_msg(text, type_name))
     return store
+
+
+@functools.lru_cache(maxsize=64)
+def _described(type_name: str) -> tuple[str, str]:
+    """Definition of a type, with those that it is made of, and its hash."""
+    definition, _ = _typestore().generate_msgdef(type_name, ros_version=2)
+    return definition, _typestore().hash_rihs01(type_name)
 
 
 def _definitions_folder() -> Path:

@@ -23,6 +23,10 @@ class ProductError(StarcalError):
     """A calibration file or camera YAML cannot be read back."""
 
 
+class ArchiveError(StarcalError):
+    """The state folder cannot be used, or not be written just now; the text says why."""
+
+
 class ImageRefused(StarcalError):
     """
     One image cannot be used; the run goes on without it.

@@ -71,9 +71,12 @@ def offset_ns(seconds: float) -> int:
 
 def make_header(time_ns: int, frame_id: str, make: Make) -> Message:
     """Return a std_msgs/Header of a time in nanoseconds."""
+    return make('std_msgs/msg/Header', stamp=_make_time(time_ns, make), frame_id=frame_id)
+
+
+def _make_time(time_ns: int, make: Make) -> Message:
     sec, nanosec = divmod(time_ns, NANOSECONDS_PER_SECOND)
-    stamp = make('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
-    return make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)
+    return make('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
 
 
 def decode_image(
@@ -381,6 +384,7 @@ def status_to_message(status: EnsembleStatus, frame_id: str, make: Make) -> Mess
         STATUS_TYPE,
         header=make_header(status.time_ns, frame_id, make),
         images=status.images,
+        images_saved=status.images_saved,
         stars=status.stars,
         min_images=status.min_images,
         min_stars=status.min_stars,
@@ -408,6 +412,7 @@ def status_from_message(message: Message) -> EnsembleStatus:
     return EnsembleStatus(
         time_ns=stamp_ns(message.header.stamp),
         images=int(message.images),
+        images_saved=int(message.images_saved),
         stars=int(message.stars),
         min_images=int(message.min_images),
         min_stars=int(message.min_stars),
@@ -427,6 +432,10 @@ def calibration_to_message(calibration: Calibration, make: Make) -> Message:
         header=make_header(calibration.time_ns, calibration.child_frame, make),
         accepted=calibration.accepted,
         reasons=list(calibration.reasons),
+        forced=calibration.forced,
+        number=calibration.number,
+        in_force_since=_make_time(calibration.in_force_since_ns, make),
+        first_image=_make_time(calibration.first_image_ns, make),
         width=camera.width,
         height=camera.height,
         fx=fx,
@@ -518,6 +527,10 @@ def calibration_from_message(message: Message) -> Calibration:
         thermal=_thermal_from_message(message),
         maps=_maps_from_message(message),
         correlation=_correlation_from_message(message),
+        first_image_ns=stamp_ns(message.first_image),
+        number=int(message.number),
+        in_force_since_ns=stamp_ns(message.in_force_since),
+        forced=bool(message.forced),
     )
 
 

@@ -8,6 +8,7 @@ that was written and read is equal to the last bit.  Files are replaced whole or
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+import contextlib
 import json
 import math
 import os
@@ -35,10 +36,20 @@ Floats = NDArray[np.float64]
 T = TypeVar('T')
 
 SCHEMA = 1
+# Keys that came after the first files were written, and what their absence means.
+_LATER_KEYS: Mapping[str, object] = {
+    'temperature': None,
+    'maps': None,
+    'correlation': None,
+    'first_image_ns': 0,
+    'number': 0,
+    'in_force_since_ns': 0,
+    'forced': False,
+}
 CALIBRATION_FILE = 'calibration.json'
 CAMERA_INFO_FILE = 'camera_info.yaml'
 
-_LATER_KEYS = {'temperature': None, 'maps': None, 'correlation': None}
+PART = '.part'  # ends the name of a file that is not whole yet
 
 # plumb_bob's order of coefficients, by our names; ROS puts k3 last.
 _PLUMB_BOB = ('k1', 'k2', 'p1', 'p2', 'k3')
@@ -56,7 +67,7 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
     ProductError
         When the file cannot be written.
     """
-    text = json.dumps(_calibration_content(calibration), indent=1, allow_nan=False)
+    text = json.dumps(calibration_content(calibration), indent=1, allow_nan=False)
     # A row of a grid on a line; within a text there is no line break to be taken for one of these.
     text = re.sub(r'\[\n([^][{}"]+)\n *\]', lambda row: f'[{" ".join(row[1].split())}]', text)
     write_atomically(path, text + '\n')
@@ -77,11 +88,22 @@ def read_calibration(path: Path) -> Calibration:
         raise ProductError(f'{path}: not JSON: {error}') from error
     if not isinstance(content, dict):
         raise ProductError(f'{path}: not a calibration (no JSON object)')
+    return calibration_from_content(path, content)
+
+
+def calibration_from_content(path: Path, content: Mapping[str, object]) -> Calibration:
+    """
+    The calibration in the JSON object of a ``calibration.json``; further keys are passed over.
+
+    Raises
+    ------
+    ProductError
+        Naming the file ``path`` and the key that is missing or wrong.
+    """
     if content.get('schema') != SCHEMA:
         raise ProductError(f'{path}: schema {content.get("schema")!r} is not {SCHEMA}')
     try:
-        # A calibration of before they were there has no such keys.
-        return _calibration_from_content(_Reader(path, {**_LATER_KEYS, **content}))
+        return _calibration_from(_Reader(path, {**_LATER_KEYS, **content}))
     except ValueError as error:  # CameraModel's own checks
         raise ProductError(f'{path}: {error}') from error
 
@@ -200,28 +222,39 @@ def _as_written_or_decoded(path: Path) -> Path:
     return path if path.exists() else Path(unquote(str(path)))
 
 
-def write_atomically(path: Path, text: str) -> None:
+def write_atomically(path: Path, content: str | bytes) -> None:
     """
-    Replace a text file whole: readers see the old one or the new one, never a part.
+    Replace a file whole: readers, and a power loss, see the old one or the new one.
 
     Raises
     ------
     ProductError
         When the file cannot be written; the old one then stands as it was.
     """
-    part = path.with_name(f'.{path.name}.{os.getpid()}.part')
+    part = path.with_name(f'.{path.name}.{os.getpid()}{PART}')
     try:
-        with part.open('w', encoding='utf-8') as file:
-            file.write(text)
+        with part.open('wb') as file:
+            file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())
         part.replace(path)
+        sync_folder(path.parent)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
         raise ProductError(f'{path}: cannot be written: {error.strerror}') from error
 
 
-def _calibration_content(calibration: Calibration) -> dict[str, object]:
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder, new and gone, outlast a power loss; raises OSError."""
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
+
+
+def calibration_content(calibration: Calibration) -> dict[str, object]:
     """The JSON object of a calibration: the interface document's keys, then this package's."""
     geometry, camera = calibration.geometry, calibration.geometry.camera
     covariance = _json_rows(calibration.covariance)
@@ -267,6 +300,10 @@ def _calibration_content(calibration: Calibration) -> dict[str, object]:
         'temperature': _thermal_content(calibration.thermal),
         'maps': _maps_content(calibration.maps),
         'correlation': _correlation_content(calibration.correlation),
+        'first_image_ns': int(calibration.first_image_ns),
+        'number': int(calibration.number),
+        'in_force_since_ns': int(calibration.in_force_since_ns),
+        'forced': bool(calibration.forced),
     }
 
 
@@ -303,7 +340,7 @@ def _thermal_content(thermal: Thermal | None) -> dict[str, object] | None:
     }
 
 
-def _calibration_from_content(reader: _Reader) -> Calibration:
+def _calibration_from(reader: _Reader) -> Calibration:
     """The record of a JSON object; `alignment_covariance_rad2` repeats a block and is not read."""
     names = reader.get('parameter_names', _texts)
     if names != CALIBRATION_PARAMETER_NAMES:
@@ -352,6 +389,10 @@ def _calibration_from_content(reader: _Reader) -> Calibration:
         thermal=None if reader.get('temperature', _is_null) else _thermal_from(reader),
         maps=None if reader.get('maps', _is_null) else _maps_from(reader),
         correlation=None if reader.get('correlation', _is_null) else _correlation_from(reader),
+        first_image_ns=reader.get('first_image_ns', _whole),
+        number=reader.get('number', _whole),
+        in_force_since_ns=reader.get('in_force_since_ns', _whole),
+        forced=reader.get('forced', _true_or_false),
     )
 
 

@@ -29,6 +29,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'no_attitude': 'no attitude sample on both sides of the image',
     'attitude_gap': 'the attitude samples about the image are too far apart',
     'out_of_order': 'the image is stamped before, or at, one already taken',
+    'duplicate': 'the ensemble holds an image of the same stamp (said by the calibrator)',
     'no_stars': 'too few star-like sources in the image',
     'no_match': 'no rotation of the predicted stars explains the sources in the image',
     'too_few_stars': 'fewer stars were measured well than an image needs',
@@ -242,7 +243,8 @@ class EnsembleStatus:
     What has been collected and what a calibration from it would be worth.
 
     ``coverage`` is (rows, cols) star observations per focal-plane cell;
-    ``predicted_sigma`` is 1-sigma per ``parameter_names``, inf where not observable.
+    ``predicted_sigma`` is 1-sigma per ``parameter_names``, inf where not observable;
+    ``images_saved`` of the images are on disk and outlast a crash or a power loss.
     """
 
     time_ns: int
@@ -254,6 +256,7 @@ class EnsembleStatus:
     coverage: NDArray[np.int64]
     parameter_names: tuple[str, ...]
     predicted_sigma: Floats
+    images_saved: int = 0
 
 
 @dataclass(frozen=True)
@@ -364,6 +367,14 @@ class Calibration:
     maps : DetectorMaps or None
     correlation : Correlation or None
         None where whoever has made the calibration does not tell.
+    first_image_ns : int
+        Stamp of the first image used.
+    number : int
+        Counts the calibrations that came into force on one calibrator; 0 for a candidate.
+    in_force_since_ns : int
+        When it came into force, or came back by a roll-back; 0 for a candidate.
+    forced : bool
+        It came into force by request, against the gate.
     """
 
     time_ns: int
@@ -396,6 +407,10 @@ class Calibration:
     thermal: Thermal | None = None
     maps: DetectorMaps | None = None
     correlation: Correlation | None = None
+    first_image_ns: int = 0
+    number: int = 0
+    in_force_since_ns: int = 0
+    forced: bool = False
 
     @property
     def sigma(self) -> Floats:

@@ -1,0 +1,331 @@
+"""The state folder: what was kept comes back, through kills, damage and a full disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import dataclasses
+import functools
+import itertools
+import json
+import multiprocessing
+from multiprocessing.connection import Connection
+from pathlib import Path
+import resource
+import shutil
+import time
+
+import numpy as np
+import pytest
+
+from starcal_ros import bag
+from starcal_ros.archive import Archive, InForce, TOPIC
+from starcal_ros.camera import CameraModel
+from starcal_ros.errors import ArchiveError
+from starcal_ros.records import (
+    Calibration,
+    CameraGeometry,
+    Ensemble,
+    StarObservations,
+)
+from starcal_ros.synthetic import scenario, true_observations
+
+CAMERA = CameraModel(640, 512, np.array([1800, 0.2, 1801, 320, 255, -0.045, 0.08, 0, 4e-4, -3e-4]))
+CALIBRATION = Calibration(
+    time_ns=1_786_160_159_999_999_999,
+    geometry=CameraGeometry(CAMERA, np.array([0.1, -0.2, 0.3, 0.9273618495495703])),
+    covariance=np.eye(13) / 3,
+    method='hierarchical',
+    estimated=('fx', 'fy', 'k1'),
+    residual_rms_px=0.1 + 0.2,
+    variance_factor=1 / 3,
+    images_used=15,
+    images_refused={'no_stars': 1},
+    stars_used=1234,
+    stars_rejected=5,
+    alignment_scatter_arcsec=19.7,
+    star_tracker_sigma_arcsec=(9.5, 10.25, 41.0),
+    centroid_scale=1.0625,
+    centroid_floor_px=0.0125,
+    dropped_catalog_ids=(),
+    misfit_images_ns=(),
+    singular_values=(1.5, 0.02),
+    weakest_direction='k2',
+    zero_skew_cost_px=0.21,
+    iterations=7,
+    termination='converged',
+    accepted=True,
+    reasons=(),
+    parent_frame='star_tracker',
+    child_frame='camera',
+    provenance={'software': 'starcal', 'note': 'µ'},
+)
+
+
+@functools.cache
+def images() -> tuple[StarObservations, ...]:
+    return true_observations(scenario('tiny', seed=7)).images
+
+
+def in_force(event: int, before: int = 0, number: int = 0) -> InForce:
+    """A record whose calibration tells its number by its residual."""
+    number = number or event
+    changed = dataclasses.replace(CALIBRATION, number=number, residual_rms_px=number / 7)
+    return InForce(event, before, changed)
+
+
+@contextlib.contextmanager
+def opened(folder: Path) -> Iterator[Archive]:
+    archive = Archive(folder, 'camera')
+    try:
+        yield archive
+    finally:
+        archive.close()
+
+
+def numbers(history: tuple[InForce, ...]) -> list[tuple[int, int]]:
+    """Event and calibration of each record."""
+    return [(record.event, record.calibration.number) for record in history]
+
+
+def assert_same_image(a: StarObservations, b: StarObservations) -> None:
+    for field in dataclasses.fields(StarObservations):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray):
+            assert x.tobytes() == y.tobytes(), field.name
+        else:
+            assert x == y or (x != x and y != y), field.name
+
+
+def test_what_is_kept_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    """In order of arrival, which is not that of the stamps."""
+    kept = Ensemble((images()[2], images()[0], images()[1]), {'no_stars': 3})
+    history = (in_force(1), in_force(2, before=1))
+    with opened(tmp_path / 'new' / 'state') as archive:
+        assert archive.read_ensemble() == Ensemble() and archive.read_history() == ()
+        archive.keep(Ensemble(kept.images[:2]), history[:1])
+        archive.keep(kept, history)
+        assert archive.saved(kept) == 3
+    with opened(tmp_path / 'new' / 'state') as archive:
+        ensemble, again = archive.read_ensemble(), archive.read_history()
+        assert archive.damage == [] and archive.last_event == 2
+    assert dict(ensemble.refused) == {'no_stars': 3}
+    for a, b in zip(kept.images, ensemble.images, strict=True):
+        assert_same_image(a, b)
+    for one, other in zip(history, again, strict=True):
+        assert (one.event, one.before) == (other.event, other.before)
+        assert one.calibration.covariance.tobytes() == other.calibration.covariance.tobytes()
+        assert one.calibration.provenance == other.calibration.provenance
+        assert one.calibration.residual_rms_px == other.calibration.residual_rms_px
+
+
+def test_the_ensemble_is_a_bag(tmp_path: Path) -> None:
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(images()[:12]), ())
+    found = list(bag.read_observations([tmp_path / 'ensemble'], TOPIC))
+    assert [one.time_ns for one in found] == [one.time_ns for one in images()[:12]]
+
+
+def test_what_goes_from_the_ensemble_goes_from_the_disk(tmp_path: Path) -> None:
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(images()[:4], {'no_stars': 1}), ())
+        archive.keep(Ensemble((*images()[:2], *images()[3:5])), ())
+    with opened(tmp_path) as archive:
+        stamps = [image.time_ns for image in archive.read_ensemble().images]
+        assert stamps == [images()[k].time_ns for k in (0, 1, 3, 4)]
+        archive.keep(Ensemble(), ())
+    with opened(tmp_path) as archive:
+        assert archive.read_ensemble() == Ensemble()
+        archive.keep(Ensemble(images()[:1]), ())
+        assert archive.saved(Ensemble(images()[:2])) == 1
+
+
+def test_an_image_that_comes_again_after_a_reset_is_kept(tmp_path: Path) -> None:
+    with opened(tmp_path) as archive:
+        for _ in range(2):
+            archive.keep(Ensemble(images()[:2]), ())
+            archive.keep(Ensemble(), ())
+        archive.keep(Ensemble(images()[:2]), ())
+    with opened(tmp_path) as archive:
+        assert len(archive.read_ensemble().images) == 2
+
+
+def test_history_is_bounded_by_what_is_handed_over(tmp_path: Path) -> None:
+    history = tuple(in_force(event) for event in range(1, 6))
+    with opened(tmp_path) as archive:
+        for k in range(1, 6):
+            archive.keep(Ensemble(), history[max(0, k - 3) : k])
+    with opened(tmp_path) as archive:
+        assert numbers(archive.read_history()) == [(3, 3), (4, 4), (5, 5)]
+
+
+def collect(folder: Path, shown: tuple[StarObservations, ...], told: Connection) -> None:
+    """In a process of its own: keep images and calibrations; tell when each call is done."""
+    with opened(folder) as archive:
+        have, history = archive.read_ensemble(), archive.read_history()
+        assert not archive.damage, archive.damage
+        for k in itertools.count(len(have.images)):
+            image = dataclasses.replace(shown[k % len(shown)], time_ns=k)
+            have = Ensemble((*have.images, image), {'no_stars': k})
+            history = (*history, in_force(archive.last_event + 1))[-3:]
+            archive.keep(have, history)
+            told.send((k, history[-1].event))
+
+
+def test_killed_at_any_instant(tmp_path: Path) -> None:
+    """What was told of as kept is there after each of ten kills, and nothing is damaged."""
+    processes = multiprocessing.get_context('forkserver')
+    processes.set_forkserver_preload(['starcal_ros.archive', 'starcal_ros.synthetic'])
+    random = np.random.default_rng(5)
+    for _ in range(10):
+        reader, writer = processes.Pipe(duplex=False)
+        child = processes.Process(target=collect, args=(tmp_path, images()[:3], writer))
+        child.start()
+        writer.close()
+        said = [reader.recv()]
+        time.sleep(random.uniform(0.0, 0.04))  # the instant is what is drawn at random
+        child.kill()
+        child.join()
+        with contextlib.suppress(EOFError):
+            while True:
+                said.append(reader.recv())
+        reader.close()
+        last_image, last_event = said[-1]
+        with opened(tmp_path) as archive:
+            ensemble, history = archive.read_ensemble(), archive.read_history()
+            assert archive.damage == []
+        stamps = [image.time_ns for image in ensemble.images]
+        assert stamps == list(range(len(stamps))) and len(stamps) in (
+            last_image + 1,
+            last_image + 2,  # kept, but killed before it was told
+        )
+        assert history[-1].event in (last_event, last_event + 1)
+        assert not list(tmp_path.glob('*/.*'))
+
+
+@pytest.mark.parametrize('kind', ['flip', 'cut'])
+@pytest.mark.parametrize('pattern', ['ensemble/*.mcap', 'calibrations/*2.json'])
+def test_a_damaged_file_is_never_believed(tmp_path: Path, pattern: str, kind: str) -> None:
+    """It is read as it was written (a flip where nothing is said), or set aside and named."""
+    sound = tmp_path / 'sound'
+    with opened(sound) as archive:
+        archive.keep(Ensemble(images()[:1]), (in_force(1), in_force(2, before=1)))
+    random = np.random.default_rng(3)
+    set_aside = 0
+    for k in range(60):
+        folder = tmp_path / f'{k}'
+        shutil.copytree(sound, folder)
+        (victim,) = folder.glob(pattern)
+        data = bytearray(victim.read_bytes())
+        place = int(random.integers(len(data)))
+        if kind == 'flip':
+            data[place] ^= 1 << int(random.integers(8))
+        else:
+            del data[place:]
+        victim.write_bytes(data)
+        with opened(folder) as archive:
+            ensemble, history = archive.read_ensemble(), archive.read_history()
+            damage = archive.damage
+        aside = list(folder.glob('*/*.damaged'))
+        assert len(damage) == len(aside) <= 1
+        set_aside += len(aside)
+        if aside:
+            assert aside[0].name == f'{victim.name}.damaged' and str(aside[0]) in damage[0]
+        if aside and pattern.startswith('ensemble'):
+            assert ensemble.images == ()
+        else:
+            assert_same_image(ensemble.images[0], images()[0])
+        expected = [(1, 1)] if aside and pattern.startswith('calib') else [(1, 1), (2, 2)]
+        assert numbers(history) == expected
+        assert history[-1].calibration.residual_rms_px == expected[-1][1] / 7
+    # Flips in the white space of JSON, or in the index of a bag, change nothing that is read.
+    assert set_aside >= (30 if kind == 'flip' else 55)
+
+
+def test_a_damaged_rollback_still_goes_back(tmp_path: Path) -> None:
+    """Its name says to which calibration, and that one has a file of its own."""
+    with opened(tmp_path) as archive:
+        history: tuple[InForce, ...] = (
+            in_force(1),
+            in_force(2, before=1),
+            in_force(3, number=1),
+        )
+        archive.keep(Ensemble(), history)
+    next(tmp_path.glob('calibrations/00000003_*')).write_bytes(b'{"half')
+    with opened(tmp_path) as archive:
+        history = archive.read_history()
+        assert numbers(history) == [(1, 1), (2, 2), (3, 1)]
+        archive.keep(Ensemble(), history)
+    with opened(tmp_path) as archive:
+        assert numbers(archive.read_history()) == [(1, 1), (2, 2), (3, 1)]
+        assert archive.damage == []
+
+
+def test_an_event_is_never_given_twice(tmp_path: Path) -> None:
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(), (in_force(1), in_force(2, before=1)))
+    next(tmp_path.glob('calibrations/00000002_*')).write_bytes(b'')
+    with opened(tmp_path) as archive:
+        assert numbers(archive.read_history()) == [(1, 1)]
+        assert archive.last_event == 2
+
+
+@pytest.mark.parametrize('key', ['schema', 'archive'])
+def test_another_version_is_left_where_it_is(tmp_path: Path, key: str) -> None:
+    from starcal_ros.archive import _sealed
+
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(), (in_force(1), in_force(2, before=1)))
+    path = next(tmp_path.glob('calibrations/00000002_*'))
+    content = json.loads(path.read_text())
+    del content['sha256']
+    content[key] = 99 if key == 'schema' else {'schema': 99}
+    path.write_text(_sealed(content))
+    with opened(tmp_path) as archive:
+        assert numbers(archive.read_history()) == [(1, 1)]
+        assert archive.damage == [f'{path}: of another version, passed over']
+    assert path.exists()
+
+
+def test_one_owner(tmp_path: Path) -> None:
+    with (
+        opened(tmp_path),
+        pytest.raises(ArchiveError, match=f'{tmp_path} is in use by another calibrator'),
+    ):
+        Archive(tmp_path, 'camera')
+    Archive(tmp_path, 'camera').close()
+
+
+def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / 'file').write_text('')
+    for path in (tmp_path / 'file', tmp_path / 'file' / 'below'):
+        with pytest.raises(ArchiveError, match=f'state_dir: {path}'):
+            Archive(path, 'camera')
+
+
+@contextlib.contextmanager
+def full_disk() -> Iterator[None]:
+    """No file of this process can grow past a hundred bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_is_told_and_tried_again(tmp_path: Path) -> None:
+    whole = Ensemble(images()[:3], {'no_stars': 1})
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(images()[:2]), (in_force(1),))
+        with full_disk():
+            for history in ((in_force(1),), (in_force(1), in_force(2))):
+                with pytest.raises(ArchiveError, match=r'^state_dir: .*cannot be written'):
+                    archive.keep(whole, history)
+            assert archive.saved(whole) == 2
+        assert not list(tmp_path.glob('*/.*'))
+        archive.keep(whole, (in_force(1), in_force(2)))
+        assert archive.saved(whole) == 3
+    with opened(tmp_path) as archive:
+        assert len(archive.read_ensemble().images) == 3
+        assert numbers(archive.read_history()) == [(1, 1), (2, 2)]
