@@ -45,7 +45,16 @@ class ObserverOptions:
 
 @dataclass(frozen=True)
 class CalibratorOptions:
-    """What the calibrator does with a new calibration beside publishing it."""
+    """What the calibrator keeps, and what it does with a new calibration beside publishing it."""
+
+    state_dir: str = option(
+        '',
+        'folder that keeps the ensemble and the calibrations from a crash to the next start;'
+        ' empty: they are held in memory alone',
+    )
+    calibration_history: int = option(
+        20, 'most calibrations kept for roll-back, the one in force included', low=2, high=10000
+    )
 
     set_camera_info_service: str = option(
         '', 'sensor_msgs/SetCameraInfo service to hand each new calibration to; empty: none'

@@ -317,8 +317,25 @@ def observe_bag(
 
 
 def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:
-    """Return the ensemble with one more image; at ``max_images`` the least informative goes."""
-    return keep_most_informative(ensemble.add(observations), setup.prior, setup.calibration)
+    """
+    Return the ensemble with one more image; at ``max_images`` the least informative goes.
+
+    An image of another size than the prior camera's, or of a stamp that the ensemble holds, is
+    counted as refused: its stars would count twice, or be of another camera.
+    """
+    refusal, camera = observations.refusal, setup.prior.camera
+    if not refusal and (observations.width, observations.height) != (camera.width, camera.height):
+        refusal = 'wrong_size'
+    if not refusal and any(image.time_ns == observations.time_ns for image in ensemble.images):
+        refusal = 'duplicate'
+    if refusal != observations.refusal:
+        observations = dataclasses.replace(observations, refusal=refusal)
+    return within_limit(ensemble.add(observations), setup)
+
+
+def within_limit(ensemble: Ensemble, setup: Setup) -> Ensemble:
+    """Return the ensemble without its least informative images, down to ``max_images``."""
+    return keep_most_informative(ensemble, setup.prior, setup.calibration)
 
 
 def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
@@ -428,6 +445,7 @@ def _calibration(
         thermal=result.thermal,
         maps=detector_maps(camera, result.covariance, result.table.measured_px[kept]),
         correlation=correlation(result.shared_covariance, result.shared_names),
+        first_image_ns=min(image.time_ns for image in ensemble.images),
     )
 
 

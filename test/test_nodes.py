@@ -153,10 +153,17 @@ def test_gate_refusal_and_force(
     diagnostics = client.collect(DiagnosticArray, '/diagnostics')
     client.until(lambda: any('refused by the gate' in m.status[0].message for m in diagnostics))
     assert not found
+    candidate = client.latched(Calibration, 'candidate_calibration')
+    client.until(lambda: candidate)
+    assert candidate[0].reasons and candidate[0].number == 0
     forced = client.call(Calibrate, '/calibrator/solve', force=True)
     assert forced.success and not forced.calibration.accepted
     client.until(lambda: found)
     assert found[0].reasons[-1] == 'put in force by request all the same'
+    assert found[0].forced and found[0].number == 1
+    client.until(
+        lambda: any('in force against the gate' in m.status[0].message for m in diagnostics)
+    )
     assert calibrator.process.poll() is None
 
 
@@ -329,6 +336,40 @@ def test_calibrator_collects_while_it_solves(
     assert all(future.result().success for future in futures)
     client.until(lambda: 'no_stars' in status[-1].refused_reasons)
     client.until(lambda: sum(status[-1].refused_counts) == 300)
+
+
+def test_state_outlasts_a_kill(
+    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
+) -> None:
+    """After kill -9: the ensemble, the calibration in force, the same answer; one owner."""
+    tool = calibrate_by_tool(tiny_bag, tmp_path / 'products')
+    state = f'state_dir:={tmp_path / "state"}'
+    killed = start_node('calibrator', ros=parameters(tiny_bag, state))
+    play(start_node, tmp_path / 'products' / 'observations.mcap')
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status and status[-1].images_saved == tool.images_used)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    second = start_node('calibrator', ros=parameters(tiny_bag, state))
+    assert second.wait() == 2
+    assert f'state_dir: {tmp_path / "state"} is in use by another calibrator' in second.said()
+    killed.process.kill()
+    killed.process.wait()
+    # The graph takes twenty seconds to forget the dead: its heir has another name.
+    start_node('calibrator', ros=(*parameters(tiny_bag, state), '-r', '__node:=heir'))
+    found = client.latched(Calibration, 'calibration')
+    client.until(lambda: found)
+    in_force = messages.calibration_from_message(found[0])
+    assert in_force.number == 1 and in_force.in_force_since_ns > 0
+    again = client.call(Calibrate, '/heir/solve', dry_run=True)
+    answer = messages.calibration_from_message(again.calibration)
+    for one in (in_force, answer):
+        np.testing.assert_array_equal(one.covariance, tool.covariance)
+    ensemble_by_tool = [sys.executable, '-m', 'starcal_ros.cli', 'calibrate']
+    ensemble_by_tool += [str(tmp_path / 'state' / 'ensemble'), '-o', str(tmp_path / 'again')]
+    ensemble_by_tool += ['--params', str(tiny_bag / 'params.yaml')]
+    subprocess.run(ensemble_by_tool, check=True, capture_output=True)
+    repeated = products.read_calibration(tmp_path / 'again' / products.CALIBRATION_FILE)
+    np.testing.assert_array_equal(repeated.covariance, tool.covariance)
 
 
 def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_bag: Path) -> None:

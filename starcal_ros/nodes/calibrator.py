@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import dataclasses
 import sys
-import threading
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped
@@ -20,41 +18,41 @@ from starcal.msg import EnsembleStatus as StatusMessage
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal.srv import Calibrate
 from starcal_ros import messages, pipeline
-from starcal_ros.errors import StarcalError
+from starcal_ros.calibrator_state import Answer, CalibratorState
 from starcal_ros.node_options import CalibratorOptions
 from starcal_ros.nodes.conversions import make_message, message_class
-from starcal_ros.nodes.lifecycle import Health, OK, run, StarcalNode, WARN
+from starcal_ros.nodes.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
 from starcal_ros.options import from_mapping
-from starcal_ros.records import Calibration, Ensemble
+from starcal_ros.records import Calibration
 
 NAME = 'calibrator'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # A solve of minutes on a slow processor, at an image a second, loses none.
 _OBSERVATIONS = QoSProfile(depth=1000)
+_RETRY_S = 1.0  # while the disk fails
 
 
 class Calibrator(StarcalNode):
     """
     Collects observations and solves on request, in a thread of its own.
 
-    The ensemble is a frozen record: a solve works on the one it began with while the next grows.
+    What is collected and in force is `CalibratorState`'s; the node tells the graph of it.
     """
 
     def __init__(self) -> None:
         super().__init__(NAME)
         self._made: list[tuple[Any, Any]] = []
-        self._lock = threading.Lock()  # of the records below; never held during a solve
-        self._ensemble = Ensemble()
-        self._in_force: Calibration | None = None
-        self._before: tuple[Calibration, ...] = ()
-        self._last_answer = ''
-        self._last_failed = False
+        self._state = CalibratorState()
+        self._last_answer = Answer(True, '')
 
     def configure(self) -> None:
-        """Load prior camera and options, make the latched publishers."""
+        """Load prior camera, options and the state folder, make the latched publishers."""
         values = self.options.values()
         self._own = from_mapping(CalibratorOptions, values)
         self._setup = pipeline.load_setup(values, self.options.classes)
+        self._state.open(self._setup, self._own)
+        for damage in self._state.damage:
+            self.get_logger().error(damage)
 
         def latched(kind: Any, topic: str) -> Any:
             publisher = self.create_lifecycle_publisher(kind, topic, LATCHED)
@@ -64,6 +62,7 @@ class Calibrator(StarcalNode):
         self._camera_info = latched(CameraInfo, 'camera_info')
         self._alignment = latched(TransformStamped, 'alignment')
         self._calibration = latched(CalibrationMessage, 'calibration')
+        self._candidate = latched(CalibrationMessage, 'candidate_calibration')
         self._status = latched(StatusMessage, 'ensemble_status')
         try:
             self._tf_static = latched(message_class('tf2_msgs/msg/TFMessage'), '/tf_static')
@@ -102,9 +101,12 @@ class Calibrator(StarcalNode):
             self.guarded(self._publish_status), callback_group=MutuallyExclusiveCallbackGroup()
         )
         self._listeners.append((self.destroy_guard_condition, self._status_due))
+        retry = self.create_timer(_RETRY_S, self.guarded(self._save_again), collecting)
+        self._listeners.append((self.destroy_timer, retry))
         self._status_due.trigger()
-        if self._in_force is not None:
-            self._publish_calibration(self._in_force)
+        in_force = self._state.in_force
+        if in_force is not None:
+            self._publish_calibration(in_force)
 
     def deactivate(self) -> None:
         """Stop collecting and answering."""
@@ -114,106 +116,86 @@ class Calibrator(StarcalNode):
             destroy(entity)
 
     def cleanup(self) -> None:
-        """Let go of the publishers; the ensemble and the calibrations stay."""
+        """Let go of the publishers and the state folder; what is in memory stays."""
         while self._made:
             destroy, entity = self._made.pop()
             destroy(entity)
+        self._state.close()
 
     def health(self) -> Health:
         """What is collected, what is in force, and what came of the last request."""
-        with self._lock:
-            ensemble, in_force = self._ensemble, self._in_force
-            numbers: dict[str, object] = {
-                'images': len(ensemble.images),
-                'stars': ensemble.star_count,
-                **{f'refused_{reason}': n for reason, n in sorted(ensemble.refused.items())},
-                'in_force': 'none' if in_force is None else in_force.time_ns,
-                'last_answer': self._last_answer,
-            }
-            if self._last_failed:
-                return WARN, self._last_answer, numbers
-            return OK, 'collecting' if in_force is None else 'calibration in force', numbers
+        state, last = self._state, self._last_answer
+        ensemble, in_force = state.ensemble, state.in_force
+        free = state.disk_free_bytes()
+        numbers: dict[str, object] = {
+            'images': len(ensemble.images),
+            'stars': ensemble.star_count,
+            **{f'refused_{reason}': n for reason, n in sorted(ensemble.refused.items())},
+            'in_force': 'none' if in_force is None else in_force.number,
+            'last_answer': last.message,
+            'state_damaged_files': len(state.damage),
+            'disk_free_mb': 'none' if free is None else free // 1_000_000,
+        }
+        if state.trouble:
+            return ERROR, f'kept in memory alone: {state.trouble}', numbers
+        if in_force is not None and in_force.forced:
+            return WARN, f'in force against the gate: {"; ".join(in_force.reasons)}', numbers
+        if not last.success:
+            return WARN, last.message, numbers
+        return OK, 'collecting' if in_force is None else 'calibration in force', numbers
 
     def _on_observations(self, message: Any) -> None:
-        observations = messages.observations_from_message(message)
-        with self._lock:
-            ensemble = self._ensemble
-        grown = pipeline.add_to_ensemble(ensemble, observations, self._setup)
-        with self._lock:
-            if self._ensemble is not ensemble:  # emptied meanwhile: it starts with this image
-                grown = Ensemble().add(observations)
-            self._ensemble = grown
+        self._state.add(messages.observations_from_message(message))
         self._status_due.trigger()
 
+    def _save_again(self) -> None:
+        if self._state.trouble:
+            self._state.save()
+            self._status_due.trigger()
+
     def _publish_status(self) -> None:
-        with self._lock:
-            ensemble = self._ensemble
-        status = pipeline.ensemble_status(ensemble, self._setup)
         frame_id = self._setup.frames.camera_frame
+        status = self._state.status()
         self._status.publish(messages.status_to_message(status, frame_id, make_message))
 
     def _on_calibrate(self, _request: Any, response: Any) -> Any:
-        response.success, response.message, _ = self._solve()
-        return response
+        return self._told(self._state.solve(self._now_ns()), response)
 
     def _on_solve(self, request: Any, response: Any) -> Any:
-        response.success, response.message, calibration = self._solve(
-            request.method, tuple(request.estimate), request.dry_run, request.force
+        answer = self._state.solve(
+            self._now_ns(),
+            request.method,
+            tuple(request.estimate),
+            request.dry_run,
+            request.force,
         )
-        if calibration is not None:
-            response.calibration = messages.calibration_to_message(calibration, make_message)
-        return response
+        if answer.calibration is not None:
+            response.calibration = messages.calibration_to_message(
+                answer.calibration, make_message
+            )
+        return self._told(answer, response)
 
     def _on_reset(self, _request: Any, response: Any) -> Any:
-        with self._lock:
-            images = len(self._ensemble.images)
-            self._ensemble = Ensemble()
+        answer = self._state.reset()
         self._status_due.trigger()
-        response.success = True
-        response.message = f'{images} images dropped; the calibration in force stays'
-        return response
+        return self._told(answer, response)
 
     def _on_rollback(self, _request: Any, response: Any) -> Any:
-        with self._lock:
-            if not self._before:
-                response.message = 'there is no calibration before the one in force'
-                if self._in_force is None:
-                    response.message = 'no calibration is in force'
-                return response
-            self._in_force, self._before = self._before[-1], self._before[:-1]
-            calibration = self._in_force
-        self._publish_calibration(calibration)
-        response.success = True
-        response.message = f'back in force: {_summary(calibration)}'
-        return response
+        return self._told(self._state.rollback(self._now_ns()), response)
 
-    def _solve(
-        self,
-        method: str = '',
-        estimate: tuple[str, ...] = (),
-        dry_run: bool = False,
-        force: bool = False,
-    ) -> tuple[bool, str, Calibration | None]:
-        """Whether a new calibration is (or would be) in force, why, and the solution."""
-        with self._lock:
-            ensemble = self._ensemble
-        try:
-            calibration = pipeline.solve(ensemble, self._setup, method, estimate)
-        except StarcalError as error:
-            return False, str(error), None
-        if not calibration.accepted and not force:
-            return False, 'refused by the gate: ' + '; '.join(calibration.reasons), calibration
-        if not calibration.accepted:
-            reasons = (*calibration.reasons, 'put in force by request all the same')
-            calibration = dataclasses.replace(calibration, reasons=reasons)
-        if dry_run:
-            return True, f'would be in force: {_summary(calibration)}', calibration
-        with self._lock:
-            if self._in_force is not None:
-                self._before = (*self._before, self._in_force)
-            self._in_force = calibration
-        self._publish_calibration(calibration)
-        return True, f'in force: {_summary(calibration)}', calibration
+    def _now_ns(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+    def _told(self, answer: Answer, response: Any) -> Any:
+        """Publish what came into force, or what the gate has refused; the filled response."""
+        if answer.calibration is not None and answer.in_force:
+            self._publish_calibration(answer.calibration)
+        elif answer.calibration is not None and not answer.success:
+            self._candidate.publish(
+                messages.calibration_to_message(answer.calibration, make_message)
+            )
+        response.success, response.message = answer.success, answer.message
+        return response
 
     def _publish_calibration(self, calibration: Calibration) -> None:
         camera_info = messages.camera_info_to_message(calibration, make_message)
@@ -240,20 +222,12 @@ class Calibrator(StarcalNode):
                 self.count_error(error)
                 response.success = False
                 response.message = f'internal error: {type(error).__name__}: {error}'
-            with self._lock:
-                self._last_answer, self._last_failed = response.message, not response.success
+            self._last_answer = Answer(response.success, response.message)
             self.get_logger().info(response.message)
             self.publish_health_change()
             return response
 
         return run_and_tell
-
-
-def _summary(calibration: Calibration) -> str:
-    return (
-        f'{calibration.residual_rms_px:.3f} px rms per axis over {calibration.stars_used} stars'
-        f' in {calibration.images_used} images'
-    )
 
 
 def main(args: Sequence[str] | None = None) -> int:
