@@ -191,9 +191,7 @@ def _with_all_parameters(
         a[k:] += np.einsum('mji,mj->mi', turn, gradient).sum(axis=0)
         B[:, :, k:] = -to_shared
         C, c = C + information, c - gradient
-    # An image on which nothing pulls keeps its rotation.
-    pulled = np.asarray(C.any(axis=(1, 2)))
-    C = np.where(pulled[:, None, None], C, np.eye(3))
+    C = _pulled(C)
     off = np.zeros(10)
     off[problem.free] = ((problem.prior_parameters - state.parameters) / problem.prior_sigma)[
         problem.free
@@ -204,6 +202,11 @@ def _with_all_parameters(
     A[np.arange(10), np.arange(10)] += weight
     a[:10] += off / problem.prior_sigma
     return NormalEquations(cost, A, a, B, C, c)
+
+
+def _pulled(C: Floats) -> Floats:
+    """The blocks (m, 3, 3) of the rotations; one on which nothing pulls keeps its rotation."""
+    return np.where(C.any(axis=(1, 2), keepdims=True), C, np.eye(3))
 
 
 def _turn_chain(problem: Problem, state: State) -> Floats:
@@ -231,12 +234,34 @@ def reduced_information(problem: Problem, state: State, blocks: Floats) -> Float
     Those are focal terms, and alignment with its rate where the method has one; the rotations of
     the images are eliminated.
     """
-    normal = _with_all_parameters(problem, state, 0.0, blocks)
-    if len(normal.C) == 0:
-        return normal.A
-    return np.asarray(
-        normal.A - np.einsum('mqi,mqj->ij', normal.B, np.linalg.solve(normal.C, normal.B))
-    )
+    of_prior = np.zeros(10)
+    of_prior[problem.free] = 1.0 / problem.prior_sigma[problem.free] ** 2
+    total = information_of_images(problem, state, blocks).sum(axis=0)
+    total[np.arange(10), np.arange(10)] += of_prior
+    return np.asarray(total)
+
+
+def information_of_images(problem: Problem, state: State, blocks: Floats) -> Floats:
+    """Information (m, p, p) of each image, without the prior: see `reduced_information`."""
+    k = 10 + len(state.focal)
+    blocks = by_shared(problem, state, blocks)
+    if problem.method == 'single':
+        p = k + 3 + len(state.rate)
+        return _by_alignment(problem, state, blocks)[:, :p, :p]
+    camera, rotation = slice(0, k), slice(k, k + 3)
+    A, B = blocks[:, camera, camera], blocks[:, rotation, camera]
+    C = blocks[:, rotation, rotation]
+    if problem.method == 'hierarchical':
+        _, J = _whitened_attitude_errors(problem, state)
+        tracker = J.transpose(0, 2, 1) @ J
+        turn = _turn_chain(problem, state)
+        p = k + turn.shape[2]
+        stars, A = A, np.zeros((len(blocks), p, p))
+        A[:, camera, camera] = stars
+        A[:, k:, k:] = turn.transpose(0, 2, 1) @ tracker @ turn
+        B = np.concatenate([B, -tracker @ turn], axis=2)
+        C = C + tracker
+    return np.asarray(A - B.transpose(0, 2, 1) @ np.linalg.solve(_pulled(C), B))
 
 
 def _whitened_attitude_errors(problem: Problem, state: State) -> tuple[Floats, Floats]:

@@ -19,7 +19,6 @@ from scipy.stats import chi2, theilslopes
 from starcal_ros.adjustment import (
     attitude_errors,
     attitudes_of_stars_alone,
-    by_shared,
     image_blocks,
     image_parameters,
     METHODS,
@@ -30,8 +29,9 @@ from starcal_ros.adjustment import (
 )
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.covariance import shared_covariance, shared_names
 from starcal_ros.errors import OptionError, TooFewObservations
-from starcal_ros.least_squares import inverse, NotObservable, Solution
+from starcal_ros.least_squares import NotObservable, Solution
 from starcal_ros.measurement import (
     arrange,
     Measurements,
@@ -41,7 +41,7 @@ from starcal_ros.measurement import (
     StarTable,
 )
 from starcal_ros.options import option
-from starcal_ros.records import ALIGNMENT_NAMES, CameraGeometry, Ensemble, Thermal
+from starcal_ros.records import CameraGeometry, Ensemble, Thermal
 from starcal_ros.thermal import weakest_term, why_unsupported
 from starcal_ros.variance import CentroidVariance, estimate_star_tracker_sigma, estimate_variance
 
@@ -51,6 +51,7 @@ Mask = NDArray[np.bool_]
 _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
 _START_FLOOR_PX = 0.05  # until the residuals tell: of the order of what is left in good images
 _ROUNDS = 10  # the set of rejected stars settles in two or three
+FEWEST_STARS = 3  # of an image: its rotation fits any one star, and two as good as any
 _FEWEST_SIGHTINGS = 3  # of a star, from which it can be told from its images
 _STAR_CHANCE = 1e-7  # that a good star is dropped for the sum of its residuals
 
@@ -234,8 +235,7 @@ def estimate_calibration(
     check_options(options)
     check_enough(ensemble, options)
     table = star_table(ensemble.images)
-    problem = _problem(ensemble, prior, options)
-    alignment = Rotation.from_quat(prior.star_tracker_from_camera_xyzw).inv()
+    problem = problem_of(ensemble, prior, options)
     order, with_rate = options.focal_temperature_order, options.alignment_temperature
     left_out = []
     unsupported = (order or with_rate) and why_unsupported(
@@ -245,13 +245,7 @@ def estimate_calibration(
         order, with_rate = 0, False
         left_out.append(unsupported)
     while True:
-        start = State(
-            prior.camera.parameters.copy(),
-            alignment,
-            alignment * problem.star_tracker_from_icrf,
-            np.zeros(order),
-            np.zeros(3 if with_rate else 0),
-        )
+        start = start_of(problem, prior, order, with_rate)
         try:
             estimate, weakest = _search(problem, start, table, prior, options)
             why = 'within chance'
@@ -278,7 +272,8 @@ def estimate_calibration(
     return dataclasses.replace(estimate, thermal=dataclasses.replace(estimate.thermal, note=note))
 
 
-def _problem(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Problem:
+def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Problem:
+    """What a search is given of an ensemble."""
     prior_sigma = np.array(options.prior_sigma)
     return Problem(
         method=options.method,
@@ -293,6 +288,18 @@ def _problem(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOpti
         ),
         above_reference_k=np.array([image.temperature_degc for image in ensemble.images])
         - options.reference_temperature_degc,
+    )
+
+
+def start_of(problem: Problem, prior: CameraGeometry, order: int, with_rate: bool) -> State:
+    """The prior as a state, with so many focal terms of zero and a rate of zero, or none."""
+    alignment = Rotation.from_quat(prior.star_tracker_from_camera_xyzw).inv()
+    return State(
+        prior.camera.parameters.copy(),
+        alignment,
+        alignment * problem.star_tracker_from_icrf,
+        np.zeros(order),
+        np.zeros(3 if with_rate else 0),
     )
 
 
@@ -384,19 +391,14 @@ def _estimate(
     at_reference = np.r_[0:10, k : k + 3]
     thermal = _thermal(state, full, options)
     weakest = weakest_term(thermal, full[k + 3 :, k + 3 :]) if thermal else ''
-    names = (
-        *PARAMETER_NAMES,
-        *(f'focal_temperature_{i}' for i in range(1, k - 9)),
-        *ALIGNMENT_NAMES,
-        *(f'{name}_temperature' for name in ALIGNMENT_NAMES),
-    )
+    names = shared_names(len(state.focal), len(state.rate) > 0)
     estimate = Estimate(
         geometry=geometry,
         covariance=full[np.ix_(at_reference, at_reference)],
         information=information[np.ix_(shared, shared)],
         information_names=tuple(names[i] for i in shared),
         shared_covariance=full,
-        shared_names=names[: len(full)],
+        shared_names=names,
         state=state,
         table=table,
         kept=kept,
@@ -511,9 +513,8 @@ def _fitting(
     summed = np.bincount(star, np.where(fits, length2, 0.0))
     bad_star = (2 * misses > sightings) | (summed > chi2.isf(_STAR_CHANCE, 2 * sightings))
     fits &= ~(bad_star & (sightings >= _FEWEST_SIGHTINGS))[star]
-    # The rotation of an image fits any one star, and two as good as any.
     left = np.bincount(table.image[fits], minlength=table.image_count)
-    return np.asarray(fits & (left[table.image] >= 3))
+    return np.asarray(fits & (left[table.image] >= FEWEST_STARS))
 
 
 def _dropped(table: StarTable, kept: Mask) -> NDArray[np.int64]:
@@ -566,22 +567,13 @@ def _result(
 
     The covariance is of camera, focal terms, alignment and its rate.
     """
-    information = reduced_information(problem, state, blocks)
-    shared = _considered_covariance(problem, information)
-    size = max(len(shared), 13 + len(state.focal))
-    full: Floats = np.zeros((size, size))
-    full[: len(shared), : len(shared)] = shared
-    alignment = state.camera_from_star_tracker
-    scatter_arcsec = 0.0
+    scatter_arcsec, good = 0.0, np.zeros(len(blocks), bool)
     if problem.method != 'single':
         eta_rad, _, seen = attitudes_of_stars_alone(problem, state, blocks)
         good = seen & np.isfinite(problem.star_tracker_sigma_rad[:, 0])
         if good.any():
             scatter_arcsec = float(np.sqrt(eta_rad[good].var(axis=0).mean())) / ARCSECOND_RAD
-    if problem.method == 'per_image':
-        if not good.any():
-            raise NotObservable('no attitude of an image fits the others')
-        alignment, full = _mean_alignment(problem, state, blocks, good, full, tracker_sigma_rad)
+    alignment, full = shared_covariance(problem, state, blocks, good, tracker_sigma_rad)
     camera = prior.camera.replace(
         **{PARAMETER_NAMES[i]: float(state.parameters[i]) for i in problem.free}
     )
@@ -589,61 +581,3 @@ def _result(
     # One of the two quaternions of a rotation, so that equal calibrations are equal numbers.
     quaternion = quaternion * math.copysign(1.0, quaternion[3])
     return CameraGeometry(camera, quaternion), full, scatter_arcsec
-
-
-def _considered_covariance(problem: Problem, information: Floats) -> Floats:
-    """
-    Covariance (p, p) of all camera parameters, and of what else the information has.
-
-    A held parameter with a prior sigma is considered: its uncertainty is its own, and what it does
-    to the estimated ones is added to theirs; one without stays at zero.
-    """
-    p = len(information)
-    estimated = np.concatenate([problem.free, np.arange(10, p)])
-    held = np.setdiff1d(np.arange(10), problem.free)
-    held_variance = np.where(
-        np.isfinite(problem.prior_sigma[held]), problem.prior_sigma[held], 0.0
-    )
-    held_variance = held_variance**2
-    noise = inverse(information[np.ix_(estimated, estimated)])
-    to_estimated = -noise @ information[np.ix_(estimated, held)]
-    result = np.zeros((p, p))
-    result[np.ix_(estimated, estimated)] = noise + (to_estimated * held_variance) @ to_estimated.T
-    result[np.ix_(estimated, held)] = to_estimated * held_variance
-    result[np.ix_(held, estimated)] = result[np.ix_(estimated, held)].T
-    result[held, held] = held_variance
-    return 0.5 * (result + result.T)
-
-
-def _mean_alignment(
-    problem: Problem,
-    state: State,
-    blocks: Floats,
-    good: Mask,
-    full: Floats,
-    tracker_sigma_rad: Floats,
-) -> tuple[Rotation, Floats]:
-    """
-    Quaternion mean of the alignments of the images (Markley et al. 2007), completing ``full``.
-
-    SciPy's mean is the dominant eigenvector of sum w q q'; weighted by the covariances of the
-    images.  The mean is linear in the rotations, and those in the camera parameters.
-    """
-    alignments = (state.camera_from_icrf * problem.star_tracker_from_icrf.inv())[good]
-    tracker = np.diag(tracker_sigma_rad**2)
-    k = len(full) - 3
-    rows = by_shared(problem, state, blocks)[good][:, k : k + 3]
-    C, B = rows[:, :, k : k + 3], rows[:, :, :k]
-    stars, by_camera = np.linalg.inv(C), np.linalg.solve(C, B)
-    within = stars + by_camera @ full[:k, :k] @ by_camera.transpose(0, 2, 1)
-    weight = 1.0 / np.trace(within + tracker, axis1=1, axis2=2)
-    alignment = alignments.mean(weight)
-    weight = weight / weight.sum()
-    A = alignment.as_matrix()
-    F = np.einsum('m,mij->ij', weight, by_camera)
-    scattered = np.einsum('m,mij->ij', weight**2, stars + A @ tracker @ A.T)
-    full = full.copy()
-    full[k:, k:] = scattered + F @ full[:k, :k] @ F.T
-    full[k:, :k] = -F @ full[:k, :k]
-    full[:k, k:] = full[k:, :k].T
-    return alignment, full

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from starcal_ros.calibration import CalibrationOptions
+from starcal_ros.adjustment import image_blocks, information_of_images, Problem, State
+from starcal_ros.calibration import CalibrationOptions, FEWEST_STARS, problem_of, start_of
 from starcal_ros.camera import (
     CameraModel,
     line_of_sight,
@@ -17,9 +18,10 @@ from starcal_ros.camera import (
     project_jacobians,
 )
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.measurement import arrange, CAMERA, normal_blocks, ROTATION, star_table
+from starcal_ros.covariance import shared_covariance, shared_names
+from starcal_ros.least_squares import NotObservable
+from starcal_ros.measurement import arrange, star_table
 from starcal_ros.records import (
-    ALIGNMENT_NAMES,
     CameraGeometry,
     Correlation,
     DetectorMaps,
@@ -27,6 +29,7 @@ from starcal_ros.records import (
     EnsembleStatus,
     StarObservations,
 )
+from starcal_ros.thermal import why_unsupported
 
 Floats = NDArray[np.float64]
 
@@ -54,67 +57,98 @@ def image_information(
     images: tuple[StarObservations, ...], prior: CameraGeometry, options: CalibrationOptions
 ) -> Floats:
     """
-    Information (m, k, k) of each image on the k estimated camera parameters.
+    Information (m, k, k) of each image on the k unknowns that all images share, at the prior.
 
-    The rotation of each image is free and eliminated (Schur complement), as in ``per_image``; an
-    image with fewer than two stars tells nothing.
+    Those are the estimated camera parameters, then the terms of temperature where these images
+    carry them, and the alignment where the method has one; the rotation of the image is
+    eliminated.  An image with fewer than three stars before the camera tells nothing.
     """
-    table = star_table(images)
-    free = np.sort([PARAMETER_NAMES.index(name) for name in options.estimate])
-    rotations = (
-        Rotation.from_quat(prior.star_tracker_from_camera_xyzw).inv()
-        * Rotation.from_quat(np.array([i.icrf_from_star_tracker_xyzw for i in images])).inv()
-    )
-    _, blocks = normal_blocks(
-        arrange(table, np.ones(len(table), bool), table.covariance_px2),
-        prior.camera.parameters,
-        rotations.as_matrix(),
-    )
-    A = blocks[:, CAMERA, CAMERA][:, free][:, :, free]
-    B = blocks[:, ROTATION, CAMERA][:, :, free]
-    C = blocks[:, ROTATION, ROTATION]
-    # An image without two stars before the camera tells nothing.
-    seen = np.array([len(image) >= 2 for image in images]) & C.any(axis=(1, 2))
-    information = np.zeros_like(A)
-    if seen.any():
-        information[seen] = A[seen] - B[seen].transpose(0, 2, 1) @ np.linalg.solve(
-            C[seen], B[seen]
-        )
-    return information
+    ensemble = Ensemble(images)
+    order, with_rate = _supported_terms(ensemble, options)
+    problem, state, blocks, _ = _at_the_prior(ensemble, prior, options, order, with_rate)
+    information = information_of_images(problem, state, blocks)
+    shared = np.concatenate([problem.free, np.arange(10, information.shape[1])])
+    return information[:, shared][:, :, shared] * blocks.any(axis=(1, 2), keepdims=True)
+
+
+def estimated_names(options: CalibrationOptions) -> tuple[str, ...]:
+    """Names of all that is to be estimated: camera, terms of temperature, alignment, its rate."""
+    names = shared_names(options.focal_temperature_order, options.alignment_temperature)
+    return tuple(name for name in names if name not in PARAMETER_NAMES or name in options.estimate)
 
 
 def predicted_sigma(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> Floats:
     """
-    1-sigma (k,) of the estimated camera parameters, in `PARAMETER_NAMES` order, before solving.
+    1-sigma (k,) of `estimated_names`, as a calibration would report it, before it is made.
 
-    From the centroid covariances at the prior geometry; infinite where not observable yet.
+    From the covariances of centroids and star tracker as given, at the prior geometry; infinite
+    where not observable yet.  Terms of temperature that the images carry are among what is
+    estimated, so all sigmas account for them.
     """
-    count = len(options.estimate)
+    names = estimated_names(options)
     if not ensemble.images:
-        return np.full(count, np.inf)
-    information = image_information(ensemble.images, prior, options).sum(axis=0)
-    diagonal = np.diag(information)
-    if (diagonal <= 0).any():
-        return np.full(count, np.inf)
-    scale = 1.0 / np.sqrt(diagonal)
-    values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
-    if values[0] < 1e-12:
-        return np.full(count, np.inf)
-    return np.asarray(scale * np.sqrt((vectors**2 / values).sum(axis=1)))
+        return np.full(len(names), np.inf)
+    terms = _supported_terms(ensemble, options)
+    found = _sigma_with(ensemble, prior, options, *terms)
+    if not found and terms != (0, False):
+        # So would the calibration: without them, where they are not observable.
+        found = _sigma_with(ensemble, prior, options, 0, False)
+    return np.array([found.get(name, np.inf) for name in names])
+
+
+def _supported_terms(ensemble: Ensemble, options: CalibrationOptions) -> tuple[int, bool]:
+    """Order of the focal terms and whether a rate, as asked for and carried by the images."""
+    order, with_rate = options.focal_temperature_order, options.alignment_temperature
+    temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
+    if (order or with_rate) and why_unsupported(temperatures_degc, order):
+        return 0, False
+    return order, with_rate
+
+
+def _at_the_prior(
+    ensemble: Ensemble,
+    prior: CameraGeometry,
+    options: CalibrationOptions,
+    order: int,
+    with_rate: bool,
+) -> tuple[Problem, State, Floats, bool]:
+    """What the estimate starts from, its normal matrices, and whether all stars are in front."""
+    problem = problem_of(ensemble, prior, options)
+    state = start_of(problem, prior, order, with_rate)
+    table = star_table(ensemble.images)
+    enough = np.array([len(image) >= FEWEST_STARS for image in ensemble.images])
+    measurements = arrange(table, enough[table.image], table.covariance_px2)
+    cost, blocks = image_blocks(problem, state, measurements)
+    return problem, state, blocks, math.isfinite(cost)
+
+
+def _sigma_with(
+    ensemble: Ensemble,
+    prior: CameraGeometry,
+    options: CalibrationOptions,
+    order: int,
+    with_rate: bool,
+) -> dict[str, float]:
+    """1-sigma by name; none where not observable."""
+    problem, state, blocks, in_front = _at_the_prior(ensemble, prior, options, order, with_rate)
+    seen = np.einsum('mii->m', blocks) > 0
+    try:
+        if not in_front:
+            return {}
+        _, covariance = shared_covariance(
+            problem, state, blocks, seen, problem.star_tracker_sigma_rad[0]
+        )
+    except (NotObservable, np.linalg.LinAlgError):
+        return {}
+    return dict(zip(shared_names(order, with_rate), np.sqrt(np.diag(covariance)), strict=True))
 
 
 def ensemble_status(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> EnsembleStatus:
     """What has been collected and what a calibration from it would be worth."""
-    names = tuple(name for name in PARAMETER_NAMES if name in options.estimate)
-    alignment = np.full(3, np.inf)
-    if ensemble.images:
-        # The attitude noise of the images, averaged: the star field within an image adds little.
-        tracker = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
-        alignment = np.full(3, np.sqrt(np.mean(tracker**2) / len(ensemble.images)))
     return EnsembleStatus(
         time_ns=ensemble.images[-1].time_ns if ensemble.images else 0,
         images=len(ensemble.images),
@@ -123,8 +157,8 @@ def ensemble_status(
         min_stars=options.min_stars,
         refused=dict(ensemble.refused),
         coverage=coverage(ensemble, prior.camera),
-        parameter_names=names + ALIGNMENT_NAMES,
-        predicted_sigma=np.concatenate([predicted_sigma(ensemble, prior, options), alignment]),
+        parameter_names=estimated_names(options),
+        predicted_sigma=predicted_sigma(ensemble, prior, options),
     )
 
 
@@ -169,15 +203,18 @@ def keep_most_informative(
     One by one the image goes whose information weighs least against that of all:
     ``trace(total^-1 information_k)``.
     """
+    if len(ensemble.images) <= options.max_images:
+        return ensemble
     images = ensemble.images
+    information = image_information(images, prior, options)
     while len(images) > options.max_images:
-        information = image_information(images, prior, options)
         total = information.sum(axis=0)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))
         inverse = np.linalg.pinv(total * scale[:, None] * scale[None, :], hermitian=True)
         worth = np.einsum('ij,mji->m', inverse * scale[:, None] * scale[None, :], information)
         least = int(worth.argmin())
         images = images[:least] + images[least + 1 :]
+        information = np.delete(information, least, axis=0)
     return replace(ensemble, images=images)
 
 

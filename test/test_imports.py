@@ -31,6 +31,7 @@ LADDER = [
     'thermal',
     'least_squares',
     'adjustment',
+    'covariance',
     'variance',
     'calibration',
     'observability',

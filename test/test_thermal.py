@@ -16,6 +16,7 @@ from starcal_ros.calibration import CalibrationOptions, Estimate, estimate_calib
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
+from starcal_ros.observability import estimated_names, keep_most_informative, predicted_sigma
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     CameraGeometry,
@@ -268,6 +269,46 @@ def test_a_changing_camera_fits_only_where_it_is_asked_for() -> None:
     rms, more = (np.sqrt(np.mean(e.residual_px[e.kept] ** 2)) for e in (estimate, without))
     assert estimate.variance_factor == pytest.approx(1.0, abs=0.1)
     assert more > 1.1 * rms
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_the_prediction_accounts_for_the_terms(method: str) -> None:
+    rate_rad = np.zeros(3) if method == 'per_image' else RATE_RAD
+    chosen = options(method, variance_components=False)
+    ensemble = observed(FOCAL, rate_rad)
+    estimate, terms = found(ensemble, chosen)
+    assert terms.note == ''
+    sigma = dict(
+        zip(estimate.shared_names, np.sqrt(np.diag(estimate.shared_covariance)), strict=True)
+    )
+    names = estimated_names(chosen)
+    assert set(names) == {n for n in sigma if n not in PARAMETER_NAMES or n in chosen.estimate}
+    predicted = dict(zip(names, predicted_sigma(ensemble, TRUTH, chosen), strict=True))
+    # The same formula without the terms in the derivatives: they scale the camera by 0.1 %.
+    for name in names:
+        assert predicted[name] == pytest.approx(sigma[name], rel=0.01), name
+    # They cost something, and what they cost is predicted.
+    plain = dataclasses.replace(chosen, focal_temperature_order=0, alignment_temperature=False)
+    assert predicted['fx'] > 1.02 * predicted_sigma(ensemble, TRUTH, plain)[names.index('fx')]
+
+
+def test_terms_that_the_images_do_not_carry_are_infinite_and_cost_nothing() -> None:
+    chosen, plain = options(), options(order=0, alignment_temperature=False)
+    ensemble = observed(FOCAL, RATE_RAD, np.full(10, 15.0))
+    names, sigma = estimated_names(chosen), predicted_sigma(ensemble, TRUTH, chosen)
+    of_temperature = np.array(['temperature' in name for name in names])
+    assert of_temperature.sum() == 5 and np.isinf(sigma[of_temperature]).all()
+    np.testing.assert_array_equal(sigma[~of_temperature], predicted_sigma(ensemble, TRUTH, plain))
+
+
+def test_images_that_tell_of_the_temperature_are_kept() -> None:
+    temperatures = np.array([15.0, 14.0, 40.0, 16.0, 15.5, -20.0, 14.5, 15.2, 13.0, 15.7])
+    ensemble = observed(FOCAL[:1], RATE_RAD, temperatures)
+    chosen = options(order=1, max_images=4)
+    plain = dataclasses.replace(chosen, focal_temperature_order=0, alignment_temperature=False)
+    kept, without = (keep_most_informative(ensemble, TRUTH, o) for o in (chosen, plain))
+    assert {40.0, -20.0} <= {image.temperature_degc for image in kept.images}
+    assert not {40.0, -20.0} <= {image.temperature_degc for image in without.images}
 
 
 def test_per_image_has_no_rate() -> None:
