@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import poisson
 
-from starcal_ros.astrometry import apparent_directions
+from starcal_ros.astrometry import apparent_directions, SiteOptions, through_the_air
 from starcal_ros.camera import field_radius_rad, line_of_sight, project, project_jacobians
 from starcal_ros.catalog import cone, StarCatalog
 from starcal_ros.centroiding import (
@@ -50,6 +50,7 @@ _VOTERS = (
     100  # brightest predictions and sources that vote: their pairs fill one histogram at once
 )
 _PULL_UNCERTAINTY = 0.25  # of a neighbour's light: stars of unlike colour differ so from their V
+SPACE = SiteOptions()
 _CHANCE = 1e-9  # greatest probability that a match is accepted by chance
 
 
@@ -89,7 +90,7 @@ class Prediction:
     Catalog stars in and about the image.
 
     ``catalog_index`` (n,) rows of the catalog, brightest first; ``direction_icrf`` (n, 3),
-    apparent;    ``direction_camera`` (n, 3); ``xy_px`` (n, 2).
+    apparent; ``direction_camera`` (n, 3); ``xy_px`` (n, 2).
     """
 
     catalog_index: NDArray[np.int64]
@@ -105,11 +106,13 @@ def predict(
     catalog: StarCatalog,
     options: IdentificationOptions,
     velocity_m_s: Floats | None = None,
+    site: SiteOptions = SPACE,
 ) -> Prediction:
     """
     Apparent catalog stars where attitude, alignment and camera put them.
 
-    Stars outside the image are kept as far as acquisition may bring them in.
+    Stars outside the image are kept as far as acquisition may bring them in; those too near to
+    the horizon of a site are not.
     """
     camera = geometry.camera
     icrf_from_camera = Rotation.from_quat(icrf_from_star_tracker_xyzw) * Rotation.from_quat(
@@ -120,7 +123,14 @@ def predict(
     radius_rad = field_radius_rad(camera, margin_px)
     index = cone(catalog, boresight_icrf, radius_rad, options.magnitude_limit)
     index = index[np.argsort(catalog.magnitude[index], kind='stable')]
-    direction_icrf = apparent_directions(catalog.select(index), time_ns, velocity_m_s)
+    if site.observer == 'ground':
+        direction_icrf, elevation_rad = through_the_air(
+            apparent_directions(catalog.select(index), time_ns), time_ns, site
+        )
+        high = elevation_rad >= math.radians(site.min_elevation_deg)
+        index, direction_icrf = index[high], direction_icrf[high]
+    else:
+        direction_icrf = apparent_directions(catalog.select(index), time_ns, velocity_m_s)
     direction_camera = icrf_from_camera.inv().apply(direction_icrf)
     xy_px = project(camera, direction_camera)
     with np.errstate(invalid='ignore'):
@@ -374,6 +384,7 @@ def observe_stars(
     centroid_options: CentroidOptions,
     options: IdentificationOptions,
     velocity_m_s: Floats | None = None,
+    site: SiteOptions = SPACE,
 ) -> StarObservations:
     """
     The measured and identified stars of one image, with those that were left out, and why.
@@ -389,7 +400,7 @@ def observe_stars(
     camera = geometry.camera
     background = measure_background(image.pixels)
     prediction = predict(
-        geometry, icrf_from_star_tracker_xyzw, image.time_ns, catalog, options, velocity_m_s
+        geometry, icrf_from_star_tracker_xyzw, image.time_ns, catalog, options, velocity_m_s, site
     )
     if len(prediction.catalog_index) < 4:
         raise ImageRefused(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from starcal_ros import bag, products
 from starcal_ros.acceptance import Candidate, GateOptions, judge
+from starcal_ros.astrometry import SiteOptions
 from starcal_ros.attitude import AttitudeHistory, AttitudeOptions
 from starcal_ros.calibration import (
     CalibrationOptions,
@@ -83,6 +84,7 @@ class Setup:
 
     frames: SetupOptions
     attitude: AttitudeOptions
+    site: SiteOptions
     centroid: CentroidOptions
     identification: IdentificationOptions
     calibration: CalibrationOptions
@@ -95,6 +97,7 @@ class Setup:
 OPTION_CLASSES = (
     SetupOptions,
     AttitudeOptions,
+    SiteOptions,
     CentroidOptions,
     IdentificationOptions,
     CalibrationOptions,
@@ -136,6 +139,7 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
     return Setup(
         frames=frames,
         attitude=from_mapping(AttitudeOptions, values),
+        site=from_mapping(SiteOptions, values),
         centroid=from_mapping(CentroidOptions, values),
         identification=identification,
         calibration=calibration,
@@ -196,6 +200,7 @@ def observe(
             setup.centroid,
             setup.identification,
             velocity_m_s,
+            setup.site,
         )
     except ImageRefused as refused:
         return refused_image(
@@ -456,6 +461,7 @@ def _provenance(
     groups = (
         setup.frames,
         setup.attitude,
+        setup.site,
         setup.centroid,
         setup.identification,
         options,

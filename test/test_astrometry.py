@@ -12,6 +12,9 @@ from starcal_ros.astrometry import (
     apparent_directions,
     directions_from,
     observer_at,
+    SiteOptions,
+    standard_pressure_hpa,
+    through_the_air,
     tt_julian_date,
 )
 from starcal_ros.catalog import load_catalog, StarCatalog
@@ -192,3 +195,75 @@ def test_times_before_utc_are_refused(stars):
 def test_velocities_that_are_none_are_refused(velocity):
     with pytest.raises(ValueError, match='velocity_m_s'):
         observer_at(0, np.array(velocity))
+
+
+TIME_NS = unix_ns(2024, 5, 1, 3)
+
+
+def zenith(site):
+    """Direction that refraction leaves, by the sum of those of stars around it."""
+    ring = np.random.default_rng(1).normal(size=(20000, 3))
+    ring /= np.linalg.norm(ring, axis=1, keepdims=True)
+    _, elevation_rad = through_the_air(ring, TIME_NS, site)
+    return ring[elevation_rad.argmax()], ring, elevation_rad
+
+
+@pytest.mark.parametrize('apparent_deg', [30.0, 45.0, 70.0])
+def test_refraction_is_that_of_the_almanac(apparent_deg):
+    site = SiteOptions('ground', 51.5, 0.0, 0.0, 1010.0, 10.0, 0.0, 0.57)
+    _, directions, elevation_rad = zenith(site)
+    near = np.abs(np.degrees(elevation_rad) - apparent_deg) < 0.5
+    seen, seen_rad = through_the_air(directions[near], TIME_NS, site)
+    bent_arcmin = np.degrees(angle_between(seen, directions[near])) * 60
+    # Bennett 1982, J. Navigation 35, 255: at 1010 hPa and 10 degC, good to 0.07 arcmin.
+    h = np.degrees(seen_rad)
+    expected = 1 / np.tan(np.radians(h + 7.31 / (h + 4.4)))
+    assert np.abs(bent_arcmin - expected).max() < 0.07
+
+
+def test_refraction_is_towards_the_zenith_and_nothing_there():
+    site = SiteOptions('ground', -20.0, 70.0, 2600.0, 740.0, 10.0)
+    up, directions, elevation_rad = zenith(site)
+    high = elevation_rad > 0.2
+    seen, _ = through_the_air(directions[high], TIME_NS, site)
+    bent = angle_between(seen, up) - angle_between(directions[high], up)
+    far = elevation_rad[high] < 1.2  # the direction called the zenith is 2 degrees off at most
+    assert (bent[far] < 0).all()
+    # A tan 2 degrees is 1.5 arcsec.
+    assert angle_between(through_the_air(up[None], TIME_NS, site)[0][0], up) < 3 * ARCSECOND_RAD
+
+
+def test_the_turning_earth_moves_stars_east():
+    # Air of no pressure: 465.1 m/s at the equator is 0.3199 arcsec (Explanatory Supplement 3rd
+    # ed., section 7.2.3).
+    site = SiteOptions('ground', 0.0, 0.0, 0.0, 1e-9)
+    up, _, _ = zenith(site)
+    moved = through_the_air(up[None], TIME_NS, site)[0][0] - up
+    assert np.linalg.norm(moved) == pytest.approx(0.3199 * ARCSECOND_RAD, rel=0.003)
+    # East is the pole times the zenith; the pole has moved by 0.1 degrees since J2000.
+    east = np.cross([0.0, 0.0, 1.0], up)
+    assert moved @ east > 0.995 * np.linalg.norm(moved) * np.linalg.norm(east)
+
+
+def test_air_pressure_follows_from_height():
+    # ISO 2533 at 0, 1500 and 3000 m, for its own temperatures there.  The formula takes the air
+    # at one temperature from there to the sea: 1.3 % off at 3000 m.
+    standard = ((0.0, 15.0, 1013.25), (1500.0, 5.25, 845.6), (3000.0, -4.5, 701.1))
+    for height_m, degc, hpa in standard:
+        assert standard_pressure_hpa(height_m, degc) == pytest.approx(hpa, rel=0.015)
+    high = SiteOptions('ground', 51.5, 0.0, 1500.0, 0.0, 5.25)
+    said = SiteOptions('ground', 51.5, 0.0, 1500.0, standard_pressure_hpa(1500.0, 5.25), 5.25)
+    directions = np.eye(3)
+    for ours, same in zip(
+        through_the_air(directions, TIME_NS, high),
+        through_the_air(directions, TIME_NS, said),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(ours, same)
+
+
+def test_under_the_horizon_all_stays_finite():
+    site = SiteOptions('ground', 89.0, 0.0)
+    seen, elevation_rad = through_the_air(np.array([[0.0, 0.0, -1.0], [1, 0, 0]]), TIME_NS, site)
+    assert np.isfinite(seen).all() and elevation_rad[0] < -1.5
+    assert through_the_air(np.empty((0, 3)), TIME_NS, site)[0].shape == (0, 3)

@@ -8,14 +8,16 @@ import json
 from pathlib import Path
 
 import cv2
+import erfa
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros import bag, pipeline, products
+from starcal_ros.astrometry import through_the_air
 from starcal_ros.attitude import attitude_sample, AttitudeHistory
 from starcal_ros.calibration import CalibrationOptions
-from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.camera import PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, OptionError, ProductError, TooFewObservations
 from starcal_ros.node_options import NODE_OPTION_CLASSES
@@ -169,6 +171,51 @@ def test_stars_are_observed(setup: pipeline.Setup) -> None:
     ).magnitude()
     # One error for all samples of an image, which do not move: the interpolation adds nothing.
     assert attitude_error < 1e-9
+
+
+def test_from_the_ground_stars_are_where_the_air_puts_them(camera_yaml: Path) -> None:
+    drawn = scene(SCENARIO, 1)
+    # A site that sees the middle of the image 20 degrees above its northern or southern horizon.
+    _, _, ahead = drawn.camera_from_icrf
+    sidereal_rad = erfa.era00(2440587.5, drawn.time_ns / (86400 * S))
+    longitude = np.degrees(np.arctan2(ahead[1], ahead[0]) - sidereal_rad) % 360
+    declination = np.degrees(np.arcsin(ahead[2]))
+    ground = {
+        'observer': 'ground',
+        'latitude_deg': declination - np.copysign(70.0, declination),
+        'longitude_deg': longitude,
+        'height_m': 500.0,
+    }
+    made = pipeline.load_setup(values(camera_yaml, **ground))
+    bent_icrf, elevation_rad = through_the_air(drawn.direction_icrf, drawn.time_ns, made.site)
+    assert np.degrees(np.median(elevation_rad)) == pytest.approx(20.0, abs=2.0)
+    pixel_px = project(TRUTH.camera, bent_icrf @ drawn.camera_from_icrf.T)
+    moved_px = pixel_px - drawn.pixel_px
+    assert np.linalg.norm(moved_px, axis=1).min() > 0.5 and np.ptp(moved_px, axis=0).max() > 1.0
+    seen = render(SCENARIO, dataclasses.replace(drawn, pixel_px=pixel_px), 1)
+    found = pipeline.observe(seen, attitudes(), made, TRUTH)
+    place = {
+        number: (pixel, direction)
+        for number, pixel, direction in zip(
+            drawn.catalog_id.tolist(), pixel_px, bent_icrf, strict=True
+        )
+    }
+    assert found.refusal == '' and len(found) > 100
+    uu, _, vv = found.covariance_px2.T
+    off_px = found.measured_px - [place[number][0] for number in found.catalog_id.tolist()]
+    in_sigma = off_px / np.sqrt(np.stack([uu, vv], axis=-1))
+    assert np.sqrt((in_sigma**2).mean()) < 1.2  # as of stars in space
+    # What is recorded is the bent direction, so that a calibration from the record is the same.
+    recorded = [place[number][1] for number in found.catalog_id.tolist()]
+    np.testing.assert_allclose(found.direction_icrf, recorded, rtol=0, atol=1e-12)
+    higher = pipeline.load_setup(values(camera_yaml, **ground, min_elevation_deg=20.0))
+    upper = pipeline.observe(seen, attitudes(), higher, TRUTH)
+    _, elevation_rad = through_the_air(
+        drawn.direction_icrf[np.isin(drawn.catalog_id, upper.catalog_id)],
+        drawn.time_ns,
+        made.site,
+    )
+    assert 30 < len(upper) < len(found) and np.degrees(elevation_rad.min()) >= 20.0
 
 
 def test_an_image_of_another_size_is_refused(setup: pipeline.Setup) -> None:
