@@ -87,6 +87,14 @@ def change(before: CameraGeometry, after: CameraGeometry) -> tuple[float, float]
     return float(turn.magnitude()), float(left_rad * after.camera.parameters[0])
 
 
+def alignment_difference_rad(a: CameraGeometry, b: CameraGeometry) -> NDArray[np.float64]:
+    """The passive small rotation (3,) of the camera frame that takes alignment b to a."""
+    st_from_a = Rotation.from_quat(a.star_tracker_from_camera_xyzw)
+    st_from_b = Rotation.from_quat(b.star_tracker_from_camera_xyzw)
+    # a_from_b = exp(-[dtheta x]), so b_from_a has dtheta as its rotation vector.
+    return np.asarray((st_from_b.inv() * st_from_a).as_rotvec())
+
+
 def judge(candidate: Candidate, options: GateOptions) -> tuple[str, ...]:
     """Every reason against a candidate, one sentence each; empty when it may come into force."""
     reasons = []

@@ -16,18 +16,16 @@ import sys
 import tempfile
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 import yaml
 
 from starcal_ros import simulation, synthetic
+from starcal_ros.acceptance import alignment_difference_rad
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
 from starcal_ros.products import read_calibration, read_camera_info, write_atomically
 from starcal_ros.records import Calibration, CameraGeometry
 
-Floats = NDArray[np.float64]
 Process = subprocess.Popen[bytes]
 
 RATE = 5.0  # ten images in eight seconds
@@ -206,14 +204,6 @@ def _own_domain() -> dict[str, str]:
                 continue
         return {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     raise NodeError('no free ROS domain on this machine: set ROS_DOMAIN_ID')
-
-
-def alignment_difference_rad(a: CameraGeometry, b: CameraGeometry) -> Floats:
-    """The passive small rotation (3,) of the camera frame that takes alignment b to a."""
-    st_from_a = Rotation.from_quat(a.star_tracker_from_camera_xyzw)
-    st_from_b = Rotation.from_quat(b.star_tracker_from_camera_xyzw)
-    # a_from_b = exp(-[dtheta x]), so b_from_a has dtheta as its rotation vector.
-    return np.asarray((st_from_b.inv() * st_from_a).as_rotvec())
 
 
 def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeometry) -> Comparison:
