@@ -141,7 +141,8 @@ def choose_topic(paths: Iterable[Path | str], type_name: str, asked: str = '') -
     if len(fitting) == 1:
         return fitting[0]
     if not fitting:
-        raise BagError(f'{where}: no topic of type {type_name}')
+        listed = ', '.join(topic.name for topic in there) or 'nothing'
+        raise BagError(f'{where}: no topic of type {type_name} (there is {listed})')
     raise BagError(f'{where}: several topics of type {type_name}, name one: {listed}')
 
 
@@ -163,7 +164,7 @@ def read_images(
     """Images of a topic one by one; one that cannot be decoded comes as refused observations."""
     for raw in read_raw(paths, [topic], on_damage):
         try:
-            message = _decode(raw)
+            message = decode(raw)
         except BagError as error:
             yield refused_image(raw.log_time_ns, 0, 0, 'bad_layout', str(error))
             continue
@@ -217,7 +218,7 @@ def read_observations(
     """
     for raw in read_raw(paths, [topic], on_damage):
         try:
-            yield messages.observations_from_message(_decode(raw))
+            yield messages.observations_from_message(decode(raw))
         except (AttributeError, ValueError) as error:
             raise BagError(f'{topic}: not readable as observations: {error}') from error
 
@@ -439,7 +440,7 @@ def _definitions_folder() -> Path:
     raise BagError('the definitions of starcal/msg are not installed: ' + str(candidates[-1]))
 
 
-def _decode(raw: RawMessage) -> messages.Message:
+def decode(raw: RawMessage) -> messages.Message:
     """
     Decoded message: by ROS's and starcal's own definitions, else by that in the bag.
 
@@ -466,7 +467,7 @@ def _decoded(
     """Messages of a topic; bytes that are none of its type are said and passed over."""
     for raw in read_raw(paths, [topic], on_damage):
         try:
-            yield _decode(raw)
+            yield decode(raw)
         except BagError as error:
             on_damage(str(error))
 
@@ -497,7 +498,9 @@ def _files_of_folder(folder: Path) -> list[Path]:
     found = listed or sorted(folder.glob('*.mcap'), key=_natural)
     if not found:
         other = ' (an SQLite bag: ros2 bag convert makes one)' if any(folder.glob('*.db3')) else ''
-        raise BagError(f'{folder}: no .mcap files in the folder{other}')
+        inside = next(folder.glob('*/*.mcap'), None)
+        near = f' (did you mean {inside.parent}?)' if inside and not other else ''
+        raise BagError(f'{folder}: no .mcap files in the folder{other}{near}')
     missing = [name for name in names if not (folder / name).is_file()]
     if missing and listed:
         raise BagError(f'{folder}: metadata.yaml lists {missing[0]}, which is not there')

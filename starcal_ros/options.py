@@ -8,8 +8,9 @@ documentation all come from those fields.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 import dataclasses
+import difflib
 import math
 from pathlib import Path
 from typing import Any, TypeVar
@@ -76,7 +77,7 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
         if not isinstance(item, str):
             raise refuse('a text')
         if meta['choices'] and item not in meta['choices']:
-            raise refuse('one of ' + ', '.join(meta['choices']))
+            raise refuse('one of ' + ', '.join(meta['choices']) + nearest(item, meta['choices']))
         return item
 
     if isinstance(default, bool):
@@ -101,6 +102,12 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
     if of_text:
         return tuple(text(item) for item in items)
     return tuple(float(number(item)) for item in items)
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """What may have been meant by a word that is not known, as the end of a complaint."""
+    near = difflib.get_close_matches(word, known, 1)
+    return f' (did you mean {near[0]}?)' if near else ''
 
 
 def names_of(*option_classes: type[Any]) -> set[str]:
@@ -136,13 +143,21 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
         content = yaml.safe_load(path.read_text())
     except OSError as error:
         raise OptionError(f'{path}: cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise OptionError(f'{path}: not a text file') from error
+    except yaml.YAMLError as error:
         line = str(error).replace('\n', ' ')
         raise OptionError(f'{path}: not YAML: {line}') from error
     if not isinstance(content, dict):
         raise OptionError(f'{path}: not a ROS parameter file (no node sections)')
     values: dict[str, object] = {}
     known = {'/**', *nodes, *('/' + n for n in nodes), *('/**/' + n for n in nodes)}
+    if not known & content.keys():
+        there = ', '.join(map(str, content))
+        raise OptionError(
+            f'{path}: not a parameter file for this: no section /**, {" or ".join(nodes)}, '
+            f'only {there[:80]}'
+        )
     for section, body in content.items():
         if section not in known:
             continue

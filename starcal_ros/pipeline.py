@@ -41,7 +41,7 @@ from starcal_ros.observability import (
     weakest_direction,
 )
 from starcal_ros.observability import ensemble_status as _ensemble_status
-from starcal_ros.options import check_value, from_mapping, names_of, option
+from starcal_ros.options import check_value, from_mapping, names_of, nearest, option
 from starcal_ros.records import (
     Calibration,
     CameraGeometry,
@@ -121,7 +121,7 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
     known = names_of(*OPTION_CLASSES, *others)
     for name in values:
         if name not in known and name != 'use_sim_time':
-            raise OptionError(f'{name}: no such parameter')
+            raise OptionError(f'{name}: no such parameter{nearest(name, known)}')
     frames = from_mapping(SetupOptions, values)
     if not frames.camera_info_url:
         raise OptionError('camera_info_url: the prior camera must be given')
@@ -254,15 +254,30 @@ def observe_next(
     before one that was used is refused; a refused image moves nothing, so that one wrong stamp
     costs one image.
     """
-    if track.latest_ns is not None and image.time_ns <= track.latest_ns:
+    try:
+        check_order(image, track.latest_ns)
+    except ImageRefused as refused:
         height, width = image.pixels.shape
-        late_s = (track.latest_ns - image.time_ns) * 1e-9
-        detail = f'{late_s:.6f} s before the last image used'
-        return refused_image(image.time_ns, width, height, 'out_of_order', detail), track
+        refusal = (refused.reason, refused.detail)
+        return refused_image(image.time_ns, width, height, *refusal), track
     observations = observe(image, attitudes, setup, track.geometry, velocity_m_s)
     observations = dataclasses.replace(observations, temperature_degc=temperature_degc)
     latest_ns = track.latest_ns if observations.refusal else image.time_ns
     return observations, Track(tracked(track.geometry, observations), latest_ns)
+
+
+def check_order(image: Image, latest_ns: int | None) -> None:
+    """
+    Hold the stamp of an image against that of the last one used, None where there is none.
+
+    Raises
+    ------
+    ImageRefused
+        ``out_of_order``.
+    """
+    if latest_ns is not None and image.time_ns <= latest_ns:
+        late_s = (latest_ns - image.time_ns) * 1e-9
+        raise ImageRefused('out_of_order', f'{late_s:.6f} s before the last image used')
 
 
 def latest_at(samples: Sequence[tuple[int, T]], time_ns: int, without: T) -> T:

@@ -100,8 +100,10 @@ def calibration_from_content(path: Path, content: Mapping[str, object]) -> Calib
     ProductError
         Naming the file ``path`` and the key that is missing or wrong.
     """
-    if content.get('schema') != SCHEMA:
-        raise ProductError(f'{path}: schema {content.get("schema")!r} is not {SCHEMA}')
+    if 'schema' not in content:
+        raise ProductError(f'{path}: not a calibration (no key schema)')
+    if content['schema'] != SCHEMA:
+        raise ProductError(f'{path}: schema {content["schema"]!r} is not {SCHEMA}')
     try:
         return _calibration_from(_Reader(path, {**_LATER_KEYS, **content}))
     except ValueError as error:  # CameraModel's own checks

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
+from collections import Counter
 from collections.abc import Callable
 import json
+import os
 from pathlib import Path
+import shlex
 import shutil
 import subprocess
 import sys
@@ -15,6 +19,7 @@ import pytest
 import yaml
 
 from starcal_ros import cli, demo
+from starcal_ros.arguments import parser
 from starcal_ros.bag import BagWriter
 from starcal_ros.records import Image
 
@@ -73,9 +78,9 @@ def test_help_is_there_at_once() -> None:
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert time.monotonic() - start < 10  # only so that a hang is noticed
-    for command in ('demo', 'calibrate', 'play', 'simulate'):
+    for command in ('demo', 'inspect', 'calibrate', 'compare', 'play', 'simulate', 'campaign'):
         assert command in done.stdout
-    for heavy in ('numpy', 'scipy', 'cv2', 'matplotlib', 'rclpy'):
+    for heavy in ('numpy', 'scipy', 'cv2', 'matplotlib', 'rclpy', 'rich', 'argcomplete'):
         assert f'| {heavy}\n' not in done.stderr.replace('  ', '')
 
 
@@ -84,6 +89,24 @@ def test_help_is_there_at_once() -> None:
     [
         ([], ['COMMAND']),
         (['fly'], ["'fly'"]),
+        (['calibrat'], ['did you mean calibrate?']),
+        (['calibrate', 'a.mcap', '--image-topick=/a'], ['--params']),
+        (['inspect', 'a.mcap', '--image-topick=/a'], ['did you mean --image-topic?']),
+        (['inspect', 'none.mcap'], ['none.mcap', 'no such bag']),
+        (['inspect', ''], ['an empty name']),
+        (['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', ''], ['--output']),
+        (['calibrate', str(TINY), '--params', str(TINY / 'camera.yaml'), '-o', 'x'], ['section']),
+        (['calibrate', str(TINY), '--params', str(TINY / 'tiny_0.mcap'), '-o', 'x'], ['text']),
+        (
+            ['calibrate', str(TINY.parent), '--params', str(TINY / 'params.yaml'), '-o', 'x'],
+            ['did you mean', str(TINY)],
+        ),
+        (['compare', 'none'], ['B']),
+        (['compare', 'none', 'none'], ['none', 'No such file']),
+        (['compare', str(TINY), str(TINY)], [str(TINY), 'no calibration.json']),
+        (['compare', *2 * [str(TINY / 'truth.json')]], ['truth.json', 'not a calibration']),
+        (['compare', *2 * [str(TINY / 'params.yaml')]], ['params.yaml', 'not JSON']),
+        (['campaign', 'tabel1', '-o', 'x'], ['did you mean table1?']),
         (['calibrate'], ['BAG']),
         (['calibrate', 'a.mcap'], ['--params']),
         (['calibrate', 'a.mcap', '--params', 'p.yaml'], ['--output']),
@@ -159,10 +182,11 @@ def test_topics_that_are_not_there(
 @pytest.mark.parametrize(
     ('changes', 'words'),
     [
-        ({'magnitude_limits': 7.0}, ['magnitude_limits', 'no such parameter']),
+        ({'magnitude_limits': 7.0}, ['magnitude_limits', 'did you mean magnitude_limit?']),
         ({'magnitude_limit': 'faint'}, ['magnitude_limit', "'faint'"]),
         ({'magnitude_limit': float('nan')}, ['magnitude_limit', 'nan']),
         ({'method': 'magic'}, ['method', "'magic'", 'hierarchical']),
+        ({'method': 'perimage'}, ['method', 'did you mean per_image?']),
         ({'estimate': ['fx', 'f']}, ['estimate', "'f'"]),
         ({'estimate': 'fx'}, ['estimate', 'list']),
         ({'max_images': -1}, ['max_images', '-1']),
@@ -201,7 +225,9 @@ def test_bad_parameters(
         ('a: [', ['not YAML']),
         ('/**:\n  camera_info_url: a.yaml\n', ['ros__parameters']),
         ('star_observer:\n  ros__parameters: 3\n', ['star_observer', 'ros__parameters']),
-        ('other_node:\n  ros__parameters: {a: 1}\n', ['camera_info_url']),
+        ('other_node:\n  ros__parameters: {a: 1}\n', ['no section /**', 'other_node']),
+        ('/**:\n  ros__parameters: {camera_name: a}\n', ['camera_name', 'bad.yaml']),
+        ('/**:\n  ros__parameters: {min_images: 3}\n', ['camera_info_url', 'bad.yaml']),
     ],
 )
 def test_bad_parameter_files(run: Run, tmp_path: Path, text: str, words: list[str]) -> None:
@@ -325,6 +351,57 @@ def test_simulate_writes_bag_truth_and_parameters(run: Run, tmp_path: Path) -> N
     same = (tmp_path / 'bag' / truth['bag']).read_bytes()
     assert (tmp_path / 'b.mcap').read_bytes() == same  # one seed, one bag
     assert json.loads((tmp_path / 'b.json').read_text()) == {**truth, 'bag': 'b.mcap'}
+
+
+def examples() -> list[tuple[str, list[str]]]:
+    """Every line of example in the helps, by command."""
+    (commands,) = (a for a in parser()._actions if isinstance(a, argparse._SubParsersAction))
+    epilogs = {'': parser().epilog, **{n: c.epilog for n, c in commands.choices.items()}}
+    return [
+        (name, shlex.split(line))
+        for name, epilog in epilogs.items()
+        for line in str(epilog).splitlines()
+        if line.startswith('  starcal ')
+    ]
+
+
+def test_each_command_has_examples_that_it_takes() -> None:
+    shown = Counter(name for name, _ in examples())
+    assert all(
+        shown[name] >= 2 for name in ('inspect', 'calibrate', 'compare', 'simulate', 'play')
+    )
+    assert set(shown) == {'', *cli._COMMANDS}
+    for _, words in examples():
+        parser().parse_args(words[1:])  # exits where it does not understand
+
+
+@pytest.mark.parametrize(
+    ('line', 'expected'),
+    [
+        ('starcal ca', ['calibrate', 'campaign']),
+        ('starcal inspect --ima', ['--image-topic']),
+        ('starcal simulate --scenario ', ['paper', 'small', 'tiny']),
+        ('starcal campaign te', ['terms']),
+        (f'starcal inspect {TINY}/', [f'{TINY}/tiny_0.mcap']),
+    ],
+)
+def test_a_shell_completes(line: str, expected: list[str], tmp_path: Path) -> None:
+    """What argcomplete's function in the shell asks the tool, and what it is told."""
+    told = tmp_path / 'told'
+    asked = {
+        '_ARGCOMPLETE': '1',
+        '_ARGCOMPLETE_IFS': '\n',
+        '_ARGCOMPLETE_STDOUT_FILENAME': str(told),
+        '_ARGCOMPLETE_SUPPRESS_SPACE': '0',
+        'COMP_LINE': line,
+        'COMP_POINT': str(len(line)),
+        'COMP_TYPE': '9',
+    }
+    subprocess.run(
+        [sys.executable, '-m', 'starcal_ros.cli'], env={**os.environ, **asked}, check=False
+    )
+    found = told.read_text().split('\n')
+    assert sorted(word.strip() for word in found) == expected
 
 
 def test_play_becomes_the_player(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -172,5 +172,5 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match='cannot be read: Is a directory'):
         read_parameter_file(tmp_path, ('foo',))
     (tmp_path / 'latin.yaml').write_bytes(b'foo: \xff\xfe\n')
-    with pytest.raises(OptionError, match='latin.yaml: not YAML'):
+    with pytest.raises(OptionError, match='latin.yaml: not a text file'):
         read_parameter_file(tmp_path / 'latin.yaml', ('foo',))

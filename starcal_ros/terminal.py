@@ -1,0 +1,99 @@
+"""What a person sees: bars and tables on a terminal, plain lines in a pipe or a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+import contextlib
+import sys
+from typing import TypeVar
+
+T = TypeVar('T')
+
+
+@contextlib.contextmanager
+def progress_bar(total: int, what: str) -> Iterator[Callable[[], None]]:
+    """A bar on a terminal, nothing elsewhere; the function given advances it by one."""
+    if not sys.stderr.isatty():
+        yield lambda: None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn('{task.description}'),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn('left'),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda: progress.advance(task)
+
+
+def with_progress(items: Iterable[T], total: int, what: str) -> Iterator[T]:
+    """The items, with a bar that shows how many of them have been dealt with."""
+    with progress_bar(total, what) as advance:
+        for item in items:
+            yield item
+            advance()
+
+
+def print_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> None:
+    """
+    Print a table: drawn on a terminal, else in columns of aligned text.
+
+    The first ``left`` columns begin at the left, the others end at the right, as numbers do.
+    """
+    rows = list(rows)
+    if not sys.stdout.isatty():
+        for line in table_lines(header, rows, left):
+            print(line)
+        return
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False, header_style='bold'
+    )
+    for k, name in enumerate(header):
+        # A name may be cut in two where the terminal is narrow; a number never.
+        table.add_column(
+            name, justify='left' if k < left else 'right', no_wrap=k >= left, overflow='fold'
+        )
+    for row in rows:
+        table.add_row(*map(Text, row))  # Text: a bracket in a name is no markup
+    Console().print(table)
+
+
+def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
+    """Lines of a table in aligned columns, two spaces between them."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    return [
+        '  '.join(
+            cell.ljust(width) if k < left else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in (header, *rows)
+    ]
+
+
+def print_verdict(good: bool, text: str) -> None:
+    """Print a line that says how something ended: in colour on a terminal that has any."""
+    if not sys.stdout.isatty():
+        print(text)
+        return
+    from rich.console import Console
+    from rich.text import Text
+
+    Console().print(Text(text, style='bold green' if good else 'bold red'))
