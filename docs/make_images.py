@@ -21,7 +21,7 @@ import yaml
 from starcal_ros import pipeline, products, simulation, synthetic
 from starcal_ros.annotation import annotate
 from starcal_ros.attitude import AttitudeHistory
-from starcal_ros.camera import CameraModel, distort, pixel_grid
+from starcal_ros.camera import distortion_px, pixel_grid
 from starcal_ros.observability import coverage
 from starcal_ros.options import read_parameter_file
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
@@ -128,12 +128,12 @@ def focal_plane(ensemble: Ensemble, setup: pipeline.Setup, file: Path) -> None:
     left, right = figure.subplots(1, 2)
 
     grid = pixel_grid(camera, 60, 48)
-    shift = _distortion_px(camera, grid)
+    shift = distortion_px(camera, grid)
     u, v, length = (a.reshape(48, 60) for a in (*grid.T, np.hypot(*shift.T)))
     lines = left.contour(u, v, length, levels=(0.25, 0.5, 1.0, 1.5, 2.0), cmap='viridis')
     left.clabel(lines, fmt='%g px')
     coarse = pixel_grid(camera, 14, 11)
-    arrows = _distortion_px(camera, coarse)
+    arrows = distortion_px(camera, coarse)
     left.quiver(*coarse.T, *arrows.T, angles='xy', color='0.4', width=0.003)
     left.set_title('distortion found')
 
@@ -147,15 +147,6 @@ def focal_plane(ensemble: Ensemble, setup: pipeline.Setup, file: Path) -> None:
     for axes in (left, right):
         axes.set(xlim=extent[:2], ylim=extent[2:], aspect='equal', xlabel='u, px', ylabel='v, px')
     figure.savefig(file, dpi=90, metadata={'Software': None})
-
-
-def _distortion_px(camera: CameraModel, pixels: Floats) -> Floats:
-    """How far the distortion moves what an ideal lens would show at some pixels, px."""
-    fx, skew, fy, cx, cy = camera.intrinsics
-    y = (pixels[:, 1] - cy) / fy
-    x = (pixels[:, 0] - cx - skew * y) / fx
-    xd, yd = distort(np.stack([x, y], axis=-1), camera.distortion).T
-    return np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1) - pixels
 
 
 def main() -> None:

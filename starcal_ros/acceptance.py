@@ -61,7 +61,9 @@ class Candidate:
     termination: str
 
 
-def change(before: CameraGeometry, after: CameraGeometry) -> tuple[float, float]:
+def movement(
+    before: CameraGeometry, after: CameraGeometry, columns: int = 15, rows: int = 12
+) -> tuple[float, NDArray[np.float64]]:
     """
     How far the lines of sight of the pixels moved in the star tracker frame.
 
@@ -69,11 +71,11 @@ def change(before: CameraGeometry, after: CameraGeometry) -> tuple[float, float]
     -------
     turn_rad : float
         The rotation common to all pixels.
-    shape_px : float
-        The largest movement of a pixel that is left.  Both are infinite where a pixel has no line
-        of sight any more.
+    left_px : (columns * rows,)
+        The movement that is left at a grid of pixels, in pixels of the middle.  Both are infinite
+        where a pixel has no line of sight any more.
     """
-    pixels = pixel_grid(before.camera, 15, 12)
+    pixels = pixel_grid(before.camera, columns, rows)
     old, new = (
         Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).apply(
             line_of_sight(geometry.camera, pixels)
@@ -81,10 +83,10 @@ def change(before: CameraGeometry, after: CameraGeometry) -> tuple[float, float]
         for geometry in (before, after)
     )
     if not (np.isfinite(old).all() and np.isfinite(new).all()):
-        return np.inf, np.inf
+        return np.inf, np.full(len(pixels), np.inf)
     turn, _ = Rotation.align_vectors(new, old)
-    left_rad = np.linalg.norm(new - turn.apply(old), axis=1).max()
-    return float(turn.magnitude()), float(left_rad * after.camera.parameters[0])
+    left_rad = np.linalg.norm(new - turn.apply(old), axis=1)
+    return float(turn.magnitude()), left_rad * after.camera.parameters[0]
 
 
 def alignment_difference_rad(a: CameraGeometry, b: CameraGeometry) -> NDArray[np.float64]:
@@ -134,7 +136,8 @@ def judge(candidate: Candidate, options: GateOptions) -> tuple[str, ...]:
             f'the distortion map is uncertain by {candidate.map_sigma_px:.3f} px at its worst, '
             f'over the limit of {options.max_map_sigma_px:g} px (max_map_sigma_px)'
         )
-    turn_rad, shape_px = change(candidate.prior, candidate.geometry)
+    turn_rad, left_px = movement(candidate.prior, candidate.geometry)
+    shape_px = left_px.max()
     if not shape_px <= options.max_change_px:
         reasons.append(
             f'the distortion map would change by {shape_px:.1f} px at its worst, '

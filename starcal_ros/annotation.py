@@ -51,13 +51,16 @@ STAR_MARKS: Mapping[str, Mark] = {
 _UNKNOWN = Mark(cv2.MARKER_STAR, _TEXT)  # a reason of another version
 
 
-def annotate(image: Image, observations: StarObservations, geometry: CameraGeometry) -> Picture:
+def annotate(
+    image: Image, observations: StarObservations, geometry: CameraGeometry, legend: bool = True
+) -> Picture:
     """
     Picture (height, width, 3) BGR of what became of the stars of an image.
 
     Crosses stand at the predicted and circles at the measured places of the stars used; those left
     out carry the mark of their reason, which the legend names with its count.  An image refused as
-    a whole says so in a banner.  ``geometry`` is what the stars are predicted with.
+    a whole says so in a banner.  ``geometry`` is what the stars are predicted with.  Without
+    ``legend`` there are marks only: a picture that will be shrunk has no room for words.
     """
     picture = np.asarray(cv2.cvtColor(stretch(image.pixels), cv2.COLOR_GRAY2BGR), np.uint8)
     size = max(image.pixels.shape) / 1000.0
@@ -71,8 +74,9 @@ def annotate(image: Image, observations: StarObservations, geometry: CameraGeome
         radius = (5 + 2 * np.log10(max(float(snr), 1.0))) * size
         center, radius = _fixed_point(uv), int(radius * (1 << _SHIFT))
         cv2.circle(picture, center, radius, _MEASURED, width, cv2.LINE_AA, _SHIFT)
-    top = _draw_banner(picture, observations, size)
-    _draw_legend(picture, observations, size, top)
+    if legend:
+        top = _draw_banner(picture, observations, size)
+        _draw_legend(picture, observations, size, top)
     return picture
 
 

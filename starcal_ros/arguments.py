@@ -50,8 +50,8 @@ exit status: 0 a calibration could use the bag; 3 it could not, and why is said;
         'calibrate from bags, without a ROS graph',
         (
             'Measures the stars of all images, solves for camera and alignment, holds the result '
-            'against the limits of the gate and writes calibration.json, camera_info.yaml and '
-            'observations.mcap into DIR.'
+            'against the limits of the gate and writes report.html, calibration.json, '
+            'camera_info.yaml and observations.mcap into DIR.'
         ),
         """\
   # the bag in the repository
@@ -75,6 +75,16 @@ exit status: 0 a calibration could use the bag; 3 it could not, and why is said;
   starcal compare out again -o difference.png
   # for a program
   starcal compare out/calibration.json again/calibration.json --json""",
+    ),
+    'report': (
+        'write report.html of a calibration anew',
+        (
+            'Makes one page from the files of a folder: verdict, parameters, residuals, how well '
+            'the camera is known, what was refused. It opens without a network.'
+        ),
+        """\
+  # of an earlier calibration, with this version of starcal
+  starcal report out""",
     ),
     'play': (
         'play a bag on the ROS graph',
@@ -176,6 +186,7 @@ def parser() -> argparse.ArgumentParser:
         ('demo', _demo),
         ('inspect', _inspect),
         ('calibrate', _calibrate),
+        ('report', _report),
         ('compare', _compare),
         ('play', _play),
         ('simulate', _simulate),
@@ -328,6 +339,12 @@ def _play(command: argparse.ArgumentParser) -> None:
         default=[],
         metavar='A:=B',
         help='publish on B what the bag has on A; may be given again',
+    )
+
+
+def _report(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        'folder', type=_path, metavar='DIR', help='folder that starcal calibrate has written'
     )
 
 

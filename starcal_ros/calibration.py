@@ -148,6 +148,8 @@ class Estimate:
         Stars that misfit across images and were left out of all.
     alignment_scatter_arcsec : float
         RMS per axis of the alignments that the images show, about their mean.
+    attitude_error_rad, attitude_covariance_rad2, attitude_seen : (m, 3), (m, 3, 3), (m,) bool
+        Star tracker errors by the stars alone, of `attitudes_of_stars_alone`.
     iterations, termination
     thermal : Thermal or None
         None where no change with temperature was asked for.
@@ -169,6 +171,9 @@ class Estimate:
     misfit_image: Mask
     dropped_catalog_id: NDArray[np.int64]
     alignment_scatter_arcsec: float
+    attitude_error_rad: Floats
+    attitude_covariance_rad2: Floats
+    attitude_seen: Mask
     iterations: int
     termination: str
     thermal: Thermal | None
@@ -385,6 +390,10 @@ def _estimate(
     geometry, full, scatter_arcsec = _result(
         problem, state, blocks, prior, verdict.tracker_sigma_rad
     )
+    alignment = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).inv()
+    attitude_error_rad, attitude_covariance_rad2, attitude_seen = attitudes_of_stars_alone(
+        problem, dataclasses.replace(state, camera_from_star_tracker=alignment), blocks
+    )
     information = reduced_information(problem, state, blocks)
     shared = np.concatenate([problem.free, np.arange(10, len(information))])
     k = 10 + len(state.focal)
@@ -409,6 +418,9 @@ def _estimate(
         misfit_image=verdict.misfit | lost,
         dropped_catalog_id=_dropped(table, kept),
         alignment_scatter_arcsec=scatter_arcsec,
+        attitude_error_rad=attitude_error_rad,
+        attitude_covariance_rad2=attitude_covariance_rad2,
+        attitude_seen=attitude_seen,
         iterations=iterations,
         termination=solution.termination,
         thermal=thermal,

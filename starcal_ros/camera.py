@@ -99,6 +99,15 @@ def distort(xy: Floats, distortion: Floats) -> Floats:
     )
 
 
+def distortion_px(camera: CameraModel, pixels: Floats) -> Floats:
+    """How far (n, 2) the distortion moves what an ideal lens would show at pixels (n, 2)."""
+    fx, skew, fy, cx, cy = camera.intrinsics
+    y = (pixels[:, 1] - cy) / fy
+    x = (pixels[:, 0] - cx - skew * y) / fx
+    xd, yd = distort(np.stack([x, y], axis=-1), camera.distortion).T
+    return np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1) - pixels
+
+
 def distort_jacobian(xy: Floats, distortion: Floats) -> Floats:
     """Derivative (..., 2, 2) of `distort` by its ideal points (Eqs. 36, 37)."""
     x, y = xy[..., 0], xy[..., 1]

@@ -133,6 +133,15 @@ class StarCatalog:
         }
         return replace(self, **columns)
 
+    def colours_bp_rp(self, identifiers: NDArray[np.int64]) -> Floats:
+        """BP - RP (n,) of stars by identifier; NaN where no star or colour is known."""
+        if len(self) == 0:
+            return np.full(len(identifiers), np.nan)
+        order = np.argsort(self.id)
+        place = np.searchsorted(self.id, identifiers, sorter=order)
+        row = order[np.minimum(place, len(self) - 1)]
+        return np.where(self.id[row] == identifiers, self.colour_bp_rp[row], np.nan)
+
 
 def column_digest(columns: Mapping[str, NDArray[np.generic]]) -> str:
     """SHA-256, in hex, of the file's integer columns with their names, types and epoch."""

@@ -64,14 +64,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _calibrate(args: argparse.Namespace) -> int:
     """Bags to products: what the two nodes do, in one process."""
-    from starcal_ros import bag, pipeline, sources, summaries
+    from starcal_ros import bag, pipeline, report, residuals, sources, summaries, thumbnails
     from starcal_ros.records import Ensemble
 
     setup = _setup(args.params)
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
     topics = sources.choose_topics(args.bags, _asked(args), setup)
-    records = sources.read(args.bags, topics, setup)
+    album = thumbnails.Album()
+    records = sources.read(args.bags, topics, setup, album.show)
     observations = list(with_progress(records, sources.count(args.bags, topics), 'images'))
     ensemble = Ensemble()
     for record in observations:
@@ -83,12 +84,15 @@ def _calibrate(args: argparse.Namespace) -> int:
             writer.write_observations('/observations', record, setup.frames.camera_frame)
     inputs = {str(path): _digest(path) for path in (*bag.mcap_files(args.bags), args.params)}
     try:
-        calibration = pipeline.solve(ensemble, setup, inputs=inputs)
+        calibration, left = pipeline.solve_with_residuals(ensemble, setup, inputs=inputs)
     except TooFewObservations as error:
         raise TooFewObservations(f'{error}{_refused_words(ensemble)}') from error
     _write_products(calibration, args.output)
+    residuals.write_residuals(left, args.output / residuals.RESIDUALS_FILE)
+    thumbnails.write_thumbnails(album.thumbnails(), args.output / thumbnails.THUMBNAILS_FOLDER)
+    shown = report.write_report(args.output)
     summaries.print_calibration(calibration, setup.prior)
-    print(f'written to {args.output}')
+    print(f'written to {args.output}; look at {shown}')
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
 
 
@@ -122,6 +126,14 @@ def _write_products(calibration: Calibration, folder: Path) -> None:
 
     products.write_calibration(calibration, folder / products.CALIBRATION_FILE)
     products.write_camera_info(calibration.geometry.camera, folder / products.CAMERA_INFO_FILE)
+
+
+def _report(args: argparse.Namespace) -> int:
+    """Write the report of a folder anew."""
+    from starcal_ros import report
+
+    print(f'written to {report.write_report(args.folder)}')
+    return EXIT_ACCEPTED
 
 
 def _refused_words(ensemble: Ensemble) -> str:
@@ -293,6 +305,7 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     'demo': _demo,
     'inspect': _inspect,
     'calibrate': _calibrate,
+    'report': _report,
     'compare': _compare,
     'play': _play,
     'simulate': _simulate,

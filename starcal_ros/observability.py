@@ -16,6 +16,7 @@ from starcal_ros.camera import (
     PARAMETER_NAMES,
     pixel_grid,
     project_jacobians,
+    project_parameters,
 )
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.covariance import shared_covariance, shared_names
@@ -271,6 +272,19 @@ def correlation(covariance: Floats, names: tuple[str, ...]) -> Correlation:
     known = np.nonzero(sigma > 0)[0]
     matrix = covariance[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])
     return Correlation(tuple(names[i] for i in known), matrix)
+
+
+def movement_px(camera: CameraModel, changes: Floats) -> Floats:
+    """
+    Worst movement (k,) over the detector of the image of a direction, px.
+
+    When the k-th of the camera parameters alone is less by ``changes`` (k,).
+    """
+    pixels = pixel_grid(camera, 25, 20)
+    directions = line_of_sight(camera, pixels)
+    moved = camera.parameters - np.diag(changes)
+    found = np.stack([project_parameters(row, directions) for row in moved])
+    return np.asarray(np.linalg.norm(pixels - found, axis=-1).max(axis=1))
 
 
 def _line_of_sight_jacobian(camera: CameraModel, columns: int, rows: int) -> tuple[Floats, Floats]:

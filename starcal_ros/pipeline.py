@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import hashlib
@@ -51,9 +51,11 @@ from starcal_ros.records import (
     refused_image,
     StarObservations,
 )
+from starcal_ros.residuals import Residuals, residuals_of
 
 Floats = NDArray[np.float64]
 T = TypeVar('T')
+OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
 
 @dataclass(frozen=True)
@@ -300,9 +302,13 @@ def observe_bag(
     setup: Setup,
     velocity_topic: str = '',
     temperature_topic: str = '',
+    on_image: OnImage | None = None,
 ) -> Iterator[StarObservations]:
     """
     Observations of every image of a bag, in the order of the bag; one image in memory at a time.
+
+    ``on_image`` is shown each image that could be decoded, with its observations and what the
+    stars were predicted with.
 
     Raises
     ------
@@ -325,6 +331,7 @@ def observe_bag(
         if isinstance(image, StarObservations):
             yield image
             continue
+        predicted_with = track.geometry
         observations, track = observe_next(
             image,
             attitudes,
@@ -333,6 +340,8 @@ def observe_bag(
             latest_at(velocities, image.time_ns, None),
             latest_at(temperatures, image.time_ns, math.nan),
         )
+        if on_image is not None:
+            on_image(image, observations, predicted_with)
         yield observations
 
 
@@ -383,6 +392,17 @@ def solve(
     OptionError
         For a method or parameter name that is none.
     """
+    return solve_with_residuals(ensemble, setup, method, estimate, inputs)[0]
+
+
+def solve_with_residuals(
+    ensemble: Ensemble,
+    setup: Setup,
+    method: str = '',
+    estimate: Sequence[str] = (),
+    inputs: Mapping[str, str] | None = None,
+) -> tuple[Calibration, Residuals]:
+    """The calibration of `solve`, and what it left over of every star and image."""
     options = setup.calibration
     override: dict[str, object] = {}
     if method:
@@ -393,13 +413,10 @@ def solve(
         if field.name in override:
             check_value(field, override[field.name])
     options = dataclasses.replace(options, **override)  # type: ignore[arg-type]
-    return _calibration(
-        estimate_calibration(ensemble, setup.prior, options),
-        ensemble,
-        setup,
-        options,
-        inputs or {},
-    )
+    result = estimate_calibration(ensemble, setup.prior, options)
+    calibration = _calibration(result, ensemble, setup, options, inputs or {})
+    colour_bp_rp = setup.catalog.colours_bp_rp(result.table.catalog_id)
+    return calibration, residuals_of(result, ensemble, colour_bp_rp)
 
 
 def _calibration(

@@ -110,6 +110,18 @@ def calibration_from_content(path: Path, content: Mapping[str, object]) -> Calib
         raise ProductError(f'{path}: {error}') from error
 
 
+def prior_of(calibration: Calibration) -> CameraGeometry | None:
+    """Camera and alignment that a calibration started from; None where it does not tell."""
+    try:
+        numbers = np.array(json.loads(calibration.provenance['prior']), np.float64)
+        camera = calibration.geometry.camera
+        return CameraGeometry(
+            CameraModel(camera.width, camera.height, numbers[:10]), numbers[10:14]
+        )
+    except (KeyError, ValueError, TypeError):
+        return None
+
+
 def write_camera_info(camera: CameraModel, path: Path, camera_name: str = 'camera') -> None:
     """
     Write a ROS camera YAML as camera_info_manager reads it, with the zero-skew fit of the camera.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from starcal_ros import bag, messages, pipeline
 from starcal_ros.errors import BagError
-from starcal_ros.pipeline import Setup
+from starcal_ros.pipeline import OnImage, Setup
 from starcal_ros.records import StarObservations
 
 
@@ -67,12 +67,14 @@ def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str
         raise BagError(f'{error}; --{what}-topic names it') from error
 
 
-def read(paths: Sequence[Path], topics: Topics, setup: Setup) -> Iterator[StarObservations]:
-    """Observations of bags, measured in images or as recorded, one by one."""
+def read(
+    paths: Sequence[Path], topics: Topics, setup: Setup, on_image: OnImage | None = None
+) -> Iterator[StarObservations]:
+    """Observations of bags, measured in images that ``on_image`` is shown, or as recorded."""
     if topics.observations:
         return bag.read_observations(paths, topics.observations)
     return pipeline.observe_bag(
-        paths, topics.image, topics.attitude, setup, topics.velocity, topics.temperature
+        paths, topics.image, topics.attitude, setup, topics.velocity, topics.temperature, on_image
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.acceptance import Candidate, change, GateOptions, judge
+from starcal_ros.acceptance import Candidate, GateOptions, judge, movement
 from starcal_ros.camera import CameraModel
 from starcal_ros.records import CameraGeometry
 
@@ -174,27 +174,28 @@ def test_no_star_at_all_is_refused() -> None:
 @pytest.mark.parametrize('axis', ['x', 'y', 'z'])
 @pytest.mark.parametrize('degrees', [0.01, 1.0, 30.0, 170.0])
 def test_a_turn_is_a_turn_and_no_change_of_shape(axis: str, degrees: float) -> None:
-    turn_rad, shape_px = change(PRIOR, turned(degrees, axis))
+    turn_rad, left_px = movement(PRIOR, turned(degrees, axis))
     assert np.degrees(turn_rad) == pytest.approx(degrees, abs=1e-7)
-    assert shape_px < 1e-6
+    assert left_px.max() < 1e-6
 
 
 def test_a_focal_length_is_a_change_of_shape() -> None:
     # 1 % at the corner, 1800 px * 0.01 * 0.227 = 4.1 px; the field curves a little of it away.
-    turn_rad, shape_px = change(PRIOR, turned(0.0, fx=1818.0, fy=1819.01))
-    assert shape_px == pytest.approx(4.1, abs=0.4)
+    turn_rad, left_px = movement(PRIOR, turned(0.0, fx=1818.0, fy=1819.01))
+    assert left_px.max() == pytest.approx(4.1, abs=0.4)
     assert np.degrees(turn_rad) < 0.01
 
 
 def test_a_principal_point_is_mostly_a_turn() -> None:
     # 30 px of 1800 are 0.955 degrees.
-    turn_rad, shape_px = change(PRIOR, turned(0.0, cx=350.0))
+    turn_rad, left_px = movement(PRIOR, turned(0.0, cx=350.0))
     assert np.degrees(turn_rad) == pytest.approx(0.955, abs=0.03)
-    assert shape_px < 30 * 0.23**2 * 2
+    assert left_px.max() < 30 * 0.23**2 * 2
 
 
 def test_a_camera_that_folds_over_is_refused() -> None:
     # 1 + 3 k1 r^2 is zero at r = 0.18: the corners have no line of sight.
-    assert change(PRIOR, turned(0.0, k1=-10.0)) == (np.inf, np.inf)
+    turn_rad, left_px = movement(PRIOR, turned(0.0, k1=-10.0))
+    assert np.isinf(turn_rad) and np.isinf(left_px).all()
     reasons = judge(dataclasses.replace(GOOD, geometry=turned(0.0, k1=-10.0)), GateOptions())
     assert len(reasons) == 2
