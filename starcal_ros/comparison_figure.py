@@ -42,11 +42,12 @@ def write(comparison: Comparison, path: Path) -> None:
             grid_px[..., 0], grid_px[..., 1], _levels(found), 12, cmap='viridis'
         )
         few = slice(None, None, 2)
-        axes.quiver(
-            *np.moveaxis(grid_px[few, few], -1, 0),
-            *np.moveaxis(found.difference_px[few, few], -1, 0),
-            angles='xy', color='white', edgecolor='black', linewidth=0.4, width=0.004,
-        )  # fmt: skip
+        if worst_px > 0:  # arrows without length have no scale
+            axes.quiver(
+                *np.moveaxis(grid_px[few, few], -1, 0),
+                *np.moveaxis(found.difference_px[few, few], -1, 0),
+                angles='xy', color='white', edgecolor='black', linewidth=0.4, width=0.004,
+            )  # fmt: skip
         unit = 'px' if np.isnan(found.sigmas).all() else 'sigma'
         figure.colorbar(levels, ax=axes, shrink=0.8, label=f'length ({unit})')
         axes.set_title(f'{title}: {worst_px:.3g} px at worst', fontsize=10)

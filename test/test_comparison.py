@@ -164,6 +164,7 @@ def test_cameras_of_other_sizes_are_refused(tiny: Calibration) -> None:
 
 
 def test_the_figure_is_drawn(tiny: Calibration, tmp_path: Path) -> None:
+    comparison_figure.write(compare(tiny, tiny), tmp_path / 'same.png')  # and no warning
     found = compare(tiny, moved(tiny, fx=1.0))
     comparison_figure.write(found, tmp_path / 'a.png')
     picture = cv2.imread(str(tmp_path / 'a.png'))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import ast
 import dataclasses
 import importlib
+import itertools
 from pathlib import Path
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from xml.etree import ElementTree
@@ -17,6 +19,7 @@ import numpy as np
 import pytest
 
 from starcal_ros import cli, pipeline
+from starcal_ros.arguments import parser
 from starcal_ros.node_options import NODE_OPTION_CLASSES, PlayerOptions
 from starcal_ros.options import read_parameter_file
 
@@ -32,30 +35,61 @@ def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def code(document: Path) -> str:
-    """All that a document shows as code, fenced or indented."""
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """A line of shell in a document; ``runs``: here and now, not only read."""
+
+    document: Path
+    words: tuple[str, ...]
+    runs: bool
+
+
+FENCE = re.compile(r'(<!-- not run: [^\n]+ -->\n+)?^```(\w*)\n(.*?)^```', re.DOTALL | re.MULTILINE)
+# A command indented by four: the older documents have such.
+INDENTED = re.compile(r'^ {4}((?:starcal|make|ros2|\.venv/bin/\S+) [a-z\-].*)$', re.MULTILINE)
+
+
+def shell_lines(document: Path) -> list[Line]:
+    """Lines of shell in a document, continued ones joined, comments cut."""
     text = document.read_text()
-    fenced = re.findall(r'^```\w*\n(.*?)^```', text, re.DOTALL | re.MULTILINE)
-    indented = re.findall(r'^ {4}(\S.*)$', text, re.MULTILINE)
-    return '\n'.join([*fenced, *indented])
+    blocks = [
+        (body, not marked) for marked, kind, body in FENCE.findall(text) if kind in ('sh', 'bash')
+    ]
+    blocks += [(line, False) for line in INDENTED.findall(FENCE.sub('', text))]
+    return [
+        Line(document, tuple(words), runs)
+        for body, runs in blocks
+        for line in body.replace('\\\n', ' ').splitlines()
+        if (words := shlex.split(line, comments=True))
+    ]
 
 
-def shell_lines() -> list[str]:
-    """Lines of shell in the documents, continued ones joined, comments cut."""
-    text = '\n'.join(code(document) for document in DOCUMENTS).replace('\\\n', ' ')
-    return sorted({' '.join(line.partition(' #')[0].split()) for line in text.splitlines()})
+LINES = [line for document in DOCUMENTS for line in shell_lines(document)]
 
 
-TOOL_LINES = [line for line in shell_lines() if re.match(r'(\.venv/bin/)?starcal [a-z]', line)]
+def lines_of(command: str) -> list[Line]:
+    """The lines that call a program, wherever it stands."""
+    return [line for line in LINES if Path(line.words[0]).name == command]
+
+
+TOOL_LINES = lines_of('starcal')
 MAKE_TARGETS = sorted(
-    {
-        word
-        for line in shell_lines()
-        if line.startswith('make ')
-        for word in line.split()[1:]
-        if '=' not in word
-    }
+    {word for line in lines_of('make') for word in line.words[1:] if '=' not in word}
 )
+# What the documents call besides, on the reader's machine: nothing of ours to hold it against.
+OTHERS = {
+    'git',
+    'cd',
+    'rosdep',
+    'colcon',
+    '.',
+    'eval',
+    'apt',
+    'sudo',
+    'xdg-open',
+    'export',
+    'kill',
+}
 
 
 def links(document: Path) -> list[str]:
@@ -76,6 +110,8 @@ def test_the_documents_are_there() -> None:
         'docs/algorithm.md',
         'docs/design.md',
         'docs/performance.md',
+        'docs/tutorial.md',
+        'QUALITY_DECLARATION.md',
         'bags/tiny/README.md',
     }
 
@@ -142,15 +178,41 @@ def test_topics_and_services_are_names_that_the_nodes_use() -> None:
         assert name in constants or {base, '/compressed'} <= constants, name
 
 
-def test_the_tool_is_called_as_it_can_be() -> None:
-    """Every subcommand and option that a document shows is one that the tool has."""
-    assert len(TOOL_LINES) >= 3
+def test_no_command_is_unknown() -> None:
+    known = {'starcal', 'make', 'ros2', 'pip', 'python', *OTHERS}
+    for line in LINES:
+        assert (Path(line.words[0]).name or line.words[0]) in known, line
+
+
+@pytest.mark.parametrize('line', TOOL_LINES, ids=lambda line: ' '.join(line.words)[:60])
+def test_the_tool_takes_the_line(line: Line) -> None:
+    """Every command and option that a document shows is one that the tool has."""
+    words = [re.sub(r'^[NMS]$', '1', word) for word in line.words]  # a number to be given
+    args = parser().parse_args(words[1:])  # ends the test where it does not understand
+    assert args.command in cli._COMMANDS
+
+
+RUNNING = sorted({line.document for line in TOOL_LINES if line.runs})
+
+
+@pytest.mark.parametrize('document', RUNNING, ids=lambda path: path.name)
+def test_the_commands_of_a_document_run(
+    document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One after the other, as a reader would."""
+    shutil.copytree(ROOT / 'bags' / 'tiny', tmp_path / 'bags' / 'tiny')
+    monkeypatch.chdir(tmp_path)
     for line in TOOL_LINES:
-        _, command, *rest = shlex.split(line)
-        told = run(sys.executable, '-m', 'starcal_ros.cli', command, '--help')
-        assert told.returncode == 0, line
-        for word in rest:
-            assert not word.startswith('-') or word in told.stdout, line
+        if line.document == document and line.runs:
+            assert cli.main(line.words[1:]) == 0, line.words
+    for name in ('calibration.json', 'camera_info.yaml', 'observations.mcap', 'report.html'):
+        assert (tmp_path / 'out' / name).is_file()
+
+
+def test_readme_and_tutorial_run() -> None:
+    assert {path.name for path in RUNNING} >= {'README.md', 'tutorial.md'}
+    ran = {line.words[1] for line in TOOL_LINES if line.runs}
+    assert ran >= {'inspect', 'calibrate', 'compare'}
 
 
 def test_subcommands_in_the_interface_document_are_those_of_the_tool() -> None:
@@ -159,25 +221,28 @@ def test_subcommands_in_the_interface_document_are_those_of_the_tool() -> None:
     assert documented == set(cli._COMMANDS)
 
 
-def test_the_calibration_of_the_readme_runs(tmp_path: Path) -> None:
-    (line,) = (line for line in TOOL_LINES if line.startswith('.venv') and ' bags/tiny ' in line)
-    words = shlex.split(line)
-    assert words[-2:] == ['-o', 'out']
-    done = run(sys.executable, '-m', 'starcal_ros.cli', *words[1:-1], tmp_path / 'out')
-    assert done.returncode == 0, done.stderr
-    for name in ('calibration.json', 'camera_info.yaml', 'observations.mcap', 'report.html'):
-        assert (tmp_path / 'out' / name).is_file()
+PARAMETER_BLOCKS = [
+    (document, text)
+    for document in DOCUMENTS
+    for _, kind, text in FENCE.findall(document.read_text())
+    if kind == 'yaml' and 'ros__parameters' in text
+]
 
 
-def test_the_parameter_file_of_the_readme_is_one(tmp_path: Path) -> None:
-    (text,) = re.findall(r'^```yaml\n(.*?)^```', (ROOT / 'README.md').read_text(), re.S | re.M)
+@pytest.mark.parametrize(
+    ('document', 'text'), PARAMETER_BLOCKS, ids=[path.name for path, _ in PARAMETER_BLOCKS]
+)
+def test_a_parameter_file_of_a_document_is_one(document: Path, text: str, tmp_path: Path) -> None:
     params = tmp_path / 'params.yaml'
     params.write_text(text)
     values = read_parameter_file(params, ('star_observer', 'calibrator'))
-    assert values['camera_info_url'] == 'camera.yaml'
     camera = ROOT / 'bags' / 'tiny' / 'camera.yaml'
     setup = pipeline.load_setup({**values, 'camera_info_url': str(camera)}, OPTIONS)
     assert setup.prior.camera.width > 0
+
+
+def test_readme_and_tutorial_show_a_parameter_file() -> None:
+    assert {path.name for path, _ in PARAMETER_BLOCKS} >= {'README.md', 'tutorial.md'}
 
 
 @pytest.mark.parametrize('target', MAKE_TARGETS)
@@ -186,27 +251,84 @@ def test_make_knows_the_target(target: str) -> None:
 
 
 def test_scripts_that_are_named_exist() -> None:
-    lines = [line for line in shell_lines() if line.startswith('.venv/bin/python -m ')]
+    lines = [line.words for line in lines_of('python') if line.words[1:2] == ('-m',)]
     assert lines
-    for line in lines:
-        module = shlex.split(line)[2]
-        assert (ROOT / (module.replace('.', '/') + '.py')).is_file(), line
+    for words in lines:
+        module = ROOT / words[2].replace('.', '/')
+        ours = module.with_suffix('.py').is_file() or (module / '__main__.py').is_file()
+        assert ours or words[2] in ('pytest', 'cProfile'), words
 
 
-def test_the_launch_file_has_the_arguments_that_the_readme_gives() -> None:
-    (line,) = (line for line in shell_lines() if line.startswith('ros2 launch '))
-    _, _, package, name, *arguments = line.split()
-    assert package == 'starcal'
-    source = (ROOT / 'launch' / name).read_text()
-    for argument in arguments:
-        assert f"'{argument.partition(':=')[0]}'" in source
+def interface(directions: str) -> dict[str, str]:
+    """Name -> type of topics or services, from the tables of the interface document."""
+    text = (ROOT / 'docs' / 'icd.md').read_text()
+    rows = re.findall(rf'^\| (?:{directions}) \| `([^`]+)` \| \[?(\w+/\w+)', text, re.MULTILINE)
+    return dict(rows)
+
+
+def check_ros_arguments(words: tuple[str, ...]) -> None:
+    """Remaps are of topics that a node has, parameters are ones it has."""
+    names = {field.name for cls in OPTIONS for field in dataclasses.fields(cls)}
+    topics = {name.lstrip('/') for name in interface('sub|pub')}
+    for before, word in itertools.pairwise(words):
+        name = word.partition(':=')[0]
+        if before in ('-r', '--remap'):
+            assert name.lstrip('/') in topics or name.startswith('__'), words
+        if before in ('-p', '--param'):
+            assert name in names, words
+
+
+def executables() -> set[str]:
+    text = (ROOT / 'setup.cfg').read_text()
+    return set(re.findall(r'^ {4}(\w+) = starcal_ros', text, re.MULTILINE))
+
+
+@pytest.mark.parametrize('line', lines_of('ros2'), ids=lambda line: ' '.join(line.words)[:60])
+def test_what_a_ros2_line_names_is_there(line: Line) -> None:
+    _, verb, *rest = line.words
+    if verb == 'launch' and rest[0] == 'starcal':
+        source = (ROOT / 'launch' / rest[1]).read_text()
+        for argument in rest[2:]:
+            assert f"'{argument.partition(':=')[0]}'" in source
+    elif verb == 'run' and rest[0] == 'starcal':
+        assert rest[1] in executables()
+        if rest[1] == 'starcal':
+            parser().parse_args(rest[2:])
+        check_ros_arguments(tuple(rest))
+    elif verb == 'service':
+        assert rest[0] == 'call'
+        _, node, service = rest[1].split('/')
+        services = interface('srv')
+        kind = services[f'~/{service}']
+        assert node == 'calibrator' and rest[2] == kind.replace('/', '/srv/')
+    elif verb == 'topic':
+        names = {name.lstrip('/') for name in interface('sub|pub')}
+        assert rest[0] in ('echo', 'hz', 'list') and rest[1].lstrip('/') in names
+    elif verb == 'bag':
+        names = {name.lstrip('/') for name in interface('sub|pub')}
+        assert rest[0] in ('record', 'play', 'convert', 'info')
+        if rest[0] == 'record':
+            assert {word.lstrip('/') for word in rest if word.startswith('/')} <= names
+    elif verb in ('param', 'lifecycle'):
+        assert rest[1].lstrip('/') in ('star_observer', 'calibrator')
+        if verb == 'param':
+            assert rest[2] in {f.name for cls in OPTIONS for f in dataclasses.fields(cls)}
+        else:
+            assert rest[2] in ('configure', 'activate', 'deactivate', 'cleanup', 'shutdown')
+    else:
+        assert verb in ('launch', 'run') and rest[0] != 'starcal', line
+
+
+def test_the_documents_show_the_ways_into_the_vehicle() -> None:
+    assert {line.words[1] for line in lines_of('ros2')} >= {'launch', 'run', 'service', 'topic'}
 
 
 def test_versions_to_install_are_the_pinned_ones() -> None:
-    (line,) = (line for line in shell_lines() if line.startswith('pip install '))
     pinned = (ROOT / 'requirements' / 'runtime.txt').read_text().splitlines()
-    assert line.split()[2:]
-    assert set(line.split()[2:]) <= set(pinned)
+    lines = [line.words for line in lines_of('pip') if line.words[1] == 'install']
+    assert lines
+    for words in lines:
+        assert words[2:] and set(words[2:]) <= set(pinned)
 
 
 def test_the_version_of_the_figures_is_that_of_the_package() -> None:
