@@ -20,12 +20,15 @@ from starcal_ros.detection import (
     stamps_about,
     windows_inside,
 )
+from starcal_ros.instrument import Instrument, PsfWidth, uniform_width
 from starcal_ros.options import option
-from starcal_ros.psf import estimate_noise, fit_psf, PixelNoise, stamp_radius_px
+from starcal_ros.psf import fit_psf, noise_sums, PixelNoise, PsfFit, stamp_radius_px
 
 Floats = NDArray[np.float64]
 
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
+_BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitive than another
+_BRIGHTEST = 60  # stars that show the level of saturation
 _MIN_PSF_SIGMA_PX = 0.45
 _MAX_PSF_SIGMA_PX = 4.0
 
@@ -75,19 +78,24 @@ class CentroidOptions:
 @dataclass(frozen=True)
 class ImageModel:
     """
-    What an image says of itself before single stars are measured.
+    What is known of an image before its single stars are measured.
 
-    ``psf_sigma_px`` is 0 where too few bright stars stand in the image to tell.
+    ``psf`` is None where too few bright stars stand in the image to tell.
     ``shape_median`` and ``shape_scatter`` (3,) are what `PsfFit.shape_change` is for its stars:
     a real lens has no circular stars, and what all stars share makes none of them suspect.
     """
 
     background: Background
-    psf_sigma_px: float
+    psf: PsfWidth | None
     pixel_noise: PixelNoise
     saturation_dn: float
     shape_median: Floats
     shape_scatter: Floats
+
+    @property
+    def psf_sigma_px(self) -> float:
+        """Mean Gaussian width of the stars; 0 where not known."""
+        return self.psf.sigma_px if self.psf else 0.0
 
 
 @dataclass(frozen=True)
@@ -97,6 +105,7 @@ class Centroids:
 
     ``xy_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``flux_dn``, ``snr`` (n,);
     ``refusal`` (n,) text: empty where the star is good, else a name of `STAR_REFUSALS`.
+    ``fit`` is None for moments; ``psf_sigma_px``, ``noise_dn`` (n,) are what it was made with.
     """
 
     xy_px: Floats
@@ -104,22 +113,25 @@ class Centroids:
     flux_dn: Floats
     snr: Floats
     refusal: NDArray[np.str_]
+    fit: PsfFit | None
+    psf_sigma_px: Floats
+    noise_dn: Floats
 
 
 def saturation_level(pixels: Pixels, options: CentroidOptions) -> float:
     """
-    Pixel value from which a pixel counts as saturated, DN.
+    Pixel value from which a pixel counts as saturated, DN; 0 where the pixels show none.
 
-    Where the options do not say: the end of the data type, or the greatest value in the image
-    when it is a plateau or the end of a 10, 12 or 14 bit range.
+    Where the options do not say: the greatest value when it is a plateau or the end of the data
+    type or of a 10, 12 or 14 bit range.
     """
     if options.saturation_dn > 0:
         return options.saturation_dn
-    peak = int(pixels.max())
+    peak = int(pixels.max(initial=0))
     ends = (255,) if pixels.dtype == np.uint8 else (1023, 4095, 16383, 65535)
     # Four pixels at one greatest value: photon noise does not do that far above the background.
     plateau = peak in ends or np.count_nonzero(pixels == peak) >= 4
-    return 0.98 * peak if plateau else float(peak) + 1.0
+    return _BELOW_PLATEAU * peak if plateau else 0.0
 
 
 def model_image(
@@ -131,10 +143,10 @@ def model_image(
     The width is the median over up to 80 bright, unsaturated, isolated sources; gain and PSF
     error are a robust regression of the squared residuals of their pixels on their signal.
     """
-    saturation_dn = saturation_level(pixels, options)
+    saturation_dn = saturation_level(pixels, options) or np.inf
     gain = options.gain_e_per_dn
     unknown = ImageModel(
-        background, 0.0, PixelNoise(gain or 1.0, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
+        background, None, PixelNoise(gain or 1.0, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
     )
     shape = (pixels.shape[0], pixels.shape[1])
     bright = sources.xy_px[sources.snr > 15.0][:400]
@@ -167,8 +179,41 @@ def model_image(
     shape_scatter = _MAD_TO_SIGMA * np.median(np.abs(fit.shape_change - shape_median), axis=0)
     limit = np.maximum(options.max_shape_change, 3.0 * shape_scatter)
     star_like = (np.abs(fit.shape_change - shape_median) < limit).all(axis=1)
-    noise_model = estimate_noise(stamps[star_like], sigma, noise_dn[star_like], gain)
-    return ImageModel(background, sigma, noise_model, saturation_dn, shape_median, shape_scatter)
+    stamps, noise_dn = stamps[star_like], noise_dn[star_like]
+    for _ in range(3):
+        fit = fit_psf(stamps, sigma, noise_dn, noise_model)
+        noise_model = noise_sums(fit, noise_dn, noise_model).pixel_noise(gain)
+    psf = uniform_width(sigma, shape[1], shape[0])
+    return ImageModel(background, psf, noise_model, saturation_dn, shape_median, shape_scatter)
+
+
+def known_model(
+    pixels: Pixels,
+    background: Background,
+    known: Instrument,
+    predicted_px: Floats,
+    options: CentroidOptions,
+) -> ImageModel:
+    """
+    What the images before have shown, for an image whose stars stand at predicted pixels (n, 2).
+
+    The predictions are sorted, brightest first: if anything of the image is saturated, they are.
+    """
+    shape = (pixels.shape[0], pixels.shape[1])
+    centre = np.rint(predicted_px).astype(np.int64)
+    centre = centre[windows_inside(shape, centre, 2)][:_BRIGHTEST]
+    cores: Pixels = stamps_about(pixels, centre, 2).astype(pixels.dtype)  # type: ignore[assignment]
+    saturation_dn = saturation_level(cores, options)
+    if saturation_dn == 0 and _BELOW_PLATEAU * cores.max(initial=0) <= known.saturation_dn:
+        saturation_dn = known.saturation_dn
+    return ImageModel(
+        background,
+        known.psf_width(),
+        known.noise.pixel_noise(options.gain_e_per_dn),
+        saturation_dn or np.inf,
+        known.shape_median,
+        known.shape_scatter,
+    )
 
 
 def _isolated(xy_px: Floats, distance_px: float) -> Floats:
@@ -188,17 +233,21 @@ def measure_stars(
 
     Where the image does not tell its PSF width, the moment method is used.
     """
-    if options.centroid == 'psf' and model.psf_sigma_px > 0:
-        return _measure_by_psf(pixels, predicted_px, model, options)
+    if options.centroid == 'psf' and model.psf is not None:
+        return _measure_by_psf(pixels, predicted_px, model, model.psf, options)
     return _measure_by_moments(pixels, predicted_px, model, options)
 
 
 def _measure_by_psf(
-    pixels: Pixels, predicted_px: Floats, model: ImageModel, options: CentroidOptions
+    pixels: Pixels,
+    predicted_px: Floats,
+    model: ImageModel,
+    psf: PsfWidth,
+    options: CentroidOptions,
 ) -> Centroids:
     """Centroids by `fit_psf`, in windows about the predicted pixels."""
     shape = (pixels.shape[0], pixels.shape[1])
-    radius = stamp_radius_px(model.psf_sigma_px)
+    radius = stamp_radius_px(psf.sigma_px)
     n = len(predicted_px)
     refusal = np.full(n, '', dtype='U16')
     centre = np.rint(np.nan_to_num(predicted_px, nan=-1e6)).astype(np.int64)
@@ -210,8 +259,10 @@ def _measure_by_psf(
     best = near.argmax(axis=1)
     centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
     stamps = stamps_about(pixels, centre, radius)
-    noise_dn = sample_mesh(model.background.noise_mesh, shape, centre.astype(np.float64))
-    fit = fit_psf(stamps, model.psf_sigma_px, noise_dn, model.pixel_noise, model.saturation_dn)
+    at_px = centre.astype(np.float64)
+    noise_dn = sample_mesh(model.background.noise_mesh, shape, at_px)
+    sigma_px = psf.at(at_px)
+    fit = fit_psf(stamps, sigma_px, noise_dn, model.pixel_noise, model.saturation_dn)
     x, y, flux, _ = fit.parameters.T
     covariance = fit.covariance
     snr = flux / np.sqrt(covariance[:, 2, 2])
@@ -221,7 +272,7 @@ def _measure_by_psf(
     misshapen = ((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1)
     # 81 pixels of normal noise pass 5 sigma once in 20,000 stars.
     misshapen |= fit.worst_pixel_sigma > 5.0
-    saturated = (stamps >= model.saturation_dn).sum(axis=(1, 2))
+    saturated = np.count_nonzero(stamps >= model.saturation_dn, axis=(1, 2))
     wandered = np.maximum(np.abs(x), np.abs(y)) > 1.5
     for bad, reason in (
         (saturated > options.max_saturated_pixels, 'saturated'),
@@ -238,6 +289,9 @@ def _measure_by_psf(
         flux_dn=flux,
         snr=snr,
         refusal=refusal,
+        fit=fit,
+        psf_sigma_px=sigma_px,
+        noise_dn=noise_dn,
     )
 
 
@@ -309,4 +363,7 @@ def _measure_by_moments(
         flux_dn=flux,
         snr=snr,
         refusal=refusal,
+        fit=None,
+        psf_sigma_px=np.zeros(n),
+        noise_dn=noise_dn,
     )

@@ -12,18 +12,21 @@ import math
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d, map_coordinates
+from scipy.ndimage import map_coordinates
 
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 _MESH_PX = 64  # glare and vignetting vary slowly over it
 _MESH_STEP_PX = 4  # 256 samples of a cell give its noise to 5 %
+_SPARSE_PX = 256
+_SPARSE_STEP_PX = 16
 _DETECTION_SIGMA_PX = (
     1.0  # matched filter of detection; 0.7 to 1.5 px stars lose under 10 % of S/N
 )
 # A Gaussian filter of sigma s leaves white noise at 1 / (2 s sqrt(pi)) of its strength.
 _NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
+_RIM_PX = 4  # the filter's own reach, and one pixel for the place of the maximum
 _HOT_PEAK_RATIO = 4.0  # peak over filtered peak: 6.3 for one lit pixel, 2.7 for a 0.7 px star
 
 
@@ -60,26 +63,64 @@ def measure_background(pixels: Pixels) -> Background:
 
     One pixel in sixteen is read.  The noise is at least that of the quantisation to whole DN.
     """
-    height, width = pixels.shape
-    rows, cols = max(1, height // _MESH_PX), max(1, width // _MESH_PX)
-    cell_v, cell_u = height // rows, width // cols
-    cells = pixels[: rows * cell_v, : cols * cell_u].reshape(rows, cell_v, cols, cell_u)
-    thinned = cells[:, ::_MESH_STEP_PX, :, ::_MESH_STEP_PX].transpose(0, 2, 1, 3)
-    samples = thinned.reshape(rows * cols, -1).astype(np.float32)
+    samples, mesh_shape = _cells(pixels, _MESH_PX, _MESH_STEP_PX)
     samples.sort(axis=1)
     count = samples.shape[1]
-    median = samples[:, count // 2]
+    median = samples[:, count // 2].copy()
     # Below the median lies no star: the lower quantiles alone give the spread.
     spread = median - samples[:, int(count * 0.1587)]
-    clip = 3.0 * np.maximum(spread, 1.0)
-    inside = np.abs(samples - median[:, None]) <= clip[:, None]
-    kept = np.maximum(inside.sum(axis=1), 1)
-    mean = (samples * inside).sum(axis=1) / kept
-    variance = ((samples - mean[:, None]) ** 2 * inside).sum(axis=1) / kept
+    samples -= median[:, None]
+    mean, noise = _clipped(samples, spread)
+    return _background(mean + median, noise, mesh_shape)
+
+
+def sample_background(pixels: Pixels) -> Background:
+    """
+    Background level and noise of an image from one pixel in 128, for fits that find their level.
+
+    The noise is that of the differences of near pixels, which a gradient in the large cells does
+    not touch.
+    """
+    samples, mesh_shape = _cells(pixels, _SPARSE_PX, _SPARSE_STEP_PX)
+    beside, _ = _cells(pixels[:, 2:], _SPARSE_PX, _SPARSE_STEP_PX, mesh_shape)
+    width = min(samples.shape[1], beside.shape[1])
+    apart = samples[:, :width] - beside[:, :width]
+    size = np.sort(np.abs(apart), axis=1)
+    _, noise = _clipped(apart, size[:, int(width * 0.6827)])
+    return _background(np.median(samples[:, ::2], axis=1), noise / math.sqrt(2.0), mesh_shape)
+
+
+def _cells(
+    pixels: Pixels, cell_px: int, step_px: int, mesh_shape: tuple[int, int] | None = None
+) -> tuple[NDArray[np.float32], tuple[int, int]]:
+    """Every so many pixels of equal cells of an image, one row for each cell; rows, columns."""
+    height, width = pixels.shape
+    rows, cols = mesh_shape or (max(1, height // cell_px), max(1, width // cell_px))
+    cell_v, cell_u = height // rows, width // cols
+    cells = pixels[: rows * cell_v, : cols * cell_u].reshape(rows, cell_v, cols, cell_u)
+    thinned = cells[:, ::step_px, :, ::step_px].transpose(0, 2, 1, 3)
+    return thinned.reshape(rows * cols, -1).astype(np.float32), (rows, cols)
+
+
+def _clipped(
+    samples: NDArray[np.float32], spread: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and 1-sigma of the rows of samples about zero, without those beyond three spreads."""
+    inside = np.abs(samples) <= 3.0 * np.maximum(spread, 1.0)[:, None]
+    kept = np.maximum(np.count_nonzero(inside, axis=1), 1)
+    samples = samples * inside
+    mean = samples.sum(axis=1) / kept
+    variance = np.einsum('ij,ij->i', samples, samples) / kept - mean**2
     # 0.9733 of the variance of a normal distribution lies within 3 sigma.
-    noise = np.sqrt(np.maximum(variance / 0.9733, 1.0 / 12.0))
-    level_mesh = _smooth_mesh(mean.reshape(rows, cols))
-    noise_mesh = _smooth_mesh(noise.reshape(rows, cols).astype(np.float32))
+    return mean, np.sqrt(np.maximum(variance, 0.0) / 0.9733)
+
+
+def _background(
+    level: NDArray[np.float32], noise: NDArray[np.float32], mesh_shape: tuple[int, int]
+) -> Background:
+    """Smooth level and noise of the cells; no noise is under that of rounding to whole DN."""
+    level_mesh = _smooth_mesh(level.reshape(mesh_shape))
+    noise_mesh = _smooth_mesh(np.maximum(noise, math.sqrt(1.0 / 12.0)).reshape(mesh_shape))
     return Background(
         level_mesh, noise_mesh, float(np.median(level_mesh)), float(np.median(noise_mesh))
     )
@@ -157,38 +198,73 @@ def detect_near(
     share is listed once.
     """
     shape = (pixels.shape[0], pixels.shape[1])
-    rim = 4  # the filter's own reach, and one pixel for the place of the maximum
     centre = np.rint(predicted_px).astype(np.int64)
-    centre = centre[windows_inside(shape, centre, reach_px + rim)]
-    windows = stamps_about(pixels, centre, reach_px + rim)
-    windows -= sample_mesh(background.level_mesh, shape, centre.astype(np.float64))[:, None, None]
-    filtered = gaussian_filter1d(windows, _DETECTION_SIGMA_PX, axis=1, truncate=3.0)
-    filtered = gaussian_filter1d(filtered, _DETECTION_SIGMA_PX, axis=2, truncate=3.0)
-    within = slice(rim, rim + 2 * reach_px + 1)
+    inside = windows_inside(shape, centre, reach_px + _RIM_PX)
+    xy, snr = _brightest(pixels, background, centre[inside], reach_px)
+    good = snr > detection_sigma
+    nearest = np.rint(xy).astype(np.int64)
+    _, first = np.unique(nearest[:, 1] * shape[1] + nearest[:, 0], return_index=True)
+    once = np.zeros(len(xy), bool)
+    once[first] = True
+    good &= once
+    order = np.nonzero(good)[0]
+    order = order[np.argsort(-snr[order], kind='stable')]
+    area = min(len(xy) * (2 * reach_px + 1) ** 2, shape[0] * shape[1])
+    return Sources(xy[order], snr[order], float(area))
+
+
+def brightest_near(
+    pixels: Pixels,
+    background: Background,
+    predicted_px: Floats,
+    reach_px: int,
+    detection_sigma: float,
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """
+    Place (n, 2) of the brightest source in a window about each predicted pixel, and if there is.
+
+    As `detect_near`, but row by row.  The windows must lie in the image with 4 px to spare.
+    """
+    centre = np.rint(predicted_px).astype(np.int64)
+    xy, snr = _brightest(pixels, background, centre, reach_px)
+    return xy, snr > detection_sigma
+
+
+def _brightest(
+    pixels: Pixels, background: Background, centre: NDArray[np.int64], reach_px: int
+) -> tuple[Floats, Floats]:
+    """Place (n, 2) and signal-to-noise (n,) of the star-like maximum of windows; 0 for none."""
+    shape = (pixels.shape[0], pixels.shape[1])
+    half = reach_px + _RIM_PX
+    windows = stamps_about(pixels, centre, half).astype(np.float32)
+    level = sample_mesh(background.level_mesh, shape, centre.astype(np.float64))
+    windows -= level[:, None, None].astype(np.float32)
+    filtered = np.zeros_like(windows)
+    if len(windows):
+        # One above the other: what the filter takes over the joints stays in the rim.
+        cv2.GaussianBlur(
+            windows.reshape(-1, 2 * half + 1),
+            (7, 7),
+            _DETECTION_SIGMA_PX,
+            dst=filtered.reshape(-1, 2 * half + 1),
+        )
+    within = slice(_RIM_PX, _RIM_PX + 2 * reach_px + 1)
     side = 2 * reach_px + 1
-    best = filtered[:, within, within].reshape(len(centre), -1).argmax(axis=1)
-    v, u = best // side + rim, best % side + rim
+    best = filtered[:, within, within].reshape(len(centre), side * side).argmax(axis=1)
+    v, u = best // side + _RIM_PX, best % side + _RIM_PX
     n = np.arange(len(centre))
     peak = filtered[n, v, u]
-    xy = centre + np.stack([u, v], axis=-1) - (reach_px + rim)
+    xy = centre + np.stack([u, v], axis=-1) - half
     noise = sample_mesh(background.noise_mesh, shape, xy.astype(np.float64))
     offset = [
         _parabola_vertex(filtered[n, v - b, u - a], peak, filtered[n, v + b, u + a])
         for a, b in ((1, 0), (0, 1))
     ]
-    snr = peak / (_NOISE_LEFT * noise)
     # At the rim of the window it is the flank of something outside.
-    inner = (np.abs(xy - centre) < reach_px).all(axis=1)
-    good = inner & (snr > detection_sigma)
-    good &= windows[n, v, u] < _HOT_PEAK_RATIO * peak
-    _, first = np.unique(xy[:, 1] * shape[1] + xy[:, 0], return_index=True)
-    once = np.zeros(len(centre), bool)
-    once[first] = True
-    good &= once
-    order = np.nonzero(good)[0]
-    order = order[np.argsort(-snr[order], kind='stable')]
-    area = min(len(centre) * side * side, shape[0] * shape[1])
-    return Sources((xy + np.stack(offset, axis=-1))[order], snr[order], float(area))
+    star_like = (np.abs(xy - centre) < reach_px).all(axis=1)
+    star_like &= windows[n, v, u] < _HOT_PEAK_RATIO * peak
+    snr = np.where(star_like, peak / (_NOISE_LEFT * noise), 0.0)
+    return xy + np.stack(offset, axis=-1), snr
 
 
 def _parabola_vertex(
@@ -201,11 +277,10 @@ def _parabola_vertex(
 
 
 def stamps_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Floats:
-    """Square windows (n, 2 radius + 1, 2 radius + 1) about integer pixels (n, 2)."""
-    offsets = np.arange(-radius, radius + 1)
-    v = centre[:, 1, None, None] + offsets[:, None]
-    u = centre[:, 0, None, None] + offsets[None, :]
-    return pixels[v, u].astype(np.float64)
+    """Square windows (n, 2 radius + 1, 2 radius + 1) about integer pixels (n, 2), inside."""
+    side = 2 * radius + 1
+    windows = np.lib.stride_tricks.sliding_window_view(pixels, (side, side))
+    return windows[centre[:, 1] - radius, centre[:, 0] - radius].astype(np.float64)
 
 
 def windows_inside(

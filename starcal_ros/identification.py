@@ -38,6 +38,7 @@ from starcal_ros.detection import (
     Sources,
 )
 from starcal_ros.errors import ImageRefused
+from starcal_ros.instrument import Instrument, learn, MeasuredStars
 from starcal_ros.options import option
 from starcal_ros.psf import neighbour_pull_px, stamp_radius_px
 from starcal_ros.records import CameraGeometry, Image, StarObservations
@@ -51,6 +52,7 @@ _VOTERS = (
 )
 _PULL_UNCERTAINTY = 0.25  # of a neighbour's light: stars of unlike colour differ so from their V
 SPACE = SiteOptions()
+_ALONE_SIGMA = 0.1  # a star whose neighbours pull it by less tells the PSF
 _CHANCE = 1e-9  # greatest probability that a match is accepted by chance
 
 
@@ -123,14 +125,7 @@ def predict(
     radius_rad = field_radius_rad(camera, margin_px)
     index = cone(catalog, boresight_icrf, radius_rad, options.magnitude_limit)
     index = index[np.argsort(catalog.magnitude[index], kind='stable')]
-    if site.observer == 'ground':
-        direction_icrf, elevation_rad = through_the_air(
-            apparent_directions(catalog.select(index), time_ns), time_ns, site
-        )
-        high = elevation_rad >= math.radians(site.min_elevation_deg)
-        index, direction_icrf = index[high], direction_icrf[high]
-    else:
-        direction_icrf = apparent_directions(catalog.select(index), time_ns, velocity_m_s)
+    index, direction_icrf = seen(catalog, index, time_ns, velocity_m_s, site)
     direction_camera = icrf_from_camera.inv().apply(direction_icrf)
     xy_px = project(camera, direction_camera)
     with np.errstate(invalid='ignore'):
@@ -140,6 +135,23 @@ def predict(
         'ij,ij->i', line_of_sight(camera, xy_px[near]), direction_camera[near]
     ) > np.cos(1e-6)
     return Prediction(index[near], direction_icrf[near], direction_camera[near], xy_px[near])
+
+
+def seen(
+    catalog: StarCatalog,
+    index: NDArray[np.intp],
+    time_ns: int,
+    velocity_m_s: Floats | None,
+    site: SiteOptions,
+) -> tuple[NDArray[np.intp], Floats]:
+    """Those rows (m,) of the catalog that the observer can see, and where (m, 3), ICRF axes."""
+    if site.observer != 'ground':
+        return index, apparent_directions(catalog.select(index), time_ns, velocity_m_s)
+    direction_icrf, elevation_rad = through_the_air(
+        apparent_directions(catalog.select(index), time_ns), time_ns, site
+    )
+    high = elevation_rad >= math.radians(site.min_elevation_deg)
+    return index[high], direction_icrf[high]
 
 
 def _in_image(xy_px: Floats, width: int, height: int, margin_px: float = 0.0) -> NDArray[np.bool_]:
@@ -295,24 +307,34 @@ def _fit_warp(
 
     def basis(xy: Floats) -> Floats:
         u, v = ((xy - half_px) / half_px).T
-        return np.stack([u**i * v**j for i, j in powers], axis=-1)
+        u_power, v_power = [np.ones_like(u)], [np.ones_like(v)]
+        for _ in range(max(i for i, _ in powers)):
+            u_power.append(u_power[-1] * u)
+            v_power.append(v_power[-1] * v)
+        return np.stack([u_power[i] * v_power[j] for i, j in powers])
 
     A = basis(predicted_px)
     residual = measured_px - predicted_px
     coefficients = np.median(residual, axis=0)[None] * (np.arange(len(powers)) == 0)[:, None]
     scatter = 1.0
     for _ in range(8):
-        left = residual - A @ coefficients
-        size = np.linalg.norm(left, axis=1)
+        left = residual - A.T @ coefficients
+        size = np.hypot(left[:, 0], left[:, 1])
+        before = scatter
         scatter = max(
             1.4826 * float(np.median(size)) / 1.1774, 0.01
         )  # Rayleigh median: 1.1774 sigma
-        spread = np.hypot(sigma_px, scatter)
-        weight = 1.0 / spread / (1.0 + (size / (2.0 * spread)) ** 2)
-        coefficients = np.linalg.lstsq(
-            A * weight[:, None], residual * weight[:, None], rcond=1e-10
-        )[0]
-    return basis(at_px) @ coefficients, scatter
+        spread2 = sigma_px**2 + scatter**2
+        weight = 1.0 / spread2 / (1.0 + size**2 / (4.0 * spread2)) ** 2
+        weighted = A * weight
+        normal = weighted @ A.T
+        # Powers up to 5 on -1 to 1 leave the normal matrix ten digits; a trace keeps the corner
+        # without stars at rest.
+        normal[np.diag_indices_from(normal)] *= 1.0 + 1e-9
+        coefficients = np.linalg.solve(normal, weighted @ residual)
+        if abs(scatter - before) < 0.03 * scatter:
+            break
+    return basis(at_px).T @ coefficients, scatter
 
 
 def neighbour_pulls(
@@ -353,41 +375,50 @@ def _separate(
     centroids: Centroids,
     model: ImageModel,
     options: IdentificationOptions,
-) -> Centroids:
+) -> tuple[Centroids, NDArray[np.bool_]]:
     """
     Centroids freed from the light of their neighbours in the catalog, or refused as blends.
 
     The pull is taken off, and what it may be wrong by is added to the covariance; where that is
-    more than ``max_blend_sigma`` the star is of no use.
+    more than ``max_blend_sigma`` the star is of no use.  Also says (n,) which stars stand alone.
     """
     pull_px, swamped = neighbour_pulls(predicted_px, magnitude, centroids.flux_dn, model)
     uncertain_px = _PULL_UNCERTAINTY * pull_px
     sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
-    beyond = np.linalg.norm(uncertain_px, axis=1) > options.max_blend_sigma * sigma_px
+    size_px = np.hypot(uncertain_px[:, 0], uncertain_px[:, 1])
+    beyond = size_px > options.max_blend_sigma * sigma_px
     refusal = centroids.refusal.copy()
     refusal[(swamped | beyond) & (refusal == '')] = 'blend'
     u, v = uncertain_px.T
-    return dataclasses.replace(
+    separated = dataclasses.replace(
         centroids,
         xy_px=centroids.xy_px - pull_px,
         covariance_px2=centroids.covariance_px2 + np.stack([u * u, u * v, v * v], axis=-1),
         refusal=refusal,
     )
+    return separated, size_px < _ALONE_SIGMA * sigma_px
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image with what is known of it: where it was taken, and what to measure it with."""
+
+    image: Image
+    icrf_from_star_tracker_xyzw: Floats
+    attitude_gap_s: float
+    velocity_m_s: Floats | None = None
+    site: SiteOptions = SPACE
 
 
 def observe_stars(
-    image: Image,
-    icrf_from_star_tracker_xyzw: Floats,
-    attitude_gap_s: float,
+    shot: Shot,
     geometry: CameraGeometry,
     catalog: StarCatalog,
     centroid_options: CentroidOptions,
     options: IdentificationOptions,
-    velocity_m_s: Floats | None = None,
-    site: SiteOptions = SPACE,
-) -> StarObservations:
+) -> tuple[StarObservations, Instrument | None]:
     """
-    The measured and identified stars of one image, with those that were left out, and why.
+    The stars of one image, searched for, and what they say of the camera's light.
 
     With too few measured well it is a refused image, ``too_few_stars``, that still says what
     became of each star.
@@ -397,10 +428,16 @@ def observe_stars(
     ImageRefused
         ``no_stars`` or ``no_match``.
     """
-    camera = geometry.camera
+    image = shot.image
     background = measure_background(image.pixels)
     prediction = predict(
-        geometry, icrf_from_star_tracker_xyzw, image.time_ns, catalog, options, velocity_m_s, site
+        geometry,
+        shot.icrf_from_star_tracker_xyzw,
+        image.time_ns,
+        catalog,
+        options,
+        shot.velocity_m_s,
+        shot.site,
     )
     if len(prediction.catalog_index) < 4:
         raise ImageRefused(
@@ -410,17 +447,38 @@ def observe_stars(
         image.pixels, background, prediction, geometry, centroid_options, options
     )
     model = model_image(image.pixels, background, sources, centroid_options)
-    if model.psf_sigma_px == 0:
+    if model.psf is None:
         # The brightest stars may all be saturated: fainter ones tell the PSF.
         sources = detect(image.pixels, background, centroid_options.detection_sigma)
         model = model_image(image.pixels, background, sources, centroid_options)
-    inside = np.nonzero(_in_image(predicted_px, camera.width, camera.height))[0]
+    prediction = dataclasses.replace(prediction, xy_px=predicted_px)
+    return measure_predicted(shot, prediction, model, None, catalog, centroid_options, options)
+
+
+def measure_predicted(
+    shot: Shot,
+    prediction: Prediction,
+    model: ImageModel,
+    instrument: Instrument | None,
+    catalog: StarCatalog,
+    centroid_options: CentroidOptions,
+    options: IdentificationOptions,
+) -> tuple[StarObservations, Instrument | None]:
+    """
+    The stars of an image once it is known where they stand, and what is known of the light then.
+
+    ``instrument`` is what was known before, None at the first image.  With too few stars measured
+    well it is a refused image, ``too_few_stars``.
+    """
+    pixels = shot.image.pixels
+    height, width = pixels.shape
+    inside = np.nonzero(_in_image(prediction.xy_px, width, height))[0]
     index = prediction.catalog_index[inside]
-    predicted_px = predicted_px[inside]
+    predicted_px = prediction.xy_px[inside]
     magnitude = catalog.magnitude[index]
-    centroids = measure_stars(image.pixels, predicted_px, model, centroid_options)
-    centroids = _separate(predicted_px, magnitude, centroids, model, options)
-    refusal = _refuse_displaced(predicted_px, centroids, camera.width)
+    centroids = measure_stars(pixels, predicted_px, model, centroid_options)
+    centroids, alone = _separate(predicted_px, magnitude, centroids, model, options)
+    refusal = _refuse_displaced(predicted_px, centroids, width)
     good = refusal == ''
     left_out = ~good
     names, code, counts = np.unique(refusal[left_out], return_inverse=True, return_counts=True)
@@ -428,14 +486,14 @@ def observe_stars(
     detail = f'{np.count_nonzero(good)} stars measured well, {options.min_stars_per_image} needed'
     if few:
         good = np.zeros_like(good)
-    return StarObservations(
-        time_ns=image.time_ns,
-        width=camera.width,
-        height=camera.height,
+    observations = StarObservations(
+        time_ns=shot.image.time_ns,
+        width=width,
+        height=height,
         refusal='too_few_stars' if few else '',
         detail=detail if few else '',
-        icrf_from_star_tracker_xyzw=icrf_from_star_tracker_xyzw,
-        attitude_gap_s=attitude_gap_s,
+        icrf_from_star_tracker_xyzw=shot.icrf_from_star_tracker_xyzw,
+        attitude_gap_s=shot.attitude_gap_s,
         catalog_id=catalog.id[index][good],
         direction_icrf=prediction.direction_icrf[inside][good],
         magnitude=magnitude[good].astype(np.float32),
@@ -447,11 +505,18 @@ def observe_stars(
         refused_catalog_id=catalog.id[index][left_out],
         refused_px=predicted_px[left_out].astype(np.float32),
         refused_reason=code.astype(np.uint8),
-        background_dn=background.level_dn,
-        noise_dn=background.noise_dn,
+        background_dn=model.background.level_dn,
+        noise_dn=model.background.noise_dn,
         psf_sigma_px=model.psf_sigma_px,
         catalog_digest=catalog.digest,
     )
+    if few or centroids.fit is None:
+        return observations, instrument
+    stars = MeasuredStars(
+        centroids.xy_px, centroids.fit, centroids.psf_sigma_px, centroids.noise_dn, good & alone
+    )
+    shown_dn = model.saturation_dn if np.isfinite(model.saturation_dn) else 0.0
+    return observations, learn(instrument, stars, model.pixel_noise, shown_dn, (width, height))
 
 
 def tracked(geometry: CameraGeometry, observations: StarObservations) -> CameraGeometry:

@@ -31,7 +31,7 @@ from starcal_ros.catalog import load_catalog, StarCatalog
 from starcal_ros.centroiding import CentroidOptions
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused, OptionError
-from starcal_ros.identification import IdentificationOptions, observe_stars, tracked
+from starcal_ros.identification import IdentificationOptions, observe_stars, Shot, tracked
 from starcal_ros.observability import (
     correlation,
     coverage,
@@ -52,6 +52,7 @@ from starcal_ros.records import (
     StarObservations,
 )
 from starcal_ros.residuals import Residuals, residuals_of
+from starcal_ros.tracking import follow, Followed, following
 
 Floats = NDArray[np.float64]
 T = TypeVar('T')
@@ -181,40 +182,7 @@ def observe(
     ``geometry`` is what the stars are predicted with: the prior or a calibration in force.
     ``velocity_m_s`` (3,) is the observer's barycentric velocity, ICRF axes; None: the Earth's.
     """
-    camera = geometry.camera
-    height, width = image.pixels.shape
-    try:
-        if (width, height) != (camera.width, camera.height):
-            raise ImageRefused(
-                'wrong_size',
-                f'{width} x {height}, the camera has {camera.width} x {camera.height}',
-            )
-        quaternion, gap_s = attitudes.at(image.time_ns, setup.attitude.max_attitude_gap_s)
-    except ImageRefused as refused:
-        return refused_image(image.time_ns, width, height, refused.reason, refused.detail)
-    try:
-        return observe_stars(
-            _without_dark(image, setup.dark),
-            quaternion,
-            gap_s,
-            geometry,
-            setup.catalog,
-            setup.centroid,
-            setup.identification,
-            velocity_m_s,
-            setup.site,
-        )
-    except ImageRefused as refused:
-        return refused_image(
-            image.time_ns,
-            width,
-            height,
-            refused.reason,
-            refused.detail,
-            icrf_from_star_tracker_xyzw=quaternion,
-            attitude_gap_s=gap_s,
-            catalog_digest=setup.catalog.digest,
-        )
+    return observe_next(image, attitudes, setup, Track(geometry), velocity_m_s)[0]
 
 
 def _without_dark(image: Image, dark: NDArray[np.uint8] | NDArray[np.uint16] | None) -> Image:
@@ -235,10 +203,17 @@ def _without_dark(image: Image, dark: NDArray[np.uint8] | NDArray[np.uint16] | N
 
 @dataclass(frozen=True)
 class Track:
-    """Where a sequence of images stands: what to predict the next with, and the last one used."""
+    """
+    Where a sequence of images stands.
+
+    ``geometry`` is what an image is searched with; ``latest_ns`` stamps the last one used.
+    ``followed`` is what the images so far have shown, with which the next is measured without a
+    search; None before the first.
+    """
 
     geometry: CameraGeometry
     latest_ns: int | None = None
+    followed: Followed | None = None
 
 
 def observe_next(
@@ -256,16 +231,57 @@ def observe_next(
     before one that was used is refused; a refused image moves nothing, so that one wrong stamp
     costs one image.
     """
+    height, width = image.pixels.shape
+    camera = track.geometry.camera
+    attitude: dict[str, object] = {}
     try:
         check_order(image, track.latest_ns)
+        if (width, height) != (camera.width, camera.height):
+            raise ImageRefused(
+                'wrong_size',
+                f'{width} x {height}, the camera has {camera.width} x {camera.height}',
+            )
+        quaternion, gap_s = attitudes.at(image.time_ns, setup.attitude.max_attitude_gap_s)
+        attitude = {
+            'icrf_from_star_tracker_xyzw': quaternion,
+            'attitude_gap_s': gap_s,
+            'catalog_digest': setup.catalog.digest,
+        }
+        shot = Shot(_without_dark(image, setup.dark), quaternion, gap_s, velocity_m_s, setup.site)
+        observations, after = _stars(shot, setup, track)
     except ImageRefused as refused:
-        height, width = image.pixels.shape
-        refusal = (refused.reason, refused.detail)
-        return refused_image(image.time_ns, width, height, *refusal), track
-    observations = observe(image, attitudes, setup, track.geometry, velocity_m_s)
-    observations = dataclasses.replace(observations, temperature_degc=temperature_degc)
-    latest_ns = track.latest_ns if observations.refusal else image.time_ns
-    return observations, Track(tracked(track.geometry, observations), latest_ns)
+        observations, after = (
+            refused_image(
+                image.time_ns, width, height, refused.reason, refused.detail, **attitude
+            ),
+            track,
+        )
+    return dataclasses.replace(observations, temperature_degc=temperature_degc), after
+
+
+def _stars(shot: Shot, setup: Setup, track: Track) -> tuple[StarObservations, Track]:
+    """The stars where the images before say, or else where a search of the image finds them."""
+    time_ns = shot.image.time_ns
+    if track.followed is not None:
+        try:
+            observations, followed = follow(
+                shot, track.followed, setup.catalog, setup.centroid, setup.identification
+            )
+            # Good to a few pixels for the camera of the search, which searches over many.
+            geometry = dataclasses.replace(
+                track.geometry,
+                star_tracker_from_camera_xyzw=followed.geometry.star_tracker_from_camera_xyzw,
+            )
+            return observations, Track(geometry, time_ns, followed)
+        except ImageRefused:
+            pass  # the search says what is wrong with the image
+    observations, instrument = observe_stars(
+        shot, track.geometry, setup.catalog, setup.centroid, setup.identification
+    )
+    if observations.refusal:
+        return observations, track
+    geometry = tracked(track.geometry, observations)
+    return observations, Track(geometry, time_ns, following(geometry, observations, instrument))
 
 
 def check_order(image: Image, latest_ns: int | None) -> None:

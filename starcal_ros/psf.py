@@ -6,36 +6,42 @@ noise of each pixel, attains the Cramer-Rao bound of the stamp.
 
 Noise of a pixel with background-free signal S, in digital numbers (DN)::
 
-    variance = noise_dn^2 + S / gain + (psf_error S)^2
+    variance = background noise_dn^2 + S / gain + (psf_error S)^2
 
+``background`` is how much more a pixel beside a star scatters than one of the open sky, and
 ``psf_error`` is how far the real PSF is from the Gaussian, as a fraction.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
+from scipy.special import erf, ndtr
 
 Floats = NDArray[np.float64]
 
-_FIT_STEPS = 12  # stars settle in three to five; what has not by then is no star
+_FIT_STEPS = 4  # stars settle in two or three; what has not by then is no star
+# Gauss-Newton divides what is left of the way by ten and more with each step, and takes one more.
+_SETTLED_SIGMA = 0.1
+_SIGNIFICANT = 3.0  # sigma
 
 
 @dataclass(frozen=True)
 class PixelNoise:
-    """Noise of one pixel with signal S: ``noise^2 + S / gain + (psf_error S)^2``, DN."""
+    """Noise of a pixel with signal S: ``background noise^2 + S / gain + (psf_error S)^2``."""
 
     gain_e_per_dn: float
     psf_error: float
+    background: float = 1.0
 
     def variance(self, signal_dn: Floats, noise_dn: Floats) -> Floats:
         """Variance in DN^2; negative signal counts as none."""
         signal = np.maximum(signal_dn, 0.0)
-        return noise_dn**2 + signal / self.gain_e_per_dn + (self.psf_error * signal) ** 2
+        per_signal = 1.0 / self.gain_e_per_dn + self.psf_error**2 * signal
+        return np.asarray(self.background * noise_dn**2 + per_signal * signal)
 
 
 @dataclass(frozen=True)
@@ -44,17 +50,27 @@ class PsfFit:
     Gaussian fits to stamps: position relative to the stamp's centre, flux, background.
 
     ``parameters`` (n, 4): x, y (px), flux, background (DN).  ``covariance`` (n, 4, 4) of them.
-    ``reduced_chi2`` and ``worst_pixel_sigma`` (n,): fit quality under the pixel noise.
+    ``worst_pixel_sigma`` (n,): the pixel that fits worst, in its own noise.
     ``shape_change`` and ``shape_sigma`` (n, 3): departure of the second moments xx, yy, xy from
     those of the PSF as a fraction of its variance, and their 1-sigma.
+    ``signal_dn`` and ``residual_dn`` (n, p): the light of the star in each pixel of its stamp and
+    what the fit leaves, NaN where the pixel took no part; ``freedom`` (n, p): the part of the
+    variance of a pixel that the fit has left in its residual.
     """
 
     parameters: Floats
     covariance: Floats
-    reduced_chi2: Floats
     worst_pixel_sigma: Floats
     shape_change: Floats
     shape_sigma: Floats
+    signal_dn: Floats
+    residual_dn: Floats
+    freedom: Floats
+
+
+def select(fit: PsfFit, stars: NDArray[np.intp] | NDArray[np.bool_]) -> PsfFit:
+    """Return the fits of some stars, by row number or mask."""
+    return PsfFit(**{field.name: getattr(fit, field.name)[stars] for field in fields(fit)})
 
 
 def stamp_radius_px(psf_sigma_px: float) -> int:
@@ -64,7 +80,7 @@ def stamp_radius_px(psf_sigma_px: float) -> int:
 
 def fit_psf(
     stamps: Floats,
-    sigma_px: float,
+    sigma_px: float | Floats,
     noise_dn: Floats,
     pixel_noise: PixelNoise,
     saturation_dn: float = np.inf,
@@ -76,8 +92,8 @@ def fit_psf(
     ----------
     stamps : (n, w, w)
         Pixel values, DN; the star within a pixel or so of the centre.
-    sigma_px : float
-        Width of the PSF.
+    sigma_px : float or (n,)
+        Width of the PSF, at each star.
     noise_dn : (n,)
         Background noise at each star.
     pixel_noise : PixelNoise
@@ -89,50 +105,74 @@ def fit_psf(
     -----
     Gauss-Newton with the weights renewed from the model at each step, so that the noise of the
     data does not bias them; a step in position is at most half a pixel.  Stars that have settled
-    to a thousandth of their sigma are left alone.
+    are left alone.
     """
     n, w, _ = stamps.shape
+    sigma_px = np.broadcast_to(np.asarray(sigma_px, np.float64), (n,))
     data = stamps.reshape(n, w * w)
     valid = data < saturation_dn
-    border = np.concatenate(
-        [stamps[:, 0], stamps[:, -1], stamps[:, 1:-1, 0], stamps[:, 1:-1, -1]], axis=1
-    )
-    background = np.median(border, axis=1)
-    peak_fraction = (2 * ndtr(0.5 / sigma_px) - 1) ** 2
-    flux = (stamps[:, w // 2, w // 2] - background) / peak_fraction
-    parameters = np.stack([np.zeros(n), np.zeros(n), flux, background], axis=-1)
+    parameters = _start(stamps, sigma_px)
+    noise2 = noise_dn[:, None] ** 2
     active = np.arange(n)
     for _ in range(_FIT_STEPS):
+        if len(active) == 0:
+            break
+        all_active = len(active) == n
         at = parameters[active]
-        J = _psf_columns(at, sigma_px, w, 4)
-        signal = at[:, 2, None] * J[:, 2]
-        weight = valid[active] / pixel_noise.variance(signal, noise_dn[active, None])
-        step, covariance = _weighted_step(J, weight, data[active] - at[:, 3, None] - signal)
+        rows = _psf_rows(at, data if all_active else data[active], sigma_px[active], w, 4)
+        weight = _weights(rows, at, noise2[active], valid[active], pixel_noise)
+        normal, gradient = _normal(rows, weight)
+        step = np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
         step[:, :2] = np.clip(step[:, :2], -0.5, 0.5)
         at = at + step
         at[:, :2] = np.clip(at[:, :2], -w / 2, w / 2)
         parameters[active] = at
-        moving = np.abs(step[:, :2]) > 1e-3 * np.sqrt(np.einsum('nii->ni', covariance)[:, :2])
+        # Against the sigma of the place with flux and background known, the smaller one.
+        moving = step[:, :2] ** 2 * np.einsum('nii->ni', normal)[:, :2] > _SETTLED_SIGMA**2
         active = active[moving.any(axis=1)]
-        if len(active) == 0:
-            break
 
     # Second moments: one linear step from the solution, in units of the PSF variance.
-    J = _psf_columns(parameters, sigma_px, w, 7)
-    signal = parameters[:, 2, None] * J[:, 2]
-    weight = valid / pixel_noise.variance(signal, noise_dn[:, None])
-    residual = data - parameters[:, 3, None] - signal
-    _, covariance = _weighted_step(J[:, :4], weight, residual)
-    shape_step, shape_covariance = _weighted_step(J, weight, residual)
-    normalised2 = weight * residual**2
+    rows = _psf_rows(parameters, data, sigma_px, w, 7)
+    weight = _weights(rows, parameters, noise2, valid, pixel_noise)
+    normal, gradient = _normal(rows, weight)
+    covariance = np.asarray(np.linalg.inv(normal[:, :4, :4]), np.float64)
+    last = (covariance @ gradient[:, :4, None])[:, :, 0]
+    last[:, :2] = np.clip(last[:, :2], -0.5, 0.5)
+    shape_covariance = np.linalg.inv(normal)
+    shape_step = (shape_covariance @ gradient[:, :, None])[:, :, 0]
+    residual = rows[:, 7]
+    leverage = ((covariance @ rows[:, :4]) * rows[:, :4]).sum(axis=1) * weight
     return PsfFit(
-        parameters=parameters,
+        parameters=parameters + last,
         covariance=covariance,
-        reduced_chi2=normalised2.sum(axis=1) / np.maximum(valid.sum(axis=1) - 4, 1),
-        worst_pixel_sigma=np.sqrt(normalised2.max(axis=1, initial=0.0)),
+        worst_pixel_sigma=np.sqrt((weight * residual**2).max(axis=1, initial=0.0)),
         shape_change=shape_step[:, 4:],
         shape_sigma=np.sqrt(np.einsum('nii->ni', shape_covariance)[:, 4:]),
+        signal_dn=parameters[:, 2, None] * rows[:, 2],
+        residual_dn=np.where(valid, residual, np.nan),
+        freedom=np.maximum(1.0 - leverage, 0.05),
     )
+
+
+def _start(stamps: Floats, sigma_px: Floats) -> Floats:
+    """Parameters (n, 4) from which the fit starts: the centre of the light next to the middle."""
+    w = stamps.shape[1]
+    border = np.concatenate(
+        [stamps[:, 0], stamps[:, -1], stamps[:, 1:-1, 0], stamps[:, 1:-1, -1]], axis=1
+    )
+    middle = border.shape[1] // 2
+    background = np.partition(border, middle, axis=1)[:, middle]
+    c = w // 2
+    core = stamps[:, c - 1 : c + 2, c - 1 : c + 2] - background[:, None, None]
+    along_x, along_y = core.sum(axis=1), core.sum(axis=2)
+    total = np.maximum(core.sum(axis=(1, 2)), 1e-12)
+    share = erf(1.5 / (math.sqrt(2.0) * sigma_px))  # of the light in three pixels
+    # The outer two of three pixels differ by this much for each pixel of the way.
+    slope = 2.0 * (_gauss(0.5 / sigma_px) - _gauss(1.5 / sigma_px)) / sigma_px
+    x = np.clip((along_x[:, 2] - along_x[:, 0]) / total * share / slope, -0.7, 0.7)
+    y = np.clip((along_y[:, 2] - along_y[:, 0]) / total * share / slope, -0.7, 0.7)
+    flux = core.sum(axis=(1, 2)) / share**2
+    return np.stack([x, y, flux, background], axis=-1)
 
 
 def neighbour_pull_px(
@@ -157,120 +197,169 @@ def neighbour_pull_px(
         Width of the PSF, and the noise as in `fit_psf`.
     """
     width = 2 * stamp_radius_px(sigma_px) + 1
-    zero = np.zeros(len(flux_dn))
-    J = _psf_columns(np.stack([zero, zero, flux_dn, zero], axis=-1), sigma_px, width, 4)
-    own = flux_dn[:, None] * J[:, 2]
+    count = len(flux_dn)
+    zero, dark = np.zeros(count), np.zeros((count, width * width))
+    sigma = np.full(count, sigma_px)
     at = np.stack([*offset_px.T, neighbour_flux_dn, zero], axis=-1)
-    light = neighbour_flux_dn[:, None] * _psf_columns(at, sigma_px, width, 4)[:, 2]
-    noise = np.full((len(flux_dn), 1), noise_dn)
-    weight = 1.0 / pixel_noise.variance(own + light, noise)
-    step, _ = _weighted_step(J, weight, light)
-    return step[:, :2]
+    # What the neighbour takes away from a dark stamp is its light.
+    light = -_psf_rows(at, dark, sigma, width, 4)[:, 4]
+    rows = _psf_rows(np.stack([zero, zero, flux_dn, zero], axis=-1), dark, sigma, width, 4)
+    own = flux_dn[:, None] * rows[:, 2]
+    rows[:, 4] = light
+    weight = 1.0 / pixel_noise.variance(own + light, np.full((count, 1), noise_dn))
+    normal, gradient = _normal(rows, weight)
+    return np.asarray(np.linalg.solve(normal, gradient[:, :, None])[:, :2, 0])
 
 
-def estimate_noise(stamps: Floats, sigma_px: float, noise_dn: Floats, gain: float) -> PixelNoise:
+@dataclass(frozen=True)
+class NoiseSums:
     """
-    Gain and PSF error that make the squared fit residuals of bright stars their variance.
+    What residuals say of the pixel noise: a regression of their squares on noise_dn^2, S and S^2.
 
-    Non-negative regression of ``residual^2 - noise^2`` on S and S^2 over the pixels that a star
-    lights, each weighted by its own expected spread; repeated as the weights settle.  A gain that
-    is given (not 0) is kept.
+    ``normal`` (3, 3) and ``right`` (3,), with each pixel weighted by its own expected spread.
+    Sums of several images can be added.
     """
-    estimate = PixelNoise(gain or 1.0, 0.02)
-    offsets = np.arange(stamps.shape[1], dtype=np.float64) - (stamps.shape[1] - 1) / 2.0
-    for _ in range(3):
-        fit = fit_psf(stamps, sigma_px, noise_dn, estimate)
-        x, y, flux, level = fit.parameters.T
-        px, py = _profile(x, sigma_px, offsets)[0], _profile(y, sigma_px, offsets)[0]
-        signal = flux[:, None, None] * py[:, :, None] * px[:, None, :]
-        residual = stamps - level[:, None, None] - signal
-        noise2 = np.broadcast_to(noise_dn[:, None, None] ** 2, signal.shape)
-        lit = signal > noise_dn[:, None, None]
-        s, noise2 = signal[lit], noise2[lit]
-        variance = noise2 + s / estimate.gain_e_per_dn + (estimate.psf_error * s) ** 2
-        keep = np.abs(residual[lit]) < 5.0 * np.sqrt(variance)
-        # 4 parameters of each star are fitted: its lit residuals are smaller by that much.
-        lit_count = max(np.count_nonzero(keep), 1)
-        shrink = max(1.0 - 3.0 * len(stamps) / lit_count, 0.3)
-        s, noise2, variance = s[keep], noise2[keep], variance[keep]
-        target = (residual[lit][keep] ** 2) / shrink - noise2
-        A = np.stack([s, s**2], axis=-1) / variance[:, None]
-        b = target / variance
-        if gain:
-            b, A = b - A[:, 0] / gain, A[:, 1:]
-            per_signal, per_signal2 = (
-                1.0 / gain,
-                max(float(A[:, 0] @ b / (A[:, 0] @ A[:, 0])), 0.0),
-            )
-        else:
-            per_signal, per_signal2 = np.linalg.lstsq(A, b, rcond=None)[0]
-            if per_signal2 < 0.0:
-                per_signal, per_signal2 = float(A[:, 0] @ b / (A[:, 0] @ A[:, 0])), 0.0
-            elif per_signal < 0.0:
-                per_signal, per_signal2 = 0.0, float(A[:, 1] @ b / (A[:, 1] @ A[:, 1]))
-        estimate = PixelNoise(
+
+    normal: Floats
+    right: Floats
+
+    def pixel_noise(self, gain_e_per_dn: float = 0.0) -> PixelNoise:
+        """
+        Noise with which the squared residuals are their variance.
+
+        A gain that is given (not 0) is kept.  An error of the PSF that is not significant is
+        none: it would take its share of the photon noise with it.
+        """
+        per_signal = 1.0 / gain_e_per_dn if gain_e_per_dn else 0.0
+        found = np.array([1.0, per_signal, 0.0])
+        right = self.right - self.normal[:, 1] * per_signal
+        free = [0, 2] if gain_e_per_dn else [0, 1, 2]
+        while free:
+            normal = self.normal[np.ix_(free, free)]
+            scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+            scales = np.outer(scale, scale)
+            inverse = np.linalg.inv(normal * scales + 1e-9 * np.eye(len(free))) * scales
+            value = inverse @ right[free]
+            # A squared normal residual over its variance has a variance of 2.
+            sigma = np.sqrt(2.0 * np.diag(inverse))
+            if free[-1] == 2 and value[-1] < _SIGNIFICANT * sigma[-1]:
+                free = free[:-1]
+            elif 1 in free and value[free.index(1)] < 0.0:
+                free.remove(1)
+            else:
+                found[free] = value
+                break
+        background, per_signal, error2 = found
+        return PixelNoise(
             1.0 / float(np.clip(per_signal, 1e-4, 1e4)),
-            float(np.sqrt(np.clip(per_signal2, 0, 0.25))),
+            float(np.sqrt(np.clip(error2, 0.0, 0.25))),
+            float(np.clip(background, 0.25, 4.0)),
         )
-    return estimate
 
 
-def _profile(centre: Floats, sigma_px: float, offsets: Floats) -> tuple[Floats, Floats, Floats]:
+def noise_sums(fit: PsfFit, noise_dn: Floats, expected: PixelNoise) -> NoiseSums:
+    """
+    Sums from the pixels of the stars of a fit, weighted by the noise expected of them.
+
+    ``noise_dn`` (n,).  Each residual is freed from what the fit itself has taken of it; one of
+    more than five sigma is something else.
+    """
+    noise2 = np.broadcast_to(noise_dn[:, None] ** 2, fit.signal_dn.shape)
+    signal = np.maximum(fit.signal_dn, 0.0)
+    variance = expected.variance(signal, noise_dn[:, None])
+    squared = np.nan_to_num(fit.residual_dn**2 / fit.freedom, nan=np.inf)
+    keep = squared < 25.0 * variance
+    weight = (1.0 / variance)[keep]
+    signal = signal[keep] * weight
+    A = np.stack([noise2[keep] * weight, signal, signal * signal / weight])
+    return NoiseSums(A @ A.T, A @ (squared[keep] * weight))
+
+
+def _gauss(t: Floats) -> Floats:
+    return np.asarray(np.exp(-0.5 * t * t) / math.sqrt(2.0 * math.pi))
+
+
+def _profile(
+    centre: Floats, sigma_px: Floats, width: int, second: bool
+) -> tuple[Floats, Floats, Floats]:
     """
     Pixel-integrated Gaussian along one axis with its first and second derivative by the centre.
 
-    ``centre`` (n,); ``offsets`` (w,) pixel centres; each result is (n, w).
+    ``centre`` and ``sigma_px`` (n,), from the middle of ``width`` pixels; results are (n, width).
     The derivative by sigma^2 is half of the second one by the centre (heat equation).
     """
-    edges = np.concatenate([offsets - 0.5, offsets[-1:] + 0.5])
-    t = (edges - centre[:, None]) / sigma_px
-    density = np.exp(-0.5 * t**2) / math.sqrt(2.0 * math.pi)
-    value = np.diff(ndtr(t), axis=1)
-    first = -np.diff(density, axis=1) / sigma_px
-    second = -np.diff(t * density, axis=1) / sigma_px**2
-    return value, first, second
+    edges = np.arange(width + 1) - width / 2.0
+    t = (edges - centre[:, None]) / sigma_px[:, None]
+    density = _gauss(t)
+    cumulative = ndtr(t)
+    value = cumulative[:, 1:] - cumulative[:, :-1]
+    first = (density[:, :-1] - density[:, 1:]) / sigma_px[:, None]
+    if not second:
+        return value, first, first
+    density *= t
+    return value, first, (density[:, :-1] - density[:, 1:]) / sigma_px[:, None] ** 2
 
 
-def _psf_columns(parameters: Floats, sigma_px: float, width: int, count: int) -> Floats:
+def _psf_rows(
+    parameters: Floats, data: Floats, sigma_px: Floats, width: int, count: int
+) -> Floats:
     """
-    Derivatives (n, count, width * width) of a stamp by x, y, flux, background.
+    Derivatives of stamps by x, y, flux, background, and last their residual.
 
-    And, with count 7, by the second moments xx, yy, xy as fractions of the PSF's variance.
+    ``data`` is (n, width^2); the result (n, count + 1, width^2).  With a count of 7, after the
+    background by the second moments xx, yy, xy as fractions of the PSF's variance.
     """
-    offsets = np.arange(width, dtype=np.float64) - (width - 1) / 2.0
-    x, y, flux, _ = parameters.T
-    px, px1, px2 = _profile(x, sigma_px, offsets)
-    py, py1, py2 = _profile(y, sigma_px, offsets)
-    J = np.empty((len(x), count, width, width))
-
-    def put(column: int, along_y: Floats, along_x: Floats) -> None:
-        np.multiply(along_y[:, :, None], along_x[:, None, :], out=J[:, column])
-
+    n = len(parameters)
+    x, y, flux, level = parameters.T
+    value, first, second = _profile(
+        np.concatenate([x, y]), np.concatenate([sigma_px, sigma_px]), width, count == 7
+    )
+    px, py, px1, py1 = value[:n], value[n:], first[:n], first[n:]
+    rows = np.empty((n, count + 1, width, width))
     flux = flux[:, None]
-    put(0, py, flux * px1)
-    put(1, py1, flux * px)
-    put(2, py, px)
-    J[:, 3] = 1.0
+    np.multiply(py[:, :, None], (flux * px1)[:, None, :], out=rows[:, 0])
+    np.multiply(py1[:, :, None], (flux * px)[:, None, :], out=rows[:, 1])
+    np.multiply(py[:, :, None], px[:, None, :], out=rows[:, 2])
+    rows[:, 3] = 1.0
     if count == 7:
-        half_variance = 0.5 * sigma_px**2
-        put(4, py, half_variance * flux * px2)
-        put(5, py2, half_variance * flux * px)
-        put(6, py1, 2 * half_variance * flux * px1)
-    return J.reshape(len(x), count, width * width)
+        px2, py2 = second[:n], second[n:]
+        variance = flux * sigma_px[:, None] ** 2
+        np.multiply(py[:, :, None], (0.5 * variance * px2)[:, None, :], out=rows[:, 4])
+        np.multiply(py2[:, :, None], (0.5 * variance * px)[:, None, :], out=rows[:, 5])
+        np.multiply(py1[:, :, None], (variance * px1)[:, None, :], out=rows[:, 6])
+    flat: Floats = rows.reshape(n, count + 1, width * width)
+    np.multiply(flat[:, 2], -flux, out=flat[:, count])
+    flat[:, count] += data
+    flat[:, count] -= level[:, None]
+    return flat
 
 
-def _weighted_step(J: Floats, weight: Floats, residual: Floats) -> tuple[Floats, Floats]:
+def _weights(
+    rows: Floats,
+    parameters: Floats,
+    noise2: Floats,
+    valid: NDArray[np.bool_],
+    pixel_noise: PixelNoise,
+) -> Floats:
+    """Inverse variance (n, p) of pixels, 0 for those that take no part."""
+    signal = np.maximum(parameters[:, 2, None], 0.0) * rows[:, 2]
+    variance = signal * pixel_noise.psf_error**2
+    variance += 1.0 / pixel_noise.gain_e_per_dn
+    variance *= signal
+    variance += pixel_noise.background * noise2
+    return np.asarray(valid / variance)
+
+
+def _normal(rows: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """
-    Weighted least-squares step (n, k) and covariance (n, k, k) of many small problems.
+    Normal matrices (n, k, k) and gradients (n, k) of many small least-squares problems.
 
-    ``J`` is (n, k, p), ``weight`` and ``residual`` (n, p).  The normal matrices are scaled to a
-    unit diagonal, and a trace of it keeps a stamp without light solvable.
+    ``rows`` (n, k + 1, p) are the derivatives and the residual.  A trace on the diagonal keeps a
+    stamp without light solvable.
     """
-    k = J.shape[1]
-    weighted = J * weight[:, None, :]
-    normal = weighted @ J.transpose(0, 2, 1)
-    scale = 1.0 / np.sqrt(np.maximum(np.einsum('nii->ni', normal), 1e-12))
-    scaled = normal * scale[:, :, None] * scale[:, None, :] + 1e-9 * np.eye(k)
-    covariance = np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :]
-    gradient = (weighted @ residual[:, :, None])[:, :, 0]
-    return (covariance @ gradient[:, :, None])[:, :, 0], covariance
+    k = rows.shape[1] - 1
+    product = (rows[:, :k] * weight[:, None, :]) @ rows.transpose(0, 2, 1)
+    normal, gradient = product[:, :, :k], product[:, :, k]
+    diagonal = np.einsum('nii->ni', normal)
+    diagonal += 1e-9 * diagonal + 1e-12
+    return normal, gradient

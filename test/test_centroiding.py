@@ -91,10 +91,8 @@ def test_the_fit_reaches_the_cramer_rao_bound(psf_sigma_px: float, bits: int) ->
     # Two coordinates of 2400 stars: the ratios are known to 1 %; three of those below 1.
     ratio = np.sqrt(np.concatenate(over_bound).mean())
     assert 0.97 < ratio < 1.05
-    # The gain found from the image is up to 15 % high for the sharpest PSF, sigma 5 % low; for the
-    # widest some of the noise of faint pixels passes for an error of the PSF, sigma 6 % high.
     truth = np.sqrt(np.concatenate(over_sigma).mean())
-    assert 0.93 < truth < 1.07
+    assert 0.96 < truth < 1.04
 
 
 def test_the_covariance_is_true_where_the_gain_is_given() -> None:
@@ -241,7 +239,7 @@ def test_noise_alone_gives_no_more_detections_than_it_should(
     assert count > 0.75 * expected - 3 * np.sqrt(expected)
 
 
-@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3])
+@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3, 2.0])
 def test_gain_and_width_are_found_from_the_image(psf_sigma_px: float) -> None:
     detector = dataclasses.replace(QUIET, psf_sigma_px=psf_sigma_px)
     gains, widths = [], []
@@ -251,7 +249,8 @@ def test_gain_and_width_are_found_from_the_image(psf_sigma_px: float) -> None:
         model = modelled(exposed(seed, xy, flux, detector))
         gains.append(model.pixel_noise.gain_e_per_dn)
         widths.append(model.psf_sigma_px)
-    assert np.mean(gains) == pytest.approx(4.0, rel=0.20)
+    # One image knows it to 6 %.
+    assert np.mean(gains) == pytest.approx(4.0, rel=0.08)
     assert np.mean(widths) == pytest.approx(psf_sigma_px, rel=0.005)
 
 
@@ -314,13 +313,13 @@ def test_a_saturated_star_can_be_measured_by_what_is_left_of_it() -> None:
     ('dtype', 'peak', 'count', 'expected'),
     [
         (np.uint8, 255, 1, 0.98 * 255),
-        (np.uint8, 254, 1, 255.0),
+        (np.uint8, 254, 1, 0.0),
         (np.uint8, 200, 4, 0.98 * 200),
         (np.uint16, 4095, 1, 0.98 * 4095),
         (np.uint16, 16383, 1, 0.98 * 16383),
         (np.uint16, 65535, 1, 0.98 * 65535),
-        (np.uint16, 3000, 1, 3001.0),
-        (np.uint16, 3000, 3, 3001.0),
+        (np.uint16, 3000, 1, 0.0),
+        (np.uint16, 3000, 3, 0.0),
         (np.uint16, 3000, 4, 0.98 * 3000),
     ],
 )
@@ -437,7 +436,8 @@ def test_the_fit_itself_is_exact_on_its_own_model() -> None:
     )
     fit = fit_psf(stamps, 1.1, np.full(50, 2.0), PixelNoise(4.0, 0.0))
     expected = np.concatenate([centre, flux[:, None], level[:, None]], axis=1)
-    # The iteration ends on steps of 1e-7 px; the stamp cut off at 5 px matters to neither.
-    np.testing.assert_allclose(fit.parameters, expected, rtol=1e-6, atol=1e-6)
-    assert fit.reduced_chi2.max() < 1e-9
-    assert np.abs(fit.shape_change).max() < 1e-6
+    # The iteration ends where a step is 0.1 sigma, takes one more, and leaves a thousandth of a
+    # sigma, which is 0.01 px here.  The residual is that before the last step.
+    np.testing.assert_allclose(fit.parameters, expected, rtol=1e-5, atol=1e-5)
+    assert np.abs(fit.residual_dn).max() < 0.01 * 2.0
+    assert np.abs(fit.shape_change).max() < 1e-4

@@ -18,8 +18,10 @@ from starcal_ros.identification import (
     neighbour_pulls,
     observe_stars,
     predict,
+    Shot,
     tracked,
 )
+from starcal_ros.instrument import uniform_width
 from starcal_ros.psf import fit_psf, PixelNoise, stamp_radius_px
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.synthetic import Detector, render, scenario, Scene, scene, star_electrons
@@ -46,9 +48,8 @@ def observed(
     geometry: CameraGeometry = PRIOR,
     options: IdentificationOptions = OPTIONS,
 ) -> StarObservations:
-    return observe_stars(
-        image, icrf_from_star_tracker_xyzw, 0.5, geometry, catalog(), CENTROIDS, options
-    )
+    shot = Shot(image, icrf_from_star_tracker_xyzw, 0.5)
+    return observe_stars(shot, geometry, catalog(), CENTROIDS, options)[0]
 
 
 def turned(geometry: CameraGeometry, turn: Rotation) -> CameraGeometry:
@@ -260,7 +261,8 @@ def image_model(noise_dn: float) -> ImageModel:
     mesh = np.zeros((1, 1), np.float32)
     background = Background(mesh, mesh + np.float32(noise_dn), 0.0, noise_dn)
     noise = PixelNoise(4.0, 0.0)
-    return ImageModel(background, SIGMA_PX, noise, 4095.0, np.zeros(3), np.zeros(3))
+    psf = uniform_width(SIGMA_PX, 33, 33)
+    return ImageModel(background, psf, noise, 4095.0, np.zeros(3), np.zeros(3))
 
 
 def pulls(
