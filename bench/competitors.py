@@ -254,7 +254,8 @@ def solve_opencv(case: Case) -> Answer:
         points.append(np.concatenate([near, 2.0 * near]).astype(np.float32))
         pixels.append(np.concatenate([table.measured_px[stars]] * 2).astype(np.float32))
     k1, k2, k3, p1, p2 = prior.distortion
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT
+    # Its normal matrix is dense; singular values of it, the default, would take twice as long.
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_USE_LU
     _, K, D, turns, _, _, _, _ = cv2.calibrateCameraExtended(
         points,
         pixels,

@@ -130,6 +130,8 @@ class Estimate:
     shared_covariance : (s, s)
         Of the ten camera parameters, focal terms, alignment and its rate.
     shared_names : tuple of s str
+    problem : Problem
+        The one whose minimum the state is.
     state : State
     table : StarTable
     kept : (n,) bool
@@ -161,6 +163,7 @@ class Estimate:
     information_names: tuple[str, ...]
     shared_covariance: Floats
     shared_names: tuple[str, ...]
+    problem: Problem
     state: State
     table: StarTable
     kept: Mask
@@ -408,6 +411,7 @@ def _estimate(
         information_names=tuple(names[i] for i in shared),
         shared_covariance=full,
         shared_names=names,
+        problem=problem,
         state=state,
         table=table,
         kept=kept,

@@ -1,5 +1,5 @@
 """
-Monte Carlo studies of calibrations whose truth is known, and the removal of terms one by one.
+Monte Carlo studies of calibrations whose truth is known.
 
 A study is a number of trials, each of which is drawn from its own (seed, study, trial) and knows
 nothing of the others: whoever computes it, and in whatever order, gets the same rows.  Lengths are
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from starcal_ros.calibration import (
-    CalibrationOptions,
     Estimate,
     estimate_calibration,
 )
@@ -35,7 +34,6 @@ from starcal_ros.campaign_trials import (
     ESTIMATED,
     information_blocks,
     map_bound_px,
-    map_error_px,
     normalised_error_squared,
     observe,
     pointing_bound_arcsec,
@@ -44,7 +42,9 @@ from starcal_ros.campaign_trials import (
     unused_residual_px,
 )
 from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.observability import map_error_px
 from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, CameraGeometry, Ensemble
+from starcal_ros.removal import removal_study
 from starcal_ros.synthetic import true_observations
 
 Floats = NDArray[np.float64]
@@ -55,8 +55,6 @@ UNUSED_IMAGES = 20
 ENOUGH = 1.01  # residual of unused images, over that of the true camera, from which more is waste
 NIGHT_S = 3590.0  # from the first image to the last (paper: 359 at ten seconds)
 CONFIDENCE = 0.99
-_KEEP_ALL_SIGMA = 20.0  # the most that the options allow
-_REMOVED_IS_ZERO = ('skew', 'k1', 'k2', 'k3', 'p1', 'p2')
 _MOST = 1000  # images, or stars of an image
 
 
@@ -118,35 +116,6 @@ class Campaign:
     design: Design
     rows: tuple[Row, ...]
     summary: tuple[Row, ...]
-
-
-@dataclass(frozen=True)
-class Removal:
-    """
-    A calibration after one more term was removed.
-
-    Attributes
-    ----------
-    removed : str
-        The term; empty for the calibration with all of them.
-    remaining : tuple of str
-        Camera parameters still estimated.
-    wald : float
-        Rise of chi^2 that the covariance before had promised.
-    residual_rms_px : float
-        Per axis, over the stars that the calibration with all terms has kept.
-    residual_std_px : (float, float)
-        Of u and of v, over the same stars.
-    map_change_px : float
-        RMS over the detector against the calibration with all terms.
-    """
-
-    removed: str
-    remaining: tuple[str, ...]
-    wald: float
-    residual_rms_px: float
-    residual_std_px: tuple[float, float]
-    map_change_px: float
 
 
 def check(design: Design) -> None:
@@ -237,76 +206,6 @@ def content(campaign: Campaign, software: str) -> str:
     lines.append(' "summary": [\n' + ',\n'.join(summary) + '\n ]')
     lines.append(' "trials": {\n' + ',\n'.join(trials) + '\n }')
     return '{\n' + ',\n'.join(lines) + '\n}\n'
-
-
-def removal_study(
-    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
-) -> tuple[Removal, ...]:
-    """
-    Calibrations with fewer and fewer terms, the least prominent going first (paper, Fig. 8).
-
-    Starts from all that ``options.estimate`` names.  Removed skew and distortion are zero, a
-    removed focal length or principal point is the prior's, and exact.  The next to go is the one
-    whose removal raises chi^2 least by the covariance (Wald: squared distance to the value that it
-    is held at, over its variance); then all is solved again.  The residual is that of the stars
-    that the first calibration has kept, whatever a poorer one makes of them.
-
-    Raises
-    ------
-    TooFewObservations
-        When the ensemble does not carry the calibration with all terms.
-    """
-    remaining = tuple(name for name in PARAMETER_NAMES if name in options.estimate)
-    full = estimate_calibration(ensemble, prior, options)
-    kept = np.split(full.kept, np.cumsum([len(image) for image in ensemble.images])[:-1])
-    images = [image.select(k) for image, k in zip(ensemble.images, kept, strict=True)]
-    ensemble = Ensemble(tuple(image for image in images if len(image)), ensemble.refused)
-    residual_px = full.residual_px[full.kept]
-    options = dataclasses.replace(options, outlier_sigma=_KEEP_ALL_SIGMA)
-    held, estimate = prior, full
-    removals = [_removal('', remaining, 0.0, residual_px, full, full)]
-    while len(remaining) > 1:
-        wald = {name: _wald(name, estimate, held) for name in remaining}
-        least = min(remaining, key=lambda name: wald[name])
-        remaining = tuple(name for name in remaining if name != least)
-        if least in _REMOVED_IS_ZERO:
-            held = dataclasses.replace(held, camera=held.camera.replace(**{least: 0.0}))
-        exact = tuple(
-            0.0 if name == least else sigma
-            for name, sigma in zip(PARAMETER_NAMES, options.prior_sigma, strict=True)
-        )
-        options = dataclasses.replace(options, estimate=remaining, prior_sigma=exact)
-        estimate = estimate_calibration(ensemble, held, options)
-        removals.append(
-            _removal(least, remaining, wald[least], estimate.residual_px, estimate, full)
-        )
-    return tuple(removals)
-
-
-def _wald(name: str, estimate: Estimate, prior: CameraGeometry) -> float:
-    k = PARAMETER_NAMES.index(name)
-    without = 0.0 if name in _REMOVED_IS_ZERO else prior.camera.parameters[k]
-    distance = estimate.geometry.camera.parameters[k] - without
-    return float(distance**2 / estimate.covariance[k, k])
-
-
-def _removal(
-    removed: str,
-    remaining: tuple[str, ...],
-    wald: float,
-    residual_px: Floats,
-    estimate: Estimate,
-    full: Estimate,
-) -> Removal:
-    std_u, std_v = residual_px.std(axis=0)
-    return Removal(
-        removed,
-        remaining,
-        wald,
-        float(np.sqrt(np.mean(residual_px**2))),
-        (float(std_u), float(std_v)),
-        map_error_px(estimate.geometry.camera, full.geometry.camera),
-    )
 
 
 def _cells(design: Design, field: StarField) -> Iterable[tuple[Row, StarField]]:
@@ -400,8 +299,8 @@ def _terms_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
             star_tracker_sigma_arcsec=(tracker, tracker, tracker),
         )
         options = calibration_options(method, design.told(tracker), estimate=PARAMETER_NAMES)
-        ensemble = true_observations(night)
-        for step, removal in enumerate(removal_study(ensemble, night.prior, options)):
+        estimate = estimate_calibration(true_observations(night), night.prior, options)
+        for step, removal in enumerate(removal_study(estimate)):
             std_u, std_v = removal.residual_std_px
             yield {
                 'images': images,

@@ -19,7 +19,7 @@ from starcal_ros.calibration import CalibrationOptions, Estimate
 from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.measurement import arrange, normal_blocks, star_table
-from starcal_ros.observability import line_of_sight_sigma_arcsec, map_sigma_px
+from starcal_ros.observability import GRID, line_of_sight_sigma_arcsec, map_sigma_px
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.synthetic import Scenario, scenario
 
@@ -27,7 +27,6 @@ Floats = NDArray[np.float64]
 
 CENTROID_SIGMA_PX = 0.1
 OUTLIER_REACH_PX = 20.0  # a misidentified star: anywhere in a square of this half side
-GRID = 25  # pixels along each side of the detector at which maps are compared
 LEAST_TRACKER_ARCSEC = 1e-3  # what a calibration takes for a perfect star tracker
 
 _FREE = [PARAMETER_NAMES.index(name) for name in CalibrationOptions().estimate]
@@ -195,20 +194,6 @@ def map_bound_px(camera: CameraModel, covariance: Floats) -> float:
 def pointing_bound_arcsec(camera: CameraModel, covariance: Floats) -> float:
     """RMS over the detector of what `pointing_error_arcsec` is to be expected to be."""
     return _rms(line_of_sight_sigma_arcsec(camera, covariance, GRID, GRID))
-
-
-def map_error_px(found: CameraModel, true: CameraModel) -> float:
-    """
-    RMS over the detector between the lines of sight of two cameras, px at the focal length.
-
-    The turn of all lines of sight that brings the two closest is removed: a calibration puts it
-    into the alignment.
-    """
-    grid = pixel_grid(true, GRID, GRID)
-    of_found, of_true = line_of_sight(found, grid), line_of_sight(true, grid)
-    turn, _ = Rotation.align_vectors(of_true, of_found)
-    angle = np.linalg.norm(turn.apply(of_found) - of_true, axis=1)
-    return _rms(angle) * float(true.parameters[0])
 
 
 def pointing_error_arcsec(found: CameraGeometry, true: CameraGeometry) -> float:

@@ -113,7 +113,7 @@ def _schur_complement(A: Floats, flat_B: Floats, W: Floats) -> Floats:
     NotObservable
         When of an unknown only rounding is left.
     """
-    S = A - flat_B.T @ W.reshape(-1, A.shape[0])
+    S = A - flat_B.T @ W.reshape(flat_B.shape)
     if (np.diag(S) < _SCHUR_TOLERANCE * np.diag(A)).any():
         raise NotObservable('the blocks explain a shared unknown')
     return np.asarray(S)
@@ -137,7 +137,7 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
     C_inverse = inverse(C)
     W = C_inverse @ normal.B
     w = np.einsum('mij,mj->mi', C_inverse, normal.c)
-    flat_B = normal.B.reshape(-1, p)
+    flat_B = normal.B.reshape(len(normal.B) * q, p)
     shared = inverse(_schur_complement(A, flat_B, W)) @ (normal.a - flat_B.T @ w.ravel())
     return shared, w - W @ shared
 
@@ -164,7 +164,8 @@ def covariance(normal: NormalEquations) -> tuple[Floats, Floats, Floats]:
         return inverse(normal.A), np.empty_like(normal.B), np.empty_like(normal.C)
     C_inverse = inverse(normal.C)
     W = C_inverse @ normal.B
-    shared = inverse(_schur_complement(normal.A, normal.B.reshape(-1, p), W))
+    flat_B = normal.B.reshape(normal.B.shape[0] * normal.B.shape[1], p)
+    shared = inverse(_schur_complement(normal.A, flat_B, W))
     cross = -W @ shared
     return shared, cross, C_inverse - cross @ np.swapaxes(W, -1, -2)
 

@@ -30,12 +30,15 @@ from starcal_ros.records import (
     EnsembleStatus,
     Image,
     refused_image,
+    Removal,
     StarObservations,
     Thermal,
 )
 
 Floats = NDArray[np.float64]
 Message = Any  # a message class of rclpy or of rosbags: they share field names and nothing else
+
+_REMOVAL_COLUMNS = ('significance', 'wald', 'chi2_rise', 'residual_rms_px', 'map_change_px')
 
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
 COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
@@ -468,6 +471,7 @@ def calibration_to_message(calibration: Calibration, make: Make) -> Message:
         **_thermal_fields(calibration.thermal),
         **_maps_fields(calibration.maps),
         **_correlation_fields(calibration.correlation),
+        **_removal_fields(calibration.removals),
         zero_skew_cost_px=float(calibration.zero_skew_cost_px),
         iterations=calibration.iterations,
         termination=calibration.termination,
@@ -527,6 +531,7 @@ def calibration_from_message(message: Message) -> Calibration:
         thermal=_thermal_from_message(message),
         maps=_maps_from_message(message),
         correlation=_correlation_from_message(message),
+        removals=_removals_from_message(message),
         first_image_ns=stamp_ns(message.first_image),
         number=int(message.number),
         in_force_since_ns=stamp_ns(message.in_force_since),
@@ -558,6 +563,43 @@ def _maps_from_message(message: Message) -> DetectorMaps | None:
         _shaped('coverage', message.coverage, cells).astype(np.int64),
         _shaped('line_of_sight_sigma_arcsec', message.line_of_sight_sigma_arcsec, grid),
         _shaped('shape_sigma_arcsec', message.shape_sigma_arcsec, grid),
+    )
+
+
+def _removal_fields(removals: tuple[Removal, ...]) -> dict[str, object]:
+    stds = np.array([removal.residual_std_px for removal in removals]).reshape(-1, 2)
+    columns = {
+        f'removal_{name}': _flat([getattr(removal, name) for removal in removals], np.float64)
+        for name in _REMOVAL_COLUMNS
+    }
+    return {
+        'removal_removed': [removal.removed for removal in removals],
+        'removal_within_chance': _flat([r.within_chance for r in removals], np.uint8),
+        'removal_residual_std_u_px': _flat(stds[:, 0], np.float64),
+        'removal_residual_std_v_px': _flat(stds[:, 1], np.float64),
+        **columns,
+    }
+
+
+def _removals_from_message(message: Message) -> tuple[Removal, ...]:
+    names = [str(name) for name in getattr(message, 'removal_removed', ())]
+    if not names:
+        return ()
+    fields = (*_REMOVAL_COLUMNS, 'residual_std_u_px', 'residual_std_v_px', 'within_chance')
+    columns = {
+        field: _shaped(
+            f'removal_{field}', getattr(message, f'removal_{field}'), (len(names),)
+        ).tolist()
+        for field in fields
+    }
+    return tuple(
+        Removal(
+            removed=name,
+            within_chance=bool(columns['within_chance'][k]),
+            residual_std_px=(columns['residual_std_u_px'][k], columns['residual_std_v_px'][k]),
+            **{field: columns[field][k] for field in _REMOVAL_COLUMNS},
+        )
+        for k, name in enumerate(names)
     )
 
 

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from starcal_ros.adjustment import image_blocks, information_of_images, Problem, State
 from starcal_ros.calibration import CalibrationOptions, FEWEST_STARS, problem_of, start_of
@@ -35,6 +36,7 @@ from starcal_ros.thermal import why_unsupported
 Floats = NDArray[np.float64]
 
 COVERAGE_ROWS, COVERAGE_COLS = 8, 10  # cells of 2 degrees on the paper's camera
+GRID = 25  # pixels along each side of the detector at which maps are compared
 MAP_ROWS, MAP_COLS = 16, 20  # of a smooth surface of degree seven
 
 
@@ -255,6 +257,20 @@ def shape_sigma_rad(
     J = (J - Q @ (Q.T @ J)).reshape(-1, 3, 10)
     variance = np.einsum('nij,jk,nik->n', J, covariance[:10, :10], J)
     return np.asarray(np.sqrt(variance).reshape(rows, columns))
+
+
+def map_error_px(found: CameraModel, true: CameraModel) -> float:
+    """
+    RMS over the detector between the lines of sight of two cameras, px at the focal length.
+
+    The turn of all lines of sight that brings the two closest is removed: a calibration puts it
+    into the alignment.
+    """
+    grid = pixel_grid(true, GRID, GRID)
+    of_found, of_true = line_of_sight(found, grid), line_of_sight(true, grid)
+    turn, _ = Rotation.align_vectors(of_true, of_found)
+    angle = np.linalg.norm(turn.apply(of_found) - of_true, axis=1)
+    return float(np.sqrt(np.mean(angle**2)) * true.parameters[0])
 
 
 def detector_maps(camera: CameraModel, covariance: Floats, pixels: Floats) -> DetectorMaps:

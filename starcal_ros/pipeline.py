@@ -51,6 +51,7 @@ from starcal_ros.records import (
     refused_image,
     StarObservations,
 )
+from starcal_ros.removal import removal_study
 from starcal_ros.residuals import Residuals, residuals_of
 from starcal_ros.tracking import follow, Followed, following
 
@@ -498,6 +499,7 @@ def _calibration(
         thermal=result.thermal,
         maps=detector_maps(camera, result.covariance, result.table.measured_px[kept]),
         correlation=correlation(result.shared_covariance, result.shared_names),
+        removals=removal_study(result),
         first_image_ns=min(image.time_ns for image in ensemble.images),
     )
 

@@ -29,6 +29,7 @@ from starcal_ros.records import (
     CameraGeometry,
     Correlation,
     DetectorMaps,
+    Removal,
     Thermal,
 )
 
@@ -41,6 +42,7 @@ _LATER_KEYS: Mapping[str, object] = {
     'temperature': None,
     'maps': None,
     'correlation': None,
+    'removals': [],
     'first_image_ns': 0,
     'number': 0,
     'in_force_since_ns': 0,
@@ -314,6 +316,7 @@ def calibration_content(calibration: Calibration) -> dict[str, object]:
         'temperature': _thermal_content(calibration.thermal),
         'maps': _maps_content(calibration.maps),
         'correlation': _correlation_content(calibration.correlation),
+        'removals': [_removal_content(removal) for removal in calibration.removals],
         'first_image_ns': int(calibration.first_image_ns),
         'number': int(calibration.number),
         'in_force_since_ns': int(calibration.in_force_since_ns),
@@ -328,6 +331,19 @@ def _maps_content(maps: DetectorMaps | None) -> dict[str, object] | None:
         'stars': maps.stars.tolist(),
         'line_of_sight_sigma_arcsec': _json_rows(maps.line_of_sight_sigma_arcsec),
         'shape_sigma_arcsec': _json_rows(maps.shape_sigma_arcsec),
+    }
+
+
+def _removal_content(removal: Removal) -> dict[str, object]:
+    return {
+        'removed': removal.removed,
+        'significance': _json_number(removal.significance),
+        'wald': _json_number(removal.wald),
+        'chi2_rise': _json_number(removal.chi2_rise),
+        'within_chance': bool(removal.within_chance),
+        'residual_rms_px': _json_number(removal.residual_rms_px),
+        'residual_std_px': [_json_number(std) for std in removal.residual_std_px],
+        'map_change_px': _json_number(removal.map_change_px),
     }
 
 
@@ -403,6 +419,7 @@ def _calibration_from(reader: _Reader) -> Calibration:
         thermal=None if reader.get('temperature', _is_null) else _thermal_from(reader),
         maps=None if reader.get('maps', _is_null) else _maps_from(reader),
         correlation=None if reader.get('correlation', _is_null) else _correlation_from(reader),
+        removals=_removals_from(reader),
         first_image_ns=reader.get('first_image_ns', _whole),
         number=reader.get('number', _whole),
         in_force_since_ns=reader.get('in_force_since_ns', _whole),
@@ -416,6 +433,26 @@ def _maps_from(reader: _Reader) -> DetectorMaps:
         np.array(reader.get('maps.line_of_sight_sigma_arcsec', _grid_of(_number_or_null))),
         np.array(reader.get('maps.shape_sigma_arcsec', _grid_of(_number_or_null))),
     )
+
+
+def _removals_from(reader: _Reader) -> tuple[Removal, ...]:
+    removals = []
+    for removal in reader.get('removals', _list_of(_mapping_of(_as_it_is))):
+        one = _Reader(reader.path, {'removals': removal})
+        std_u, std_v = one.get('removals.residual_std_px', _numbers(2, null=True))
+        removals.append(
+            Removal(
+                removed=one.get('removals.removed', _text),
+                significance=one.get('removals.significance', _number_or_null),
+                wald=one.get('removals.wald', _number_or_null),
+                chi2_rise=one.get('removals.chi2_rise', _number_or_null),
+                within_chance=one.get('removals.within_chance', _true_or_false),
+                residual_rms_px=one.get('removals.residual_rms_px', _number_or_null),
+                residual_std_px=(std_u, std_v),
+                map_change_px=one.get('removals.map_change_px', _number_or_null),
+            )
+        )
+    return tuple(removals)
 
 
 def _correlation_from(reader: _Reader) -> Correlation:
@@ -485,6 +522,10 @@ def _number_or_null(value: object) -> float:
 def _whole(value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise ValueError('a whole number')
+    return value
+
+
+def _as_it_is(value: object) -> object:
     return value
 
 

@@ -318,6 +318,42 @@ class Correlation:
 
 
 @dataclass(frozen=True)
+class Removal:
+    """
+    A calibration after one more term was removed, those before it staying removed.
+
+    Attributes
+    ----------
+    removed : str
+        The term; empty for the calibration with all of them.
+    significance : float
+        How far the term is from what it is held at without it, in its sigma, with all terms.
+    wald : float
+        Rise of chi^2 that the covariance before the removal had promised.
+    chi2_rise : float
+        Against the calibration with all terms, over its stars and with its weights.
+    within_chance : bool
+        Whether this and all removed before it may be dropped: terms that are none would raise
+        chi^2 by as much in more than 1 of 100.
+    residual_rms_px : float
+        Per axis, over the same stars.
+    residual_std_px : (float, float)
+        Of u and of v.
+    map_change_px : float
+        RMS over the detector against the calibration with all terms, the common turn removed.
+    """
+
+    removed: str
+    significance: float
+    wald: float
+    chi2_rise: float
+    within_chance: bool
+    residual_rms_px: float
+    residual_std_px: tuple[float, float]
+    map_change_px: float
+
+
+@dataclass(frozen=True)
 class Calibration:
     """
     One calibration with its covariance, statistics and provenance.
@@ -367,6 +403,8 @@ class Calibration:
     maps : DetectorMaps or None
     correlation : Correlation or None
         None where whoever has made the calibration does not tell.
+    removals : tuple of Removal
+        First that of no term, then the terms in the order in which they would go; may be empty.
     first_image_ns : int
         Stamp of the first image used.
     number : int
@@ -407,6 +445,7 @@ class Calibration:
     thermal: Thermal | None = None
     maps: DetectorMaps | None = None
     correlation: Correlation | None = None
+    removals: tuple[Removal, ...] = ()
     first_image_ns: int = 0
     number: int = 0
     in_force_since_ns: int = 0

@@ -37,6 +37,7 @@ LADDER = [
     'variance',
     'calibration',
     'observability',
+    'removal',
     'acceptance',
     'synthetic',
     'mcap_records',

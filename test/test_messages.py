@@ -24,6 +24,7 @@ from starcal_ros.records import (
     EnsembleStatus,
     Image,
     refused_image,
+    Removal,
     StarObservations,
     Thermal,
 )
@@ -238,6 +239,10 @@ def calibration() -> Calibration:
             np.sqrt(np.arange(12.0)).reshape(4, 3),
         ),
         correlation=Correlation(('fx', 'fy'), np.array([[1.0, 1 / 3], [1 / 3, 1.0]])),
+        removals=(
+            Removal('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
+            Removal('k3', -0.3, 0.5, 1 / 7, False, 0.3, (0.25, 0.35), 1e-9),
+        ),
     )
 
 
@@ -276,7 +281,7 @@ def test_records_round_trip(make: Any) -> None:
             result,
             messages.calibration_from_message(messages.calibration_to_message(result, make)),
         )
-    silent = dataclasses.replace(calibration(), maps=None, correlation=None)
+    silent = dataclasses.replace(calibration(), maps=None, correlation=None, removals=())
     assert_same(
         silent, messages.calibration_from_message(messages.calibration_to_message(silent, make))
     )
@@ -335,8 +340,10 @@ def test_older_recordings_are_read() -> None:
     assert record.refused_px.shape == (0, 2)
     message = messages.calibration_to_message(calibration(), plain)
     del message.reference_temperature_degc, message.coverage_rows, message.correlation_names
+    del message.removal_removed
     found = messages.calibration_from_message(message)
     assert found.thermal is None and found.maps is None and found.correlation is None
+    assert found.removals == ()
 
 
 @pytest.mark.parametrize(
@@ -346,6 +353,8 @@ def test_older_recordings_are_read() -> None:
         ('line_of_sight_sigma_arcsec', 'line_of_sight_sigma_arcsec: 1 numbers, not 4 x 3'),
         ('shape_sigma_arcsec', 'shape_sigma_arcsec: 1 numbers, not 4 x 3'),
         ('correlation', 'correlation: 1 numbers, not 2 x 2'),
+        ('removal_wald', 'removal_wald: 1 numbers, not 2'),
+        ('removal_within_chance', 'removal_within_chance: 1 numbers, not 2'),
     ],
 )
 def test_grids_of_another_size_are_refused(field: str, text: str) -> None:

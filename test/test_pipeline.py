@@ -450,6 +450,19 @@ def test_a_solution_is_mapped_over_the_detector(setup: pipeline.Setup) -> None:
     )
 
 
+def test_a_solution_says_what_each_term_is_worth(setup: pipeline.Setup) -> None:
+    found = pipeline.solve(ensemble(), setup)
+    first, *removals = found.removals
+    assert first.residual_rms_px == pytest.approx(found.residual_rms_px, rel=1e-9)
+    assert {removal.removed for removal in removals} == set(found.estimated)
+    for removal in removals:
+        if removal.removed in ('fx', 'fy'):
+            continue
+        k = PARAMETER_NAMES.index(removal.removed)
+        expected = found.geometry.camera.parameters[k] / found.sigma[k]
+        assert removal.significance == pytest.approx(expected, rel=1e-6)
+
+
 def test_method_and_names_can_be_said_for_one_solution(setup: pipeline.Setup) -> None:
     found = pipeline.solve(ensemble(), setup, method='single', estimate=['fx', 'fy', 'k1'])
     assert (found.method, found.estimated) == ('single', ('fx', 'fy', 'k1'))

@@ -30,6 +30,7 @@ from starcal_ros.records import (
     CameraGeometry,
     Correlation,
     DetectorMaps,
+    Removal,
     Thermal,
 )
 
@@ -41,6 +42,11 @@ MAPS = DetectorMaps(
     np.arange(6).reshape(2, 3),
     np.arange(12.0).reshape(4, 3) / 7,
     np.arange(12.0).reshape(3, 4) / 3,
+)
+REMOVALS = (
+    Removal('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
+    Removal('k3', -1 / 3, 0.5, 1 / 7, True, 0.1 + 0.2, (0.1, 1 / 3), 1e-17),
+    Removal('fx', 4e5, 1.6e11, 1.7e11, False, 700.5, (500.0, 600.0), 12.0),
 )
 CORRELATION = Correlation(('fx', 'pitch'), np.array([[1.0, -1 / 3], [-1 / 3, 1.0]]))
 THERMAL = Thermal(21.5, (4e-5, -6e-7), (1e-6, 2e-8), (1e-5, 0.0, -3e-5), (1e-6,) * 3, 'a word')
@@ -140,6 +146,7 @@ def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
         {'thermal': THERMAL},
         {'thermal': Thermal(20.0, note='left out: everything')},
         {'maps': MAPS, 'correlation': CORRELATION},
+        {'removals': REMOVALS},
     )
     for changes in cases:
         calibration = calibration_of(**changes)
@@ -226,7 +233,7 @@ def test_a_file_of_before_temperature_is_read(tmp_path: Path) -> None:
     path = tmp_path / 'c.json'
     write_calibration(calibration_of(), path)
     content = json.loads(path.read_text())
-    del content['temperature'], content['maps'], content['correlation']
+    del content['temperature'], content['maps'], content['correlation'], content['removals']
     path.write_text(json.dumps(content))
     assert_same(calibration_of(), read_calibration(path))
 
@@ -256,12 +263,15 @@ def test_a_file_of_before_temperature_is_read(tmp_path: Path) -> None:
         ),
         (lambda c: c['maps'].pop('stars'), "key 'maps.stars' is missing"),
         (lambda c: c['maps']['stars'][0].pop(), 'maps.stars: .* is not a grid of rows alike'),
+        (lambda c: c.update(removals=[1]), r'removals: \[1\] is not a mapping'),
+        (lambda c: c['removals'][1].pop('wald'), "key 'removals.wald' is missing"),
+        (lambda c: c['removals'][1].update(within_chance=1), 'within_chance: 1 is not true or'),
         (lambda c: c['correlation']['matrix'].pop(), 'correlation.matrix is not of the size'),
     ],
 )
 def test_a_damaged_calibration_is_refused_by_file_and_key(tmp_path, change, says) -> None:
     path = tmp_path / 'c.json'
-    record = calibration_of(thermal=THERMAL, maps=MAPS, correlation=CORRELATION)
+    record = calibration_of(thermal=THERMAL, maps=MAPS, correlation=CORRELATION, removals=REMOVALS)
     write_calibration(record, path)
     content = json.loads(path.read_text())
     change(content)
