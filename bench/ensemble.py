@@ -1,0 +1,150 @@
+"""
+What it costs to keep 60 of 359 images: of their information, not of their number.
+
+Sixty images cannot know what 359 know. The best that any sixty of them could do is bounded from
+below by the convex relaxation of the choice (weights of 0 to 1 that sum to sixty).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.competitors import make_ensemble
+from bench.table import Table
+from starcal_ros.calibration import CalibrationOptions
+from starcal_ros.observability import (
+    image_information,
+    keep_most_informative,
+    predicted_sigma,
+)
+from starcal_ros.records import CameraGeometry, Ensemble
+from starcal_ros.synthetic import scenario, true_observations
+
+Floats = NDArray[np.float64]
+
+TARGET = 1.05
+RANDOM_CHOICES = 200
+_STEPS = 400  # of Frank-Wolfe: a gap of some 0.1 %
+
+
+def stream(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Ensemble:
+    """The images that are left when they come one by one, as the calibrator has them."""
+    kept = Ensemble()
+    for image in ensemble.images:
+        kept = keep_most_informative(kept.add(image), prior, options)
+    return kept
+
+
+def least_mean_variance(information: Floats, count: int, unit: Floats) -> float:
+    """
+    No ``count`` of the images (m, k, k) have a lower mean variance, in squares of ``unit`` (k,).
+
+    A-optimal design, relaxed to weights: convex, so its tangent at any weights is a lower bound.
+    Frank-Wolfe: a tangent is least at some ``count`` whole images.
+    """
+    scaled = information * unit[:, None] * unit[None, :]
+    weight = np.full(len(scaled), count / len(scaled))
+    best = 0.0
+    for step in range(_STEPS):
+        inverse = np.linalg.inv(np.einsum('m,mij->ij', weight, scaled))
+        gradient = -np.einsum('ij,mjk,ki->m', inverse, scaled, inverse)
+        least = np.argsort(gradient)[:count]
+        tangent = np.trace(inverse) - gradient @ weight + gradient[least].sum()
+        best = max(best, float(tangent))
+        vertex = np.zeros(len(scaled))
+        vertex[least] = 1.0
+        weight += (vertex - weight) * 2.0 / (step + 2.0 + count)
+    return best / len(unit)
+
+
+def measure(
+    title: str,
+    ensemble: Ensemble,
+    prior: CameraGeometry,
+    options: CalibrationOptions,
+    random_choices: int = RANDOM_CHOICES,
+) -> Table:
+    """Rms and worst sigma of choices of ``max_images``, by those of all and by the best choice."""
+    m, count = len(ensemble.images), options.max_images
+    everything = predicted_sigma(ensemble, prior, options)
+    information = image_information(ensemble.images, prior, options)
+    least = np.sqrt(least_mean_variance(information, count, everything))
+    table = Table(
+        title,
+        (
+            'images',
+            'choice',
+            'sigma by all',
+            'worst',
+            'by sqrt(count)',
+            'by best possible',
+            'target',
+        ),
+        notes=[
+            f'sigma by all: rms over {len(everything)} unknowns of sigma over that of all images.',
+            f'by sqrt(count): the same, over sqrt({m}/{count}), that of images all alike.',
+            'best possible: a lower bound of the rms, by convex relaxation of the choice.',
+        ],
+    )
+    rng = np.random.default_rng(1)
+    chosen = [rng.choice(m, count, replace=False) for _ in range(random_choices)]
+    at_random = [np.sqrt(np.diag(np.linalg.inv(information[rows].sum(axis=0)))) for rows in chosen]
+    choices = [
+        (m, 'all', everything),
+        (
+            count,
+            'streamed, one by one',
+            predicted_sigma(stream(ensemble, prior, options), prior, options),
+        ),
+        (
+            count,
+            'from all at once',
+            predicted_sigma(keep_most_informative(ensemble, prior, options), prior, options),
+        ),
+        (
+            count,
+            f'best of {random_choices} at random',
+            min(at_random, key=lambda s: _rms(s / everything)),
+        ),
+        (count, 'at random, mean', np.mean(at_random, axis=0)),
+    ]
+    for images, name, sigma in choices:
+        ratio = sigma / everything
+        by_best = _rms(ratio) / least
+        judged = ''
+        if 'streamed' in name:
+            judged = f'<= {TARGET:g}: ' + ('met' if by_best <= TARGET else 'MISSED')
+        table.add(
+            images,
+            name,
+            _rms(ratio),
+            float(ratio.max()),
+            _rms(ratio) / np.sqrt(m / images),
+            None if images == m else by_best,
+            judged,
+        )
+    return table
+
+
+def run(quick: bool) -> list[Table]:
+    """Images of the whole sky with like stars, and of the paper's drifting night."""
+    m, count = (30, 8) if quick else (359, 60)
+    options = CalibrationOptions(star_tracker_sigma_arcsec=(20.0, 20.0, 20.0), max_images=count)
+    whole_sky, prior = make_ensemble(m)
+    night = dataclasses.replace(scenario('paper'), image_count=m, magnitude_limit=6.65)
+    tables = [
+        measure(f'{count} of {m} images over the whole sky', whole_sky, prior, options),
+        measure(
+            f'{count} of {m} images of one hour', true_observations(night), night.prior, options
+        ),
+    ]
+    for table in tables:
+        print(table.text())
+    return tables
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
