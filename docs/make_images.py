@@ -1,8 +1,8 @@
 """
 Draw the pictures of the README and the documents: ``python docs/make_images.py [DIR]``.
 
-The package computes everything shown from the simulated campaign `small`, seed 1, so the pictures
-can be made again after a change and the numbers in them are those of the run.
+The package computes everything shown from the simulated campaign `small`, seed 1, and the bag in
+the repository, so the pictures can be made again after a change and the numbers are the run's.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from pathlib import Path
+import shutil
+import subprocess
 import tempfile
 
 import cv2
@@ -18,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 import yaml
 
-from starcal_ros import pipeline, products, simulation, synthetic
+from starcal_ros import cli, pipeline, products, simulation, synthetic
 from starcal_ros.annotation import annotate
 from starcal_ros.attitude import AttitudeHistory
 from starcal_ros.camera import distortion_px, pixel_grid
@@ -31,6 +33,8 @@ Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 FOLDER = Path(__file__).parent / 'images'
+TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
+REPORT_SIZE = (1100, 900)  # the first screen, px
 SHOWN_IMAGE = 12
 CLOSE_UP_FIRST, CLOSE_UP_SIZE = (826, 520), (270, 212)  # a part with bright and faint stars
 
@@ -149,6 +153,26 @@ def focal_plane(ensemble: Ensemble, setup: pipeline.Setup, file: Path) -> None:
     figure.savefig(file, dpi=90, metadata={'Software': None})
 
 
+def report_page(file: Path) -> None:
+    """The first screen of the small bag's report, as a browser shows it."""
+    browser = next(filter(None, map(shutil.which, ('chromium', 'google-chrome'))), None)
+    if browser is None:
+        print(f'{file.name}: not drawn, there is no chromium here')
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        arguments = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', folder]
+        assert cli.main(arguments) == 0
+        look = [
+            '--headless',
+            '--no-sandbox',
+            '--hide-scrollbars',
+            f'--window-size={",".join(map(str, REPORT_SIZE))}',
+            f'--screenshot={file.resolve()}',
+            (Path(folder) / 'report.html').as_uri(),
+        ]
+        subprocess.run([browser, *look], check=True, capture_output=True)
+
+
 def main() -> None:
     """Draw all pictures."""
     parser = argparse.ArgumentParser(description='Draw the pictures of the documents.')
@@ -164,6 +188,7 @@ def main() -> None:
         if index == SHOWN_IMAGE:
             star_field(image, observations, setup.prior, folder / 'star_field.png')
     focal_plane(ensemble, setup, folder / 'focal_plane.png')
+    report_page(folder / 'report.png')
 
 
 if __name__ == '__main__':
