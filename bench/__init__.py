@@ -1,4 +1,7 @@
-"""Measurements of time and memory, against other people's code where there is some."""
+"""Measurements of time, memory and accuracy, against other people's code where there is some."""
 
 NAMES = ('solver', 'ensemble', 'measure', 'calibrate', 'observer')
 """The benches, each a module with ``run(quick)`` that prints its tables and returns them."""
+
+LONG = ('accuracy', 'paper')
+"""Those that take some minutes: run when they are named."""

@@ -1,4 +1,4 @@
-"""`starcal calibrate` as a whole process: 24 images of 1296 x 1024, from bag to products."""
+"""`starcal calibrate` as a whole process, from bag to products."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ _STAGES = (
     ('import of Python modules', 'importlib._bootstrap', '_find_and_load'),
     ('load options, camera, catalog', 'pipeline', 'load_setup'),
     ('read images from the bag', 'bag', 'read_images'),
-    ('measure and identify stars', 'pipeline', 'observe'),
+    ('measure and identify stars', 'pipeline', 'observe_next'),
     ('  background', 'detection', 'measure_background'),
     ('  prediction', 'identification', 'predict'),
     ('  match', 'identification', '_find'),
     ('  PSF and pixel noise', 'centroiding', 'model_image'),
+    ('  images after the first', 'tracking', 'follow'),
     ('  centroids', 'centroiding', 'measure_stars'),
     ('estimate', 'calibration', 'estimate_calibration'),
     ('digest of the bag', 'cli', '_digest'),
@@ -41,7 +42,7 @@ def run(quick: bool) -> list[Table]:
         out = Path(folder, 'out')
         command = ['starcal_ros.cli', 'calibrate', str(made.bag)]
         command += ['--params', str(made.params), '-o', str(out)]
-        wall = _time_command(name, scenario.image_count, ['-m', *command], 1 if quick else 3)
+        wall = time_command(name, scenario.image_count, ['-m', *command], 1 if quick else 3)
         profile = Path(folder, 'profile')
         _run(['-m', 'cProfile', '-o', str(profile), '-m', *command])
         stages = _stages(profile)
@@ -50,15 +51,18 @@ def run(quick: bool) -> list[Table]:
     return [wall, stages]
 
 
-def _time_command(name: str, images: int, command: list[str], repeats: int) -> Table:
+def time_command(
+    name: str, images: int, command: list[str], repeats: int, target_s: float = TARGET_S
+) -> Table:
+    """Wall time, processor time and memory of a calibration as a process of its own."""
     runs = [_run(command) for _ in range(repeats)]
     wall_s, user_s, system_s, peak_mb = zip(*runs, strict=True)
-    met = 'met' if min(wall_s) < TARGET_S else 'MISSED'
+    met = 'met' if min(wall_s) < target_s else 'MISSED'
     table = Table(
         f'starcal calibrate, scenario {name}, {images} images; {repeats} runs',
         ('', 'least', 'median', 'target'),
     )
-    table.add('wall s', min(wall_s), statistics.median(wall_s), f'< {TARGET_S:g}: {met}')
+    table.add('wall s', min(wall_s), statistics.median(wall_s), f'< {target_s:g}: {met}')
     table.add('user s', min(user_s), statistics.median(user_s), '')
     table.add('system s', min(system_s), statistics.median(system_s), '')
     table.add('peak MB', min(peak_mb), statistics.median(peak_mb), '')

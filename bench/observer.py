@@ -18,6 +18,7 @@ from pathlib import Path
 import signal
 import socket
 import statistics
+import struct
 import subprocess
 import sys
 import tempfile
@@ -163,14 +164,16 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
     """In a process of its own: send the frames at a steady rate and tell when each was sent."""
     from geometry_msgs.msg import QuaternionStamped
     import rclpy
+    from rclpy.serialization import serialize_message
     from sensor_msgs.msg import Image as ImageMessage
 
     from starcal_ros import messages
     from starcal_ros.nodes.conversions import make_message
 
     sent_s: dict[int, float] = {}
+    # Serialized once: what the publisher takes of the two cores is not of the node.
     ready = [
-        (messages.image_to_message(image, 'camera', make_message), attitudes[1])
+        (serialize_message(messages.image_to_message(image, 'camera', make_message)), attitudes[1])
         for image, attitudes in frames
     ]
     # Camera and star tracker are participants of their own, as on a spacecraft: Fast DDS delays a
@@ -184,9 +187,11 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
             time.sleep(0.05)
         start_s = time.monotonic() + 2.0  # the reader may see the writer later than it is seen
         for k in range(count):
-            message, attitude = ready[k % len(ready)]
+            content, attitude = ready[k % len(ready)]
             time_ns = _FIRST_NS + round(k / rate_hz * 1e9)
-            message.header = messages.make_header(time_ns, 'camera', make_message)
+            # The stamp comes first in the message, after four bytes that tell the encoding.
+            stamp = struct.pack('=iI', *divmod(time_ns, 10**9))
+            message = b''.join((content[:4], stamp, memoryview(content)[12:]))
             time.sleep(max(0.0, start_s + k / rate_hz - time.monotonic()))
             xyzw = attitude.icrf_from_star_tracker_xyzw
             sent_s[time_ns] = time.monotonic()

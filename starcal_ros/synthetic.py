@@ -7,8 +7,8 @@ shows; `true_observations` goes on to noisy centroids without pixels, `render` t
 
 What is modelled: proper motion and aberration of the catalog, pixel-integrated Gaussian stars,
 photon, dark and read noise, hot pixels, cosmic rays, saturation, quantisation, and one error of
-the star tracker per image.  What is not: smear, a PSF that varies over the field, and flat-field
-errors.
+the star tracker per image; a PSF that widens towards the corners where it is asked for.  What is
+not: smear, and flat-field errors.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ ATTITUDE_OFFSETS_S = (-0.75, -0.25, 0.25, 0.75)
 class Detector:
     """The detector and the light that falls on it; electrons are per pixel and image."""
 
-    psf_sigma_px: float = 0.95
+    psf_sigma_px: float = 0.95  # at the centre of the detector
+    psf_growth: float = 0.0  # of the width, centre to corner, with the square of the distance
     zero_point_electrons: float = 3.0e5  # from a star of V = 0: 35 mm f/2 lens, 0.1 s
     sky_electrons: float = 1.5
     dark_electrons: float = 3.0
@@ -66,6 +67,13 @@ class Detector:
     hot_fraction: float = 2e-4
     hot_electrons: float = 600.0  # mean of an exponential law
     cosmic_rays: float = 2.0  # mean number per image
+
+    def psf_sigma_at(self, pixels_px: Floats, shape: tuple[int, int]) -> Floats:
+        """Width (n,) of the stars at pixels (n, 2) of a detector of (height, width)."""
+        middle = np.array([shape[1] - 1, shape[0] - 1]) / 2.0
+        part2 = ((pixels_px - middle) ** 2).sum(axis=1) / (middle**2).sum()
+        # What stands beyond a corner is no wider than what stands in it.
+        return np.asarray(self.psf_sigma_px * (1.0 + self.psf_growth * np.minimum(part2, 1.0)))
 
     @property
     def full_dn(self) -> int:
@@ -316,7 +324,7 @@ def scene(
         catalog = _bundled_catalog(scenario.magnitude_limit)
     camera, time_ns = scenario.truth.camera, scenario.time_ns(index)
     R = camera_from_icrf(scenario, index)
-    margin_px = _stamp_half(scenario.detector.psf_sigma_px)
+    margin_px = _stamp_half(scenario.detector.psf_sigma_px * (1 + scenario.detector.psf_growth))
     stars = catalog.select(cone(catalog, R[2], field_radius_rad(camera, margin_px)))
     directions = apparent_directions(stars, time_ns)
     pixels = project(camera, directions @ R.T)
@@ -426,7 +434,9 @@ def _stamp_half(psf_sigma_px: float) -> int:
     return math.ceil(_STAMP_SIGMAS * psf_sigma_px)
 
 
-def _stamps(centers_px: Floats, psf_sigma_px: float) -> tuple[NDArray[np.int64], Floats, Floats]:
+def _stamps(
+    centers_px: Floats, psf_sigma_px: float | Floats
+) -> tuple[NDArray[np.int64], Floats, Floats]:
     """
     Pixel numbers about centers (n,) on one axis, and the light that falls in each, and its slope.
 
@@ -438,19 +448,24 @@ def _stamps(centers_px: Floats, psf_sigma_px: float) -> tuple[NDArray[np.int64],
     slope : (n, m)
         Its derivative by the center, 1/px.
     """
-    half = _stamp_half(psf_sigma_px)
+    sigma_px = np.broadcast_to(np.asarray(psf_sigma_px, np.float64), centers_px.shape)
+    half = _stamp_half(float(sigma_px.max(initial=0.1)))
     edges = np.arange(-half, half + 2) - 0.5
     nearest = np.rint(centers_px).astype(np.int64)
-    z = (nearest[:, None] + edges - centers_px[:, None]) / (math.sqrt(2) * psf_sigma_px)
-    density = np.exp(-z * z) / (math.sqrt(2 * math.pi) * psf_sigma_px)
+    width = math.sqrt(2) * sigma_px[:, None]
+    z = (nearest[:, None] + edges - centers_px[:, None]) / width
+    density = np.exp(-z * z) / (math.sqrt(math.pi) * width)
     pixels = nearest[:, None] + np.arange(-half, half + 1)
     return pixels, np.diff(erf(z), axis=1) / 2, -np.diff(density, axis=1)
 
 
 def star_electrons(
-    pixels_px: Floats, flux_electrons: Floats, psf_sigma_px: float, shape: tuple[int, int]
+    pixels_px: Floats,
+    flux_electrons: Floats,
+    psf_sigma_px: float | Floats,
+    shape: tuple[int, int],
 ) -> Floats:
-    """Mean signal (height, width) of stars: Gaussians (n, 2), (n,) integrated over each pixel."""
+    """Mean signal (height, width) of stars (n, 2), (n,): Gaussians integrated over each pixel."""
     height, width = shape
     u, share_u, _ = _stamps(pixels_px[:, 0], psf_sigma_px)
     v, share_v, _ = _stamps(pixels_px[:, 1], psf_sigma_px)
@@ -478,8 +493,9 @@ def centroid_bound(
         Flux over its own bound.
     """
     height, width = shape
-    u, share_u, slope_u = _stamps(pixels_px[:, 0], detector.psf_sigma_px)
-    v, share_v, slope_v = _stamps(pixels_px[:, 1], detector.psf_sigma_px)
+    sigma_px = detector.psf_sigma_at(pixels_px, shape)
+    u, share_u, slope_u = _stamps(pixels_px[:, 0], sigma_px)
+    v, share_v, slope_v = _stamps(pixels_px[:, 1], sigma_px)
     flux = np.asarray(flux_electrons, np.float64)[:, None, None]
     shape_of_star = share_v[:, :, None] * share_u[:, None, :]
     gradients = np.stack(
@@ -551,7 +567,10 @@ def render(scenario: Scenario, shown: Scene, index: int, pattern: Floats | None 
     rng = _stream(scenario.seed, _PIXELS, index)
     mean = fixed_pattern(scenario) if pattern is None else pattern
     mean = mean + star_electrons(
-        shown.pixel_px, shown.flux_electrons, detector.psf_sigma_px, shape
+        shown.pixel_px,
+        shown.flux_electrons,
+        detector.psf_sigma_at(shown.pixel_px, shape),
+        shape,
     )
     mean += cosmic_ray_electrons(detector, shape, rng)
     return Image(shown.time_ns, expose(mean, detector, rng))

@@ -84,6 +84,36 @@ def test_an_ensemble_knows_its_light_better_than_an_image() -> None:
     assert not width.coefficients[1:].any()  # the same all over the field
 
 
+def test_a_width_that_changes_over_the_field_is_learnt() -> None:
+    detector = dataclasses.replace(SCENARIO.detector, psf_growth=0.3)
+    soft = dataclasses.replace(SCENARIO, detector=detector)
+    known: Followed | None = None
+    for index in range(5):
+        one = scene(soft, index)
+        image = Shot(render(soft, one, index), one.icrf_from_star_tracker_xyzw, 0.5)
+        if known is None:
+            observations, instrument = observe_stars(image, PRIOR, catalog(), CENTROIDS, OPTIONS)
+            known = following(PRIOR, observations, instrument)
+            assert known is not None
+        else:
+            observations, known = followed(image, known)
+    assert known is not None
+    camera = PRIOR.camera
+    grid = pixel_grid(camera, 7, 5)
+    true_px = detector.psf_sigma_at(grid, (camera.height, camera.width))
+    found_px = known.instrument.psf_width().at(grid)
+    # 30 % wider in the corners; some 250 bright stars tell it to a few percent there.
+    assert np.abs(found_px / true_px - 1.0).max() < 0.06
+    # And no star's error is larger than it says.
+    order = np.argsort(one.catalog_id)
+    row = order[np.searchsorted(one.catalog_id[order], observations.catalog_id)]
+    error = observations.measured_px - one.pixel_px[row]
+    sigma = np.sqrt(observations.covariance_px2[:, [0, 2]])
+    # 300 stars, two axes: known to 3 %, and some have companions fainter than the catalog.
+    assert 0.85 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.15
+    assert observations.refused_stars.get('elongated', 0) < 0.3 * len(observations)
+
+
 @pytest.mark.parametrize(('scale', 'k1'), [(1.02, 0.0), (1.0, 0.05)])
 def test_the_camera_that_predicts_is_corrected(scale: float, k1: float) -> None:
     camera = PRIOR.camera

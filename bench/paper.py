@@ -1,0 +1,35 @@
+"""
+`starcal calibrate` on the set of the paper: 359 images of 2592 x 2048, from bag to products.
+
+The bag is 3.8 GB and takes some minutes to render; it is deleted at the end.  A fourth of the
+images goes first: memory that does not grow with them is the same for both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+import tempfile
+
+from bench.calibrate import time_command
+from bench.table import Table
+from starcal_ros import simulation, synthetic
+
+TARGET_S = 60.0
+
+
+def run(quick: bool) -> list[Table]:
+    """Render a bag of each length and time the calibration from it."""
+    scenario = synthetic.scenario('paper')
+    lengths = (4, 8) if quick else (scenario.image_count // 4, scenario.image_count)
+    tables = []
+    for count in lengths:
+        print(f'paper: rendering {count} images', flush=True)
+        with tempfile.TemporaryDirectory() as folder:
+            shorter = dataclasses.replace(scenario, image_count=count)
+            made = simulation.write_bag(shorter, Path(folder, 'bag'))
+            command = ['-m', 'starcal_ros.cli', 'calibrate', str(made.bag)]
+            command += ['--params', str(made.params), '-o', str(Path(folder, 'out'))]
+            tables.append(time_command('paper', count, command, 1, TARGET_S))
+        print(tables[-1].text(), flush=True)
+    return tables
