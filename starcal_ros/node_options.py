@@ -76,6 +76,7 @@ class PlayerOptions:
     images_in_flight: int = option(
         4, 'images sent ahead of their observations where a star observer listens', low=1
     )
+    clock: bool = option(False, 'publish the time of the bag on /clock, for use_sim_time')
 
 
 NODE_OPTION_CLASSES = (NodeOptions, ObserverOptions, CalibratorOptions)

@@ -15,6 +15,7 @@ from rclpy.exceptions import ROSInterruptException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
 
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal_ros import bag, messages
@@ -33,6 +34,7 @@ _IMAGE_DEPTH, _OTHER_DEPTH = 10, 20_000
 _UNACKED = {True: _IMAGE_DEPTH // 2, False: _OTHER_DEPTH // 2}
 _SMALL_PER_S = 2000.0  # what a Python reader takes beside its other work
 _ACK_S = 30.0
+_CLOCK_S = 0.01  # of wall clock, between two messages on /clock
 _LATCHED_TYPES = (messages.CALIBRATION_TYPE, messages.STATUS_TYPE, messages.CAMERA_INFO_TYPE)
 
 
@@ -47,6 +49,8 @@ class BagPlayer(Node):
         self._topics = bag.topics([self.own.bag])
         self._players = {}
         for topic in self._topics:
+            if self.own.clock and topic.name == '/clock':
+                continue  # two clocks would go back and forth
             try:
                 kind = message_class(topic.type_name)
             except ImportError:
@@ -57,6 +61,12 @@ class BagPlayer(Node):
         if not self._players:
             raise BagError(f'{self.own.bag}: no topic in it can be played here')
         self._images = {t.name for t in self._topics if t.type_name == messages.IMAGE_TYPE}
+        self._clock_publisher = (
+            self.create_publisher(Clock, '/clock', QoSProfile(depth=10))
+            if self.own.clock
+            else None
+        )
+        self._clock_due_s = 0.0
         self._unacked = dict.fromkeys(self._players, 0)
         self._observed = threading.Condition()
         self._observed_count = 0
@@ -91,6 +101,7 @@ class BagPlayer(Node):
             if self.own.rate:
                 since_s = (raw.log_time_ns - first_ns) / NANOSECONDS_PER_SECOND
                 _sleep_until(start_s + since_s / self.own.rate)
+            self._tell_time(raw.log_time_ns)
             is_image = raw.topic in self._images
             if is_image:
                 self._wait_for_observations(sent_images)
@@ -129,6 +140,14 @@ class BagPlayer(Node):
                     self.get_logger().warning('no observations come: images are no longer paced')
                     self._paced = False
                     return
+
+    def _tell_time(self, time_ns: int) -> None:
+        if self._clock_publisher is None or time.monotonic() < self._clock_due_s:
+            return
+        self._clock_due_s = time.monotonic() + _CLOCK_S
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(time_ns, NANOSECONDS_PER_SECOND)
+        self._clock_publisher.publish(message)
 
     def _on_observations(self, _message: Any) -> None:
         with self._observed:
