@@ -202,6 +202,9 @@ def _without_dark(image: Image, dark: NDArray[np.uint8] | NDArray[np.uint16] | N
     return Image(image.time_ns, np.clip(level, 0, 65535).astype(np.uint16))
 
 
+_IMAGES_OF_A_RESTART = 3  # two images may have changed places on their way; three do not
+
+
 @dataclass(frozen=True)
 class Track:
     """
@@ -209,12 +212,15 @@ class Track:
 
     ``geometry`` is what an image is searched with; ``latest_ns`` stamps the last one used.
     ``followed`` is what the images so far have shown, with which the next is measured without a
-    search; None before the first.
+    search; None before the first.  ``behind`` images in a row, the last of them at ``behind_ns``,
+    were stamped before the last one used.
     """
 
     geometry: CameraGeometry
     latest_ns: int | None = None
     followed: Followed | None = None
+    behind: int = 0
+    behind_ns: int = 0
 
 
 def observe_next(
@@ -230,8 +236,10 @@ def observe_next(
 
     A sequence starts with the prior, or with the calibration in force.  An image stamped at or
     before one that was used is refused; a refused image moves nothing, so that one wrong stamp
-    costs one image.
+    costs one image.  The third such image in a row, in order among themselves, is believed: a
+    clock was set back, or a recording plays again.  The sequence starts anew with it.
     """
+    track = _after_order(track, image.time_ns)
     height, width = image.pixels.shape
     camera = track.geometry.camera
     attitude: dict[str, object] = {}
@@ -258,6 +266,16 @@ def observe_next(
             track,
         )
     return dataclasses.replace(observations, temperature_degc=temperature_degc), after
+
+
+def _after_order(track: Track, time_ns: int) -> Track:
+    """Where a sequence stands when an image has come: one from the past counts, the third rules."""
+    if track.latest_ns is None or time_ns > track.latest_ns:
+        return dataclasses.replace(track, behind=0)
+    behind = track.behind + 1 if track.behind and time_ns > track.behind_ns else 1
+    if behind < _IMAGES_OF_A_RESTART:
+        return dataclasses.replace(track, behind=behind, behind_ns=time_ns)
+    return Track(track.geometry)
 
 
 def _stars(shot: Shot, setup: Setup, track: Track) -> tuple[StarObservations, Track]:

@@ -219,7 +219,7 @@ def refused_image(
 
 @dataclass(frozen=True)
 class Ensemble:
-    """What a calibration is made from: usable images in time order, and counts of the others."""
+    """What a calibration is made from: usable images as they came, and counts of the others."""
 
     images: tuple[StarObservations, ...] = ()
     refused: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -230,11 +230,17 @@ class Ensemble:
         return sum(len(image) for image in self.images)
 
     def add(self, observations: StarObservations) -> Ensemble:
-        """Return the ensemble with one more image, kept or counted by its reason."""
+        """
+        Return the ensemble with one more image, kept or counted by its reason.
+
+        One with the stamp of an image held takes its place: a recording played twice does not
+        count twice.
+        """
         if observations.refusal:
             count = self.refused.get(observations.refusal, 0) + 1
             return Ensemble(self.images, {**self.refused, observations.refusal: count})
-        return Ensemble((*self.images, observations), self.refused)
+        others = (image for image in self.images if image.time_ns != observations.time_ns)
+        return Ensemble((*others, observations), self.refused)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -203,3 +204,84 @@ def test_only_the_last_seconds_are_kept() -> None:
     held.add(START_NS + 2 * S, attitude_sample(START_NS + 2 * S, quaternions[2], DIRECT))
     assert len(held) == 6
     assert refusal(held, START_NS + 2 * S) == 'no_attitude'
+
+
+def steady(
+    rate_hz: float, seconds: float, start_ns: int = START_NS
+) -> list[tuple[int, np.ndarray]]:
+    """Samples of a slow turn about z, 1 mrad/s, at a rate."""
+    count = int(rate_hz * seconds) + 1
+    stamps = [start_ns + round(k / rate_hz * S) for k in range(count)]
+    return [(stamp, turned(stamp)) for stamp in stamps]
+
+
+def turned(time_ns: int) -> np.ndarray:
+    half = 0.5e-3 * (time_ns - START_NS) / S
+    return np.array([0.0, 0.0, math.sin(half), math.cos(half)])
+
+
+@pytest.mark.parametrize('rate_hz', [0.5, 1.0, 10.0, 100.0])
+def test_any_rate_late_doubled_and_out_of_order(rate_hz: float) -> None:
+    """What a steady turn gives at any time does not depend on how its samples came."""
+    rng = np.random.default_rng(13)
+    samples = steady(rate_hz, 60.0)
+    late_s = rng.uniform(0.0, 8.0, len(samples))  # some overtake hundreds of others
+    order = np.argsort([t for t, _ in samples] + late_s * S)
+    came = [samples[k] for k in order]
+    came += [came[k] for k in rng.integers(0, len(came), 20)]  # the doubled ones, very late
+    held = history(came, keep_s=3600.0, jump_s=10.0)
+    for time_ns in START_NS + rng.integers(S, 59 * S, 50):
+        # Slerp of a steady turn is exact; half angles of 0.06 rad have 1e-17 in a double.
+        assert angle_between(held.at(int(time_ns), 2.0)[0], turned(time_ns)) < 1e-14
+
+
+def test_a_dropout_of_minutes_costs_its_own_images_alone() -> None:
+    before, after = steady(10.0, 20.0), steady(10.0, 20.0, START_NS + 300 * S)
+    held = history([*before, *after], keep_s=3600.0, jump_s=10.0)
+    assert refusal(held, START_NS + 100 * S) == 'attitude_gap'
+    assert refusal(held, START_NS - S) == 'no_attitude'
+    for dt_s in (19, 301):
+        assert held.at(START_NS + dt_s * S + 1, 2.0)[1] == pytest.approx(0.1)
+    assert held.latest_ns == START_NS + 320 * S
+
+
+@pytest.mark.parametrize('wrong_s', [-(10**9), -4000, -60, 60, 4000, 10**9, 9 * 10**8])
+def test_one_wrong_stamp_costs_nothing(wrong_s: int) -> None:
+    """A sample stamped in the future must not make the true ones too old to keep."""
+    samples = steady(10.0, 60.0)
+    k = 300
+    wrong = (samples[k][0] + wrong_s * S, random_quaternions(14, 1)[0])
+    held = history([*samples[:k], wrong, *samples[k + 1 :]], keep_s=3600.0, jump_s=10.0)
+    assert held.latest_ns == samples[-1][0]
+    for dt_s in (1, 29, 31, 59):
+        time_ns = START_NS + dt_s * S + S // 3
+        found, gap_s = held.at(time_ns, 2.0)
+        assert gap_s == pytest.approx(0.1)
+        assert angle_between(found, turned(time_ns)) < 1e-14
+
+
+@pytest.mark.parametrize('back_s', [30, 600, 100_000])
+def test_a_clock_set_back_is_believed(back_s: int) -> None:
+    """Samples of the clock before do not mix with those of the clock now, which come first."""
+    other = random_quaternions(15, 1)[0]
+    before = [(t, other) for t, _ in steady(10.0, 60.0, START_NS + (back_s - 30) * S)]
+    now = steady(10.0, 60.0)
+    held = history([*before, *now], keep_s=3600.0, jump_s=10.0)
+    assert held.latest_ns == now[-1][0]
+    for dt_s in (1, 31, 59):
+        time_ns = START_NS + dt_s * S + S // 3
+        assert angle_between(held.at(time_ns, 2.0)[0], turned(time_ns)) < 1e-14
+
+
+def test_memory_of_a_fast_tracker_is_bounded() -> None:
+    """Five minutes at 100 Hz, 20 s kept: 2000 samples of 40 bytes, and four times that at most."""
+    held = AttitudeHistory(keep_s=20.0, jump_s=10.0)
+    sample = attitude_sample(START_NS, np.array([0.0, 0.0, 0.0, 1.0]), DIRECT)
+    tracemalloc.start()
+    for k in range(30_000):
+        held.add(START_NS + k * S // 100, sample)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(held) == 2001
+    # Twice for what is forgotten but not yet moved, twice for the copy that moves the rest.
+    assert peak_bytes < 2000 * 40 * 4

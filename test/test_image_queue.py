@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import threading
+import time
 
 from starcal_ros.nodes.image_queue import ImageQueue, Waiting
+
+SECOND_NS = 10**9
 
 
 def put(queue: ImageQueue, *stamps: int) -> None:
@@ -65,3 +68,15 @@ def test_close_ends_the_waiting() -> None:
     queue.close()
     thread.join(10.0)
     assert found == [None]
+
+
+def test_a_stamp_in_the_future_does_not_hold_the_others_back() -> None:
+    """It comes out when the next shows it to be wrong; one a little ahead waits as ever."""
+    queue = ImageQueue(5, 60.0, lambda stamp: stamp < 10 * SECOND_NS)
+    put(queue, 100 * SECOND_NS, SECOND_NS)
+    assert [take(queue).time_ns for _ in range(2)] == [100 * SECOND_NS, SECOND_NS]
+    queue = ImageQueue(5, 0.05, lambda stamp: stamp < 10 * SECOND_NS)
+    put(queue, 11 * SECOND_NS, 9 * SECOND_NS)
+    taken = take(queue)
+    assert taken.time_ns == 11 * SECOND_NS
+    assert time.monotonic() - taken.arrived_s >= 0.05

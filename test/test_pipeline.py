@@ -261,7 +261,36 @@ def test_out_of_order_images_say_by_how_much(setup: pipeline.Setup) -> None:
     found, after = pipeline.observe_next(image(), attitudes(), setup, track)
     assert found.refusal == 'out_of_order'
     assert found.detail == '0.250000 s before the last image used'
-    assert after == track
+    assert (after.geometry, after.latest_ns) == (track.geometry, track.latest_ns)
+
+
+def passed(setup: pipeline.Setup, track: pipeline.Track, *offsets_s: int) -> list[str]:
+    """Refusals of one image at several times about that of the last used; no attitudes come."""
+    found = []
+    for offset_s in offsets_s:
+        one = dataclasses.replace(image(), time_ns=image().time_ns + offset_s * 10**9)
+        observations, track = pipeline.observe_next(one, AttitudeHistory(), setup, track)
+        found.append(observations.refusal)
+    return found
+
+
+def test_the_third_image_in_a_row_from_the_past_starts_anew(setup: pipeline.Setup) -> None:
+    """A clock set back costs two images; two that have changed places do not start anything."""
+    late, taken = 'out_of_order', 'no_attitude'
+    track = pipeline.Track(setup.prior, image().time_ns)
+    assert passed(setup, track, -90, -80, -70, -60) == [late, late, taken, taken]
+    assert passed(setup, track, -90, -80, -85, -70) == [late, late, late, late]
+    assert passed(setup, track, -90, -80, 5, -70, -60, 6) == [late, late, taken, late, late, taken]
+
+
+def test_a_recording_that_plays_twice_counts_once(setup: pipeline.Setup) -> None:
+    first, _ = pipeline.observe_next(image(), attitudes(), setup, pipeline.Track(setup.prior))
+    assert not first.refusal
+    later = dataclasses.replace(first, time_ns=first.time_ns + 1)
+    ensemble = Ensemble().add(first).add(later)
+    again = dataclasses.replace(first, attitude_gap_s=0.125)
+    ensemble = ensemble.add(again)
+    assert ensemble.images == (later, again)
 
 
 def test_a_refused_image_does_not_put_those_after_it_out_of_order(setup: pipeline.Setup) -> None:

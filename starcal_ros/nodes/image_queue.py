@@ -9,6 +9,11 @@ import threading
 import time
 from typing import Any
 
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+
+# A stamp so far ahead of the image after it is wrong: no waiting brings its attitude.
+_WRONG_NS = 10 * NANOSECONDS_PER_SECOND
+
 
 @dataclass(frozen=True)
 class Waiting:
@@ -78,9 +83,16 @@ class ImageQueue:
                 if self._images:
                     first = self._images[0]
                     left_s = first.arrived_s + self._timeout_s - time.monotonic()
-                    if first.message is None or left_s <= 0 or self._is_ready(first.time_ns):
+                    if first.message is None or left_s <= 0 or self._is_due(first):
                         self._images.popleft()
                         self._held -= first.message is not None
                         return first
                 self._changed.wait(left_s)
             return None
+
+    def _is_due(self, first: Waiting) -> bool:
+        """Whether the first image is ready, or its stamp is wrong beside that of the next."""
+        if self._is_ready(first.time_ns):
+            return True
+        following = self._images[1].time_ns if len(self._images) > 1 else first.time_ns
+        return first.time_ns - following > _WRONG_NS and self._is_ready(following)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Sequence
+import dataclasses
 import math
 import sys
 import threading
@@ -28,7 +29,6 @@ from starcal_ros.nodes.image_queue import ImageQueue, Waiting
 from starcal_ros.nodes.lifecycle import Health, OK, run, StarcalNode, WARN
 from starcal_ros.options import from_mapping
 from starcal_ros.records import (
-    AttitudeSample,
     CameraGeometry,
     Image,
     refused_image,
@@ -39,13 +39,14 @@ NAME = 'star_observer'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Ten seconds of a fast star tracker; a bag played at speed sends them in bursts.
 _SAMPLES = QoSProfile(depth=2000)
+_JUMP_S = 10.0  # stamps that go back by less are late, not of another clock
 
 
 class StarObserver(StarcalNode):
     """
     Measures the stars of every image, in order of arrival, in one thread of its own.
 
-    Callbacks only take: the thread that measures alone owns the attitude history.
+    Callbacks only take: what the images are predicted with changes in the thread that measures.
     """
 
     def __init__(self) -> None:
@@ -62,7 +63,7 @@ class StarObserver(StarcalNode):
         values = self.options.values()
         self._own = from_mapping(ObserverOptions, values)
         self._setup = pipeline.load_setup(values, self.options.classes)
-        self._track = pipeline.Track(self._setup.prior)
+        self._geometry = self._setup.prior
         self._observations = self.create_lifecycle_publisher(
             ObservationsMessage, 'observations', QoSProfile(depth=100)
         )
@@ -73,11 +74,14 @@ class StarObserver(StarcalNode):
 
     def activate(self) -> None:
         """Start to take images and attitudes, and the thread that measures."""
-        self._attitudes = AttitudeHistory(self._own.attitude_history_s)
-        self._new_attitudes: deque[tuple[int, AttitudeSample | None]] = deque()
+        jump_s = max(_JUMP_S, self._setup.attitude.max_attitude_gap_s)
+        self._attitudes = AttitudeHistory(self._own.attitude_history_s, jump_s)
+        self._track = pipeline.Track(self._geometry)
+        self._predicted_from = self._geometry
         self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
         self._temperatures: deque[tuple[int, float]] = deque(maxlen=_SAMPLES.depth)
         self._counts.clear()
+        self._restarts = 0
         self._last_refusal = ''
         self._queue = ImageQueue(
             self._own.image_queue, self._own.attitude_timeout_s, self._attitude_has_come
@@ -137,6 +141,7 @@ class StarObserver(StarcalNode):
             'images_used': counts.get('', 0),
             'images_waiting': len(self._queue or ()),
             'attitudes': len(self._attitudes),
+            'restarts': self._restarts,
             **{f'refused_{reason}': n for reason, n in sorted(counts.items()) if reason},
         }
         if self._last_refusal:
@@ -155,7 +160,7 @@ class StarObserver(StarcalNode):
     def _on_attitude(self, message: Any) -> None:
         time_ns, quaternion = messages.attitude_from_message(message)
         direction = self._setup.attitude.attitude_direction
-        self._new_attitudes.append((time_ns, attitude_sample(time_ns, quaternion, direction)))
+        self._attitudes.add(time_ns, attitude_sample(time_ns, quaternion, direction))
         if self._queue is not None:
             self._queue.wake()
 
@@ -170,13 +175,11 @@ class StarObserver(StarcalNode):
         prior = self._setup.prior.camera
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
             raise ValueError('calibration: of another image size than the prior camera')
-        self._track = pipeline.Track(geometry, self._track.latest_ns)
+        self._geometry = geometry
         self.get_logger().info('stars are predicted with the calibration in force')
 
     def _attitude_has_come(self, time_ns: int) -> bool:
         """Whether the samples about an image are there, or a later one shows they will not be."""
-        while self._new_attitudes:
-            self._attitudes.add(*self._new_attitudes.popleft())
         latest_ns = self._attitudes.latest_ns
         if latest_ns is None or latest_ns < time_ns:
             return False
@@ -201,7 +204,6 @@ class StarObserver(StarcalNode):
             self.publish_health_change()
 
     def _measure(self, waiting: Waiting) -> None:
-        self._attitude_has_come(waiting.time_ns)
         if waiting.message is None:
             detail = f'{self._own.image_queue} images were waiting'
             self._publish(self._refused(waiting, 'overrun', detail))
@@ -213,18 +215,24 @@ class StarObserver(StarcalNode):
         except ImageRefused as refused:
             self._publish(self._refused(waiting, refused.reason, refused.detail))
             return
-        predicted_with = self._track.geometry
+        if self._geometry is not self._predicted_from:
+            self._predicted_from = self._geometry
+            self._track = dataclasses.replace(self._track, geometry=self._geometry)
+        before = self._track
         observations, self._track = pipeline.observe_next(
             image,
             self._attitudes,
             self._setup,
-            self._track,
+            before,
             pipeline.latest_at(list(self._velocities), image.time_ns, None),
             pipeline.latest_at(list(self._temperatures), image.time_ns, math.nan),
         )
+        if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
+            self._restarts += 1
+            self.get_logger().warning('the stamps of the images have gone back: started anew')
         self._publish(observations)
         if self._annotated.get_subscription_count():
-            self._publish_annotated(image, observations, predicted_with)
+            self._publish_annotated(image, observations, before.geometry)
 
     def _refused(self, waiting: Waiting, reason: str, detail: str) -> StarObservations:
         return refused_image(waiting.time_ns, waiting.width, waiting.height, reason, detail)
