@@ -269,7 +269,7 @@ def observe_next(
 
 
 def _after_order(track: Track, time_ns: int) -> Track:
-    """Where a sequence stands when an image has come: one from the past counts, the third rules."""
+    """Where a sequence stands when an image has come; the third from the past starts it anew."""
     if track.latest_ns is None or time_ns > track.latest_ns:
         return dataclasses.replace(track, behind=0)
     behind = track.behind + 1 if track.behind and time_ns > track.behind_ns else 1

@@ -89,6 +89,8 @@ class StarcalNode(LifecycleNode):
 
     def count_error(self, error: Exception) -> None:
         """Log an error that was not foreseen and count it for the diagnostics."""
+        if not self.context.ok():
+            return  # at shutdown handles vanish under whatever runs
         self._errors += 1
         where = error.__traceback__
         while where is not None and where.tb_next is not None:
@@ -210,12 +212,21 @@ def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | N
     0 after SIGINT or SIGTERM; 2 for bad parameters or files, with one line that names them.
     """
     node = None
+    is_up = False
+
+    def is_told_to_end() -> bool:
+        # A signal shuts ROS down at once; what the node was just making then fails.
+        return is_up and not rclpy.ok()
+
     try:
         rclpy.init(args=None if args is None else [name, *args])
+        is_up = True
         node = make_node()
         executor = MultiThreadedExecutor(_THREADS)
         executor.add_node(node)
         if node.options.values()['autostart'] and not _start(node):
+            if is_told_to_end():
+                return 0
             print(f'{name}: {node.failure}', file=sys.stderr)
             return 2
         _spin(node, executor)
@@ -225,6 +236,8 @@ def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | N
     except (KeyboardInterrupt, ExternalShutdownException, ROSInterruptException):
         pass
     except Exception as error:
+        if is_told_to_end():
+            return 0
         print(f'{name}: {one_line(error)}', file=sys.stderr)
         return 2
     finally:
@@ -260,8 +273,7 @@ def _spin(node: StarcalNode, executor: MultiThreadedExecutor) -> None:
         except (KeyboardInterrupt, ExternalShutdownException):
             return
         except Exception as error:
-            if node.context.ok():  # at shutdown handles vanish under the executor
-                node.count_error(error)
+            node.count_error(error)
 
 
 def one_line(error: Exception) -> str:
