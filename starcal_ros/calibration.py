@@ -590,6 +590,9 @@ def _result(
         if good.any():
             scatter_arcsec = float(np.sqrt(eta_rad[good].var(axis=0).mean())) / ARCSECOND_RAD
     alignment, full = shared_covariance(problem, state, blocks, good, tracker_sigma_rad)
+    focal_px = state.parameters[[0, 2]]
+    if not (focal_px > 0).all():
+        raise NotObservable(f'fx, fy of {focal_px.round(1).tolist()} px are of a mirrored image')
     camera = prior.camera.replace(
         **{PARAMETER_NAMES[i]: float(state.parameters[i]) for i in problem.free}
     )

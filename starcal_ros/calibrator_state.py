@@ -134,7 +134,9 @@ class CalibratorState:
     ) -> Answer:
         """Solve, and put in force what the gate accepts or ``force`` demands."""
         try:
-            calibration = pipeline.solve(self.ensemble, self._setup, method, estimate)
+            calibration = pipeline.solve(
+                self.ensemble, self._setup, method, estimate, in_force=self.in_force
+            )
         except StarcalError as error:
             return Answer(False, str(error))
         if not calibration.accepted and not force:

@@ -19,7 +19,7 @@ import numpy as np
 import yaml
 
 from starcal_ros import simulation, synthetic
-from starcal_ros.acceptance import alignment_difference_rad
+from starcal_ros.agreement import alignment_difference_rad
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError

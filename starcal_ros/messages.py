@@ -28,6 +28,7 @@ from starcal_ros.records import (
     Correlation,
     DetectorMaps,
     EnsembleStatus,
+    Halves,
     Image,
     refused_image,
     Removal,
@@ -436,6 +437,7 @@ def calibration_to_message(calibration: Calibration, make: Make) -> Message:
         accepted=calibration.accepted,
         reasons=list(calibration.reasons),
         forced=calibration.forced,
+        **_halves_fields(calibration.halves),
         number=calibration.number,
         in_force_since=_make_time(calibration.in_force_since_ns, make),
         first_image=_make_time(calibration.first_image_ns, make),
@@ -536,6 +538,7 @@ def calibration_from_message(message: Message) -> Calibration:
         number=int(message.number),
         in_force_since_ns=stamp_ns(message.in_force_since),
         forced=bool(message.forced),
+        halves=_halves_from_message(message),
     )
 
 
@@ -617,6 +620,27 @@ def _correlation_from_message(message: Message) -> Correlation | None:
         return None
     matrix = _shaped('correlation', message.correlation, (len(names), len(names)))
     return Correlation(names, matrix)
+
+
+def _halves_fields(halves: Halves | None) -> dict[str, object]:
+    halves = halves or Halves(math.nan, math.nan, math.nan, math.nan)
+    return {
+        'halves_shape_px': float(halves.shape_px),
+        'halves_shape_chance': float(halves.shape_chance),
+        'halves_turn_arcsec': float(halves.turn_arcsec),
+        'halves_chance': float(halves.chance),
+    }
+
+
+def _halves_from_message(message: Message) -> Halves | None:
+    if math.isnan(message.halves_chance):
+        return None
+    return Halves(
+        shape_px=float(message.halves_shape_px),
+        shape_chance=float(message.halves_shape_chance),
+        turn_arcsec=float(message.halves_turn_arcsec),
+        chance=float(message.halves_chance),
+    )
 
 
 def _thermal_fields(thermal: Thermal | None) -> dict[str, object]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from starcal_ros import bag, products
 from starcal_ros.acceptance import Candidate, GateOptions, judge
+from starcal_ros.agreement import difference, halves
 from starcal_ros.astrometry import SiteOptions
 from starcal_ros.attitude import AttitudeHistory, AttitudeOptions
 from starcal_ros.calibration import (
@@ -47,6 +48,7 @@ from starcal_ros.records import (
     CameraGeometry,
     Ensemble,
     EnsembleStatus,
+    Halves,
     Image,
     refused_image,
     StarObservations,
@@ -413,12 +415,13 @@ def solve(
     method: str = '',
     estimate: Sequence[str] = (),
     inputs: Mapping[str, str] | None = None,
+    in_force: Calibration | None = None,
 ) -> Calibration:
     """
     A calibration of the ensemble with the verdict of the gate and its provenance.
 
     ``method`` and ``estimate`` override the options where not empty; ``inputs`` names what the
-    observations came from, for the provenance.
+    observations came from, for the provenance; the gate holds the change against ``in_force``.
 
     Raises
     ------
@@ -427,7 +430,7 @@ def solve(
     OptionError
         For a method or parameter name that is none.
     """
-    return solve_with_residuals(ensemble, setup, method, estimate, inputs)[0]
+    return solve_with_residuals(ensemble, setup, method, estimate, inputs, in_force)[0]
 
 
 def solve_with_residuals(
@@ -436,6 +439,7 @@ def solve_with_residuals(
     method: str = '',
     estimate: Sequence[str] = (),
     inputs: Mapping[str, str] | None = None,
+    in_force: Calibration | None = None,
 ) -> tuple[Calibration, Residuals]:
     """The calibration of `solve`, and what it left over of every star and image."""
     options = setup.calibration
@@ -449,7 +453,7 @@ def solve_with_residuals(
             check_value(field, override[field.name])
     options = dataclasses.replace(options, **override)  # type: ignore[arg-type]
     result = estimate_calibration(ensemble, setup.prior, options)
-    calibration = _calibration(result, ensemble, setup, options, inputs or {})
+    calibration = _calibration(result, ensemble, setup, options, inputs or {}, in_force)
     colour_bp_rp = setup.catalog.colours_bp_rp(result.table.catalog_id)
     return calibration, residuals_of(result, ensemble, colour_bp_rp)
 
@@ -460,26 +464,51 @@ def _calibration(
     setup: Setup,
     options: CalibrationOptions,
     inputs: Mapping[str, str],
+    in_force: Calibration | None,
 ) -> Calibration:
     """Statistics, verdict and provenance of an estimate."""
     kept = result.kept
     rms_px = float(np.sqrt(np.mean(result.residual_px[kept] ** 2)))
     camera = result.geometry.camera
+    singular_values, weakest = weakest_direction(result.information, result.information_names)
+    zero_skew_cost_px = zero_skew_fit(camera)[1]
+    maps = detector_maps(camera, result.covariance, result.table.measured_px[kept])
+    agreed = None
+    if setup.gate.min_halves_chance > 0:
+        agreed = halves(ensemble, setup.prior, options)
+    step = None
+    if in_force is not None:
+        step = difference(
+            in_force.geometry,
+            in_force.covariance,
+            result.geometry,
+            result.covariance,
+            tuple(name for name in options.estimate if name in in_force.estimated),
+        )
+    given_rad = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
     reasons = judge(
         Candidate(
             geometry=result.geometry,
             prior=setup.prior,
             covariance=result.covariance,
             residual_rms_px=rms_px,
+            images_used=len(ensemble.images),
+            images_misfit=int(result.misfit_image.sum()),
             stars_used=int(kept.sum()),
             stars_rejected=int((~kept).sum()),
             coverage=coverage(ensemble, camera),
             map_sigma_px=float(map_sigma_px(camera, result.covariance).max()),
+            line_of_sight_sigma_arcsec=float(maps.line_of_sight_sigma_arcsec.max()),
+            singular_value=float(singular_values[-1]),
+            zero_skew_cost_px=zero_skew_cost_px,
+            star_tracker_excess=float((result.star_tracker_sigma_rad / given_rad).max()),
             termination=result.termination,
+            halves=agreed,
+            step=step,
         ),
         setup.gate,
+        options,
     )
-    singular_values, weakest = weakest_direction(result.information, result.information_names)
     return Calibration(
         time_ns=max(image.time_ns for image in ensemble.images),
         geometry=result.geometry,
@@ -506,7 +535,7 @@ def _calibration(
         ),
         singular_values=tuple(float(value) for value in singular_values),
         weakest_direction=weakest,
-        zero_skew_cost_px=zero_skew_fit(camera)[1],
+        zero_skew_cost_px=zero_skew_cost_px,
         iterations=result.iterations,
         termination=result.termination,
         accepted=not reasons,
@@ -515,10 +544,18 @@ def _calibration(
         child_frame=setup.frames.camera_frame,
         provenance=_provenance(setup, options, ensemble, inputs),
         thermal=result.thermal,
-        maps=detector_maps(camera, result.covariance, result.table.measured_px[kept]),
+        maps=maps,
         correlation=correlation(result.shared_covariance, result.shared_names),
         removals=removal_study(result),
         first_image_ns=min(image.time_ns for image in ensemble.images),
+        halves=None
+        if agreed is None
+        else Halves(
+            shape_px=agreed.shape_px,
+            shape_chance=agreed.shape_chance,
+            turn_arcsec=agreed.turn_rad / ARCSECOND_RAD,
+            chance=agreed.chance,
+        ),
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 import contextlib
+import dataclasses
 import json
 import math
 import os
@@ -29,6 +30,7 @@ from starcal_ros.records import (
     CameraGeometry,
     Correlation,
     DetectorMaps,
+    Halves,
     Removal,
     Thermal,
 )
@@ -47,6 +49,7 @@ _LATER_KEYS: Mapping[str, object] = {
     'number': 0,
     'in_force_since_ns': 0,
     'forced': False,
+    'halves': None,
 }
 CALIBRATION_FILE = 'calibration.json'
 CAMERA_INFO_FILE = 'camera_info.yaml'
@@ -321,6 +324,9 @@ def calibration_content(calibration: Calibration) -> dict[str, object]:
         'number': int(calibration.number),
         'in_force_since_ns': int(calibration.in_force_since_ns),
         'forced': bool(calibration.forced),
+        'halves': None
+        if calibration.halves is None
+        else {k: _json_number(v) for k, v in dataclasses.asdict(calibration.halves).items()},
     }
 
 
@@ -424,6 +430,14 @@ def _calibration_from(reader: _Reader) -> Calibration:
         number=reader.get('number', _whole),
         in_force_since_ns=reader.get('in_force_since_ns', _whole),
         forced=reader.get('forced', _true_or_false),
+        halves=None
+        if reader.get('halves', _is_null)
+        else Halves(
+            **{
+                field.name: reader.get(f'halves.{field.name}', _number_or_null)
+                for field in dataclasses.fields(Halves)
+            }
+        ),
     )
 
 

@@ -360,6 +360,26 @@ class Removal:
 
 
 @dataclass(frozen=True)
+class Halves:
+    """
+    How the calibrations of the earlier and the later half of the images differ.
+
+    Attributes
+    ----------
+    shape_px, shape_chance : float
+        Largest movement of a line of sight, common turn removed, px at the focal length; and how
+        often chance makes the cameras differ as much.
+    turn_arcsec, chance : float
+        The common turn; and the same of camera and alignment together.
+    """
+
+    shape_px: float
+    shape_chance: float
+    turn_arcsec: float
+    chance: float
+
+
+@dataclass(frozen=True)
 class Calibration:
     """
     One calibration with its covariance, statistics and provenance.
@@ -419,6 +439,8 @@ class Calibration:
         When it came into force, or came back by a roll-back; 0 for a candidate.
     forced : bool
         It came into force by request, against the gate.
+    halves : Halves or None
+        None where the halves of the images were not compared.
     """
 
     time_ns: int
@@ -456,6 +478,7 @@ class Calibration:
     number: int = 0
     in_force_since_ns: int = 0
     forced: bool = False
+    halves: Halves | None = None
 
     @property
     def sigma(self) -> Floats:

@@ -21,7 +21,7 @@ import matplotlib
 import numpy as np
 
 from starcal_ros import bag, report_figures
-from starcal_ros.acceptance import alignment_difference_rad, movement
+from starcal_ros.agreement import alignment_difference_rad, movement
 from starcal_ros.camera import INTRINSIC_NAMES, PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.messages import OBSERVATIONS_TYPE

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binned_statistic, norm
 
-from starcal_ros.acceptance import movement
+from starcal_ros.agreement import movement
 from starcal_ros.camera import CameraModel, distortion_px, pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.measurement import whitening

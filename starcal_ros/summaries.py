@@ -8,7 +8,7 @@ from datetime import datetime, timezone
 import numpy as np
 
 from starcal_ros import thermal
-from starcal_ros.acceptance import alignment_difference_rad
+from starcal_ros.agreement import alignment_difference_rad
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.comparison import Comparison, DifferenceMap
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND

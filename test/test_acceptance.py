@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.acceptance import Candidate, GateOptions, judge, movement
+from starcal_ros.acceptance import Candidate, GateOptions
+from starcal_ros.acceptance import judge as judge_with
+from starcal_ros.agreement import Difference, movement
+from starcal_ros.calibration import CalibrationOptions
 from starcal_ros.camera import CameraModel
 from starcal_ros.records import CameraGeometry
 
@@ -22,12 +26,29 @@ GOOD = Candidate(
     prior=PRIOR,
     covariance=np.diag(np.full(13, 1e-8)),
     residual_rms_px=0.1,
+    images_used=20,
+    images_misfit=1,
     stars_used=990,
     stars_rejected=10,
     coverage=np.ones((8, 10), np.int64),
     map_sigma_px=0.01,
+    line_of_sight_sigma_arcsec=2.0,
+    singular_value=0.02,
+    zero_skew_cost_px=0.1,
+    star_tracker_excess=1.0,
     termination='converged',
+    halves=Difference(1e-5, 0.05, 8.0, 8, 11.0, 11),
+    step=Difference(1e-4, 0.5, 32.0, 8, 44.0, 11),
 )
+
+
+def judge(candidate: Candidate, options: GateOptions) -> tuple[str, ...]:
+    return judge_with(candidate, options, CalibrationOptions())
+
+
+def only(axis: int, limit: float) -> tuple[float, ...]:
+    """Limits of the parameter sigmas: of one alone."""
+    return tuple(limit if k == axis else 0.0 for k in range(13))
 
 
 def turned(degrees: float, axis: str = 'x', **parameters: float) -> CameraGeometry:
@@ -90,6 +111,131 @@ def test_a_good_candidate_passes() -> None:
             ),
         ),
         (
+            {'images_misfit': 6},
+            'max_misfit_fraction',
+            0.3,
+            0.29,
+            (
+                'the attitudes of 6 of 20 images do not fit, more than a fraction of 0.29 '
+                '(max_misfit_fraction)'
+            ),
+        ),
+        (
+            {'star_tracker_excess': 3.0},
+            'max_star_tracker_excess',
+            3.0,
+            2.5,
+            (
+                'the star tracker is 3.0 times worse than given, over the limit of 2.5 '
+                '(max_star_tracker_excess)'
+            ),
+        ),
+        (
+            {'line_of_sight_sigma_arcsec': 20.0},
+            'max_line_of_sight_sigma_arcsec',
+            20.0,
+            19.0,
+            (
+                'a line of sight is uncertain by 20.0 arcsec at its worst, over the limit of 19 '
+                'arcsec (max_line_of_sight_sigma_arcsec)'
+            ),
+        ),
+        (
+            {'covariance': np.diag([4.0, *[1e-8] * 12])},
+            'max_parameter_sigma',
+            only(0, 2.0),
+            only(0, 1.9),
+            'fx is uncertain by 2, over the limit of 1.9 (max_parameter_sigma)',
+        ),
+        (  # 1e-4 rad are 20.6 arcsec
+            {},
+            'max_parameter_sigma',
+            only(12, 21.0),
+            only(12, 20.0),
+            'alignment_z is uncertain by 20.6, over the limit of 20 (max_parameter_sigma)',
+        ),
+        (
+            {'singular_value': 1e-3},
+            'min_singular_value',
+            1e-3,
+            2e-3,
+            (
+                'the smallest singular value is 1.0e-03, under the limit of 0.002 '
+                '(min_singular_value): what is estimated cannot be told apart'
+            ),
+        ),
+        (
+            {'zero_skew_cost_px': 0.7},
+            'max_zero_skew_cost_px',
+            0.7,
+            0.6,
+            (
+                'camera_info without skew is 0.70 px off at its worst, over the limit of 0.6 px '
+                '(max_zero_skew_cost_px)'
+            ),
+        ),
+        (
+            {'halves': Difference(1e-5, 0.6, 60.0, 8, 60.0, 11)},
+            'max_halves_px',
+            0.6,
+            0.5,
+            (
+                'the earlier and the later half of the images differ by 0.6 px, over the limit '
+                'of 0.5 px (max_halves_px); chance does it once in 2e+09 (min_halves_chance)'
+            ),
+        ),
+        (
+            {'halves': Difference(1e-4, 0.1, 8.0, 8, 60.0, 11)},
+            'max_halves_turn_arcsec',
+            20.7,
+            20.0,
+            (
+                'the earlier and the later half of the images are turned by 20.6 arcsec, over the '
+                'limit of 20 arcsec (max_halves_turn_arcsec); chance does it once in 1e+08 '
+                '(min_halves_chance)'
+            ),
+        ),
+        (
+            {'halves': Difference(1e-5, 1.6, 20.0, 8, 21.0, 11)},
+            'min_halves_chance',
+            1e-2,
+            2e-2,
+            (
+                'the earlier and the later half of the images differ by 1.6 px, over the limit '
+                'of 1 px (max_halves_px); chance does it once in 1e+02 (min_halves_chance)'
+            ),
+        ),
+        (
+            {'step': Difference(1e-4, 4.0, 32.0, 8, 44.0, 11)},
+            'max_step_px',
+            4.0,
+            3.5,
+            (
+                'the distortion map would change by 4.00 px against the calibration in force, '
+                'over the limit of 3.5 px (max_step_px)'
+            ),
+        ),
+        (
+            {'step': Difference(np.radians(0.2), 0.1, 32.0, 8, 44.0, 11)},
+            'max_step_turn_deg',
+            0.2001,
+            0.19,
+            (
+                'the lines of sight would turn by 0.200 degrees against the calibration in '
+                'force, over the limit of 0.19 degrees (max_step_turn_deg)'
+            ),
+        ),
+        (
+            {},
+            'max_step_sigma',
+            2.0,
+            1.9,
+            (
+                'what is estimated would change by 2.0 sigma against the calibration in force, '
+                'over the limit of 1.9 (max_step_sigma)'
+            ),
+        ),
+        (
             {'geometry': turned(0.0, fx=1818.0, fy=1819.01)},
             'max_change_px',
             4.1,
@@ -102,11 +248,35 @@ def test_a_good_candidate_passes() -> None:
     ],
 )
 def test_each_limit_trips_alone(
-    changes: dict[str, object], limit: str, at_limit: float, beyond: float, reason: str
+    changes: dict[str, Any], limit: str, at_limit: Any, beyond: Any, reason: str
 ) -> None:
-    candidate = dataclasses.replace(GOOD, **changes)  # type: ignore[arg-type]
+    candidate = dataclasses.replace(GOOD, **changes)
     assert judge(candidate, GateOptions(**{limit: at_limit})) == ()
     assert judge(candidate, GateOptions(**{limit: beyond})) == (reason,)
+
+
+def test_what_is_left_must_be_enough() -> None:
+    """The fewest images and stars hold for what fits, not for what was collected."""
+    options = GateOptions(max_misfit_fraction=1.0)
+    candidate = dataclasses.replace(GOOD, images_misfit=18, stars_used=50, stars_rejected=0)
+    assert judge(candidate, options) == (
+        '2 images fit, under the limit of 3 (min_images)',
+        '50 stars fit, under the limit of 60 (min_stars)',
+    )
+
+
+def test_what_cannot_be_compared_is_not_held_against_it() -> None:
+    strict = GateOptions(
+        max_halves_px=0.0, max_halves_turn_arcsec=0.0, min_halves_chance=1.0, max_step_px=0.0
+    )
+    assert judge(dataclasses.replace(GOOD, halves=None, step=None), strict) == ()
+
+
+def test_halves_that_differ_by_chance_or_by_little_pass() -> None:
+    unlikely = Difference(1e-6, 0.1, 90.0, 8, 99.0, 11)
+    large = Difference(1e-3, 2.0, 9.0, 8, 12.0, 11)
+    for halves in (unlikely, large):
+        assert judge(dataclasses.replace(GOOD, halves=halves), GateOptions()) == ()
 
 
 def test_a_search_that_did_not_converge_is_refused() -> None:

@@ -16,7 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 import yaml
 
-from starcal_ros import acceptance, demo, simulation, synthetic
+from starcal_ros import agreement, demo, simulation, synthetic
 from starcal_ros.bag import read_attitudes, read_images
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
@@ -52,7 +52,7 @@ def normalised_error(calibration: Calibration, truth: CameraGeometry) -> tuple[f
     free = [k for k, name in enumerate(PARAMETER_NAMES) if name in calibration.estimated]
     error = np.r_[
         (calibration.geometry.camera.parameters - truth.camera.parameters)[free],
-        acceptance.alignment_difference_rad(calibration.geometry, truth),
+        agreement.alignment_difference_rad(calibration.geometry, truth),
     ]
     rows = [*free, 10, 11, 12]
     covariance = calibration.covariance[np.ix_(rows, rows)]
@@ -158,7 +158,7 @@ def test_the_tiny_bag_is_small_and_says_what_it_is() -> None:
     assert truth['k_true'] == made.truth.camera.intrinsics.tolist()
     assert truth['d_true'] == made.truth.camera.distortion.tolist()
     geometry = simulation.true_geometry(truth)
-    angles_rad = acceptance.alignment_difference_rad(geometry, made.truth)
+    angles_rad = agreement.alignment_difference_rad(geometry, made.truth)
     assert np.abs(angles_rad).max() < 1e-14  # there and back through a matrix
     assert read_camera_info(TINY / 'camera.yaml').parameters.tolist() == [
         *truth['k_prior'],

@@ -38,6 +38,7 @@ LADDER = [
     'calibration',
     'observability',
     'removal',
+    'agreement',
     'acceptance',
     'synthetic',
     'mcap_records',

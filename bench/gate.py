@@ -1,0 +1,227 @@
+"""
+The gate: how often it refuses a good campaign, and whether it refuses those that are spoilt.
+
+Star fields of the paper's camera with all their errors drawn, as in `starcal campaign`; then the
+same with one thing wrong.  The limits are the defaults.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+import dataclasses
+import re
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bench.frames import load_set_up
+from bench.table import Table
+from starcal_ros import pipeline
+from starcal_ros.camera import project
+from starcal_ros.campaign_trials import (
+    draw_star_field,
+    observe,
+    pointing_error_arcsec,
+    StarField,
+)
+from starcal_ros.errors import TooFewObservations
+from starcal_ros.observability import map_error_px
+from starcal_ros.records import CameraGeometry, Ensemble
+from starcal_ros.synthetic import scenario
+
+SIZES = ((6, 80), (12, 30), (12, 80), (30, 80))  # images and stars of an image
+TRACKER_ARCSEC = (5.0, 20.0, 40.0)
+OUTLIER_SHARE = 0.01
+GOOD, SPOILT = 200, 40  # campaigns of each size, and of each case
+
+Spoil = Callable[[StarField, float, np.random.Generator], Ensemble]
+
+
+def run(quick: bool) -> list[Table]:
+    """Judge good campaigns of several sizes, then spoilt ones."""
+    setup = load_set_up(scenario('paper'))
+    good = Table(
+        'Good campaigns and the gate with its default limits',
+        ('images', 'stars each', 'campaigns', 'refused', 'halves under 1 %', 'least chance'),
+        notes=['halves under 1 %: how many have halves that differ as one in a hundred should.'],
+    )
+    for images, stars in SIZES:
+        chances, refused = [], 0
+        for k in range(10 if quick else GOOD):
+            rng = np.random.default_rng([images, stars, k])
+            tracker = TRACKER_ARCSEC[k % len(TRACKER_ARCSEC)]
+            field = draw_star_field(rng, images, stars)
+            reasons, chance, _ = _judged(
+                setup, field, observe(field, tracker, OUTLIER_SHARE), tracker
+            )
+            chances.append(chance)
+            if reasons:
+                print(f'refused: {images} x {stars}, {k}: {reasons}')
+            refused += bool(reasons)
+        share = float(np.mean(np.array(chances) < 0.01))
+        good.add(images, stars, len(chances), refused, share, float(np.nanmin(chances)))
+    spoilt = Table(
+        'Spoilt campaigns of 12 images of 80 stars and the gate with its default limits',
+        ('what is wrong', 'campaigns', 'refused', 'let through: worst error px', 'by'),
+        notes=[
+            'error: of the lines of sight of what was let through against the truth, RMS over',
+            'the detector, px; of a truth that changes, against the half that is farther off.',
+        ],
+    )
+    for name, spoil in CASES.items():
+        by: Counter[str] = Counter()
+        let_through = [0.0]
+        count = 5 if quick else SPOILT
+        for k in range(count):
+            rng = np.random.default_rng([12, 80, k])
+            tracker = TRACKER_ARCSEC[k % len(TRACKER_ARCSEC)]
+            field = draw_star_field(rng, 12, 80)
+            reasons, _, error_px = _judged(setup, field, spoil(field, tracker, rng), tracker)
+            by.update(reasons)
+            if not reasons:
+                let_through.append(error_px)
+        refused = count - len(let_through) + 1
+        worst = max(let_through) if refused < count else None
+        spoilt.add(
+            name, count, refused, worst, ', '.join(f'{n} {r}' for r, n in by.most_common(3))
+        )
+    for table in (good, spoilt):
+        print(table.text())
+    return [good, spoilt]
+
+
+def _judged(
+    setup: pipeline.Setup, field: StarField, ensemble: Ensemble, tracker_arcsec: float
+) -> tuple[list[str], float, float]:
+    """Names of the limits that a campaign fails, the chance of its halves, its error, px."""
+    told = (tracker_arcsec,) * 3
+    options = dataclasses.replace(setup.calibration, star_tracker_sigma_arcsec=told)
+    setup = dataclasses.replace(setup, prior=field.prior, calibration=options)
+    try:
+        found = pipeline.solve(ensemble, setup)
+    except TooFewObservations:
+        return ['cannot be solved'], np.nan, np.nan
+    names = [(re.findall(r'\((\w+)\)', reason) or [reason])[0] for reason in found.reasons]
+    focal_px = float(field.truth.camera.parameters[0])
+    pointing_px = pointing_error_arcsec(found.geometry, field.truth) * np.pi / 648000 * focal_px
+    error_px = max(pointing_px, map_error_px(found.geometry.camera, field.truth.camera))
+    chance = np.nan if found.halves is None else found.halves.chance
+    return names, chance, error_px
+
+
+def _seen_by(field: StarField, truth: CameraGeometry, rows: slice) -> StarField:
+    """The field with some of its images taken through another camera, or mounted otherwise."""
+    star_tracker_from_icrf = (
+        Rotation.from_quat(field.truth.star_tracker_from_camera_xyzw) * field.camera_from_icrf
+    )
+    camera_from_icrf = (
+        Rotation.from_quat(truth.star_tracker_from_camera_xyzw).inv() * star_tracker_from_icrf
+    )
+    directions = np.einsum('mij,mnj->mni', camera_from_icrf.as_matrix(), field.direction_icrf)
+    pixels = field.pixel_px.copy()
+    pixels[rows] = project(truth.camera, directions[rows])
+    return dataclasses.replace(field, pixel_px=pixels)
+
+
+def _turned(geometry: CameraGeometry, arcsec: float, rng: np.random.Generator) -> CameraGeometry:
+    axis = rng.normal(size=3)
+    turn = Rotation.from_rotvec(arcsec * np.pi / 648000 * axis / np.linalg.norm(axis))
+    alignment = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * turn
+    return dataclasses.replace(geometry, star_tracker_from_camera_xyzw=alignment.as_quat())
+
+
+def _focus_drifts(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+    """By 0.3 % in all, from the first image to the last."""
+    for k in range(len(field.pixel_px)):
+        factor = 1 + 3e-3 * k / (len(field.pixel_px) - 1)
+        camera = field.truth.camera
+        fx, skew, fy = camera.intrinsics[:3] * factor
+        moved = dataclasses.replace(field.truth, camera=camera.replace(fx=fx, skew=skew, fy=fy))
+        field = _seen_by(field, moved, slice(k, k + 1))
+    return observe(field, tracker, OUTLIER_SHARE)
+
+
+def _alignment_jumps(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+    half = slice(len(field.pixel_px) // 2, None)
+    field = _seen_by(field, _turned(field.truth, 180.0, rng), half)
+    return observe(field, tracker, OUTLIER_SHARE)
+
+
+def _two_alignments(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+    other = _turned(field.truth, 1800.0, rng)
+    for k in rng.permutation(len(field.pixel_px))[::2]:
+        field = _seen_by(field, other, slice(k, k + 1))
+    return observe(field, tracker, OUTLIER_SHARE)
+
+
+def _attitude_inverted(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+    images = [
+        dataclasses.replace(
+            image,
+            icrf_from_star_tracker_xyzw=image.icrf_from_star_tracker_xyzw * [-1, -1, -1, 1],
+        )
+        for image in observe(field, tracker, OUTLIER_SHARE).images
+    ]
+    return Ensemble(tuple(images))
+
+
+def _equinox_of_date(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+    """Catalog directions of the equinox of 2026 taken for ICRF: 26 years at 50.3 arcsec."""
+    precession = Rotation.from_euler('x', 23.44, degrees=True) * Rotation.from_euler(
+        'z', 26 * 50.3 / 3600, degrees=True
+    )
+    precession = precession * Rotation.from_euler('x', -23.44, degrees=True)
+    turned = precession.apply(field.direction_icrf.reshape(-1, 3))
+    turned = turned.reshape(field.direction_icrf.shape)
+    return observe(dataclasses.replace(field, direction_icrf=turned), tracker, OUTLIER_SHARE)
+
+
+def _old_places(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+    """Proper motion left out since 1950: 76 years of 50 mas each axis, as bright stars have."""
+    motion_rad = rng.normal(0.0, 76 * 0.05 * np.pi / 648000, field.direction_icrf.shape)
+    moved = field.direction_icrf + motion_rad
+    moved /= np.linalg.norm(moved, axis=-1, keepdims=True)
+    return observe(dataclasses.replace(field, direction_icrf=moved), tracker, OUTLIER_SHARE)
+
+
+def _focal_scaled(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+    """Pixels of an image that was scaled by 5 % about the principal point."""
+    camera = field.truth.camera
+    center = camera.intrinsics[3:]
+    pixels = center + 1.05 * (field.pixel_px - center)
+    return observe(dataclasses.replace(field, pixel_px=pixels), tracker, OUTLIER_SHARE)
+
+
+def _mirrored(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+    """The image is turned over, left for right."""
+    pixels = field.pixel_px.copy()
+    pixels[..., 0] = field.truth.camera.width - 1 - pixels[..., 0]
+    return observe(dataclasses.replace(field, pixel_px=pixels), tracker, OUTLIER_SHARE)
+
+
+def _many_wrong_stars(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+    return observe(field, tracker, 0.4)
+
+
+def _one_corner(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
+    """Stars in a quarter of the detector alone."""
+    images = [
+        image.select(np.all(image.measured_px < [image.width / 2, image.height / 2], axis=1))
+        for image in observe(field, tracker, OUTLIER_SHARE).images
+    ]
+    return Ensemble(tuple(images))
+
+
+CASES: dict[str, Spoil] = {
+    'focal length drifts by 0.3 %': _focus_drifts,
+    'alignment jumps by 180 arcsec halfway': _alignment_jumps,
+    'half of the images, any, turned by 0.5 deg': _two_alignments,
+    'attitude of the wrong direction': _attitude_inverted,
+    'catalog of the wrong equinox': _equinox_of_date,
+    'proper motion left out for 76 years': _old_places,
+    'image scaled by 5 %': _focal_scaled,
+    'image mirrored': _mirrored,
+    '40 % of the stars misidentified': _many_wrong_stars,
+    'stars in one corner alone': _one_corner,
+}
