@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from bench.frames import history, load_set_up, render_frame
 from bench.table import Table
 from starcal_ros import pipeline, synthetic
-from starcal_ros.campaign_trials import map_bound_px, map_error_px
+from starcal_ros.campaign_trials import map_bound_px
+from starcal_ros.observability import map_error_px
 from starcal_ros.records import (
     CALIBRATION_PARAMETER_NAMES,
     CameraGeometry,
