@@ -265,7 +265,7 @@ def _measure_by_psf(
     fit = fit_psf(stamps, sigma_px, noise_dn, model.pixel_noise, model.saturation_dn)
     x, y, flux, _ = fit.parameters.T
     covariance = fit.covariance
-    snr = flux / np.sqrt(covariance[:, 2, 2])
+    snr = fit.snr
 
     departure = np.abs(fit.shape_change - model.shape_median)
     limit = np.maximum(options.max_shape_change, 4.0 * model.shape_scatter)
@@ -328,7 +328,8 @@ def _measure_by_moments(
     total = np.maximum(flux, 1e-12)
     x = (weight * offsets[None, None, :]).sum(axis=(1, 2)) / total
     y = (weight * offsets[None, :, None]).sum(axis=(1, 2)) / total
-    variance = np.where(mask, model.pixel_noise.variance(signal, noise_dn[:, None, None]), 0.0)
+    of_pixel = model.pixel_noise.variance(signal, noise_dn[:, None, None], flux[:, None, None])
+    variance = np.where(mask, of_pixel, 0.0)
     dx = offsets[None, None, :] - x[:, None, None]
     dy = offsets[None, :, None] - y[:, None, None]
     covariance = (

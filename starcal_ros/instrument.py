@@ -131,8 +131,7 @@ def learn(
         Width and height of the detector.
     """
     fit = stars.fit
-    snr = fit.parameters[:, 2] / np.sqrt(fit.covariance[:, 2, 2])
-    bright = np.nonzero(stars.usable & (snr > _BRIGHT_SNR))[0][:_MOST]
+    bright = np.nonzero(stars.usable & (fit.snr > _BRIGHT_SNR))[0][:_MOST]
     if len(bright) < _FEWEST:
         return before
     fit, noise_dn = select(fit, bright), stars.noise_dn[bright]

@@ -4,16 +4,21 @@ Gaussian fits to stars, all stars of an image at once.
 A pixel-integrated circular Gaussian with free position, flux and local background, weighted by the
 noise of each pixel, attains the Cramer-Rao bound of the stamp.
 
-Noise of a pixel with background-free signal S, in digital numbers (DN)::
+Noise of a pixel with background-free signal S of a star of flux F, in digital numbers (DN)::
 
-    variance = background noise_dn^2 + S / gain + (psf_error S)^2
+    variance = background noise_dn^2 + S / gain + psf_error^2 S F
 
 ``background`` is how much more a pixel beside a star scatters than one of the open sky, and
-``psf_error`` is how far the real PSF is from the Gaussian, as a fraction.
+``psf_error`` is how far the real PSF is from the Gaussian.  That error is of one sign over several
+pixels, and largest beside the core: no noise that weights could hold down.  A fit that trusts the
+core less for its sake leans on the wings, where the Gaussian is worst.  So the weights are of the
+noise alone, and the error of the PSF is in the covariance.  With F in its term it grows as the
+square of the brightness, and photon noise as the brightness: that tells one from the other.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, fields
 import math
 
@@ -31,16 +36,16 @@ _SIGNIFICANT = 3.0  # sigma
 
 @dataclass(frozen=True)
 class PixelNoise:
-    """Noise of a pixel with signal S: ``background noise^2 + S / gain + (psf_error S)^2``."""
+    """Noise of a pixel: ``background noise^2 + S / gain + psf_error^2 S F``, S of it, F of all."""
 
     gain_e_per_dn: float
     psf_error: float
     background: float = 1.0
 
-    def variance(self, signal_dn: Floats, noise_dn: Floats) -> Floats:
+    def variance(self, signal_dn: Floats, noise_dn: Floats, flux_dn: Floats) -> Floats:
         """Variance in DN^2; negative signal counts as none."""
         signal = np.maximum(signal_dn, 0.0)
-        per_signal = 1.0 / self.gain_e_per_dn + self.psf_error**2 * signal
+        per_signal = 1.0 / self.gain_e_per_dn + self.psf_error**2 * np.maximum(flux_dn, 0.0)
         return np.asarray(self.background * noise_dn**2 + per_signal * signal)
 
 
@@ -50,6 +55,7 @@ class PsfFit:
     Gaussian fits to stamps: position relative to the stamp's centre, flux, background.
 
     ``parameters`` (n, 4): x, y (px), flux, background (DN).  ``covariance`` (n, 4, 4) of them.
+    ``snr`` (n,): flux over its 1-sigma from the noise alone.
     ``worst_pixel_sigma`` (n,): the pixel that fits worst, in its own noise.
     ``shape_change`` and ``shape_sigma`` (n, 3): departure of the second moments xx, yy, xy from
     those of the PSF as a fraction of its variance, and their 1-sigma.
@@ -60,6 +66,7 @@ class PsfFit:
 
     parameters: Floats
     covariance: Floats
+    snr: Floats
     worst_pixel_sigma: Floats
     shape_change: Floats
     shape_sigma: Floats
@@ -142,13 +149,26 @@ def fit_psf(
     shape_step = (shape_covariance @ gradient[:, :, None])[:, :, 0]
     residual = rows[:, 7]
     leverage = ((covariance @ rows[:, :4]) * rows[:, :4]).sum(axis=1) * weight
+    signal = parameters[:, 2, None] * rows[:, 2]
+    parameters = parameters + last
+    snr = parameters[:, 2] / np.sqrt(covariance[:, 2, 2])
+    trust = weight
+    if pixel_noise.psf_error > 0:
+        # Of a pixel's variance, this many times what its weight holds is the error of the PSF.
+        flux = np.maximum(parameters[:, 2, None], 0.0)
+        excess = pixel_noise.psf_error**2 * flux * np.maximum(signal, 0.0) * weight
+        trust = weight / (1.0 + excess)
+        scatter = (rows[:, :7] * (excess * weight)[:, None, :]) @ rows[:, :7].transpose(0, 2, 1)
+        covariance = covariance + covariance @ scatter[:, :4, :4] @ covariance
+        shape_covariance = shape_covariance + shape_covariance @ scatter @ shape_covariance
     return PsfFit(
-        parameters=parameters + last,
+        parameters=parameters,
         covariance=covariance,
-        worst_pixel_sigma=np.sqrt((weight * residual**2).max(axis=1, initial=0.0)),
+        snr=snr,
+        worst_pixel_sigma=np.sqrt((trust * residual**2).max(axis=1, initial=0.0)),
         shape_change=shape_step[:, 4:],
         shape_sigma=np.sqrt(np.einsum('nii->ni', shape_covariance)[:, 4:]),
-        signal_dn=parameters[:, 2, None] * rows[:, 2],
+        signal_dn=signal,
         residual_dn=np.where(valid, residual, np.nan),
         freedom=np.maximum(1.0 - leverage, 0.05),
     )
@@ -206,7 +226,8 @@ def neighbour_pull_px(
     rows = _psf_rows(np.stack([zero, zero, flux_dn, zero], axis=-1), dark, sigma, width, 4)
     own = flux_dn[:, None] * rows[:, 2]
     rows[:, 4] = light
-    weight = 1.0 / pixel_noise.variance(own + light, np.full((count, 1), noise_dn))
+    zero_error = dataclasses.replace(pixel_noise, psf_error=0.0)
+    weight = 1.0 / zero_error.variance(own + light, np.full((count, 1), noise_dn), zero[:, None])
     normal, gradient = _normal(rows, weight)
     return np.asarray(np.linalg.solve(normal, gradient[:, :, None])[:, :2, 0])
 
@@ -214,7 +235,7 @@ def neighbour_pull_px(
 @dataclass(frozen=True)
 class NoiseSums:
     """
-    What residuals say of the pixel noise: a regression of their squares on noise_dn^2, S and S^2.
+    What residuals say of the pixel noise: a regression of their squares on noise_dn^2, S and S F.
 
     ``normal`` (3, 3) and ``right`` (3,), with each pixel weighted by its own expected spread.
     Sums of several images can be added.
@@ -266,12 +287,13 @@ def noise_sums(fit: PsfFit, noise_dn: Floats, expected: PixelNoise) -> NoiseSums
     """
     noise2 = np.broadcast_to(noise_dn[:, None] ** 2, fit.signal_dn.shape)
     signal = np.maximum(fit.signal_dn, 0.0)
-    variance = expected.variance(signal, noise_dn[:, None])
+    flux = np.broadcast_to(np.maximum(fit.parameters[:, 2, None], 0.0), signal.shape)
+    variance = expected.variance(signal, noise_dn[:, None], flux)
     squared = np.nan_to_num(fit.residual_dn**2 / fit.freedom, nan=np.inf)
     keep = squared < 25.0 * variance
     weight = (1.0 / variance)[keep]
     signal = signal[keep] * weight
-    A = np.stack([noise2[keep] * weight, signal, signal * signal / weight])
+    A = np.stack([noise2[keep] * weight, signal, signal * flux[keep]])
     return NoiseSums(A @ A.T, A @ (squared[keep] * weight))
 
 
@@ -341,11 +363,9 @@ def _weights(
     valid: NDArray[np.bool_],
     pixel_noise: PixelNoise,
 ) -> Floats:
-    """Inverse variance (n, p) of pixels, 0 for those that take no part."""
-    signal = np.maximum(parameters[:, 2, None], 0.0) * rows[:, 2]
-    variance = signal * pixel_noise.psf_error**2
-    variance += 1.0 / pixel_noise.gain_e_per_dn
-    variance *= signal
+    """Inverse noise variance (n, p) of pixels, 0 for those that take no part."""
+    variance = np.maximum(parameters[:, 2, None], 0.0) * rows[:, 2]
+    variance /= pixel_noise.gain_e_per_dn
     variance += pixel_noise.background * noise2
     return np.asarray(valid / variance)
 
