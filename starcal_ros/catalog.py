@@ -48,6 +48,9 @@ PARALLAX_UNIT_RAD = 2e-5 * ARCSECOND_RAD  # 0.02 mas
 MAGNITUDE_UNIT = 1e-3
 NO_COLOUR = -32768
 
+# What is marked as a close pair: a neighbour within this.
+CLOSE_PAIR_RAD = 20.0 * ARCSECOND_RAD
+
 # What a cone is widened by: the fastest star of the catalog (8.7 arcsec a year) moves this far in
 # 35 years, and aberration brings a star in from 20 arcsec.
 CONE_MARGIN_RAD = 330 * ARCSECOND_RAD

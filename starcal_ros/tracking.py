@@ -141,7 +141,8 @@ def _predict(
         direction_icrf[near],
         direction_camera[near],
     )
-    return Prediction(index, direction_icrf, direction_camera, project(camera, direction_camera))
+    xy_px = project(camera, direction_camera)
+    return Prediction(index, direction_icrf, direction_camera, xy_px, float(camera.parameters[0]))
 
 
 def _find_turn(

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.catalog import load_catalog, StarCatalog
 from starcal_ros.centroiding import CentroidOptions, ImageModel
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.detection import Background
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification import (
@@ -20,6 +21,7 @@ from starcal_ros.identification import (
     predict,
     Shot,
     tracked,
+    unlisted_pull_px,
 )
 from starcal_ros.instrument import uniform_width
 from starcal_ros.psf import fit_psf, PixelNoise, stamp_radius_px
@@ -297,6 +299,42 @@ def test_what_is_left_of_a_pull_that_is_let_pass_is_under_a_sigma() -> None:
                 if not (swamped[0] or beyond):
                     worst = max(worst, abs(pull_px - found[0, 0]) / sigma_px)
     assert worst < 1.0
+
+
+@pytest.mark.parametrize('ratio', [0.02, 0.1, 0.3, 0.5])
+def test_of_two_stars_that_look_like_one_the_centre_of_light_is_measured(ratio: float) -> None:
+    distance_px = 0.1 * SIGMA_PX
+    # What is measured is the flux of both.
+    total = 2000.0 * np.array([1.0 + ratio, 1.0 + ratio])
+    pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
+    magnitude = np.array([5.0, 5.0 - 2.5 * np.log10(ratio)])
+    found, _ = neighbour_pulls(pair, magnitude, total, image_model(2.1))
+    # To first order in the distance; the second is (distance / sigma)^2, 1 %.
+    assert found[0, 0] == pytest.approx(ratio / (1.0 + ratio) * distance_px, rel=0.02)
+
+
+def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure() -> None:
+    # A star of V = 5 in a catalog to V = 9: the companion has a fortieth of its light or less,
+    # within 20 arcsec, here 2 px.
+    px_per_rad = 2.0 / (20.0 * ARCSECOND_RAD)
+    rng = np.random.default_rng(4)
+    share = 10 ** (-0.4 * (4.0 + rng.uniform(0.0, 1.0, 100000)))
+    away_px = 2.0 * rng.uniform(size=100000) * share
+    drawn_px = np.sqrt(np.mean(away_px**2) / 2)
+    found = unlisted_pull_px(np.array([5.0, 9.0, 9.5]), 9.0, px_per_rad)
+    assert found[0] == pytest.approx(drawn_px, rel=0.05)  # 0.58 and 0.65 are rounded
+    assert found[1] == found[2] == pytest.approx(10**1.6 * found[0])
+    one, image = shown(2)
+    marked = dataclasses.replace(catalog(), close_pair=np.ones(len(catalog()), bool))
+    before = observed(image, one.icrf_from_star_tracker_xyzw)
+    shot = Shot(image, one.icrf_from_star_tracker_xyzw, 0.5)
+    after, _ = observe_stars(shot, PRIOR, marked, CENTROIDS, OPTIONS)
+    assert after.refused_stars['blend'] > before.refused_stars['blend']
+    both, i, j = np.intersect1d(before.catalog_id, after.catalog_id, return_indices=True)
+    more_px2 = after.covariance_px2[j] - before.covariance_px2[i]
+    assert len(both) > 50 and (more_px2[:, [0, 2]] >= 0).all() and more_px2[:, 0].max() > 1e-6
+    # Stars whose companion is in the catalog have it taken off, mark or no mark.
+    np.testing.assert_array_equal(after.measured_px[j], before.measured_px[i])
 
 
 def test_only_the_fainter_of_two_unlike_stars_is_swamped() -> None:

@@ -24,6 +24,7 @@ from starcal_ros.node_options import NODE_OPTION_CLASSES
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     CALIBRATION_PARAMETER_NAMES,
+    CameraGeometry,
     Ensemble,
     Image,
     refused_image,
@@ -300,6 +301,44 @@ def test_a_refused_image_does_not_put_those_after_it_out_of_order(setup: pipelin
     assert refused.refusal == 'no_attitude'
     found, track = pipeline.observe_next(image(), attitudes(), setup, track)
     assert found.refusal == '' and track.latest_ns == image().time_ns
+
+
+@pytest.mark.parametrize('jump_deg', [1.0, 6.0])
+def test_a_star_tracker_that_jumped_and_came_back(setup: pipeline.Setup, jump_deg: float) -> None:
+    turned = CameraGeometry(
+        setup.prior.camera,
+        (
+            Rotation.from_quat(setup.prior.star_tracker_from_camera_xyzw)
+            * Rotation.from_euler('xyz', [0.7, -0.5, 3.0], degrees=True)
+        ).as_quat(),
+    )
+    off = np.array([0.6, -0.8, 0.0]) * np.radians(jump_deg)
+    track, lengths, seen = pipeline.Track(turned), [], []
+    for index in range(5):
+        held = AttitudeHistory()
+        for sample in attitude_samples(SCENARIO, index):
+            right = Rotation.from_quat(sample.icrf_from_star_tracker_xyzw)
+            reported = right * Rotation.from_rotvec(off) if index == 2 else right
+            held.add(
+                sample.time_ns,
+                attitude_sample(sample.time_ns, reported.as_quat(), 'st_to_inertial'),
+            )
+        before = track
+        found, track = pipeline.observe_next(image(index), held, setup, track)
+        lengths.append(len(found))
+        seen.append(found.refusal)
+        if found.refusal:
+            assert track is before
+    # Beyond the search the jump is refused, within it the stars are still the right ones.
+    assert seen == ['', '', '' if jump_deg < 1.5 else 'no_match', '', '']
+    used = [length for length, refusal in zip(lengths, seen, strict=True) if not refusal]
+    assert min(used) > 60
+    # What the first image found of the turned alignment has carried to the last.
+    left = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw).inv() * Rotation.from_quat(
+        track.geometry.star_tracker_from_camera_xyzw
+    )
+    # One error of the tracker, (10, 10, 40) arcsec, and what the prior camera is off by.
+    assert left.magnitude() < 200 * ARCSECOND_RAD
 
 
 def test_the_last_sample_at_or_before_an_image_counts() -> None:

@@ -43,6 +43,7 @@ from scipy.spatial import cKDTree
 from starcal_ros.catalog import (
     CATALOG_FORMAT,
     CATALOG_PATH,
+    CLOSE_PAIR_RAD,
     column_digest,
     COLUMN_TYPES,
     cone,
@@ -69,7 +70,6 @@ TYCHO_EPOCH_JYEAR = 2000.0
 
 SAME_STAR_RAD = 3.0 * ARCSECOND_RAD
 PHOTOCENTRE_RAD = 2.5 * ARCSECOND_RAD
-CLOSE_PAIR_RAD = 20.0 * ARCSECOND_RAD
 CLOSE_PAIR_MAGNITUDES = 5.0
 GAIA_BRIGHT_LIMIT_HP = 3.0
 # Separation and difference of magnitude within which a Gaia and a Tycho-2 star are the same:
