@@ -118,7 +118,9 @@ exit status: 0 a calibration could use the bag; 3 it could not, and why is said;
   # star tracker noise against method, as in Table 1 of the paper
   starcal campaign table1 -o studies
   # smaller: two noises, twenty trials
-  starcal campaign table1 -o studies --trials 20 --tracker 0 20""",
+  starcal campaign table1 -o studies --trials 20 --tracker 0 20
+  # the whole night of the paper from pixels, with its figures: some minutes
+  starcal campaign paper -o paper""",
     ),
 }
 
@@ -256,7 +258,7 @@ def _scenarios(**_: object) -> Iterable[str]:
 def _studies(**_: object) -> Iterable[str]:
     from starcal_ros.campaign import STUDIES
 
-    return STUDIES
+    return (*STUDIES, 'paper')
 
 
 def _topics(command: argparse.ArgumentParser) -> None:
@@ -368,7 +370,7 @@ def _simulate(command: argparse.ArgumentParser) -> None:
 
 def _campaign(command: argparse.ArgumentParser) -> None:
     study = command.add_argument(
-        'study', metavar='STUDY', help='table1, images, terms or coverage'
+        'study', metavar='STUDY', help='table1, images, terms, coverage or paper'
     )
     _completed(study, _studies)
     command.add_argument(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import contextlib
+import functools
 import itertools
 import logging
 from multiprocessing import resource_tracker
@@ -13,12 +14,15 @@ import signal
 import tempfile
 import threading
 from types import FrameType
+from typing import TypeVar
 
 import dask
 from distributed import Client, Future, LocalCluster
 
 from starcal_ros.campaign import Design, Row, run_trial
 from starcal_ros.errors import OptionError
+
+Result = TypeVar('Result')
 
 LOOPBACK = '127.0.0.1'
 _CONNECT_S = 10.0
@@ -46,8 +50,21 @@ def run_trials(
     scheduler: str = '',
     on_trial: Callable[[], None] = lambda: None,
 ) -> list[Row]:
+    """Rows of all trials of a design, in any order; see `run_each`."""
+    trial = functools.partial(run_trial, design)
+    found = run_each(trial, design.trials, workers, scheduler, on_trial)
+    return [row for _, rows in found for row in rows]
+
+
+def run_each(
+    function: Callable[[int], Result],
+    count: int,
+    workers: int = 0,
+    scheduler: str = '',
+    on_each: Callable[[], None] = lambda: None,
+) -> list[tuple[int, Result]]:
     """
-    Rows of all trials of a design, in any order.
+    What a function makes of each of 0 to count - 1, with that number, in any order.
 
     Parameters
     ----------
@@ -55,8 +72,8 @@ def run_trials(
         Processes to start on this machine; 0: none, all is done here.
     scheduler : str
         Address of a Dask scheduler, whose workers have this package; then none is started.
-    on_trial : callable
-        Called after each trial.
+    on_each : callable
+        Called after each.
 
     Raises
     ------
@@ -64,11 +81,11 @@ def run_trials(
         When there is no scheduler at the address.
     """
     if not scheduler and workers == 0:
-        rows: list[Row] = []
-        for trial in range(design.trials):
-            rows += run_trial(design, trial)
-            on_trial()
-        return rows
+        results = []
+        for number in range(count):
+            results.append((number, function(number)))
+            on_each()
+        return results
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(_interrupts_wait())
         stack.enter_context(dask.config.set(_SETTINGS))
@@ -76,24 +93,28 @@ def run_trials(
         if scheduler:
             client = stack.enter_context(_client(scheduler))
         else:
-            cluster = stack.enter_context(_local_cluster(min(workers, design.trials)))
+            cluster = stack.enter_context(_local_cluster(min(workers, count)))
             client = stack.enter_context(_client(cluster))
-        return _gather(client, design, on_trial, stop)
+        return _gather(client, function, count, on_each, stop)
 
 
 def _gather(
-    client: Client, design: Design, on_trial: Callable[[], None], stop: threading.Event
-) -> list[Row]:
-    """Rows of all trials, a few trials ahead of the workers: 100,000 would be slow to give up."""
-    rows: list[Row] = []
-    finished: queue.SimpleQueue[Future[tuple[Row, ...]]] = queue.SimpleQueue()
-    handed_out: set[Future[tuple[Row, ...]]] = set()
-    trials = iter(range(design.trials))
+    client: Client,
+    function: Callable[[int], Result],
+    count: int,
+    on_each: Callable[[], None],
+    stop: threading.Event,
+) -> list[tuple[int, Result]]:
+    """All results, a few numbers ahead of the workers: 100,000 would be slow to give up."""
+    results: list[tuple[int, Result]] = []
+    finished: queue.SimpleQueue[Future[Result]] = queue.SimpleQueue()
+    handed_out: dict[Future[Result], int] = {}
+    numbers = iter(range(count))
 
-    def hand_out(count: int) -> None:
-        for trial in itertools.islice(trials, count):
-            future = client.submit(run_trial, design, trial, pure=False, retries=2)
-            handed_out.add(future)
+    def hand_out(most: int) -> None:
+        for number in itertools.islice(numbers, most):
+            future = client.submit(function, number, pure=False, retries=2)
+            handed_out[future] = number
             future.add_done_callback(finished.put)  # type: ignore[no-untyped-call]
 
     threads = client.nthreads()  # type: ignore[no-untyped-call]
@@ -103,11 +124,10 @@ def _gather(
             raise KeyboardInterrupt
         with contextlib.suppress(queue.Empty):
             future = finished.get(timeout=_GLANCE_S)
-            rows += future.result()
-            handed_out.remove(future)
-            on_trial()
+            results.append((handed_out.pop(future), future.result()))
+            on_each()
             hand_out(1)
-    return rows
+    return results
 
 
 @contextlib.contextmanager

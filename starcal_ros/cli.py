@@ -276,8 +276,11 @@ def _campaign(args: argparse.Namespace) -> int:
     from starcal_ros import campaign, campaign_figures, campaign_workers, pipeline, products
     from starcal_ros.options import nearest
 
+    if args.study == 'paper':
+        return _paper(args)
     if args.study not in campaign.STUDIES:
-        known = ', '.join(campaign.STUDIES) + nearest(args.study, campaign.STUDIES)
+        studies = (*campaign.STUDIES, 'paper')
+        known = ', '.join(studies) + nearest(args.study, studies)
         raise OptionError(f'STUDY: {args.study!r} is not one of {known}')
     what, usual = campaign.STUDIES[args.study]
     design = dataclasses.replace(
@@ -291,9 +294,7 @@ def _campaign(args: argparse.Namespace) -> int:
         told_arcsec=args.tracker_told,
     )
     campaign.check(design)
-    workers = campaign_workers.processors() if args.workers is None else args.workers
-    if not 0 <= workers <= 1024:
-        raise OptionError(f'--workers: {workers} is not within 0 to 1024')
+    workers = _workers(args)
     _make_folder(args.output)
     start = time.monotonic()
     with progress_bar(design.trials, 'trials') as advance:
@@ -307,6 +308,49 @@ def _campaign(args: argparse.Namespace) -> int:
     print(f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s')
     print('\n'.join(campaign.table(found)))
     print(f'written to {path} and {path.with_suffix(".png").name}')
+    return EXIT_ACCEPTED
+
+
+def _workers(args: argparse.Namespace) -> int:
+    from starcal_ros.campaign_workers import processors
+
+    workers: int = processors() if args.workers is None else args.workers
+    if not 0 <= workers <= 1024:
+        raise OptionError(f'--workers: {workers} is not within 0 to 1024')
+    return workers
+
+
+def _paper(args: argparse.Namespace) -> int:
+    """Show the paper again."""
+    import dataclasses
+    import functools
+
+    from starcal_ros import campaign, paper_figures, paper_study, pipeline, products
+    from starcal_ros.campaign_workers import run_each, run_trials
+    from starcal_ros.synthetic import scenario
+
+    workers = _workers(args)
+    table1 = dataclasses.replace(
+        paper_study.TABLE_1, seed=args.seed, trials=args.trials or paper_study.TABLE_1.trials
+    )
+    campaign.check(table1)
+    images = scenario(paper_study.NIGHT, args.seed).image_count
+    _make_folder(args.output / 'images')
+    with progress_bar(images, 'frames') as advance:
+        frame = functools.partial(paper_study.observe_frame, args.seed)
+        frames = run_each(frame, images, workers, args.scheduler, advance)
+    with progress_bar(table1.trials, 'trials') as advance:
+        rows = run_trials(table1, workers, args.scheduler, advance)
+    observations = [frames_at for _, frames_at in sorted(frames, key=lambda item: item[0])]
+    found = paper_study.study(observations, campaign.conclude(table1, rows), args.seed)
+    software = f'starcal {pipeline.software_version()}'
+    for name, png in paper_figures.pngs(found).items():
+        products.write_atomically(args.output / 'images' / f'paper_{name}.png', png)
+    path = args.output / 'paper.md'
+    products.write_atomically(path, paper_study.page(found, software))
+    content = {'software': software, **paper_study.numbers(found)}
+    products.write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
+    print(f'written to {path}, with figures in {args.output / "images"}')
     return EXIT_ACCEPTED
 
 

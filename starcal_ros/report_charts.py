@@ -69,6 +69,14 @@ def charts_of(calibration: Calibration, residuals: Residuals | None) -> Mapping[
                 f'{sigma.min():.3g}″ to {sigma.max():.3g}″. Each colour is an eighth of the '
                 'detector.',
             )
+    if len(calibration.removals) > 1:
+        dropped = [r.removed for r in calibration.removals[1:] if r.within_chance]
+        charts['terms'] = Chart(
+            'What each term is worth',
+            figures.term_worth(calibration.removals),
+            'Terms left out one after the other, the least missed first; all others are solved '
+            'again. Within chance (shaded): ' + (', '.join(dropped) or 'none') + '.',
+        )
     if residuals is not None and residuals.used.any():
         charts.update(_residual_charts(calibration, residuals))
     return charts

@@ -26,7 +26,7 @@ from starcal_ros.agreement import movement
 from starcal_ros.camera import CameraModel, distortion_px, pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.measurement import whitening
-from starcal_ros.records import CameraGeometry, DetectorMaps
+from starcal_ros.records import CameraGeometry, DetectorMaps, Removal
 from starcal_ros.residuals import Residuals
 
 Floats = NDArray[np.float64]
@@ -419,3 +419,24 @@ def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Ma
         axes.set_ylim(-top, top)
     panels[-1].set_xlabel('time from the first image (min)')
     return _svg(figure, 'alignment')
+
+
+def term_worth(removals: Sequence[Removal]) -> Markup:
+    """Residual and map as terms are left out one after the other (paper, Fig. 8)."""
+    figure, axes = _figure()
+    steps = np.arange(len(removals))
+    chance = [k for k, removal in enumerate(removals) if removal.within_chance]
+    if len(chance) > 1:
+        axes.axvspan(-0.5, max(chance) + 0.5, color=GRID, alpha=0.6, linewidth=0)
+    axes.plot(steps, [removal.residual_rms_px for removal in removals], 'o-', color=SERIES[0],
+              markersize=4, linewidth=1.4, label='residual, rms per axis')  # fmt: skip
+    axes.plot(steps[1:], [removal.map_change_px for removal in removals[1:]], 's--',
+              color=SERIES[1], markersize=4, linewidth=1.4, label='change of the map')  # fmt: skip
+    axes.set_yscale('log')
+    axes.set_xlim(-0.5, len(removals) - 0.5)
+    axes.set_xticks(
+        steps, ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])]
+    )
+    axes.set(xlabel='left out, one after the other', ylabel='px')
+    axes.legend(loc='upper left')
+    return _svg(figure, 'terms')

@@ -64,6 +64,8 @@ LADDER = [
     'campaign_trials',
     'campaign',
     'campaign_workers',
+    'paper_study',
+    'paper_figures',
     'campaign_figures',
     'demo',
     'arguments',

@@ -34,6 +34,7 @@ FIGURES = (
     'phase',
     'line_of_sight',
     'shape',
+    'terms',
     'alignment',
 )
 
@@ -134,6 +135,7 @@ def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:
         variance_factor=np.nan,
         maps=None,
         correlation=None,
+        removals=(),
         time_ns=-(2**63),
     )
     products.write_calibration(calibration, tmp_path / products.CALIBRATION_FILE)

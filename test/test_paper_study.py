@@ -1,0 +1,77 @@
+"""The paper's night: frames as any image, judging by images not seen, the page."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from starcal_ros import campaign, campaign_workers, paper_figures, paper_study, synthetic
+from starcal_ros.paper_study import judge, PaperStudy, spread
+from starcal_ros.records import Ensemble
+
+NIGHT = synthetic.scenario(paper_study.NIGHT, seed=3)
+
+
+@pytest.fixture(scope='module')
+def ensemble() -> Ensemble:
+    """Observations of eighteen frames of the night, without pixels."""
+    return synthetic.true_observations(dataclasses.replace(NIGHT, cadence_s=200.0, image_count=18))
+
+
+@pytest.fixture(scope='module')
+def found(ensemble: Ensemble) -> PaperStudy:
+    design = campaign.Design('table1', 2, (15,), (20,), (0.0, 20.0), ('per_image', 'single'))
+    table1 = campaign.conclude(design, campaign_workers.run_trials(design))
+    return paper_study.study(ensemble.images, table1, seed=3)
+
+
+def test_a_frame_is_measured_in_its_pixels() -> None:
+    observed = paper_study.observe_frame(3, 100)
+    assert observed.refusal == '' and len(observed) > 200
+    truth = synthetic.scene(NIGHT, 100)
+    order = np.argsort(truth.catalog_id)
+    row = order[np.searchsorted(truth.catalog_id, observed.catalog_id, sorter=order)]
+    off = observed.measured_px - truth.pixel_px[row]
+    sigma = np.sqrt(observed.covariance_px2[:, [0, 2]])
+    # Of five hundred numbers of unit variance, the spread is known to 3 %.
+    assert np.median(np.abs(off / sigma)) == pytest.approx(0.674, abs=0.1)
+
+
+def test_the_true_camera_leaves_the_noise(ensemble: Ensemble) -> None:
+    judged = judge(NIGHT.truth.camera, ensemble.images, 4.5)
+    sigma2 = np.concatenate([i.covariance_px2[:, [0, 2]] for i in ensemble.images])
+    # 10^4 numbers; the rotation of an image takes three of its 600 degrees of freedom.
+    assert judged.rms_px(range(len(ensemble.images))) == pytest.approx(
+        np.sqrt(sigma2.mean()), rel=0.03
+    )
+    assert judged.fits.mean() > 0.999  # 4.5 sigma: 4 in 10^5
+    wrong = judge(NIGHT.prior.camera, ensemble.images, 1e9)
+    assert wrong.rms_px([0]) > 2 * judged.rms_px([0])
+
+
+def test_images_are_spread_over_the_night() -> None:
+    assert spread(3, 359) == (0, 179, 358)
+    assert len(spread(15, 359)) == 15
+    assert spread(15, 4) == (0, 1, 2, 3)
+
+
+def test_the_study_shows_what_the_paper_concludes(found: PaperStudy) -> None:
+    assert len(found.used) == 15
+    rows = {str(row['method']): row for row in found.methods}
+    # Three images of 300 stars that were not used: 2.4 % is the 1-sigma of such a ratio.
+    assert float(rows['per_image']['others_px']) == pytest.approx(found.noise_rms_px, rel=0.02)
+    assert float(rows['single']['map_error_px']) > 2 * float(rows['per_image']['map_error_px'])
+    gone = [removal.removed for removal in found.removals[1:]]
+    assert {'k3', 'cx', 'cy'} <= set(gone[:4])
+    assert not {'k1', 'fx', 'fy'} & set(gone[:5])
+
+
+def test_the_page_and_its_figures(found: PaperStudy) -> None:
+    text = paper_study.page(found, 'starcal 0')
+    figures = paper_figures.pngs(found)
+    assert set(re.findall(r'\(images/paper_(\w+)\.png\)', text)) == set(figures)
+    assert all(png.startswith(b'\x89PNG') for png in figures.values())
+    assert 'nan' not in text
