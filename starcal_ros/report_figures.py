@@ -438,5 +438,5 @@ def term_worth(removals: Sequence[Removal]) -> Markup:
         steps, ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])]
     )
     axes.set(xlabel='left out, one after the other', ylabel='px')
-    axes.legend(loc='upper left')
+    axes.legend(loc='lower right')
     return _svg(figure, 'terms')
