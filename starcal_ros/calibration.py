@@ -350,10 +350,14 @@ def _search(
         np.zeros(table.image_count, bool),
         everything,
     )
-    covariance_px2 = verdict.variance.of(table.covariance_px2)
-    solution = _robust_search(problem, start, arrange(table, everything, covariance_px2))
+    measurements = _arranged(table, verdict)
+    solution = _robust_search(problem, start, measurements)
     iterations = solution.iterations
-    after = _judge(problem, solution.state, table, verdict, given_rad, options)
+    _, blocks = image_blocks(problem, solution.state, measurements)
+    del measurements  # before the next: they are as large as the table
+    after, measurements = _judge(
+        problem, solution.state, blocks, table, verdict, given_rad, options
+    )
     for _ in range(_ROUNDS):
         verdict = after
         problem = dataclasses.replace(
@@ -362,20 +366,28 @@ def _search(
                 verdict.misfit[:, None], np.inf, verdict.tracker_sigma_rad
             ),
         )
-        covariance_px2 = verdict.variance.of(table.covariance_px2)
-        measurements = arrange(table, verdict.kept, covariance_px2)
+        del blocks
         solution = minimise(problem, solution.state, measurements)
         iterations += solution.iterations
-        after = _judge(problem, solution.state, table, verdict, given_rad, options)
+        _, blocks = image_blocks(problem, solution.state, measurements)
+        del measurements
+        after, measurements = _judge(
+            problem, solution.state, blocks, table, verdict, given_rad, options
+        )
         if after.agrees_with(verdict):
             break
-    return _estimate(problem, solution, measurements, table, verdict, prior, options, iterations)
+    del measurements
+    return _estimate(problem, solution, blocks, table, verdict, prior, options, iterations)
+
+
+def _arranged(table: StarTable, verdict: _Verdict) -> Measurements:
+    return arrange(table, verdict.kept, verdict.variance.of(table.covariance_px2))
 
 
 def _estimate(
     problem: Problem,
     solution: Solution[State],
-    measurements: Measurements,
+    blocks: Floats,
     table: StarTable,
     verdict: _Verdict,
     prior: CameraGeometry,
@@ -384,7 +396,6 @@ def _estimate(
 ) -> tuple[Estimate, str]:
     """What a search has found, and the term of temperature to leave out, if any."""
     state = solution.state
-    _, blocks = image_blocks(problem, state, measurements)
     residual_px = _residuals(problem, state, table)
     kept = verdict.kept
     freedom = _freedom(problem, state, blocks, kept, verdict.tracker_sigma_rad)
@@ -482,25 +493,29 @@ def _with_slope(problem: Problem, state: State) -> State:
 def _judge(
     problem: Problem,
     state: State,
+    blocks: Floats,
     table: StarTable,
     before: _Verdict,
     given_rad: Floats,
     options: CalibrationOptions,
-) -> _Verdict:
-    """Variances and misfits from the residuals at a state that the verdict before has led to."""
+) -> tuple[_Verdict, Measurements]:
+    """
+    Variances and misfits from the residuals at a state that the verdict before has led to.
+
+    With the measurements as the verdict has them, which a search with it needs.
+    """
     residual_px = _residuals(problem, state, table)
-    measurements = arrange(table, before.kept, before.variance.of(table.covariance_px2))
-    _, blocks = image_blocks(problem, state, measurements)
     variance, tracker_sigma_rad = CentroidVariance(1.0, 0.0), given_rad
     if options.variance_components:
         freedom = _freedom(problem, state, blocks, before.kept, before.tracker_sigma_rad)
         variance = estimate_variance(residual_px, table.covariance_px2, before.kept, freedom)
     kept = _fitting(residual_px, table, variance, options)
+    del residual_px
     misfit: Mask = np.zeros(table.image_count, bool)
+    measurements = arrange(table, kept, variance.of(table.covariance_px2))
     # One rotation for all has no attitude of an image to judge.
     if problem.method != 'single':
         # By the stars that fit: one that does not turns an image of few by more than the tracker.
-        measurements = arrange(table, kept, variance.of(table.covariance_px2))
         _, blocks = image_blocks(problem, state, measurements)
         eta_rad, covariance_rad2, seen = attitudes_of_stars_alone(problem, state, blocks)
         fitted = 2 if len(state.rate) else 1  # mean of the attitudes, and slope
@@ -509,7 +524,7 @@ def _judge(
         )
         if options.variance_components:
             tracker_sigma_rad = found_rad
-    return _Verdict(variance, tracker_sigma_rad, misfit, kept)
+    return _Verdict(variance, tracker_sigma_rad, misfit, kept), measurements
 
 
 def _fitting(
@@ -523,7 +538,7 @@ def _fitting(
     """
     length2 = squared_sigmas(residual_px, variance.of(table.covariance_px2))
     fits = length2 < options.outlier_sigma**2
-    _, star = np.unique(table.catalog_id, return_inverse=True)
+    star = table.star
     sightings = np.bincount(star)
     misses = np.bincount(star, ~fits)
     summed = np.bincount(star, np.where(fits, length2, 0.0))

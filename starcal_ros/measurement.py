@@ -31,12 +31,14 @@ class StarTable:
     """
     All stars of an ensemble as columns, in image order.
 
-    ``image`` (n,) index of the image; ``catalog_id`` (n,); ``direction_icrf`` (n, 3);
+    ``image`` (n,) index of the image; ``catalog_id`` (n,); ``star`` (n,) index of the catalog star
+    among those that were seen; ``direction_icrf`` (n, 3);
     ``measured_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``image_count``.
     """
 
     image: NDArray[np.int64]
     catalog_id: NDArray[np.int64]
+    star: NDArray[np.int64]
     direction_icrf: Floats
     measured_px: Floats
     covariance_px2: Floats
@@ -50,9 +52,11 @@ class StarTable:
 def star_table(images: Sequence[StarObservations]) -> StarTable:
     """Return the columns of all stars of the images."""
     counts = [len(observed) for observed in images]
+    catalog_id = np.concatenate([np.empty(0, np.int64), *(i.catalog_id for i in images)])
     return StarTable(
         image=np.repeat(np.arange(len(images)), counts),
-        catalog_id=np.concatenate([np.empty(0, np.int64), *(i.catalog_id for i in images)]),
+        catalog_id=catalog_id,
+        star=np.unique(catalog_id, return_inverse=True)[1],
         direction_icrf=np.concatenate([np.empty((0, 3)), *(i.direction_icrf for i in images)]),
         measured_px=np.concatenate([np.empty((0, 2)), *(i.measured_px for i in images)]),
         covariance_px2=np.concatenate([np.empty((0, 3)), *(i.covariance_px2 for i in images)]),
@@ -101,10 +105,6 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
     order = np.nonzero(keep)[0]
     counts = np.bincount(table.image[order], minlength=table.image_count)
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    # Together, a star is one line of memory to fetch.
-    columns = np.concatenate(
-        [table.direction_icrf, table.measured_px, whitening(covariance_px2).T], axis=1
-    )
     images = np.argsort(counts, kind='stable')
     images = images[counts[images] > 0]
     chunks = []
@@ -118,11 +118,18 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
         width = counts[chosen[-1]]
         slot = np.arange(width)
         real = slot[None, :] < counts[chosen, None]
-        row = order[starts[chosen, None] + np.where(real, slot[None, :], 0)]
-        field = np.ascontiguousarray(np.take(columns, row.ravel(), axis=0).T)
-        field[5:] *= real.ravel()
-        direction_icrf = field[:3].reshape(3, *row.shape).transpose(1, 0, 2)
-        chunks.append(_Chunk(chosen, direction_icrf, field[3:5], field[5:]))
+        row = order[starts[chosen, None] + np.where(real, slot[None, :], 0)].ravel()
+        direction_icrf = np.ascontiguousarray(table.direction_icrf[row].T)
+        whitener = whitening(covariance_px2[row])
+        whitener *= real.ravel()
+        chunks.append(
+            _Chunk(
+                chosen,
+                direction_icrf.reshape(3, *real.shape).transpose(1, 0, 2),
+                np.ascontiguousarray(table.measured_px[row].T),
+                whitener,
+            )
+        )
         first = last
     largest = max((chunk.measured_px[0].size for chunk in chunks), default=0)
     return Measurements(tuple(chunks), table.image_count, np.empty(30 * largest))
@@ -261,9 +268,17 @@ def _whitened_columns(
 
 def residuals_px(table: StarTable, parameters: Floats, camera_from_icrf: Floats) -> Floats:
     """Measured minus predicted pixels (n, 2) of every star; parameters (10,) or (m, 10)."""
-    direction_camera = np.einsum('nij,nj->ni', camera_from_icrf[table.image], table.direction_icrf)
-    own = parameters if parameters.ndim == 1 else parameters[table.image].T
-    return np.asarray(table.measured_px - project_parameters(own, direction_camera))
+    residual_px = table.measured_px.copy()
+    # In parts: a rotation for each of all stars would be most of the memory of a calibration.
+    for first in range(0, len(table), _CHUNK_STARS):
+        part = slice(first, first + _CHUNK_STARS)
+        image = table.image[part]
+        direction_camera = np.einsum(
+            'nij,nj->ni', camera_from_icrf[image], table.direction_icrf[part]
+        )
+        own = parameters if parameters.ndim == 1 else parameters[image].T
+        residual_px[part] -= project_parameters(own, direction_camera)
+    return residual_px
 
 
 def squared_sigmas(residual_px: Floats, covariance_px2: Floats) -> Floats:
