@@ -32,6 +32,7 @@ from starcal_ros.campaign_trials import (
     draw_star_field,
     errors,
     ESTIMATED,
+    far_prior,
     information_blocks,
     map_bound_px,
     normalised_error_squared,
@@ -51,6 +52,8 @@ Floats = NDArray[np.float64]
 Row = dict[str, 'int | float | str']
 
 OUTLIER_SHARE = 0.02
+MANY_OUTLIERS = 0.1
+SAME_SIGMAS = 0.01  # two answers nearer than this in every parameter are one minimum
 UNUSED_IMAGES = 20
 ENOUGH = 1.01  # residual of unused images, over that of the true camera, from which more is waste
 NIGHT_S = 3590.0  # from the first image to the last (paper: 359 at ten seconds)
@@ -104,6 +107,10 @@ STUDIES: Mapping[str, tuple[str, Design]] = {
     'coverage': (
         'whether errors are as large as the reported covariance says',
         Design('coverage', 200, (16,), (80,), (20.0,), ('per_image', 'hierarchical')),
+    ),
+    'start': (
+        'whether a prior that is far off leads to the same minimum, with outliers too',
+        Design('start', 100, (16,), (80,), (20.0,), _METHODS),
     ),
 }
 """Name -> what it shows, and its design unless told otherwise."""
@@ -344,6 +351,37 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
                 }
 
 
+def _start_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
+    """All ten parameters from the truth and from a prior that is far off, of the same stars."""
+    field = draw_star_field(rng, max(design.images), max(design.stars))
+    far = far_prior(field.truth, rng)
+    for cell, part in _cells(design, field):
+        for tracker, share in itertools.product(design.tracker_arcsec, (0.0, MANY_OUTLIERS)):
+            ensemble = observe(part, tracker, share)
+            for method in design.methods:
+                options = calibration_options(
+                    method, design.told(tracker), estimate=PARAMETER_NAMES
+                )
+                near, away = (
+                    estimate_calibration(ensemble, prior, options) for prior in (field.truth, far)
+                )
+                sigma = np.sqrt(np.diag(near.covariance))
+                apart = np.abs(errors(away.geometry, near.geometry)) / sigma
+                wild = (part.luck < share).ravel()
+                yield {
+                    **cell,
+                    'tracker_arcsec': tracker,
+                    'outlier_share': share,
+                    'method': method,
+                    'apart_sigmas': float(apart.max()),
+                    'map_px': map_error_px(away.geometry.camera, field.truth.camera),
+                    'outliers': int(wild.sum()),
+                    'outliers_kept': int((away.kept & wild).sum()),
+                    'iterations_near': near.iterations,
+                    'iterations_far': away.iterations,
+                }
+
+
 def _groups(rows: Sequence[Row], *names: str) -> Iterable[tuple[Row, list[Row]]]:
     """Rows that agree in all the named columns, in the order in which they first appear."""
     groups: dict[tuple[int | float | str, ...], list[Row]] = {}
@@ -462,17 +500,34 @@ def _coverage_summary(rows: Sequence[Row]) -> Iterable[Row]:
         }
 
 
+def _start_summary(rows: Sequence[Row]) -> Iterable[Row]:
+    for key, cell in _groups(rows, 'images', 'stars', 'tracker_arcsec', 'outlier_share', 'method'):
+        apart = column(cell, 'apart_sigmas')
+        yield {
+            **key,
+            **_common(cell),
+            'same_minimum': int((apart < SAME_SIGMAS).sum()),
+            'worst_apart_sigmas': float(apart.max()),
+            'outliers': int(column(cell, 'outliers').sum()),
+            'outliers_kept': int(column(cell, 'outliers_kept').sum()),
+            'iterations_near': float(column(cell, 'iterations_near').mean()),
+            'iterations_far': float(column(cell, 'iterations_far').mean()),
+        }
+
+
 _TRIALS: Mapping[str, Callable[[Design, np.random.Generator], Iterable[Row]]] = {
     'table1': _table1_trial,
     'images': _images_trial,
     'terms': _terms_trial,
     'coverage': _coverage_trial,
+    'start': _start_trial,
 }
 _SUMMARIES: Mapping[str, Callable[[Sequence[Row]], Iterable[Row]]] = {
     'table1': _table1_summary,
     'images': _images_summary,
     'terms': _terms_summary,
     'coverage': _coverage_summary,
+    'start': _start_summary,
 }
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from starcal_ros.camera import PARAMETER_NAMES
-from starcal_ros.campaign import Campaign, column, ENOUGH, Row, UNUSED_IMAGES
+from starcal_ros.campaign import Campaign, column, ENOUGH, Row, SAME_SIGMAS, UNUSED_IMAGES
 from starcal_ros.campaign_trials import ESTIMATED
 
 # Colours of Okabe and Ito, told apart by the colour-blind; marker; width, for lines that coincide.
@@ -255,9 +255,32 @@ def _coverage(campaign: Campaign) -> Figure:
     return figure
 
 
+def _start(campaign: Campaign) -> Figure:
+    """How far apart the answers from a near and from a far prior are, sorted."""
+    shares = _values(campaign.rows, 'outlier_share')
+    figure, axes = _panels(campaign, 1, len(shares), 4.8, 3.2)
+    for axis, share in zip(axes[0], shares, strict=True):
+        every = _where(campaign.rows, outlier_share=share)
+        for method in _values(every, 'method'):
+            colour, marker, width = _LOOKS[str(method)]
+            apart = np.sort(column(_where(every, method=method), 'apart_sigmas'))
+            axis.plot(
+                np.linspace(0, 100, len(apart)), np.maximum(apart, 1e-12),
+                color=colour, marker=marker, markersize=3, linewidth=width, label=method,
+            )  # fmt: skip
+        axis.axhline(SAME_SIGMAS, color='k', linewidth=1, linestyle=':', label='one minimum')
+        axis.set_yscale('log')
+        axis.set_title(f'outliers {100 * float(share):.0f} %', fontsize=10)
+        axis.set_xlabel('share of the trials (%)')
+        axis.set_ylabel('answers from near and far apart,\nworst parameter (sigmas)')
+        axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
 _FIGURES: Mapping[str, Callable[[Campaign], Figure]] = {
     'table1': _table1,
     'images': _images,
     'terms': _terms,
     'coverage': _coverage,
+    'start': _start,
 }

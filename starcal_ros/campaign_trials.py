@@ -27,6 +27,9 @@ Floats = NDArray[np.float64]
 
 CENTROID_SIGMA_PX = 0.1
 OUTLIER_REACH_PX = 20.0  # a misidentified star: anywhere in a square of this half side
+FAR_FOCAL = 0.2
+FAR_PRINCIPAL_POINT_PX = 100.0
+FAR_ALIGNMENT_RAD = math.radians(0.3)
 LEAST_TRACKER_ARCSEC = 1e-3  # what a calibration takes for a perfect star tracker
 
 _FREE = [PARAMETER_NAMES.index(name) for name in CalibrationOptions().estimate]
@@ -101,6 +104,29 @@ def draw_star_field(rng: np.random.Generator, images: int, stars: int) -> StarFi
         luck=rng.uniform(0.0, 1.0, (images, stars)),
         outlier_px=rng.uniform(-OUTLIER_REACH_PX, OUTLIER_REACH_PX, pixels.shape),
     )
+
+
+def far_prior(truth: CameraGeometry, rng: np.random.Generator) -> CameraGeometry:
+    """
+    A prior far off in a random direction.
+
+    The focal lengths are off by `FAR_FOCAL`, the principal point by `FAR_PRINCIPAL_POINT_PX` and
+    the alignment by `FAR_ALIGNMENT_RAD`; of distortion and skew it knows nothing.
+    """
+    fx, _, fy, cx, cy = truth.camera.parameters[:5]
+    longer = 1.0 + FAR_FOCAL * rng.choice([-1.0, 1.0])
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    pinhole = {
+        'fx': longer * fx,
+        'fy': longer * fy,
+        'cx': cx + FAR_PRINCIPAL_POINT_PX * math.cos(angle),
+        'cy': cy + FAR_PRINCIPAL_POINT_PX * math.sin(angle),
+    }
+    camera = truth.camera.replace(**{**dict.fromkeys(PARAMETER_NAMES, 0.0), **pinhole})
+    axis = rng.normal(size=3)
+    turn = Rotation.from_rotvec(FAR_ALIGNMENT_RAD * axis / np.linalg.norm(axis))
+    star_tracker_from_camera = Rotation.from_quat(truth.star_tracker_from_camera_xyzw) * turn
+    return CameraGeometry(camera, star_tracker_from_camera.as_quat())
 
 
 def observe(field: StarField, tracker_arcsec: float, outlier_share: float = 0.0) -> Ensemble:

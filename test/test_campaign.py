@@ -34,6 +34,7 @@ SMALL = {
     'images': {'trials': 2, 'images': (2, 5), 'stars': (30,)},
     'terms': {'trials': 2, 'images': (4,)},
     'coverage': {'trials': 4, 'images': (4,), 'stars': (20,), 'seed': 5},
+    'start': {'trials': 3},
 }
 each_study = pytest.mark.parametrize('study', SMALL)
 
@@ -194,6 +195,18 @@ def test_errors_are_as_large_as_the_covariance_says(method: str) -> None:
         assert float(row['to_bound']) == pytest.approx(1.0, abs=0.12)
         # The mean of 60 errors of one sigma: four of its own sigmas, for 11 of them.
         assert abs(float(row['worst_bias_sigmas'])) < 4 / np.sqrt(60)
+
+
+def test_a_prior_far_off_leads_to_the_same_minimum() -> None:
+    """Alignment 0.3 degrees, focal length 20 %, principal point 100 px off; 10 % outliers too."""
+    for row in here(small('start')).summary:
+        assert row['same_minimum'] == row['trials']
+        if row['outlier_share']:
+            assert int(row['outliers']) > 300
+        if row['method'] != 'single':
+            # Of outliers within 20 px, one in 4000 is within 3.5 sigma of 0.1 px by chance.
+            # `single` takes the star tracker's 20 arcsec for noise of 0.7 px: more stay in.
+            assert int(row['outliers_kept']) <= 3
 
 
 def test_unused_images_fit_better_the_more_are_used() -> None:
