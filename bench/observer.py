@@ -9,22 +9,16 @@ attitude of its own sky and a stamp that goes on.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-import contextlib
 import importlib.util
 import multiprocessing
-import os
 from pathlib import Path
-import signal
-import socket
 import statistics
 import struct
-import subprocess
-import sys
 import tempfile
 import time
 from typing import Any
 
+from bench import graph
 from bench.frames import paper_scenario, render_frame, write_set_up
 from bench.table import Table
 from starcal_ros.records import AttitudeSample, Image
@@ -67,36 +61,6 @@ def run(quick: bool) -> list[Table]:
     return [table]
 
 
-def _free_domain() -> int:
-    """A ROS domain in which nobody on this machine takes part."""
-    for domain in range(1 + os.getpid() % 100, 201):
-        with (
-            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
-            contextlib.suppress(OSError),
-        ):
-            # The first participant of a domain holds this port (RTPS 9.6.1.1).
-            probe.bind(('', 7410 + 250 * domain))
-            return domain
-    raise RuntimeError('no free ROS domain on this machine')
-
-
-@contextlib.contextmanager
-def _observer(params: Path) -> Iterator[int]:
-    """The node's process number; it is stopped at the end."""
-    arguments = ['-m', 'starcal_ros.nodes.star_observer', '--ros-args']
-    arguments += ['--params-file', str(params), '--log-level', 'error']
-    process = subprocess.Popen([sys.executable, *arguments], stdin=subprocess.DEVNULL)
-    try:
-        yield process.pid
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(START_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
 def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tuple[Any, ...]:
     """Send frames and collect observations; the cells of a row after the rate."""
     import rclpy
@@ -104,12 +68,15 @@ def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tupl
 
     from starcal.msg import StarObservations
 
-    os.environ['ROS_DOMAIN_ID'] = str(_free_domain())
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    graph.own_domain()
     arrived: dict[int, tuple[float, str, int]] = {}
     resident_mb: dict[int, float] = {}
 
-    with _observer(params) as number, rclpy.Context() as context:
+    with (
+        graph.running('star_observer', params, params.with_name('log')) as process,
+        rclpy.Context() as context,
+    ):
+        number = process.pid
         node = rclpy.create_node('bench', context=context)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
@@ -117,14 +84,14 @@ def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tupl
         def take(message: Any) -> None:
             time_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
             arrived[time_ns] = (time.monotonic(), message.refusal, len(message.catalog_id))
-            resident_mb[len(arrived)] = _resident_mb(number)
+            resident_mb[len(arrived)] = graph.resident_mb(number)
 
         node.create_subscription(StarObservations, 'observations', take, 1000)
         spawn = multiprocessing.get_context('spawn')
         receiver, sender = spawn.Pipe(duplex=False)
         publisher = spawn.Process(target=_publish, args=(frames, rate_hz, count, sender))
         publisher.start()
-        start_s, start_cpu_s = time.monotonic(), _processor_s(number)
+        start_s, start_cpu_s = time.monotonic(), graph.processor_s(number)
         deadline_s = start_s + 2 * START_S + count / rate_hz
         while not receiver.poll() and time.monotonic() < deadline_s:
             executor.spin_once(timeout_sec=0.02)
@@ -139,7 +106,7 @@ def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tupl
         publisher.join()
         if not arrived:
             raise RuntimeError('the star observer has not answered')
-        processor_ms = 1e3 * (_processor_s(number) - start_cpu_s) / len(arrived)
+        processor_ms = 1e3 * (graph.processor_s(number) - start_cpu_s) / len(arrived)
         executor.shutdown()
         node.destroy_node()
     late_ms = [1e3 * (arrived[t][0] - sent_s[t]) for t in sent_s if t in arrived]
@@ -203,14 +170,3 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
             images.publish(message)
         pipe.send(sent_s)
         time.sleep(2 * LATE_S)
-
-
-def _resident_mb(number: int) -> float:
-    pages = int(Path(f'/proc/{number}/statm').read_text().split()[1])
-    return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
-
-
-def _processor_s(number: int) -> float:
-    """User and system time of a process so far."""
-    fields = Path(f'/proc/{number}/stat').read_text().rpartition(')')[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')

@@ -140,6 +140,8 @@ class Calibrator(StarcalNode):
             return ERROR, f'kept in memory alone: {state.trouble}', numbers
         if in_force is not None and in_force.forced:
             return WARN, f'in force against the gate: {"; ".join(in_force.reasons)}', numbers
+        if self.count_publishers(self._calibration.topic_name) > 1:
+            return WARN, f'another publisher of {self._calibration.topic_name}', numbers
         if not last.success:
             return WARN, last.message, numbers
         return OK, 'collecting' if in_force is None else 'calibration in force', numbers

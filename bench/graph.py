@@ -1,0 +1,159 @@
+"""A ROS graph of its own for a bench: nodes as processes, a client, what a process uses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import contextlib
+import os
+from pathlib import Path
+import signal
+import socket
+import subprocess
+import sys
+import time
+from typing import Any
+
+START_S = 60.0  # a node imports and starts in 2 s; a busy machine makes that much of it
+
+
+def own_domain() -> None:
+    """Move this process and its children to a ROS domain in which nobody else takes part."""
+    os.environ['ROS_DOMAIN_ID'] = str(_free_domain())
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+
+def _free_domain() -> int:
+    """A ROS domain in which nobody on this machine takes part."""
+    for domain in range(1 + os.getpid() % 100, 201):
+        with (
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
+            contextlib.suppress(OSError),
+        ):
+            # The first participant of a domain holds this port (RTPS 9.6.1.1).
+            probe.bind(('', 7410 + 250 * domain))
+            return domain
+    raise RuntimeError('no free ROS domain on this machine')
+
+
+def start(
+    name: str, params: Path, log: Path, *values: str, node: str = '', **options: Any
+) -> subprocess.Popen[bytes]:
+    """A node process with a parameter file and further values, ``'name:=value'``."""
+    arguments = ['-m', f'starcal_ros.nodes.{name}', '--ros-args', '--params-file', str(params)]
+    arguments += [word for value in values for word in ('-p', value)]
+    arguments += ['-r', f'__node:={node or name}', '--log-level', 'warn']
+    with log.open('ab') as output:
+        return subprocess.Popen(
+            [sys.executable, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            **options,
+        )
+
+
+@contextlib.contextmanager
+def running(
+    name: str, params: Path, log: Path, *values: str, node: str = '', **options: Any
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A node process that is stopped at the end."""
+    process = start(name, params, log, *values, node=node, **options)
+    try:
+        yield process
+    finally:
+        stop(process)
+
+
+def stop(process: subprocess.Popen[bytes]) -> int:
+    """Exit status after SIGINT; kills the process when it does not listen."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(START_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+class Client:
+    """A bare node with its own context, spun while something is waited for."""
+
+    def __init__(self, name: str = 'bench') -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node(name, context=self.context)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+    def spin(self, seconds: float = 0.0) -> None:
+        """Take what has come, at most one thing, waiting so long for it."""
+        self._executor.spin_once(timeout_sec=seconds)
+
+    def until(
+        self, condition: Callable[[], object], what: str, timeout_s: float = START_S
+    ) -> None:
+        """Spin until a condition holds; RuntimeError where it does not within the time."""
+        if not self.holds(condition, timeout_s):
+            raise RuntimeError(f'{what}: not within {timeout_s:g} s')
+
+    def holds(self, condition: Callable[[], object], timeout_s: float = START_S) -> bool:
+        """Whether a condition comes to hold within a time."""
+        deadline_s = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > deadline_s:
+                return False
+            self.spin(0.02)
+        return True
+
+    def call(self, kind: Any, name: str, timeout_s: float = START_S, **fields: Any) -> Any:
+        """Answer of a service."""
+        client = self.node.create_client(kind, name)
+        try:
+            self.until(client.service_is_ready, name, timeout_s)
+            future = client.call_async(kind.Request(**fields))
+            self.until(future.done, name, timeout_s)
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def collect(self, kind: Any, topic: str, take: Callable[[Any], None], latched: bool) -> Any:
+        """Subscribe to a topic."""
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        qos = QoSProfile(depth=1 if latched else 5000, durability=durability)
+        return self.node.create_subscription(kind, topic, take, qos)
+
+    def publisher(self, kind: Any, topic: str, depth: int = 1000, latched: bool = False) -> Any:
+        """A publisher that somebody listens to already."""
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        qos = QoSProfile(depth=depth, durability=durability)
+        publisher = self.node.create_publisher(kind, topic, qos)
+        self.until(publisher.get_subscription_count, f'a listener of {topic}')
+        return publisher
+
+
+def resident_mb(number: int) -> float:
+    """Memory of a process."""
+    pages = int(Path(f'/proc/{number}/statm').read_text().split()[1])
+    return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
+
+
+def processor_s(number: int) -> float:
+    """User and system time of a process so far."""
+    fields = Path(f'/proc/{number}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
