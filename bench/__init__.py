@@ -3,5 +3,5 @@
 NAMES = ('solver', 'ensemble', 'measure', 'calibrate', 'observer', 'gate')
 """The benches, each a module with ``run(quick)`` that prints its tables and returns them."""
 
-LONG = ('accuracy', 'paper', 'faults', 'soak')
+LONG = ('accuracy', 'paper', 'faults', 'soak', 'transport')
 """Those that take some minutes: run when they are named."""
