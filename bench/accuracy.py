@@ -119,11 +119,18 @@ def scenario_of(case: Case, seed: int) -> Scenario:
         fitted = camera.replace(fx=fx * scale, fy=fy * scale, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
         return dataclasses.replace(geometry, camera=fitted)
 
+    # A longer lens of the same f-number gathers more light.
+    light = max(1.0, focal_px / base.prior.camera.parameters[0]) ** 2
+    detector = dataclasses.replace(
+        base.detector,
+        psf_sigma_px=case.psf_sigma_px,
+        zero_point_electrons=light * base.detector.zero_point_electrons,
+    )
     return dataclasses.replace(
         base,
         truth=lens(base.truth),
         prior=lens(base.prior),
-        detector=dataclasses.replace(base.detector, psf_sigma_px=case.psf_sigma_px),
+        detector=detector,
         star_tracker_sigma_arcsec=(case.tracker_arcsec,) * 3,
         start_ns=base.start_ns + seed * 4_001_000_000_000,
         cadence_s=_APART_S,

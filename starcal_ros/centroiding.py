@@ -8,9 +8,11 @@ PSF, pixel noise and saturation, is found from its own brighter stars where the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from starcal_ros.detection import (
     Background,
@@ -22,12 +24,22 @@ from starcal_ros.detection import (
 )
 from starcal_ros.instrument import Instrument, PsfWidth, uniform_width
 from starcal_ros.options import option
-from starcal_ros.psf import fit_psf, noise_sums, PixelNoise, PsfFit, stamp_radius_px
+from starcal_ros.psf import (
+    fit_psf,
+    light_in_stamps,
+    noise_sums,
+    PixelNoise,
+    PsfFit,
+    replace_rows,
+    stamp_radius_px,
+)
 
 Floats = NDArray[np.float64]
 
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitive than another
+_MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours
+_NEIGHBOUR_NOISE = 0.1  # of the noise of a pixel: less light of a neighbour changes nothing
 _BRIGHTEST = 60  # stars that show the level of saturation
 _MIN_PSF_SIGMA_PX = 0.45
 _MAX_PSF_SIGMA_PX = 4.0
@@ -105,7 +117,8 @@ class Centroids:
 
     ``xy_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``flux_dn``, ``snr`` (n,);
     ``refusal`` (n,) text: empty where the star is good, else a name of `STAR_REFUSALS`.
-    ``fit`` is None for moments; ``psf_sigma_px``, ``noise_dn`` (n,) are what it was made with.
+    ``fit`` is None for moments; ``psf_sigma_px``, ``noise_dn`` (n,) are what it was made with, and
+    the light of the stars ``modelled`` (n,) was taken from their neighbours.
     """
 
     xy_px: Floats
@@ -116,6 +129,7 @@ class Centroids:
     fit: PsfFit | None
     psf_sigma_px: Floats
     noise_dn: Floats
+    modelled: NDArray[np.bool_]
 
 
 def saturation_level(pixels: Pixels, options: CentroidOptions) -> float:
@@ -231,7 +245,8 @@ def measure_stars(
     """
     Centroids of the stars near predicted pixels (n, 2), by the method of the options.
 
-    Where the image does not tell its PSF width, the moment method is used.
+    The brighter of two neighbours is to come first.  Where the image does not tell its PSF width,
+    the moment method is used.
     """
     if options.centroid == 'psf' and model.psf is not None:
         return _measure_by_psf(pixels, predicted_px, model, model.psf, options)
@@ -263,6 +278,10 @@ def _measure_by_psf(
     noise_dn = sample_mesh(model.background.noise_mesh, shape, at_px)
     sigma_px = psf.at(at_px)
     fit = fit_psf(stamps, sigma_px, noise_dn, model.pixel_noise, model.saturation_dn)
+    saturated = np.count_nonzero(stamps >= model.saturation_dn, axis=(1, 2))
+    fit, modelled = _without_neighbours(
+        stamps, predicted_px, centre, fit, inside & (saturated == 0), sigma_px, noise_dn, model
+    )
     x, y, flux, _ = fit.parameters.T
     covariance = fit.covariance
     snr = fit.snr
@@ -272,7 +291,6 @@ def _measure_by_psf(
     misshapen = ((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1)
     # 81 pixels of normal noise pass 5 sigma once in 20,000 stars.
     misshapen |= fit.worst_pixel_sigma > 5.0
-    saturated = np.count_nonzero(stamps >= model.saturation_dn, axis=(1, 2))
     wandered = np.maximum(np.abs(x), np.abs(y)) > 1.5
     for bad, reason in (
         (saturated > options.max_saturated_pixels, 'saturated'),
@@ -292,7 +310,64 @@ def _measure_by_psf(
         fit=fit,
         psf_sigma_px=sigma_px,
         noise_dn=noise_dn,
+        modelled=modelled,
     )
+
+
+def _without_neighbours(
+    stamps: Floats,
+    predicted_px: Floats,
+    centre: NDArray[np.int64],
+    fit: PsfFit,
+    usable: NDArray[np.bool_],
+    sigma_px: Floats,
+    noise_dn: Floats,
+    model: ImageModel,
+) -> tuple[PsfFit, NDArray[np.bool_]]:
+    """
+    The fits once more, without the light of those neighbours that are measured themselves.
+
+    Also (n,) which stars those are.  Only stars with a neighbour in reach are fitted again, twice:
+    the second time with neighbours that were freed from their own.
+    """
+    n, width, _ = stamps.shape
+    in_place = np.abs(fit.parameters[:, :2]).max(axis=1) < 1.5
+    modelled = usable & (fit.snr > _MODELLED_SNR) & in_place
+    if n < 2:
+        return fit, modelled
+    # A star out of the stamp lights it with its wing.
+    reach_px = math.sqrt(2.0) * (width // 2) + 2.0 * float(sigma_px.max(initial=0.0))
+    pairs = cKDTree(centre).query_pairs(reach_px, output_type='ndarray')
+    apart_px = np.linalg.norm(predicted_px[pairs[:, 0]] - predicted_px[pairs[:, 1]], axis=1)
+    near = apart_px < max(3.0, 3.0 * float(sigma_px.max(initial=0.0)))
+    # Both would be fitted to the light of the brighter one, which comes first.
+    modelled[pairs[near].max(axis=1)] = False
+    star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    told = modelled[other]
+    star, other = star[told], other[told]
+    away_px = (centre[other] - centre[star]).astype(np.float64)
+    for _ in range(2):
+        at_px = away_px + fit.parameters[other, :2]
+        light = light_in_stamps(at_px, fit.parameters[other, 2], sigma_px[other], width)
+        lit = light.max(axis=1, initial=0.0) > _NEIGHBOUR_NOISE * noise_dn[star]
+        again, row = np.unique(star[lit], return_inverse=True)
+        if len(again) == 0:
+            break
+        neighbours = np.zeros((len(again), width * width))
+        np.add.at(neighbours, row, light[lit])
+        # The light is taken off, its photon noise stays.
+        noise = model.pixel_noise
+        noise2 = noise_dn[again, None] ** 2
+        noise2 = noise2 + neighbours / (noise.gain_e_per_dn * noise.background)
+        freed = fit_psf(
+            stamps[again] - neighbours.reshape(-1, width, width),
+            sigma_px[again],
+            np.sqrt(noise2),
+            model.pixel_noise,
+            model.saturation_dn,
+        )
+        fit = replace_rows(fit, again, freed)
+    return fit, modelled
 
 
 def _measure_by_moments(
@@ -367,4 +442,5 @@ def _measure_by_moments(
         fit=None,
         psf_sigma_px=np.zeros(n),
         noise_dn=noise_dn,
+        modelled=np.zeros(n, bool),
     )

@@ -52,6 +52,8 @@ _VOTERS = (
 )
 _PULL_UNCERTAINTY = 0.25  # of a neighbour's light: stars of unlike colour differ so from their V
 SPACE = SiteOptions()
+_MODELLED_UNCERTAINTY = 0.05  # of that of a star measured itself: wings that are no Gaussian's
+_NEAR_SIGMA, _MODELLED_NEAR_SIGMA = 5.0, 3.0  # a bright neighbour nearer than this swamps
 _ALONE_SIGMA = 0.1  # a star whose neighbours pull it by less tells the PSF
 _CHANCE = 1e-9  # greatest probability that a match is accepted by chance
 
@@ -346,14 +348,28 @@ def _fit_warp(
 
 
 def neighbour_pulls(
-    xy_px: Floats, magnitude: Floats, flux_dn: Floats, model: ImageModel
-) -> tuple[Floats, NDArray[np.bool_]]:
+    xy_px: Floats,
+    magnitude: Floats,
+    flux_dn: Floats,
+    model: ImageModel,
+    modelled: NDArray[np.bool_] | None = None,
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """
-    How far (n, 2) the neighbours of each star pull its centroid, and (n,) whether one swamps it.
+    How the neighbours of each star pull its centroid.
 
     ``flux_dn`` (n,) is measured, with what of a neighbour falls into it; the neighbour's follows
     from the difference of the magnitudes.  Where the two are too close to be told apart, the pull
-    is from the star to the centre of their light.
+    is from the star to the centre of their light.  The light of stars that are ``modelled`` (n,)
+    is taken off already.
+
+    Returns
+    -------
+    pull_px : (n, 2)
+        By those that are not modelled.
+    uncertain_px : (n, 2)
+        What the pull of all neighbours may be wrong by once it is taken off.
+    swamped : (n,)
+        Whether a neighbour is too near and too bright for that.
     """
     sigma_px = model.psf_sigma_px or 1.0
     reach_px = stamp_radius_px(sigma_px) * math.sqrt(2.0) + 2.0 * sigma_px
@@ -363,9 +379,9 @@ def neighbour_pulls(
     flux = np.maximum(flux_dn[star], 1.0)
     offset_px = xy_px[other] - xy_px[star]
     distance_px = np.linalg.norm(offset_px, axis=1)
+    known = np.zeros(len(star), bool) if modelled is None else modelled[other]
     # What two Gaussians have in common: all the light of one that stands behind the other.
-    within = np.exp(-((0.5 * distance_px / sigma_px) ** 2))
-    total_px = np.zeros_like(xy_px)
+    within = np.where(known, 0.0, np.exp(-((0.5 * distance_px / sigma_px) ** 2)))
     pull_px = neighbour_pull_px(
         flux,
         offset_px,
@@ -374,14 +390,17 @@ def neighbour_pulls(
         model.background.noise_dn,
         model.pixel_noise,
     )
-    np.add.at(total_px, star, pull_px)
+    total_px, uncertain_px = np.zeros_like(xy_px), np.zeros_like(xy_px)
+    np.add.at(total_px, star[~known], pull_px[~known])
+    part = np.where(known, _MODELLED_UNCERTAINTY, _PULL_UNCERTAINTY)
+    np.add.at(uncertain_px, star, part[:, None] * pull_px)
     # A neighbour half as bright takes part of the window for itself: no small pull any more.  Nor
     # is the centre of a double of like stars used: their orbits, which no catalog of places has,
     # move it by arcseconds (zeta Herculis).
-    near = distance_px < 5.0 * sigma_px
+    near = distance_px < np.where(known, _MODELLED_NEAR_SIGMA, _NEAR_SIGMA) * sigma_px
     swamped = np.zeros(len(xy_px), bool)
     swamped[star[near & (ratio > 0.5)]] = True
-    return total_px, swamped
+    return total_px, uncertain_px, swamped
 
 
 def unlisted_pull_px(magnitude: Floats, faintest: float, px_per_rad: float) -> Floats:
@@ -422,8 +441,9 @@ def _separate(
     1-sigma per axis of the pull of companions that are not in the catalog.  Also says (n,) which
     stars stand alone.
     """
-    pull_px, swamped = neighbour_pulls(predicted_px, magnitude, centroids.flux_dn, model)
-    uncertain_px = _PULL_UNCERTAINTY * pull_px
+    pull_px, uncertain_px, swamped = neighbour_pulls(
+        predicted_px, magnitude, centroids.flux_dn, model, centroids.modelled
+    )
     sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
     size_px = np.sqrt((uncertain_px**2).sum(axis=1) + 2.0 * unlisted_px**2)
     beyond = size_px > options.max_blend_sigma * sigma_px

@@ -80,6 +80,16 @@ def select(fit: PsfFit, stars: NDArray[np.intp] | NDArray[np.bool_]) -> PsfFit:
     return PsfFit(**{field.name: getattr(fit, field.name)[stars] for field in fields(fit)})
 
 
+def replace_rows(fit: PsfFit, stars: NDArray[np.intp], by: PsfFit) -> PsfFit:
+    """Return the fits with those of some stars, by row number, replaced."""
+    changed = {}
+    for field in fields(fit):
+        column = getattr(fit, field.name).copy()
+        column[stars] = getattr(by, field.name)
+        changed[field.name] = column
+    return PsfFit(**changed)
+
+
 def stamp_radius_px(psf_sigma_px: float) -> int:
     """Half width of the fitting window: beyond 3.5 sigma lies under 0.3 % of a star's light."""
     return int(np.clip(np.ceil(3.5 * psf_sigma_px), 3, 12))
@@ -101,8 +111,8 @@ def fit_psf(
         Pixel values, DN; the star within a pixel or so of the centre.
     sigma_px : float or (n,)
         Width of the PSF, at each star.
-    noise_dn : (n,)
-        Background noise at each star.
+    noise_dn : (n,) or (n, w * w)
+        Noise at each star, or in each pixel, without the star's own light.
     pixel_noise : PixelNoise
         How the noise grows with signal.
     saturation_dn : float
@@ -119,7 +129,7 @@ def fit_psf(
     data = stamps.reshape(n, w * w)
     valid = data < saturation_dn
     parameters = _start(stamps, sigma_px)
-    noise2 = noise_dn[:, None] ** 2
+    noise2 = (noise_dn[:, None] if noise_dn.ndim == 1 else noise_dn) ** 2
     active = np.arange(n)
     for _ in range(_FIT_STEPS):
         if len(active) == 0:
@@ -193,6 +203,19 @@ def _start(stamps: Floats, sigma_px: Floats) -> Floats:
     y = np.clip((along_y[:, 2] - along_y[:, 0]) / total * share / slope, -0.7, 0.7)
     flux = core.sum(axis=(1, 2)) / share**2
     return np.stack([x, y, flux, background], axis=-1)
+
+
+def light_in_stamps(place_px: Floats, flux_dn: Floats, sigma_px: Floats, width: int) -> Floats:
+    """Light (k, width^2) in stamps of stars at (k, 2) from their middles, in or out of them."""
+    count = len(flux_dn)
+    value, _, _ = _profile(
+        np.concatenate([place_px[:, 0], place_px[:, 1]]),
+        np.concatenate([sigma_px, sigma_px]),
+        width,
+        False,
+    )
+    light = value[count:, :, None] * (flux_dn[:, None] * value[:count])[:, None, :]
+    return np.asarray(light.reshape(count, width * width))
 
 
 def neighbour_pull_px(
