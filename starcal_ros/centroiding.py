@@ -39,7 +39,7 @@ Floats = NDArray[np.float64]
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitive than another
 _MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours
-_NEIGHBOUR_NOISE = 0.1  # of the noise of a pixel: less light of a neighbour changes nothing
+_NEIGHBOUR_NOISE = 0.2  # of the noise of a pixel: less light of a neighbour changes nothing
 _BRIGHTEST = 60  # stars that show the level of saturation
 _MIN_PSF_SIGMA_PX = 0.45
 _MAX_PSF_SIGMA_PX = 4.0
@@ -365,6 +365,7 @@ def _without_neighbours(
             np.sqrt(noise2),
             model.pixel_noise,
             model.saturation_dn,
+            fit.parameters[again],
         )
         fit = replace_rows(fit, again, freed)
     return fit, modelled

@@ -101,6 +101,7 @@ def fit_psf(
     noise_dn: Floats,
     pixel_noise: PixelNoise,
     saturation_dn: float = np.inf,
+    start: Floats | None = None,
 ) -> PsfFit:
     """
     Weighted least-squares fit of the pixel-integrated Gaussian to every stamp at once.
@@ -117,6 +118,8 @@ def fit_psf(
         How the noise grows with signal.
     saturation_dn : float
         Pixels at or above this say nothing of the star and take no part.
+    start : (n, 4), optional
+        Parameters near which the fit ends.
 
     Notes
     -----
@@ -128,7 +131,7 @@ def fit_psf(
     sigma_px = np.broadcast_to(np.asarray(sigma_px, np.float64), (n,))
     data = stamps.reshape(n, w * w)
     valid = data < saturation_dn
-    parameters = _start(stamps, sigma_px)
+    parameters = _start(stamps, sigma_px) if start is None else start.copy()
     noise2 = (noise_dn[:, None] if noise_dn.ndim == 1 else noise_dn) ** 2
     active = np.arange(n)
     for _ in range(_FIT_STEPS):
