@@ -43,6 +43,7 @@ STAR_MARKS: Mapping[str, Mark] = {
     'saturated': Mark(cv2.MARKER_TRIANGLE_UP, (0, 230, 255)),
     'too_few_pixels': Mark(cv2.MARKER_TRIANGLE_UP, (190, 190, 190)),
     'elongated': Mark(cv2.MARKER_TILTED_CROSS, (0, 150, 255)),
+    'hot_pixel': Mark(cv2.MARKER_CROSS, (80, 80, 255)),
     'faint': Mark(cv2.MARKER_DIAMOND, (150, 150, 150), 6.0),  # the most by far
     'ambiguous': Mark(cv2.MARKER_STAR, (80, 80, 255)),
 }
@@ -63,7 +64,7 @@ def annotate(
     ``legend`` there are marks only: a picture that will be shrunk has no room for words.
     """
     picture = np.asarray(cv2.cvtColor(stretch(image.pixels), cv2.COLOR_GRAY2BGR), np.uint8)
-    size = max(image.pixels.shape) / 1000.0
+    size = max(max(image.pixels.shape) / 1000.0, 0.6)  # smaller letters cannot be read
     width = max(1, round(size))
     for reason, places in observations.refused_places().items():
         for uv in places:

@@ -38,6 +38,7 @@ from starcal_ros.detection import (
     Sources,
 )
 from starcal_ros.errors import ImageRefused
+from starcal_ros.fixed_pattern import refuse_on_hot_pixels
 from starcal_ros.instrument import Instrument, learn, MeasuredStars
 from starcal_ros.options import option
 from starcal_ros.psf import neighbour_pull_px, stamp_radius_px
@@ -54,6 +55,7 @@ _PULL_UNCERTAINTY = 0.25  # of a neighbour's light: stars of unlike colour diffe
 SPACE = SiteOptions()
 _MODELLED_UNCERTAINTY = 0.05  # of that of a star measured itself: wings that are no Gaussian's
 _NEAR_SIGMA, _MODELLED_NEAR_SIGMA = 5.0, 3.0  # a bright neighbour nearer than this swamps
+NO_PIXELS = np.empty(0, np.int64)
 _ALONE_SIGMA = 0.1  # a star whose neighbours pull it by less tells the PSF
 _CHANCE = 1e-9  # greatest probability that a match is accepted by chance
 
@@ -462,13 +464,18 @@ def _separate(
 
 @dataclass(frozen=True)
 class Shot:
-    """One image with what is known of it: where it was taken, and what to measure it with."""
+    """
+    One image with what is known of it: where it was taken, and what to measure it with.
+
+    ``hot_pixels`` (k,) are the numbers of pixels, row by row from 0, that spoil a star.
+    """
 
     image: Image
     icrf_from_star_tracker_xyzw: Floats
     attitude_gap_s: float
     velocity_m_s: Floats | None = None
     site: SiteOptions = SPACE
+    hot_pixels: NDArray[np.int64] = dataclasses.field(default_factory=lambda: NO_PIXELS)
 
 
 def observe_stars(
@@ -544,7 +551,14 @@ def measure_predicted(
         unlisted, unlisted_pull_px(magnitude, faintest, prediction.px_per_rad), 0.0
     )
     centroids, alone = _separate(predicted_px, magnitude, unlisted_px, centroids, model, options)
-    refusal = _refuse_displaced(predicted_px, centroids, width)
+    refusal = refuse_on_hot_pixels(
+        predicted_px,
+        _refuse_displaced(predicted_px, centroids, width),
+        shot.hot_pixels,
+        width,
+        model.psf_sigma_px,
+        stamp_radius_px(model.psf_sigma_px or 1.0),
+    )
     good = refusal == ''
     left_out = ~good
     names, code, counts = np.unique(refusal[left_out], return_inverse=True, return_counts=True)

@@ -15,6 +15,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from starcal_ros import bag, products
 from starcal_ros.acceptance import Candidate, GateOptions, judge
@@ -29,9 +30,16 @@ from starcal_ros.calibration import (
 )
 from starcal_ros.camera import zero_skew_fit
 from starcal_ros.catalog import load_catalog, StarCatalog
-from starcal_ros.centroiding import CentroidOptions
+from starcal_ros.centroiding import CentroidOptions, saturation_level
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused, OptionError
+from starcal_ros.fixed_pattern import (
+    FixedPatternOptions,
+    hot_in_dark,
+    HotPixels,
+    learn_hot_pixels,
+    NO_HOT_PIXELS,
+)
 from starcal_ros.identification import IdentificationOptions, observe_stars, Shot, tracked
 from starcal_ros.observability import (
     correlation,
@@ -55,6 +63,7 @@ from starcal_ros.records import (
 )
 from starcal_ros.removal import removal_study
 from starcal_ros.residuals import Residuals, residuals_of
+from starcal_ros.screening import Fingerprint, fingerprint, sample_rows, screen, ScreeningOptions
 from starcal_ros.tracking import follow, Followed, following
 
 Floats = NDArray[np.float64]
@@ -98,12 +107,18 @@ class Setup:
     prior: CameraGeometry
     catalog: StarCatalog
     dark: NDArray[np.uint8] | NDArray[np.uint16] | None
+    dark_pedestal_dn: int = 0
+    hot: HotPixels = NO_HOT_PIXELS
+    screening: ScreeningOptions = dataclasses.field(default_factory=ScreeningOptions)
+    fixed_pattern: FixedPatternOptions = dataclasses.field(default_factory=FixedPatternOptions)
 
 
 OPTION_CLASSES = (
     SetupOptions,
     AttitudeOptions,
     SiteOptions,
+    ScreeningOptions,
+    FixedPatternOptions,
     CentroidOptions,
     IdentificationOptions,
     CalibrationOptions,
@@ -142,17 +157,23 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
     calibration = from_mapping(CalibrationOptions, values)
     check_options(calibration)
     path = Path(frames.catalog) if frames.catalog else None
+    fixed_pattern = from_mapping(FixedPatternOptions, values)
+    dark = _read_dark(frames.dark_frame, camera.width, camera.height)
     return Setup(
         frames=frames,
         attitude=from_mapping(AttitudeOptions, values),
         site=from_mapping(SiteOptions, values),
+        screening=from_mapping(ScreeningOptions, values),
+        fixed_pattern=fixed_pattern,
         centroid=from_mapping(CentroidOptions, values),
         identification=identification,
         calibration=calibration,
         gate=from_mapping(GateOptions, values),
         prior=CameraGeometry(camera, quaternion / norm),
         catalog=load_catalog(path, identification.magnitude_limit),
-        dark=_read_dark(frames.dark_frame, camera.width, camera.height),
+        dark=dark,
+        dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
+        hot=hot_in_dark(dark, fixed_pattern),
     )
 
 
@@ -188,20 +209,22 @@ def observe(
     return observe_next(image, attitudes, setup, Track(geometry), velocity_m_s)[0]
 
 
-def _without_dark(image: Image, dark: NDArray[np.uint8] | NDArray[np.uint16] | None) -> Image:
+def _without_dark(image: Image, setup: Setup) -> Image:
     """The image less the dark frame, kept positive by the dark frame's own median."""
+    pixels, dark = image.pixels, setup.dark
     if dark is None:
         return image
-    if dark.dtype != image.pixels.dtype:
-        raise ImageRefused(
-            'bad_encoding', f'{image.pixels.dtype} image, the dark frame is {dark.dtype}'
-        )
+    if dark.dtype != pixels.dtype:
+        raise ImageRefused('bad_encoding', f'{pixels.dtype} image, the dark frame is {dark.dtype}')
     # Noise below the dark level must not be cut off at zero: it would bias the background.
-    pedestal = int(np.median(dark))
-    level = image.pixels.astype(np.int32) - dark + pedestal
-    if image.pixels.dtype == np.uint8:
-        return Image(image.time_ns, np.clip(level, 0, 255).astype(np.uint8))
-    return Image(image.time_ns, np.clip(level, 0, 65535).astype(np.uint16))
+    level = pixels.astype(np.int32) - dark + setup.dark_pedestal_dn
+    # What is saturated stays at the end of the range, where it is known as such.
+    peak = int(pixels.max())
+    level[pixels >= (saturation_level(pixels, setup.centroid) or np.inf)] = peak
+    level = np.clip(level, 0, peak)
+    if pixels.dtype == np.uint8:
+        return Image(image.time_ns, level.astype(np.uint8))
+    return Image(image.time_ns, level.astype(np.uint16))
 
 
 _IMAGES_OF_A_RESTART = 3  # two images may have changed places on their way; three do not
@@ -215,7 +238,8 @@ class Track:
     ``geometry`` is what an image is searched with; ``latest_ns`` stamps the last one used.
     ``followed`` is what the images so far have shown, with which the next is measured without a
     search; None before the first.  ``behind`` images in a row, the last of them at ``behind_ns``,
-    were stamped before the last one used.
+    were stamped before the last one used.  ``seen`` is the last frame of all, used or not,
+    which a stuck camera shows again; ``hot`` the hot pixels found so far.
     """
 
     geometry: CameraGeometry
@@ -223,6 +247,8 @@ class Track:
     followed: Followed | None = None
     behind: int = 0
     behind_ns: int = 0
+    seen: Fingerprint | None = None
+    hot: HotPixels | None = None
 
 
 def observe_next(
@@ -239,12 +265,14 @@ def observe_next(
     A sequence starts with the prior, or with the calibration in force.  An image stamped at or
     before one that was used is refused; a refused image moves nothing, so that one wrong stamp
     costs one image.  The third such image in a row, in order among themselves, is believed: a
-    clock was set back, or a recording plays again.  The sequence starts anew with it.
+    clock was set back, or a recording plays again.  The sequence starts anew with it.  The pixels
+    of the image before are refused, used or not, when they come again under another stamp.
     """
     track = _after_order(track, image.time_ns)
     height, width = image.pixels.shape
     camera = track.geometry.camera
     attitude: dict[str, object] = {}
+    remembered = track
     try:
         check_order(image, track.latest_ns)
         if (width, height) != (camera.width, camera.height):
@@ -252,20 +280,26 @@ def observe_next(
                 'wrong_size',
                 f'{width} x {height}, the camera has {camera.width} x {camera.height}',
             )
+        sample = sample_rows(image.pixels)
+        seen = fingerprint(image, sample)
+        remembered = dataclasses.replace(track, seen=seen)
         quaternion, gap_s = attitudes.at(image.time_ns, setup.attitude.max_attitude_gap_s)
         attitude = {
             'icrf_from_star_tracker_xyzw': quaternion,
             'attitude_gap_s': gap_s,
             'catalog_digest': setup.catalog.digest,
         }
-        shot = Shot(_without_dark(image, setup.dark), quaternion, gap_s, velocity_m_s, setup.site)
-        observations, after = _stars(shot, setup, track)
+        saturation_dn = setup.centroid.saturation_dn
+        screen(sample, seen, track.seen, saturation_dn, setup.dark, setup.screening)
+        hot = (track.hot or setup.hot).index
+        shot = Shot(_without_dark(image, setup), quaternion, gap_s, velocity_m_s, setup.site, hot)
+        observations, after = _stars(shot, setup, remembered)
     except ImageRefused as refused:
         observations, after = (
             refused_image(
                 image.time_ns, width, height, refused.reason, refused.detail, **attitude
             ),
-            track,
+            remembered,
         )
     return dataclasses.replace(observations, temperature_degc=temperature_degc), after
 
@@ -277,7 +311,7 @@ def _after_order(track: Track, time_ns: int) -> Track:
     behind = track.behind + 1 if track.behind and time_ns > track.behind_ns else 1
     if behind < _IMAGES_OF_A_RESTART:
         return dataclasses.replace(track, behind=behind, behind_ns=time_ns)
-    return Track(track.geometry)
+    return Track(track.geometry, hot=track.hot)
 
 
 def _stars(shot: Shot, setup: Setup, track: Track) -> tuple[StarObservations, Track]:
@@ -293,7 +327,10 @@ def _stars(shot: Shot, setup: Setup, track: Track) -> tuple[StarObservations, Tr
                 track.geometry,
                 star_tracker_from_camera_xyzw=followed.geometry.star_tracker_from_camera_xyzw,
             )
-            return observations, Track(geometry, time_ns, followed)
+            after = dataclasses.replace(
+                track, geometry=geometry, latest_ns=time_ns, followed=followed
+            )
+            return observations, _with_hot_pixels(after, shot, observations, setup)
         except ImageRefused:
             pass  # the search says what is wrong with the image
     observations, instrument = observe_stars(
@@ -302,7 +339,30 @@ def _stars(shot: Shot, setup: Setup, track: Track) -> tuple[StarObservations, Tr
     if observations.refusal:
         return observations, track
     geometry = tracked(track.geometry, observations)
-    return observations, Track(geometry, time_ns, following(geometry, observations, instrument))
+    after = dataclasses.replace(
+        track,
+        geometry=geometry,
+        latest_ns=time_ns,
+        followed=following(geometry, observations, instrument),
+    )
+    return observations, _with_hot_pixels(after, shot, observations, setup)
+
+
+def _with_hot_pixels(
+    track: Track, shot: Shot, observations: StarObservations, setup: Setup
+) -> Track:
+    """The track with the hot pixels that an image shows, which is aligned as the track says."""
+    icrf_from_star_tracker = Rotation.from_quat(shot.icrf_from_star_tracker_xyzw)
+    hot = learn_hot_pixels(
+        track.hot or setup.hot,
+        shot.image.pixels,
+        observations.background_dn,
+        observations.noise_dn,
+        icrf_from_star_tracker * Rotation.from_quat(track.geometry.star_tracker_from_camera_xyzw),
+        float(track.geometry.camera.parameters[0]),
+        setup.fixed_pattern,
+    )
+    return dataclasses.replace(track, hot=hot)
 
 
 def check_order(image: Image, latest_ns: int | None) -> None:

@@ -264,7 +264,7 @@ def test_bags_without_a_usable_image(run: Run, tmp_path: Path) -> None:
     blank = np.full((512, 640), 33, np.uint16)
     for pixels, attitudes, reason in (
         (blank, False, 'no_attitude'),
-        (blank, True, 'no_stars'),
+        (blank, True, 'blank'),
         (blank[:100], True, 'wrong_size'),
     ):
         bag = tmp_path / f'{reason}.mcap'

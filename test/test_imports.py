@@ -23,6 +23,8 @@ LADDER = [
     'catalog',
     'astrometry',
     'messages',
+    'screening',
+    'fixed_pattern',
     'detection',
     'psf',
     'instrument',

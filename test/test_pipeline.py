@@ -249,8 +249,10 @@ def test_an_image_without_attitude_is_refused(setup: pipeline.Setup) -> None:
 
 
 def test_an_image_that_nothing_explains_keeps_its_attitude(setup: pipeline.Setup) -> None:
-    dark = Image(image().time_ns, np.full_like(image().pixels, 40))
-    found = pipeline.observe(dark, attitudes(), setup, setup.prior)
+    noise = np.random.default_rng(5).normal(40.0, 3.0, image().pixels.shape)
+    found = pipeline.observe(
+        Image(image().time_ns, noise.astype(np.uint16)), attitudes(), setup, setup.prior
+    )
     assert found.refusal == 'no_stars'
     assert found.attitude_gap_s == 0.5
     assert found.catalog_digest == setup.catalog.digest
@@ -296,7 +298,7 @@ def test_a_recording_that_plays_twice_counts_once(setup: pipeline.Setup) -> None
 
 def test_a_refused_image_does_not_put_those_after_it_out_of_order(setup: pipeline.Setup) -> None:
     track = pipeline.Track(setup.prior)
-    future = dataclasses.replace(image(), time_ns=image().time_ns + 10**15)
+    future = dataclasses.replace(image(2), time_ns=image().time_ns + 10**15)
     refused, track = pipeline.observe_next(future, attitudes(), setup, track)
     assert refused.refusal == 'no_attitude'
     found, track = pipeline.observe_next(image(), attitudes(), setup, track)
@@ -328,7 +330,8 @@ def test_a_star_tracker_that_jumped_and_came_back(setup: pipeline.Setup, jump_de
         lengths.append(len(found))
         seen.append(found.refusal)
         if found.refusal:
-            assert track is before
+            assert track.geometry is before.geometry and track.followed is before.followed
+            assert track.latest_ns == before.latest_ns
     # Beyond the search the jump is refused, within it the stars are still the right ones.
     assert seen == ['', '', '' if jump_deg < 1.5 else 'no_match', '', '']
     used = [length for length, refusal in zip(lengths, seen, strict=True) if not refusal]
@@ -600,3 +603,75 @@ def test_from_pixels_to_a_calibration_that_is_true(setup: pipeline.Setup) -> Non
     assert np.abs(error / calibration.sigma[free]).max() < 4.5
     assert calibration.residual_rms_px < 0.25
     assert Detector().psf_sigma_px == pytest.approx(collected.images[0].psf_sigma_px, rel=0.02)
+
+
+def test_a_frame_that_is_shown_again_is_refused_once_its_stamp_is_new(
+    setup: pipeline.Setup,
+) -> None:
+    held = attitudes(1)
+    for sample in attitude_samples(SCENARIO, 2):
+        held.add(sample.time_ns, sample)
+    first, track = pipeline.observe_next(image(1), held, setup, pipeline.Track(setup.prior))
+    stuck = Image(image(2).time_ns, image(1).pixels)
+    again, track = pipeline.observe_next(stuck, held, setup, track)
+    assert (first.refusal, again.refusal) == ('', 'frozen')
+    assert again.attitude_gap_s == 0.5
+    next_one, _ = pipeline.observe_next(image(2), held, setup, track)
+    assert next_one.refusal == ''
+
+
+def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(setup: pipeline.Setup) -> None:
+    """One is put under a star of the third image: bright or dim, the star is left out for it."""
+    track = pipeline.Track(setup.prior)
+    held = AttitudeHistory()
+    for index in range(1, 4):
+        for sample in attitude_samples(SCENARIO, index):
+            held.add(sample.time_ns, sample)
+    plain = pipeline.observe(image(3), held, setup, setup.prior)
+    star = np.argsort(plain.snr)[len(plain) // 2]
+    u, v = np.rint(plain.measured_px[star] + [1.0, 0.0]).astype(int)
+    for index in (1, 2, 3):
+        pixels = image(index).pixels.copy()
+        # 15 sigma, one pixel off the centre of a star, pull it by several of its own sigma.
+        pixels[v, u] += round(15.0 * plain.noise_dn)
+        found, track = pipeline.observe_next(
+            dataclasses.replace(image(index), pixels=pixels), held, setup, track
+        )
+        assert found.refusal == ''
+    assert plain.catalog_id[star] not in found.catalog_id
+    reason = found.refused_reason[found.refused_catalog_id == plain.catalog_id[star]]
+    assert [list(found.refused_stars)[code] for code in reason] == ['hot_pixel']
+
+
+def test_hot_pixels_of_the_dark_frame_are_known_from_the_first_image(
+    camera_yaml: Path, tmp_path: Path, setup: pipeline.Setup
+) -> None:
+    plain = pipeline.observe(image(), attitudes(), setup, setup.prior)
+    u, v = np.rint(plain.measured_px[0]).astype(int)
+    dark = np.full(image().pixels.shape, 32, np.uint16)
+    dark[v, u] = 60
+    cv2.imwrite(str(tmp_path / 'dark.png'), dark)
+    made = pipeline.load_setup(values(camera_yaml, dark_frame=str(tmp_path / 'dark.png')))
+    found = pipeline.observe(image(), attitudes(), made, made.prior)
+    assert found.refused_stars['hot_pixel'] == 1
+    assert plain.catalog_id[0] not in found.catalog_id
+
+
+def test_a_saturated_star_is_known_as_such_under_a_dark_frame(
+    camera_yaml: Path, tmp_path: Path
+) -> None:
+    """What the dark frame takes away must not hide that the converter was at its end."""
+    dark = np.random.default_rng(4).normal(32.0, 2.0, image().pixels.shape).astype(np.uint16)
+    made = pipeline.load_setup(
+        values(camera_yaml, dark_frame=write_png(tmp_path / 'dark.png', dark))
+    )
+    pixels = image().pixels.copy()
+    plain = pipeline.observe(image(), attitudes(), made, made.prior)
+    u, v = np.rint(plain.measured_px[plain.snr.argmax()]).astype(int)
+    pixels[v - 1 : v + 2, u - 1 : u + 2] = 4095
+    found = pipeline.observe(
+        dataclasses.replace(image(), pixels=pixels), attitudes(), made, made.prior
+    )
+    brightest = plain.catalog_id[plain.snr.argmax()]
+    reason = found.refused_reason[found.refused_catalog_id == brightest]
+    assert [list(found.refused_stars)[code] for code in reason] == ['saturated']

@@ -1,0 +1,154 @@
+"""
+Hot pixels: from a dark frame, and learnt from images as the stars move over the detector.
+
+A single lit pixel that is lit again after the sky has moved on belongs to the detector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.options import option
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+_SCANNED_PX = 1 << 21  # of one image, in 0.3 ms; larger images are scanned in turns
+_MOVED_PX = 5.0  # the light of a star that has moved so far has left its pixels
+_SPILT = 0.2  # mean of the four next pixels over the peak: 0.24 for a star of 0.45 px
+_CORE_SIGMAS = 2.0
+_MOST = 100_000  # a detector with more has another fault, and the list stays small
+_MAD_TO_SIGMA = 1.4826  # of a normal distribution
+
+
+@dataclass(frozen=True)
+class FixedPatternOptions:
+    """What counts as a hot pixel."""
+
+    hot_pixel_sigma: float = option(
+        10.0,
+        'how far above the background a single pixel must stand, in pixel noise, to be hot: in '
+        'the dark frame, or at the same place in two images between which the stars have moved',
+        low=3.0,
+        high=10000.0,
+    )
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Single lit pixels of one part of the detector, sorted, and where the camera looked."""
+
+    lit: Indices
+    icrf_from_camera: Rotation
+
+
+@dataclass(frozen=True)
+class HotPixels:
+    """
+    What is known of a detector's hot pixels.
+
+    ``index`` (n,) are their numbers, row by row from 0, sorted; ``strips`` the parts of the
+    detector as they were last seen, and ``turn`` which of them is to be looked at next.
+    """
+
+    index: Indices
+    strips: tuple[Strip | None, ...] = ()
+    turn: int = 0
+
+
+NO_HOT_PIXELS = HotPixels(np.empty(0, np.int64))
+
+
+def hot_in_dark(dark: Pixels | None, options: FixedPatternOptions) -> HotPixels:
+    """Hot pixels of a dark frame: those far above its median, by the spread of all its pixels."""
+    if dark is None:
+        return NO_HOT_PIXELS
+    level = float(np.median(dark))
+    spread = _MAD_TO_SIGMA * float(np.median(np.abs(dark[::4, ::4] - level)))
+    limit = level + options.hot_pixel_sigma * max(spread, math.sqrt(1.0 / 12.0))
+    return HotPixels(np.flatnonzero(dark > limit)[:_MOST])
+
+
+def learn_hot_pixels(
+    known: HotPixels,
+    pixels: Pixels,
+    background_dn: float,
+    noise_dn: float,
+    icrf_from_camera: Rotation,
+    focal_px: float,
+    options: FixedPatternOptions,
+) -> HotPixels:
+    """
+    What is known after one more image, of which one strip is looked at.
+
+    ``pixels`` (height, width) are without the dark frame.  ``icrf_from_camera`` says where the
+    camera looked: a strip tells once that has moved since it was last seen.
+    """
+    height = pixels.shape[0]
+    count = -(-pixels.size // _SCANNED_PX)
+    strips = known.strips or (None,) * count
+    before = strips[known.turn]
+    turn = (known.turn + 1) % count
+    if before is not None:
+        moved_px = (before.icrf_from_camera.inv() * icrf_from_camera).magnitude() * focal_px
+        if moved_px < _MOVED_PX:
+            return HotPixels(known.index, strips, turn)
+    rows = (known.turn * height // count, (known.turn + 1) * height // count)
+    lit = _single_lit(pixels, rows, background_dn, options.hot_pixel_sigma * noise_dn)
+    index = known.index
+    if before is not None:
+        again = np.intersect1d(before.lit, lit, assume_unique=True)
+        index = np.union1d(index, again)[:_MOST]
+    seen = Strip(lit, icrf_from_camera)
+    return HotPixels(index, (*strips[: known.turn], seen, *strips[known.turn + 1 :]), turn)
+
+
+def _single_lit(
+    pixels: Pixels, rows: tuple[int, int], background_dn: float, threshold_dn: float
+) -> Indices:
+    """Numbers of the pixels of some rows that are lit while the four next to them are not."""
+    height, width = pixels.shape
+    lit = np.flatnonzero(pixels[rows[0] : rows[1]] > background_dn + threshold_dn)
+    v, u = np.divmod(lit + rows[0] * width, width)
+    inner = (u >= 1) & (u < width - 1) & (v >= 1) & (v < height - 1)
+    v, u = v[inner], u[inner]
+    peak = pixels[v, u] - background_dn
+    beside = [pixels[v + b, u + a] for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    spilt = np.mean(beside, axis=0) - background_dn
+    single = spilt < _SPILT * peak
+    return np.asarray((v * width + u)[single][:_MOST], np.int64)
+
+
+def refuse_on_hot_pixels(
+    xy_px: Floats,
+    refusal: NDArray[np.str_],
+    hot: Indices,
+    width: int,
+    psf_sigma_px: float,
+    window_px: int,
+) -> NDArray[np.str_]:
+    """
+    Refusals (n,) of stars at (n, 2), with ``hot_pixel`` where one is the cause.
+
+    A hot pixel in the core, within two sigma, spoils any star.  One elsewhere in the window, half
+    ``window_px`` wide, is the cause where the star was refused for its shape.
+    """
+    if len(hot) == 0:
+        return refusal
+    v, u = np.divmod(hot, width)
+    tree = cKDTree(np.stack([u, v], axis=-1))
+    asked = np.flatnonzero(np.isin(refusal, ('', 'elongated', 'ambiguous')))
+    core_px = _CORE_SIGMAS * (psf_sigma_px or 1.0)
+    core, _ = tree.query(xy_px[asked], distance_upper_bound=core_px)
+    window, _ = tree.query(xy_px[asked], p=np.inf, distance_upper_bound=window_px + 0.5)
+    cause = np.isfinite(core) | (np.isfinite(window) & (refusal[asked] != ''))
+    changed = refusal.copy()
+    changed[asked[cause]] = 'hot_pixel'
+    return changed
