@@ -1,0 +1,203 @@
+"""
+Draw the pictures of docs/gallery.md: ``python -m docs.make_gallery [DIR]``.
+
+Every picture is what `starcal` says of a simulated frame that was spoilt on purpose.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from docs.make_images import FOLDER, setup_of
+from starcal_ros import pipeline, synthetic
+from starcal_ros.annotation import annotate
+from starcal_ros.attitude import AttitudeHistory
+from starcal_ros.records import Image, StarObservations
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+SCENARIO = synthetic.scenario('tiny')
+PLAIN = setup_of(SCENARIO)
+# Fainter stars would cover the pictures with their marks.
+SETUP = dataclasses.replace(
+    PLAIN, identification=dataclasses.replace(PLAIN.identification, magnitude_limit=7.5)
+)
+SHAPE = (SCENARIO.truth.camera.height, SCENARIO.truth.camera.width)
+FULL_DN = SCENARIO.detector.full_dn
+FIELD = 7  # of some hundred stars, bright and faint
+DRAWN_PX = (400, 320)
+ABOUT_PX = 12  # half width of what is shown about a star
+ENLARGED = 7
+
+
+def electrons(smear_px: float = 0.0, field: int = FIELD) -> Floats:
+    """Mean signal of a field, its stars smeared along a line."""
+    shown, psf_px = synthetic.scene(SCENARIO, field), SCENARIO.detector.psf_sigma_px
+    steps = max(1, round(4 * smear_px))
+    mean = synthetic.fixed_pattern(SCENARIO)
+    for k in range(steps):
+        moved = shown.pixel_px + ((k + 0.5) / steps - 0.5) * smear_px * np.array([0.8, 0.6])
+        flux = shown.flux_electrons / steps
+        mean = mean + synthetic.star_electrons(moved, flux, psf_px, SHAPE)
+    return mean
+
+
+def expose(mean: Floats) -> NDArray[np.uint16]:
+    """A frame of a mean signal, always with the same noise."""
+    pixels = synthetic.expose(mean, SCENARIO.detector, np.random.default_rng(8))
+    return pixels.astype(np.uint16)
+
+
+def attitudes(field: int = FIELD, reported: int | None = None) -> AttitudeHistory:
+    """What the star tracker says about a frame: the truth, or the attitude of another field."""
+    held = AttitudeHistory()
+    told = synthetic.attitude_samples(SCENARIO, field if reported is None else reported)
+    for sample, at in zip(told, synthetic.attitude_samples(SCENARIO, field), strict=True):
+        held.add(at.time_ns, dataclasses.replace(sample, time_ns=at.time_ns))
+    return held
+
+
+def whole_frames() -> Mapping[str, tuple[Image, StarObservations]]:
+    """Name of a picture -> a frame and what became of it."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    time_ns, sound = SCENARIO.time_ns(FIELD), electrons()
+    pixels, before = expose(sound), expose(electrons(field=FIELD - 1))
+    half = SHAPE[0] // 2
+    limb = np.where(np.hypot(u - 700.0, v - 560.0) < 450.0, 1e6, 0.0)
+    lost, torn = pixels.copy(), before.copy()
+    lost[half:] = 0
+    torn[:half] = pixels[:half]
+    frames = {
+        'accepted': pixels,
+        'accepted_mild_glare': expose(sound + 0.15 * u),
+        'accepted_smear': expose(electrons(3.0)),
+        'overexposed': expose(sound + limb),
+        'glare': expose(sound + 1.2e4 * np.exp(-np.hypot(u + 60.0, v + 60.0) / 350.0)),
+        'incomplete_lost': lost,
+        'incomplete_torn': torn,
+        'no_stars': expose(synthetic.fixed_pattern(SCENARIO)),
+        'too_few_stars': expose(electrons(25.0)),
+    }
+    found = {}
+    earlier = Image(SCENARIO.time_ns(FIELD - 1), before)
+    held = attitudes()
+    _, track = pipeline.observe_next(earlier, held, SETUP, pipeline.Track(SETUP.prior))
+    for name, spoilt in frames.items():
+        image = Image(time_ns, spoilt)
+        found[name] = (image, pipeline.observe_next(image, held, SETUP, track)[0])
+    frozen = Image(time_ns, before)
+    found['frozen'] = (frozen, pipeline.observe_next(frozen, held, SETUP, track)[0])
+    image = Image(time_ns, pixels)
+    jumped = attitudes(reported=FIELD + 1)
+    found['no_match'] = (image, pipeline.observe(image, jumped, SETUP, SETUP.prior))
+    return found
+
+
+def drawn(image: Image, observations: StarObservations) -> Picture:
+    """A whole frame with its marks, at the size of the gallery."""
+    scale = DRAWN_PX[0] / SHAPE[1]
+    camera = SETUP.prior.camera
+    fx, skew, fy = scale * camera.intrinsics[:3]
+    cx, cy = scale * (camera.intrinsics[3:] + 0.5) - 0.5
+    small = cv2.resize(image.pixels, DRAWN_PX, interpolation=cv2.INTER_AREA)
+    shown = dataclasses.replace(
+        observations,
+        measured_px=scale * (observations.measured_px + 0.5) - 0.5,
+        refused_px=(scale * (observations.refused_px + 0.5) - 0.5).astype(np.float32),
+    )
+    geometry = dataclasses.replace(
+        SETUP.prior, camera=camera.replace(fx=fx, skew=skew, fy=fy, cx=cx, cy=cy)
+    )
+    return annotate(Image(image.time_ns, np.asarray(small, np.uint16)), shown, geometry)
+
+
+def spoilt_stars() -> tuple[Image, StarObservations]:
+    """A frame in which single stars have met with an accident each, and what became of them."""
+    plain = pipeline.observe(
+        Image(SCENARIO.time_ns(FIELD), expose(electrons())), attitudes(), SETUP, SETUP.prior
+    )
+    places = plain.measured_px[np.argsort(-plain.snr)]
+    inside = ((places > 40) & (places < np.array([SHAPE[1], SHAPE[0]]) - 41)).all(axis=1)
+    burnt, crossed, hot, moved = np.rint(places[inside][[3, 30, 40, 20]]).astype(int)
+    mean = electrons()
+    mean[burnt[1] - 1 : burnt[1] + 2, burnt[0] - 1 : burnt[0] + 2] += 1e6
+    for k in range(-5, 6):
+        mean[crossed[1] + k // 2, crossed[0] + k] += 600.0
+    star = np.s_[moved[1] - 4 : moved[1] + 5, moved[0] - 4 : moved[0] + 5]
+    mean[star] = np.roll(mean[star], 3, axis=1)
+    bright = expose(mean)
+    bright[hot[1], hot[0] + 1] += 60
+    number = hot[1] * SHAPE[1] + hot[0] + 1
+    known = dataclasses.replace(
+        SETUP, hot=dataclasses.replace(SETUP.hot, index=np.array([number], np.int64))
+    )
+    image = Image(SCENARIO.time_ns(FIELD), bright)
+    return image, pipeline.observe(image, attitudes(), known, known.prior)
+
+
+def star_sheet(image: Image, observations: StarObservations) -> Picture:
+    """The brightest star of each reason, enlarged, and one that was used."""
+    magnitude = dict(zip(SETUP.catalog.id.tolist(), SETUP.catalog.magnitude, strict=True))
+    brightness = np.array([magnitude[star] for star in observations.refused_catalog_id.tolist()])
+    usable = observations.measured_px[np.argsort(-observations.snr)]
+    shown = {'used': usable[[12]], **observations.refused_places()}
+    cells = []
+    for code, (reason, places) in enumerate(shown.items(), start=-1):
+        if reason != 'used':
+            of_reason = brightness[observations.refused_reason == code]
+            places = places[np.argsort(of_reason, kind='stable')]
+        cells.append(_close_up(image, observations, reason, np.rint(places[0]).astype(int)))
+    blank = np.full_like(cells[0], 255)
+    cells += [blank] * (-len(cells) % 4)
+    rows = [np.hstack(cells[k : k + 4]) for k in range(0, len(cells), 4)]
+    return np.asarray(np.vstack(rows), np.uint8)
+
+
+def _close_up(
+    image: Image, observations: StarObservations, reason: str, centre: NDArray[np.int_]
+) -> Picture:
+    """The pixels about a star, with its mark, under its reason."""
+    side = 2 * ABOUT_PX + 1
+    around = cv2.copyMakeBorder(
+        image.pixels, *[ABOUT_PX] * 4, cv2.BORDER_CONSTANT, value=float(observations.background_dn)
+    )
+    u, v = centre
+    pixels = around[v : v + side, u : u + side]
+    size = (side * ENLARGED, side * ENLARGED)
+    large = cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST)
+    low, high = observations.background_dn - 2, observations.background_dn + 20
+    level = np.clip((large.astype(float) - low) / (high - low), 0.0, 1.0)
+    picture = cv2.cvtColor((40 + 215 * level).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    color = (80, 220, 80) if reason == 'used' else (60, 60, 255)
+    middle = (size[0] // 2, size[1] // 2)
+    cv2.circle(picture, middle, 5 * ENLARGED, color, 1, cv2.LINE_AA)
+    picture = cv2.copyMakeBorder(picture, 24, 4, 4, 4, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+    text = reason.replace('_', ' ')
+    cv2.putText(picture, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.asarray(picture, np.uint8)
+
+
+def main() -> None:
+    """Draw all pictures."""
+    parser = argparse.ArgumentParser(description='Draw the pictures of the gallery.')
+    parser.add_argument('folder', nargs='?', type=Path, default=FOLDER, metavar='DIR')
+    folder = parser.parse_args().folder
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = {f'gallery_{name}': drawn(*frame) for name, frame in whole_frames().items()}
+    pictures['gallery_stars'] = star_sheet(*spoilt_stars())
+    for name, picture in pictures.items():
+        # Few steps of brightness: noise compresses badly, and nobody sees the difference.
+        small = picture // 16 * 17 if name == 'gallery_glare' else picture // 48 * 51
+        cv2.imwrite(str(folder / f'{name}.png'), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+if __name__ == '__main__':
+    main()
