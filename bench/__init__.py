@@ -1,7 +1,7 @@
-"""Measurements of time, memory and accuracy, against other people's code where there is some."""
+"""Measurements of time, memory, accuracy and wrong matches, some against other people's code."""
 
 NAMES = ('solver', 'ensemble', 'measure', 'calibrate', 'observer', 'gate')
 """The benches, each a module with ``run(quick)`` that prints its tables and returns them."""
 
-LONG = ('accuracy', 'paper', 'faults', 'soak', 'transport')
+LONG = ('accuracy', 'acquisition', 'paper', 'faults', 'soak', 'transport')
 """Those that take some minutes: run when they are named."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from scipy.stats import poisson
+from scipy.stats import binom, poisson
 
 from starcal_ros.astrometry import apparent_directions, SiteOptions, through_the_air
 from starcal_ros.camera import field_radius_rad, line_of_sight, project, project_jacobians
@@ -57,6 +57,8 @@ _MODELLED_UNCERTAINTY = 0.05  # of that of a star measured itself: wings that ar
 _NEAR_SIGMA, _MODELLED_NEAR_SIGMA = 5.0, 3.0  # a bright neighbour nearer than this swamps
 NO_PIXELS = np.empty(0, np.int64)
 _ALONE_SIGMA = 0.1  # a star whose neighbours pull it by less tells the PSF
+_PARTS = 3  # of the image along each side, in which a match must hold
+_PART_CHANCE = 1e-3  # greatest probability that a right match misses so many in a part
 _CHANCE = 1e-9  # greatest probability that a match is accepted by chance
 
 
@@ -699,7 +701,8 @@ def _match(
         xy = xy + correction
     inside = _in_image(xy[bright], camera.width, camera.height)
     radius_px = 2.0
-    matched = len(_pairs(xy[bright][inside], seen.xy_px, radius_px))
+    met = _pairs(xy[bright][inside], seen.xy_px, radius_px)
+    matched = len(met)
     density = len(seen.snr) / sources.searched_px2
     tried = int(np.count_nonzero(inside))
     expected = tried * -np.expm1(-density * np.pi * radius_px**2)
@@ -710,7 +713,35 @@ def _match(
             'no_match',
             f'{matched} of {tried} predicted stars meet a source, {expected:.0f} would by chance',
         )
+    if _matched_in_part(seen, met[:, 1], camera.width, camera.height):
+        raise ImageRefused('no_match', 'stars agree in a part of the image only')
     return xy
+
+
+def _matched_in_part(sources: Sources, met: NDArray[np.int64], width: int, height: int) -> bool:
+    """
+    Whether the bright sources of most parts of the image meet far fewer predictions than of one.
+
+    ``met`` are the sources that meet one.  In a crowded field a wrong scale or shape can be right
+    in one part and chance in the others, and beyond chance in all.  A part without stars, behind a
+    cloud, shows no sources and says nothing.
+    """
+    bright = sources.snr >= np.median(sources.snr[met])
+    meets = np.zeros(len(sources.snr), bool)
+    meets[met] = True
+    cell = np.clip((sources.xy_px * _PARTS / [width, height]).astype(np.int64), 0, _PARTS - 1)
+    cell_of = cell[:, 1] * _PARTS + cell[:, 0]
+    shown = np.bincount(cell_of[bright], minlength=_PARTS**2)
+    found = np.bincount(cell_of[bright & meets], minlength=_PARTS**2)
+    told = shown >= 4
+    if np.count_nonzero(told) < 2:
+        return False
+    best = float((found[told] / (shown[told] + 1.0)).max())
+    # Not by a little: a cosmic ray is several sources in one place.
+    missed = (binom.cdf(found[told], shown[told], best) < _PART_CHANCE) & (
+        found[told] < best / 3 * shown[told]
+    )
+    return bool(2 * np.count_nonzero(missed) > np.count_nonzero(told))
 
 
 def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.str_]:

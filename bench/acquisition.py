@@ -1,0 +1,324 @@
+"""
+Acquisition: how often a field is matched that should not be, and one that should is found.
+
+Every trial is a rendered image of 640 x 512, pixels to stars: `identification.observe_stars`, from
+the search beside the predictions to the whole one of 1.5 degrees and 5 degrees of roll, and in one
+row `tracking.follow`.  Seeds are fixed; a match is wrong where more than one star in ten stands
+where another was drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import dataclasses
+from dataclasses import dataclass
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import beta
+
+from bench.table import Table
+from starcal_ros import synthetic
+from starcal_ros.catalog import load_catalog, StarCatalog
+from starcal_ros.centroiding import CentroidOptions
+from starcal_ros.errors import ImageRefused
+from starcal_ros.identification import IdentificationOptions, observe_stars, Shot, tracked
+from starcal_ros.records import CameraGeometry, Image
+from starcal_ros.synthetic import Inertial, Scenario, Scene
+from starcal_ros.tracking import follow, Followed, following
+
+Floats = NDArray[np.float64]
+
+SEED = 20161
+IMAGES = 40  # rendered for each kind of field
+ATTITUDES = 100  # tried on each of them
+TRUE_FIELDS = 100  # for each row of what is to be found
+QUICK = 12  # of a hundred
+MATCH_PX = 2.0  # a star farther from where it was drawn is another one
+RIGHT = 0.9  # share of its stars that a match has right
+
+
+@dataclass(frozen=True)
+class Found:
+    """What became of one trial."""
+
+    accepted: bool
+    wrong: bool
+    seconds: float
+
+
+def run(quick: bool) -> list[Table]:
+    """Scrambled fields, then fields to be found; twenty minutes, or one."""
+    share = QUICK / 100 if quick else 1.0
+    images, attitudes = max(3, round(IMAGES * share)), max(4, round(ATTITUDES * share))
+    refused = scrambled(images, attitudes)
+    print(refused.text(), flush=True)
+    found = to_be_found(max(6, round(TRUE_FIELDS * share)))
+    print(found.text())
+    return [refused, found]
+
+
+def scrambled(images: int, attitudes: int) -> Table:
+    """How many fields are accepted that no attitude within the search explains."""
+    table = Table(
+        'Fields that must be refused',
+        ('field', 'tried', 'wrongly accepted', '95 % limit', 'ms each'),
+        notes=[
+            'limit: Clopper and Pearson, one-sided; with none accepted it is 3 in those tried.'
+        ],
+    )
+    catalog = load_catalog(None, IdentificationOptions().magnitude_limit)
+    total = np.zeros(2, np.int64)
+    for seed, (name, draw) in enumerate(SCRAMBLES.items()):
+        rng = np.random.default_rng([SEED, seed])
+        scenario = random_fields(rng, images)
+        found = []
+        for image, scene, tried in draw(scenario, rng, attitudes):
+            known: CameraGeometry | Followed = scenario.prior
+            if name in FOLLOWED:
+                known = followed_from(image, scene, scenario.prior, catalog)
+            found += [trial(image, scene, attitude, known, catalog) for attitude in tried]
+        wrong = sum(one.wrong for one in found)
+        total += [len(found), wrong]
+        milliseconds = 1e3 * float(np.mean([one.seconds for one in found]))
+        table.add(name, len(found), wrong, _limit(wrong, len(found)), milliseconds)
+    table.add('all', int(total[0]), int(total[1]), _limit(int(total[1]), int(total[0])), None)
+    return table
+
+
+def to_be_found(fields: int) -> Table:
+    """How many fields are found from a random error within the search."""
+    table = Table(
+        'Fields to be found, off by up to 1.5 degrees and 5 degrees of roll',
+        ('field', 'tried', 'found', 'refused', 'wrong', 'median ms', 'worst ms'),
+    )
+    catalog = load_catalog(None, IdentificationOptions().magnitude_limit)
+    for seed, (name, (detector, missing, strange)) in enumerate(DIFFICULTIES.items()):
+        rng = np.random.default_rng([SEED, 100 + seed])
+        scenario = random_fields(rng, fields)
+        scenario = dataclasses.replace(
+            scenario, detector=dataclasses.replace(scenario.detector, **detector)
+        )
+        found = []
+        for index in range(fields):
+            drawn = synthetic.scene(scenario, index)
+            image = synthetic.render(scenario, changed(drawn, rng, missing, strange), index)
+            off = turned(scenario.prior, error_within_the_search(rng))
+            found.append(trial(image, drawn, drawn.icrf_from_star_tracker_xyzw, off, catalog))
+        wrong = sum(one.wrong for one in found)
+        right = sum(one.accepted for one in found) - wrong
+        milliseconds = 1e3 * np.array([one.seconds for one in found])
+        table.add(
+            name, fields, right, fields - right - wrong, wrong,
+            float(np.median(milliseconds)), float(milliseconds.max()),
+        )  # fmt: skip
+    return table
+
+
+def trial(
+    image: Image,
+    drawn: Scene,
+    icrf_from_star_tracker_xyzw: Floats,
+    known: CameraGeometry | Followed,
+    catalog: StarCatalog,
+) -> Found:
+    """One image searched, or followed from another, its stars held against those drawn."""
+    shot = Shot(image, icrf_from_star_tracker_xyzw, 0.0)
+    centroid, options = CentroidOptions(), IdentificationOptions()
+    start_s = time.process_time()
+    try:
+        if isinstance(known, Followed):
+            stars, _ = follow(shot, known, catalog, centroid, options)
+        else:
+            stars, _ = observe_stars(shot, known, catalog, centroid, options)
+    except ImageRefused:
+        return Found(accepted=False, wrong=False, seconds=time.process_time() - start_s)
+    seconds = time.process_time() - start_s
+    if stars.refusal:
+        return Found(accepted=False, wrong=False, seconds=seconds)
+    place = dict(zip(drawn.catalog_id.tolist(), drawn.pixel_px, strict=True))
+    nowhere = np.array([np.nan, np.nan])
+    true_px = np.array([place.get(number, nowhere) for number in stars.catalog_id.tolist()])
+    right = np.linalg.norm(stars.measured_px - true_px, axis=1) < MATCH_PX
+    return Found(accepted=True, wrong=bool(right.mean() < RIGHT), seconds=seconds)
+
+
+def followed_from(
+    image: Image, drawn: Scene, prior: CameraGeometry, catalog: StarCatalog
+) -> Followed | CameraGeometry:
+    """What an image whose attitude is right shows, with which others are to be followed."""
+    shot = Shot(image, drawn.icrf_from_star_tracker_xyzw, 0.0)
+    stars, instrument = observe_stars(
+        shot, prior, catalog, CentroidOptions(), IdentificationOptions()
+    )
+    return following(tracked(prior, stars), stars, instrument) or prior
+
+
+def random_fields(rng: np.random.Generator, count: int) -> Scenario:
+    """A camera of 20 x 16 degrees that looks anywhere in the sky."""
+    attitudes = Rotation.random(count, random_state=rng)
+    z = attitudes.apply([0.0, 0.0, 1.0])
+    fields = np.stack(
+        [
+            np.degrees(np.arctan2(z[:, 1], z[:, 0])) % 360,
+            np.degrees(np.arcsin(z[:, 2])),
+            rng.uniform(0, 360, count),
+        ],
+        axis=-1,
+    )
+    return dataclasses.replace(
+        synthetic.scenario('tiny', seed=int(rng.integers(1000))),
+        pointing=Inertial(tuple((float(a), float(d), float(r)) for a, d, r in fields)),
+        image_count=count,
+    )
+
+
+def turned(geometry: CameraGeometry, turn: Rotation) -> CameraGeometry:
+    """A geometry whose camera is turned about its own axes."""
+    rotation = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * turn
+    return CameraGeometry(geometry.camera, rotation.as_quat())
+
+
+def error_within_the_search(rng: np.random.Generator) -> Rotation:
+    """A turn of the camera by up to 1.5 degrees, evenly over the disc, and a roll of up to 5."""
+    tilt_rad, roll_rad = np.radians([1.48 * np.sqrt(rng.uniform()), rng.uniform(-4.9, 4.9)])
+    about = rng.uniform(0, 2 * np.pi)
+    tilt = Rotation.from_rotvec(tilt_rad * np.array([np.cos(about), np.sin(about), 0.0]))
+    return tilt * Rotation.from_rotvec([0.0, 0.0, roll_rad])
+
+
+def changed(drawn: Scene, rng: np.random.Generator, missing: float, strange: int) -> Scene:
+    """The scene without a share of its stars, and with bright ones that no catalog has."""
+    seen = rng.uniform(size=len(drawn.pixel_px)) >= missing
+    electrons = 10 ** rng.uniform(4.0, 6.5, strange)
+    return dataclasses.replace(
+        drawn,
+        pixel_px=np.concatenate([drawn.pixel_px[seen], scattered(rng, strange)]),
+        flux_electrons=np.concatenate([drawn.flux_electrons[seen], electrons]),
+    )
+
+
+def scattered(rng: np.random.Generator, count: int) -> Floats:
+    """Places (count, 2) anywhere in the image."""
+    return rng.uniform([0, 0], [639, 511], (count, 2))
+
+
+def _limit(wrong: int, tried: int) -> float:
+    return float(beta.ppf(0.95, wrong + 1, tried - wrong))
+
+
+Draw = Callable[[Scenario, np.random.Generator, int], Iterator[tuple[Image, Scene, list[Floats]]]]
+
+
+def _anywhere(rng: np.random.Generator, count: int) -> list[Floats]:
+    return list(Rotation.random(count, random_state=rng).as_quat())
+
+
+def random_attitudes(
+    scenario: Scenario, rng: np.random.Generator, count: int
+) -> Iterator[tuple[Image, Scene, list[Floats]]]:
+    """True stars, and an attitude from anywhere."""
+    for index in range(scenario.image_count):
+        drawn = synthetic.scene(scenario, index)
+        yield synthetic.render(scenario, drawn, index), drawn, _anywhere(rng, count)
+
+
+def beyond_the_search(
+    scenario: Scenario, rng: np.random.Generator, count: int
+) -> Iterator[tuple[Image, Scene, list[Floats]]]:
+    """True stars, and an attitude 2 to 8 degrees off: most of the stars are shared, but moved."""
+    for index in range(scenario.image_count):
+        drawn = synthetic.scene(scenario, index)
+        right = Rotation.from_quat(drawn.icrf_from_star_tracker_xyzw)
+        # About axes across the line of sight: the camera's x and y, seen from the star tracker.
+        st_from_camera = Rotation.from_quat(scenario.truth.star_tracker_from_camera_xyzw)
+        about = rng.uniform(0, 2 * np.pi, count)
+        axis = st_from_camera.apply(
+            np.stack([np.cos(about), np.sin(about), np.zeros(count)], axis=-1)
+        )
+        angle_rad = np.radians(rng.uniform(2.0, 8.0, count))
+        wrong = right * Rotation.from_rotvec(angle_rad[:, None] * axis)
+        yield synthetic.render(scenario, drawn, index), drawn, list(wrong.as_quat())
+
+
+def random_sources(
+    scenario: Scenario, rng: np.random.Generator, count: int
+) -> Iterator[tuple[Image, Scene, list[Floats]]]:
+    """The brightnesses of true stars, each anywhere in the image."""
+    for index in range(scenario.image_count):
+        drawn = synthetic.scene(scenario, index)
+        image = synthetic.render(
+            scenario,
+            dataclasses.replace(drawn, pixel_px=scattered(rng, len(drawn.pixel_px))),
+            index,
+        )
+        nothing = dataclasses.replace(drawn, catalog_id=np.zeros_like(drawn.catalog_id))
+        yield image, nothing, _anywhere(rng, count)
+
+
+def dense_fields(
+    scenario: Scenario, rng: np.random.Generator, count: int
+) -> Iterator[tuple[Image, Scene, list[Floats]]]:
+    """A star in every hundred pixels, hot pixels and cosmic rays besides."""
+    detector = dataclasses.replace(scenario.detector, hot_fraction=2e-3, cosmic_rays=30.0)
+    scenario = dataclasses.replace(scenario, detector=detector)
+    for index in range(scenario.image_count):
+        drawn = synthetic.scene(scenario, index)
+        more = 3300
+        crowded = dataclasses.replace(
+            drawn,
+            pixel_px=np.concatenate([drawn.pixel_px, scattered(rng, more)]),
+            flux_electrons=np.concatenate([drawn.flux_electrons, 10 ** rng.uniform(2.5, 4, more)]),
+        )
+        yield synthetic.render(scenario, crowded, index), drawn, _anywhere(rng, count)
+
+
+def shifted_copies(
+    scenario: Scenario, rng: np.random.Generator, count: int
+) -> Iterator[tuple[Image, Scene, list[Floats]]]:
+    """Each star four times, as a shaken camera or a reflection shows it; attitudes anywhere."""
+    for index in range(scenario.image_count):
+        drawn = synthetic.scene(scenario, index)
+        shifts = np.concatenate([np.zeros((1, 2)), rng.uniform(-40, 40, (3, 2))])
+        doubled = dataclasses.replace(
+            drawn,
+            pixel_px=(drawn.pixel_px[None] + shifts[:, None]).reshape(-1, 2),
+            flux_electrons=np.tile(drawn.flux_electrons, 4),
+        )
+        yield synthetic.render(scenario, doubled, index), drawn, _anywhere(rng, count)
+
+
+FOLLOWED = ('followed, attitude from anywhere', 'followed, attitude 2 to 8 degrees off')
+SCRAMBLES: dict[str, Draw] = {
+    'true stars, attitude from anywhere': random_attitudes,
+    'true stars, attitude 2 to 8 degrees off': beyond_the_search,
+    'stars at random places': random_sources,
+    'a star in every hundred pixels': dense_fields,
+    'each star four times': shifted_copies,
+    FOLLOWED[0]: random_attitudes,
+    FOLLOWED[1]: beyond_the_search,
+}
+"""Name of a kind of field -> its images, what is true of them, and the attitudes to try."""
+
+QUIET: dict[str, Any] = {'hot_fraction': 0.0, 'cosmic_rays': 0.0}
+DIFFICULTIES: dict[str, tuple[dict[str, Any], float, int]] = {
+    'clean': (QUIET, 0.0, 0),
+    'hot pixels: 1 in 1000': ({**QUIET, 'hot_fraction': 1e-3}, 0.0, 0),
+    'hot pixels: 1 in 100': ({**QUIET, 'hot_fraction': 1e-2}, 0.0, 0),
+    '50 cosmic rays': ({**QUIET, 'cosmic_rays': 50.0}, 0.0, 0),
+    '500 cosmic rays': ({**QUIET, 'cosmic_rays': 500.0}, 0.0, 0),
+    '5 planets': (QUIET, 0.0, 5),
+    '50 planets': (QUIET, 0.0, 50),
+    'half of the stars missing': (QUIET, 0.5, 0),
+    '4 of 5 stars missing': (QUIET, 0.8, 0),
+    '9 of 10 stars missing': (QUIET, 0.9, 0),
+    'hot 1 in 1000, 50 cosmic rays, 5 planets, half missing': (
+        {'hot_fraction': 1e-3, 'cosmic_rays': 50.0},
+        0.5,
+        5,
+    ),
+}
+"""Name -> changes of the detector, share of stars missing, bright strangers."""
