@@ -39,6 +39,7 @@ NAME = 'star_observer'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Ten seconds of a fast star tracker; a bag played at speed sends them in bursts.
 _SAMPLES = QoSProfile(depth=2000)
+_MAX_VELOCITY_M_S = 1e6
 _JUMP_S = 10.0  # stamps that go back by less are late, not of another clock
 
 
@@ -165,7 +166,11 @@ class StarObserver(StarcalNode):
             self._queue.wake()
 
     def _on_velocity(self, message: Any) -> None:
-        self._velocities.append(messages.velocity_from_message(message))
+        time_ns, velocity_m_s = messages.velocity_from_message(message)
+        # The Earth's is 3e4; one like this or not finite would send the stars anywhere.
+        if not float(abs(velocity_m_s).max()) < _MAX_VELOCITY_M_S:
+            raise ValueError(f'velocity: {velocity_m_s.tolist()} m/s is none of a spacecraft')
+        self._velocities.append((time_ns, velocity_m_s))
 
     def _on_temperature(self, message: Any) -> None:
         self._temperatures.append(messages.temperature_from_message(message))
