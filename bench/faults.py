@@ -22,10 +22,15 @@ from typing import Any
 from bench import graph
 from bench.frames import history, render_frame, write_set_up
 from bench.table import Table
-from starcal_ros import bag, messages, pipeline, simulation, synthetic
+from starcal_ros import bag, pipeline, simulation, synthetic
+from starcal_ros.calibration_messages import calibration_to_message
 from starcal_ros.errors import BagError
+from starcal_ros.image_messages import image_to_message
+from starcal_ros.message_fields import make_header
+from starcal_ros.observation_messages import observations_to_message
 from starcal_ros.options import read_parameter_file
 from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.telemetry_messages import attitude_to_message
 
 COLUMNS = ('fault', 'node', 'times', 'what', 'answered', 'lost', 'wrong', 'died')
 _ANSWER_S = 60.0
@@ -82,9 +87,9 @@ class _Bench:
         """Observations as a message, with another stamp where one is given."""
         from starcal_ros.nodes.conversions import make_message
 
-        message = messages.observations_to_message(record, 'camera', make_message)
+        message = observations_to_message(record, 'camera', make_message)
         if time_ns is not None:
-            message.header = messages.make_header(time_ns, 'camera', make_message)
+            message.header = make_header(time_ns, 'camera', make_message)
         return message
 
     def running(self, name: str, *values: str, **options: Any) -> Any:
@@ -129,9 +134,9 @@ def _hostile_to_observer(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]
     from starcal_ros.nodes.conversions import make_message
 
     image, samples = bench.frames[0]
-    small = messages.image_to_message(image, 'camera', make_message)
+    small = image_to_message(image, 'camera', make_message)
     small.height, small.width, small.step, small.data = 4, 4, 8, bytes(32)
-    attitude = messages.attitude_to_message(
+    attitude = attitude_to_message(
         image.time_ns, samples[1].icrf_from_star_tracker_xyzw, 'icrf', make_message
     )
     inputs: list[tuple[Any, str, Any]] = [
@@ -195,14 +200,14 @@ def _measures_a_sound_image(bench: _Bench, client: graph.Client, answers: list[A
     attitudes = client.publisher(QuaternionStamped, 'attitude')
     images = client.publisher(Image, 'image')
     image, samples = bench.frames[0]
-    message = messages.image_to_message(image, 'camera', make_message)
+    message = image_to_message(image, 'camera', make_message)
     for k in range(1, 6):  # the first ones may come before their attitude
         time_ns = image.time_ns + k * 10**12
         for sample_ns in range(time_ns - 10**9, time_ns + 2 * 10**9, 5 * 10**8 + 1):
             xyzw = samples[1].icrf_from_star_tracker_xyzw
-            attitudes.publish(messages.attitude_to_message(sample_ns, xyzw, 'icrf', make_message))
+            attitudes.publish(attitude_to_message(sample_ns, xyzw, 'icrf', make_message))
         client.holds(lambda: False, 0.5)
-        message.header = messages.make_header(time_ns, 'camera', make_message)
+        message.header = make_header(time_ns, 'camera', make_message)
         before = len(answers)
         images.publish(message)
         client.holds(lambda: len(answers) > before, _ANSWER_S)  # noqa: B023
@@ -252,7 +257,7 @@ def _send(
 def _calibration(bench: _Bench) -> Any:
     from starcal_ros.nodes.conversions import make_message
 
-    return messages.calibration_to_message(bench.calibration, make_message)
+    return calibration_to_message(bench.calibration, make_message)
 
 
 def _finite(answers: list[Any], bad: list[str]) -> Callable[[Any], None]:

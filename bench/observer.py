@@ -134,13 +134,14 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import Image as ImageMessage
 
-    from starcal_ros import messages
+    from starcal_ros.image_messages import image_to_message
     from starcal_ros.nodes.conversions import make_message
+    from starcal_ros.telemetry_messages import attitude_to_message
 
     sent_s: dict[int, float] = {}
     # Serialized once: what the publisher takes of the two cores is not of the node.
     ready = [
-        (serialize_message(messages.image_to_message(image, 'camera', make_message)), attitudes[1])
+        (serialize_message(image_to_message(image, 'camera', make_message)), attitudes[1])
         for image, attitudes in frames
     ]
     # Camera and star tracker are participants of their own, as on a spacecraft: Fast DDS delays a
@@ -164,9 +165,7 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
             sent_s[time_ns] = time.monotonic()
             for around_ns in (-_AROUND_NS, _AROUND_NS):
                 stamp_ns = time_ns + around_ns
-                attitudes.publish(
-                    messages.attitude_to_message(stamp_ns, xyzw, 'icrf', make_message)
-                )
+                attitudes.publish(attitude_to_message(stamp_ns, xyzw, 'icrf', make_message))
             images.publish(message)
         pipe.send(sent_s)
         time.sleep(2 * LATE_S)

@@ -18,7 +18,10 @@ from typing import Any
 from bench import graph
 from bench.frames import render_frame, write_set_up
 from bench.table import Table
-from starcal_ros import messages, synthetic
+from starcal_ros import synthetic
+from starcal_ros.image_messages import image_to_message
+from starcal_ros.message_fields import make_header
+from starcal_ros.telemetry_messages import attitude_to_message
 
 FRAMES = 10
 MAX_IMAGES = 50
@@ -54,8 +57,7 @@ def _soak(folder: Path, count: int) -> Table:
     params = write_set_up(scenario, folder)
     frames = [render_frame(scenario, index) for index in range(FRAMES)]
     ready = [
-        (messages.image_to_message(image, 'camera', make_message), samples[1])
-        for image, samples in frames
+        (image_to_message(image, 'camera', make_message), samples[1]) for image, samples in frames
     ]
     answers: Counter[str] = Counter()
     collected = [0]
@@ -90,9 +92,9 @@ def _soak(folder: Path, count: int) -> Table:
             for around_ns in _AROUND_NS:
                 xyzw = sample.icrf_from_star_tracker_xyzw
                 attitudes.publish(
-                    messages.attitude_to_message(time_ns + around_ns, xyzw, 'icrf', make_message)
+                    attitude_to_message(time_ns + around_ns, xyzw, 'icrf', make_message)
                 )
-            message.header = messages.make_header(time_ns, 'camera', make_message)
+            message.header = make_header(time_ns, 'camera', make_message)
             images.publish(message)
             sent = k + 1
             if not client.holds(lambda: sent - answers.total() < _IN_FLIGHT, _LATE_S):  # noqa: B023

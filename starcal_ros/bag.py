@@ -28,11 +28,32 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 import yaml
 
-from starcal_ros import messages
 from starcal_ros.attitude import attitude_sample, AttitudeHistory, AttitudeOptions
+from starcal_ros.calibration_messages import calibration_to_message
 from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.image_messages import image_from_message, image_to_message, refused_from_message
 from starcal_ros.mcap_records import Damage, MAGIC, RawMessage, read_messages, read_summary
+from starcal_ros.message_types import (
+    ATTITUDE_TYPE,
+    CALIBRATION_TYPE,
+    IMAGE_TYPE,
+    Message,
+    OBSERVATIONS_TYPE,
+    STATUS_TYPE,
+    TEMPERATURE_TYPE,
+    VELOCITY_TYPE,
+)
+from starcal_ros.observation_messages import observations_from_message, observations_to_message
 from starcal_ros.records import Calibration, EnsembleStatus, Image, refused_image, StarObservations
+from starcal_ros.status_messages import status_to_message
+from starcal_ros.telemetry_messages import (
+    attitude_from_message,
+    attitude_to_message,
+    temperature_from_message,
+    temperature_to_message,
+    velocity_from_message,
+    velocity_to_message,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -169,9 +190,9 @@ def read_images(
             yield refused_image(raw.log_time_ns, 0, 0, 'bad_layout', str(error))
             continue
         try:
-            yield messages.image_from_message(message, stamp_offset_s)
+            yield image_from_message(message, stamp_offset_s)
         except ImageRefused as refused:
-            yield messages.refused_from_message(message, stamp_offset_s, refused)
+            yield refused_from_message(message, stamp_offset_s, refused)
 
 
 def read_attitudes(
@@ -184,7 +205,7 @@ def read_attitudes(
     options = options or AttitudeOptions()
     history = AttitudeHistory()
     for message in _decoded(paths, topic, on_damage):
-        time_ns, quaternion = messages.attitude_from_message(message)
+        time_ns, quaternion = attitude_from_message(message)
         history.add(time_ns, attitude_sample(time_ns, quaternion, options.attitude_direction))
     return history
 
@@ -194,7 +215,7 @@ def read_velocities(
 ) -> Iterator[tuple[int, Floats]]:
     """Stamps and velocities (3,) in m/s of a topic."""
     for message in _decoded(paths, topic, on_damage):
-        yield messages.velocity_from_message(message)
+        yield velocity_from_message(message)
 
 
 def read_temperatures(
@@ -202,7 +223,7 @@ def read_temperatures(
 ) -> Iterator[tuple[int, float]]:
     """Stamps and temperatures in degrees Celsius of a topic; NaN where not known."""
     for message in _decoded(paths, topic, on_damage):
-        yield messages.temperature_from_message(message)
+        yield temperature_from_message(message)
 
 
 def read_observations(
@@ -218,7 +239,7 @@ def read_observations(
     """
     for raw in read_raw(paths, [topic], on_damage):
         try:
-            yield messages.observations_from_message(decode(raw))
+            yield observations_from_message(decode(raw))
         except (AttributeError, ValueError) as error:
             raise BagError(f'{topic}: not readable as observations: {error}') from error
 
@@ -297,44 +318,42 @@ class BagWriter:
 
     def write_image(self, topic: str, image: Image, frame_id: str) -> None:
         """Write a sensor_msgs/Image."""
-        message = messages.image_to_message(image, frame_id, make_message)
-        self._write(topic, messages.IMAGE_TYPE, image.time_ns, message)
+        message = image_to_message(image, frame_id, make_message)
+        self._write(topic, IMAGE_TYPE, image.time_ns, message)
 
     def write_attitude(self, topic: str, time_ns: int, xyzw: Floats, frame_id: str) -> None:
         """Write a geometry_msgs/QuaternionStamped in the inertial frame ``frame_id``."""
-        message = messages.attitude_to_message(time_ns, xyzw, frame_id, make_message)
-        self._write(topic, messages.ATTITUDE_TYPE, time_ns, message)
+        message = attitude_to_message(time_ns, xyzw, frame_id, make_message)
+        self._write(topic, ATTITUDE_TYPE, time_ns, message)
 
     def write_velocity(
         self, topic: str, time_ns: int, velocity_m_s: Floats, frame_id: str
     ) -> None:
         """Write a geometry_msgs/TwistStamped."""
-        message = messages.velocity_to_message(time_ns, velocity_m_s, frame_id, make_message)
-        self._write(topic, messages.VELOCITY_TYPE, time_ns, message)
+        message = velocity_to_message(time_ns, velocity_m_s, frame_id, make_message)
+        self._write(topic, VELOCITY_TYPE, time_ns, message)
 
     def write_temperature(
         self, topic: str, time_ns: int, temperature_degc: float, frame_id: str
     ) -> None:
         """Write a sensor_msgs/Temperature."""
-        message = messages.temperature_to_message(
-            time_ns, temperature_degc, frame_id, make_message
-        )
-        self._write(topic, messages.TEMPERATURE_TYPE, time_ns, message)
+        message = temperature_to_message(time_ns, temperature_degc, frame_id, make_message)
+        self._write(topic, TEMPERATURE_TYPE, time_ns, message)
 
     def write_observations(self, topic: str, record: StarObservations, frame_id: str) -> None:
         """Write a starcal/StarObservations."""
-        message = messages.observations_to_message(record, frame_id, make_message)
-        self._write(topic, messages.OBSERVATIONS_TYPE, record.time_ns, message)
+        message = observations_to_message(record, frame_id, make_message)
+        self._write(topic, OBSERVATIONS_TYPE, record.time_ns, message)
 
     def write_status(self, topic: str, status: EnsembleStatus, frame_id: str) -> None:
         """Write a starcal/EnsembleStatus."""
-        message = messages.status_to_message(status, frame_id, make_message)
-        self._write(topic, messages.STATUS_TYPE, status.time_ns, message)
+        message = status_to_message(status, frame_id, make_message)
+        self._write(topic, STATUS_TYPE, status.time_ns, message)
 
     def write_calibration(self, topic: str, calibration: Calibration) -> None:
         """Write a starcal/Calibration."""
-        message = messages.calibration_to_message(calibration, make_message)
-        self._write(topic, messages.CALIBRATION_TYPE, calibration.time_ns, message, latched=True)
+        message = calibration_to_message(calibration, make_message)
+        self._write(topic, CALIBRATION_TYPE, calibration.time_ns, message, latched=True)
 
     def _write(
         self, topic: str, type_name: str, time_ns: int, message: object, latched: bool = False
@@ -406,7 +425,7 @@ class BagWriter:
         }
 
 
-def make_message(type_name: str, /, **fields: Any) -> messages.Message:
+def make_message(type_name: str, /, **fields: Any) -> Message:
     """Return a message of rosbags: the ``make`` of `messages` for bags."""
     return _typestore().types[type_name](**fields)
 
@@ -416,7 +435,7 @@ def _typestore() -> Typestore:
     """ROS's own types and starcal's."""
     store = get_typestore(Stores.ROS2_JAZZY)
     folder = _definitions_folder()
-    for type_name in (messages.OBSERVATIONS_TYPE, messages.STATUS_TYPE, messages.CALIBRATION_TYPE):
+    for type_name in (OBSERVATIONS_TYPE, STATUS_TYPE, CALIBRATION_TYPE):
         text = (folder / f'{type_name.rpartition("/")[2]}.msg').read_text()
         store.register(get_types_from_msg(text, type_name))
     return store
@@ -440,7 +459,7 @@ def _definitions_folder() -> Path:
     raise BagError('the definitions of starcal/msg are not installed: ' + str(candidates[-1]))
 
 
-def decode(raw: RawMessage) -> messages.Message:
+def decode(raw: RawMessage) -> Message:
     """
     Decoded message: by ROS's and starcal's own definitions, else by that in the bag.
 
@@ -461,9 +480,7 @@ def decode(raw: RawMessage) -> messages.Message:
         ) from error
 
 
-def _decoded(
-    paths: Iterable[Path | str], topic: str, on_damage: Damage
-) -> Iterator[messages.Message]:
+def _decoded(paths: Iterable[Path | str], topic: str, on_damage: Damage) -> Iterator[Message]:
     """Messages of a topic; bytes that are none of its type are said and passed over."""
     for raw in read_raw(paths, [topic], on_damage):
         try:

@@ -154,10 +154,11 @@ def _refused_words(ensemble: Ensemble) -> str:
 
 def _inspect(args: argparse.Namespace) -> int:
     """Say what a bag holds."""
-    from starcal_ros import bag, inspection, messages, summaries
+    from starcal_ros import bag, inspection, summaries
+    from starcal_ros.message_types import COMPRESSED_TYPE, IMAGE_TYPE, OBSERVATIONS_TYPE
 
     setup = _setup(args.params) if args.params else None
-    kinds = (messages.IMAGE_TYPE, messages.COMPRESSED_TYPE, messages.OBSERVATIONS_TYPE)
+    kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in bag.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:
         found = inspection.inspect(args.bags, _asked(args), setup, on_image=advance)

@@ -10,11 +10,21 @@ from pathlib import Path
 
 import numpy as np
 
-from starcal_ros import bag, messages, pipeline, sources
+from starcal_ros import bag, message_fields, pipeline, sources
 from starcal_ros.attitude import attitude_sample, AttitudeOptions
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.image_messages import decode_png
 from starcal_ros.mcap_records import Damage
+from starcal_ros.message_types import (
+    ATTITUDE_TYPE,
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    Message,
+    OBSERVATIONS_TYPE,
+    TEMPERATURE_TYPE,
+    VELOCITY_TYPE,
+)
 from starcal_ros.records import (
     Ensemble,
     EnsembleStatus,
@@ -23,14 +33,15 @@ from starcal_ros.records import (
     StarObservations,
 )
 from starcal_ros.sources import Topics
+from starcal_ros.telemetry_messages import attitude_from_message
 
-_IMAGES = (messages.IMAGE_TYPE, messages.COMPRESSED_TYPE)
+_IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
 _STAMPED = (
     *_IMAGES,
-    messages.ATTITUDE_TYPE,
-    messages.VELOCITY_TYPE,
-    messages.TEMPERATURE_TYPE,
-    messages.OBSERVATIONS_TYPE,
+    ATTITUDE_TYPE,
+    VELOCITY_TYPE,
+    TEMPERATURE_TYPE,
+    OBSERVATIONS_TYPE,
 )
 
 
@@ -200,11 +211,11 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
             except BagError:
                 bad[raw.topic] += 1
             else:
-                stamp_ns = messages.stamp_ns(message.header.stamp)
+                stamp_ns = message_fields.stamp_ns(message.header.stamp)
                 if raw.type_name in _IMAGES:
                     kinds[raw.topic][_kind(message)] += 1
-                elif raw.type_name == messages.ATTITUDE_TYPE:
-                    sample = attitude_sample(*messages.attitude_from_message(message), '')
+                elif raw.type_name == ATTITUDE_TYPE:
+                    sample = attitude_sample(*attitude_from_message(message), '')
                     bad[raw.topic] += sample is None
         stamps[raw.topic].append(stamp_ns)
     return tuple(
@@ -232,12 +243,12 @@ def _topic_content(
     )
 
 
-def _kind(message: messages.Message) -> str:
+def _kind(message: Message) -> str:
     """Encoding and size of an image message, in words."""
     if hasattr(message, 'encoding'):
         return f'{message.encoding} {message.width} x {message.height}'
     try:
-        pixels = messages.decode_png(message.data, 0).pixels
+        pixels = decode_png(message.data, 0).pixels
     except ImageRefused:
         return f'{message.format or "compressed"}, not a PNG of one channel'
     return f'PNG {8 * pixels.itemsize} bit {pixels.shape[1]} x {pixels.shape[0]}'

@@ -6,8 +6,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from starcal_ros import bag, messages, pipeline
+from starcal_ros import bag, pipeline
 from starcal_ros.errors import BagError
+from starcal_ros.message_types import (
+    ATTITUDE_TYPE,
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    OBSERVATIONS_TYPE,
+    TEMPERATURE_TYPE,
+    VELOCITY_TYPE,
+)
 from starcal_ros.pipeline import OnImage, Setup
 from starcal_ros.records import StarObservations
 
@@ -37,26 +45,26 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
     """
     there = bag.topics(paths)
     types = {topic.type_name for topic in there}
-    image_types = [t for t in (messages.IMAGE_TYPE, messages.COMPRESSED_TYPE) if t in types]
-    only_recorded = not image_types and messages.OBSERVATIONS_TYPE in types
+    image_types = [t for t in (IMAGE_TYPE, COMPRESSED_TYPE) if t in types]
+    only_recorded = not image_types and OBSERVATIONS_TYPE in types
     if asked.observations or (only_recorded and not asked.image):
-        kind = messages.OBSERVATIONS_TYPE
+        kind = OBSERVATIONS_TYPE
         return Topics(observations=_choose(paths, kind, asked.observations, 'observations'))
-    image_type = next(iter(image_types), messages.IMAGE_TYPE)
+    image_type = next(iter(image_types), IMAGE_TYPE)
     for kind in image_types:
         if any(t.type_name == kind and t.name == f'/{asked.image.lstrip("/")}' for t in there):
             image_type = kind
     image = _choose(paths, image_type, asked.image, 'image')
-    attitude = _choose(paths, messages.ATTITUDE_TYPE, asked.attitude, 'attitude')
+    attitude = _choose(paths, ATTITUDE_TYPE, asked.attitude, 'attitude')
     velocity, temperature = asked.velocity, asked.temperature
-    if velocity or messages.VELOCITY_TYPE in types:
-        velocity = _choose(paths, messages.VELOCITY_TYPE, velocity, 'velocity')
+    if velocity or VELOCITY_TYPE in types:
+        velocity = _choose(paths, VELOCITY_TYPE, velocity, 'velocity')
     options = setup.calibration if setup else None
     used = options and (options.focal_temperature_order or options.alignment_temperature)
-    thermometers = sum(topic.type_name == messages.TEMPERATURE_TYPE for topic in there)
+    thermometers = sum(topic.type_name == TEMPERATURE_TYPE for topic in there)
     # A spacecraft has many: which one is the camera's matters only where it is made use of.
     if temperature or thermometers == 1 or (thermometers and used):
-        temperature = _choose(paths, messages.TEMPERATURE_TYPE, temperature, 'temperature')
+        temperature = _choose(paths, TEMPERATURE_TYPE, temperature, 'temperature')
     return Topics(image, attitude, velocity, temperature)
 
 

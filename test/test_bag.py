@@ -19,9 +19,12 @@ import pytest
 from rosbags.highlevel import AnyReader
 import yaml
 
-from starcal_ros import bag, messages
+from starcal_ros import bag
 from starcal_ros.attitude import AttitudeOptions
 from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.image_messages import color_image_to_message, image_to_message
+from starcal_ros.message_fields import stamp_ns
+from starcal_ros.message_types import ATTITUDE_TYPE, CALIBRATION_TYPE, IMAGE_TYPE
 from starcal_ros.records import Image, refused_image, StarObservations
 
 SHARED = Path(__file__).parents[2] / 'shared'  # inputs from elsewhere, not part of the tree
@@ -104,7 +107,7 @@ def test_read_by_rosbags(folder: Path) -> None:
         image = next(c for c in reader.connections if c.topic == '/image')
         assert image.msgtype == 'sensor_msgs/msg/Image'
         found = [
-            (time_ns, messages.stamp_ns(stamped(reader, data, c.msgtype).header.stamp))
+            (time_ns, stamp_ns(stamped(reader, data, c.msgtype).header.stamp))
             for c, time_ns, data in reader.messages([image])
         ]
         assert found == [(START_NS + k * SECOND_NS,) * 2 for k in range(6)]
@@ -142,14 +145,14 @@ def test_what_rosbag2_needs(folder: Path) -> None:
 def test_topics_and_their_choice(folder: Path) -> None:
     """The only topic of a type is taken; else the error lists those there are."""
     listed = {t.name: (t.type_name, t.count) for t in bag.topics([folder])}
-    assert listed['/image'] == (messages.IMAGE_TYPE, 6)
-    assert listed['/attitude'] == (messages.ATTITUDE_TYPE, 12)
-    assert bag.choose_topic([folder], messages.IMAGE_TYPE) == '/image'
-    assert bag.choose_topic([folder], messages.IMAGE_TYPE, 'image') == '/image'
+    assert listed['/image'] == (IMAGE_TYPE, 6)
+    assert listed['/attitude'] == (ATTITUDE_TYPE, 12)
+    assert bag.choose_topic([folder], IMAGE_TYPE) == '/image'
+    assert bag.choose_topic([folder], IMAGE_TYPE, 'image') == '/image'
     with pytest.raises(BagError, match=r'no topic /nope of type sensor_msgs.*there are: /image\)'):
-        bag.choose_topic([folder], messages.IMAGE_TYPE, '/nope')
+        bag.choose_topic([folder], IMAGE_TYPE, '/nope')
     with pytest.raises(BagError, match='no topic of type starcal/msg/Calibration'):
-        bag.choose_topic([folder], messages.CALIBRATION_TYPE)
+        bag.choose_topic([folder], CALIBRATION_TYPE)
 
 
 def test_several_topics_of_a_type(tmp_path: Path) -> None:
@@ -158,7 +161,7 @@ def test_several_topics_of_a_type(tmp_path: Path) -> None:
         for topic in ('/b', '/a'):
             writer.write_image(topic, Image(0, np.zeros((2, 2), np.uint8)), '')
     with pytest.raises(BagError, match='several topics of type .* name one: /a, /b'):
-        bag.choose_topic([tmp_path / 'two'], messages.IMAGE_TYPE)
+        bag.choose_topic([tmp_path / 'two'], IMAGE_TYPE)
 
 
 @pytest.mark.parametrize(
@@ -198,12 +201,10 @@ def test_split_bag_is_read_in_order(tmp_path: Path) -> None:
 
 def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
     """An image in colour comes as a refusal between the others; so do bytes that are no image."""
-    bad = messages.color_image_to_message(
-        7, np.zeros((2, 3, 3), np.uint8), 'cam', bag.make_message
-    )
+    bad = color_image_to_message(7, np.zeros((2, 3, 3), np.uint8), 'cam', bag.make_message)
     with bag.BagWriter(tmp_path / 'mixed') as writer:
         writer.write_image('/image', Image(6, np.zeros((2, 3), np.uint8)), '')
-        writer._write('/image', messages.IMAGE_TYPE, 7, bad)
+        writer._write('/image', IMAGE_TYPE, 7, bad)
         number = writer._channels['/image'].number
         writer._writer.add_message(number, 8, b'\x00\x01\x00\x00rubbish', 8)
         writer.write_image('/image', Image(9, np.zeros((2, 3), np.uint8)), '')
@@ -299,7 +300,7 @@ def test_a_flip_costs_its_chunk_alone(tmp_path: Path, small_chunks: Path) -> Non
         assert len(bag.read_attitudes([file], '/attitude', on_damage=said.append)) == 15
         assert said[-1].endswith('lost 1 of 16 on /attitude')
         assert len(images_of(file, on_damage=said.append)) == 8
-        assert bag.choose_topic([file], messages.ATTITUDE_TYPE) == '/attitude'
+        assert bag.choose_topic([file], ATTITUDE_TYPE) == '/attitude'
 
 
 @settings(max_examples=250, derandomize=True, deadline=None)
@@ -355,18 +356,18 @@ def test_other_writers(tmp_path: Path, indexed: bool) -> None:
     """A file without chunks or summary is read, a channel that is not ROS 2 is passed over."""
     file = tmp_path / 'plain.mcap'
     store = bag._typestore()
-    message = messages.image_to_message(Image(5, np.ones((2, 2), np.uint8)), '', bag.make_message)
+    message = image_to_message(Image(5, np.ones((2, 2), np.uint8)), '', bag.make_message)
     with file.open('wb') as stream:
         writer = Writer(
             stream, use_chunking=indexed, use_statistics=indexed, compression=CompressionType.NONE
         )
         writer.start()
-        definition, _ = store.generate_msgdef(messages.IMAGE_TYPE, ros_version=2)
-        schema = writer.register_schema(messages.IMAGE_TYPE, 'ros2msg', definition.encode())
+        definition, _ = store.generate_msgdef(IMAGE_TYPE, ros_version=2)
+        schema = writer.register_schema(IMAGE_TYPE, 'ros2msg', definition.encode())
         image = writer.register_channel('/image', 'cdr', schema)
         other = writer.register_channel('/other', 'json', 0)
         writer.add_message(other, 1, b'{}', 1)
-        writer.add_message(image, 5, bytes(store.serialize_cdr(message, messages.IMAGE_TYPE)), 5)
+        writer.add_message(image, 5, bytes(store.serialize_cdr(message, IMAGE_TYPE)), 5)
         writer.finish()
     assert [t.name for t in bag.topics([file])] == ['/image']
     (read,) = images_of(file)
@@ -415,12 +416,12 @@ def test_bags_of_others(name: str, images: int, shape: tuple[int, int], dtype: A
     """Bags by other writers are read whole, without a word about damage."""
     said: list[str] = []
     path = real(name)
-    topic = bag.choose_topic([path], messages.IMAGE_TYPE)
+    topic = bag.choose_topic([path], IMAGE_TYPE)
     found = list(bag.read_images([path], topic, on_damage=said.append))
     assert len(found) == images
     for image in found:
         assert isinstance(image, Image)
         assert (image.pixels.shape, image.pixels.dtype) == (shape, dtype)
-    attitude_topic = bag.choose_topic([path], messages.ATTITUDE_TYPE)
+    attitude_topic = bag.choose_topic([path], ATTITUDE_TYPE)
     assert len(bag.read_attitudes([path], attitude_topic, on_damage=said.append)) == 2 * images
     assert not said

@@ -276,16 +276,15 @@ def test_bags_without_a_usable_image(run: Run, tmp_path: Path) -> None:
 def test_images_of_a_wrong_encoding(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from starcal_ros import messages
+    from starcal_ros.image_messages import image_to_message
+    from starcal_ros.message_types import Make, Message
 
-    plain = messages.image_to_message
-
-    def colour(image: Image, frame_id: str, make: messages.Make) -> messages.Message:
-        message = plain(image, frame_id, make)
+    def colour(image: Image, frame_id: str, make: Make) -> Message:
+        message = image_to_message(image, frame_id, make)
         message.encoding = 'bgr8'
         return message
 
-    monkeypatch.setattr(messages, 'image_to_message', colour)
+    monkeypatch.setattr('starcal_ros.bag.image_to_message', colour)
     bag = tmp_path / 'colour.mcap'
     write_bag_of(bag, np.zeros((512, 640), np.uint8))
     monkeypatch.undo()

@@ -12,11 +12,20 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from rclpy.serialization import deserialize_message, serialize_message
-from test_messages import assert_same, calibration, observations  # type: ignore[import-not-found]
+from sample_records import assert_same, calibration, observations, status  # type: ignore[import-not-found]
 
-from starcal_ros import bag, messages
+from starcal_ros import bag
+from starcal_ros.calibration_messages import (
+    alignment_to_message,
+    calibration_from_message,
+    calibration_to_message,
+    camera_info_to_message,
+)
+from starcal_ros.image_messages import image_from_message, image_to_message
 from starcal_ros.nodes.conversions import make_message, message_class
-from starcal_ros.records import EnsembleStatus, Image
+from starcal_ros.observation_messages import observations_from_message, observations_to_message
+from starcal_ros.records import Image
+from starcal_ros.status_messages import status_from_message, status_to_message
 
 
 def through_wire(message: Any) -> Any:
@@ -26,41 +35,31 @@ def through_wire(message: Any) -> Any:
 
 def test_records_survive_the_wire() -> None:
     record = observations()
-    message = through_wire(messages.observations_to_message(record, 'cam', make_message))
-    assert_same(record, messages.observations_from_message(message))
+    message = through_wire(observations_to_message(record, 'cam', make_message))
+    assert_same(record, observations_from_message(message))
     result = calibration()
-    message = through_wire(messages.calibration_to_message(result, make_message))
-    assert_same(result, messages.calibration_from_message(message))
-    status = EnsembleStatus(
-        time_ns=7,
-        images=3,
-        stars=40,
-        min_images=5,
-        min_stars=100,
-        refused={'no_match': 1},
-        coverage=np.arange(12).reshape(3, 4),
-        parameter_names=('fx', 'fy'),
-        predicted_sigma=np.array([1.5, np.inf]),
-    )
-    message = through_wire(messages.status_to_message(status, 'cam', make_message))
-    assert_same(status, messages.status_from_message(message))
+    message = through_wire(calibration_to_message(result, make_message))
+    assert_same(result, calibration_from_message(message))
+    ensemble = status()
+    message = through_wire(status_to_message(ensemble, 'cam', make_message))
+    assert_same(ensemble, status_from_message(message))
 
 
 def test_camera_info_and_alignment_survive_the_wire() -> None:
     result = calibration()
-    info = through_wire(messages.camera_info_to_message(result, make_message))
+    info = through_wire(camera_info_to_message(result, make_message))
     assert info.k[0] > 3000 and info.k[1] == 0.0 and info.k[8] == 1.0
     assert len(info.d) == 5
-    alignment = through_wire(messages.alignment_to_message(result, make_message))
+    alignment = through_wire(alignment_to_message(result, make_message))
     assert alignment.transform.rotation.y == -0.7
 
 
 def test_both_kinds_of_message_are_the_same_on_the_wire() -> None:
     """What the nodes publish is what the bag writer writes; only padding bytes may differ."""
     for build in (
-        lambda make: messages.observations_to_message(observations(), 'cam', make),
-        lambda make: messages.calibration_to_message(calibration(), make),
-        lambda make: messages.image_to_message(Image(5, np.ones((4, 6), np.uint16)), 'c', make),
+        lambda make: observations_to_message(observations(), 'cam', make),
+        lambda make: calibration_to_message(calibration(), make),
+        lambda make: image_to_message(Image(5, np.ones((4, 6), np.uint16)), 'c', make),
     ):
         live, recorded = build(make_message), build(bag.make_message)
         data = bag._typestore().serialize_cdr(recorded, recorded.__msgtype__)
@@ -72,7 +71,7 @@ def test_large_images_are_quick() -> None:
     """Building and reading 26 MB takes as long as copying it, not as long as a Python loop."""
     image = Image(0, np.ones((3600, 3600), np.uint16))
     start_s = time.perf_counter()
-    back = messages.image_from_message(messages.image_to_message(image, '', make_message))
+    back = image_from_message(image_to_message(image, '', make_message))
     assert time.perf_counter() - start_s < 1.0  # 20 ms alone; an element-wise copy takes 1.6 s
     np.testing.assert_array_equal(back.pixels, image.pixels)
 

@@ -22,7 +22,8 @@ pytest.importorskip('starcal.msg')
 from diagnostic_msgs.msg import DiagnosticArray
 
 from starcal.msg import EnsembleStatus
-from starcal_ros import bag, messages
+from starcal_ros import bag
+from starcal_ros.message_fields import stamp_ns
 from starcal_ros.records import Image
 
 ROOT = Path(__file__).parents[1]
@@ -71,7 +72,7 @@ def test_a_bag_plays_again_by_its_clock(
     images = len(list(bag.read_images([tiny_bag], '/opnav/image_raw')))
     client.until(lambda: status and status[-1].images == images)
     stamps = [raw.log_time_ns for raw in bag.read_raw([tiny_bag])]
-    last_ns = messages.stamp_ns(health[-1].header.stamp)
+    last_ns = stamp_ns(health[-1].header.stamp)
     # Within the bag, whatever pass of it: the diagnostics take the time from /clock.
     assert min(stamps) <= last_ns <= max(stamps) + 10**9
 

@@ -10,11 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-from starcal_ros import bag, cli, inspection, messages, pipeline, products, simulation
+from starcal_ros import bag, cli, inspection, pipeline, products, simulation
+from starcal_ros.message_fields import make_header
+from starcal_ros.message_types import COMPRESSED_TYPE
 from starcal_ros.node_options import NODE_OPTION_CLASSES
 from starcal_ros.options import read_parameter_file
 from starcal_ros.records import Image
 from starcal_ros.sources import Topics
+from starcal_ros.telemetry_messages import attitude_from_message
 
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 PARAMS = TINY / 'params.yaml'
@@ -41,9 +44,7 @@ def write_spoilt(path: Path, images: list[Image]) -> None:
     dark; image 5 is cut; the samples about image 7 are no rotations; after image 9 the attitudes
     end, and one more image comes.
     """
-    samples = [
-        messages.attitude_from_message(bag.decode(raw)) for raw in bag.read_raw([TINY], [ATTITUDE])
-    ]
+    samples = [attitude_from_message(bag.decode(raw)) for raw in bag.read_raw([TINY], [ATTITUDE])]
     stamps = [image.time_ns for image in images]
 
     def near(k: int, time_ns: int) -> bool:
@@ -128,14 +129,14 @@ def test_compressed_images_are_told_apart(tmp_path: Path, tiny_images: list[Imag
             pixels = tiny_images[k].pixels
             coded = cv2.imencode(ending, pixels if ending == '.png' else pixels.astype(np.uint8))
             message = bag.make_message(
-                messages.COMPRESSED_TYPE,
-                header=messages.make_header(tiny_images[k].time_ns, 'camera', bag.make_message),
+                COMPRESSED_TYPE,
+                header=make_header(tiny_images[k].time_ns, 'camera', bag.make_message),
                 format=ending[1:],
                 data=np.asarray(coded[1]).ravel(),
             )
-            writer._write('/image', messages.COMPRESSED_TYPE, tiny_images[k].time_ns, message)
+            writer._write('/image', COMPRESSED_TYPE, tiny_images[k].time_ns, message)
         for raw in bag.read_raw([TINY], [ATTITUDE]):
-            time_ns, xyzw = messages.attitude_from_message(bag.decode(raw))
+            time_ns, xyzw = attitude_from_message(bag.decode(raw))
             writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
     found = inspection.inspect([path], ASKED)
     (image,) = (t for t in found.topics if t.name == '/image')
@@ -191,7 +192,7 @@ def test_a_bag_that_cannot_be_calibrated_ends_with_3(
     few = tmp_path / 'few.mcap'
     with bag.BagWriter(few) as writer:
         for raw in bag.read_raw([TINY], [ATTITUDE]):
-            time_ns, xyzw = messages.attitude_from_message(bag.decode(raw))
+            time_ns, xyzw = attitude_from_message(bag.decode(raw))
             writer.write_attitude(ATTITUDE, time_ns, xyzw, 'icrf')
         for image in tiny_images[:2]:
             writer.write_image(IMAGE, image, 'camera')

@@ -34,10 +34,15 @@ from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal.srv import Calibrate
-from starcal_ros import bag, messages, products
+from starcal_ros import bag, message_fields, products
+from starcal_ros.calibration_messages import calibration_from_message
+from starcal_ros.image_messages import image_from_message, image_to_message
+from starcal_ros.message_fields import make_header
 from starcal_ros.nodes.conversions import make_message
+from starcal_ros.observation_messages import observations_to_message
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.records import refused_image
+from starcal_ros.telemetry_messages import attitude_to_message, temperature_to_message
 
 BOTH = ('star_observer', 'calibrator')
 REMAPS = ('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude')
@@ -52,7 +57,7 @@ def parameters(folder: Path, *more: str) -> tuple[str, ...]:
 def blank(stamp_ns: int, **change: Any) -> Any:
     """Return an image message of a dark sky, with some of its fields as asked."""
     pixels = np.zeros((8, 8), np.uint16)
-    message = messages.image_to_message(ImageRecord(stamp_ns, pixels), '', make_message)
+    message = image_to_message(ImageRecord(stamp_ns, pixels), '', make_message)
     for name, value in change.items():
         setattr(message, name, value)
     return message
@@ -60,7 +65,7 @@ def blank(stamp_ns: int, **change: Any) -> Any:
 
 def attitude(stamp_ns: int) -> Any:
     """Return an attitude message."""
-    return messages.attitude_to_message(stamp_ns, np.array([0, 0, 0, 1.0]), '', make_message)
+    return attitude_to_message(stamp_ns, np.array([0, 0, 0, 1.0]), '', make_message)
 
 
 def calibrate_by_tool(folder: Path, output: Path) -> Any:
@@ -93,7 +98,7 @@ def test_nodes_and_tool_give_the_same_calibration(
     assert answer.success, answer.message
     found = client.latched(Calibration, 'calibration')
     client.until(lambda: found)
-    live = messages.calibration_from_message(found[0])
+    live = calibration_from_message(found[0])
     offline = calibrate_by_tool(tiny_bag, tmp_path / 'products')
     for a, b in (
         (live.geometry.camera.parameters, offline.geometry.camera.parameters),
@@ -187,8 +192,8 @@ def test_every_image_gets_one_answer(
     for k in range(30):
         attitudes.publish(attitude(k * 500_000_000))
     client.until(lambda: len(answers) == len(sent))
-    stamps = [messages.stamp_ns(m.header.stamp) for m, _ in sent]
-    assert [messages.stamp_ns(a.header.stamp) for a in answers] == stamps
+    stamps = [message_fields.stamp_ns(m.header.stamp) for m, _ in sent]
+    assert [message_fields.stamp_ns(a.header.stamp) for a in answers] == stamps
     assert [a.refusal for a in answers] == [reason for _, reason in sent]
     assert all(a.detail for a in answers)
     images.publish(blank(60_000_000_000))
@@ -231,7 +236,7 @@ def test_observations_carry_the_temperature(
     diagnostics = client.collect(DiagnosticArray, '/diagnostics')
     first = next(bag.read_raw([tiny_bag], ['/opnav/image_raw']))
     for offset_ns, degc in ((-2 * 10**9, 3.5), (-(10**9), -7.25), (10**9, 40.0)):
-        message = messages.temperature_to_message(
+        message = temperature_to_message(
             first.log_time_ns + offset_ns, degc, 'camera', make_message
         )
         temperatures.publish(message)
@@ -263,10 +268,10 @@ def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path
     first = next(iter(bag.read_images([tiny_bag], '/opnav/image_raw')))
     assert isinstance(first, ImageRecord)
     message = CompressedImage(format='mono16; png compressed')
-    message.header = messages.make_header(first.time_ns, 'camera', make_message)
+    message.header = make_header(first.time_ns, 'camera', make_message)
     message.data = array.array('B', cv2.imencode('.png', first.pixels)[1].tobytes())
     compressed.publish(message)
-    images.publish(messages.image_to_message(first, 'camera', make_message))
+    images.publish(image_to_message(first, 'camera', make_message))
     for sample in bag.read_raw([tiny_bag], ['/star_tracker/attitude']):
         attitudes.publish(sample.data)
     client.until(lambda: raw and png)
@@ -331,7 +336,7 @@ def test_calibrator_collects_while_it_solves(
     futures = [solve.call_async(Calibrate.Request(dry_run=True)) for _ in range(5)]
     for k in range(300):
         refused = refused_image(k, 8, 8, 'no_stars', '')
-        observations.publish(messages.observations_to_message(refused, '', make_message))
+        observations.publish(observations_to_message(refused, '', make_message))
     client.until(lambda: all(future.done() for future in futures), 120.0)
     assert all(future.result().success for future in futures)
     client.until(lambda: 'no_stars' in status[-1].refused_reasons)
@@ -358,10 +363,10 @@ def test_state_outlasts_a_kill(
     start_node('calibrator', ros=(*parameters(tiny_bag, state), '-r', '__node:=heir'))
     found = client.latched(Calibration, 'calibration')
     client.until(lambda: found)
-    in_force = messages.calibration_from_message(found[0])
+    in_force = calibration_from_message(found[0])
     assert in_force.number == 1 and in_force.in_force_since_ns > 0
     again = client.call(Calibrate, '/heir/solve', dry_run=True)
-    answer = messages.calibration_from_message(again.calibration)
+    answer = calibration_from_message(again.calibration)
     for one in (in_force, answer):
         np.testing.assert_array_equal(one.covariance, tool.covariance)
     ensemble_by_tool = [sys.executable, '-m', 'starcal_ros.cli', 'calibrate']
@@ -378,7 +383,7 @@ def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_ba
     observations = client.publisher(StarObservations, 'observations')
     observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
     refused = refused_image(5, 8, 8, 'no_stars', '')
-    observations.publish(messages.observations_to_message(refused, '', make_message))
+    observations.publish(observations_to_message(refused, '', make_message))
     status = client.latched(EnsembleStatus, 'ensemble_status')
     client.until(lambda: status and list(status[-1].refused_reasons) == ['no_stars'])
     assert 'direction_icrf: 0 numbers, not 2 x 3' in calibrator.said()
@@ -544,10 +549,10 @@ def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: P
     client.until(lambda: len(images) == 24 and len(attitudes) == 24 * 40)
     sound = list(bag.read_images([tmp_path / 'large'], '/image'))
     for message, image in zip(images, sound, strict=True):
-        got = messages.image_from_message(message)
+        got = image_from_message(message)
         assert got.time_ns == image.time_ns and isinstance(image, ImageRecord)
         np.testing.assert_array_equal(got.pixels, image.pixels)
-    stamps = [messages.stamp_ns(m.header.stamp) for m in attitudes]
+    stamps = [message_fields.stamp_ns(m.header.stamp) for m in attitudes]
     assert stamps == sorted(stamps)
 
 

@@ -18,9 +18,17 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from starcal.msg import StarObservations as ObservationsMessage
-from starcal_ros import bag, messages
+from starcal_ros import bag
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, StarcalError
+from starcal_ros.message_types import (
+    ATTITUDE_TYPE,
+    CALIBRATION_TYPE,
+    CAMERA_INFO_TYPE,
+    IMAGE_TYPE,
+    OBSERVATIONS_TYPE,
+    STATUS_TYPE,
+)
 from starcal_ros.node_options import PlayerOptions
 from starcal_ros.nodes.conversions import message_class
 from starcal_ros.nodes.lifecycle import end_quietly, one_line
@@ -35,7 +43,7 @@ _UNACKED = {True: _IMAGE_DEPTH // 2, False: _OTHER_DEPTH // 2}
 _SMALL_PER_S = 2000.0  # what a Python reader takes beside its other work
 _ACK_S = 30.0
 _CLOCK_S = 0.01  # of wall clock, between two messages on /clock
-_LATCHED_TYPES = (messages.CALIBRATION_TYPE, messages.STATUS_TYPE, messages.CAMERA_INFO_TYPE)
+_LATCHED_TYPES = (CALIBRATION_TYPE, STATUS_TYPE, CAMERA_INFO_TYPE)
 
 
 class BagPlayer(Node):
@@ -60,7 +68,7 @@ class BagPlayer(Node):
             self._players[topic.name] = self.create_publisher(kind, topic.name, _offer(topic))
         if not self._players:
             raise BagError(f'{self.own.bag}: no topic in it can be played here')
-        self._images = {t.name for t in self._topics if t.type_name == messages.IMAGE_TYPE}
+        self._images = {t.name for t in self._topics if t.type_name == IMAGE_TYPE}
         self._clock_publisher = (
             self.create_publisher(Clock, '/clock', QoSProfile(depth=10))
             if self.own.clock
@@ -72,7 +80,7 @@ class BagPlayer(Node):
         self._observed_count = 0
         # A bag that holds observations would be paced by its own, and take itself for a listener.
         types = {topic.type_name for topic in self._topics}
-        self._paced = bool(self._images) and messages.OBSERVATIONS_TYPE not in types
+        self._paced = bool(self._images) and OBSERVATIONS_TYPE not in types
         if self._paced:
             self._observations = self.create_subscription(
                 ObservationsMessage, 'observations', self._on_observations, QoSProfile(depth=1000)
@@ -120,7 +128,7 @@ class BagPlayer(Node):
 
     def _wait_for_subscribers(self) -> None:
         """Wait until somebody listens to every image and attitude topic, or long enough."""
-        inputs = (messages.IMAGE_TYPE, messages.ATTITUDE_TYPE)
+        inputs = (IMAGE_TYPE, ATTITUDE_TYPE)
         needed = [t.name for t in self._topics if t.type_name in inputs] or list(self._players)
         deadline_s = time.monotonic() + self.own.wait_for_subscribers_s
         while missing := [n for n in needed if not self._players[n].get_subscription_count()]:
@@ -161,9 +169,7 @@ class BagPlayer(Node):
 def _offer(topic: bag.Topic) -> QoSProfile:
     if topic.type_name in _LATCHED_TYPES:
         return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    return QoSProfile(
-        depth=_IMAGE_DEPTH if topic.type_name == messages.IMAGE_TYPE else _OTHER_DEPTH
-    )
+    return QoSProfile(depth=_IMAGE_DEPTH if topic.type_name == IMAGE_TYPE else _OTHER_DEPTH)
 
 
 def _listen(player: BagPlayer) -> None:

@@ -17,13 +17,20 @@ from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import EnsembleStatus as StatusMessage
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal.srv import Calibrate
-from starcal_ros import messages, pipeline
+from starcal_ros import pipeline
+from starcal_ros.calibration_messages import (
+    alignment_to_message,
+    calibration_to_message,
+    camera_info_to_message,
+)
 from starcal_ros.calibrator_state import Answer, CalibratorState
 from starcal_ros.node_options import CalibratorOptions
 from starcal_ros.nodes.conversions import make_message, message_class
 from starcal_ros.nodes.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
+from starcal_ros.observation_messages import observations_from_message
 from starcal_ros.options import from_mapping
 from starcal_ros.records import Calibration
+from starcal_ros.status_messages import status_to_message
 
 NAME = 'calibrator'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -147,7 +154,7 @@ class Calibrator(StarcalNode):
         return OK, 'collecting' if in_force is None else 'calibration in force', numbers
 
     def _on_observations(self, message: Any) -> None:
-        self._state.add(messages.observations_from_message(message))
+        self._state.add(observations_from_message(message))
         self._status_due.trigger()
 
     def _save_again(self) -> None:
@@ -158,7 +165,7 @@ class Calibrator(StarcalNode):
     def _publish_status(self) -> None:
         frame_id = self._setup.frames.camera_frame
         status = self._state.status()
-        self._status.publish(messages.status_to_message(status, frame_id, make_message))
+        self._status.publish(status_to_message(status, frame_id, make_message))
 
     def _on_calibrate(self, _request: Any, response: Any) -> Any:
         return self._told(self._state.solve(self._now_ns()), response)
@@ -172,9 +179,7 @@ class Calibrator(StarcalNode):
             request.force,
         )
         if answer.calibration is not None:
-            response.calibration = messages.calibration_to_message(
-                answer.calibration, make_message
-            )
+            response.calibration = calibration_to_message(answer.calibration, make_message)
         return self._told(answer, response)
 
     def _on_reset(self, _request: Any, response: Any) -> Any:
@@ -193,18 +198,16 @@ class Calibrator(StarcalNode):
         if answer.calibration is not None and answer.in_force:
             self._publish_calibration(answer.calibration)
         elif answer.calibration is not None and not answer.success:
-            self._candidate.publish(
-                messages.calibration_to_message(answer.calibration, make_message)
-            )
+            self._candidate.publish(calibration_to_message(answer.calibration, make_message))
         response.success, response.message = answer.success, answer.message
         return response
 
     def _publish_calibration(self, calibration: Calibration) -> None:
-        camera_info = messages.camera_info_to_message(calibration, make_message)
-        alignment = messages.alignment_to_message(calibration, make_message)
+        camera_info = camera_info_to_message(calibration, make_message)
+        alignment = alignment_to_message(calibration, make_message)
         self._camera_info.publish(camera_info)
         self._alignment.publish(alignment)
-        self._calibration.publish(messages.calibration_to_message(calibration, make_message))
+        self._calibration.publish(calibration_to_message(calibration, make_message))
         if self._tf_static is not None:
             self._tf_static.publish(make_message('tf2_msgs/msg/TFMessage', transforms=[alignment]))
         if self._camera_client is not None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ros.messages import Message
+from starcal_ros.message_types import Message
 
 _CODES = {
     np.dtype(np.uint8): 'B',

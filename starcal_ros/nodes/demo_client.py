@@ -21,7 +21,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus
-from starcal_ros.messages import calibration_from_message
+from starcal_ros.calibration_messages import calibration_from_message
 from starcal_ros.products import write_calibration
 
 _LATCHED = QoSProfile(

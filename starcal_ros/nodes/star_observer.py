@@ -18,21 +18,30 @@ from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import StarObservations as ObservationsMessage
-from starcal_ros import messages, pipeline
+from starcal_ros import pipeline
 from starcal_ros.annotation import annotate
 from starcal_ros.attitude import attitude_sample, AttitudeHistory
+from starcal_ros.calibration_messages import calibration_from_message
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
+from starcal_ros.image_messages import color_image_to_message, image_from_message
+from starcal_ros.message_fields import offset_ns, stamp_ns
 from starcal_ros.node_options import ObserverOptions
 from starcal_ros.nodes.conversions import make_message
 from starcal_ros.nodes.image_queue import ImageQueue, Waiting
 from starcal_ros.nodes.lifecycle import Health, OK, run, StarcalNode, WARN
+from starcal_ros.observation_messages import observations_to_message
 from starcal_ros.options import from_mapping
 from starcal_ros.records import (
     CameraGeometry,
     Image,
     refused_image,
     StarObservations,
+)
+from starcal_ros.telemetry_messages import (
+    attitude_from_message,
+    temperature_from_message,
+    velocity_from_message,
 )
 
 NAME = 'star_observer'
@@ -152,31 +161,31 @@ class StarObserver(StarcalNode):
         return OK, 'observing', numbers
 
     def _on_image(self, message: Any) -> None:
-        time_ns = messages.stamp_ns(message.header.stamp)
-        time_ns += messages.offset_ns(self._setup.attitude.stamp_offset_s)
+        time_ns = stamp_ns(message.header.stamp)
+        time_ns += offset_ns(self._setup.attitude.stamp_offset_s)
         if self._queue is not None:
             width, height = getattr(message, 'width', 0), getattr(message, 'height', 0)
             self._queue.put(time_ns, width, height, message)
 
     def _on_attitude(self, message: Any) -> None:
-        time_ns, quaternion = messages.attitude_from_message(message)
+        time_ns, quaternion = attitude_from_message(message)
         direction = self._setup.attitude.attitude_direction
         self._attitudes.add(time_ns, attitude_sample(time_ns, quaternion, direction))
         if self._queue is not None:
             self._queue.wake()
 
     def _on_velocity(self, message: Any) -> None:
-        time_ns, velocity_m_s = messages.velocity_from_message(message)
+        time_ns, velocity_m_s = velocity_from_message(message)
         # The Earth's is 3e4; one like this or not finite would send the stars anywhere.
         if not float(abs(velocity_m_s).max()) < _MAX_VELOCITY_M_S:
             raise ValueError(f'velocity: {velocity_m_s.tolist()} m/s is none of a spacecraft')
         self._velocities.append((time_ns, velocity_m_s))
 
     def _on_temperature(self, message: Any) -> None:
-        self._temperatures.append(messages.temperature_from_message(message))
+        self._temperatures.append(temperature_from_message(message))
 
     def _on_calibration(self, message: Any) -> None:
-        geometry = messages.calibration_from_message(message).geometry
+        geometry = calibration_from_message(message).geometry
         prior = self._setup.prior.camera
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
             raise ValueError('calibration: of another image size than the prior camera')
@@ -189,7 +198,7 @@ class StarObserver(StarcalNode):
         if latest_ns is None or latest_ns < time_ns:
             return False
         gap_s = self._setup.attitude.max_attitude_gap_s
-        if latest_ns > time_ns + messages.offset_ns(gap_s):
+        if latest_ns > time_ns + offset_ns(gap_s):
             return True
         try:
             self._attitudes.at(time_ns, gap_s)
@@ -214,9 +223,7 @@ class StarObserver(StarcalNode):
             self._publish(self._refused(waiting, 'overrun', detail))
             return
         try:
-            image = messages.image_from_message(
-                waiting.message, self._setup.attitude.stamp_offset_s
-            )
+            image = image_from_message(waiting.message, self._setup.attitude.stamp_offset_s)
         except ImageRefused as refused:
             self._publish(self._refused(waiting, refused.reason, refused.detail))
             return
@@ -244,9 +251,7 @@ class StarObserver(StarcalNode):
 
     def _publish(self, observations: StarObservations) -> None:
         frame_id = self._setup.frames.camera_frame
-        self._observations.publish(
-            messages.observations_to_message(observations, frame_id, make_message)
-        )
+        self._observations.publish(observations_to_message(observations, frame_id, make_message))
         self._counts[observations.refusal] += 1
         self._last_refusal = (
             observations.refusal and f'{observations.refusal}: {observations.detail}'
@@ -263,7 +268,7 @@ class StarObserver(StarcalNode):
         picture = annotate(image, observations, geometry)
         frame_id = self._setup.frames.camera_frame
         self._annotated.publish(
-            messages.color_image_to_message(image.time_ns, picture, frame_id, make_message)
+            color_image_to_message(image.time_ns, picture, frame_id, make_message)
         )
 
 

@@ -1,0 +1,25 @@
+"""The types of the messages, and what stands for one that rclpy or rosbags has made."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+IMAGE_TYPE = 'sensor_msgs/msg/Image'
+COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
+ATTITUDE_TYPE = 'geometry_msgs/msg/QuaternionStamped'
+VELOCITY_TYPE = 'geometry_msgs/msg/TwistStamped'
+TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
+CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
+ALIGNMENT_TYPE = 'geometry_msgs/msg/TransformStamped'
+OBSERVATIONS_TYPE = 'starcal/msg/StarObservations'
+CALIBRATION_TYPE = 'starcal/msg/Calibration'
+STATUS_TYPE = 'starcal/msg/EnsembleStatus'
+
+Message = Any  # a message class of rclpy or of rosbags: they share field names and nothing else
+
+
+class Make(Protocol):
+    """Builds a message of a type, ``'pkg/msg/Name'``, from its fields."""
+
+    def __call__(self, type_name: str, /, **fields: object) -> Message:
+        """Return the message."""

@@ -1,0 +1,137 @@
+"""Records with a different number in every place, and how to tell that none was lost."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from starcal_ros.camera import CameraModel
+from starcal_ros.records import (
+    Calibration,
+    CameraGeometry,
+    Correlation,
+    DetectorMaps,
+    EnsembleStatus,
+    Halves,
+    refused_image,
+    Removal,
+    StarObservations,
+    Thermal,
+)
+
+TIME_NS = 1_700_000_000_123_456_789
+
+
+def observations(n: int = 5) -> StarObservations:
+    """Observations of n stars with a different number in every place."""
+    random = np.random.default_rng(3)
+    directions = random.normal(size=(n, 3))
+    return dataclasses.replace(
+        refused_image(TIME_NS, 1296, 1024, '', ''),
+        icrf_from_star_tracker_xyzw=np.array([0.1, 0.7, -0.1, 0.7]),
+        attitude_gap_s=0.5,
+        catalog_id=np.array([2**62 + k for k in range(n - 1)] + [-71683], np.int64),
+        direction_icrf=directions / np.linalg.norm(directions, axis=1, keepdims=True),
+        magnitude=random.normal(size=n).astype(np.float32),
+        measured_px=random.uniform(0, 1000, (n, 2)),
+        covariance_px2=np.c_[random.uniform(1, 2, n), random.uniform(-1, 1, n), np.full(n, 2.0)],
+        flux_dn=random.uniform(size=n).astype(np.float32),
+        snr=random.uniform(size=n).astype(np.float32),
+        refused_stars={'blend': 3, 'saturated': 1},
+        background_dn=101.5,
+        noise_dn=3.25,
+        psf_sigma_px=0.95,
+        catalog_digest='abc',
+        temperature_degc=-12.3,
+        refused_catalog_id=np.array([2**62 + 20, -5, 7, 8], np.int64),
+        refused_px=random.uniform(0, 1000, (4, 2)).astype(np.float32),
+        refused_reason=np.array([0, 1, 0, 0], np.uint8),
+    )
+
+
+def calibration() -> Calibration:
+    """A calibration with a different number in every place."""
+    parameters = [3641.5, -0.74, 3642.3, 647.5, 511.5, -0.051, 0.117, 0.01, 5.1e-4, 3.2e-4]
+    camera = CameraModel(1296, 1024, np.array(parameters))
+    return Calibration(
+        time_ns=TIME_NS,
+        geometry=CameraGeometry(camera, np.array([0.1, -0.7, 0.1, 0.7])),
+        covariance=np.arange(169.0).reshape(13, 13) / 7,
+        method='hierarchical',
+        estimated=('fx', 'fy'),
+        residual_rms_px=0.101,
+        variance_factor=1.02,
+        images_used=15,
+        images_refused={'no_match': 2},
+        stars_used=1234,
+        stars_rejected=5,
+        alignment_scatter_arcsec=4.5,
+        star_tracker_sigma_arcsec=(9.5, 10.25, 41.0),
+        centroid_scale=1.0625,
+        centroid_floor_px=0.0125,
+        dropped_catalog_ids=(-71683, 4295806720),
+        misfit_images_ns=(1_700_000_000_123_456_789,),
+        singular_values=(1.5, 0.75, 0.02),
+        weakest_direction='k2 and k3 can hardly be told apart',
+        zero_skew_cost_px=0.3,
+        iterations=7,
+        termination='cost',
+        accepted=True,
+        reasons=('one', 'two'),
+        parent_frame='st',
+        child_frame='cam',
+        provenance={'catalog': 'x', 'version': '1'},
+        thermal=Thermal(
+            21.5, (4e-5, -6e-7), (1e-6, 2e-8), (1e-5, 2e-5, 3e-5), (1e-6, 2e-6, 3e-6), 'a word'
+        ),
+        maps=DetectorMaps(
+            np.arange(6).reshape(2, 3),
+            np.arange(12.0).reshape(4, 3) / 7,
+            np.sqrt(np.arange(12.0)).reshape(4, 3),
+        ),
+        halves=Halves(shape_px=0.03, shape_chance=0.4, turn_arcsec=1.7, chance=0.6),
+        correlation=Correlation(('fx', 'fy'), np.array([[1.0, 1 / 3], [1 / 3, 1.0]])),
+        removals=(
+            Removal('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
+            Removal('k3', -0.3, 0.5, 1 / 7, False, 0.3, (0.25, 0.35), 1e-9),
+        ),
+    )
+
+
+def status() -> EnsembleStatus:
+    """A status with a different number in every place."""
+    return EnsembleStatus(
+        time_ns=TIME_NS,
+        images=3,
+        stars=40,
+        min_images=5,
+        min_stars=100,
+        refused={'no_match': 1},
+        coverage=np.arange(12).reshape(3, 4),
+        parameter_names=('fx', 'fy'),
+        predicted_sigma=np.array([1.5, np.inf]),
+    )
+
+
+def plain(_type: str, /, **fields: Any) -> SimpleNamespace:
+    """Return a message that is nothing but its fields."""
+    return SimpleNamespace(**fields)
+
+
+def assert_same(a: Any, b: Any) -> None:
+    """Every field equal, arrays with type and shape."""
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if dataclasses.is_dataclass(x):
+            assert_same(x, y)
+        elif isinstance(x, float) and np.isnan(x):
+            assert np.isnan(y), field.name
+        elif isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype, field.name
+            np.testing.assert_array_equal(x, y, err_msg=field.name, strict=True)
+        else:
+            assert x == y, field.name
+            assert type(x) is type(y) or isinstance(x, float), field.name
