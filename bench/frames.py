@@ -8,8 +8,9 @@ import tempfile
 
 import yaml
 
-from starcal_ros import pipeline, products, simulation, synthetic
+from starcal_ros import pipeline, simulation, synthetic
 from starcal_ros.attitude import AttitudeHistory
+from starcal_ros.camera_info import write_camera_info
 from starcal_ros.options import read_parameter_file
 from starcal_ros.records import AttitudeSample, Image
 from starcal_ros.synthetic import Scenario
@@ -18,7 +19,7 @@ from starcal_ros.synthetic import Scenario
 def write_set_up(scenario: Scenario, folder: Path, **values: object) -> Path:
     """Prior camera and parameter file of a scenario in a folder; returns the latter."""
     camera, params = folder / 'camera.yaml', folder / 'params.yaml'
-    products.write_camera_info(scenario.prior.camera, camera)
+    write_camera_info(scenario.prior.camera, camera)
     content = simulation.parameters(scenario, f'file://{camera}')
     content['/**']['ros__parameters'].update(values)  # type: ignore[index]
     params.write_text(yaml.safe_dump(content))

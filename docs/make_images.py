@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 import yaml
 
-from starcal_ros import cli, pipeline, products, simulation, synthetic
+from starcal_ros import cli, pipeline, simulation, synthetic
 from starcal_ros.annotation import annotate
 from starcal_ros.attitude import AttitudeHistory
 from starcal_ros.camera import distortion_px, pixel_grid
+from starcal_ros.camera_info import write_camera_info
 from starcal_ros.observability import coverage
 from starcal_ros.options import read_parameter_file
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
@@ -43,7 +44,7 @@ def setup_of(scenario: Scenario) -> pipeline.Setup:
     """What `starcal calibrate` would start on a simulated campaign with."""
     with tempfile.TemporaryDirectory() as folder:
         camera, params = Path(folder, 'camera.yaml'), Path(folder, 'params.yaml')
-        products.write_camera_info(scenario.prior.camera, camera)
+        write_camera_info(scenario.prior.camera, camera)
         params.write_text(yaml.safe_dump(simulation.parameters(scenario, str(camera))))
         return pipeline.load_setup(read_parameter_file(params, ()))
 

@@ -25,15 +25,9 @@ import re
 import shutil
 
 from starcal_ros.bag import BagWriter, read_observations
+from starcal_ros.calibration_file import calibration_content, calibration_from_content, SCHEMA
 from starcal_ros.errors import ArchiveError, BagError, ProductError
-from starcal_ros.products import (
-    calibration_content,
-    calibration_from_content,
-    PART,
-    SCHEMA,
-    sync_folder,
-    write_atomically,
-)
+from starcal_ros.product_files import PART, sync_folder, write_atomically
 from starcal_ros.records import Calibration, Ensemble, StarObservations
 
 ARCHIVE_SCHEMA = 1

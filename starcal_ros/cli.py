@@ -109,11 +109,12 @@ def _calibrate_into(
 
 def _setup(params: Path) -> Setup:
     """Every option of a parameter file, and what they name, loaded."""
-    from starcal_ros import pipeline, products
+    from starcal_ros import pipeline
+    from starcal_ros.camera_info import with_camera_url_from
     from starcal_ros.node_options import NODE_OPTION_CLASSES
     from starcal_ros.options import read_parameter_file
 
-    values = products.with_camera_url_from(read_parameter_file(params, NODES), params)
+    values = with_camera_url_from(read_parameter_file(params, NODES), params)
     try:
         return pipeline.load_setup(values, others=NODE_OPTION_CLASSES)
     except OptionError as error:
@@ -133,10 +134,12 @@ def _asked(args: argparse.Namespace) -> Topics:
 
 
 def _write_products(calibration: Calibration, folder: Path) -> None:
-    from starcal_ros import products
+    from starcal_ros import calibration_file
+    from starcal_ros.calibration_file import write_calibration
+    from starcal_ros.camera_info import CAMERA_INFO_FILE, write_camera_info
 
-    products.write_calibration(calibration, folder / products.CALIBRATION_FILE)
-    products.write_camera_info(calibration.geometry.camera, folder / products.CAMERA_INFO_FILE)
+    write_calibration(calibration, folder / calibration_file.CALIBRATION_FILE)
+    write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE)
 
 
 def _report(args: argparse.Namespace) -> int:
@@ -171,9 +174,10 @@ def _inspect(args: argparse.Namespace) -> int:
 
 def _compare(args: argparse.Namespace) -> int:
     """Say how far two calibrations are apart."""
-    from starcal_ros import comparison, comparison_figure, products, summaries
+    from starcal_ros import comparison, comparison_figure, summaries
+    from starcal_ros.calibration_file import read_calibration
 
-    found = comparison.compare(*(products.read_calibration(_file(p)) for p in (args.a, args.b)))
+    found = comparison.compare(*(read_calibration(_file(p)) for p in (args.a, args.b)))
     if args.output:
         comparison_figure.write(found, args.output)
     if args.json:
@@ -187,7 +191,7 @@ def _compare(args: argparse.Namespace) -> int:
 
 def _file(path: Path) -> Path:
     """The calibration of a folder, or the file itself."""
-    from starcal_ros.products import CALIBRATION_FILE
+    from starcal_ros.calibration_file import CALIBRATION_FILE
 
     if not path.is_dir():
         return path
@@ -274,8 +278,14 @@ def _campaign(args: argparse.Namespace) -> int:
     import dataclasses
     import time
 
-    from starcal_ros import campaign, campaign_figures, campaign_workers, pipeline, products
+    from starcal_ros import (
+        campaign,
+        campaign_figures,
+        campaign_workers,
+        pipeline,
+    )
     from starcal_ros.options import nearest
+    from starcal_ros.product_files import write_atomically
 
     if args.study == 'paper':
         return _paper(args)
@@ -304,7 +314,7 @@ def _campaign(args: argparse.Namespace) -> int:
     found = campaign.conclude(design, rows)
     path = args.output / f'{design.study}.json'
     software = f'starcal {pipeline.software_version()}'
-    products.write_atomically(path, campaign.content(found, software))
+    write_atomically(path, campaign.content(found, software))
     path.with_suffix('.png').write_bytes(campaign_figures.png(found))
     print(f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s')
     print('\n'.join(campaign.table(found)))
@@ -326,8 +336,9 @@ def _paper(args: argparse.Namespace) -> int:
     import dataclasses
     import functools
 
-    from starcal_ros import campaign, paper_figures, paper_study, pipeline, products
+    from starcal_ros import campaign, paper_figures, paper_study, pipeline
     from starcal_ros.campaign_workers import run_each, run_trials
+    from starcal_ros.product_files import write_atomically
     from starcal_ros.synthetic import scenario
 
     workers = _workers(args)
@@ -346,11 +357,11 @@ def _paper(args: argparse.Namespace) -> int:
     found = paper_study.study(observations, campaign.conclude(table1, rows), args.seed)
     software = f'starcal {pipeline.software_version()}'
     for name, png in paper_figures.pngs(found).items():
-        products.write_atomically(args.output / 'images' / f'paper_{name}.png', png)
+        write_atomically(args.output / 'images' / f'paper_{name}.png', png)
     path = args.output / 'paper.md'
-    products.write_atomically(path, paper_study.page(found, software))
+    write_atomically(path, paper_study.page(found, software))
     content = {'software': software, **paper_study.numbers(found)}
-    products.write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
+    write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
     print(f'written to {path}, with figures in {args.output / "images"}')
     return EXIT_ACCEPTED
 

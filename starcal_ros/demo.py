@@ -20,10 +20,12 @@ import yaml
 
 from starcal_ros import simulation, synthetic
 from starcal_ros.agreement import alignment_difference_rad
+from starcal_ros.calibration_file import read_calibration
 from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.camera_info import read_camera_info
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
-from starcal_ros.products import read_calibration, read_camera_info, write_atomically
+from starcal_ros.product_files import write_atomically
 from starcal_ros.records import Calibration, CameraGeometry
 
 Process = subprocess.Popen[bytes]

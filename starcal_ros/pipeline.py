@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from starcal_ros import bag, products
+from starcal_ros import bag
 from starcal_ros.acceptance import Candidate, GateOptions, judge
 from starcal_ros.agreement import difference, halves
 from starcal_ros.astrometry import SiteOptions
@@ -29,6 +29,7 @@ from starcal_ros.calibration import (
     estimate_calibration,
 )
 from starcal_ros.camera import zero_skew_fit
+from starcal_ros.camera_info import read_camera_info
 from starcal_ros.catalog import load_catalog, StarCatalog
 from starcal_ros.centroiding import CentroidOptions, saturation_level
 from starcal_ros.constants import ARCSECOND_RAD
@@ -146,7 +147,7 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
     frames = from_mapping(SetupOptions, values)
     if not frames.camera_info_url:
         raise OptionError('camera_info_url: the prior camera must be given')
-    camera = products.read_camera_info(frames.camera_info_url)
+    camera = read_camera_info(frames.camera_info_url)
     quaternion = np.array(frames.prior_alignment)
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1.0) > 1e-3:

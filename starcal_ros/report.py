@@ -22,16 +22,12 @@ import numpy as np
 
 from starcal_ros import bag, report_figures
 from starcal_ros.agreement import alignment_difference_rad, movement
+from starcal_ros.calibration_file import CALIBRATION_FILE, prior_of, read_calibration
 from starcal_ros.camera import INTRINSIC_NAMES, PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.message_types import OBSERVATIONS_TYPE
 from starcal_ros.observability import map_sigma_px, movement_px
-from starcal_ros.products import (
-    CALIBRATION_FILE,
-    prior_of,
-    read_calibration,
-    write_atomically,
-)
+from starcal_ros.product_files import write_atomically
 from starcal_ros.records import (
     Calibration,
     CameraGeometry,

@@ -9,7 +9,7 @@ from markupsafe import Markup
 import numpy as np
 
 from starcal_ros import report_figures as figures
-from starcal_ros.products import prior_of
+from starcal_ros.calibration_file import prior_of
 from starcal_ros.records import Calibration
 from starcal_ros.residuals import Residuals
 

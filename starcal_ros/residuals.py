@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from starcal_ros.calibration import Estimate
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
-from starcal_ros.products import write_atomically
+from starcal_ros.product_files import write_atomically
 from starcal_ros.records import Ensemble
 
 Floats = NDArray[np.float64]

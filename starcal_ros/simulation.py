@@ -15,8 +15,9 @@ import yaml
 
 from starcal_ros.bag import BagWriter
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES
+from starcal_ros.camera_info import write_camera_info
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.products import write_atomically, write_camera_info
+from starcal_ros.product_files import write_atomically
 from starcal_ros.records import AttitudeSample, CameraGeometry
 from starcal_ros.synthetic import (
     attitude_samples,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.annotation import annotate, stretch
-from starcal_ros.products import write_atomically
+from starcal_ros.product_files import write_atomically
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
 THUMBNAILS_FOLDER = 'thumbnails'

@@ -9,8 +9,9 @@ import resource
 import numpy as np
 import pytest
 
-from starcal_ros import pipeline, products
+from starcal_ros import pipeline
 from starcal_ros.calibrator_state import Answer, CalibratorState
+from starcal_ros.camera_info import write_camera_info
 from starcal_ros.errors import ArchiveError, OptionError
 from starcal_ros.node_options import CalibratorOptions
 from starcal_ros.records import Ensemble, refused_image, StarObservations
@@ -26,7 +27,7 @@ def shown() -> tuple[StarObservations, ...]:
 
 def load(folder: Path, scenario_name: str = 'tiny', **values: object) -> pipeline.Setup:
     prior = scenario(scenario_name, seed=7).prior
-    products.write_camera_info(prior.camera, folder / f'{scenario_name}.yaml')
+    write_camera_info(prior.camera, folder / f'{scenario_name}.yaml')
     return pipeline.load_setup(
         {
             'camera_info_url': str(folder / f'{scenario_name}.yaml'),

@@ -12,11 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros import cli, comparison, comparison_figure
+from starcal_ros.calibration_file import read_calibration, write_calibration
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.comparison import compare, GRID
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, ProductError
-from starcal_ros.products import read_calibration, write_calibration
 from starcal_ros.records import Calibration
 
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'

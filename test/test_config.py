@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from starcal_ros import pipeline, products
+from starcal_ros import pipeline
+from starcal_ros.camera_info import read_camera_info, with_camera_url_from
 from starcal_ros.node_options import NODE_OPTION_CLASSES
 from starcal_ros.options import check_value, read_parameter_file
 
@@ -46,10 +47,8 @@ def test_every_parameter_stands_with_its_default() -> None:
 )
 def test_examples_load(path: Path) -> None:
     if path.stem.endswith('_camera'):
-        assert products.read_camera_info(str(path)).width > 0
+        assert read_camera_info(str(path)).width > 0
         return
     values = read_parameter_file(path, ('star_observer', 'calibrator'))
-    setup = pipeline.load_setup(
-        products.with_camera_url_from(values, path), others=NODE_OPTION_CLASSES
-    )
+    setup = pipeline.load_setup(with_camera_url_from(values, path), others=NODE_OPTION_CLASSES)
     assert setup.prior.camera.width > 0

@@ -18,9 +18,10 @@ import yaml
 
 from starcal_ros import agreement, demo, simulation, synthetic
 from starcal_ros.bag import read_attitudes, read_images
+from starcal_ros.calibration_file import read_calibration
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project
+from starcal_ros.camera_info import read_camera_info
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.products import read_calibration, read_camera_info
 from starcal_ros.records import Calibration, CameraGeometry, Image
 
 ROOT = Path(__file__).parents[1]

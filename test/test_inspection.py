@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from starcal_ros import bag, cli, inspection, pipeline, products, simulation
+from starcal_ros import bag, cli, inspection, pipeline, simulation
+from starcal_ros.camera_info import with_camera_url_from
 from starcal_ros.message_fields import make_header
 from starcal_ros.message_types import COMPRESSED_TYPE
 from starcal_ros.node_options import NODE_OPTION_CLASSES
@@ -27,7 +28,7 @@ IMAGE, ATTITUDE = simulation.IMAGE_TOPIC, simulation.ATTITUDE_TOPIC
 
 @pytest.fixture(scope='module')
 def setup() -> pipeline.Setup:
-    values = products.with_camera_url_from(read_parameter_file(PARAMS, cli.NODES), PARAMS)
+    values = with_camera_url_from(read_parameter_file(PARAMS, cli.NODES), PARAMS)
     return pipeline.load_setup(values, NODE_OPTION_CLASSES)
 
 

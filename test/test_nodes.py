@@ -34,7 +34,8 @@ from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal.srv import Calibrate
-from starcal_ros import bag, message_fields, products
+from starcal_ros import bag, message_fields
+from starcal_ros.calibration_file import CALIBRATION_FILE, read_calibration
 from starcal_ros.calibration_messages import calibration_from_message
 from starcal_ros.image_messages import image_from_message, image_to_message
 from starcal_ros.message_fields import make_header
@@ -74,7 +75,7 @@ def calibrate_by_tool(folder: Path, output: Path) -> Any:
     command += [str(folder / 'params.yaml'), '-o', str(output)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return products.read_calibration(output / products.CALIBRATION_FILE)
+    return read_calibration(output / CALIBRATION_FILE)
 
 
 def play(start_node: StartNode, folder: Path, *more: str) -> None:
@@ -373,7 +374,7 @@ def test_state_outlasts_a_kill(
     ensemble_by_tool += [str(tmp_path / 'state' / 'ensemble'), '-o', str(tmp_path / 'again')]
     ensemble_by_tool += ['--params', str(tiny_bag / 'params.yaml')]
     subprocess.run(ensemble_by_tool, check=True, capture_output=True)
-    repeated = products.read_calibration(tmp_path / 'again' / products.CALIBRATION_FILE)
+    repeated = read_calibration(tmp_path / 'again' / CALIBRATION_FILE)
     np.testing.assert_array_equal(repeated.covariance, tool.covariance)
 
 

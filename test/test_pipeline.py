@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros import bag, pipeline, products
+from starcal_ros import bag, pipeline
 from starcal_ros.astrometry import through_the_air
 from starcal_ros.attitude import attitude_sample, AttitudeHistory
 from starcal_ros.calibration import CalibrationOptions
 from starcal_ros.camera import PARAMETER_NAMES, project
+from starcal_ros.camera_info import write_camera_info
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, OptionError, ProductError, TooFewObservations
 from starcal_ros.node_options import NODE_OPTION_CLASSES
@@ -47,7 +48,7 @@ S = 1_000_000_000
 @pytest.fixture(scope='module')
 def camera_yaml(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp('prior') / 'camera.yaml'
-    products.write_camera_info(SCENARIO.prior.camera, path)
+    write_camera_info(SCENARIO.prior.camera, path)
     return path
 
 

@@ -13,8 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from starcal_ros import cli, products, report, residuals
+from starcal_ros import cli, report, residuals
 from starcal_ros.arguments import EXIT_ACCEPTED, EXIT_BAD_INPUT
+from starcal_ros.calibration_file import (
+    CALIBRATION_FILE,
+    prior_of,
+    read_calibration,
+    write_calibration,
+)
 
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 BROWSER = next(
@@ -56,12 +62,12 @@ def page(folder: Path) -> str:
 
 
 def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> None:
-    calibration = products.read_calibration(folder / products.CALIBRATION_FILE)
+    calibration = read_calibration(folder / CALIBRATION_FILE)
     assert '✓ Accepted' in page
     fx, sigma = calibration.geometry.camera.parameters[0], calibration.sigma[0]
     assert f'<td>{fx:.3f}</td>' in page  # to a hundredth of the sigma of 0.05 px
     assert f'<td>{sigma:.2g}</td>' in page
-    prior = products.prior_of(calibration)
+    prior = prior_of(calibration)
     assert prior is not None
     change = fx - prior.camera.parameters[0]
     assert f'<td>{change / sigma:+.1f}</td>' in page
@@ -92,7 +98,7 @@ def test_report_rebuilds_the_same_page(folder: Path, page: str) -> None:
 def test_a_folder_with_a_calibration_alone_says_what_is_missing(
     folder: Path, tmp_path: Path
 ) -> None:
-    shutil.copy(folder / products.CALIBRATION_FILE, tmp_path)
+    shutil.copy(folder / CALIBRATION_FILE, tmp_path)
     text = report.write_report(tmp_path).read_text()
     assert 'not in this folder (residuals.npz)' in text
     assert 'did not have the images' in text
@@ -100,10 +106,10 @@ def test_a_folder_with_a_calibration_alone_says_what_is_missing(
 
 
 def test_a_refused_calibration_says_why(folder: Path, tmp_path: Path) -> None:
-    calibration = products.read_calibration(folder / products.CALIBRATION_FILE)
+    calibration = read_calibration(folder / CALIBRATION_FILE)
     reasons = ('residual 2 px & more is over the limit',)
     refused = dataclasses.replace(calibration, accepted=False, reasons=reasons)
-    products.write_calibration(refused, tmp_path / products.CALIBRATION_FILE)
+    write_calibration(refused, tmp_path / CALIBRATION_FILE)
     text = report.write_report(tmp_path).read_text()
     assert '✕ Refused' in text and '✓ Accepted' not in text
     assert 'residual 2 px &amp; more is over the limit' in text
@@ -111,7 +117,7 @@ def test_a_refused_calibration_says_why(folder: Path, tmp_path: Path) -> None:
 
 def test_names_are_text_and_never_markup(folder: Path, tmp_path: Path) -> None:
     evil = '</script><script>alert(1)</script><img src=x onerror=alert(1)>'
-    calibration = products.read_calibration(folder / products.CALIBRATION_FILE)
+    calibration = read_calibration(folder / CALIBRATION_FILE)
     calibration = dataclasses.replace(
         calibration,
         child_frame=evil,
@@ -119,7 +125,7 @@ def test_names_are_text_and_never_markup(folder: Path, tmp_path: Path) -> None:
         provenance={**calibration.provenance, evil: evil, 'options': 'no JSON', 'prior': '[1]'},
         images_refused={evil: 1},
     )
-    products.write_calibration(calibration, tmp_path / products.CALIBRATION_FILE)
+    write_calibration(calibration, tmp_path / CALIBRATION_FILE)
     shutil.copy(folder / residuals.RESIDUALS_FILE, tmp_path)
     text = report.write_report(tmp_path).read_text()
     assert '<script>alert' not in text and '<img src=x' not in text
@@ -127,7 +133,7 @@ def test_names_are_text_and_never_markup(folder: Path, tmp_path: Path) -> None:
 
 def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:
     """A calibration with nothing finite in it, and residuals of which none was used."""
-    calibration = products.read_calibration(folder / products.CALIBRATION_FILE)
+    calibration = read_calibration(folder / CALIBRATION_FILE)
     calibration = dataclasses.replace(
         calibration,
         covariance=np.full((13, 13), np.nan),
@@ -138,7 +144,7 @@ def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:
         removals=(),
         time_ns=-(2**63),
     )
-    products.write_calibration(calibration, tmp_path / products.CALIBRATION_FILE)
+    write_calibration(calibration, tmp_path / CALIBRATION_FILE)
     left = residuals.read_residuals(folder / residuals.RESIDUALS_FILE)
     nothing = dataclasses.replace(
         left,
