@@ -24,6 +24,7 @@ from bench.frames import history, load_set_up, render_frame
 from bench.table import Table
 from starcal_ros import pipeline, synthetic
 from starcal_ros.campaign_trials import map_bound_px
+from starcal_ros.errors import TooFewObservations
 from starcal_ros.observability import map_error_px
 from starcal_ros.records import (
     CALIBRATION_PARAMETER_NAMES,
@@ -71,14 +72,15 @@ def run(quick: bool) -> list[Table]:
         f'From pixels, {IMAGES} images of {SIZE[0]} x {SIZE[1]}, {seeds} seeds',
         (
             *('field deg', 'PSF px', 'tracker "', 'map / bound rms', 'median', 'worst', 'target'),
-            *('star / bound', 'star / sigma', 'stars'),
+            *('star / bound', 'star / sigma', 'stars', 'not solved'),
         ),
         notes=[
             'map: rms over the detector after the best common turn.  star: rms error per axis',
             'over the bound of each star and over its own sigma, signal-to-noise above 10.',
+            'not solved: campaigns without a calibration; no other column knows of them.',
         ],
     )
-    with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context('spawn')) as pool:
+    with ProcessPoolExecutor(_cores(), multiprocessing.get_context('spawn')) as pool:
         for case in cases:
             rows = list(pool.map(trial, [case] * seeds, range(1, seeds + 1)))
             table.add(*_summary(case, rows))
@@ -87,20 +89,30 @@ def run(quick: bool) -> list[Table]:
     return [table]
 
 
+def _cores() -> int:
+    """Return how many cores this process may run on."""
+    return len(os.sched_getaffinity(0))
+
+
 def _summary(case: Case, rows: Iterable[Floats]) -> tuple[float | str, ...]:
-    ratio, over_bound2, over_sigma2, stars = np.array(list(rows)).T
+    table = np.array(list(rows))
+    solved = np.isfinite(table).all(axis=1)
+    unsolved = int(np.count_nonzero(~solved))
+    before = (case.field_deg, case.psf_sigma_px, case.tracker_arcsec)
+    if not solved.any():
+        return (*before, *([math.nan] * 3), 'MISSED', math.nan, math.nan, 0, unsolved)
+    ratio, over_bound2, over_sigma2, stars = table[solved].T
     rms = math.sqrt(float(np.mean(ratio**2)))
     return (
-        case.field_deg,
-        case.psf_sigma_px,
-        case.tracker_arcsec,
+        *before,
         rms,
         float(np.median(ratio)),
         float(ratio.max()),
-        'met' if rms <= TARGET else 'MISSED',
+        'met' if rms <= TARGET and not unsolved else 'MISSED',
         math.sqrt(float(over_bound2.mean())),
         math.sqrt(float(over_sigma2.mean())),
         int(stars.mean()),
+        unsolved,
     )
 
 
@@ -139,7 +151,11 @@ def scenario_of(case: Case, seed: int) -> Scenario:
 
 
 def trial(case: Case, seed: int) -> Floats:
-    """Map error by its bound; mean squares of star errors by bound and by sigma; stars: (4,)."""
+    """
+    Map error by its bound; mean squares of star errors by bound and by sigma; stars: (4,).
+
+    NaN where the campaign gives no calibration.
+    """
     scenario = scenario_of(case, seed)
     setup = load_set_up(scenario)
     track = pipeline.Track(setup.prior)
@@ -148,8 +164,12 @@ def trial(case: Case, seed: int) -> Floats:
         image, samples = render_frame(scenario, index)
         observed, track = pipeline.observe_next(image, history(samples), setup, track)
         ensemble = pipeline.add_to_ensemble(ensemble, observed, setup)
-        stars.append(_star_errors(scenario, index, observed))
-    found = pipeline.solve(ensemble, setup)
+        if len(observed):
+            stars.append(_star_errors(scenario, index, observed))
+    try:
+        found = pipeline.solve(ensemble, setup)
+    except TooFewObservations:
+        return np.full(4, np.nan)
     bound = np.zeros((13, 13))
     columns = [CALIBRATION_PARAMETER_NAMES.index(name) for name in synthetic.BOUND_NAMES]
     bound[np.ix_(columns, columns)] = synthetic.cramer_rao_covariance(scenario)
