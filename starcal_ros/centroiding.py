@@ -327,8 +327,8 @@ def _without_neighbours(
     """
     The fits once more, without the light of those neighbours that are measured themselves.
 
-    Also (n,) which stars those are.  Only stars with a neighbour in reach are fitted again, twice:
-    the second time with neighbours that were freed from their own.
+    Also (n,) which stars those are.  Only stars with a neighbour in reach are fitted again, and
+    once more those whose neighbours were freed from their own in between.
     """
     n, width, _ = stamps.shape
     in_place = np.abs(fit.parameters[:, :2]).max(axis=1) < 1.5
@@ -347,6 +347,8 @@ def _without_neighbours(
     star, other = star[told], other[told]
     away_px = (centre[other] - centre[star]).astype(np.float64)
     for _ in range(2):
+        if len(star) == 0:
+            break
         at_px = away_px + fit.parameters[other, :2]
         light = light_in_stamps(at_px, fit.parameters[other, 2], sigma_px[other], width)
         lit = light.max(axis=1, initial=0.0) > _NEIGHBOUR_NOISE * noise_dn[star]
@@ -368,6 +370,8 @@ def _without_neighbours(
             fit.parameters[again],
         )
         fit = replace_rows(fit, again, freed)
+        after_freed = np.isin(star, star[np.isin(other, again)])
+        star, other, away_px = star[after_freed], other[after_freed], away_px[after_freed]
     return fit, modelled
 
 

@@ -115,7 +115,9 @@ def _single_lit(
 ) -> Indices:
     """Numbers of the pixels of some rows that are lit while the four next to them are not."""
     height, width = pixels.shape
-    lit = np.flatnonzero(pixels[rows[0] : rows[1]] > background_dn + threshold_dn)
+    # Whole numbers: against a float every pixel would be made one.
+    floor_dn = min(max(math.floor(background_dn + threshold_dn), 0), np.iinfo(pixels.dtype).max)
+    lit = np.flatnonzero(pixels[rows[0] : rows[1]] > floor_dn)
     v, u = np.divmod(lit + rows[0] * width, width)
     inner = (u >= 1) & (u < width - 1) & (v >= 1) & (v < height - 1)
     v, u = v[inner], u[inner]

@@ -362,24 +362,28 @@ def _psf_rows(
     value, first, second = _profile(
         np.concatenate([x, y]), np.concatenate([sigma_px, sigma_px]), width, count == 7
     )
-    px, py, px1, py1 = value[:n], value[n:], first[:n], first[n:]
-    rows = np.empty((n, count + 1, width, width))
+    rows = np.empty((n, count + 1, width * width))
     flux = flux[:, None]
-    np.multiply(py[:, :, None], (flux * px1)[:, None, :], out=rows[:, 0])
-    np.multiply(py1[:, :, None], (flux * px)[:, None, :], out=rows[:, 1])
-    np.multiply(py[:, :, None], px[:, None, :], out=rows[:, 2])
+    # Spread over the stamp first: products of long rows take a third of those of short ones.
+    px, py = np.tile(value[:n], width), np.repeat(value[n:], width, axis=1)
+    flux_px1 = np.tile(flux * first[:n], width)
+    py1 = np.repeat(first[n:], width, axis=1)
+    np.multiply(py, flux_px1, out=rows[:, 0])
+    np.multiply(py, px, out=rows[:, 2])
+    px *= flux
+    np.multiply(py1, px, out=rows[:, 1])
     rows[:, 3] = 1.0
     if count == 7:
-        px2, py2 = second[:n], second[n:]
-        variance = flux * sigma_px[:, None] ** 2
-        np.multiply(py[:, :, None], (0.5 * variance * px2)[:, None, :], out=rows[:, 4])
-        np.multiply(py2[:, :, None], (0.5 * variance * px)[:, None, :], out=rows[:, 5])
-        np.multiply(py1[:, :, None], (variance * px1)[:, None, :], out=rows[:, 6])
-    flat: Floats = rows.reshape(n, count + 1, width * width)
-    np.multiply(flat[:, 2], -flux, out=flat[:, count])
-    flat[:, count] += data
-    flat[:, count] -= level[:, None]
-    return flat
+        variance = sigma_px[:, None] ** 2
+        np.multiply(py, np.tile(0.5 * flux * variance * second[:n], width), out=rows[:, 4])
+        np.multiply(px, np.repeat(0.5 * variance * second[n:], width, axis=1), out=rows[:, 5])
+        py1 *= variance
+        np.multiply(py1, flux_px1, out=rows[:, 6])
+    residual = rows[:, count]
+    np.multiply(rows[:, 2], -flux, out=residual)
+    residual += data
+    residual -= level[:, None]
+    return rows
 
 
 def _weights(
