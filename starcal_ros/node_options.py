@@ -41,6 +41,11 @@ class ObserverOptions:
     attitude_history_s: float = option(
         3600.0, 'how long attitude samples are kept for images still to come, s', low=1.0
     )
+    camera_info_per_image: bool = option(
+        False,
+        'publish the calibration in force once for each image, with its header, on'
+        ' image_camera_info',
+    )
 
 
 @dataclass(frozen=True)
@@ -55,9 +60,14 @@ class CalibratorOptions:
     calibration_history: int = option(
         20, 'most calibrations kept for roll-back, the one in force included', low=2, high=10000
     )
-
     set_camera_info_service: str = option(
         '', 'sensor_msgs/SetCameraInfo service to hand each new calibration to; empty: none'
+    )
+    set_camera_info_timeout_s: float = option(
+        5.0,
+        'longest wait for that service, and then for its answer, before it counts as a failure, s',
+        low=0.1,
+        high=3600.0,
     )
 
 

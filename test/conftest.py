@@ -164,3 +164,19 @@ def client() -> Iterator[Client]:
     one = Client()
     yield one
     one.close()
+
+
+@pytest.fixture
+def other_client() -> Iterator[Client]:
+    """A second client, which answers nothing while nobody waits on it."""
+    pytest.importorskip('rclpy')
+    one = Client()
+    yield one
+    one.close()
+
+
+@pytest.fixture(scope='session')
+def tiny_observations() -> Any:
+    """An ensemble of the tiny bag's sky as if measured, without pixels."""
+    synthetic = pytest.importorskip('starcal_ros.synthetic')
+    return synthetic.true_observations(synthetic.scenario('tiny'))

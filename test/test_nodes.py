@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 from collections.abc import Callable
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -15,9 +16,13 @@ from typing import Any, TYPE_CHECKING
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 if TYPE_CHECKING:
     from conftest import Client, NodeProcess, StartNode
+
+    from starcal_ros.records import Calibration as CalibrationRecord
+    from starcal_ros.records import Ensemble
 
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
@@ -28,15 +33,20 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Temperature
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal.srv import Calibrate
-from starcal_ros import bag, message_fields
+from starcal_ros import bag, message_fields, pipeline
 from starcal_ros.calibration_file import CALIBRATION_FILE, read_calibration
-from starcal_ros.calibration_messages import calibration_from_message
+from starcal_ros.calibration_messages import (
+    calibration_from_message,
+    calibration_to_message,
+    camera_info_to_message,
+)
 from starcal_ros.image_messages import image_from_message, image_to_message
 from starcal_ros.message_fields import make_header
 from starcal_ros.nodes.conversions import make_message
@@ -320,6 +330,60 @@ def test_annotated_image(client: Client, start_node: StartNode, tiny_bag: Path) 
     assert (picture.height, picture.width) == (answers[0].height, answers[0].width)
     assert len(picture.data) == picture.height * picture.width * 3
     assert np.ptp(np.frombuffer(picture.data, np.uint8)) > 100
+
+
+def test_camera_info_per_image(
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_observations: Ensemble
+) -> None:
+    """The calibration in force with the header of each image; the prior and candidates never."""
+    values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())['/**']['ros__parameters']
+    setup = pipeline.load_setup({**values, 'camera_info_url': str(tiny_bag / 'camera.yaml')})
+    in_force = pipeline.solve(tiny_observations, setup)
+    assert in_force.accepted
+    candidate = dataclasses.replace(in_force, accepted=False, reasons=('bad',))
+    observer = start_node(
+        'star_observer',
+        ros=parameters(tiny_bag, 'camera_info_per_image:=true', 'attitude_timeout_s:=0.0'),
+    )
+    best_effort = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+    lossy = client.collect(CameraInfo, 'image_camera_info', best_effort)
+    infos: list[Any] = client.collect(CameraInfo, 'image_camera_info')
+    answers: list[Any] = client.collect(StarObservations, 'observations')
+    images = client.publisher(Image, 'image', 50)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    calibrations = client.node.create_publisher(Calibration, 'calibration', latched)
+    camera = setup.prior.camera
+
+    def show(stamp_ns: int, frame_id: str = 'opnav', **size: int) -> Any:
+        message = blank(stamp_ns, **{'width': camera.width, 'height': camera.height, **size})
+        message.header.frame_id = frame_id
+        images.publish(message)
+        return message.header
+
+    def publish(calibration: CalibrationRecord, said: str) -> None:
+        calibrations.publish(calibration_to_message(calibration, make_message))
+        client.until(lambda: said in observer.said())
+
+    show(1)
+    publish(candidate, 'calibration: one that the gate has refused')
+    show(2)
+    client.until(lambda: len(answers) == 2)
+    publish(in_force, 'stars are predicted with the calibration in force')
+    headers = [show(3), show(4, width=8, height=8), show(7), show(5, 'other')]
+    client.until(lambda: len(answers) == 6 and len(infos) == 3)
+    # Nothing of the first two comes later: what is of one publisher comes in order.
+    assert [info.header for info in infos] == [headers[0], *headers[2:]]
+    assert lossy[0].header in headers
+    expected = camera_info_to_message(in_force, make_message)
+    for info in infos:
+        expected.header = info.header
+        assert info == expected
+    forced = dataclasses.replace(candidate, forced=True, child_frame='elsewhere')
+    calibrations.publish(calibration_to_message(forced, make_message))
+    client.until(lambda: observer.said().count('stars are predicted') == 2)
+    header = show(8)
+    client.until(lambda: len(infos) == 4)
+    assert infos[-1].header == header
 
 
 def test_calibrator_collects_while_it_solves(

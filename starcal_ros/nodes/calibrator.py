@@ -10,7 +10,6 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo
-from sensor_msgs.srv import SetCameraInfo
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration as CalibrationMessage
@@ -24,15 +23,18 @@ from starcal_ros.calibration_messages import (
     camera_info_to_message,
 )
 from starcal_ros.calibrator_state import Answer, CalibratorState
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.node_options import CalibratorOptions
+from starcal_ros.nodes.camera_driver import CameraDriver
 from starcal_ros.nodes.conversions import make_message, message_class
 from starcal_ros.nodes.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
 from starcal_ros.observation_messages import observations_from_message
 from starcal_ros.options import from_mapping
-from starcal_ros.records import Calibration
+from starcal_ros.records import Calibration, IMAGE_REFUSALS
 from starcal_ros.status_messages import status_to_message
 
 NAME = 'calibrator'
+_NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # A solve of minutes on a slow processor, at an image a second, loses none.
 _OBSERVATIONS = QoSProfile(depth=1000)
@@ -51,6 +53,8 @@ class Calibrator(StarcalNode):
         self._made: list[tuple[Any, Any]] = []
         self._state = CalibratorState()
         self._last_answer = Answer(True, '')
+        self._last_gate = 'none'
+        self._driver: CameraDriver | None = None
 
     def configure(self) -> None:
         """Load prior camera, options and the state folder, make the latched publishers."""
@@ -75,18 +79,16 @@ class Calibrator(StarcalNode):
             self._tf_static = latched(message_class('tf2_msgs/msg/TFMessage'), '/tf_static')
         except ImportError:
             self._tf_static = None
-        self._camera_client = None
-        if self._own.set_camera_info_service:
-            self._camera_client = self.create_client(
-                SetCameraInfo, self._own.set_camera_info_service
-            )
-            self._made.append((self.destroy_client, self._camera_client))
 
     def activate(self) -> None:
         """Start to collect and to answer."""
         self._listeners: list[tuple[Any, Any]] = []
         collecting, solving = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
-        deciding = MutuallyExclusiveCallbackGroup()
+        deciding, sending = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
+        if self._own.set_camera_info_service:
+            self._driver = CameraDriver(
+                self, self._own.set_camera_info_service, self._own.set_camera_info_timeout_s
+            )
         listener = self.create_subscription(
             ObservationsMessage,
             'observations',
@@ -100,6 +102,7 @@ class Calibrator(StarcalNode):
             (Calibrate, '~/solve', self._on_solve, solving),
             (Trigger, '~/reset', self._on_reset, deciding),
             (Trigger, '~/rollback', self._on_rollback, deciding),
+            (Trigger, '~/send_camera_info', self._on_send_camera_info, sending),
         ):
             service = self.create_service(kind, name, self._answered(answer), callback_group=group)
             self._listeners.append((self.destroy_service, service))
@@ -117,6 +120,9 @@ class Calibrator(StarcalNode):
 
     def deactivate(self) -> None:
         """Stop collecting and answering."""
+        if self._driver is not None:
+            self._driver.close()
+            self._driver = None
         listeners = getattr(self, '_listeners', [])
         while listeners:
             destroy, entity = listeners.pop()
@@ -134,12 +140,24 @@ class Calibrator(StarcalNode):
         state, last = self._state, self._last_answer
         ensemble, in_force = state.ensemble, state.in_force
         free = state.disk_free_bytes()
+        age_s: object = 'none'
+        if in_force is not None:
+            age_ns = self._now_ns() - in_force.in_force_since_ns
+            age_s = round(age_ns / NANOSECONDS_PER_SECOND, 1)
+        driver = self._driver
         numbers: dict[str, object] = {
             'images': len(ensemble.images),
             'stars': ensemble.star_count,
-            **{f'refused_{reason}': n for reason, n in sorted(ensemble.refused.items())},
+            **{
+                f'refused_{reason}': count
+                for reason, count in {**_NONE_REFUSED, **ensemble.refused}.items()
+            },
             'in_force': 'none' if in_force is None else in_force.number,
+            'calibration_age_s': age_s,
+            'last_gate': self._last_gate,
             'last_answer': last.message,
+            'camera_driver': 'none' if driver is None else driver.outcome,
+            'camera_driver_failures': 0 if driver is None else driver.failures,
             'state_damaged_files': len(state.damage),
             'disk_free_mb': 'none' if free is None else free // 1_000_000,
         }
@@ -149,6 +167,10 @@ class Calibrator(StarcalNode):
             return WARN, f'in force against the gate: {"; ".join(in_force.reasons)}', numbers
         if self.count_publishers(self._calibration.topic_name) > 1:
             return WARN, f'another publisher of {self._calibration.topic_name}', numbers
+        if state.damage:
+            return WARN, f'set aside as damaged: {"; ".join(state.damage)}', numbers
+        if driver is not None and driver.has_failed:
+            return WARN, f'the camera was not told: {driver.outcome}', numbers
         if not last.success:
             return WARN, last.message, numbers
         return OK, 'collecting' if in_force is None else 'calibration in force', numbers
@@ -168,15 +190,17 @@ class Calibrator(StarcalNode):
         self._status.publish(status_to_message(status, frame_id, make_message))
 
     def _on_calibrate(self, _request: Any, response: Any) -> Any:
-        return self._told(self._state.solve(self._now_ns()), response)
+        return self._told(self._judged(self._state.solve(self._now_ns())), response)
 
     def _on_solve(self, request: Any, response: Any) -> Any:
-        answer = self._state.solve(
-            self._now_ns(),
-            request.method,
-            tuple(request.estimate),
-            request.dry_run,
-            request.force,
+        answer = self._judged(
+            self._state.solve(
+                self._now_ns(),
+                request.method,
+                tuple(request.estimate),
+                request.dry_run,
+                request.force,
+            )
         )
         if answer.calibration is not None:
             response.calibration = calibration_to_message(answer.calibration, make_message)
@@ -190,8 +214,23 @@ class Calibrator(StarcalNode):
     def _on_rollback(self, _request: Any, response: Any) -> Any:
         return self._told(self._state.rollback(self._now_ns()), response)
 
+    def _on_send_camera_info(self, _request: Any, response: Any) -> Any:
+        driver = self._driver
+        if driver is None:
+            response.success, response.message = False, 'set_camera_info_service is not given'
+        else:
+            response.success, response.message = driver.hand_over_again()
+        return response
+
     def _now_ns(self) -> int:
         return int(self.get_clock().now().nanoseconds)
+
+    def _judged(self, answer: Answer) -> Answer:
+        """Keep what the gate has said for the diagnostics."""
+        if answer.calibration is not None:
+            reasons = '; '.join(answer.calibration.reasons)
+            self._last_gate = 'accepted' if answer.calibration.accepted else f'refused: {reasons}'
+        return answer
 
     def _told(self, answer: Answer, response: Any) -> Any:
         """Publish what came into force, or what the gate has refused; the filled response."""
@@ -199,6 +238,7 @@ class Calibrator(StarcalNode):
             self._publish_calibration(answer.calibration)
         elif answer.calibration is not None and not answer.success:
             self._candidate.publish(calibration_to_message(answer.calibration, make_message))
+        self._last_answer = Answer(answer.success, answer.message)
         response.success, response.message = answer.success, answer.message
         return response
 
@@ -210,12 +250,8 @@ class Calibrator(StarcalNode):
         self._calibration.publish(calibration_to_message(calibration, make_message))
         if self._tf_static is not None:
             self._tf_static.publish(make_message('tf2_msgs/msg/TFMessage', transforms=[alignment]))
-        if self._camera_client is not None:
-            if self._camera_client.service_is_ready():
-                self._camera_client.call_async(SetCameraInfo.Request(camera_info=camera_info))
-            else:
-                service = self._own.set_camera_info_service
-                self.get_logger().warning(f'{service}: not there; the camera was not told')
+        if self._driver is not None:
+            self._driver.hand_over(camera_info)
 
     def _answered(self, answer: Any) -> Any:
         """Return the service callback with errors answered, logged and counted."""
@@ -227,7 +263,7 @@ class Calibrator(StarcalNode):
                 self.count_error(error)
                 response.success = False
                 response.message = f'internal error: {type(error).__name__}: {error}'
-            self._last_answer = Answer(response.success, response.message)
+                self._last_answer = Answer(False, response.message)
             self.get_logger().info(response.message)
             self.publish_health_change()
             return response

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import functools
+import resource
 import signal
 import sys
 import threading
@@ -25,7 +26,8 @@ from starcal_ros.pipeline import OPTION_CLASSES
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Health = tuple[bytes, str, dict[str, object]]
 
-_THREADS = 6  # images, attitudes, services, solve, status, one spare: none waits for another
+# Images, attitudes, services, solve, status, driver, its answer, a spare: none waits for another.
+_THREADS = 8
 
 
 class StarcalNode(LifecycleNode):
@@ -130,7 +132,9 @@ class StarcalNode(LifecycleNode):
             level, text, numbers = WARN, self.failure or f'not active: {state}', {}
             if self.failure:
                 level = ERROR
-        return level, text, {**numbers, 'callback_errors': self._errors}
+        peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # as Linux counts it
+        common = {'memory_peak_mb': peak_kb // 1000, 'callback_errors': self._errors}
+        return level, text, {**numbers, **common}
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Configure; a bad parameter or file leaves the node unconfigured."""

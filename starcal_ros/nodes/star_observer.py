@@ -8,12 +8,13 @@ import dataclasses
 import math
 import sys
 import threading
+import time
 from typing import Any
 
 from geometry_msgs.msg import QuaternionStamped, TwistStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CompressedImage, Temperature
+from sensor_msgs.msg import CameraInfo, CompressedImage, Temperature
 from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
@@ -21,7 +22,7 @@ from starcal.msg import StarObservations as ObservationsMessage
 from starcal_ros import pipeline
 from starcal_ros.annotation import annotate
 from starcal_ros.attitude import attitude_sample, AttitudeHistory
-from starcal_ros.calibration_messages import calibration_from_message
+from starcal_ros.calibration_messages import calibration_from_message, camera_info_to_message
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.image_messages import color_image_to_message, image_from_message
@@ -30,11 +31,13 @@ from starcal_ros.node_options import ObserverOptions
 from starcal_ros.nodes.conversions import make_message
 from starcal_ros.nodes.image_queue import ImageQueue, Waiting
 from starcal_ros.nodes.lifecycle import Health, OK, run, StarcalNode, WARN
+from starcal_ros.nodes.recent import Recent
 from starcal_ros.observation_messages import observations_to_message
 from starcal_ros.options import from_mapping
 from starcal_ros.records import (
     CameraGeometry,
     Image,
+    IMAGE_REFUSALS,
     refused_image,
     StarObservations,
 )
@@ -67,6 +70,10 @@ class StarObserver(StarcalNode):
         self._queue: ImageQueue | None = None
         self._counts: Counter[str] = Counter()
         self._last_refusal = ''
+        self._camera_info: Any = (
+            None  # of the calibration in force; its header is the last image's
+        )
+        self._camera_infos: Any = None
 
     def configure(self) -> None:
         """Load prior camera and catalog, make the publishers."""
@@ -81,6 +88,12 @@ class StarObserver(StarcalNode):
             ImageMessage, 'annotated_image', QoSProfile(depth=2)
         )
         self._publishers_made = [self._observations, self._annotated]
+        self._camera_info = self._camera_infos = None
+        if self._own.camera_info_per_image:
+            self._camera_infos = self.create_lifecycle_publisher(
+                CameraInfo, 'image_camera_info', QoSProfile(depth=self._own.image_queue)
+            )
+            self._publishers_made.append(self._camera_infos)
 
     def activate(self) -> None:
         """Start to take images and attitudes, and the thread that measures."""
@@ -93,6 +106,7 @@ class StarObserver(StarcalNode):
         self._counts.clear()
         self._restarts = 0
         self._last_refusal = ''
+        self._image_arrivals, self._latency_s, self._attitude_step_s = Recent(), Recent(), Recent()
         self._queue = ImageQueue(
             self._own.image_queue, self._own.attitude_timeout_s, self._attitude_has_come
         )
@@ -150,9 +164,14 @@ class StarObserver(StarcalNode):
             'images': sum(counts.values()),
             'images_used': counts.get('', 0),
             'images_waiting': len(self._queue or ()),
+            'image_rate_hz': _short(self._image_arrivals.rate_hz()),
+            'latency_median_s': _short(self._latency_s.median()),
+            'latency_worst_s': _short(self._latency_s.largest()),
             'attitudes': len(self._attitudes),
+            'attitude_rate_hz': _short(self._attitude_step_s.rate_hz()),
+            'attitude_gap_s': _short(self._attitude_step_s.largest()),
             'restarts': self._restarts,
-            **{f'refused_{reason}': n for reason, n in sorted(counts.items()) if reason},
+            **{f'refused_{reason}': counts.get(reason, 0) for reason in sorted(IMAGE_REFUSALS)},
         }
         if self._last_refusal:
             return WARN, f'last image refused: {self._last_refusal}', numbers
@@ -161,16 +180,34 @@ class StarObserver(StarcalNode):
         return OK, 'observing', numbers
 
     def _on_image(self, message: Any) -> None:
+        self._image_arrivals.add(0.0)
+        self._publish_camera_info(message)
         time_ns = stamp_ns(message.header.stamp)
         time_ns += offset_ns(self._setup.attitude.stamp_offset_s)
         if self._queue is not None:
             width, height = getattr(message, 'width', 0), getattr(message, 'height', 0)
             self._queue.put(time_ns, width, height, message)
 
+    def _publish_camera_info(self, message: Any) -> None:
+        """Publish the calibration in force with the header of an image message."""
+        camera_info = self._camera_info
+        if camera_info is None or self._camera_infos is None:
+            return
+        # A compressed image does not say its size; one of another size has another camera.
+        size = (camera_info.width, camera_info.height)
+        if (getattr(message, 'width', size[0]), getattr(message, 'height', size[1])) == size:
+            camera_info.header = message.header
+            self._camera_infos.publish(camera_info)
+
     def _on_attitude(self, message: Any) -> None:
         time_ns, quaternion = attitude_from_message(message)
         direction = self._setup.attitude.attitude_direction
+        before_ns = self._attitudes.latest_ns
         self._attitudes.add(time_ns, attitude_sample(time_ns, quaternion, direction))
+        # A late sample is no gap, and neither is a step back of the clock.
+        latest_ns = self._attitudes.latest_ns or 0
+        step_ns = 0 if before_ns is None else max(0, latest_ns - before_ns)
+        self._attitude_step_s.add(step_ns / NANOSECONDS_PER_SECOND)
         if self._queue is not None:
             self._queue.wake()
 
@@ -185,11 +222,16 @@ class StarObserver(StarcalNode):
         self._temperatures.append(temperature_from_message(message))
 
     def _on_calibration(self, message: Any) -> None:
-        geometry = calibration_from_message(message).geometry
+        calibration = calibration_from_message(message)
+        if not (calibration.accepted or calibration.forced):
+            raise ValueError('calibration: one that the gate has refused')
+        geometry = calibration.geometry
         prior = self._setup.prior.camera
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
             raise ValueError('calibration: of another image size than the prior camera')
         self._geometry = geometry
+        if self._camera_infos is not None:
+            self._camera_info = camera_info_to_message(calibration, make_message)
         self.get_logger().info('stars are predicted with the calibration in force')
 
     def _attitude_has_come(self, time_ns: int) -> bool:
@@ -215,6 +257,7 @@ class StarObserver(StarcalNode):
                 self.count_error(error)
                 detail = f'{type(error).__name__}: {error}'
                 self._publish(self._refused(waiting, 'internal_error', detail))
+            self._latency_s.add(time.monotonic() - waiting.arrived_s)
             self.publish_health_change()
 
     def _measure(self, waiting: Waiting) -> None:
@@ -270,6 +313,10 @@ class StarObserver(StarcalNode):
         self._annotated.publish(
             color_image_to_message(image.time_ns, picture, frame_id, make_message)
         )
+
+
+def _short(number: float | None) -> str:
+    return 'none' if number is None else f'{number:.3f}'
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -1,0 +1,132 @@
+"""The camera's driver, handed each calibration that comes into force."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from sensor_msgs.srv import SetCameraInfo
+
+from starcal_ros.nodes.lifecycle import StarcalNode
+
+_LOOK_S = 0.5  # how often to look for the service and at the clock
+ACCEPTED = 'accepted'
+
+
+class CameraDriver:
+    """
+    A client of a driver's set_camera_info that says what became of each call.
+
+    A calibration is sent as soon as the service is there.  One that is refused, or not answered in
+    time, is sent again only by `hand_over_again`, or when the service has gone and come back: a
+    driver that says no would say so every second.  Safe to use from several threads.
+
+    Parameters
+    ----------
+    node : StarcalNode
+        Its log is told of every failure.
+    service : str
+    timeout_s : float
+        Longest wait for the service, and then for its answer, before it counts as a failure.
+    """
+
+    def __init__(self, node: StarcalNode, service: str, timeout_s: float) -> None:
+        self.failures = 0
+        self.outcome = 'no calibration'
+        self.has_failed = False  # at the last attempt
+        self._node, self._service, self._timeout_s = node, service, timeout_s
+        self._camera_info: Any = None
+        self._is_due = False  # to be sent when the service is there
+        self._is_there = False
+        self._call: Any = None
+        self._since_s = 0.0
+        self._closed = False
+        self._changed = threading.Condition(threading.RLock())
+        group = ReentrantCallbackGroup()
+        self._client = node.create_client(SetCameraInfo, service, callback_group=group)
+        self._timer = node.create_timer(_LOOK_S, node.guarded(self._look), group)
+
+    def close(self) -> None:
+        """Let go of the service; whoever waits is told."""
+        with self._changed:
+            self._closed = True
+            self._drop_call()
+            self._changed.notify_all()
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_client(self._client)
+
+    def hand_over(self, camera_info: Any) -> None:
+        """Send a sensor_msgs/CameraInfo, in place of any before it; does not wait."""
+        with self._changed:
+            self._camera_info = camera_info
+            self._begin()
+
+    def hand_over_again(self) -> tuple[bool, str]:
+        """Send the last one again and wait for the end of it: whether accepted, and a sentence."""
+        with self._changed:
+            if self._camera_info is None:
+                return False, 'no calibration is in force'
+            self._begin()
+            self._changed.wait_for(
+                lambda: self._closed or not (self._is_due or self._call), 3 * self._timeout_s
+            )
+            return self.outcome == ACCEPTED, f'{self._service}: {self.outcome}'
+
+    def _begin(self) -> None:
+        self._drop_call()
+        self._is_due, self._since_s = True, time.monotonic()
+        self.outcome, self.has_failed = 'waiting for the service', False
+        self._look()
+
+    def _look(self) -> None:
+        with self._changed:
+            if self._closed:
+                return
+            was_there, self._is_there = self._is_there, self._client.service_is_ready()
+            overdue = time.monotonic() - self._since_s > self._timeout_s
+            if self._is_there and (
+                self._is_due or (self._camera_info is not None and not was_there)
+            ):
+                self._send()
+            elif self._is_due and overdue:
+                self._end('not there; sent when it comes', False)
+            elif self._call is not None and overdue:
+                self._drop_call()
+                self._end(f'no answer within {self._timeout_s:g} s', False)
+
+    def _send(self) -> None:
+        self._drop_call()
+        self._is_due, self._since_s = False, time.monotonic()
+        self.outcome = 'waiting for its answer'
+        self._call = self._client.call_async(SetCameraInfo.Request(camera_info=self._camera_info))
+        self._call.add_done_callback(self._node.guarded(self._answered))
+
+    def _answered(self, call: Any) -> None:
+        with self._changed:
+            if call is not self._call or self._closed:
+                return  # of a calibration that is not in force any more
+            self._call = None
+            if call.exception() is not None:
+                self._end(f'failed: {call.exception()}', False)
+            elif call.result().success:
+                self._end(ACCEPTED, True)
+            else:
+                self._end(f'refused: {" ".join(call.result().status_message.split())}', False)
+
+    def _drop_call(self) -> None:
+        if self._call is not None:
+            self._client.remove_pending_request(self._call)
+            self._call = None
+
+    def _end(self, outcome: str, success: bool) -> None:
+        self._is_due = False
+        self.outcome, self.has_failed = outcome, not success
+        said = f'{self._service}: {outcome}'
+        if success:
+            self._node.get_logger().info(said)
+        else:
+            self.failures += 1
+            self._node.get_logger().error(said)
+        self._changed.notify_all()

@@ -1,0 +1,100 @@
+"""Every transition in every state of both nodes, and the end by a signal from each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import signal
+from typing import Any, TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+
+NUMBERS = sorted(
+    {value for name in dir(Transition) if isinstance(value := getattr(Transition, name), int)}
+)
+CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
+ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
+SHUTDOWN = {
+    'unconfigured': Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
+    'inactive': Transition.TRANSITION_INACTIVE_SHUTDOWN,
+    'active': Transition.TRANSITION_ACTIVE_SHUTDOWN,
+}
+PATHS = {'unconfigured': (), 'inactive': (CONFIGURE,), 'active': (CONFIGURE, ACTIVATE)}
+# What a state allows but the shutdown: there, where it leads, and the way back.
+ALLOWED: dict[str, tuple[tuple[int, str, tuple[int, ...]], ...]] = {
+    'unconfigured': ((CONFIGURE, 'inactive', (CLEANUP,)),),
+    'inactive': ((CLEANUP, 'unconfigured', (CONFIGURE,)), (ACTIVATE, 'active', (DEACTIVATE,))),
+    'active': ((DEACTIVATE, 'inactive', (ACTIVATE,)),),
+    'finalized': (),
+}
+
+
+class Manager:
+    """Takes one node through its states."""
+
+    def __init__(self, client: Client, name: str) -> None:
+        self._client = client
+        self._change = client.node.create_client(ChangeState, f'/{name}/change_state')
+        self._get = client.node.create_client(GetState, f'/{name}/get_state')
+        client.until(lambda: self._change.service_is_ready() and self._get.service_is_ready())
+
+    def _call(self, service: Any, request: Any) -> Any:
+        future = service.call_async(request)
+        self._client.until(future.done)
+        return future.result()
+
+    def change(self, number: int) -> bool:
+        """Whether the node made a transition."""
+        request = ChangeState.Request(transition=Transition(id=number))
+        return bool(self._call(self._change, request).success)
+
+    def state(self) -> str:
+        """Label of the state the node is in."""
+        return str(self._call(self._get, GetState.Request()).current_state.label)
+
+
+def try_everything(manager: Manager, state: str) -> None:
+    """Every transition there is: the state's own are made, the others refused without effect."""
+    own = {number for number, _, _ in ALLOWED[state]} | {SHUTDOWN.get(state)}
+    for number in (*NUMBERS, 200):
+        if number not in own:
+            assert not manager.change(number), number
+            assert manager.state() == state, number
+    for number, reached, back in ALLOWED[state]:
+        assert manager.change(number)
+        assert manager.state() == reached
+        assert all(manager.change(step) for step in back)
+        assert manager.state() == state
+
+
+@pytest.mark.parametrize('shut_down', [False, True])
+@pytest.mark.parametrize('state', PATHS)
+def test_every_transition_in_every_state(
+    client: Client, start_node: StartNode, tiny_bag: Path, state: str, shut_down: bool
+) -> None:
+    """Each node survives all of them, and ends with status 0 where a signal finds it."""
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'autostart:=false')
+    nodes = [start_node(name, ros=ros) for name in ('star_observer', 'calibrator')]
+    # Each state meets both signals; the two nodes end by the same code.
+    signals = [signal.SIGINT, signal.SIGTERM]
+    for node, number in zip(nodes, signals[::-1] if shut_down else signals, strict=True):
+        manager = Manager(client, node.name)
+        assert all(manager.change(step) for step in PATHS[state])
+        if shut_down:
+            assert manager.change(SHUTDOWN[state])
+        else:
+            try_everything(manager, state)
+        reached = 'finalized' if shut_down else state
+        assert manager.state() == reached
+        if shut_down and state == 'active':
+            try_everything(manager, reached)
+        assert node.stop(number) == 0, node.said()
+        assert 'Traceback' not in node.said()
