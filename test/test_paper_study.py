@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from pathlib import Path
 import re
 
 import numpy as np
 import pytest
 
-from starcal_ros import campaign, campaign_workers, paper_figures, paper_study, synthetic
+from starcal_ros import campaign, campaign_workers, cli, paper_figures, paper_study, synthetic
 from starcal_ros.paper_study import judge, PaperStudy, spread
 from starcal_ros.records import Ensemble
 
@@ -75,3 +77,19 @@ def test_the_page_and_its_figures(found: PaperStudy) -> None:
     assert set(re.findall(r'\(images/paper_(\w+)\.png\)', text)) == set(figures)
     assert all(png.startswith(b'\x89PNG') for png in figures.values())
     assert 'nan' not in text
+
+
+def test_one_command_makes_it_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command as it is, with a worker of its own, on the first five frames of the night."""
+    short = dataclasses.replace(paper_study.TABLE_1, stars=(20,), tracker_arcsec=(20.0,))
+    night = dataclasses.replace(NIGHT, image_count=5)
+    monkeypatch.setattr(paper_study, 'TABLE_1', short)
+    monkeypatch.setattr(paper_study, 'CALIBRATED_WITH', 4)
+    monkeypatch.setattr(synthetic, 'scenario', lambda *_: night)  # what counts the frames
+    asked = ['campaign', 'paper', '--trials', '1', '--seed', '3', '--workers', '1']
+    assert cli.main([*asked, '-o', str(tmp_path)]) == 0
+    numbers = json.loads((tmp_path / 'paper.json').read_text())
+    assert (numbers['images'], numbers['used'], numbers['others']) == (5, 4, 1)
+    text = (tmp_path / 'paper.md').read_text()
+    linked = re.findall(r'\((images/paper_\w+\.png)\)', text)
+    assert linked and all((tmp_path / name).read_bytes()[:4] == b'\x89PNG' for name in linked)
