@@ -140,8 +140,9 @@ def _on_detector(axes: Axes, camera: CameraModel) -> None:
         axes.spines[side].set_visible(True)
 
 
-def _detector_figure(camera: CameraModel) -> tuple[Figure, Axes]:
-    height = 0.75 + 3.9 * camera.height / camera.width
+def _detector_figure(camera: CameraModel, beside: float = 0.0) -> tuple[Figure, Axes]:
+    """A figure of the detector's proportion; ``beside`` is the width of what stands at its right."""
+    height = 0.75 + (3.9 - beside) * camera.height / camera.width
     figure, axes = _figure(_SIZE[0], min(height, 5.5))
     _on_detector(axes, camera)
     return figure, axes
@@ -377,7 +378,7 @@ def residuals_against_pixel_phase(residuals: Residuals) -> Markup:
 
 def line_of_sight_sigma(sigma_arcsec: Floats, camera: CameraModel, name: str) -> Markup:
     """1-sigma of lines of sight at a regular grid of pixels, corner to corner, arcsec."""
-    figure, axes = _detector_figure(camera)
+    figure, axes = _detector_figure(camera, beside=0.8)
     rows, columns = sigma_arcsec.shape
     u = np.linspace(0, camera.width - 1, columns)
     v = np.linspace(0, camera.height - 1, rows)
@@ -388,10 +389,19 @@ def line_of_sight_sigma(sigma_arcsec: Floats, camera: CameraModel, name: str) ->
             u, v, sigma_arcsec, levels, cmap='viridis', norm=BoundaryNorm(levels, 256)
         )
         bar = figure.colorbar(filled, cax=axes.inset_axes((1.03, 0, 0.045, 1)), spacing='uniform')
-        bar.set_ticks(levels.tolist(), labels=[f'{level:.3g}' for level in levels])
+        bar.set_ticks(levels.tolist(), labels=_told_apart(levels))
         bar.ax.tick_params(size=0)
         bar.set_label('1-sigma (arcsec)')
     return _svg(figure, name)
+
+
+def _told_apart(levels: Floats) -> list[str]:
+    """Numbers with three digits, or as many as it takes to tell them apart."""
+    for digits in range(3, 7):
+        labels = [f'{level:.{digits}g}' for level in levels]
+        if len(set(labels)) == len(labels):
+            break
+    return labels
 
 
 def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Markup:
