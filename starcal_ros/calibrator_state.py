@@ -13,16 +13,24 @@ from starcal_ros.archive import Archive, InForce
 from starcal_ros.errors import ArchiveError, OptionError, StarcalError
 from starcal_ros.node_options import CalibratorOptions
 from starcal_ros.records import Calibration, Ensemble, EnsembleStatus, StarObservations
+from starcal_ros.residuals import Residuals
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What came of a request: ``calibration`` is the solution, where there is one."""
+    """
+    What came of a request: ``calibration`` is the solution, where there is one.
+
+    ``observations`` are those that it was solved from, and ``residuals`` what it left of them; a
+    calibration that came back by a roll-back has neither.
+    """
 
     success: bool
     message: str
     calibration: Calibration | None = None
     in_force: bool = False
+    residuals: Residuals | None = None
+    observations: tuple[StarObservations, ...] = ()
 
 
 class CalibratorState:
@@ -133,15 +141,16 @@ class CalibratorState:
         force: bool = False,
     ) -> Answer:
         """Solve, and put in force what the gate accepts or ``force`` demands."""
+        ensemble = self.ensemble
         try:
-            calibration = pipeline.solve(
-                self.ensemble, self._setup, method, estimate, in_force=self.in_force
+            calibration, residuals = pipeline.solve_with_residuals(
+                ensemble, self._setup, method, estimate, in_force=self.in_force
             )
         except StarcalError as error:
             return Answer(False, str(error))
         if not calibration.accepted and not force:
-            reasons = '; '.join(calibration.reasons)
-            return Answer(False, f'refused by the gate: {reasons}', calibration)
+            refused = f'refused by the gate: {"; ".join(calibration.reasons)}'
+            return Answer(False, refused, calibration, False, residuals, ensemble.images)
         if not calibration.accepted:
             why = (*calibration.reasons, 'put in force by request all the same')
             calibration = dataclasses.replace(calibration, reasons=why, forced=True)
@@ -153,8 +162,8 @@ class CalibratorState:
             calibration = dataclasses.replace(calibration, number=event, in_force_since_ns=now_ns)
             self._append(InForce(event, before, calibration))
         self.save()
-        answer = self._answer(f'in force: {summary(calibration)}')
-        return dataclasses.replace(answer, calibration=calibration, in_force=True)
+        message = self._answer(f'in force: {summary(calibration)}').message
+        return Answer(True, message, calibration, True, residuals, ensemble.images)
 
     def rollback(self, now_ns: int) -> Answer:
         """Return to the calibration before the one in force."""

@@ -83,6 +83,7 @@ def _calibrate_into(
 ) -> Calibration:
     """Calibrate from bags; all that a report is made from goes into the folder."""
     from starcal_ros import bag, pipeline, residuals, sources, thumbnails
+    from starcal_ros.product_files import OBSERVATIONS_FILE
     from starcal_ros.records import Ensemble
 
     topics = sources.choose_topics(bags, asked, setup)
@@ -94,7 +95,7 @@ def _calibrate_into(
         ensemble = pipeline.add_to_ensemble(ensemble, record, setup)
     _make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
-    with bag.BagWriter(folder / 'observations.mcap') as writer:
+    with bag.BagWriter(folder / OBSERVATIONS_FILE) as writer:
         for record in observations:
             writer.write_observations('/observations', record, setup.frames.camera_frame)
     try:

@@ -60,6 +60,9 @@ class CalibratorOptions:
     calibration_history: int = option(
         20, 'most calibrations kept for roll-back, the one in force included', low=2, high=10000
     )
+    state_report: bool = option(
+        True, 'keep in state_dir a report of what is in force and of the last refused candidate'
+    )
     set_camera_info_service: str = option(
         '', 'sensor_msgs/SetCameraInfo service to hand each new calibration to; empty: none'
     )

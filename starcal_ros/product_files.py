@@ -8,6 +8,9 @@ from pathlib import Path
 
 from starcal_ros.errors import ProductError
 
+OBSERVATIONS_FILE = 'observations.mcap'
+REPORT_FILE = 'report.html'
+
 PART = '.part'  # ends the name of a file that is not whole yet
 
 

@@ -27,7 +27,7 @@ from starcal_ros.camera import INTRINSIC_NAMES, PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.message_types import OBSERVATIONS_TYPE
 from starcal_ros.observability import map_sigma_px, movement_px
-from starcal_ros.product_files import write_atomically
+from starcal_ros.product_files import OBSERVATIONS_FILE, REPORT_FILE, write_atomically
 from starcal_ros.records import (
     Calibration,
     CameraGeometry,
@@ -40,8 +40,6 @@ from starcal_ros.residuals import read_residuals, Residuals, RESIDUALS_FILE
 from starcal_ros.thermal import summary as thermal_summary
 from starcal_ros.thumbnails import read_thumbnails, Thumbnail, THUMBNAILS_FOLDER
 
-REPORT_FILE = 'report.html'
-OBSERVATIONS_FILE = 'observations.mcap'
 _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200
 
@@ -138,6 +136,7 @@ def _context(found: Found) -> Mapping[str, object]:
     return {
         'calibration': calibration,
         'time': _utc(calibration.time_ns),
+        'in_force_since': _utc(calibration.in_force_since_ns),
         'parameters': _parameter_rows(calibration, prior),
         'alignment': _alignment_rows(calibration, prior),
         'limits': _limits(calibration, prior),

@@ -141,7 +141,7 @@ def _on_detector(axes: Axes, camera: CameraModel) -> None:
 
 
 def _detector_figure(camera: CameraModel, beside: float = 0.0) -> tuple[Figure, Axes]:
-    """A figure of the detector's proportion; ``beside`` is the width of what stands at its right."""
+    """A figure with the proportion of the detector; ``beside`` is what its right side takes."""
     height = 0.75 + (3.9 - beside) * camera.height / camera.width
     figure, axes = _figure(_SIZE[0], min(height, 5.5))
     _on_detector(axes, camera)

@@ -62,6 +62,7 @@ LADDER = [
     'node_options',
     'pipeline',
     'calibrator_state',
+    'calibrator_reports',
     'sources',
     'inspection',
     'comparison',

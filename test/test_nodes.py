@@ -155,7 +155,8 @@ def test_gate_refusal_and_force(
 ) -> None:
     """A refused candidate is in the answer alone, unless it is forced."""
     calibrate_by_tool(tiny_bag, tmp_path / 'products')
-    strict = ('max_residual_rms_px:=0.001',)
+    state = tmp_path / 'state'
+    strict = ('max_residual_rms_px:=0.001', f'state_dir:={state}')
     calibrator = start_node('calibrator', ros=parameters(tiny_bag, *strict))
     play(start_node, tmp_path / 'products' / 'observations.mcap')
     status = client.latched(EnsembleStatus, 'ensemble_status')
@@ -172,6 +173,8 @@ def test_gate_refusal_and_force(
     candidate = client.latched(Calibration, 'candidate_calibration')
     client.until(lambda: candidate)
     assert candidate[0].reasons and candidate[0].number == 0
+    client.until((state / 'candidate_report' / 'report.html').exists, 120.0)
+    assert not (state / 'report').exists()
     forced = client.call(Calibrate, '/calibrator/solve', force=True)
     assert forced.success and not forced.calibration.accepted
     client.until(lambda: found)
@@ -180,6 +183,9 @@ def test_gate_refusal_and_force(
     client.until(
         lambda: any('in force against the gate' in m.status[0].message for m in diagnostics)
     )
+    page = state / 'report' / 'report.html'
+    client.until(page.exists, 120.0)
+    assert ', and in force all the same: calibration 1' in page.read_text()
     assert calibrator.process.poll() is None
 
 
@@ -418,7 +424,11 @@ def test_state_outlasts_a_kill(
     play(start_node, tmp_path / 'products' / 'observations.mcap')
     status = client.latched(EnsembleStatus, 'ensemble_status')
     client.until(lambda: status and status[-1].images_saved == tool.images_used)
+    (tmp_path / 'state' / '.report.new').touch()  # a report cannot be written, and harms nothing
     assert client.call(Trigger, '/calibrator/calibrate').success
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: any('no report: ' in m.status[0].message for m in diagnostics))
+    assert '/state/report/report.html: not made: ' in killed.said()
     second = start_node('calibrator', ros=parameters(tiny_bag, state))
     assert second.wait() == 2
     assert f'state_dir: {tmp_path / "state"} is in use by another calibrator' in second.said()

@@ -21,6 +21,7 @@ from starcal_ros.calibration_file import (
     read_calibration,
     write_calibration,
 )
+from starcal_ros.product_files import REPORT_FILE
 
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 BROWSER = next(
@@ -58,7 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='module')
 def page(folder: Path) -> str:
-    return (folder / report.REPORT_FILE).read_text()
+    return (folder / REPORT_FILE).read_text()
 
 
 def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> None:
@@ -92,7 +93,7 @@ def test_the_page_needs_nothing_else(page: str) -> None:
 
 def test_report_rebuilds_the_same_page(folder: Path, page: str) -> None:
     assert cli.main(['report', str(folder)]) == EXIT_ACCEPTED
-    assert (folder / report.REPORT_FILE).read_text() == page
+    assert (folder / REPORT_FILE).read_text() == page
 
 
 def test_a_folder_with_a_calibration_alone_says_what_is_missing(

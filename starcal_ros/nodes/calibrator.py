@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 import sys
 from typing import Any
 
@@ -22,6 +23,7 @@ from starcal_ros.calibration_messages import (
     calibration_to_message,
     camera_info_to_message,
 )
+from starcal_ros.calibrator_reports import CalibratorReports, CANDIDATE, IN_FORCE, Subject
 from starcal_ros.calibrator_state import Answer, CalibratorState
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.node_options import CalibratorOptions
@@ -52,6 +54,7 @@ class Calibrator(StarcalNode):
         super().__init__(NAME)
         self._made: list[tuple[Any, Any]] = []
         self._state = CalibratorState()
+        self._reports = CalibratorReports(self.guarded(self._on_report))
         self._last_answer = Answer(True, '')
         self._last_gate = 'none'
         self._driver: CameraDriver | None = None
@@ -62,6 +65,10 @@ class Calibrator(StarcalNode):
         self._own = from_mapping(CalibratorOptions, values)
         self._setup = pipeline.load_setup(values, self.options.classes)
         self._state.open(self._setup, self._own)
+        self._reports.open(
+            self._own.state_dir if self._own.state_report else '',
+            self._setup.frames.camera_frame,
+        )
         for damage in self._state.damage:
             self.get_logger().error(damage)
 
@@ -133,6 +140,7 @@ class Calibrator(StarcalNode):
         while self._made:
             destroy, entity = self._made.pop()
             destroy(entity)
+        self._reports.close()
         self._state.close()
 
     def health(self) -> Health:
@@ -173,6 +181,8 @@ class Calibrator(StarcalNode):
             return WARN, f'the camera was not told: {driver.outcome}', numbers
         if not last.success:
             return WARN, last.message, numbers
+        if self._reports.trouble:
+            return WARN, f'no report: {self._reports.trouble}', numbers
         return OK, 'collecting' if in_force is None else 'calibration in force', numbers
 
     def _on_observations(self, message: Any) -> None:
@@ -236,11 +246,25 @@ class Calibrator(StarcalNode):
         """Publish what came into force, or what the gate has refused; the filled response."""
         if answer.calibration is not None and answer.in_force:
             self._publish_calibration(answer.calibration)
+            self._show(IN_FORCE, answer)
         elif answer.calibration is not None and not answer.success:
             self._candidate.publish(calibration_to_message(answer.calibration, make_message))
+            self._show(CANDIDATE, answer)
         self._last_answer = Answer(answer.success, answer.message)
         response.success, response.message = answer.success, answer.message
         return response
+
+    def _show(self, report: str, answer: Answer) -> None:
+        if answer.calibration is not None:
+            subject = Subject(answer.calibration, answer.residuals, answer.observations)
+            self._reports.show(report, subject)
+
+    def _on_report(self, page: Path, trouble: str) -> None:
+        if trouble:
+            self.get_logger().warning(f'{page}: not made: {trouble}')
+        else:
+            self.get_logger().info(f'look at {page}')
+        self.publish_health_change()
 
     def _publish_calibration(self, calibration: Calibration) -> None:
         camera_info = camera_info_to_message(calibration, make_message)
