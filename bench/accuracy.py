@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from bench.frames import history, load_set_up, render_frame
 from bench.table import Table
-from starcal_ros import pipeline, synthetic
+from starcal_ros import pipeline, synthetic, synthetic_centroids
 from starcal_ros.campaign_trials import map_bound_px
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.observability import map_error_px
@@ -171,8 +171,8 @@ def trial(case: Case, seed: int) -> Floats:
     except TooFewObservations:
         return np.full(4, np.nan)
     bound = np.zeros((13, 13))
-    columns = [CALIBRATION_PARAMETER_NAMES.index(name) for name in synthetic.BOUND_NAMES]
-    bound[np.ix_(columns, columns)] = synthetic.cramer_rao_covariance(scenario)
+    columns = [CALIBRATION_PARAMETER_NAMES.index(name) for name in synthetic_centroids.BOUND_NAMES]
+    bound[np.ix_(columns, columns)] = synthetic_centroids.cramer_rao_covariance(scenario)
     error_px = map_error_px(found.geometry.camera, scenario.truth.camera)
     over_bound2, over_sigma2 = np.concatenate(stars, axis=1).mean(axis=1)
     ratio = error_px / map_bound_px(scenario.truth.camera, bound)
@@ -185,7 +185,7 @@ def _star_errors(scenario: Scenario, index: int, observed: StarObservations) -> 
     order = np.argsort(shown.catalog_id)
     row = order[np.searchsorted(shown.catalog_id[order], observed.catalog_id)]
     camera = scenario.truth.camera
-    covariance, snr = synthetic.centroid_bound(
+    covariance, snr = synthetic_centroids.centroid_bound(
         shown.pixel_px[row],
         shown.flux_electrons[row],
         scenario.detector,

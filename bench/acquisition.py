@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import beta
 
 from bench.table import Table
-from starcal_ros import synthetic
+from starcal_ros import synthetic, synthetic_images
 from starcal_ros.catalog import load_catalog, StarCatalog
 from starcal_ros.centroiding import CentroidOptions
 from starcal_ros.errors import ImageRefused
@@ -105,7 +105,7 @@ def to_be_found(fields: int) -> Table:
         found = []
         for index in range(fields):
             drawn = synthetic.scene(scenario, index)
-            image = synthetic.render(scenario, changed(drawn, rng, missing, strange), index)
+            image = synthetic_images.render(scenario, changed(drawn, rng, missing, strange), index)
             off = turned(scenario.prior, error_within_the_search(rng))
             found.append(trial(image, drawn, drawn.icrf_from_star_tracker_xyzw, off, catalog))
         wrong = sum(one.wrong for one in found)
@@ -223,7 +223,7 @@ def random_attitudes(
     """True stars, and an attitude from anywhere."""
     for index in range(scenario.image_count):
         drawn = synthetic.scene(scenario, index)
-        yield synthetic.render(scenario, drawn, index), drawn, _anywhere(rng, count)
+        yield synthetic_images.render(scenario, drawn, index), drawn, _anywhere(rng, count)
 
 
 def beyond_the_search(
@@ -241,7 +241,7 @@ def beyond_the_search(
         )
         angle_rad = np.radians(rng.uniform(2.0, 8.0, count))
         wrong = right * Rotation.from_rotvec(angle_rad[:, None] * axis)
-        yield synthetic.render(scenario, drawn, index), drawn, list(wrong.as_quat())
+        yield synthetic_images.render(scenario, drawn, index), drawn, list(wrong.as_quat())
 
 
 def random_sources(
@@ -250,7 +250,7 @@ def random_sources(
     """The brightnesses of true stars, each anywhere in the image."""
     for index in range(scenario.image_count):
         drawn = synthetic.scene(scenario, index)
-        image = synthetic.render(
+        image = synthetic_images.render(
             scenario,
             dataclasses.replace(drawn, pixel_px=scattered(rng, len(drawn.pixel_px))),
             index,
@@ -273,7 +273,7 @@ def dense_fields(
             pixel_px=np.concatenate([drawn.pixel_px, scattered(rng, more)]),
             flux_electrons=np.concatenate([drawn.flux_electrons, 10 ** rng.uniform(2.5, 4, more)]),
         )
-        yield synthetic.render(scenario, crowded, index), drawn, _anywhere(rng, count)
+        yield synthetic_images.render(scenario, crowded, index), drawn, _anywhere(rng, count)
 
 
 def shifted_copies(
@@ -288,7 +288,7 @@ def shifted_copies(
             pixel_px=(drawn.pixel_px[None] + shifts[:, None]).reshape(-1, 2),
             flux_electrons=np.tile(drawn.flux_electrons, 4),
         )
-        yield synthetic.render(scenario, doubled, index), drawn, _anywhere(rng, count)
+        yield synthetic_images.render(scenario, doubled, index), drawn, _anywhere(rng, count)
 
 
 FOLLOWED = ('followed, attitude from anywhere', 'followed, attitude 2 to 8 degrees off')

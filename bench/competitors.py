@@ -25,7 +25,8 @@ from starcal_ros.camera import PARAMETER_NAMES, project_jacobians, project_param
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.measurement import arrange, star_table, StarTable
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.synthetic import BOUND_NAMES, scenario, true_observations
+from starcal_ros.synthetic import scenario
+from starcal_ros.synthetic_centroids import BOUND_NAMES, true_observations
 
 Floats = NDArray[np.float64]
 

@@ -21,7 +21,8 @@ from starcal_ros.observability import (
     predicted_sigma,
 )
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.synthetic import scenario, true_observations
+from starcal_ros.synthetic import scenario
+from starcal_ros.synthetic_centroids import true_observations
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import tempfile
 
 import yaml
 
-from starcal_ros import pipeline, simulation, synthetic
+from starcal_ros import pipeline, simulation, synthetic, synthetic_images
 from starcal_ros.attitude import AttitudeHistory
 from starcal_ros.camera_info import write_camera_info
 from starcal_ros.options import read_parameter_file
@@ -40,7 +40,7 @@ def paper_scenario(magnitude_limit: float) -> Scenario:
 
 def render_frame(scenario: Scenario, index: int) -> tuple[Image, list[AttitudeSample]]:
     """A frame and the star tracker's samples about it."""
-    image = synthetic.render(scenario, synthetic.scene(scenario, index), index)
+    image = synthetic_images.render(scenario, synthetic.scene(scenario, index), index)
     return image, list(synthetic.attitude_samples(scenario, index))
 
 

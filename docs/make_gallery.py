@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from docs.make_images import FOLDER, setup_of
-from starcal_ros import pipeline, synthetic
+from starcal_ros import pipeline, synthetic, synthetic_images
 from starcal_ros.annotation import annotate
 from starcal_ros.attitude import AttitudeHistory
 from starcal_ros.records import Image, StarObservations
@@ -42,17 +42,17 @@ def electrons(smear_px: float = 0.0, field: int = FIELD) -> Floats:
     """Mean signal of a field, its stars smeared along a line."""
     shown, psf_px = synthetic.scene(SCENARIO, field), SCENARIO.detector.psf_sigma_px
     steps = max(1, round(4 * smear_px))
-    mean = synthetic.fixed_pattern(SCENARIO)
+    mean = synthetic_images.fixed_pattern(SCENARIO)
     for k in range(steps):
         moved = shown.pixel_px + ((k + 0.5) / steps - 0.5) * smear_px * np.array([0.8, 0.6])
         flux = shown.flux_electrons / steps
-        mean = mean + synthetic.star_electrons(moved, flux, psf_px, SHAPE)
+        mean = mean + synthetic_images.star_electrons(moved, flux, psf_px, SHAPE)
     return mean
 
 
 def expose(mean: Floats) -> NDArray[np.uint16]:
     """A frame of a mean signal, always with the same noise."""
-    pixels = synthetic.expose(mean, SCENARIO.detector, np.random.default_rng(8))
+    pixels = synthetic_images.expose(mean, SCENARIO.detector, np.random.default_rng(8))
     return pixels.astype(np.uint16)
 
 
@@ -83,7 +83,7 @@ def whole_frames() -> Mapping[str, tuple[Image, StarObservations]]:
         'glare': expose(sound + 1.2e4 * np.exp(-np.hypot(u + 60.0, v + 60.0) / 350.0)),
         'incomplete_lost': lost,
         'incomplete_torn': torn,
-        'no_stars': expose(synthetic.fixed_pattern(SCENARIO)),
+        'no_stars': expose(synthetic_images.fixed_pattern(SCENARIO)),
         'too_few_stars': expose(electrons(25.0)),
     }
     found = {}

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 import yaml
 
-from starcal_ros import cli, pipeline, simulation, synthetic
+from starcal_ros import cli, pipeline, simulation, synthetic, synthetic_images
 from starcal_ros.annotation import annotate
 from starcal_ros.attitude import AttitudeHistory
 from starcal_ros.camera import distortion_px, pixel_grid
@@ -183,7 +183,7 @@ def main() -> None:
     scenario = synthetic.scenario('small')
     setup = setup_of(scenario)
     ensemble = Ensemble()
-    for index, image in enumerate(synthetic.images(scenario)):
+    for index, image in enumerate(synthetic_images.images(scenario)):
         observations = observe(scenario, setup, image, index)
         ensemble = ensemble.add(observations)
         if index == SHOWN_IMAGE:

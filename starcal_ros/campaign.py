@@ -46,7 +46,7 @@ from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.observability import map_error_px
 from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, CameraGeometry, Ensemble
 from starcal_ros.removal import removal_study
-from starcal_ros.synthetic import true_observations
+from starcal_ros.synthetic_centroids import true_observations
 
 Floats = NDArray[np.float64]
 Row = dict[str, 'int | float | str']

@@ -33,14 +33,8 @@ from starcal_ros.observability import map_error_px
 from starcal_ros.pipeline import observe, Setup, SetupOptions
 from starcal_ros.records import Ensemble, Removal, StarObservations
 from starcal_ros.removal import removal_study
-from starcal_ros.synthetic import (
-    attitude_samples,
-    fixed_pattern,
-    render,
-    Scenario,
-    scenario,
-    scene,
-)
+from starcal_ros.synthetic import attitude_samples, Scenario, scenario, scene
+from starcal_ros.synthetic_images import fixed_pattern, render
 
 Floats = NDArray[np.float64]
 

@@ -19,16 +19,14 @@ from starcal_ros.camera_info import write_camera_info
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.product_files import write_atomically
 from starcal_ros.records import AttitudeSample, CameraGeometry
-from starcal_ros.synthetic import (
-    attitude_samples,
+from starcal_ros.synthetic import attitude_samples, Scenario, scenes
+from starcal_ros.synthetic_centroids import (
     BOUND_NAMES,
     BOUND_SNR,
     centroid_bound,
     cramer_rao_covariance,
-    images,
-    Scenario,
-    scenes,
 )
+from starcal_ros.synthetic_images import images
 
 Floats = NDArray[np.float64]
 

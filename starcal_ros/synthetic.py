@@ -1,14 +1,12 @@
 """
-Star-field truth: scene, noise and pixels as separate functions.
+Star fields with a known truth: campaigns, and what each of their images shows.
 
 `scenario` names a whole campaign with its truth drawn from a seed; `scene` is what one image of it
-shows; `true_observations` goes on to noisy centroids without pixels, `render` to pixels.
-`cramer_rao_covariance` says how well any estimator could do on them.
+shows, without noise.  `synthetic_images` goes on to pixels, `synthetic_centroids` to noisy
+centroids without them.
 
-What is modelled: proper motion and aberration of the catalog, pixel-integrated Gaussian stars,
-photon, dark and read noise, hot pixels, cosmic rays, saturation, quantisation, and one error of
-the star tracker per image; a PSF that widens towards the corners where it is asked for.  What is
-not: smear, and flat-field errors.
+What is modelled: proper motion and aberration of the catalog, and one error of the star tracker
+per image.
 """
 
 from __future__ import annotations
@@ -22,31 +20,18 @@ import erfa
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import erf
 
 from starcal_ros.astrometry import apparent_directions, tt_julian_date
-from starcal_ros.camera import (
-    CameraModel,
-    field_radius_rad,
-    PARAMETER_NAMES,
-    project,
-    project_jacobians,
-)
+from starcal_ros.camera import CameraModel, field_radius_rad, project
 from starcal_ros.catalog import cone, load_catalog, StarCatalog
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, Image, StarObservations
+from starcal_ros.records import AttitudeSample, CameraGeometry
 
 Floats = NDArray[np.float64]
-
 # Streams of random numbers: (seed, purpose, image).  An image is the same whatever came before.
-_TRUTH, _ATTITUDE, _CENTROID, _PATTERN, _PIXELS = range(5)
-
+TRUTH_STREAM, ATTITUDE_STREAM, CENTROID_STREAM, PATTERN_STREAM, PIXEL_STREAM = range(5)
 _STAMP_SIGMAS = 6.0  # half a stamp: 2e-9 of a star's light falls outside
-
-BOUND_NAMES = ('fx', 'skew', 'fy', 'k1', 'k2', 'k3', 'p1', 'p2')
-BOUND_SNR = 5.0
 _UNIX_EPOCH_JD = 2440587.5  # 1970-01-01T00:00 UTC, POSIX
-
 ATTITUDE_OFFSETS_S = (-0.75, -0.25, 0.25, 0.75)
 """When the star tracker reports about an image: 2 Hz, never at the image itself."""
 
@@ -170,7 +155,6 @@ _TINY_FIELDS = (
 )
 _HOUSTON = EarthFixed(latitude_deg=29.76, longitude_deg=-95.37, roll_deg=20.0)
 _HERCULES_NS = 1778829600 * NANOSECONDS_PER_SECOND  # 2026-05-15 07:20 UTC: 16.5 h sidereal there
-
 SCENARIOS: Mapping[str, str] = {
     'tiny': '10 images of 640 x 512, ten star fields at 4 s: the bag in the repository',
     'small': '24 images of 1296 x 1024, zenith over Houston at 60 s',
@@ -221,7 +205,7 @@ def _scenario(
     pointing: EarthFixed | Inertial = _HOUSTON,
 ) -> Scenario:
     """A 20 x 16 degree camera of any size as the ground knows it, and as launch has left it."""
-    rng = _stream(seed, _TRUTH)
+    rng = random_stream(seed, TRUTH_STREAM)
     width, height = size
     focal_px = 35.0 / 0.0048 * width / 2592  # 35 mm lens; 4.8 um pixels at full resolution
     nominal = CameraModel(
@@ -258,7 +242,8 @@ def _scenario(
     )
 
 
-def _stream(seed: int, purpose: int, index: int = 0) -> np.random.Generator:
+def random_stream(seed: int, purpose: int, index: int = 0) -> np.random.Generator:
+    """Random numbers of one of the purposes ``*_STREAM``, for an image."""
     return np.random.default_rng([seed, purpose, index])
 
 
@@ -292,7 +277,8 @@ def _icrf_from_star_tracker_xyzw(
     icrf_from_camera = Rotation.from_matrix(camera_from_icrf(scenario, index, offset_s)).inv()
     # The tracker's frame is off by small passive angles about its own axes.
     sigma_rad = np.array(scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD
-    error_rad = noise * sigma_rad * _stream(scenario.seed, _ATTITUDE, index).normal(size=3)
+    rng = random_stream(scenario.seed, ATTITUDE_STREAM, index)
+    error_rad = noise * sigma_rad * rng.normal(size=3)
     reported = icrf_from_camera * camera_from_star_tracker * Rotation.from_rotvec(error_rad)
     return np.asarray(reported.as_quat())
 
@@ -313,6 +299,11 @@ def _bundled_catalog(magnitude_limit: float) -> StarCatalog:
     return load_catalog(None, magnitude_limit)
 
 
+def stamp_half_px(psf_sigma_px: float) -> int:
+    """How far from its pixel the light of a star is drawn."""
+    return math.ceil(_STAMP_SIGMAS * psf_sigma_px)
+
+
 def scene(
     scenario: Scenario,
     index: int,
@@ -324,7 +315,7 @@ def scene(
         catalog = _bundled_catalog(scenario.magnitude_limit)
     camera, time_ns = scenario.truth.camera, scenario.time_ns(index)
     R = camera_from_icrf(scenario, index)
-    margin_px = _stamp_half(scenario.detector.psf_sigma_px * (1 + scenario.detector.psf_growth))
+    margin_px = stamp_half_px(scenario.detector.psf_sigma_px * (1 + scenario.detector.psf_growth))
     stars = catalog.select(cone(catalog, R[2], field_radius_rad(camera, margin_px)))
     directions = apparent_directions(stars, time_ns)
     pixels = project(camera, directions @ R.T)
@@ -353,265 +344,3 @@ def scenes(
     """The scenes of all images, one after the other."""
     for index in range(scenario.image_count):
         yield scene(scenario, index, catalog, attitude_noise)
-
-
-def true_observations(
-    scenario: Scenario,
-    centroid_sigma_px: float | None = None,
-    snr_limit: float = BOUND_SNR,
-    centroid_noise: bool = True,
-    attitude_noise: bool = True,
-    catalog: StarCatalog | None = None,
-) -> Ensemble:
-    """
-    Observations of every star on the detector above a signal-to-noise ratio, without pixels.
-
-    Parameters
-    ----------
-    centroid_sigma_px : float, optional
-        Error per axis of every star; without it each star has its Cramer-Rao bound.
-    centroid_noise, attitude_noise : bool
-        Whether the errors are put in; the covariances are reported all the same.
-    """
-    ensemble = Ensemble()
-    for index in range(scenario.image_count):
-        shown = scene(scenario, index, catalog, attitude_noise)
-        rng = _stream(scenario.seed, _CENTROID, index)
-        ensemble = ensemble.add(
-            _observations(scenario, shown, centroid_sigma_px, snr_limit, centroid_noise, rng)
-        )
-    return ensemble
-
-
-def _observations(
-    scenario: Scenario,
-    shown: Scene,
-    centroid_sigma_px: float | None,
-    snr_limit: float,
-    centroid_noise: bool,
-    rng: np.random.Generator,
-) -> StarObservations:
-    camera, detector = scenario.truth.camera, scenario.detector
-    covariance, snr = centroid_bound(
-        shown.pixel_px, shown.flux_electrons, detector, (camera.height, camera.width)
-    )
-    if centroid_sigma_px is not None:
-        covariance = np.broadcast_to(np.eye(2) * centroid_sigma_px**2, covariance.shape)
-    # Drawn for all stars before any is left out: one star's luck does not hang on another's.
-    error = rng.normal(size=shown.pixel_px.shape)
-    measured = shown.pixel_px.copy()
-    if centroid_noise:
-        measured += np.einsum('nij,nj->ni', np.linalg.cholesky(covariance), error)
-    inside = (shown.pixel_px > 0) & (shown.pixel_px < [camera.width - 1, camera.height - 1])
-    every = StarObservations(
-        time_ns=shown.time_ns,
-        width=camera.width,
-        height=camera.height,
-        refusal='',
-        detail='',
-        icrf_from_star_tracker_xyzw=shown.icrf_from_star_tracker_xyzw,
-        attitude_gap_s=0.5,
-        catalog_id=shown.catalog_id,
-        direction_icrf=shown.direction_icrf,
-        magnitude=shown.magnitude.astype(np.float32),
-        measured_px=measured,
-        covariance_px2=np.stack(
-            [covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]], axis=-1
-        ),
-        flux_dn=(shown.flux_electrons / detector.electrons_per_dn).astype(np.float32),
-        snr=snr.astype(np.float32),
-        refused_stars={},
-        background_dn=detector.offset_dn
-        + detector.background_electrons / detector.electrons_per_dn,
-        noise_dn=detector.noise_electrons / detector.electrons_per_dn,
-        psf_sigma_px=detector.psf_sigma_px,
-        catalog_digest=shown.catalog_digest,
-    )
-    return every.select(inside.all(axis=1) & (snr > snr_limit))
-
-
-def _stamp_half(psf_sigma_px: float) -> int:
-    return math.ceil(_STAMP_SIGMAS * psf_sigma_px)
-
-
-def _stamps(
-    centers_px: Floats, psf_sigma_px: float | Floats
-) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """
-    Pixel numbers about centers (n,) on one axis, and the light that falls in each, and its slope.
-
-    Returns
-    -------
-    pixels : (n, m)
-    share : (n, m)
-        Integral of the Gaussian over each pixel.
-    slope : (n, m)
-        Its derivative by the center, 1/px.
-    """
-    sigma_px = np.broadcast_to(np.asarray(psf_sigma_px, np.float64), centers_px.shape)
-    half = _stamp_half(float(sigma_px.max(initial=0.1)))
-    edges = np.arange(-half, half + 2) - 0.5
-    nearest = np.rint(centers_px).astype(np.int64)
-    width = math.sqrt(2) * sigma_px[:, None]
-    z = (nearest[:, None] + edges - centers_px[:, None]) / width
-    density = np.exp(-z * z) / (math.sqrt(math.pi) * width)
-    pixels = nearest[:, None] + np.arange(-half, half + 1)
-    return pixels, np.diff(erf(z), axis=1) / 2, -np.diff(density, axis=1)
-
-
-def star_electrons(
-    pixels_px: Floats,
-    flux_electrons: Floats,
-    psf_sigma_px: float | Floats,
-    shape: tuple[int, int],
-) -> Floats:
-    """Mean signal (height, width) of stars (n, 2), (n,): Gaussians integrated over each pixel."""
-    height, width = shape
-    u, share_u, _ = _stamps(pixels_px[:, 0], psf_sigma_px)
-    v, share_v, _ = _stamps(pixels_px[:, 1], psf_sigma_px)
-    light = flux_electrons[:, None, None] * share_v[:, :, None] * share_u[:, None, :]
-    v_all, u_all = np.broadcast_arrays(v[:, :, None], u[:, None, :])
-    inside = (u_all >= 0) & (u_all < width) & (v_all >= 0) & (v_all < height)
-    cells = v_all[inside] * width + u_all[inside]
-    electrons = np.bincount(cells, light[inside], height * width).reshape(height, width)
-    return np.asarray(electrons, np.float64)
-
-
-def centroid_bound(
-    pixels_px: Floats, flux_electrons: Floats, detector: Detector, shape: tuple[int, int]
-) -> tuple[Floats, Floats]:
-    """
-    Cramer-Rao bound of the centroid of single stars, flux free and background known.
-
-    Pixels outside the detector or saturated tell nothing.
-
-    Returns
-    -------
-    covariance_px2 : (n, 2, 2)
-        A thousand px^2 and more for a star without a usable pixel.
-    snr : (n,)
-        Flux over its own bound.
-    """
-    height, width = shape
-    sigma_px = detector.psf_sigma_at(pixels_px, shape)
-    u, share_u, slope_u = _stamps(pixels_px[:, 0], sigma_px)
-    v, share_v, slope_v = _stamps(pixels_px[:, 1], sigma_px)
-    flux = np.asarray(flux_electrons, np.float64)[:, None, None]
-    shape_of_star = share_v[:, :, None] * share_u[:, None, :]
-    gradients = np.stack(
-        [
-            flux * share_v[:, :, None] * slope_u[:, None, :],
-            flux * slope_v[:, :, None] * share_u[:, None, :],
-            flux * shape_of_star,  # by log flux, which keeps the matrix well scaled
-        ],
-        axis=1,
-    )
-    mean = flux * shape_of_star
-    full_electrons = (detector.full_dn - detector.offset_dn) * detector.electrons_per_dn
-    usable = (mean + detector.background_electrons < full_electrons) & (
-        ((v >= 0) & (v < height))[:, :, None] & ((u >= 0) & (u < width))[:, None, :]
-    )
-    weight = usable / (mean + detector.noise_electrons**2)
-    information = np.einsum('niyx,nyx,njyx->nij', gradients, weight, gradients)
-    # The last term keeps stars without any information invertible.
-    covariance = np.linalg.inv(information + 1e-6 * np.eye(3))
-    return covariance[:, :2, :2], 1 / np.sqrt(covariance[:, 2, 2])
-
-
-def fixed_pattern(scenario: Scenario) -> Floats:
-    """Mean dark signal and sky (height, width), electrons; the same in every image."""
-    detector, camera = scenario.detector, scenario.truth.camera
-    rng = _stream(scenario.seed, _PATTERN)
-    pattern = np.full(camera.height * camera.width, detector.background_electrons)
-    hot = rng.choice(pattern.size, round(detector.hot_fraction * pattern.size), replace=False)
-    pattern[hot] += rng.exponential(detector.hot_electrons, hot.size)
-    return pattern.reshape(camera.height, camera.width)
-
-
-def cosmic_ray_electrons(
-    detector: Detector, shape: tuple[int, int], rng: np.random.Generator
-) -> Floats:
-    """Signal (height, width) of cosmic rays: tracks of random place, length and charge."""
-    height, width = shape
-    count = rng.poisson(detector.cosmic_rays)
-    start = rng.uniform(0, [width, height], (count, 2))
-    length_px = rng.exponential(4.0, count)
-    angle = rng.uniform(0, 2 * np.pi, count)
-    charge = rng.lognormal(math.log(3000.0), 0.7, count)  # electrons in the whole track
-    along = np.linspace(0.0, 1.0, 64)
-    u = start[:, :1] + (length_px * np.cos(angle))[:, None] * along
-    v = start[:, 1:] + (length_px * np.sin(angle))[:, None] * along
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    cells = v[inside].astype(np.int64) * width + u[inside].astype(np.int64)
-    share = np.broadcast_to(charge[:, None] / along.size, u.shape)[inside]
-    electrons = np.bincount(cells, share, height * width).reshape(height, width)
-    return np.asarray(electrons, np.float64)
-
-
-def expose(
-    mean_electrons: Floats, detector: Detector, rng: np.random.Generator
-) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """One exposure of a mean signal: photon and read noise, then the converter."""
-    electrons = rng.poisson(mean_electrons) + rng.normal(
-        0.0, detector.read_noise_electrons, mean_electrons.shape
-    )
-    counts = np.rint(electrons / detector.electrons_per_dn + detector.offset_dn)
-    counts = np.clip(counts, 0, detector.full_dn)
-    return counts.astype(np.uint8) if detector.bits <= 8 else counts.astype(np.uint16)
-
-
-def render(scenario: Scenario, shown: Scene, index: int, pattern: Floats | None = None) -> Image:
-    """The image of a scene; `fixed_pattern` may be passed in where many images are rendered."""
-    detector, camera = scenario.detector, scenario.truth.camera
-    shape = (camera.height, camera.width)
-    rng = _stream(scenario.seed, _PIXELS, index)
-    mean = fixed_pattern(scenario) if pattern is None else pattern
-    mean = mean + star_electrons(
-        shown.pixel_px,
-        shown.flux_electrons,
-        detector.psf_sigma_at(shown.pixel_px, shape),
-        shape,
-    )
-    mean += cosmic_ray_electrons(detector, shape, rng)
-    return Image(shown.time_ns, expose(mean, detector, rng))
-
-
-def images(scenario: Scenario, catalog: StarCatalog | None = None) -> Iterator[Image]:
-    """All images, rendered one after the other."""
-    pattern = fixed_pattern(scenario)
-    for index in range(scenario.image_count):
-        yield render(scenario, scene(scenario, index, catalog), index, pattern)
-
-
-def cramer_rao_covariance(
-    scenario: Scenario,
-    names: tuple[str, ...] = BOUND_NAMES,
-    snr_limit: float = BOUND_SNR,
-    catalog: StarCatalog | None = None,
-) -> Floats:
-    """
-    Least covariance of the named camera parameters that any unbiased estimator can have.
-
-    Every star above the signal-to-noise limit counts, with its own bound; the attitude of each
-    image is free and the parameters not named are held.
-    """
-    camera = scenario.truth.camera
-    columns = [PARAMETER_NAMES.index(name) for name in names]
-    information = np.zeros((len(columns), len(columns)))
-    for shown in scenes(scenario, catalog):
-        covariance, snr = centroid_bound(
-            shown.pixel_px, shown.flux_electrons, scenario.detector, (camera.height, camera.width)
-        )
-        inside = (shown.pixel_px > 0) & (shown.pixel_px < [camera.width - 1, camera.height - 1])
-        keep = inside.all(axis=1) & (snr > snr_limit)
-        in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
-        _, J_parameters, J_rotation = project_jacobians(camera, in_camera)
-        W = np.linalg.inv(covariance[keep])
-        J, G = J_parameters[..., columns], J_rotation
-        N_cc = np.einsum('nia,nij,njb->ab', J, W, J, optimize=True)
-        N_ca = np.einsum('nia,nij,njb->ab', J, W, G, optimize=True)
-        N_aa = np.einsum('nia,nij,njb->ab', G, W, G, optimize=True)
-        information += N_cc - N_ca @ np.linalg.solve(N_aa, N_ca.T)
-    scale = 1 / np.sqrt(np.diag(information))
-    covariance_scaled = np.linalg.inv(information * np.outer(scale, scale))
-    return np.asarray(covariance_scaled * np.outer(scale, scale))

@@ -179,4 +179,5 @@ def other_client() -> Iterator[Client]:
 def tiny_observations() -> Any:
     """An ensemble of the tiny bag's sky as if measured, without pixels."""
     synthetic = pytest.importorskip('starcal_ros.synthetic')
-    return synthetic.true_observations(synthetic.scenario('tiny'))
+    centroids = pytest.importorskip('starcal_ros.synthetic_centroids')
+    return centroids.true_observations(synthetic.scenario('tiny'))

@@ -20,7 +20,8 @@ from starcal_ros.calibration import CalibrationOptions, Estimate, estimate_calib
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.records import Ensemble
-from starcal_ros.synthetic import scenario, true_observations
+from starcal_ros.synthetic import scenario
+from starcal_ros.synthetic_centroids import true_observations
 
 Residuals = Callable[[np.ndarray], np.ndarray]
 

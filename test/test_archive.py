@@ -28,7 +28,8 @@ from starcal_ros.records import (
     Ensemble,
     StarObservations,
 )
-from starcal_ros.synthetic import scenario, true_observations
+from starcal_ros.synthetic import scenario
+from starcal_ros.synthetic_centroids import true_observations
 
 CAMERA = CameraModel(640, 512, np.array([1800, 0.2, 1801, 320, 255, -0.045, 0.08, 0, 4e-4, -3e-4]))
 CALIBRATION = Calibration(

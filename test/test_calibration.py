@@ -21,7 +21,8 @@ from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, proje
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
-from starcal_ros.synthetic import BOUND_NAMES, cramer_rao_covariance, scenario, true_observations
+from starcal_ros.synthetic import scenario
+from starcal_ros.synthetic_centroids import BOUND_NAMES, cramer_rao_covariance, true_observations
 from starcal_ros.variance import estimate_variance
 
 SCENARIO = scenario('tiny', seed=3)

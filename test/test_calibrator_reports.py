@@ -20,7 +20,8 @@ from starcal_ros.calibrator_reports import CalibratorReports, CANDIDATE, IN_FORC
 from starcal_ros.calibrator_state import CalibratorState
 from starcal_ros.camera_info import write_camera_info
 from starcal_ros.node_options import CalibratorOptions
-from starcal_ros.synthetic import scenario, true_observations
+from starcal_ros.synthetic import scenario
+from starcal_ros.synthetic_centroids import true_observations
 
 SCENARIO = scenario('tiny', seed=7)
 PAGE_S = 120.0  # the longest wait for a page on a machine that is busy

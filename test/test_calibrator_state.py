@@ -15,7 +15,8 @@ from starcal_ros.camera_info import write_camera_info
 from starcal_ros.errors import ArchiveError, OptionError
 from starcal_ros.node_options import CalibratorOptions
 from starcal_ros.records import Ensemble, refused_image, StarObservations
-from starcal_ros.synthetic import scenario, true_observations
+from starcal_ros.synthetic import scenario
+from starcal_ros.synthetic_centroids import true_observations
 
 SCENARIO = scenario('tiny', seed=7)
 

@@ -19,7 +19,9 @@ from starcal_ros.centroiding import (
 from starcal_ros.detection import detect, measure_background, sample_mesh
 from starcal_ros.psf import fit_psf, noise_sums, PixelNoise
 from starcal_ros.records import STAR_REFUSALS
-from starcal_ros.synthetic import centroid_bound, Detector, expose, star_electrons
+from starcal_ros.synthetic import Detector
+from starcal_ros.synthetic_centroids import centroid_bound
+from starcal_ros.synthetic_images import expose, star_electrons
 
 SHAPE = (512, 640)
 QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)

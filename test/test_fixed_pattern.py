@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros import synthetic
+from starcal_ros import synthetic, synthetic_images
 from starcal_ros.fixed_pattern import (
     FixedPatternOptions,
     hot_in_dark,
@@ -33,10 +33,10 @@ NOISE_DN = DETECTOR.noise_electrons / DETECTOR.electrons_per_dn
 def images(count: int, looking: int | None = None) -> tuple[tuple[Pixels, Rotation], ...]:
     """Frames and where the camera looked: at one field after the other, or at one all the time."""
     shown = [synthetic.scene(SCENARIO, k if looking is None else looking) for k in range(count)]
-    pattern = synthetic.fixed_pattern(SCENARIO)
+    pattern = synthetic_images.fixed_pattern(SCENARIO)
     return tuple(
         (
-            synthetic.render(SCENARIO, one, k, pattern).pixels,
+            synthetic_images.render(SCENARIO, one, k, pattern).pixels,
             Rotation.from_matrix(one.camera_from_icrf).inv(),
         )
         for k, one in enumerate(shown)
@@ -53,7 +53,7 @@ def learnt(seen: tuple[tuple[Pixels, Rotation], ...], known: HotPixels = UNKNOWN
 
 def hot_in_truth(sigmas: float) -> set[int]:
     """Hot pixels of the simulated detector so far above its noise, not on its border."""
-    excess = (synthetic.fixed_pattern(SCENARIO) - DETECTOR.background_electrons).copy()
+    excess = (synthetic_images.fixed_pattern(SCENARIO) - DETECTOR.background_electrons).copy()
     excess[[0, -1]] = 0.0
     excess[:, [0, -1]] = 0.0
     return set(np.flatnonzero(excess > sigmas * DETECTOR.noise_electrons).tolist())
@@ -129,6 +129,8 @@ def test_stars_on_hot_pixels(offset: tuple[float, float], before: str, after: st
 
 def test_a_quiet_detector_has_none() -> None:
     quiet = dataclasses.replace(SCENARIO, detector=dataclasses.replace(DETECTOR, hot_fraction=0.0))
-    shown = [(synthetic.render(quiet, synthetic.scene(quiet, k), k).pixels, k) for k in range(3)]
+    shown = [
+        (synthetic_images.render(quiet, synthetic.scene(quiet, k), k).pixels, k) for k in range(3)
+    ]
     seen = tuple((pixels, Rotation.from_euler('x', k, degrees=True)) for pixels, k in shown)
     assert len(learnt(seen).index) == 0

@@ -26,7 +26,8 @@ from starcal_ros.identification import (
 from starcal_ros.instrument import uniform_width
 from starcal_ros.psf import fit_psf, PixelNoise, stamp_radius_px
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
-from starcal_ros.synthetic import Detector, render, scenario, Scene, scene, star_electrons
+from starcal_ros.synthetic import Detector, scenario, Scene, scene
+from starcal_ros.synthetic_images import render, star_electrons
 
 SCENARIO = scenario('tiny', seed=6)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior

@@ -49,6 +49,8 @@ LADDER = [
     'agreement',
     'acceptance',
     'synthetic',
+    'synthetic_images',
+    'synthetic_centroids',
     'mcap_records',
     'bag',
     'product_files',

@@ -23,7 +23,8 @@ from starcal_ros.observability import (
     predicted_sigma,
 )
 from starcal_ros.records import CameraGeometry, Ensemble, refused_image
-from starcal_ros.synthetic import cramer_rao_covariance, scenario, true_observations
+from starcal_ros.synthetic import scenario
+from starcal_ros.synthetic_centroids import cramer_rao_covariance, true_observations
 
 SCENARIO = scenario('tiny', seed=4)
 PRIOR, TRUTH = SCENARIO.prior, SCENARIO.truth

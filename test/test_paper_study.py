@@ -10,7 +10,15 @@ import re
 import numpy as np
 import pytest
 
-from starcal_ros import campaign, campaign_workers, cli, paper_figures, paper_study, synthetic
+from starcal_ros import (
+    campaign,
+    campaign_workers,
+    cli,
+    paper_figures,
+    paper_study,
+    synthetic,
+    synthetic_centroids,
+)
 from starcal_ros.paper_study import judge, PaperStudy, spread
 from starcal_ros.records import Ensemble
 
@@ -20,7 +28,9 @@ NIGHT = synthetic.scenario(paper_study.NIGHT, seed=3)
 @pytest.fixture(scope='module')
 def ensemble() -> Ensemble:
     """Observations of eighteen frames of the night, without pixels."""
-    return synthetic.true_observations(dataclasses.replace(NIGHT, cadence_s=200.0, image_count=18))
+    return synthetic_centroids.true_observations(
+        dataclasses.replace(NIGHT, cadence_s=200.0, image_count=18)
+    )
 
 
 @pytest.fixture(scope='module')

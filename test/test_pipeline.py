@@ -30,15 +30,9 @@ from starcal_ros.records import (
     Image,
     refused_image,
 )
-from starcal_ros.synthetic import (
-    attitude_samples,
-    Detector,
-    render,
-    scenario,
-    scene,
-    star_electrons,
-    true_observations,
-)
+from starcal_ros.synthetic import attitude_samples, Detector, scenario, scene
+from starcal_ros.synthetic_centroids import true_observations
+from starcal_ros.synthetic_images import render, star_electrons
 
 SCENARIO = scenario('tiny', seed=7)
 TRUTH = SCENARIO.truth

@@ -16,7 +16,7 @@ from starcal_ros.camera import line_of_sight, PARAMETER_NAMES
 from starcal_ros.observability import map_error_px
 from starcal_ros.records import CameraGeometry
 from starcal_ros.removal import removal_study
-from starcal_ros.synthetic import true_observations
+from starcal_ros.synthetic_centroids import true_observations
 
 TRACKER_ARCSEC = 20.0
 

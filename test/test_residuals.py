@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros import synthetic
+from starcal_ros import synthetic, synthetic_centroids
 from starcal_ros.calibration import CalibrationOptions, estimate_calibration
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
@@ -20,7 +20,7 @@ SCENARIO = dataclasses.replace(synthetic.scenario('small', seed=4), image_count=
 
 @pytest.fixture(scope='module', params=['hierarchical', 'per_image', 'single'])
 def left(request: pytest.FixtureRequest) -> Residuals:
-    ensemble = synthetic.true_observations(SCENARIO)
+    ensemble = synthetic_centroids.true_observations(SCENARIO)
     options = CalibrationOptions(
         method=request.param,
         star_tracker_sigma_arcsec=SCENARIO.star_tracker_sigma_arcsec,

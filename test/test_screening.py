@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 import pytest
 
-from starcal_ros import synthetic
+from starcal_ros import synthetic, synthetic_images
 from starcal_ros.errors import ImageRefused
 from starcal_ros.records import Image
 from starcal_ros.screening import (
@@ -31,7 +31,7 @@ S = 1_000_000_000
 @functools.cache
 def frame(index: int = 0) -> NDArray[np.uint16]:
     """A frame of the simulator."""
-    return synthetic.render(SCENARIO, synthetic.scene(SCENARIO, index), index).pixels  # type: ignore[return-value]
+    return synthetic_images.render(SCENARIO, synthetic.scene(SCENARIO, index), index).pixels  # type: ignore[return-value]
 
 
 def refusal(

@@ -24,7 +24,8 @@ from starcal_ros.records import (
     StarObservations,
     Thermal,
 )
-from starcal_ros.synthetic import scenario, true_observations
+from starcal_ros.synthetic import scenario
+from starcal_ros.synthetic_centroids import true_observations
 
 SCENARIO = scenario('tiny', seed=3)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior

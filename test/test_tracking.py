@@ -15,7 +15,8 @@ from starcal_ros.centroiding import CentroidOptions
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification import IdentificationOptions, observe_stars, Shot
 from starcal_ros.records import CameraGeometry, Image, StarObservations
-from starcal_ros.synthetic import render, scenario, Scene, scene
+from starcal_ros.synthetic import scenario, Scene, scene
+from starcal_ros.synthetic_images import render
 from starcal_ros.tracking import follow, Followed, following
 
 SCENARIO = scenario('tiny', seed=8)

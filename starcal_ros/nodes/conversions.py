@@ -1,4 +1,4 @@
-"""Building of rclpy's messages: the ``make`` of `starcal_ros.messages` for the graph."""
+"""Building of rclpy's messages: the ``make`` of `starcal_ros.message_types` for the graph."""
 
 from __future__ import annotations
 
