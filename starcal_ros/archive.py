@@ -53,6 +53,14 @@ class InForce:
     calibration: Calibration
 
 
+@dataclass(frozen=True)
+class _Kept:
+    """An image on disk, and where."""
+
+    image: StarObservations
+    path: Path
+
+
 class _AnotherVersion(Exception):
     """A file that is sound, but not of this version of starcal."""
 
@@ -81,7 +89,7 @@ class Archive:
         self.damage: list[str] = []
         self.last_event = 0
         self._frame_id = frame_id
-        self._images: dict[int, Path] = {}  # by stamp: those on disk
+        self._images: dict[int, _Kept] = {}  # by stamp: those on disk
         self._next_image = 1
         self._refused: dict[str, int] = {}
         self._events: dict[int, Path] = {}  # those on disk
@@ -99,7 +107,12 @@ class Archive:
 
     def saved(self, ensemble: Ensemble) -> int:
         """How many images of an ensemble are on disk."""
-        return sum(image.time_ns in self._images for image in ensemble.images)
+        return sum(map(self._holds, ensemble.images))
+
+    def _holds(self, image: StarObservations) -> bool:
+        # Not by its stamp: after a reset that the disk did not take, another image may have it.
+        kept = self._images.get(image.time_ns)
+        return kept is not None and kept.image is image
 
     def free_bytes(self) -> int:
         """Room left on the disk; 0 where it does not tell."""
@@ -115,7 +128,7 @@ class Archive:
             image = self._read_image(path)
             if image is not None and image.time_ns not in self._images:
                 images.append(image)
-                self._images[image.time_ns] = path
+                self._images[image.time_ns] = _Kept(image, path)
         for path in self._files(_ENSEMBLE, _REFUSED):
             content = self._unsealed(path, 'schema', ARCHIVE_SCHEMA)
             self._refused = _counts(content.get('refused')) if content else {}
@@ -163,7 +176,7 @@ class Archive:
             if self._images and not current & self._images.keys():
                 self._empty()
             for image in ensemble.images:
-                if image.time_ns not in self._images:
+                if not self._holds(image):
                     self._keep_image(image)
             if dict(ensemble.refused) != self._refused:
                 content = {'schema': ARCHIVE_SCHEMA, 'refused': dict(ensemble.refused)}
@@ -194,8 +207,13 @@ class Archive:
         self.last_event = max(self.last_event, record.event)
 
     def _keep_image(self, image: StarObservations) -> None:
+        stale = self._images.get(image.time_ns)
+        if stale is not None:
+            stale.path.unlink(missing_ok=True)
+            del self._images[image.time_ns]
         data = BagWriter.one_observation(TOPIC, image, self._frame_id)
-        self._images[image.time_ns] = self._write(_ENSEMBLE, f'{self._next_image:08d}.mcap', data)
+        path = self._write(_ENSEMBLE, f'{self._next_image:08d}.mcap', data)
+        self._images[image.time_ns] = _Kept(image, path)
         self._next_image += 1
 
     def _write(self, folder: str, name: str, content: str | bytes) -> Path:
@@ -207,11 +225,14 @@ class Archive:
         return path
 
     def _drop(self, images: set[int], events: set[int]) -> None:
-        for files, wanted in ((self._images, images), (self._events, events)):
-            for key in [key for key in files if key not in wanted]:
-                with contextlib.suppress(OSError):
-                    files[key].unlink(missing_ok=True)
-                    del files[key]
+        for stamp in self._images.keys() - images:
+            with contextlib.suppress(OSError):
+                self._images[stamp].path.unlink(missing_ok=True)
+                del self._images[stamp]
+        for event in self._events.keys() - events:
+            with contextlib.suppress(OSError):
+                self._events[event].unlink(missing_ok=True)
+                del self._events[event]
 
     def _empty(self) -> None:
         shutil.rmtree(self.folder / _EMPTIED, ignore_errors=True)

@@ -447,16 +447,12 @@ def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: S
     """
     Return the ensemble with one more image; at ``max_images`` the least informative goes.
 
-    An image of another size than the prior camera's, or of a stamp that the ensemble holds, is
-    counted as refused: its stars would count twice, or be of another camera.
+    An image of another size than the prior camera's is counted as refused: its stars are of
+    another camera.
     """
-    refusal, camera = observations.refusal, setup.prior.camera
-    if not refusal and (observations.width, observations.height) != (camera.width, camera.height):
-        refusal = 'wrong_size'
-    if not refusal and any(image.time_ns == observations.time_ns for image in ensemble.images):
-        refusal = 'duplicate'
-    if refusal != observations.refusal:
-        observations = dataclasses.replace(observations, refusal=refusal)
+    size, camera = (observations.width, observations.height), setup.prior.camera
+    if not observations.refusal and size != (camera.width, camera.height):
+        observations = dataclasses.replace(observations, refusal='wrong_size')
     return within_limit(ensemble.add(observations), setup)
 
 

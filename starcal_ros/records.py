@@ -239,14 +239,16 @@ class Ensemble:
         """
         Return the ensemble with one more image, kept or counted by its reason.
 
-        One with the stamp of an image held takes its place: a recording played twice does not
-        count twice.
+        One with the stamp of an image held is counted as ``duplicate``, and the first stands,
+        whatever the later one holds: a recording played twice does not count twice.
         """
-        if observations.refusal:
-            count = self.refused.get(observations.refusal, 0) + 1
-            return Ensemble(self.images, {**self.refused, observations.refusal: count})
-        others = (image for image in self.images if image.time_ns != observations.time_ns)
-        return Ensemble((*others, observations), self.refused)
+        refusal = observations.refusal
+        if not refusal and any(image.time_ns == observations.time_ns for image in self.images):
+            refusal = 'duplicate'
+        if refusal:
+            count = self.refused.get(refusal, 0) + 1
+            return Ensemble(self.images, {**self.refused, refusal: count})
+        return Ensemble((*self.images, observations), self.refused)
 
 
 @dataclass(frozen=True)

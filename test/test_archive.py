@@ -120,6 +120,20 @@ def test_what_is_kept_comes_back_to_the_last_bit(tmp_path: Path) -> None:
         assert one.calibration.residual_rms_px == other.calibration.residual_rms_px
 
 
+def test_another_image_of_a_stamp_on_disk_takes_its_place(tmp_path: Path) -> None:
+    """A reset that the disk did not take must not bring the first one back."""
+    first, second = images()[0], dataclasses.replace(images()[1], time_ns=images()[0].time_ns)
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble((first, images()[2])), ())
+        grown = Ensemble((images()[2], second))
+        assert archive.saved(grown) == 1
+        archive.keep(grown, ())
+        assert archive.saved(grown) == 2
+    with opened(tmp_path) as archive:
+        for a, b in zip(grown.images, archive.read_ensemble().images, strict=True):
+            assert_same_image(a, b)
+
+
 def test_the_ensemble_is_a_bag(tmp_path: Path) -> None:
     with opened(tmp_path) as archive:
         archive.keep(Ensemble(images()[:12]), ())

@@ -147,6 +147,22 @@ def test_what_would_count_twice_or_wrong_is_refused(
     assert dict(status.refused) == {'duplicate': 1, 'wrong_size': 1}
 
 
+def test_the_first_of_a_stamp_stands_in_memory_and_on_disk(
+    setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    other = dataclasses.replace(shown[1], time_ns=shown[0].time_ns)
+    before = filled(setup, (*shown[:2], other), tmp_path)
+    before.close()
+    after = started(setup, tmp_path)
+    after.add(other)
+    for state in (before, after):
+        stars = [image.catalog_id.tolist() for image in state.ensemble.images]
+        assert stars == [image.catalog_id.tolist() for image in shown[:2]]
+    assert dict(before.ensemble.refused) == {'duplicate': 1}
+    assert dict(after.ensemble.refused) == {'duplicate': 2}
+    after.close()
+
+
 def test_the_limit_holds_on_disk_too(
     setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:

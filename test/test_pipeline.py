@@ -288,7 +288,7 @@ def test_a_recording_that_plays_twice_counts_once(setup: pipeline.Setup) -> None
     ensemble = Ensemble().add(first).add(later)
     again = dataclasses.replace(first, attitude_gap_s=0.125)
     ensemble = ensemble.add(again)
-    assert ensemble.images == (later, again)
+    assert ensemble.images == (first, later) and dict(ensemble.refused) == {'duplicate': 1}
 
 
 def test_a_refused_image_does_not_put_those_after_it_out_of_order(setup: pipeline.Setup) -> None:
