@@ -84,6 +84,7 @@ LADDER = [
     'demo',
     'arguments',
     'cli',
+    'nodes.start',
     'nodes.conversions',
     'nodes.image_queue',
     'nodes.recent',

@@ -1,0 +1,35 @@
+"""
+What the console scripts call: the heavy imports take a second or more, and Ctrl-C may come then.
+
+Python would answer it with a traceback from whatever was being imported; the system's own action
+ends the process without one.
+"""
+
+from __future__ import annotations
+
+import importlib
+import signal
+
+
+def star_observer() -> int:
+    """Run the star observer; see `starcal_ros.nodes.star_observer.main`."""
+    return _run('star_observer')
+
+
+def calibrator() -> int:
+    """Run the calibrator; see `starcal_ros.nodes.calibrator.main`."""
+    return _run('calibrator')
+
+
+def bag_player() -> int:
+    """Run the bag player; see `starcal_ros.nodes.bag_player.main`."""
+    return _run('bag_player')
+
+
+def _run(name: str) -> int:
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:  # not where nohup or a shell has it ignored
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    module = importlib.import_module(f'starcal_ros.nodes.{name}')
+    signal.signal(signal.SIGINT, before)
+    return int(module.main())
