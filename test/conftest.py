@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-START_S = 30.0  # a node imports and starts in 2 s; two busy cores make that much of it
+START_S = 60.0  # a node imports and starts in 2 s; two busy cores make that much of it
 NODES = 'starcal_ros.nodes.'
 
 

@@ -81,6 +81,7 @@ class StarObserver(StarcalNode):
         self._own = from_mapping(ObserverOptions, values)
         self._setup = pipeline.load_setup(values, self.options.classes)
         self._geometry = self._setup.prior
+        self._calibration_number = 0  # of the one that stars are predicted with; 0: the prior
         self._observations = self.create_lifecycle_publisher(
             ObservationsMessage, 'observations', QoSProfile(depth=100)
         )
@@ -171,6 +172,8 @@ class StarObserver(StarcalNode):
             'attitude_rate_hz': _short(self._attitude_step_s.rate_hz()),
             'attitude_gap_s': _short(self._attitude_step_s.largest()),
             'restarts': self._restarts,
+            'calibration': self._calibration_number or 'prior',
+            'listeners': self._observations.get_subscription_count(),
             **{f'refused_{reason}': counts.get(reason, 0) for reason in sorted(IMAGE_REFUSALS)},
         }
         if self._last_refusal:
@@ -229,7 +232,7 @@ class StarObserver(StarcalNode):
         prior = self._setup.prior.camera
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
             raise ValueError('calibration: of another image size than the prior camera')
-        self._geometry = geometry
+        self._geometry, self._calibration_number = geometry, calibration.number
         if self._camera_infos is not None:
             self._camera_info = camera_info_to_message(calibration, make_message)
         self.get_logger().info('stars are predicted with the calibration in force')
@@ -255,10 +258,12 @@ class StarObserver(StarcalNode):
                 self._measure(waiting)
             except Exception as error:
                 self.count_error(error)
+                if not self.context.ok():
+                    return  # told to end: nobody can be answered any more
                 detail = f'{type(error).__name__}: {error}'
                 self._publish(self._refused(waiting, 'internal_error', detail))
             self._latency_s.add(time.monotonic() - waiting.arrived_s)
-            self.publish_health_change()
+            self.guarded(self.publish_health_change)()
 
     def _measure(self, waiting: Waiting) -> None:
         if waiting.message is None:
