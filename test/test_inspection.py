@@ -85,7 +85,7 @@ def test_verdicts_are_those_of_the_calibration(
     full = inspection.inspect([path], ASKED, setup, lambda: seen.append(1))
     by_reason = {r.reason: r.count for r in full.refused}
     # With the stars and the camera, two more: the dark image and the cut one.
-    expected = {r.reason: r.count for r in quick.refused} | {'no_stars': 1, 'wrong_size': 1}
+    expected = {r.reason: r.count for r in quick.refused} | {'blank': 1, 'wrong_size': 1}
     assert by_reason == expected
     assert len(seen) == full.images == 12
     observed = list(pipeline.observe_bag([path], IMAGE, ATTITUDE, setup))
