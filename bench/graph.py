@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import os
 from pathlib import Path
@@ -36,15 +36,21 @@ def _free_domain() -> int:
 
 
 def start(
-    name: str, params: Path, log: Path, *values: str, node: str = '', **options: Any
+    name: str,
+    params: Path,
+    log: Path,
+    *values: str,
+    node: str = '',
+    before: Sequence[str] = (),
+    **options: Any,
 ) -> subprocess.Popen[bytes]:
-    """A node process with a parameter file and further values, ``'name:=value'``."""
+    """A node process with a parameter file and further values; ``before`` runs its command."""
     arguments = ['-m', f'starcal_ros.nodes.{name}', '--ros-args', '--params-file', str(params)]
     arguments += [word for value in values for word in ('-p', value)]
     arguments += ['-r', f'__node:={node or name}', '--log-level', 'warn']
     with log.open('ab') as output:
         return subprocess.Popen(
-            [sys.executable, *arguments],
+            [*before, sys.executable, *arguments],
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,

@@ -1,0 +1,222 @@
+"""Images through both nodes while either is killed; what is published is checked."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+import time
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+
+from bench import graph
+from starcal_ros.image_messages import image_to_message
+from starcal_ros.message_fields import make_header, stamp_ns
+from starcal_ros.telemetry_messages import attitude_to_message
+
+if TYPE_CHECKING:
+    from bench.faults import _Bench
+
+_FIRST_NS = 1_778_829_600_000_000_000
+_STEP_NS = 1_000_000_000
+_AROUND_NS = (-200_000_000, -20_000_000, 20_000_000, 200_000_000)
+_IN_FLIGHT = 4
+_ANSWER_S = 60.0
+# Centroids of a frame hang on the prediction by far less than their noise of 0.05 px.
+_SAME_PX = 0.5
+
+
+class Flight:
+    """
+    Both nodes, the images that flow, the solves that run, and what is remembered of their answers.
+
+    ``lost`` of the calibrator are images that it told as saved and did not have after a restart,
+    of the star observer images sent to a running one that were never answered.  ``wrong`` of the
+    calibrator is a calibration latched that the gate refused, that is older than one before, or
+    whose number had another content; of the star observer a star measured where it is not, or no
+    calibration in use after a restart though one is latched.
+    """
+
+    NODES = ('star_observer', 'calibrator')
+
+    def __init__(self, bench: _Bench, state: Path) -> None:
+        self._bench = bench
+        kept = (f'state_dir:={state}', 'max_images:=5000')
+        self._values = {'star_observer': (), 'calibrator': kept}
+        self._running: dict[str, Any] = {}
+        self._names: dict[str, str] = {}
+        self._known: dict[int, list[float]] = {}  # content of the calibrations by number
+        self._status: list[Any] = []
+        self._latched: list[Any] = []
+        self._health: dict[str, dict[str, str]] = {}
+        self._answered_ns: set[int] = set()
+        self._in_flight_ns: set[int] = set()
+        self._solving: Any = None
+        self._solve: Any = None
+        self.sent = self.told = 0
+        self.kills: Counter[str] = Counter()
+        self.lost: Counter[str] = Counter()
+        self.wrong: Counter[str] = Counter()
+        self.died: Counter[str] = Counter()
+        self._truth = [
+            dict(zip(one.catalog_id.tolist(), one.measured_px, strict=True))
+            for one in bench.observations
+        ]
+
+    @property
+    def answered(self) -> int:
+        """How many images have been answered."""
+        return len(self._answered_ns)
+
+    @property
+    def numbers(self) -> int:
+        """How many calibrations have been in force."""
+        return len(self._known)
+
+    def __enter__(self) -> Flight:
+        from diagnostic_msgs.msg import DiagnosticArray
+        from geometry_msgs.msg import QuaternionStamped
+        from sensor_msgs.msg import Image
+
+        from starcal.msg import StarObservations
+
+        self._client = graph.Client()
+        # A small message waits behind a large one of its participant: the tracker has its own.
+        self._tracker = graph.Client('star_tracker')
+        self._client.collect(StarObservations, 'observations', self._take, latched=False)
+        self._client.collect(DiagnosticArray, '/diagnostics', self._take_health, latched=False)
+        self._images = self._client.node.create_publisher(Image, 'image', 20)
+        self._attitudes = self._tracker.node.create_publisher(QuaternionStamped, 'attitude', 1000)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._running.values():
+            graph.stop(process)
+        self._tracker.__exit__()
+        self._client.__exit__()
+
+    def fly(self, seconds: float) -> None:
+        """Start what is not running, and send images and ask for solves for so long."""
+        from std_srvs.srv import Trigger
+
+        missing = [name for name in self.NODES if name not in self._running]
+        for name in missing:
+            self._start(name)
+        for name in missing:
+            is_observer = name == 'star_observer'
+            if not (self._observer_is_ready() if is_observer else self._calibrator_is_ready()):
+                self._running.pop(name).kill()
+                self.died[name] += 1
+                return
+        if self._known:
+            newest = str(max(self._known))
+            mine = self._names['star_observer']
+            taken = self._client.holds(
+                lambda: int(self._said(mine, 'calibration', 'prior', '0')) >= int(newest)
+            )
+            self.wrong['star_observer'] += not taken
+        end_s = time.monotonic() + seconds
+        first = self.sent
+        while time.monotonic() < end_s or self.sent == first:
+            self._send()
+            if not self._client.holds(lambda: len(self._in_flight_ns) < _IN_FLIGHT, _ANSWER_S):
+                self.lost['star_observer'] += len(self._in_flight_ns)
+                self._in_flight_ns.clear()
+            if self._solving is None or self._solving.done():
+                self._solving = self._solve.call_async(Trigger.Request())
+
+    def kill(self, *names: str) -> None:
+        """Kill nodes at once, and look at what they have published before."""
+        for name in names:
+            self._running[name].kill()
+        for name in names:
+            self.died[name] += self._running.pop(name).wait() != -9
+            self.kills[name] += 1
+        self._client.holds(lambda: False, 0.1)  # what was still under way
+        if 'star_observer' in names:
+            self._in_flight_ns.clear()
+        if 'calibrator' in names:
+            self._solving = None
+        self.told = max([self.told, *(message.images_saved for message in self._status)])
+        for message in self._latched:
+            content = [message.fx, message.fy, *message.distortion, *message.covariance]
+            self.wrong['calibrator'] += not message.accepted
+            self.wrong['calibrator'] += self._known.setdefault(message.number, content) != content
+        self._status.clear()
+        self._latched.clear()
+
+    def _start(self, name: str) -> None:
+        # Each heir has a name of its own: the graph takes 20 s to forget the dead.
+        self._names[name] = f'{name}{self.kills[name]}'
+        bench, node = self._bench, self._names[name]
+        self._running[name] = graph.start(
+            name, bench.params, bench.log, *self._values[name], node=node
+        )
+
+    def _observer_is_ready(self) -> bool:
+        """Whether it is heard and answers; what was sent before it was matched is no loss."""
+        mine, before = self._names['star_observer'], self.answered
+        if not self._client.holds(lambda: int(self._said(mine, 'listeners', '', '0')) >= 1):
+            return False
+        for _ in range(int(_ANSWER_S)):
+            self._send()
+            if self._client.holds(lambda: self.answered > before, 1.0):
+                self._in_flight_ns.clear()
+                return True
+        return False
+
+    def _calibrator_is_ready(self) -> bool:
+        from std_srvs.srv import Trigger
+
+        from starcal.msg import Calibration, EnsembleStatus
+
+        client = self._client
+        client.collect(EnsembleStatus, 'ensemble_status', self._status.append, latched=True)
+        client.collect(Calibration, 'calibration', self._latched.append, latched=True)
+        self._solve = client.node.create_client(Trigger, f'{self._names["calibrator"]}/calibrate')
+        if not client.holds(lambda: self._status and self._solve.service_is_ready()):
+            return False
+        self.lost['calibrator'] += max(0, self.told - self._status[0].images)
+        if self._known:
+            client.holds(lambda: self._latched, 10.0)
+            newest = self._latched[0].number if self._latched else 0
+            self.wrong['calibrator'] += newest < max(self._known)
+        return True
+
+    def _said(self, node: str, key: str, none: str, instead: str) -> str:
+        """A value of the newest diagnostics of a node."""
+        value = self._health.get(node, {}).get(key, instead)
+        return instead if value == none else value
+
+    def _send(self) -> None:
+        from starcal_ros.nodes.conversions import make_message
+
+        image, samples = self._bench.frames[self.sent % len(self._bench.frames)]
+        time_ns = _FIRST_NS + self.sent * _STEP_NS
+        for around_ns in _AROUND_NS:
+            xyzw = samples[1].icrf_from_star_tracker_xyzw
+            self._attitudes.publish(
+                attitude_to_message(time_ns + around_ns, xyzw, 'icrf', make_message)
+            )
+        message = image_to_message(image, 'camera', make_message)
+        message.header = make_header(time_ns, 'camera', make_message)
+        self._images.publish(message)
+        self._in_flight_ns.add(time_ns)
+        self.sent += 1
+
+    def _take(self, message: Any) -> None:
+        time_ns = stamp_ns(message.header.stamp)
+        self._answered_ns.add(time_ns)
+        self._in_flight_ns.discard(time_ns)
+        truth = self._truth[(time_ns - _FIRST_NS) // _STEP_NS % len(self._truth)]
+        measured = np.reshape(message.measured_px, (-1, 2))
+        for star, place in zip(message.catalog_id, measured, strict=True):
+            known = truth.get(star)
+            # A star near the limit may be found in one pass and not in the other.
+            if known is not None and np.abs(known - place).max() > _SAME_PX:
+                self.wrong['star_observer'] += 1
+
+    def _take_health(self, message: Any) -> None:
+        status = message.status[0]
+        node = status.name.removeprefix('starcal: ')
+        self._health[node] = {value.key: value.value for value in status.values}
