@@ -1,0 +1,85 @@
+"""
+Draw how centroids depend on the phase in the pixel: ``python -m docs.make_phase [FILE]``.
+
+Stars of one brightness, each anywhere in its pixel, are rendered and measured by either method:
+the mean error for every tenth of a pixel, and the amplitude of its first wave.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.centroiding import CentroidOptions, measure_stars, model_image
+from starcal_ros.detection import detect, measure_background
+from starcal_ros.synthetic import Detector, expose, star_electrons
+
+Floats = NDArray[np.float64]
+
+FILE = Path(__file__).parent / 'images' / 'pixel_phase.png'
+SHAPE = (1024, 1296)
+SPACING_PX = 24
+IMAGES = 12
+FLUXES_ELECTRONS = (6e2, 2e3, 2e4, 4e5)
+METHODS = ('psf', 'moment')
+BINS = 10
+
+
+def measure(method: str, flux_electrons: float) -> tuple[Floats, Floats, float]:
+    """Errors (n,) in px and phases (n,) of both coordinates of many stars, and the median snr."""
+    # 16 bits hold the brightest of them.
+    detector = dataclasses.replace(
+        Detector(cosmic_rays=0.0, hot_fraction=0.0), bits=16, offset_dn=500.0
+    )
+    options = CentroidOptions(centroid=method)
+    errors, phases, snr = [], [], []
+    for seed in range(IMAGES):
+        rng = np.random.default_rng([seed, int(flux_electrons)])
+        v, u = np.mgrid[SPACING_PX : SHAPE[0] - SPACING_PX : SPACING_PX, 24:1272:SPACING_PX]
+        xy = np.stack([u.ravel(), v.ravel()], axis=-1) + rng.uniform(-0.5, 0.5, (u.size, 2))
+        light = star_electrons(xy, np.full(len(xy), flux_electrons), detector.psf_sigma_px, SHAPE)
+        pixels = expose(light + detector.background_electrons, detector, rng)
+        background = measure_background(pixels)
+        sources = detect(pixels, background, options.detection_sigma)
+        model = model_image(pixels, background, sources, options)
+        found = measure_stars(pixels, xy, model, options)
+        good = found.refusal == ''
+        errors.append((found.xy_px - xy)[good].ravel())
+        phases.append((xy - np.rint(xy))[good].ravel())
+        snr.append(found.snr[good])
+    return np.concatenate(errors), np.concatenate(phases), float(np.median(np.concatenate(snr)))
+
+
+def main() -> None:
+    """Draw both methods side by side and print the amplitudes."""
+    parser = argparse.ArgumentParser(description='Draw the pixel-phase error of centroids.')
+    parser.add_argument('file', nargs='?', type=Path, default=FILE)
+    figure = Figure(figsize=(11, 3.6), layout='constrained')
+    panels = figure.subplots(1, 2, sharey=True)
+    edges = np.linspace(-0.5, 0.5, BINS + 1)
+    for axes, method in zip(panels, METHODS, strict=True):
+        for flux in FLUXES_ELECTRONS:
+            error, phase, snr = measure(method, flux)
+            part = np.clip(np.digitize(phase, edges) - 1, 0, BINS - 1)
+            count = np.bincount(part, minlength=BINS)
+            mean = np.bincount(part, error, minlength=BINS) / count
+            sigma = np.sqrt(np.bincount(part, error**2, minlength=BINS)) / count
+            middle = 0.5 * (edges[1:] + edges[:-1])
+            axes.errorbar(middle, mean, sigma, marker='.', label=f'S/N {snr:.0f}')
+            wave = 2 * abs(np.mean(error * np.exp(2j * np.pi * phase)))
+            chance = 2 * np.sqrt(np.mean(error**2) / len(error))
+            print(f'{method:<7} S/N {snr:6.1f}  wave {wave:.4f} px, by chance {chance:.4f} px')
+        axes.axhspan(-0.01, 0.01, color='0.9', zorder=0)
+        axes.set(title=method, xlabel='place of the star in its pixel, px')
+    panels[0].set_ylabel('mean error, px')
+    panels[1].legend()
+    figure.savefig(parser.parse_args().file, dpi=90, metadata={'Software': None})
+
+
+if __name__ == '__main__':
+    main()
