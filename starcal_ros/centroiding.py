@@ -22,6 +22,7 @@ from starcal_ros.detection import (
     stamps_about,
     windows_inside,
 )
+from starcal_ros.fixed_pattern import hot_in_stamps, NO_HOT_PIXELS
 from starcal_ros.instrument import Instrument, PsfWidth, uniform_width
 from starcal_ros.options import option
 from starcal_ros.psf import (
@@ -240,16 +241,21 @@ def _isolated(xy_px: Floats, distance_px: float) -> Floats:
 
 
 def measure_stars(
-    pixels: Pixels, predicted_px: Floats, model: ImageModel, options: CentroidOptions
+    pixels: Pixels,
+    predicted_px: Floats,
+    model: ImageModel,
+    options: CentroidOptions,
+    hot_pixels: NDArray[np.int64] = NO_HOT_PIXELS.index,
 ) -> Centroids:
     """
     Centroids of the stars near predicted pixels (n, 2), by the method of the options.
 
     The brighter of two neighbours is to come first.  Where the image does not tell its PSF width,
-    the moment method is used.
+    the moment method is used.  ``hot_pixels`` (k,), numbers row by row from 0, sorted, take no
+    part in a fit.
     """
     if options.centroid == 'psf' and model.psf is not None:
-        return _measure_by_psf(pixels, predicted_px, model, model.psf, options)
+        return _measure_by_psf(pixels, predicted_px, model, model.psf, options, hot_pixels)
     return _measure_by_moments(pixels, predicted_px, model, options)
 
 
@@ -259,6 +265,7 @@ def _measure_by_psf(
     model: ImageModel,
     psf: PsfWidth,
     options: CentroidOptions,
+    hot_pixels: NDArray[np.int64],
 ) -> Centroids:
     """Centroids by `fit_psf`, in windows about the predicted pixels."""
     shape = (pixels.shape[0], pixels.shape[1])
@@ -270,17 +277,31 @@ def _measure_by_psf(
     refusal[~inside] = 'border'
     centre = np.clip(centre, radius + 1, [shape[1] - radius - 2, shape[0] - radius - 2])
     # The window goes where the star is: the brightest pixel next to the prediction.
-    near = stamps_about(pixels, centre, 1).reshape(n, 9)
-    best = near.argmax(axis=1)
+    near = stamps_about(pixels, centre, 1)
+    near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0.0
+    best = near.reshape(n, 9).argmax(axis=1)
     centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
     stamps = stamps_about(pixels, centre, radius)
     at_px = centre.astype(np.float64)
     noise_dn = sample_mesh(model.background.noise_mesh, shape, at_px)
     sigma_px = psf.at(at_px)
-    fit = fit_psf(stamps, sigma_px, noise_dn, model.pixel_noise, model.saturation_dn)
-    saturated = np.count_nonzero(stamps >= model.saturation_dn, axis=(1, 2))
+    saturated = stamps >= model.saturation_dn
+    hot = hot_in_stamps(hot_pixels, centre, radius, shape[1])
+    # The start of the fit looks at all pixels; to the fit itself these say nothing.
+    stamps[hot] = np.median(stamps, axis=(1, 2))[np.nonzero(hot)[0]] if hot.any() else 0.0
+    out = saturated | hot
+    fit = fit_psf(stamps, sigma_px, noise_dn, model.pixel_noise, out)
+    saturated_pixels = np.count_nonzero(saturated & ~hot, axis=(1, 2))
     fit, modelled = _without_neighbours(
-        stamps, predicted_px, centre, fit, inside & (saturated == 0), sigma_px, noise_dn, model
+        stamps,
+        predicted_px,
+        centre,
+        fit,
+        inside & (saturated_pixels == 0),
+        sigma_px,
+        noise_dn,
+        model,
+        out,
     )
     x, y, flux, _ = fit.parameters.T
     covariance = fit.covariance
@@ -293,7 +314,7 @@ def _measure_by_psf(
     misshapen |= fit.worst_pixel_sigma > 5.0
     wandered = np.maximum(np.abs(x), np.abs(y)) > 1.5
     for bad, reason in (
-        (saturated > options.max_saturated_pixels, 'saturated'),
+        (saturated_pixels > options.max_saturated_pixels, 'saturated'),
         ((snr < options.min_snr) | ~np.isfinite(snr), 'faint'),
         (wandered, 'not_detected'),
         (misshapen, 'elongated'),
@@ -323,6 +344,7 @@ def _without_neighbours(
     sigma_px: Floats,
     noise_dn: Floats,
     model: ImageModel,
+    out: NDArray[np.bool_],
 ) -> tuple[PsfFit, NDArray[np.bool_]]:
     """
     The fits once more, without the light of those neighbours that are measured themselves.
@@ -366,7 +388,7 @@ def _without_neighbours(
             sigma_px[again],
             np.sqrt(noise2),
             model.pixel_noise,
-            model.saturation_dn,
+            out[again],
             fit.parameters[again],
         )
         fit = replace_rows(fit, again, freed)

@@ -23,7 +23,7 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _SCANNED_PX = 1 << 21  # of one image, in 0.3 ms; larger images are scanned in turns
 _MOVED_PX = 5.0  # the light of a star that has moved so far has left its pixels
 _SPILT = 0.2  # mean of the four next pixels over the peak: 0.24 for a star of 0.45 px
-_CORE_SIGMAS = 2.0
+_CORE_PX = 1.5  # a star on a hot pixel itself has lost its peak
 _MOST = 100_000  # a detector with more has another fault, and the list stays small
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
@@ -128,27 +128,42 @@ def _single_lit(
     return np.asarray((v * width + u)[single][:_MOST], np.int64)
 
 
+def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> NDArray[np.bool_]:
+    """Which pixels (n, 2 radius + 1, 2 radius + 1) of windows about pixels (n, 2) are hot."""
+    side = 2 * radius + 1
+    found = np.zeros((len(centre), side, side), bool)
+    if len(hot) == 0:
+        return found
+    row = centre[:, 1, None] + np.arange(-radius, radius + 1)
+    first = row * width + centre[:, 0, None] - radius
+    low, high = np.searchsorted(hot, first), np.searchsorted(hot, first + side)
+    star, line = np.nonzero(high > low)
+    low, high, first = low[star, line], high[star, line], first[star, line]
+    for k in range(int((high - low).max(initial=0))):
+        more = low + k < high
+        found[star[more], line[more], hot[low[more] + k] - first[more]] = True
+    return found
+
+
 def refuse_on_hot_pixels(
     xy_px: Floats,
     refusal: NDArray[np.str_],
     hot: Indices,
     width: int,
-    psf_sigma_px: float,
     window_px: int,
 ) -> NDArray[np.str_]:
     """
     Refusals (n,) of stars at (n, 2), with ``hot_pixel`` where one is the cause.
 
-    A hot pixel in the core, within two sigma, spoils any star.  One elsewhere in the window, half
-    ``window_px`` wide, is the cause where the star was refused for its shape.
+    A hot pixel at the peak spoils any star, as what is left of it tells little.  One elsewhere in
+    the window, half ``window_px`` wide, is the cause where the star was refused for its shape.
     """
     if len(hot) == 0:
         return refusal
     v, u = np.divmod(hot, width)
     tree = cKDTree(np.stack([u, v], axis=-1))
     asked = np.flatnonzero(np.isin(refusal, ('', 'elongated', 'ambiguous')))
-    core_px = _CORE_SIGMAS * (psf_sigma_px or 1.0)
-    core, _ = tree.query(xy_px[asked], distance_upper_bound=core_px)
+    core, _ = tree.query(xy_px[asked], distance_upper_bound=_CORE_PX)
     window, _ = tree.query(xy_px[asked], p=np.inf, distance_upper_bound=window_px + 0.5)
     cause = np.isfinite(core) | (np.isfinite(window) & (refusal[asked] != ''))
     changed = refusal.copy()

@@ -38,7 +38,7 @@ from starcal_ros.detection import (
     Sources,
 )
 from starcal_ros.errors import ImageRefused
-from starcal_ros.fixed_pattern import refuse_on_hot_pixels
+from starcal_ros.fixed_pattern import NO_HOT_PIXELS, refuse_on_hot_pixels
 from starcal_ros.instrument import Instrument, learn, MeasuredStars
 from starcal_ros.options import option
 from starcal_ros.psf import neighbour_pull_px, stamp_radius_px
@@ -55,7 +55,6 @@ _PULL_UNCERTAINTY = 0.25  # of a neighbour's light: stars of unlike colour diffe
 SPACE = SiteOptions()
 _MODELLED_UNCERTAINTY = 0.05  # of that of a star measured itself: wings that are no Gaussian's
 _NEAR_SIGMA, _MODELLED_NEAR_SIGMA = 5.0, 3.0  # a bright neighbour nearer than this swamps
-NO_PIXELS = np.empty(0, np.int64)
 _ALONE_SIGMA = 0.1  # a star whose neighbours pull it by less tells the PSF
 _PARTS = 3  # of the image along each side, in which a match must hold
 _PART_CHANCE = 1e-3  # greatest probability that a right match misses so many in a part
@@ -477,7 +476,7 @@ class Shot:
     attitude_gap_s: float
     velocity_m_s: Floats | None = None
     site: SiteOptions = SPACE
-    hot_pixels: NDArray[np.int64] = dataclasses.field(default_factory=lambda: NO_PIXELS)
+    hot_pixels: NDArray[np.int64] = dataclasses.field(default_factory=lambda: NO_HOT_PIXELS.index)
 
 
 def observe_stars(
@@ -546,7 +545,7 @@ def measure_predicted(
     index = prediction.catalog_index[inside]
     predicted_px = prediction.xy_px[inside]
     magnitude = catalog.magnitude[index]
-    centroids = measure_stars(pixels, predicted_px, model, centroid_options)
+    centroids = measure_stars(pixels, predicted_px, model, centroid_options, shot.hot_pixels)
     unlisted = catalog.close_pair[index] & ~_close(prediction.direction_icrf[inside])
     faintest = float(catalog.magnitude[-1])
     unlisted_px = np.where(
@@ -558,7 +557,6 @@ def measure_predicted(
         _refuse_displaced(predicted_px, centroids, width),
         shot.hot_pixels,
         width,
-        model.psf_sigma_px,
         stamp_radius_px(model.psf_sigma_px or 1.0),
     )
     good = refusal == ''

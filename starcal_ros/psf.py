@@ -100,7 +100,7 @@ def fit_psf(
     sigma_px: float | Floats,
     noise_dn: Floats,
     pixel_noise: PixelNoise,
-    saturation_dn: float = np.inf,
+    out: NDArray[np.bool_] | None = None,
     start: Floats | None = None,
 ) -> PsfFit:
     """
@@ -116,8 +116,8 @@ def fit_psf(
         Noise at each star, or in each pixel, without the star's own light.
     pixel_noise : PixelNoise
         How the noise grows with signal.
-    saturation_dn : float
-        Pixels at or above this say nothing of the star and take no part.
+    out : (n, w, w), optional
+        Pixels that say nothing of the star, saturated or hot, and take no part.
     start : (n, 4), optional
         Parameters near which the fit ends.
 
@@ -130,7 +130,7 @@ def fit_psf(
     n, w, _ = stamps.shape
     sigma_px = np.broadcast_to(np.asarray(sigma_px, np.float64), (n,))
     data = stamps.reshape(n, w * w)
-    valid = data < saturation_dn
+    valid = np.ones(data.shape, bool) if out is None else ~out.reshape(n, w * w)
     parameters = _start(stamps, sigma_px) if start is None else start.copy()
     noise2 = (noise_dn[:, None] if noise_dn.ndim == 1 else noise_dn) ** 2
     active = np.arange(n)

@@ -128,6 +128,45 @@ def test_no_bias_with_the_phase_in_the_pixel(psf_sigma_px: float) -> None:
     assert len(bias) == 10 and np.abs(bias).max() < 0.002
 
 
+@pytest.mark.parametrize('flux', [6e2, 1e3, 2e4])
+def test_no_bias_with_the_phase_at_any_signal(flux: float) -> None:
+    """Signal-to-noise of about 14, 21 and 130: the amplitude of one wave over the pixel."""
+    error, phase = [], []
+    for seed in range(4):
+        xy = star_grid(30 + seed)
+        found = measured(exposed(seed, xy, np.full(len(xy), flux), QUIET), xy)
+        good = found.refusal == ''
+        assert good.mean() > 0.95
+        error.append((found.xy_px - xy)[good])
+        phase.append(2 * np.pi * xy[good])
+    wave = np.exp(1j * np.concatenate(phase).ravel())
+    squared = np.concatenate(error).ravel() ** 2
+    amplitude_px = 2 * np.abs(np.mean(np.concatenate(error).ravel() * wave))
+    # The noise of the stars alone gives a wave of this size.
+    by_chance_px = 2 * np.sqrt(squared.mean() / len(squared))
+    assert by_chance_px < 0.004
+    assert amplitude_px < 0.01
+
+
+def test_a_hot_pixel_takes_no_part_in_a_fit() -> None:
+    squared = []
+    for seed in range(4):
+        xy = star_grid(40 + seed)
+        pixels = exposed(seed, xy, unlike_fluxes(seed, len(xy)), QUIET)
+        model = modelled(pixels)
+        u, v = np.rint(xy + np.array([2.0, -1.0])).astype(int).T
+        pixels[v, u] += 400
+        plain = measure_stars(pixels, xy, model, PSF)
+        assert np.mean(plain.refusal == '') < 0.1
+        hot = np.sort(v * pixels.shape[1] + u)
+        freed = measure_stars(pixels, xy, model, PSF, hot)
+        good = (freed.refusal == '') & (freed.snr > 10)
+        assert good.mean() > 0.8
+        squared.append((freed.xy_px - xy)[good] ** 2 / freed.covariance_px2[good][:, [0, 2]])
+    # Two coordinates of more than 1300 stars: known to 1.4 %.
+    assert np.sqrt(np.concatenate(squared).mean()) == pytest.approx(1.0, abs=0.05)
+
+
 def test_moments_are_pulled_to_the_middle_of_the_pixel() -> None:
     # The paper's method cuts the wings off, at 3 px and at its threshold.
     detector = dataclasses.replace(QUIET, bits=16, electrons_per_dn=10.0, offset_dn=500.0)
