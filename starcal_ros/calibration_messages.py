@@ -235,7 +235,7 @@ def _correlation_from_message(message: Message) -> Correlation | None:
 
 
 def _halves_fields(halves: Halves | None) -> dict[str, object]:
-    halves = halves or Halves(math.nan, math.nan, math.nan, math.nan)
+    halves = halves or Halves(-1.0, -1.0, -1.0, -1.0)
     return {
         'halves_shape_px': float(halves.shape_px),
         'halves_shape_chance': float(halves.shape_chance),
@@ -245,7 +245,8 @@ def _halves_fields(halves: Halves | None) -> dict[str, object]:
 
 
 def _halves_from_message(message: Message) -> Halves | None:
-    if math.isnan(message.halves_chance):
+    # Recordings of before the field was there have none.
+    if not getattr(message, 'halves_chance', -1.0) >= 0:
         return None
     return Halves(
         shape_px=float(message.halves_shape_px),

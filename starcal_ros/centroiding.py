@@ -72,10 +72,11 @@ class CentroidOptions:
         low=0.0,
     )
     max_saturated_pixels: int = option(
-        0,
-        'most saturated pixels of a star that is used; the PSF fit leaves them out',
+        40,
+        'most saturated pixels of a star that is used, which the PSF fit places by the others;'
+        ' 0 for a detector that blooms',
         low=0,
-        high=20,
+        high=200,
     )
     gain_e_per_dn: float = option(
         0.0, 'detector gain, electrons per DN; 0: found from the image', low=0.0

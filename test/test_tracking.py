@@ -21,7 +21,8 @@ from starcal_ros.tracking import follow, Followed, following
 
 SCENARIO = scenario('tiny', seed=8)
 PRIOR = SCENARIO.prior
-OPTIONS, CENTROIDS = IdentificationOptions(), CentroidOptions()
+OPTIONS = IdentificationOptions()
+CENTROIDS = CentroidOptions(max_saturated_pixels=0)
 
 
 @functools.cache
