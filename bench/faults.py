@@ -50,9 +50,9 @@ def run(quick: bool) -> list[Table]:
     with tempfile.TemporaryDirectory() as folder:
         bench = _Bench(Path(folder))
         for fault, quick_times, times in (
-            (_damaged_bags, 60, 5000),
-            (_hostile_to_observer, 30, 10_000),
-            (_hostile_to_calibrator, 30, 10_000),
+            (_damaged_bags, 40, 5000),
+            (_hostile_to_observer, 20, 10_000),
+            (_hostile_to_calibrator, 20, 10_000),
             (_killed, 2, 50),
             (_no_room, 1, 5),
             (_many_callers, 10, 10),
