@@ -60,14 +60,26 @@ class NodeProcess:
 
     def stop(self, number: int = signal.SIGINT) -> int:
         """Exit status after a signal; kills it when it does not listen."""
-        if self.process.poll() is None:
-            self.process.send_signal(number)
+        self.tell_to_end(number)
         try:
             return self.process.wait(START_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
             raise
+
+    def tell_to_end(self, number: int = signal.SIGINT) -> None:
+        """Send a signal, if it is still there."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+
+    def end(self) -> None:
+        """Wait for it to end; kill it when it does not."""
+        try:
+            self.process.wait(START_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
 
 
 StartNode = Callable[..., NodeProcess]
@@ -85,8 +97,12 @@ def start_node(tmp_path: Path) -> Iterator[StartNode]:
         return started[-1]
 
     yield start
+    # One that does not end must not stay for the tests after it, nor keep the others here; whether
+    # nodes end when they are told is for test_lifecycle to say.
     for process in started:
-        process.stop()
+        process.tell_to_end()
+    for process in started:
+        process.end()
 
 
 @pytest.fixture(scope='session')
