@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import functools
 
 import numpy as np
 import pytest
+from sample_sky import with_planets  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.catalog import load_catalog, StarCatalog
@@ -25,7 +27,13 @@ from starcal_ros.identification import (
 )
 from starcal_ros.instrument import uniform_width
 from starcal_ros.psf import fit_psf, PixelNoise, stamp_radius_px
-from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.records import (
+    CameraGeometry,
+    Image,
+    refused_image,
+    STAR_REFUSALS,
+    StarObservations,
+)
 from starcal_ros.synthetic import Detector, scenario, Scene, scene
 from starcal_ros.synthetic_images import render, star_electrons
 
@@ -177,6 +185,72 @@ def test_hot_pixels_and_missing_and_strange_stars() -> None:
     off_px = np.linalg.norm(found.measured_px - true_px, axis=1)
     # A strange star beside a true one pulls it; the catalog knows nothing of it.
     assert len(found) > 80 and (off_px < 1.0).mean() > 0.98
+
+
+@pytest.mark.parametrize('index', range(10))
+@pytest.mark.parametrize('turn_deg', [0.0, 1.0], ids=['near', 'searched'])
+def test_planets_are_no_stars(index: int, turn_deg: float) -> None:
+    one, _ = shown(index)
+    image = render(SCENARIO, with_planets(SCENARIO, one, index), index)
+    turn = Rotation.from_rotvec(np.radians(turn_deg) * np.array([0.6, -0.8, 2.0]))
+    assert_right(observed(image, one.icrf_from_star_tracker_xyzw, turned(PRIOR, turn)), one)
+
+
+def reasons(found: StarObservations) -> dict[int, str]:
+    """Why each star that was left out was."""
+    names = list(found.refused_stars)
+    pairs = zip(found.refused_catalog_id.tolist(), found.refused_reason.tolist(), strict=True)
+    return {number: names[code] for number, code in pairs}
+
+
+def moved_right(pixels: np.ndarray, u: int, v: int, shift: int) -> None:
+    """The light about a pixel stands some pixels to the right of its place."""
+    window = slice(v - 7, v + 8), slice(u - 7, u + 8)
+    pixels[window] = np.roll(pixels[window], shift, axis=1)
+
+
+def sharpened(pixels: np.ndarray, u: int, v: int) -> None:
+    """Of the light about a pixel only the three brightest pixels are left."""
+    window = pixels[v - 4 : v + 5, u - 4 : u + 5]
+    window[window < np.sort(window.ravel())[-3]] = np.median(pixels)
+
+
+@pytest.mark.parametrize(
+    ('reason', 'centroid', 'spoil'),
+    [
+        # Another source stands where the star should, and too near to be told from it.
+        ('ambiguous', 'psf', functools.partial(moved_right, shift=1)),
+        ('ambiguous', 'moment', functools.partial(moved_right, shift=2)),
+        # The pixel next to the prediction is lit by something that stands elsewhere.
+        ('not_detected', 'psf', functools.partial(moved_right, shift=3)),
+        ('too_few_pixels', 'moment', sharpened),
+    ],
+)
+def test_one_spoilt_star_is_left_out_by_its_reason(
+    reason: str, centroid: str, spoil: Callable[..., None]
+) -> None:
+    one, image = shown(0)
+    options = CentroidOptions(centroid=centroid)
+
+    def seen(pixels: np.ndarray) -> StarObservations:
+        shot = Shot(Image(image.time_ns, pixels), one.icrf_from_star_tracker_xyzw, 0.5)
+        return observe_stars(shot, PRIOR, catalog(), options, OPTIONS)[0]
+
+    before = seen(image.pixels)
+    apart = np.linalg.norm(one.pixel_px[:, None] - one.pixel_px[None], axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    alone = set(one.catalog_id[apart.min(axis=1) > 15.0].tolist())
+    brightest = next(k for k in np.argsort(-before.flux_dn) if before.catalog_id[k] in alone)
+    star = int(before.catalog_id[brightest])
+    pixels = image.pixels.copy()
+    spoil(pixels, *np.rint(before.measured_px[brightest]).astype(int).tolist())
+    after = seen(pixels)
+    # Those at a limit may change from one refusal to another, as the noise is found anew.
+    fell_out = {
+        number: why for number, why in reasons(after).items() if number not in reasons(before)
+    }
+    assert fell_out == {star: reason}
+    assert reason in STAR_REFUSALS
 
 
 def test_an_empty_image_has_no_stars() -> None:

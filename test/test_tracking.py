@@ -7,6 +7,7 @@ import functools
 
 import numpy as np
 import pytest
+from sample_sky import with_planets  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import line_of_sight, pixel_grid, project
@@ -167,6 +168,21 @@ def test_no_window_of_another_sky_is_believed() -> None:
                 followed(dataclasses.replace(one, image=image), known)
             lost += 1
     assert lost == 90
+
+
+@pytest.mark.parametrize('index', range(1, 10))
+def test_planets_are_no_stars(index: int) -> None:
+    _, known = searched(0)
+    one = shown(index)[0]
+    image = render(SCENARIO, with_planets(SCENARIO, one, index), index)
+    found, _ = followed(dataclasses.replace(shot(index), image=image), known)
+    # The brightest of them raise the noise over some percent of this small field.
+    assert found.refusal == '' and len(found) > 0.8 * len(followed(shot(index), known)[0])
+    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
+    true_px = np.array([place[number] for number in found.catalog_id.tolist()])
+    off = (found.measured_px - true_px) / np.sqrt(found.covariance_px2[:, [0, 2]])
+    # Several hundred normal deviates; a wrong star is some hundred sigma off.
+    assert np.abs(off).max() < 6.0 and np.sqrt((off**2).mean()) < 1.2
 
 
 def test_an_image_that_tells_nothing_is_not_followed() -> None:
