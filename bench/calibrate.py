@@ -22,7 +22,7 @@ _STAGES = (
     ('read images from the bag', 'bag', 'read_images'),
     ('measure and identify stars', 'pipeline', 'observe_next'),
     ('  background', 'detection', 'measure_background'),
-    ('  prediction', 'identification', 'predict'),
+    ('  prediction', 'prediction', 'predict'),
     ('  match', 'identification', '_find'),
     ('  PSF and pixel noise', 'centroiding', 'model_image'),
     ('  images after the first', 'tracking', 'follow'),

@@ -29,14 +29,9 @@ from starcal_ros.detection import (
     sample_background,
 )
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification import (
-    IdentificationOptions,
-    measure_predicted,
-    Prediction,
-    seen,
-    Shot,
-)
+from starcal_ros.identification import IdentificationOptions, measure_predicted, Shot
 from starcal_ros.instrument import Instrument
+from starcal_ros.prediction import Prediction, seen
 from starcal_ros.records import CameraGeometry, StarObservations
 
 Floats = NDArray[np.float64]
