@@ -110,6 +110,15 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f' (did you mean {near[0]}?)' if near else ''
 
 
+def holds_options(kind: object) -> bool:
+    """Whether a type is a dataclass whose fields were made with `option`."""
+    return (
+        isinstance(kind, type)
+        and dataclasses.is_dataclass(kind)
+        and all('description' in field.metadata for field in dataclasses.fields(kind))
+    )
+
+
 def names_of(*option_classes: type[Any]) -> set[str]:
     """Every option name of the given dataclasses."""
     return {f.name for cls in option_classes for f in dataclasses.fields(cls)}

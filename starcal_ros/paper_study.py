@@ -27,12 +27,14 @@ from starcal_ros.campaign import Campaign, Design, Row
 from starcal_ros.catalog import load_catalog
 from starcal_ros.centroiding import CentroidOptions
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.fixed_pattern import FixedPatternOptions
 from starcal_ros.identification import IdentificationOptions
 from starcal_ros.measurement import squared_sigmas, star_table
 from starcal_ros.observability import map_error_px
 from starcal_ros.pipeline import observe, Setup, SetupOptions
 from starcal_ros.records import Ensemble, Removal, StarObservations
 from starcal_ros.removal import removal_study
+from starcal_ros.screening import ScreeningOptions
 from starcal_ros.synthetic import attitude_samples, Scenario, scenario, scene
 from starcal_ros.synthetic_images import fixed_pattern, render
 
@@ -122,6 +124,8 @@ def setup_of(seed: int) -> Setup:
         frames=SetupOptions(),
         attitude=AttitudeOptions(),
         site=SiteOptions(),
+        screening=ScreeningOptions(),
+        fixed_pattern=FixedPatternOptions(),
         centroid=CentroidOptions(),
         identification=identification,
         calibration=CalibrationOptions(

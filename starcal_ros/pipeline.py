@@ -10,7 +10,7 @@ import importlib.metadata
 import json
 import math
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, get_type_hints, TypeVar
 
 import cv2
 import numpy as np
@@ -51,7 +51,15 @@ from starcal_ros.observability import (
     weakest_direction,
 )
 from starcal_ros.observability import ensemble_status as _ensemble_status
-from starcal_ros.options import check_value, from_mapping, names_of, nearest, option
+from starcal_ros.options import (
+    check_value,
+    from_mapping,
+    holds_options,
+    names_of,
+    nearest,
+    option,
+    OptionValue,
+)
 from starcal_ros.records import (
     Calibration,
     CameraGeometry,
@@ -101,6 +109,8 @@ class Setup:
     frames: SetupOptions
     attitude: AttitudeOptions
     site: SiteOptions
+    screening: ScreeningOptions
+    fixed_pattern: FixedPatternOptions
     centroid: CentroidOptions
     identification: IdentificationOptions
     calibration: CalibrationOptions
@@ -110,21 +120,20 @@ class Setup:
     dark: NDArray[np.uint8] | NDArray[np.uint16] | None
     dark_pedestal_dn: int = 0
     hot: HotPixels = NO_HOT_PIXELS
-    screening: ScreeningOptions = dataclasses.field(default_factory=ScreeningOptions)
-    fixed_pattern: FixedPatternOptions = dataclasses.field(default_factory=FixedPatternOptions)
+
+    def options(self) -> dict[str, OptionValue]:
+        """Every option of every stage, by name."""
+        return {
+            name: value
+            for group in _OPTION_GROUPS
+            for name, value in dataclasses.asdict(getattr(self, group)).items()
+        }
 
 
-OPTION_CLASSES = (
-    SetupOptions,
-    AttitudeOptions,
-    SiteOptions,
-    ScreeningOptions,
-    FixedPatternOptions,
-    CentroidOptions,
-    IdentificationOptions,
-    CalibrationOptions,
-    GateOptions,
-)
+_OPTION_GROUPS: dict[str, type[Any]] = {
+    name: kind for name, kind in get_type_hints(Setup).items() if holds_options(kind)
+}
+OPTION_CLASSES = tuple(_OPTION_GROUPS.values())
 
 
 def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Setup:
@@ -499,18 +508,18 @@ def solve_with_residuals(
     in_force: Calibration | None = None,
 ) -> tuple[Calibration, Residuals]:
     """The calibration of `solve`, and what it left over of every star and image."""
-    options = setup.calibration
     override: dict[str, object] = {}
     if method:
         override['method'] = method
     if estimate:
         override['estimate'] = tuple(estimate)
-    for field in dataclasses.fields(options):
+    for field in dataclasses.fields(CalibrationOptions):
         if field.name in override:
             check_value(field, override[field.name])
-    options = dataclasses.replace(options, **override)  # type: ignore[arg-type]
+    options = dataclasses.replace(setup.calibration, **override)  # type: ignore[arg-type]
+    setup = dataclasses.replace(setup, calibration=options)
     result = estimate_calibration(ensemble, setup.prior, options)
-    calibration = _calibration(result, ensemble, setup, options, inputs or {}, in_force)
+    calibration = _calibration(result, ensemble, setup, inputs or {}, in_force)
     colour_bp_rp = setup.catalog.colours_bp_rp(result.table.catalog_id)
     return calibration, residuals_of(result, ensemble, colour_bp_rp)
 
@@ -519,11 +528,11 @@ def _calibration(
     result: Estimate,
     ensemble: Ensemble,
     setup: Setup,
-    options: CalibrationOptions,
     inputs: Mapping[str, str],
     in_force: Calibration | None,
 ) -> Calibration:
     """Statistics, verdict and provenance of an estimate."""
+    options = setup.calibration
     kept = result.kept
     rms_px = float(np.sqrt(np.mean(result.residual_px[kept] ** 2)))
     camera = result.geometry.camera
@@ -599,7 +608,7 @@ def _calibration(
         reasons=reasons,
         parent_frame=setup.frames.star_tracker_frame,
         child_frame=setup.frames.camera_frame,
-        provenance=_provenance(setup, options, ensemble, inputs),
+        provenance=_provenance(setup, ensemble, inputs),
         thermal=result.thermal,
         maps=maps,
         correlation=correlation(result.shared_covariance, result.shared_names),
@@ -616,20 +625,8 @@ def _calibration(
     )
 
 
-def _provenance(
-    setup: Setup, options: CalibrationOptions, ensemble: Ensemble, inputs: Mapping[str, str]
-) -> dict[str, str]:
+def _provenance(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -> dict[str, str]:
     """Where a calibration comes from, enough to repeat it."""
-    groups = (
-        setup.frames,
-        setup.attitude,
-        setup.site,
-        setup.centroid,
-        setup.identification,
-        options,
-        setup.gate,
-    )
-    chosen = {name: value for group in groups for name, value in dataclasses.asdict(group).items()}
     prior = np.r_[setup.prior.camera.parameters, setup.prior.star_tracker_from_camera_xyzw]
     digest = hashlib.sha256()
     for image in ensemble.images:
@@ -640,7 +637,7 @@ def _provenance(
     return {
         'software': f'starcal {software_version()}',
         'catalog': setup.catalog.digest,
-        'options': json.dumps(chosen, sort_keys=True),
+        'options': json.dumps(setup.options(), sort_keys=True),
         'prior': json.dumps(prior.tolist()),
         'observations_sha256': digest.hexdigest(),
         **{f'input {name}': value for name, value in inputs.items()},

@@ -22,6 +22,7 @@ from starcal_ros.camera_info import write_camera_info
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, OptionError, ProductError, TooFewObservations
 from starcal_ros.node_options import NODE_OPTION_CLASSES
+from starcal_ros.options import holds_options, names_of
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     CALIBRATION_PARAMETER_NAMES,
@@ -556,6 +557,14 @@ def test_a_bad_solution_is_refused_and_says_why(camera_yaml: Path) -> None:
     assert len(found.reasons) == 1 and 'max_map_sigma_px' in found.reasons[0]
 
 
+def test_a_setup_holds_the_options_of_every_stage(setup: pipeline.Setup) -> None:
+    """None that one of its fields has is missing where parameters are declared and told."""
+    held = [value for value in vars(setup).values() if holds_options(type(value))]
+    assert tuple(map(type, held)) == pipeline.OPTION_CLASSES and len(held) == 9
+    for group in held:
+        assert dataclasses.asdict(group).items() <= setup.options().items()
+
+
 def test_provenance_tells_all_that_went_in(setup: pipeline.Setup, camera_yaml: Path) -> None:
     first = pipeline.solve(ensemble(), setup, inputs={'bag': 'abc'}).provenance
     assert first['software'].startswith('starcal ')
@@ -566,6 +575,7 @@ def test_provenance_tells_all_that_went_in(setup: pipeline.Setup, camera_yaml: P
     assert prior[10:] == setup.prior.star_tracker_from_camera_xyzw.tolist()
     # From the options in it the setup can be made again.
     options = json.loads(first['options'])
+    assert set(options) == names_of(*pipeline.OPTION_CLASSES)
     again = pipeline.load_setup(options)
     second = pipeline.solve(ensemble(), again, inputs={'bag': 'abc'})
     assert second.provenance == first
