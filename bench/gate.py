@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 import dataclasses
-import re
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -102,7 +101,7 @@ def _judged(
         found = pipeline.solve(ensemble, setup)
     except TooFewObservations:
         return ['cannot be solved'], np.nan, np.nan
-    names = [(re.findall(r'\((\w+)\)', reason) or [reason])[0] for reason in found.reasons]
+    names = [check.option or check.note for check in found.gate if check.kept is False]
     focal_px = float(field.truth.camera.parameters[0])
     pointing_px = pointing_error_arcsec(found.geometry, field.truth) * np.pi / 648000 * focal_px
     error_px = max(pointing_px, map_error_px(found.geometry.camera, field.truth.camera))

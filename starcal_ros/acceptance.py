@@ -1,9 +1,11 @@
-"""The gate: whether a candidate calibration may come into force, and if not, every reason."""
+"""The gate: what a candidate calibration is held against, and every reason to refuse it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+import dataclasses
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,7 @@ from starcal_ros.agreement import Difference, movement
 from starcal_ros.calibration import CalibrationOptions
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.options import option
-from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, CameraGeometry
+from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, CameraGeometry, GateCheck
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,10 @@ class GateOptions:
         0.25, 'largest fraction of stars left out as outliers', low=0.0, high=1.0
     )
     min_coverage: float = option(
-        0.3, 'least fraction of the focal-plane cells that hold a star', low=0.0, high=1.0
+        0.3,
+        'least fraction of the focal-plane cells that hold a star that fits',
+        low=0.0,
+        high=1.0,
     )
     max_map_sigma_px: float = option(
         0.5,
@@ -134,7 +139,7 @@ class Candidate:
         Images of the ensemble, and those of them whose attitude does not fit.
     stars_used, stars_rejected : int
     coverage : (rows, cols)
-        Star observations in each cell of the focal plane.
+        Star observations used in each cell of the focal plane.
     map_sigma_px, line_of_sight_sigma_arcsec : float
         Largest over the detector.
     singular_value : float
@@ -143,8 +148,8 @@ class Candidate:
     star_tracker_excess : float
         Largest ratio of the sigma found to the one given.
     termination : str
-    halves : Difference or None
-        Of the earlier and the later half of the images; None where they could not be compared.
+    halves : Difference or str
+        Of the earlier and the later half of the images, or why they were not compared.
     step : Difference or None
         From the calibration in force; None where there is none.
     """
@@ -164,21 +169,69 @@ class Candidate:
     zero_skew_cost_px: float
     star_tracker_excess: float
     termination: str
-    halves: Difference | None = None
+    halves: Difference | str
     step: Difference | None = None
 
 
 def judge(
     candidate: Candidate, options: GateOptions, calibration: CalibrationOptions
-) -> tuple[str, ...]:
+) -> tuple[GateCheck, ...]:
     """
-    Every reason against a candidate, one sentence each; empty when it may come into force.
+    What the gate looks at, each with what was found and whether it is kept.
 
-    A limit is written as what must hold, so that NaN is refused: a comparison with it is false.
+    Where a number that all others are made of is not finite, the checks end with it.
     """
-    reasons = []
-    if candidate.termination != 'converged':
-        reasons.append(f'the solver did not converge ({candidate.termination})')
+    checks = (_solver(candidate), _numbers(candidate))
+    if not checks[-1].kept:
+        return checks
+    return (
+        *checks,
+        *_of_the_fit(candidate, options, calibration),
+        *_of_the_halves(candidate, options),
+        *_of_the_knowledge(candidate, options),
+        *_of_the_change(candidate, options),
+    )
+
+
+def reasons_of(checks: Iterable[GateCheck]) -> tuple[str, ...]:
+    """A sentence for each check that is not kept; empty where nothing speaks against it."""
+    return tuple(_reason(check) for check in checks if check.kept is False)
+
+
+def _reason(check: GateCheck) -> str:
+    if not check.option:
+        return check.note
+    side = 'under' if check.is_least else 'over'
+    note = f'; {check.note}' if check.note else ''
+    return (
+        f'{check.name} is {check.found_text}, {side} the limit of {check.limit_text} '
+        f'({check.option}){note}'
+    )
+
+
+def _check(
+    options: GateOptions | CalibrationOptions,
+    option: str,
+    name: str,
+    found: float | str,
+    unit: str = '',
+) -> GateCheck:
+    """What was found, or why it was not, against the limit of an option."""
+    limit = float(getattr(options, option))
+    if isinstance(found, str):
+        return GateCheck(name, option, math.nan, limit, unit, None, found)
+    # A limit is written as what must hold, so that NaN is refused: a comparison with it is false.
+    kept = found >= limit if option.startswith('min_') else found <= limit
+    return GateCheck(name, option, float(found), limit, unit, bool(kept))
+
+
+def _solver(candidate: Candidate) -> GateCheck:
+    kept = candidate.termination == 'converged'
+    note = '' if kept else f'the solver did not converge ({candidate.termination})'
+    return GateCheck('solver converged', '', math.nan, math.nan, '', kept, note)
+
+
+def _numbers(candidate: Candidate) -> GateCheck:
     values = np.concatenate(
         [
             candidate.geometry.camera.parameters,
@@ -186,142 +239,147 @@ def judge(
             candidate.covariance.ravel(),
         ]
     )
+    note = ''
     if not np.isfinite(values).all():
-        return (*reasons, 'a parameter or its covariance is not a finite number')
-    if (np.diag(candidate.covariance) < 0).any():
-        return (*reasons, 'a variance is negative')
-    return (
-        *reasons,
-        *_against_the_fit(candidate, options, calibration),
-        *_against_the_knowledge(candidate, options),
-        *_against_the_change(candidate, options),
+        note = 'a parameter or its covariance is not a finite number'
+    elif (np.diag(candidate.covariance) < 0).any():
+        note = 'a variance is negative'
+    name = 'numbers finite, variances positive'
+    return GateCheck(name, '', math.nan, math.nan, '', not note, note)
+
+
+def _of_the_fit(
+    candidate: Candidate, options: GateOptions, calibration: CalibrationOptions
+) -> Iterator[GateCheck]:
+    """What does not fit, and whether enough does."""
+    stars = max(candidate.stars_used + candidate.stars_rejected, 1)
+    fitting = candidate.images_used - candidate.images_misfit
+    yield _check(
+        options, 'max_residual_rms_px', 'residual per axis', candidate.residual_rms_px, 'px'
+    )
+    yield _check(
+        options,
+        'max_rejected_fraction',
+        'fraction of stars left out as outliers',
+        candidate.stars_rejected / stars,
+    )
+    yield _check(
+        options,
+        'max_misfit_fraction',
+        'fraction of images whose attitude does not fit',
+        candidate.images_misfit / max(candidate.images_used, 1),
+    )
+    yield _check(calibration, 'min_images', 'number of images that fit', fitting)
+    yield _check(calibration, 'min_stars', 'number of stars that fit', candidate.stars_used)
+    yield _check(
+        options,
+        'max_star_tracker_excess',
+        '1-sigma of the star tracker, found over given, at its worst',
+        candidate.star_tracker_excess,
     )
 
 
-def _against_the_fit(
-    candidate: Candidate, options: GateOptions, calibration: CalibrationOptions
-) -> Iterator[str]:
-    """What does not fit, and whether enough does."""
-    if not candidate.residual_rms_px <= options.max_residual_rms_px:
-        yield (
-            f'residual {candidate.residual_rms_px:.3f} px per axis is over the limit of '
-            f'{options.max_residual_rms_px:g} px (max_residual_rms_px)'
-        )
-    total = candidate.stars_used + candidate.stars_rejected
-    if not candidate.stars_rejected <= options.max_rejected_fraction * total:
-        yield (
-            f'{candidate.stars_rejected} of {total} stars are outliers, more than a fraction of '
-            f'{options.max_rejected_fraction:g} (max_rejected_fraction)'
-        )
-    if not candidate.images_misfit <= options.max_misfit_fraction * candidate.images_used:
-        yield (
-            f'the attitudes of {candidate.images_misfit} of {candidate.images_used} images do not '
-            f'fit, more than a fraction of {options.max_misfit_fraction:g} (max_misfit_fraction)'
-        )
-    fitting = candidate.images_used - candidate.images_misfit
-    if not fitting >= calibration.min_images:
-        yield (f'{fitting} images fit, under the limit of {calibration.min_images} (min_images)')
-    if not candidate.stars_used >= calibration.min_stars:
-        yield (
-            f'{candidate.stars_used} stars fit, under the limit of {calibration.min_stars} '
-            '(min_stars)'
-        )
-    if not candidate.star_tracker_excess <= options.max_star_tracker_excess:
-        yield (
-            f'the star tracker is {candidate.star_tracker_excess:.1f} times worse than given, '
-            f'over the limit of {options.max_star_tracker_excess:g} (max_star_tracker_excess)'
-        )
+def _of_the_halves(candidate: Candidate, options: GateOptions) -> Iterator[GateCheck]:
+    """Whether the earlier and the later images show one camera, or differ by chance."""
     halves = candidate.halves
-    if halves is None:
-        return
-    turn_arcsec = halves.turn_rad / ARCSECOND_RAD
-    for chance, value, limit, unit, what, name in (
-        (halves.shape_chance, halves.shape_px, options.max_halves_px, 'px', 'differ', ''),
+    for name, parameter, found, unit, chance in (
         (
-            *(halves.chance, turn_arcsec, options.max_halves_turn_arcsec),
-            *('arcsec', 'are turned', '_turn_arcsec'),
+            'change of the distortion map between the halves of the images',
+            'max_halves_px',
+            halves if isinstance(halves, str) else halves.shape_px,
+            'px',
+            math.nan if isinstance(halves, str) else halves.shape_chance,
+        ),
+        (
+            'turn between the halves of the images',
+            'max_halves_turn_arcsec',
+            halves if isinstance(halves, str) else halves.turn_rad / ARCSECOND_RAD,
+            'arcsec',
+            math.nan if isinstance(halves, str) else halves.chance,
         ),
     ):
-        if not chance >= options.min_halves_chance and not value <= limit:
-            yield (
-                f'the earlier and the later half of the images {what} by {value:.3g} {unit}, over '
-                f'the limit of {limit:g} {unit} (max_halves{name or "_px"}); chance does it once '
-                f'in {1 / max(chance, 1e-99):.0e} (min_halves_chance)'
-            )
+        check = _check(options, parameter, name, found, unit)
+        if check.kept is None:
+            yield check
+            continue
+        likely = chance >= options.min_halves_chance
+        note = (
+            f'the chance of as much is {chance:.1g}, {"at least" if likely else "under"} '
+            f'{options.min_halves_chance:g} (min_halves_chance)'
+        )
+        yield dataclasses.replace(check, kept=check.kept or likely, note=note)
 
 
-def _against_the_knowledge(candidate: Candidate, options: GateOptions) -> Iterator[str]:
+def _of_the_knowledge(candidate: Candidate, options: GateOptions) -> Iterator[GateCheck]:
     """What is known too little of."""
-    covered = float((candidate.coverage > 0).mean())
-    if not covered >= options.min_coverage:
-        yield (
-            f'stars cover {100 * covered:.0f} % of the detector, under the limit of '
-            f'{100 * options.min_coverage:.0f} % (min_coverage)'
-        )
-    if not candidate.map_sigma_px <= options.max_map_sigma_px:
-        yield (
-            f'the distortion map is uncertain by {candidate.map_sigma_px:.3f} px at its worst, '
-            f'over the limit of {options.max_map_sigma_px:g} px (max_map_sigma_px)'
-        )
-    if not candidate.line_of_sight_sigma_arcsec <= options.max_line_of_sight_sigma_arcsec:
-        yield (
-            f'a line of sight is uncertain by {candidate.line_of_sight_sigma_arcsec:.1f} arcsec '
-            f'at its worst, over the limit of {options.max_line_of_sight_sigma_arcsec:g} arcsec '
-            '(max_line_of_sight_sigma_arcsec)'
-        )
+    yield _check(
+        options,
+        'min_coverage',
+        'fraction of the detector with stars that fit',
+        float((candidate.coverage > 0).mean()),
+    )
+    yield _check(
+        options,
+        'max_map_sigma_px',
+        '1-sigma of the distortion map at its worst',
+        candidate.map_sigma_px,
+        'px',
+    )
+    yield _check(
+        options,
+        'max_line_of_sight_sigma_arcsec',
+        '1-sigma of a line of sight at its worst',
+        candidate.line_of_sight_sigma_arcsec,
+        'arcsec',
+    )
     sigma = np.sqrt(np.diag(candidate.covariance))
     sigma[10:] /= ARCSECOND_RAD
-    for name, value, limit in zip(
-        CALIBRATION_PARAMETER_NAMES, sigma, options.max_parameter_sigma, strict=True
+    units = ('px',) * 5 + ('',) * 5 + ('arcsec',) * 3
+    for name, found, limit, unit in zip(
+        CALIBRATION_PARAMETER_NAMES, sigma, options.max_parameter_sigma, units, strict=True
     ):
-        if limit > 0 and not value <= limit:
-            yield (
-                f'{name} is uncertain by {value:.3g}, over the limit of {limit:g} '
-                '(max_parameter_sigma)'
-            )
-    if not candidate.singular_value >= options.min_singular_value:
-        yield (
-            f'the smallest singular value is {candidate.singular_value:.1e}, under the limit of '
-            f'{options.min_singular_value:g} (min_singular_value): what is estimated cannot be '
-            'told apart'
-        )
+        if limit > 0:
+            kept = bool(found <= limit)
+            name = f'1-sigma of {name}'
+            yield GateCheck(name, 'max_parameter_sigma', float(found), limit, unit, kept)
+    yield _check(
+        options,
+        'min_singular_value',
+        'smallest singular value',
+        candidate.singular_value,
+    )
 
 
-def _against_the_change(candidate: Candidate, options: GateOptions) -> Iterator[str]:
+def _of_the_change(candidate: Candidate, options: GateOptions) -> Iterator[GateCheck]:
     """What would change too much for whoever uses it."""
-    if not candidate.zero_skew_cost_px <= options.max_zero_skew_cost_px:
-        yield (
-            f'camera_info without skew is {candidate.zero_skew_cost_px:.2f} px off at its worst, '
-            f'over the limit of {options.max_zero_skew_cost_px:g} px (max_zero_skew_cost_px)'
-        )
+    yield _check(
+        options,
+        'max_zero_skew_cost_px',
+        'error of camera_info, which has no skew, at its worst',
+        candidate.zero_skew_cost_px,
+        'px',
+    )
     turn_rad, left_px = movement(candidate.prior, candidate.geometry)
-    shape_px = left_px.max()
-    if not shape_px <= options.max_change_px:
-        yield (
-            f'the distortion map would change by {shape_px:.1f} px at its worst, '
-            f'over the limit of {options.max_change_px:g} px (max_change_px)'
-        )
-    if not np.degrees(turn_rad) <= options.max_turn_deg:
-        yield (
-            f'the lines of sight would turn by {np.degrees(turn_rad):.3f} degrees, '
-            f'over the limit of {options.max_turn_deg:g} degrees (max_turn_deg)'
-        )
     step = candidate.step
-    if step is None:
-        return
-    if not step.shape_px <= options.max_step_px:
-        yield (
-            f'the distortion map would change by {step.shape_px:.2f} px against the calibration '
-            f'in force, over the limit of {options.max_step_px:g} px (max_step_px)'
-        )
-    if not np.degrees(step.turn_rad) <= options.max_step_turn_deg:
-        yield (
-            f'the lines of sight would turn by {np.degrees(step.turn_rad):.3f} degrees against '
-            f'the calibration in force, over the limit of {options.max_step_turn_deg:g} degrees '
-            '(max_step_turn_deg)'
-        )
-    if options.max_step_sigma > 0 and not step.rms_sigma <= options.max_step_sigma:
-        yield (
-            f'what is estimated would change by {step.rms_sigma:.1f} sigma against the '
-            f'calibration in force, over the limit of {options.max_step_sigma:g} (max_step_sigma)'
-        )
+    none = 'no calibration was in force'
+    no_limit = '' if options.max_step_sigma > 0 else 'no limit is set'
+    of_map, of_sight = 'change of the distortion map', 'turn of the lines of sight'
+    prior, before = 'from the prior', 'from the calibration in force'
+    for parameter, name, found, unit in (
+        ('max_change_px', f'{of_map} {prior} at its worst', left_px.max(), 'px'),
+        ('max_turn_deg', f'{of_sight} {prior}', math.degrees(turn_rad), 'deg'),
+        ('max_step_px', f'{of_map} {before} at its worst', step.shape_px if step else none, 'px'),
+        (
+            'max_step_turn_deg',
+            f'{of_sight} {before}',
+            math.degrees(step.turn_rad) if step else none,
+            'deg',
+        ),
+        (
+            'max_step_sigma',
+            f'change of what is estimated {before}',
+            no_limit or (step.rms_sigma if step else none),
+            'sigma',
+        ),
+    ):
+        yield _check(options, parameter, name, found, unit)

@@ -137,21 +137,20 @@ def _squared_sigmas(moves: Floats, covariance: Floats) -> tuple[float, int]:
 
 def halves(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
-) -> Difference | None:
+) -> Difference | str:
     """
     Difference of the calibrations of the earlier and of the later half of the images.
 
     What drifts or jumps while an ensemble is collected shows here: halves that are interleaved
-    would share it.  None where there are too few images, where a half does not determine what is
-    to be estimated, or where a change with temperature is: the halves are of other temperatures.
+    would share it.  In words, why there is none: with too few images, where a half does not
+    determine what is to be estimated, or where a change with temperature is, since the halves are
+    of other temperatures.
     """
     images = sorted(ensemble.images, key=lambda image: image.time_ns)
-    if (
-        len(images) < FEWEST_IMAGES
-        or options.focal_temperature_order
-        or options.alignment_temperature
-    ):
-        return None
+    if len(images) < FEWEST_IMAGES:
+        return f'{len(images)} images, {FEWEST_IMAGES} make two halves'
+    if options.focal_temperature_order or options.alignment_temperature:
+        return 'the halves are of other temperatures'
     options = dataclasses.replace(options, min_images=2, min_stars=FEWEST_STARS)
     middle = len(images) // 2
     try:
@@ -159,8 +158,8 @@ def halves(
             estimate_calibration(Ensemble(tuple(part)), prior, options)
             for part in (images[:middle], images[middle:])
         )
-    except TooFewObservations:
-        return None
+    except TooFewObservations as error:
+        return f'a half alone cannot be solved: {error}'
     return difference(
         first.geometry, first.covariance, second.geometry, second.covariance, options.estimate
     )

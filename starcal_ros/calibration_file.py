@@ -41,6 +41,7 @@ from starcal_ros.records import (
     CameraGeometry,
     Correlation,
     DetectorMaps,
+    GateCheck,
     Halves,
     Removal,
     Thermal,
@@ -59,6 +60,7 @@ _LATER_KEYS: Mapping[str, object] = {
     'in_force_since_ns': 0,
     'forced': False,
     'halves': None,
+    'gate': [],
 }
 CALIBRATION_FILE = 'calibration.json'
 
@@ -184,6 +186,7 @@ def calibration_content(calibration: Calibration) -> dict[str, object]:
         'halves': None
         if calibration.halves is None
         else {k: _json_number(v) for k, v in dataclasses.asdict(calibration.halves).items()},
+        'gate': [_check_content(check) for check in calibration.gate],
     }
 
 
@@ -207,6 +210,18 @@ def _removal_content(removal: Removal) -> dict[str, object]:
         'residual_rms_px': _json_number(removal.residual_rms_px),
         'residual_std_px': [_json_number(std) for std in removal.residual_std_px],
         'map_change_px': _json_number(removal.map_change_px),
+    }
+
+
+def _check_content(check: GateCheck) -> dict[str, object]:
+    return {
+        'name': check.name,
+        'option': check.option,
+        'found': _json_number(check.found),
+        'limit': _json_number(check.limit),
+        'unit': check.unit,
+        'kept': check.kept,
+        'note': check.note,
     }
 
 
@@ -295,6 +310,7 @@ def _calibration_from(reader: CheckedValues) -> Calibration:
                 for field in dataclasses.fields(Halves)
             }
         ),
+        gate=_checks_from(reader),
     )
 
 
@@ -324,6 +340,26 @@ def _removals_from(reader: CheckedValues) -> tuple[Removal, ...]:
             )
         )
     return tuple(removals)
+
+
+def _checks_from(reader: CheckedValues) -> tuple[GateCheck, ...]:
+    checks = []
+    for check in reader.get('gate', list_of(mapping_of(anything))):
+        one = CheckedValues(reader.path, {'gate': check})
+        checks.append(
+            GateCheck(
+                name=one.get('gate.name', string),
+                option=one.get('gate.option', string),
+                found=one.get('gate.found', finite_or_null),
+                limit=one.get('gate.limit', finite_or_null),
+                unit=one.get('gate.unit', string),
+                kept=None
+                if one.get('gate.kept', is_null)
+                else one.get('gate.kept', true_or_false),
+                note=one.get('gate.note', string),
+            )
+        )
+    return tuple(checks)
 
 
 def _correlation_from(reader: CheckedValues) -> Correlation:

@@ -31,11 +31,13 @@ from starcal_ros.records import (
     CameraGeometry,
     Correlation,
     DetectorMaps,
+    GateCheck,
     Halves,
     Removal,
     Thermal,
 )
 
+_NOT_CHECKED = -1  # in gate_kept
 _REMOVAL_COLUMNS = ('significance', 'wald', 'chi2_rise', 'residual_rms_px', 'map_change_px')
 
 
@@ -50,6 +52,7 @@ def calibration_to_message(calibration: Calibration, make: Make) -> Message:
         reasons=list(calibration.reasons),
         forced=calibration.forced,
         **_halves_fields(calibration.halves),
+        **_gate_fields(calibration.gate),
         number=calibration.number,
         in_force_since=make_time(calibration.in_force_since_ns, make),
         first_image=make_time(calibration.first_image_ns, make),
@@ -151,6 +154,7 @@ def calibration_from_message(message: Message) -> Calibration:
         in_force_since_ns=stamp_ns(message.in_force_since),
         forced=bool(message.forced),
         halves=_halves_from_message(message),
+        gate=_gate_from_message(message),
     )
 
 
@@ -253,6 +257,48 @@ def _halves_from_message(message: Message) -> Halves | None:
         shape_chance=float(message.halves_shape_chance),
         turn_arcsec=float(message.halves_turn_arcsec),
         chance=float(message.halves_chance),
+    )
+
+
+def _gate_fields(checks: tuple[GateCheck, ...]) -> dict[str, object]:
+    return {
+        'gate_name': [check.name for check in checks],
+        'gate_option': [check.option for check in checks],
+        'gate_found': flat_array([check.found for check in checks], np.float64),
+        'gate_limit': flat_array([check.limit for check in checks], np.float64),
+        'gate_unit': [check.unit for check in checks],
+        'gate_kept': flat_array(
+            [_NOT_CHECKED if check.kept is None else check.kept for check in checks], np.int8
+        ),
+        'gate_note': [check.note for check in checks],
+    }
+
+
+def _gate_from_message(message: Message) -> tuple[GateCheck, ...]:
+    # Recordings of before the field was there have none.
+    if not len(getattr(message, 'gate_name', ())):
+        return ()
+    columns = zip(
+        message.gate_name,
+        message.gate_option,
+        message.gate_found,
+        message.gate_limit,
+        message.gate_unit,
+        message.gate_kept,
+        message.gate_note,
+        strict=True,
+    )
+    return tuple(
+        GateCheck(
+            str(name),
+            str(option),
+            float(found),
+            float(limit),
+            str(unit),
+            None if kept == _NOT_CHECKED else bool(kept),
+            str(note),
+        )
+        for name, option, found, limit, unit, kept, note in columns
     )
 
 

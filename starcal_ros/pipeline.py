@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros import bag
-from starcal_ros.acceptance import Candidate, GateOptions, judge
-from starcal_ros.agreement import difference, halves
+from starcal_ros.acceptance import Candidate, GateOptions, judge, reasons_of
+from starcal_ros.agreement import Difference, difference, halves
 from starcal_ros.astrometry import SiteOptions
 from starcal_ros.attitude import AttitudeHistory, AttitudeOptions
 from starcal_ros.calibration import (
@@ -44,7 +44,6 @@ from starcal_ros.fixed_pattern import (
 from starcal_ros.identification import IdentificationOptions, observe_stars, Shot, tracked
 from starcal_ros.observability import (
     correlation,
-    coverage,
     detector_maps,
     keep_most_informative,
     map_sigma_px,
@@ -539,7 +538,7 @@ def _calibration(
     singular_values, weakest = weakest_direction(result.information, result.information_names)
     zero_skew_cost_px = zero_skew_fit(camera)[1]
     maps = detector_maps(camera, result.covariance, result.table.measured_px[kept])
-    agreed = None
+    agreed: Difference | str = 'min_halves_chance is 0'
     if setup.gate.min_halves_chance > 0:
         agreed = halves(ensemble, setup.prior, options)
     step = None
@@ -552,7 +551,7 @@ def _calibration(
             tuple(name for name in options.estimate if name in in_force.estimated),
         )
     given_rad = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
-    reasons = judge(
+    checks = judge(
         Candidate(
             geometry=result.geometry,
             prior=setup.prior,
@@ -562,7 +561,7 @@ def _calibration(
             images_misfit=int(result.misfit_image.sum()),
             stars_used=int(kept.sum()),
             stars_rejected=int((~kept).sum()),
-            coverage=coverage(ensemble, camera),
+            coverage=maps.stars,
             map_sigma_px=float(map_sigma_px(camera, result.covariance).max()),
             line_of_sight_sigma_arcsec=float(maps.line_of_sight_sigma_arcsec.max()),
             singular_value=float(singular_values[-1]),
@@ -575,6 +574,7 @@ def _calibration(
         setup.gate,
         options,
     )
+    reasons = reasons_of(checks)
     return Calibration(
         time_ns=max(image.time_ns for image in ensemble.images),
         geometry=result.geometry,
@@ -615,13 +615,14 @@ def _calibration(
         removals=removal_study(result),
         first_image_ns=min(image.time_ns for image in ensemble.images),
         halves=None
-        if agreed is None
+        if isinstance(agreed, str)
         else Halves(
             shape_px=agreed.shape_px,
             shape_chance=agreed.shape_chance,
             turn_arcsec=agreed.turn_rad / ARCSECOND_RAD,
             chance=agreed.chance,
         ),
+        gate=checks,
     )
 
 

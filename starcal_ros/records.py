@@ -388,6 +388,58 @@ class Halves:
 
 
 @dataclass(frozen=True)
+class GateCheck:
+    """
+    One thing that the gate looks at.
+
+    Attributes
+    ----------
+    name : str
+        What it is, in words.
+    option : str
+        The parameter that limits it: from below where it begins with ``min_``, else from above.
+        Empty for what needs no number: it holds or not.
+    found, limit : float
+        In ``unit``; ``found`` is NaN where it was not checked, both where there is no number.
+    unit : str
+        Empty for pure numbers.
+    kept : bool or None
+        None where it was not checked.
+    note : str
+        Why it was not checked, or what decided beside the limit; may be empty.
+    """
+
+    name: str
+    option: str
+    found: float
+    limit: float
+    unit: str
+    kept: bool | None
+    note: str = ''
+
+    @property
+    def is_least(self) -> bool:
+        """Whether the limit is the least that is allowed."""
+        return self.option.startswith('min_')
+
+    @property
+    def found_text(self) -> str:
+        """What was found with its unit; empty where there is no number to be found."""
+        return self._text(self.found) if self.option and self.kept is not None else ''
+
+    @property
+    def limit_text(self) -> str:
+        """The limit with its unit; empty where there is none."""
+        return self._text(self.limit) if self.option else ''
+
+    def _text(self, value: float) -> str:
+        if not math.isfinite(value):
+            return 'not a finite number'
+        number = f'{value:.4g}' if abs(value) < 1e4 else f'{value:.0f}'
+        return f'{number} {self.unit}' if self.unit else number
+
+
+@dataclass(frozen=True)
 class Calibration:
     """
     One calibration with its covariance, statistics and provenance.
@@ -449,6 +501,8 @@ class Calibration:
         It came into force by request, against the gate.
     halves : Halves or None
         None where the halves of the images were not compared.
+    gate : tuple of GateCheck
+        What the gate has looked at; empty where whoever has made the calibration does not tell.
     """
 
     time_ns: int
@@ -487,6 +541,7 @@ class Calibration:
     in_force_since_ns: int = 0
     forced: bool = False
     halves: Halves | None = None
+    gate: tuple[GateCheck, ...] = ()
 
     @property
     def sigma(self) -> Floats:

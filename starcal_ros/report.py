@@ -8,7 +8,7 @@ whose file is not there says so.  The page needs no network: styles, script and 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 import json
@@ -21,12 +21,12 @@ import matplotlib
 import numpy as np
 
 from starcal_ros import bag, report_figures
-from starcal_ros.agreement import alignment_difference_rad, movement
+from starcal_ros.agreement import alignment_difference_rad
 from starcal_ros.calibration_file import CALIBRATION_FILE, prior_of, read_calibration
 from starcal_ros.camera import INTRINSIC_NAMES, PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.message_types import OBSERVATIONS_TYPE
-from starcal_ros.observability import map_sigma_px, movement_px
+from starcal_ros.observability import movement_px
 from starcal_ros.product_files import OBSERVATIONS_FILE, REPORT_FILE, write_atomically
 from starcal_ros.records import (
     Calibration,
@@ -67,16 +67,6 @@ class Row:
     change_sigmas: str
     moves_px: str
     sigma_px: str
-
-
-@dataclass(frozen=True)
-class Limit:
-    """A limit of the gate and what was found."""
-
-    name: str
-    found: str
-    limit: str
-    kept: bool
 
 
 def write_report(folder: Path) -> Path:
@@ -139,7 +129,6 @@ def _context(found: Found) -> Mapping[str, object]:
         'in_force_since': _utc(calibration.in_force_since_ns),
         'parameters': _parameter_rows(calibration, prior),
         'alignment': _alignment_rows(calibration, prior),
-        'limits': _limits(calibration, prior),
         'tiles': _tiles(calibration),
         'thermal': thermal_summary(calibration.thermal) if calibration.thermal else '',
         'charts': charts_of(calibration, residuals),
@@ -233,80 +222,6 @@ def _alignment_rows(calibration: Calibration, prior: CameraGeometry | None) -> l
         )
         for k, axis in enumerate('xyz')
     ]
-
-
-def _limits(calibration: Calibration, prior: CameraGeometry | None) -> list[Limit]:
-    """The limits of the gate beside what they bound; those that the provenance does not tell."""
-    options = _options_of(calibration)
-    limits = []
-    for name, key, value, scale, unit in _bounded(calibration, prior):
-        limit = options.get(key)
-        if isinstance(limit, int | float):
-            least = key.startswith('min_')
-            limits.append(
-                Limit(
-                    name,
-                    f'{scale * value:.3g}{unit}',
-                    f'{"at least" if least else "at most"} {scale * limit:.3g}{unit}',
-                    bool(value >= limit if least else value <= limit),
-                )
-            )
-    return [*limits, *_halves_limits(calibration, options)]
-
-
-def _halves_limits(calibration: Calibration, options: Mapping[str, object]) -> Iterator[Limit]:
-    """What the gate holds against two halves that differ by more than chance."""
-    halves, least = calibration.halves, options.get('min_halves_chance')
-    if halves is None or not isinstance(least, int | float):
-        return
-    for name, key, value, chance, unit in (
-        ('distortion map', 'max_halves_px', halves.shape_px, halves.shape_chance, ' px'),
-        ('turn', 'max_halves_turn_arcsec', halves.turn_arcsec, halves.chance, '″'),
-    ):
-        limit = options.get(key)
-        if isinstance(limit, int | float):
-            yield Limit(
-                f'earlier against later half of the images: {name}',
-                f'{value:.3g}{unit}, chance {chance:.1g}',
-                f'at most {limit:.3g}{unit}, or chance at least {least:g}',
-                bool(value <= limit or chance >= least),
-            )
-
-
-def _bounded(
-    calibration: Calibration, prior: CameraGeometry | None
-) -> Iterator[tuple[str, str, float, float, str]]:
-    """What the gate bounds: its name, its option, its value, and how that is written."""
-    seen = calibration.stars_used + calibration.stars_rejected
-    misfit = len(calibration.misfit_images_ns) / max(calibration.images_used, 1)
-    rejected = calibration.stars_rejected / max(seen, 1)
-    shape_sigma_px = map_sigma_px(calibration.geometry.camera, calibration.covariance).max()
-    yield 'residual, rms per axis', 'max_residual_rms_px', calibration.residual_rms_px, 1, ' px'
-    yield 'stars left out as outliers', 'max_rejected_fraction', rejected, 100, ' %'
-    yield 'images that misfit', 'max_misfit_fraction', misfit, 100, ' %'
-    if calibration.maps is not None:
-        covered = float((calibration.maps.stars > 0).mean())
-        worst = float(calibration.maps.line_of_sight_sigma_arcsec.max())
-        yield 'detector covered by stars', 'min_coverage', covered, 100, ' %'
-        name = '1-sigma of a line of sight at its worst'
-        yield name, 'max_line_of_sight_sigma_arcsec', worst, 1, '″'
-    yield (
-        '1-sigma of the distortion map at its worst',
-        'max_map_sigma_px',
-        shape_sigma_px,
-        1,
-        ' px',
-    )
-    if calibration.singular_values:
-        least = min(calibration.singular_values)
-        yield 'smallest singular value', 'min_singular_value', least, 1, ''
-    cost_px = calibration.zero_skew_cost_px
-    yield 'camera without skew, error at its worst', 'max_zero_skew_cost_px', cost_px, 1, ' px'
-    if prior is not None:
-        turn_rad, left_px = movement(prior, calibration.geometry)
-        change_px, turn_deg = float(left_px.max()), math.degrees(turn_rad)
-        yield 'change of the distortion map at its worst', 'max_change_px', change_px, 1, ' px'
-        yield 'common turn of the lines of sight', 'max_turn_deg', turn_deg, 1, '°'
 
 
 def _none(count: int) -> str:

@@ -15,6 +15,7 @@ from starcal_ros.records import (
     Correlation,
     DetectorMaps,
     EnsembleStatus,
+    GateCheck,
     Halves,
     refused_image,
     Removal,
@@ -97,6 +98,10 @@ def calibration() -> Calibration:
         removals=(
             Removal('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
             Removal('k3', -0.3, 0.5, 1 / 7, False, 0.3, (0.25, 0.35), 1e-9),
+        ),
+        gate=(
+            GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 0.25, 'px', False, 'a word'),
+            GateCheck('stars', 'min_stars', 1234.0, 60.0, '', True),
         ),
     )
 

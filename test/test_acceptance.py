@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.acceptance import Candidate, GateOptions
-from starcal_ros.acceptance import judge as judge_with
+from starcal_ros.acceptance import Candidate, GateOptions, judge, reasons_of
 from starcal_ros.agreement import Difference, movement
 from starcal_ros.calibration import CalibrationOptions
 from starcal_ros.camera import CameraModel
-from starcal_ros.records import CameraGeometry
+from starcal_ros.options import names_of
+from starcal_ros.records import CameraGeometry, GateCheck
 
 CAMERA = CameraModel(
     640, 512, np.array([1800, 0.2, 1801, 320, 255, -0.045, 0.08, 0.0, 4e-4, -3e-4])
@@ -42,8 +42,14 @@ GOOD = Candidate(
 )
 
 
-def judge(candidate: Candidate, options: GateOptions) -> tuple[str, ...]:
-    return judge_with(candidate, options, CalibrationOptions())
+def reasons(candidate: Candidate, options: GateOptions) -> tuple[str, ...]:
+    return reasons_of(judge(candidate, options, CalibrationOptions()))
+
+
+def checks(candidate: Candidate, options: GateOptions) -> dict[str, GateCheck]:
+    """By the parameter that limits them, those without one by their name."""
+    found = judge(candidate, options, CalibrationOptions())
+    return {check.option or check.name: check for check in found}
 
 
 def only(axis: int, limit: float) -> tuple[float, ...]:
@@ -63,7 +69,7 @@ def half_covered() -> np.ndarray:
 
 
 def test_a_good_candidate_passes() -> None:
-    assert judge(GOOD, GateOptions()) == ()
+    assert reasons(GOOD, GateOptions()) == ()
 
 
 @pytest.mark.parametrize(
@@ -74,21 +80,27 @@ def test_a_good_candidate_passes() -> None:
             'max_residual_rms_px',
             0.8,
             0.79,
-            'residual 0.800 px per axis is over the limit of 0.79 px (max_residual_rms_px)',
+            'residual per axis is 0.8 px, over the limit of 0.79 px (max_residual_rms_px)',
         ),
         (
             {'stars_used': 90, 'stars_rejected': 10},
             'max_rejected_fraction',
             0.1,
             0.099,
-            '10 of 100 stars are outliers, more than a fraction of 0.099 (max_rejected_fraction)',
+            (
+                'fraction of stars left out as outliers is 0.1, over the limit of 0.099 '
+                '(max_rejected_fraction)'
+            ),
         ),
         (
             {'coverage': half_covered()},
             'min_coverage',
             0.5,
             0.51,
-            'stars cover 50 % of the detector, under the limit of 51 % (min_coverage)',
+            (
+                'fraction of the detector with stars that fit is 0.5, under the limit of 0.51 '
+                '(min_coverage)'
+            ),
         ),
         (
             {'map_sigma_px': 0.4},
@@ -96,8 +108,8 @@ def test_a_good_candidate_passes() -> None:
             0.4,
             0.39,
             (
-                'the distortion map is uncertain by 0.400 px at its worst, '
-                'over the limit of 0.39 px (max_map_sigma_px)'
+                '1-sigma of the distortion map at its worst is 0.4 px, over the limit of 0.39 px '
+                '(max_map_sigma_px)'
             ),
         ),
         (
@@ -106,8 +118,8 @@ def test_a_good_candidate_passes() -> None:
             1.0001,
             0.999,
             (
-                'the lines of sight would turn by 1.000 degrees, '
-                'over the limit of 0.999 degrees (max_turn_deg)'
+                'turn of the lines of sight from the prior is 1 deg, over the limit of 0.999 deg '
+                '(max_turn_deg)'
             ),
         ),
         (
@@ -116,7 +128,7 @@ def test_a_good_candidate_passes() -> None:
             0.3,
             0.29,
             (
-                'the attitudes of 6 of 20 images do not fit, more than a fraction of 0.29 '
+                'fraction of images whose attitude does not fit is 0.3, over the limit of 0.29 '
                 '(max_misfit_fraction)'
             ),
         ),
@@ -126,8 +138,8 @@ def test_a_good_candidate_passes() -> None:
             3.0,
             2.5,
             (
-                'the star tracker is 3.0 times worse than given, over the limit of 2.5 '
-                '(max_star_tracker_excess)'
+                '1-sigma of the star tracker, found over given, at its worst is 3, over the limit '
+                'of 2.5 (max_star_tracker_excess)'
             ),
         ),
         (
@@ -136,7 +148,7 @@ def test_a_good_candidate_passes() -> None:
             20.0,
             19.0,
             (
-                'a line of sight is uncertain by 20.0 arcsec at its worst, over the limit of 19 '
+                '1-sigma of a line of sight at its worst is 20 arcsec, over the limit of 19 '
                 'arcsec (max_line_of_sight_sigma_arcsec)'
             ),
         ),
@@ -145,24 +157,24 @@ def test_a_good_candidate_passes() -> None:
             'max_parameter_sigma',
             only(0, 2.0),
             only(0, 1.9),
-            'fx is uncertain by 2, over the limit of 1.9 (max_parameter_sigma)',
+            '1-sigma of fx is 2 px, over the limit of 1.9 px (max_parameter_sigma)',
         ),
         (  # 1e-4 rad are 20.6 arcsec
             {},
             'max_parameter_sigma',
             only(12, 21.0),
             only(12, 20.0),
-            'alignment_z is uncertain by 20.6, over the limit of 20 (max_parameter_sigma)',
+            (
+                '1-sigma of alignment_z is 20.63 arcsec, over the limit of 20 arcsec '
+                '(max_parameter_sigma)'
+            ),
         ),
         (
             {'singular_value': 1e-3},
             'min_singular_value',
             1e-3,
             2e-3,
-            (
-                'the smallest singular value is 1.0e-03, under the limit of 0.002 '
-                '(min_singular_value): what is estimated cannot be told apart'
-            ),
+            ('smallest singular value is 0.001, under the limit of 0.002 (min_singular_value)'),
         ),
         (
             {'zero_skew_cost_px': 0.7},
@@ -170,8 +182,8 @@ def test_a_good_candidate_passes() -> None:
             0.7,
             0.6,
             (
-                'camera_info without skew is 0.70 px off at its worst, over the limit of 0.6 px '
-                '(max_zero_skew_cost_px)'
+                'error of camera_info, which has no skew, at its worst is 0.7 px, over the limit '
+                'of 0.6 px (max_zero_skew_cost_px)'
             ),
         ),
         (
@@ -180,8 +192,9 @@ def test_a_good_candidate_passes() -> None:
             0.6,
             0.5,
             (
-                'the earlier and the later half of the images differ by 0.6 px, over the limit '
-                'of 0.5 px (max_halves_px); chance does it once in 2e+09 (min_halves_chance)'
+                'change of the distortion map between the halves of the images is 0.6 px, over '
+                'the limit of 0.5 px (max_halves_px); the chance of as much is 5e-10, under '
+                '0.0001 (min_halves_chance)'
             ),
         ),
         (
@@ -190,8 +203,8 @@ def test_a_good_candidate_passes() -> None:
             20.7,
             20.0,
             (
-                'the earlier and the later half of the images are turned by 20.6 arcsec, over the '
-                'limit of 20 arcsec (max_halves_turn_arcsec); chance does it once in 1e+08 '
+                'turn between the halves of the images is 20.63 arcsec, over the limit of 20 '
+                'arcsec (max_halves_turn_arcsec); the chance of as much is 9e-09, under 0.0001 '
                 '(min_halves_chance)'
             ),
         ),
@@ -201,8 +214,9 @@ def test_a_good_candidate_passes() -> None:
             1e-2,
             2e-2,
             (
-                'the earlier and the later half of the images differ by 1.6 px, over the limit '
-                'of 1 px (max_halves_px); chance does it once in 1e+02 (min_halves_chance)'
+                'change of the distortion map between the halves of the images is 1.6 px, over '
+                'the limit of 1 px (max_halves_px); the chance of as much is 0.01, under 0.02 '
+                '(min_halves_chance)'
             ),
         ),
         (
@@ -211,7 +225,7 @@ def test_a_good_candidate_passes() -> None:
             4.0,
             3.5,
             (
-                'the distortion map would change by 4.00 px against the calibration in force, '
+                'change of the distortion map from the calibration in force at its worst is 4 px, '
                 'over the limit of 3.5 px (max_step_px)'
             ),
         ),
@@ -221,8 +235,8 @@ def test_a_good_candidate_passes() -> None:
             0.2001,
             0.19,
             (
-                'the lines of sight would turn by 0.200 degrees against the calibration in '
-                'force, over the limit of 0.19 degrees (max_step_turn_deg)'
+                'turn of the lines of sight from the calibration in force is 0.2 deg, over the '
+                'limit of 0.19 deg (max_step_turn_deg)'
             ),
         ),
         (
@@ -231,8 +245,8 @@ def test_a_good_candidate_passes() -> None:
             2.0,
             1.9,
             (
-                'what is estimated would change by 2.0 sigma against the calibration in force, '
-                'over the limit of 1.9 (max_step_sigma)'
+                'change of what is estimated from the calibration in force is 2 sigma, over the '
+                'limit of 1.9 sigma (max_step_sigma)'
             ),
         ),
         (
@@ -241,8 +255,8 @@ def test_a_good_candidate_passes() -> None:
             4.1,
             3.0,
             (
-                'the distortion map would change by 3.9 px at its worst, '
-                'over the limit of 3 px (max_change_px)'
+                'change of the distortion map from the prior at its worst is 3.916 px, over the '
+                'limit of 3 px (max_change_px)'
             ),
         ),
     ],
@@ -251,17 +265,17 @@ def test_each_limit_trips_alone(
     changes: dict[str, Any], limit: str, at_limit: Any, beyond: Any, reason: str
 ) -> None:
     candidate = dataclasses.replace(GOOD, **changes)
-    assert judge(candidate, GateOptions(**{limit: at_limit})) == ()
-    assert judge(candidate, GateOptions(**{limit: beyond})) == (reason,)
+    assert reasons(candidate, GateOptions(**{limit: at_limit})) == ()
+    assert reasons(candidate, GateOptions(**{limit: beyond})) == (reason,)
 
 
 def test_what_is_left_must_be_enough() -> None:
     """The fewest images and stars hold for what fits, not for what was collected."""
     options = GateOptions(max_misfit_fraction=1.0)
     candidate = dataclasses.replace(GOOD, images_misfit=18, stars_used=50, stars_rejected=0)
-    assert judge(candidate, options) == (
-        '2 images fit, under the limit of 3 (min_images)',
-        '50 stars fit, under the limit of 60 (min_stars)',
+    assert reasons(candidate, options) == (
+        'number of images that fit is 2, under the limit of 3 (min_images)',
+        'number of stars that fit is 50, under the limit of 60 (min_stars)',
     )
 
 
@@ -269,21 +283,51 @@ def test_what_cannot_be_compared_is_not_held_against_it() -> None:
     strict = GateOptions(
         max_halves_px=0.0, max_halves_turn_arcsec=0.0, min_halves_chance=1.0, max_step_px=0.0
     )
-    assert judge(dataclasses.replace(GOOD, halves=None, step=None), strict) == ()
+    candidate = dataclasses.replace(GOOD, halves='5 images', step=None)
+    assert reasons(candidate, strict) == ()
+    found = checks(candidate, strict)
+    none = 'no calibration was in force'
+    notes = {option: check.note for option, check in found.items() if check.kept is None}
+    assert notes == {
+        'max_halves_px': '5 images',
+        'max_halves_turn_arcsec': '5 images',
+        'max_step_px': none,
+        'max_step_turn_deg': none,
+        'max_step_sigma': 'no limit is set',
+    }
+    assert all(np.isnan(found[option].found) for option in notes)
+    assert found['max_step_px'].found_text == '' and found['max_step_px'].limit_text == '0 px'
+
+
+def test_every_limit_has_its_check() -> None:
+    """With the limit as the option has it; a chance stands with what it excuses."""
+    options = GateOptions(max_parameter_sigma=only(0, 2.0), max_step_sigma=3.0)
+    found = checks(GOOD, options)
+    assert all(check.kept for check in found.values())
+    limited = {name for name in found if found[name].option}
+    assert limited == names_of(GateOptions) - {'min_halves_chance'} | {'min_images', 'min_stars'}
+    for name in limited - {'min_images', 'min_stars', 'max_parameter_sigma'}:
+        assert found[name].limit == getattr(options, name)
+    assert 'min_halves_chance' in found['max_halves_px'].note
+
+
+def test_large_counts_are_written_out() -> None:
+    found = checks(dataclasses.replace(GOOD, stars_used=123456), GateOptions())['min_stars']
+    assert (found.found_text, found.limit_text) == ('123456', '60')
 
 
 def test_halves_that_differ_by_chance_or_by_little_pass() -> None:
     unlikely = Difference(1e-6, 0.1, 90.0, 8, 99.0, 11)
     large = Difference(1e-3, 2.0, 9.0, 8, 12.0, 11)
     for halves in (unlikely, large):
-        assert judge(dataclasses.replace(GOOD, halves=halves), GateOptions()) == ()
+        assert reasons(dataclasses.replace(GOOD, halves=halves), GateOptions()) == ()
 
 
 def test_a_search_that_did_not_converge_is_refused() -> None:
     for termination in ('no_descent', 'iteration_limit'):
         candidate = dataclasses.replace(GOOD, termination=termination)
         expected = (f'the solver did not converge ({termination})',)
-        assert judge(candidate, GateOptions()) == expected
+        assert reasons(candidate, GateOptions()) == expected
 
 
 def test_every_reason_is_given() -> None:
@@ -296,7 +340,7 @@ def test_every_reason_is_given() -> None:
         termination='no_descent',
         geometry=turned(5.0, k1=6.0),
     )
-    assert len(judge(candidate, GateOptions())) == 7
+    assert len(reasons(candidate, GateOptions())) == 7
 
 
 def not_finite(name: str, bad: float) -> Candidate:
@@ -315,30 +359,30 @@ def not_finite(name: str, bad: float) -> Candidate:
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
 @pytest.mark.parametrize('name', ['covariance diagonal', 'map_sigma_px'])
 def test_what_is_not_finite_is_refused(name: str, bad: float) -> None:
-    assert judge(not_finite(name, bad), GateOptions())
+    assert reasons(not_finite(name, bad), GateOptions())
 
 
 @pytest.mark.parametrize('name', ['residual_rms_px', 'covariance', 'quaternion'])
 def test_nothing_that_is_nan_passes(name: str) -> None:
-    assert judge(not_finite(name, np.nan), GateOptions())
+    assert reasons(not_finite(name, np.nan), GateOptions())
 
 
 def test_an_infinite_residual_is_refused() -> None:
-    assert judge(not_finite('residual_rms_px', np.inf), GateOptions())
+    assert reasons(not_finite('residual_rms_px', np.inf), GateOptions())
 
 
 def test_a_negative_variance_is_refused() -> None:
     covariance = GOOD.covariance.copy()
     covariance[3, 3] = -1e-9
     candidate = dataclasses.replace(GOOD, covariance=covariance)
-    assert judge(candidate, GateOptions()) == ('a variance is negative',)
+    assert reasons(candidate, GateOptions()) == ('a variance is negative',)
 
 
 def test_no_star_at_all_is_refused() -> None:
     candidate = dataclasses.replace(
         GOOD, stars_used=0, stars_rejected=0, coverage=np.zeros((8, 10), np.int64)
     )
-    assert any('min_coverage' in reason for reason in judge(candidate, GateOptions()))
+    assert any('min_coverage' in reason for reason in reasons(candidate, GateOptions()))
 
 
 @pytest.mark.parametrize('axis', ['x', 'y', 'z'])
@@ -367,5 +411,5 @@ def test_a_camera_that_folds_over_is_refused() -> None:
     # 1 + 3 k1 r^2 is zero at r = 0.18: the corners have no line of sight.
     turn_rad, left_px = movement(PRIOR, turned(0.0, k1=-10.0))
     assert np.isinf(turn_rad) and np.isinf(left_px).all()
-    reasons = judge(dataclasses.replace(GOOD, geometry=turned(0.0, k1=-10.0)), GateOptions())
-    assert len(reasons) == 2
+    found = reasons(dataclasses.replace(GOOD, geometry=turned(0.0, k1=-10.0)), GateOptions())
+    assert len(found) == 2

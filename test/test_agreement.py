@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.agreement import difference, halves, movement
+from starcal_ros.agreement import Difference, difference, halves, movement
 from starcal_ros.calibration import CalibrationOptions
 from starcal_ros.camera import project
 from starcal_ros.campaign_trials import (
@@ -83,7 +83,7 @@ def test_halves_of_one_camera_differ_by_chance() -> None:
     chances = []
     for trial in range(30):
         found = halves(observe(drawn(trial), 20.0), drawn(trial).prior, OPTIONS)
-        assert found is not None
+        assert isinstance(found, Difference)
         chances += [found.chance, found.shape_chance]
     # Of sixty chances the least is under 1e-4 once in 170 such tests; the seed is fixed.
     assert min(chances) > 1e-4
@@ -97,7 +97,7 @@ def test_a_change_midway_shows() -> None:
     fx, skew, fy = camera.intrinsics[:3] * 1.002
     zoomed = dataclasses.replace(field.truth, camera=camera.replace(fx=fx, skew=skew, fy=fy))
     found = halves(observe(seen_from_the_middle(field, zoomed), 20.0), field.prior, OPTIONS)
-    assert found is not None and found.shape_chance < 1e-9
+    assert isinstance(found, Difference) and found.shape_chance < 1e-9
     # 0.2 % at the corner, 1650 px from the centre; halves know it to 0.1 px.
     assert found.shape_px == pytest.approx(movement(field.truth, zoomed)[1].max(), abs=0.4)
 
@@ -105,7 +105,7 @@ def test_a_change_midway_shows() -> None:
     mounting = Rotation.from_quat(field.truth.star_tracker_from_camera_xyzw) * turn
     turned = dataclasses.replace(field.truth, star_tracker_from_camera_xyzw=mounting.as_quat())
     found = halves(observe(seen_from_the_middle(field, turned), 20.0), field.prior, OPTIONS)
-    assert found is not None and found.chance < 1e-9 < 1e-4 < found.shape_chance
+    assert isinstance(found, Difference) and found.chance < 1e-9 < 1e-4 < found.shape_chance
     # 20 arcsec, 1e-4 rad, for each image: four of these in each half know it to 7e-5.
     assert found.turn_rad == pytest.approx(1e-3, abs=3e-4)
 
@@ -113,8 +113,10 @@ def test_a_change_midway_shows() -> None:
 def test_what_cannot_be_halved_is_not_compared() -> None:
     field = drawn(2)
     ensemble = observe(field, 20.0)
-    assert halves(Ensemble(ensemble.images[:5]), field.prior, OPTIONS) is None
+    assert halves(Ensemble(ensemble.images[:5]), field.prior, OPTIONS) == (
+        '5 images, 6 make two halves'
+    )
     thermal = dataclasses.replace(OPTIONS, focal_temperature_order=1)
-    assert halves(ensemble, field.prior, thermal) is None
+    assert halves(ensemble, field.prior, thermal) == 'the halves are of other temperatures'
     few = Ensemble(tuple(image.select(np.arange(60) < 20) for image in ensemble.images))
-    assert halves(few, field.prior, OPTIONS) is None
+    assert str(halves(few, field.prior, OPTIONS)).startswith('a half alone cannot be solved: ')

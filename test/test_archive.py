@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from starcal_ros import bag
-from starcal_ros.archive import Archive, InForce, TOPIC
+from starcal_ros.archive import _sealed, Archive, InForce, TOPIC
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ArchiveError
 from starcal_ros.records import (
@@ -257,6 +257,19 @@ def test_a_damaged_file_is_never_believed(tmp_path: Path, pattern: str, kind: st
     assert set_aside >= (30 if kind == 'flip' else 55)
 
 
+def test_a_calibration_of_before_the_gate_told_is_read(tmp_path: Path) -> None:
+    with opened(tmp_path) as archive:
+        archive.keep(Ensemble(), (in_force(1),))
+    (path,) = tmp_path.glob('calibrations/*.json')
+    content = json.loads(path.read_text())
+    del content['sha256'], content['gate']
+    path.write_text(_sealed(content))
+    with opened(tmp_path) as archive:
+        (record,) = archive.read_history()
+        assert archive.damage == []
+    assert record.calibration.gate == ()
+
+
 def test_a_damaged_rollback_still_goes_back(tmp_path: Path) -> None:
     """Its name says to which calibration, and that one has a file of its own."""
     with opened(tmp_path) as archive:
@@ -287,8 +300,6 @@ def test_an_event_is_never_given_twice(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('key', ['schema', 'archive'])
 def test_another_version_is_left_where_it_is(tmp_path: Path, key: str) -> None:
-    from starcal_ros.archive import _sealed
-
     with opened(tmp_path) as archive:
         archive.keep(Ensemble(), (in_force(1), in_force(2, before=1)))
     path = next(tmp_path.glob('calibrations/00000002_*'))

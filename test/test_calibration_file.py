@@ -22,6 +22,7 @@ from starcal_ros.records import (
     CameraGeometry,
     Correlation,
     DetectorMaps,
+    GateCheck,
     Removal,
     Thermal,
 )
@@ -41,6 +42,11 @@ REMOVALS = (
     Removal('fx', 4e5, 1.6e11, 1.7e11, False, 700.5, (500.0, 600.0), 12.0),
 )
 CORRELATION = Correlation(('fx', 'pitch'), np.array([[1.0, -1 / 3], [-1 / 3, 1.0]]))
+GATE = (
+    GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 1.0, 'px', True),
+    GateCheck('solver converged', '', math.nan, math.nan, '', False, 'no_descent'),
+    GateCheck('turn', 'max_step_turn_deg', math.nan, 0.5, 'deg', None, 'nothing was in force'),
+)
 THERMAL = Thermal(21.5, (4e-5, -6e-7), (1e-6, 2e-8), (1e-5, 0.0, -3e-5), (1e-6,) * 3, 'a word')
 
 
@@ -123,6 +129,13 @@ def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
         assert_same(calibration, read_calibration(tmp_path / 'calibration.json'))
 
 
+def test_what_the_gate_has_looked_at_comes_back(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    write_calibration(calibration_of(gate=GATE), path)
+    assert [check['kept'] for check in json.loads(path.read_text())['gate']] == [True, False, None]
+    assert repr(read_calibration(path).gate) == repr(GATE)  # NaN is not equal to itself
+
+
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
@@ -203,6 +216,7 @@ def test_a_file_of_before_temperature_is_read(tmp_path: Path) -> None:
     write_calibration(calibration_of(), path)
     content = json.loads(path.read_text())
     del content['temperature'], content['maps'], content['correlation'], content['removals']
+    del content['gate']
     path.write_text(json.dumps(content))
     assert_same(calibration_of(), read_calibration(path))
 
@@ -235,12 +249,16 @@ def test_a_file_of_before_temperature_is_read(tmp_path: Path) -> None:
         (lambda c: c.update(removals=[1]), r'removals: \[1\] is not a mapping'),
         (lambda c: c['removals'][1].pop('wald'), "key 'removals.wald' is missing"),
         (lambda c: c['removals'][1].update(within_chance=1), 'within_chance: 1 is not true or'),
+        (lambda c: c['gate'][0].pop('note'), "key 'gate.note' is missing"),
+        (lambda c: c['gate'][0].update(kept=1), 'gate.kept: 1 is not true or false'),
         (lambda c: c['correlation']['matrix'].pop(), 'correlation.matrix is not of the size'),
     ],
 )
 def test_a_damaged_calibration_is_refused_by_file_and_key(tmp_path, change, says) -> None:
     path = tmp_path / 'c.json'
-    record = calibration_of(thermal=THERMAL, maps=MAPS, correlation=CORRELATION, removals=REMOVALS)
+    record = calibration_of(
+        thermal=THERMAL, maps=MAPS, correlation=CORRELATION, removals=REMOVALS, gate=GATE
+    )
     write_calibration(record, path)
     content = json.loads(path.read_text())
     change(content)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import cv2
@@ -18,7 +19,7 @@ from starcal_ros.calibration_messages import (
     camera_info_to_message,
 )
 from starcal_ros.camera import line_of_sight, project
-from starcal_ros.records import Thermal
+from starcal_ros.records import GateCheck, Thermal
 
 
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
@@ -32,14 +33,26 @@ def test_calibration_round_trip(make: Any) -> None:
         assert_same(record, calibration_from_message(calibration_to_message(record, make)))
 
 
+@pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
+def test_what_the_gate_did_not_check_is_told(make: Any) -> None:
+    gate = (
+        *calibration().gate,
+        GateCheck('turn', 'max_step_turn_deg', math.nan, 0.5, 'deg', None, 'nothing in force'),
+    )
+    message = calibration_to_message(dataclasses.replace(calibration(), gate=gate), make)
+    assert list(message.gate_kept) == [0, 1, -1]
+    # NaN is not equal to itself.
+    assert repr(calibration_from_message(message).gate) == repr(gate)
+
+
 def test_older_calibrations_are_read() -> None:
     """Fields that were added since are as if nothing was known."""
     message = calibration_to_message(calibration(), plain)
     del message.reference_temperature_degc, message.coverage_rows, message.correlation_names
-    del message.removal_removed
+    del message.removal_removed, message.gate_name
     found = calibration_from_message(message)
     assert found.thermal is None and found.maps is None and found.correlation is None
-    assert found.removals == ()
+    assert found.removals == () and found.gate == ()
 
 
 @pytest.mark.parametrize(

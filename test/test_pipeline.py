@@ -555,6 +555,17 @@ def test_a_bad_solution_is_refused_and_says_why(camera_yaml: Path) -> None:
     found = pipeline.solve(ensemble(), strict)
     assert not found.accepted
     assert len(found.reasons) == 1 and 'max_map_sigma_px' in found.reasons[0]
+    refused = [check for check in found.gate if check.kept is False]
+    assert [check.option for check in refused] == ['max_map_sigma_px']
+    assert refused[0].limit == 1e-6 and found.reasons[0].startswith(refused[0].name)
+
+
+def test_the_gate_counts_the_stars_that_were_used(setup: pipeline.Setup) -> None:
+    """Those left out as outliers cover nothing."""
+    found = pipeline.solve(ensemble(), setup)
+    assert found.maps is not None
+    covered = next(check for check in found.gate if check.option == 'min_coverage')
+    assert covered.found == (found.maps.stars > 0).mean()
 
 
 def test_a_setup_holds_the_options_of_every_stage(setup: pipeline.Setup) -> None:

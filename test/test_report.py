@@ -62,6 +62,10 @@ def page(folder: Path) -> str:
     return (folder / REPORT_FILE).read_text()
 
 
+def page_of(folder: Path) -> str:
+    return report.write_report(folder).read_text()
+
+
 def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> None:
     calibration = read_calibration(folder / CALIBRATION_FILE)
     assert '✓ Accepted' in page
@@ -100,7 +104,7 @@ def test_a_folder_with_a_calibration_alone_says_what_is_missing(
     folder: Path, tmp_path: Path
 ) -> None:
     shutil.copy(folder / CALIBRATION_FILE, tmp_path)
-    text = report.write_report(tmp_path).read_text()
+    text = page_of(tmp_path)
     assert 'not in this folder (residuals.npz)' in text
     assert 'did not have the images' in text
     assert 'id="figure-vectors"' in text and 'id="figure-images"' not in text
@@ -111,9 +115,35 @@ def test_a_refused_calibration_says_why(folder: Path, tmp_path: Path) -> None:
     reasons = ('residual 2 px & more is over the limit',)
     refused = dataclasses.replace(calibration, accepted=False, reasons=reasons)
     write_calibration(refused, tmp_path / CALIBRATION_FILE)
-    text = report.write_report(tmp_path).read_text()
+    text = page_of(tmp_path)
     assert '✕ Refused' in text and '✓ Accepted' not in text
     assert 'residual 2 px &amp; more is over the limit' in text
+
+
+def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: Path) -> None:
+    calibration = read_calibration(folder / CALIBRATION_FILE)
+    assert len(calibration.gate) > 15
+    not_kept = dataclasses.replace(calibration.gate[2], found=8.125, kept=False)
+    not_checked = next(check for check in calibration.gate if check.kept is None)
+    shown = dataclasses.replace(calibration, gate=(not_kept, not_checked))
+    write_calibration(shown, tmp_path / CALIBRATION_FILE)
+    table = re.findall(r'<table class="limits">.*?</table>', page_of(tmp_path), re.DOTALL)[0]
+    rows = [re.findall(r'<t[hd][^>]*>([^<]*)<', row) for row in table.split('<tr>')[2:]]
+    assert rows == [
+        [not_kept.name, '8.125 px', 'at most 1 px', 'not kept', 'max_residual_rms_px', ''],
+        [
+            *(not_checked.name, '', f'at most {not_checked.limit_text}', 'not checked'),
+            *(not_checked.option, not_checked.note),
+        ],
+    ]
+
+
+def test_a_calibration_of_before_the_gate_told_says_so(folder: Path, tmp_path: Path) -> None:
+    calibration = read_calibration(folder / CALIBRATION_FILE)
+    write_calibration(dataclasses.replace(calibration, gate=()), tmp_path / CALIBRATION_FILE)
+    text = page_of(tmp_path)
+    assert 'does not tell what the gate has looked at' in text
+    assert '<table class="limits">' not in text
 
 
 def test_names_are_text_and_never_markup(folder: Path, tmp_path: Path) -> None:
@@ -128,7 +158,7 @@ def test_names_are_text_and_never_markup(folder: Path, tmp_path: Path) -> None:
     )
     write_calibration(calibration, tmp_path / CALIBRATION_FILE)
     shutil.copy(folder / residuals.RESIDUALS_FILE, tmp_path)
-    text = report.write_report(tmp_path).read_text()
+    text = page_of(tmp_path)
     assert '<script>alert' not in text and '<img src=x' not in text
 
 
@@ -153,7 +183,7 @@ def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:
         attitude_error_arcsec=np.full_like(left.attitude_error_arcsec, np.nan),
     )
     residuals.write_residuals(nothing, tmp_path / residuals.RESIDUALS_FILE)
-    assert '<html' in report.write_report(tmp_path).read_text()
+    assert '<html' in page_of(tmp_path)
 
 
 @pytest.mark.parametrize('damage', ['calibration.json', 'residuals.npz', 'observations.mcap'])

@@ -12,6 +12,7 @@ import numpy as np
 from starcal_ros.message_types import Message
 
 _CODES = {
+    np.dtype(np.int8): 'b',
     np.dtype(np.uint8): 'B',
     np.dtype(np.uint32): 'I',
     np.dtype(np.int64): 'q',
