@@ -64,11 +64,22 @@ class Difference:
         return float(chi2.sf(self.shape_chi2, self.shape_freedom)) if self.shape_freedom else 1.0
 
 
+def lines_of_sight(geometry: CameraGeometry, columns: int, rows: int) -> Floats:
+    """
+    Of a grid of pixels in the star tracker frame, (columns * rows, 3), row by row.
+
+    NaN where a pixel has no line of sight.
+    """
+    in_camera = line_of_sight(geometry.camera, pixel_grid(geometry.camera, columns, rows))
+    star_tracker_from_camera = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
+    return np.asarray(star_tracker_from_camera.apply(in_camera))
+
+
 def movement(
     before: CameraGeometry, after: CameraGeometry, columns: int = 15, rows: int = 12
 ) -> tuple[float, Floats]:
     """
-    How far the lines of sight of the pixels moved in the star tracker frame.
+    How far the lines of sight of the pixels of a camera moved in the star tracker frame.
 
     Returns
     -------
@@ -78,15 +89,9 @@ def movement(
         The movement that is left at a grid of pixels, in pixels of the middle.  Both are infinite
         where a pixel has no line of sight any more.
     """
-    pixels = pixel_grid(before.camera, columns, rows)
-    old, new = (
-        Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).apply(
-            line_of_sight(geometry.camera, pixels)
-        )
-        for geometry in (before, after)
-    )
+    old, new = (lines_of_sight(geometry, columns, rows) for geometry in (before, after))
     if not (np.isfinite(old).all() and np.isfinite(new).all()):
-        return np.inf, np.full(len(pixels), np.inf)
+        return np.inf, np.full(len(old), np.inf)
     turn, _ = Rotation.align_vectors(new, old)
     left_rad = np.linalg.norm(new - turn.apply(old), axis=1)
     return float(turn.magnitude()), left_rad * after.camera.parameters[0]

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.agreement import alignment_difference_rad, lines_of_sight
 from starcal_ros.calibration import CalibrationOptions, Estimate
-from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, pixel_grid, project
+from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.measurement import arrange, normal_blocks, star_table
 from starcal_ros.observability import GRID, line_of_sight_sigma_arcsec, map_sigma_px
@@ -224,23 +225,14 @@ def pointing_bound_arcsec(camera: CameraModel, covariance: Floats) -> float:
 
 def pointing_error_arcsec(found: CameraGeometry, true: CameraGeometry) -> float:
     """RMS over the detector between the lines of sight in the star tracker frame, arcsec."""
-    grid = pixel_grid(true.camera, GRID, GRID)
-    of_found, of_true = (
-        Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).apply(
-            line_of_sight(geometry.camera, grid)
-        )
-        for geometry in (found, true)
-    )
+    of_found, of_true = (lines_of_sight(geometry, GRID, GRID) for geometry in (found, true))
     return _rms(np.linalg.norm(of_found - of_true, axis=1)) / ARCSECOND_RAD
 
 
 def errors(found: CameraGeometry, true: CameraGeometry) -> Floats:
     """Found less true (13,): camera parameters, then the passive turn of the camera frame, rad."""
-    star_tracker_from_found, star_tracker_from_true = (
-        Rotation.from_quat(g.star_tracker_from_camera_xyzw) for g in (found, true)
-    )
-    turn = -(star_tracker_from_found.inv() * star_tracker_from_true).as_rotvec()
-    return np.concatenate([found.camera.parameters - true.camera.parameters, turn])
+    turn_rad = alignment_difference_rad(found, true)
+    return np.concatenate([found.camera.parameters - true.camera.parameters, turn_rad])
 
 
 def normalised_error_squared(estimate: Estimate, true: CameraGeometry) -> float:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from starcal_ros.agreement import alignment_difference_rad
-from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
+from starcal_ros.agreement import alignment_difference_rad, lines_of_sight
+from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.observability import line_of_sight_sigma_arcsec, map_sigma_px
@@ -97,7 +97,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         ]
     )
     sigma = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
-    old, new = (_lines_of_sight(calibration.geometry) for calibration in (a, b))
+    old, new = (_sound_lines_of_sight(calibration.geometry) for calibration in (a, b))
     turn, _ = Rotation.align_vectors(new, old)
     sight_sigma_rad = _both(
         *(
@@ -123,14 +123,14 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     )
 
 
-def _lines_of_sight(geometry: CameraGeometry) -> Floats:
+def _sound_lines_of_sight(geometry: CameraGeometry) -> Floats:
     """Of the grid, (GRID^2, 3), star tracker frame."""
-    directions = line_of_sight(geometry.camera, pixel_grid(geometry.camera, GRID, GRID))
+    directions = lines_of_sight(geometry, GRID, GRID)
     if not np.isfinite(directions).all():
         raise ProductError(
             'a calibration has pixels without a line of sight: its distortion folds'
         )
-    return np.asarray(Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).apply(directions))
+    return directions
 
 
 def _both(a: Floats, b: Floats) -> Floats:
