@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime, timezone
 import json
 import math
 from pathlib import Path
@@ -24,7 +23,7 @@ from starcal_ros import bag, report_figures
 from starcal_ros.agreement import alignment_difference_rad
 from starcal_ros.calibration_file import CALIBRATION_FILE, prior_of, read_calibration
 from starcal_ros.camera import INTRINSIC_NAMES, PARAMETER_NAMES
-from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.message_types import OBSERVATIONS_TYPE
 from starcal_ros.observability import movement_px
 from starcal_ros.product_files import OBSERVATIONS_FILE, REPORT_FILE, write_atomically
@@ -39,6 +38,7 @@ from starcal_ros.report_charts import charts_of
 from starcal_ros.residuals import read_residuals, Residuals, RESIDUALS_FILE
 from starcal_ros.thermal import summary as thermal_summary
 from starcal_ros.thumbnails import read_thumbnails, Thumbnail, THUMBNAILS_FOLDER
+from starcal_ros.utc import utc_text
 
 _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200
@@ -125,8 +125,8 @@ def _context(found: Found) -> Mapping[str, object]:
     prior = prior_of(calibration)
     return {
         'calibration': calibration,
-        'time': _utc(calibration.time_ns),
-        'in_force_since': _utc(calibration.in_force_since_ns),
+        'time': utc_text(calibration.time_ns),
+        'in_force_since': utc_text(calibration.in_force_since_ns),
         'parameters': _parameter_rows(calibration, prior),
         'alignment': _alignment_rows(calibration, prior),
         'tiles': _tiles(calibration),
@@ -148,14 +148,6 @@ def _options_of(calibration: Calibration) -> Mapping[str, object]:
     except (KeyError, ValueError):
         return {}
     return options if isinstance(options, dict) else {}
-
-
-def _utc(time_ns: int) -> str:
-    try:
-        moment = datetime.fromtimestamp(time_ns / NANOSECONDS_PER_SECOND, timezone.utc)
-    except (OverflowError, OSError, ValueError):
-        return f'{time_ns} ns'
-    return f'{moment:%Y-%m-%d %H:%M:%S} UTC'
 
 
 def _significant(value: float, sigma: float) -> str:
@@ -280,7 +272,7 @@ def _slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[st
         images.append(
             {
                 'number': k + 1,
-                'time': _utc(int(residuals.image_time_ns[k])),
+                'time': utc_text(int(residuals.image_time_ns[k])),
                 'rms': None if math.isnan(rms[k]) else round(float(rms[k]), 4),
                 'misfit': bool(residuals.image_misfit[k]),
                 'tracker': [None if math.isnan(e) else round(float(e), 2) for e in error],
@@ -315,9 +307,9 @@ def _refused_images(found: Found) -> list[Mapping[str, object]]:
                 'reason': reason,
                 'meaning': IMAGE_REFUSALS.get(reason, ''),
                 'count': count,
-                'images': [(_utc(o.time_ns), o.detail) for o in images[:_LISTED_REFUSED]],
+                'images': [(utc_text(o.time_ns), o.detail) for o in images[:_LISTED_REFUSED]],
                 'pictures': [
-                    (_picture(pictures[o.time_ns]), _utc(o.time_ns), o.detail)
+                    (_picture(pictures[o.time_ns]), utc_text(o.time_ns), o.detail)
                     for o in images
                     if o.time_ns in pictures
                 ],
@@ -337,7 +329,7 @@ def _refused_stars(found: Found) -> list[Mapping[str, object]]:
             'meaning': STAR_REFUSALS.get(reason, ''),
             'count': count,
             'pictures': [
-                (_picture(t), _utc(t.time_ns)) for t in found.thumbnails if t.reason == reason
+                (_picture(t), utc_text(t.time_ns)) for t in found.thumbnails if t.reason == reason
             ],
         }
         for reason, count in sorted(counts.items(), key=lambda item: -item[1])
@@ -348,7 +340,7 @@ def _refused_stars(found: Found) -> list[Mapping[str, object]]:
 def _used_images(found: Found) -> list[tuple[Markup, str, int]]:
     stars = {o.time_ns: len(o) for o in found.observations or () if not o.refusal}
     return [
-        (_picture(t), _utc(t.time_ns), stars[t.time_ns])
+        (_picture(t), utc_text(t.time_ns), stars[t.time_ns])
         for t in found.thumbnails
         if not t.reason and t.time_ns in stars
     ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from datetime import datetime, timezone
 
 import numpy as np
 
@@ -11,10 +10,11 @@ from starcal_ros import thermal
 from starcal_ros.agreement import alignment_difference_rad
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.comparison import Comparison, DifferenceMap
-from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.inspection import Inspection, TopicContent
 from starcal_ros.records import Calibration, CameraGeometry
 from starcal_ros.terminal import print_table, print_verdict
+from starcal_ros.utc import utc_text
 
 
 def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
@@ -192,7 +192,7 @@ def _predicted(name: str, sigma: float) -> str:
 
 
 def _topic_notes(topic: TopicContent) -> list[str]:
-    notes = [f'{_utc(topic.first_ns)} to {_clock(topic.last_ns)} UTC']
+    notes = [f'{utc_text(topic.first_ns)} to {_clock(topic.last_ns)}']
     if topic.kinds:
         notes.append(', '.join(f'{count} of {kind}' for kind, count in topic.kinds.items()))
     if topic.bad:
@@ -202,15 +202,5 @@ def _topic_notes(topic: TopicContent) -> list[str]:
     return notes
 
 
-def _utc(time_ns: int) -> str:
-    """Date and time to the millisecond."""
-    seconds, rest_ns = divmod(time_ns, NANOSECONDS_PER_SECOND)
-    try:
-        whole = datetime.fromtimestamp(seconds, timezone.utc)
-    except (ValueError, OverflowError, OSError):
-        return f'{time_ns} ns'  # not a date that a calendar has
-    return f'{whole:%Y-%m-%d %H:%M:%S}.{rest_ns // 1_000_000:03d}'
-
-
 def _clock(time_ns: int) -> str:
-    return _utc(time_ns).partition(' ')[2]
+    return utc_text(time_ns).partition(' ')[2]

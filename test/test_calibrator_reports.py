@@ -105,7 +105,7 @@ def test_the_folder_is_as_the_tool_writes_it(
         'report.html', 'residuals.npz',
     }  # fmt: skip
     text = page.read_text()
-    assert 'calibration 1, in force since 2027-01-15 08:00:00 UTC' in text
+    assert 'calibration 1, in force since 2027-01-15 08:00:00.000 UTC' in text
     assert 'figure-images' in text and 'did not have the images' in text
     page.unlink()
     assert cli.main(['report', str(page.parent)]) == 0

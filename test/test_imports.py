@@ -15,6 +15,7 @@ PACKAGE = Path(__file__).parents[1] / 'starcal_ros'
 # In the order of the method: from numbers to images, stars, a calibration, and what comes of it.
 LADDER = [
     'constants',
+    'utc',
     'errors',
     'options',
     'camera',
