@@ -1,16 +1,10 @@
-"""The status of an ensemble to a message and back."""
+"""The status of an ensemble to a message."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from starcal_ros.message_fields import (
-    counts_of_reasons,
-    flat_array,
-    make_header,
-    shaped_array,
-    stamp_ns,
-)
+from starcal_ros.message_fields import flat_array, make_header
 from starcal_ros.message_types import Make, Message, STATUS_TYPE
 from starcal_ros.records import EnsembleStatus
 
@@ -33,29 +27,4 @@ def status_to_message(status: EnsembleStatus, frame_id: str, make: Make) -> Mess
         coverage=flat_array(status.coverage, np.uint32),
         parameter_names=list(status.parameter_names),
         predicted_sigma=flat_array(status.predicted_sigma, np.float64),
-    )
-
-
-def status_from_message(message: Message) -> EnsembleStatus:
-    """
-    Ensemble status of a starcal/EnsembleStatus.
-
-    Raises
-    ------
-    ValueError
-        When the arrays of the message do not fit each other.
-    """
-    shape = int(message.coverage_rows), int(message.coverage_cols)
-    names = tuple(str(name) for name in message.parameter_names)
-    return EnsembleStatus(
-        time_ns=stamp_ns(message.header.stamp),
-        images=int(message.images),
-        images_saved=int(message.images_saved),
-        stars=int(message.stars),
-        min_images=int(message.min_images),
-        min_stars=int(message.min_stars),
-        refused=counts_of_reasons(message.refused_reasons, message.refused_counts),
-        coverage=shaped_array('coverage', message.coverage, shape).astype(np.int64),
-        parameter_names=names,
-        predicted_sigma=shaped_array('predicted_sigma', message.predicted_sigma, (len(names),)),
     )

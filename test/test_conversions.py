@@ -25,7 +25,7 @@ from starcal_ros.image_messages import image_from_message, image_to_message
 from starcal_ros.nodes.conversions import make_message, message_class
 from starcal_ros.observation_messages import observations_from_message, observations_to_message
 from starcal_ros.records import Image
-from starcal_ros.status_messages import status_from_message, status_to_message
+from starcal_ros.status_messages import status_to_message
 
 
 def through_wire(message: Any) -> Any:
@@ -40,9 +40,8 @@ def test_records_survive_the_wire() -> None:
     result = calibration()
     message = through_wire(calibration_to_message(result, make_message))
     assert_same(result, calibration_from_message(message))
-    ensemble = status()
-    message = through_wire(status_to_message(ensemble, 'cam', make_message))
-    assert_same(ensemble, status_from_message(message))
+    message = status_to_message(status(), 'cam', make_message)
+    assert through_wire(message) == message
 
 
 def test_camera_info_and_alignment_survive_the_wire() -> None:
