@@ -43,6 +43,7 @@ from starcal_ros.options import option
 from starcal_ros.prediction import in_image, predict, Prediction, SPACE, within_image
 from starcal_ros.psf import stamp_radius_px
 from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.tearing import find_tear
 from starcal_ros.warp import fit_warp
 
 Floats = NDArray[np.float64]
@@ -113,7 +114,7 @@ def observe_stars(
     Raises
     ------
     ImageRefused
-        ``no_stars`` or ``no_match``.
+        ``no_stars``, ``no_match`` or ``incomplete``.
     """
     image = shot.image
     background = measure_background(image.pixels)
@@ -157,6 +158,11 @@ def measure_predicted(
 
     ``instrument`` is what was known before, None at the first image.  With too few stars measured
     well it is a refused image, ``too_few_stars``.
+
+    Raises
+    ------
+    ImageRefused
+        ``incomplete`` where the stars show that some rows were lost.
     """
     height, width = shot.image.pixels.shape
     shown = within_image(prediction, width, height)
@@ -164,6 +170,7 @@ def measure_predicted(
         shot.image.pixels, shown.xy_px, model, centroid_options, shot.hot_pixels
     )
     centroids, alone = separate(shown, catalog, centroids, model, options.max_blend_sigma)
+    _refuse_torn(shown.xy_px, centroids, (height, width))
     refusal = refuse_on_hot_pixels(
         shown.xy_px,
         _refuse_displaced(shown.xy_px, centroids, width),
@@ -312,3 +319,21 @@ def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) ->
     limit_px = np.maximum(5.0 * np.hypot(sigma_px[good], 0.5 * scatter_px), 0.3)
     refusal[good[off_px > np.minimum(limit_px, 2.0)]] = 'ambiguous'
     return refusal
+
+
+def _refuse_torn(predicted_px: Floats, centroids: Centroids, shape: tuple[int, int]) -> None:
+    """
+    Refuse a frame whose stars jump at some row against their predictions (n, 2).
+
+    Raises
+    ------
+    ImageRefused
+        ``incomplete``.
+    """
+    good = np.isin(centroids.refusal, ('', 'not_detected'))
+    variance_px2 = 0.5 * (centroids.covariance_px2[good, 0] + centroids.covariance_px2[good, 2])
+    tear = find_tear(predicted_px[good], centroids.xy_px[good], np.sqrt(variance_px2), shape)
+    if tear is not None:
+        u, v = tear.off_px
+        detail = f'below row {tear.row} the stars stand ({u:+.1f}, {v:+.1f}) px from their places'
+        raise ImageRefused('incomplete', detail)

@@ -33,7 +33,9 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'overexposed': 'too large a part of the image is saturated',
     'blank': 'every pixel has the same value',
     'frozen': 'the pixels are those of an earlier image with another stamp',
-    'incomplete': 'a part of the image is constant, repeats itself or belongs to an earlier image',
+    'incomplete': (
+        'a part of the image is constant, repeats itself, is shifted or is of an earlier image'
+    ),
     'glare': 'the background is too steep over most of the image',
     'no_stars': 'too few star-like sources in the image',
     'no_match': 'no rotation of the predicted stars explains the sources in the image',

@@ -87,7 +87,7 @@ def follow(
     Raises
     ------
     ImageRefused
-        ``no_match`` when the track is lost, ``too_few_stars``.
+        ``no_match`` when the track is lost, ``too_few_stars``, ``incomplete``.
     """
     pixels = shot.image.pixels
     prediction = _predict(shot, before, catalog, options)

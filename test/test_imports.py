@@ -40,6 +40,7 @@ LADDER = [
     'warp',
     'acquisition',
     'blends',
+    'tearing',
     'identification',
     'tracking',
     'measurement',
