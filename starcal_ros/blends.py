@@ -16,7 +16,9 @@ from starcal_ros.psf import neighbour_pull_px, stamp_radius_px
 
 Floats = NDArray[np.float64]
 
-_PULL_UNCERTAINTY = 0.25  # of a neighbour's light: stars of unlike colour differ so from their V
+# Of the pull of a star that is not measured itself: it is one linear step of several, and stars of
+# unlike colour differ by a quarter from their V.
+_PULL_UNCERTAINTY = 1.0
 _MODELLED_UNCERTAINTY = 0.05  # of that of a star measured itself: wings that are no Gaussian's
 _NEAR_SIGMA, _MODELLED_NEAR_SIGMA = 5.0, 3.0  # a bright neighbour nearer than this swamps
 _ALONE_SIGMA = 0.1  # a star whose neighbours pull it by less tells the PSF

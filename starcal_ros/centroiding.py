@@ -20,6 +20,7 @@ from starcal_ros.detection import (
     sample_mesh,
     Sources,
     stamps_about,
+    stamps_at_edges,
     windows_inside,
 )
 from starcal_ros.fixed_pattern import hot_in_stamps, NO_HOT_PIXELS
@@ -274,23 +275,24 @@ def _measure_by_psf(
     n = len(predicted_px)
     refusal = np.full(n, '', dtype='U16')
     centre = np.rint(np.nan_to_num(predicted_px, nan=-1e6)).astype(np.int64)
-    inside = windows_inside(shape, centre, radius + 1)
+    inside = windows_inside(shape, centre, 1)
     refusal[~inside] = 'border'
-    centre = np.clip(centre, radius + 1, [shape[1] - radius - 2, shape[0] - radius - 2])
+    innermost = np.array([shape[1] - 2, shape[0] - 2])
+    centre = np.clip(centre, 1, innermost)
     # The window goes where the star is: the brightest pixel next to the prediction.
     near = stamps_about(pixels, centre, 1)
     near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0.0
     best = near.reshape(n, 9).argmax(axis=1)
-    centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
-    stamps = stamps_about(pixels, centre, radius)
+    centre = np.clip(centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1), 1, innermost)
+    stamps, outside = stamps_at_edges(pixels, centre, radius)
     at_px = centre.astype(np.float64)
     noise_dn = sample_mesh(model.background.noise_mesh, shape, at_px)
     sigma_px = psf.at(at_px)
-    saturated = stamps >= model.saturation_dn
-    hot = hot_in_stamps(hot_pixels, centre, radius, shape[1])
+    saturated = (stamps >= model.saturation_dn) & ~outside
+    hot = hot_in_stamps(hot_pixels, centre, radius, shape[1]) & ~outside
     # The start of the fit looks at all pixels; to the fit itself these say nothing.
     stamps[hot] = np.median(stamps, axis=(1, 2))[np.nonzero(hot)[0]] if hot.any() else 0.0
-    out = saturated | hot
+    out = saturated | hot | outside
     fit = fit_psf(stamps, sigma_px, noise_dn, model.pixel_noise, out)
     saturated_pixels = np.count_nonzero(saturated & ~hot, axis=(1, 2))
     fit, modelled = _without_neighbours(

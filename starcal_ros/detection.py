@@ -283,6 +283,30 @@ def stamps_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Floa
     return windows[centre[:, 1] - radius, centre[:, 0] - radius].astype(np.float64)
 
 
+def stamps_at_edges(
+    pixels: Pixels, centre: NDArray[np.int64], radius: int
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """
+    As `stamps_about`, for windows that may leave the image, and which of their pixels do.
+
+    What lies outside repeats the pixel at the edge.
+    """
+    shape = (pixels.shape[0], pixels.shape[1])
+    largest = np.array([shape[1] - 1, shape[0] - 1])
+    stamps = stamps_about(pixels, np.clip(centre, radius, largest - radius), radius)
+    outside = np.zeros(stamps.shape, bool)
+    leaves = np.nonzero(~windows_inside(shape, centre, radius))[0]
+    if len(leaves):
+        reach = np.arange(-radius, radius + 1)
+        u, v = (centre[leaves, axis, None] + reach for axis in (0, 1))
+        outside[leaves] = ((u < 0) | (u > largest[0]))[:, None] | ((v < 0) | (v > largest[1]))[
+            :, :, None
+        ]
+        u, v = np.clip(u, 0, largest[0]), np.clip(v, 0, largest[1])
+        stamps[leaves] = pixels[v[:, :, None], u[:, None]]
+    return stamps, outside
+
+
 def windows_inside(
     shape: tuple[int, int], centre: NDArray[np.int64], radius: int
 ) -> NDArray[np.bool_]:

@@ -47,7 +47,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
 
 STAR_REFUSALS: Mapping[str, str] = {
     'not_detected': 'predicted inside the image but no source stands there',
-    'border': 'the measuring window leaves the image',
+    'border': 'the core of the star, or its window by moments, leaves the image',
     'blend': 'another catalog star or source is in the measuring window',
     'saturated': 'a pixel of the star is saturated',
     'too_few_pixels': 'too few pixels stand above the noise',

@@ -305,7 +305,9 @@ def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure() -> None:
     before = observed(image, one.icrf_from_star_tracker_xyzw)
     shot = Shot(image, one.icrf_from_star_tracker_xyzw, 0.5)
     after, _ = observe_stars(shot, PRIOR, marked, CENTROIDS, OPTIONS)
-    assert after.refused_stars['blend'] > before.refused_stars['blend']
+    strict = dataclasses.replace(OPTIONS, max_blend_sigma=0.1)
+    fewer, _ = observe_stars(shot, PRIOR, marked, CENTROIDS, strict)
+    assert fewer.refused_stars['blend'] > after.refused_stars['blend']
     both, i, j = np.intersect1d(before.catalog_id, after.catalog_id, return_indices=True)
     more_px2 = after.covariance_px2[j] - before.covariance_px2[i]
     assert len(both) > 50 and (more_px2[:, [0, 2]] >= 0).all() and more_px2[:, 0].max() > 1e-6
