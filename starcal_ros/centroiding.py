@@ -27,13 +27,16 @@ from starcal_ros.fixed_pattern import hot_in_stamps, NO_HOT_PIXELS
 from starcal_ros.instrument import Instrument, PsfWidth, uniform_width
 from starcal_ros.options import option
 from starcal_ros.psf import (
+    approach,
+    first_guess,
+    fit_at,
     fit_psf,
     light_in_stamps,
     noise_sums,
     PixelNoise,
     PsfFit,
-    replace_rows,
     stamp_radius_px,
+    Stamps,
 )
 
 Floats = NDArray[np.float64]
@@ -42,6 +45,7 @@ _MAD_TO_SIGMA = 1.4826  # of a normal distribution
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitive than another
 _MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours
 _NEIGHBOUR_NOISE = 0.2  # of the noise of a pixel: less light of a neighbour changes nothing
+_FIRST_STEPS = 2  # of a fit, before the light of neighbours is taken off
 _BRIGHTEST = 60  # stars that show the level of saturation
 _MIN_PSF_SIGMA_PX = 0.45
 _MAX_PSF_SIGMA_PX = 4.0
@@ -290,22 +294,23 @@ def _measure_by_psf(
     sigma_px = psf.at(at_px)
     saturated = (stamps >= model.saturation_dn) & ~outside
     hot = hot_in_stamps(hot_pixels, centre, radius, shape[1]) & ~outside
-    # The start of the fit looks at all pixels; to the fit itself these say nothing.
-    stamps[hot] = np.median(stamps, axis=(1, 2))[np.nonzero(hot)[0]] if hot.any() else 0.0
+    # The first guess looks at all pixels; to the fit itself these say nothing.
+    if hot.any():
+        stamps[hot] = np.median(stamps, axis=(1, 2))[np.nonzero(hot)[0]]
     out = saturated | hot | outside
-    fit = fit_psf(stamps, sigma_px, noise_dn, model.pixel_noise, out)
+    windows = Stamps(stamps, sigma_px, noise_dn[:, None] ** 2, out if out.any() else None)
+    parameters = approach(windows, first_guess(windows), model.pixel_noise, _FIRST_STEPS)
     saturated_pixels = np.count_nonzero(saturated & ~hot, axis=(1, 2))
-    fit, modelled = _without_neighbours(
-        stamps,
+    windows, parameters, modelled = _without_neighbours(
+        windows,
+        parameters,
         predicted_px,
         centre,
-        fit,
         inside & (saturated_pixels == 0),
-        sigma_px,
-        noise_dn,
-        model,
-        out,
+        model.pixel_noise,
     )
+    parameters = approach(windows, parameters, model.pixel_noise)
+    fit = fit_at(windows, parameters, model.pixel_noise)
     x, y, flux, _ = fit.parameters.T
     covariance = fit.covariance
     snr = fit.snr
@@ -339,65 +344,60 @@ def _measure_by_psf(
 
 
 def _without_neighbours(
-    stamps: Floats,
+    stamps: Stamps,
+    parameters: Floats,
     predicted_px: Floats,
     centre: NDArray[np.int64],
-    fit: PsfFit,
     usable: NDArray[np.bool_],
-    sigma_px: Floats,
-    noise_dn: Floats,
-    model: ImageModel,
-    out: NDArray[np.bool_],
-) -> tuple[PsfFit, NDArray[np.bool_]]:
+    noise: PixelNoise,
+) -> tuple[Stamps, Floats, NDArray[np.bool_]]:
     """
-    The fits once more, without the light of those neighbours that are measured themselves.
+    The stamps without the light of those neighbours that are measured themselves.
 
-    Also (n,) which stars those are.  Only stars with a neighbour in reach are fitted again, and
-    once more those whose neighbours were freed from their own in between.
+    Also the parameters (n, 4), near those of their fit, and (n,) which stars those are.
     """
-    n, width, _ = stamps.shape
-    in_place = np.abs(fit.parameters[:, :2]).max(axis=1) < 1.5
-    modelled = usable & (fit.snr > _MODELLED_SNR) & in_place
-    if n < 2:
-        return fit, modelled
+    flux, sigma_px = parameters[:, 2], stamps.sigma_px
+    # In the light of 4 pi sigma^2 pixels of the sky stands what noise a fitted flux has.
+    sky_dn2 = 4.0 * math.pi * sigma_px**2 * stamps.noise2_dn2[:, 0]
+    snr2 = flux**2 / (sky_dn2 + np.maximum(flux, 0.0) / noise.gain_e_per_dn)
+    in_place = np.abs(parameters[:, :2]).max(axis=1) < 1.5
+    modelled = usable & (flux > 0.0) & (snr2 > _MODELLED_SNR**2) & in_place
+    if len(stamps) < 2:
+        return stamps, parameters, modelled
+    widest_px = float(sigma_px.max())
     # A star out of the stamp lights it with its wing.
-    reach_px = math.sqrt(2.0) * (width // 2) + 2.0 * float(sigma_px.max(initial=0.0))
+    reach_px = math.sqrt(2.0) * (stamps.width // 2) + 2.0 * widest_px
     pairs = cKDTree(centre).query_pairs(reach_px, output_type='ndarray')
     apart_px = np.linalg.norm(predicted_px[pairs[:, 0]] - predicted_px[pairs[:, 1]], axis=1)
-    near = apart_px < max(3.0, 3.0 * float(sigma_px.max(initial=0.0)))
     # Both would be fitted to the light of the brighter one, which comes first.
-    modelled[pairs[near].max(axis=1)] = False
+    modelled[pairs[apart_px < max(3.0, 3.0 * widest_px)].max(axis=1)] = False
     star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     told = modelled[other]
     star, other = star[told], other[told]
     away_px = (centre[other] - centre[star]).astype(np.float64)
+    freed = stamps
+    # Twice: the light of a neighbour is known better once it is freed from that of its own.
     for _ in range(2):
-        if len(star) == 0:
-            break
-        at_px = away_px + fit.parameters[other, :2]
-        light = light_in_stamps(at_px, fit.parameters[other, 2], sigma_px[other], width)
-        lit = light.max(axis=1, initial=0.0) > _NEIGHBOUR_NOISE * noise_dn[star]
+        light = light_in_stamps(
+            away_px + parameters[other, :2], parameters[other, 2], sigma_px[other], stamps.width
+        )
+        lit = light.max(axis=1, initial=0.0) > _NEIGHBOUR_NOISE * np.sqrt(
+            stamps.noise2_dn2[star, 0]
+        )
         again, row = np.unique(star[lit], return_inverse=True)
         if len(again) == 0:
             break
-        neighbours = np.zeros((len(again), width * width))
+        neighbours = np.zeros((len(again), stamps.width**2))
         np.add.at(neighbours, row, light[lit])
+        data_dn = stamps.data_dn.copy()
+        data_dn[again] -= neighbours.reshape(-1, stamps.width, stamps.width)
         # The light is taken off, its photon noise stays.
-        noise = model.pixel_noise
-        noise2 = noise_dn[again, None] ** 2
-        noise2 = noise2 + neighbours / (noise.gain_e_per_dn * noise.background)
-        freed = fit_psf(
-            stamps[again] - neighbours.reshape(-1, width, width),
-            sigma_px[again],
-            np.sqrt(noise2),
-            model.pixel_noise,
-            out[again],
-            fit.parameters[again],
-        )
-        fit = replace_rows(fit, again, freed)
-        after_freed = np.isin(star, star[np.isin(other, again)])
-        star, other, away_px = star[after_freed], other[after_freed], away_px[after_freed]
-    return fit, modelled
+        noise2_dn2 = np.repeat(stamps.noise2_dn2, stamps.width**2, axis=1)
+        noise2_dn2[again] += neighbours / (noise.gain_e_per_dn * noise.background)
+        freed = Stamps(data_dn, sigma_px, noise2_dn2, stamps.out)
+        parameters = parameters.copy()
+        parameters[again] = approach(freed.select(again), parameters[again], noise, _FIRST_STEPS)
+    return freed, parameters, modelled
 
 
 def _measure_by_moments(

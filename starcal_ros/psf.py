@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 _FIT_STEPS = 4  # stars settle in two or three; what has not by then is no star
 # Gauss-Newton divides what is left of the way by ten and more with each step, and takes one more.
-_SETTLED_SIGMA = 0.1
+_SETTLED_SIGMA = 0.3
 _SIGNIFICANT = 3.0  # sigma
 
 
@@ -80,28 +80,66 @@ def select(fit: PsfFit, stars: NDArray[np.intp] | NDArray[np.bool_]) -> PsfFit:
     return PsfFit(**{field.name: getattr(fit, field.name)[stars] for field in fields(fit)})
 
 
-def replace_rows(fit: PsfFit, stars: NDArray[np.intp], by: PsfFit) -> PsfFit:
-    """Return the fits with those of some stars, by row number, replaced."""
-    changed = {}
-    for field in fields(fit):
-        column = getattr(fit, field.name).copy()
-        column[stars] = getattr(by, field.name)
-        changed[field.name] = column
-    return PsfFit(**changed)
-
-
 def stamp_radius_px(psf_sigma_px: float) -> int:
     """Half width of the fitting window: beyond 3.5 sigma lies under 0.3 % of a star's light."""
     return int(np.clip(np.ceil(3.5 * psf_sigma_px), 3, 12))
 
 
+@dataclass(frozen=True)
+class Stamps:
+    """
+    Square windows about stars, and what a fit needs to know of each pixel.
+
+    Parameters
+    ----------
+    data_dn : (n, w, w)
+        Pixel values; the star within a pixel or so of the middle.
+    sigma_px : (n,)
+        Width of the PSF at each star.
+    noise2_dn2 : (n, 1) or (n, w * w)
+        Variance of each star's pixels, or of each pixel, without the star's own light.
+    out : (n, w, w), optional
+        Pixels that say nothing of the star, saturated or hot, and take no part.
+    """
+
+    data_dn: Floats
+    sigma_px: Floats
+    noise2_dn2: Floats
+    out: NDArray[np.bool_] | None = None
+
+    def __len__(self) -> int:
+        """Return the number of stars."""
+        return len(self.data_dn)
+
+    @property
+    def width(self) -> int:
+        """Pixels along each side of a window."""
+        return self.data_dn.shape[1]
+
+    @property
+    def flat_dn(self) -> Floats:
+        """Pixel values, (n, w * w)."""
+        return self.data_dn.reshape(len(self), self.width**2)
+
+    @property
+    def valid(self) -> NDArray[np.bool_] | None:
+        """Which pixels (n, w * w) take part; None: all."""
+        return None if self.out is None else ~self.out.reshape(len(self), self.width**2)
+
+    def select(self, stars: NDArray[np.intp]) -> Stamps:
+        """Return the windows of some stars, by row number."""
+        if len(stars) == len(self):
+            return self
+        return Stamps(
+            self.data_dn[stars],
+            self.sigma_px[stars],
+            self.noise2_dn2[stars],
+            None if self.out is None else self.out[stars],
+        )
+
+
 def fit_psf(
-    stamps: Floats,
-    sigma_px: float | Floats,
-    noise_dn: Floats,
-    pixel_noise: PixelNoise,
-    out: NDArray[np.bool_] | None = None,
-    start: Floats | None = None,
+    stamps: Floats, sigma_px: float | Floats, noise_dn: Floats, pixel_noise: PixelNoise
 ) -> PsfFit:
     """
     Weighted least-squares fit of the pixel-integrated Gaussian to every stamp at once.
@@ -112,48 +150,52 @@ def fit_psf(
         Pixel values, DN; the star within a pixel or so of the centre.
     sigma_px : float or (n,)
         Width of the PSF, at each star.
-    noise_dn : (n,) or (n, w * w)
-        Noise at each star, or in each pixel, without the star's own light.
+    noise_dn : (n,)
+        Noise at each star, without its own light.
     pixel_noise : PixelNoise
         How the noise grows with signal.
-    out : (n, w, w), optional
-        Pixels that say nothing of the star, saturated or hot, and take no part.
-    start : (n, 4), optional
-        Parameters near which the fit ends.
+    """
+    sigma_px = np.broadcast_to(np.asarray(sigma_px, np.float64), (len(stamps),))
+    windows = Stamps(stamps, sigma_px, noise_dn[:, None] ** 2)
+    return fit_at(windows, approach(windows, first_guess(windows), pixel_noise), pixel_noise)
 
-    Notes
-    -----
+
+def approach(
+    stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise, steps: int = _FIT_STEPS
+) -> Floats:
+    """
+    Parameters (n, 4) after some steps towards the fit: x, y (px), flux, background (DN).
+
     Gauss-Newton with the weights renewed from the model at each step, so that the noise of the
     data does not bias them; a step in position is at most half a pixel.  Stars that have settled
     are left alone.
     """
-    n, w, _ = stamps.shape
-    sigma_px = np.broadcast_to(np.asarray(sigma_px, np.float64), (n,))
-    data = stamps.reshape(n, w * w)
-    valid = np.ones(data.shape, bool) if out is None else ~out.reshape(n, w * w)
-    parameters = _start(stamps, sigma_px) if start is None else start.copy()
-    noise2 = (noise_dn[:, None] if noise_dn.ndim == 1 else noise_dn) ** 2
-    active = np.arange(n)
-    for _ in range(_FIT_STEPS):
+    parameters = parameters.copy()
+    half_px = stamps.width / 2
+    active = np.arange(len(stamps))
+    for _ in range(steps):
         if len(active) == 0:
             break
-        all_active = len(active) == n
-        at = parameters[active]
-        rows = _psf_rows(at, data if all_active else data[active], sigma_px[active], w, 4)
-        weight = _weights(rows, at, noise2[active], valid[active], pixel_noise)
-        normal, gradient = _normal(rows, weight)
+        chosen, at = stamps.select(active), parameters[active]
+        rows = _psf_rows(at, chosen.flat_dn, chosen.sigma_px, chosen.width, 4)
+        normal, gradient = _normal(rows, _weights(rows, at, chosen, pixel_noise))
         step = np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
         step[:, :2] = np.clip(step[:, :2], -0.5, 0.5)
         at = at + step
-        at[:, :2] = np.clip(at[:, :2], -w / 2, w / 2)
+        at[:, :2] = np.clip(at[:, :2], -half_px, half_px)
         parameters[active] = at
         # Against the sigma of the place with flux and background known, the smaller one.
         moving = step[:, :2] ** 2 * np.einsum('nii->ni', normal)[:, :2] > _SETTLED_SIGMA**2
         active = active[moving.any(axis=1)]
+    return parameters
 
+
+def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFit:
+    """Fits to stamps whose parameters (n, 4) are near: the last step, and what is known of it."""
+    valid = stamps.valid
     # Second moments: one linear step from the solution, in units of the PSF variance.
-    rows = _psf_rows(parameters, data, sigma_px, w, 7)
-    weight = _weights(rows, parameters, noise2, valid, pixel_noise)
+    rows = _psf_rows(parameters, stamps.flat_dn, stamps.sigma_px, stamps.width, 7)
+    weight = _weights(rows, parameters, stamps, pixel_noise)
     normal, gradient = _normal(rows, weight)
     covariance = np.asarray(np.linalg.inv(normal[:, :4, :4]), np.float64)
     last = (covariance @ gradient[:, :4, None])[:, :, 0]
@@ -182,14 +224,14 @@ def fit_psf(
         shape_change=shape_step[:, 4:],
         shape_sigma=np.sqrt(np.einsum('nii->ni', shape_covariance)[:, 4:]),
         signal_dn=signal,
-        residual_dn=np.where(valid, residual, np.nan),
+        residual_dn=residual if valid is None else np.where(valid, residual, np.nan),
         freedom=np.maximum(1.0 - leverage, 0.05),
     )
 
 
-def _start(stamps: Floats, sigma_px: Floats) -> Floats:
+def first_guess(windows: Stamps) -> Floats:
     """Parameters (n, 4) from which the fit starts: the centre of the light next to the middle."""
-    w = stamps.shape[1]
+    stamps, sigma_px, w = windows.data_dn, windows.sigma_px, windows.width
     border = np.concatenate(
         [stamps[:, 0], stamps[:, -1], stamps[:, 1:-1, 0], stamps[:, 1:-1, -1]], axis=1
     )
@@ -386,18 +428,13 @@ def _psf_rows(
     return rows
 
 
-def _weights(
-    rows: Floats,
-    parameters: Floats,
-    noise2: Floats,
-    valid: NDArray[np.bool_],
-    pixel_noise: PixelNoise,
-) -> Floats:
+def _weights(rows: Floats, parameters: Floats, stamps: Stamps, pixel_noise: PixelNoise) -> Floats:
     """Inverse noise variance (n, p) of pixels, 0 for those that take no part."""
     variance = np.maximum(parameters[:, 2, None], 0.0) * rows[:, 2]
     variance /= pixel_noise.gain_e_per_dn
-    variance += pixel_noise.background * noise2
-    return np.asarray(valid / variance)
+    variance += pixel_noise.background * stamps.noise2_dn2
+    valid = stamps.valid
+    return np.asarray(1.0 / variance if valid is None else valid / variance)
 
 
 def _normal(rows: Floats, weight: Floats) -> tuple[Floats, Floats]:

@@ -67,8 +67,10 @@ def test_a_followed_image_gives_the_stars_of_a_search(index: int) -> None:
     assert len(both) > 0.8 * max(len(tracked), len(whole))
     apart = tracked.measured_px[a] - whole.measured_px[b]
     sigma = np.sqrt(whole.covariance_px2[b][:, [0, 2]])
-    # The same pixels; width and noise are known a little otherwise.
-    assert np.sqrt(np.mean((apart / sigma) ** 2)) < 0.1
+    # The same pixels; width and noise are known a little otherwise.  A star whose neighbour is at
+    # the limit of being measured itself moves by what that pulls, which is in its covariance.
+    off2 = np.sort(((apart / sigma) ** 2).mean(axis=1))
+    assert np.sqrt(off2[:-1].mean()) < 0.05 and off2[-1] < 9.0
     assert tracked.noise_dn == pytest.approx(whole.noise_dn, rel=0.1)
     assert tracked.background_dn == pytest.approx(whole.background_dn, abs=0.5)
 
