@@ -1,7 +1,7 @@
 """
 From pixels to a calibration, against the Cramer-Rao bound: cameras, PSF widths, star trackers.
 
-Every seed renders a campaign of its own, measures it through `pipeline.observe_next`, solves it,
+Every seed renders a campaign of its own, measures it through `sequence.observe_next`, solves it,
 and compares the lines of sight over the detector with the truth, the best common turn removed.
 The bound is that of every star above a signal-to-noise ratio of 5, the attitude of each image
 free.  One draw scatters by about 30 %: the figure is the rms over the seeds.
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from bench.frames import history, load_set_up, render_frame
 from bench.table import Table
-from starcal_ros import pipeline, synthetic, synthetic_centroids
+from starcal_ros import sequence, solution, synthetic, synthetic_centroids
 from starcal_ros.campaign_trials import map_bound_px
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.observability import map_error_px
@@ -158,16 +158,16 @@ def trial(case: Case, seed: int) -> Floats:
     """
     scenario = scenario_of(case, seed)
     setup = load_set_up(scenario)
-    track = pipeline.Track(setup.prior)
+    track = sequence.Track(setup.prior)
     ensemble, stars = Ensemble(), []
     for index in range(scenario.image_count):
         image, samples = render_frame(scenario, index)
-        observed, track = pipeline.observe_next(image, history(samples), setup, track)
-        ensemble = pipeline.add_to_ensemble(ensemble, observed, setup)
+        observed, track = sequence.observe_next(image, history(samples), setup, track)
+        ensemble = solution.add_to_ensemble(ensemble, observed, setup)
         if len(observed):
             stars.append(_star_errors(scenario, index, observed))
     try:
-        found = pipeline.solve(ensemble, setup)
+        found = solution.solve(ensemble, setup)
     except TooFewObservations:
         return np.full(4, np.nan)
     bound = np.zeros((13, 13))

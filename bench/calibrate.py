@@ -18,9 +18,9 @@ TARGET_S = 6.0
 # What a call takes with all that it calls; the stages indented below one are parts of it.
 _STAGES = (
     ('import of Python modules', 'importlib._bootstrap', '_find_and_load'),
-    ('load options, camera, catalog', 'pipeline', 'load_setup'),
+    ('load options, camera, catalog', 'camera_setup', 'load_setup'),
     ('read images from the bag', 'bag', 'read_images'),
-    ('measure and identify stars', 'pipeline', 'observe_next'),
+    ('measure and identify stars', 'sequence', 'observe_next'),
     ('  background', 'detection', 'measure_background'),
     ('  prediction', 'prediction', 'predict'),
     ('  match', 'identification', '_find'),

@@ -21,9 +21,10 @@ from typing import Any
 from bench import graph
 from bench.frames import history, render_frame, write_set_up
 from bench.table import Table
-from starcal_ros import bag, pipeline, simulation, synthetic
+from starcal_ros import bag, sequence, simulation, solution, synthetic
 from starcal_ros.archive import Archive
 from starcal_ros.calibration_messages import calibration_to_message
+from starcal_ros.camera_setup import load_setup
 from starcal_ros.errors import BagError
 from starcal_ros.image_messages import image_to_message
 from starcal_ros.message_fields import make_header
@@ -74,14 +75,14 @@ class _Bench:
         self.params = write_set_up(self.scenario, folder)
         self.log = folder / 'log'
         self.frames = [render_frame(self.scenario, index) for index in range(10)]
-        self.setup = pipeline.load_setup(read_parameter_file(self.params, ()))
+        self.setup = load_setup(read_parameter_file(self.params, ()))
         self.observations: list[StarObservations] = []
-        track = pipeline.Track(self.setup.prior)
+        track = sequence.Track(self.setup.prior)
         for image, samples in self.frames:
-            found, track = pipeline.observe_next(image, history(samples), self.setup, track)
+            found, track = sequence.observe_next(image, history(samples), self.setup, track)
             self.observations.append(found)
         ensemble = functools.reduce(Ensemble.add, self.observations, Ensemble())
-        self.calibration = pipeline.solve(ensemble, self.setup)
+        self.calibration = solution.solve(ensemble, self.setup)
 
     def message(self, record: StarObservations, time_ns: int | None = None) -> Any:
         """Observations as a message, with another stamp where one is given."""

@@ -8,9 +8,10 @@ import tempfile
 
 import yaml
 
-from starcal_ros import pipeline, simulation, synthetic, synthetic_images
+from starcal_ros import simulation, synthetic, synthetic_images
 from starcal_ros.attitude import AttitudeHistory
 from starcal_ros.camera_info import write_camera_info
+from starcal_ros.camera_setup import load_setup, Setup
 from starcal_ros.options import read_parameter_file
 from starcal_ros.records import AttitudeSample, Image
 from starcal_ros.synthetic import Scenario
@@ -26,11 +27,11 @@ def write_set_up(scenario: Scenario, folder: Path, **values: object) -> Path:
     return params
 
 
-def load_set_up(scenario: Scenario, **values: object) -> pipeline.Setup:
+def load_set_up(scenario: Scenario, **values: object) -> Setup:
     """The options of a scenario with its prior camera and catalog loaded."""
     with tempfile.TemporaryDirectory() as folder:
         params = write_set_up(scenario, Path(folder), **values)
-        return pipeline.load_setup(read_parameter_file(params, ()))
+        return load_setup(read_parameter_file(params, ()))
 
 
 def paper_scenario(magnitude_limit: float) -> Scenario:
@@ -45,7 +46,7 @@ def render_frame(scenario: Scenario, index: int) -> tuple[Image, list[AttitudeSa
 
 
 def history(samples: list[AttitudeSample]) -> AttitudeHistory:
-    """The samples as the pipeline takes them."""
+    """The samples as a sequence takes them."""
     attitudes = AttitudeHistory()
     for sample in samples:
         attitudes.add(sample.time_ns, sample)

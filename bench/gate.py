@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from bench.frames import load_set_up
 from bench.table import Table
-from starcal_ros import pipeline
+from starcal_ros import solution
 from starcal_ros.camera import project
+from starcal_ros.camera_setup import Setup
 from starcal_ros.campaign_trials import (
     draw_star_field,
     observe,
@@ -91,14 +92,14 @@ def run(quick: bool) -> list[Table]:
 
 
 def _judged(
-    setup: pipeline.Setup, field: StarField, ensemble: Ensemble, tracker_arcsec: float
+    setup: Setup, field: StarField, ensemble: Ensemble, tracker_arcsec: float
 ) -> tuple[list[str], float, float]:
     """Names of the limits that a campaign fails, the chance of its halves, its error, px."""
     told = (tracker_arcsec,) * 3
     options = dataclasses.replace(setup.calibration, star_tracker_sigma_arcsec=told)
     setup = dataclasses.replace(setup, prior=field.prior, calibration=options)
     try:
-        found = pipeline.solve(ensemble, setup)
+        found = solution.solve(ensemble, setup)
     except TooFewObservations:
         return ['cannot be solved'], np.nan, np.nan
     names = [check.option or check.note for check in found.gate if check.kept is False]

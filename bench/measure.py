@@ -1,5 +1,5 @@
 """
-The stars of one frame: `pipeline.observe_next` against the detectors of sep and photutils.
+The stars of one frame: `sequence.observe_next` against the detectors of sep and photutils.
 
 Those two only detect and centroid; ours also predicts, identifies, fits the PSF and judges every
 star.  All take the same mono16 frame of 2592 x 2048.
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.frames import history, load_set_up, paper_scenario, render_frame
 from bench.table import Table
-from starcal_ros import pipeline
+from starcal_ros import sequence
 from starcal_ros.detection import Pixels
 
 MAGNITUDE_LIMIT = 7.45  # leaves about 120 stars
@@ -32,7 +32,7 @@ def run(quick: bool) -> list[Table]:
     setup = load_set_up(scenario, magnitude_limit=MAGNITUDE_LIMIT)
     image, samples = render_frame(scenario, 0)
     attitudes = history(samples)
-    _, track = pipeline.observe_next(image, attitudes, setup, pipeline.Track(setup.prior))
+    _, track = sequence.observe_next(image, attitudes, setup, sequence.Track(setup.prior))
     track = dataclasses.replace(track, latest_ns=None)  # the same image once more
     prior = Rotation.from_quat(setup.prior.star_tracker_from_camera_xyzw)
     turn = Rotation.from_rotvec(np.radians(ACQUISITION_DEG) * np.array([0.6, -0.8, 0.0]))
@@ -40,12 +40,12 @@ def run(quick: bool) -> list[Table]:
         setup.prior, star_tracker_from_camera_xyzw=(prior * turn).as_quat()
     )
     ways: dict[str, Callable[[], int]] = {
-        'starcal, tracking': lambda: len(pipeline.observe_next(image, attitudes, setup, track)[0]),
+        'starcal, tracking': lambda: len(sequence.observe_next(image, attitudes, setup, track)[0]),
         'starcal, first image': lambda: len(
-            pipeline.observe(image, attitudes, setup, setup.prior)
+            sequence.observe(image, attitudes, setup, setup.prior)
         ),
         f'starcal, alignment {ACQUISITION_DEG} deg off': lambda: len(
-            pipeline.observe(image, attitudes, setup, shifted)
+            sequence.observe(image, attitudes, setup, shifted)
         ),
     }
     if importlib.util.find_spec('sep'):

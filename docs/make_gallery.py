@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from docs.make_images import FOLDER, setup_of
-from starcal_ros import pipeline, synthetic, synthetic_images
+from starcal_ros import sequence, synthetic, synthetic_images
 from starcal_ros.annotation import annotate
 from starcal_ros.attitude import AttitudeHistory
 from starcal_ros.records import Image, StarObservations
@@ -89,15 +89,15 @@ def whole_frames() -> Mapping[str, tuple[Image, StarObservations]]:
     found = {}
     earlier = Image(SCENARIO.time_ns(FIELD - 1), before)
     held = attitudes()
-    _, track = pipeline.observe_next(earlier, held, SETUP, pipeline.Track(SETUP.prior))
+    _, track = sequence.observe_next(earlier, held, SETUP, sequence.Track(SETUP.prior))
     for name, spoilt in frames.items():
         image = Image(time_ns, spoilt)
-        found[name] = (image, pipeline.observe_next(image, held, SETUP, track)[0])
+        found[name] = (image, sequence.observe_next(image, held, SETUP, track)[0])
     frozen = Image(time_ns, before)
-    found['frozen'] = (frozen, pipeline.observe_next(frozen, held, SETUP, track)[0])
+    found['frozen'] = (frozen, sequence.observe_next(frozen, held, SETUP, track)[0])
     image = Image(time_ns, pixels)
     jumped = attitudes(reported=FIELD + 1)
-    found['no_match'] = (image, pipeline.observe(image, jumped, SETUP, SETUP.prior))
+    found['no_match'] = (image, sequence.observe(image, jumped, SETUP, SETUP.prior))
     return found
 
 
@@ -121,7 +121,7 @@ def drawn(image: Image, observations: StarObservations) -> Picture:
 
 def spoilt_stars() -> tuple[Image, StarObservations]:
     """A frame in which single stars have met with an accident each, and what became of them."""
-    plain = pipeline.observe(
+    plain = sequence.observe(
         Image(SCENARIO.time_ns(FIELD), expose(electrons())), attitudes(), SETUP, SETUP.prior
     )
     places = plain.measured_px[np.argsort(-plain.snr)]
@@ -140,7 +140,7 @@ def spoilt_stars() -> tuple[Image, StarObservations]:
         SETUP, hot=dataclasses.replace(SETUP.hot, index=np.array([number], np.int64))
     )
     image = Image(SCENARIO.time_ns(FIELD), bright)
-    return image, pipeline.observe(image, attitudes(), known, known.prior)
+    return image, sequence.observe(image, attitudes(), known, known.prior)
 
 
 def star_sheet(image: Image, observations: StarObservations) -> Picture:

@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 import yaml
 
-from starcal_ros import cli, pipeline, simulation, synthetic, synthetic_images
+from starcal_ros import cli, sequence, simulation, solution, synthetic, synthetic_images
 from starcal_ros.annotation import annotate
 from starcal_ros.attitude import AttitudeHistory
 from starcal_ros.camera import distortion_px, pixel_grid
 from starcal_ros.camera_info import write_camera_info
+from starcal_ros.camera_setup import load_setup, Setup
 from starcal_ros.observability import coverage
 from starcal_ros.options import read_parameter_file
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
@@ -40,23 +41,21 @@ SHOWN_IMAGE = 12
 CLOSE_UP_FIRST, CLOSE_UP_SIZE = (826, 520), (270, 212)  # a part with bright and faint stars
 
 
-def setup_of(scenario: Scenario) -> pipeline.Setup:
+def setup_of(scenario: Scenario) -> Setup:
     """What `starcal calibrate` would start on a simulated campaign with."""
     with tempfile.TemporaryDirectory() as folder:
         camera, params = Path(folder, 'camera.yaml'), Path(folder, 'params.yaml')
         write_camera_info(scenario.prior.camera, camera)
         params.write_text(yaml.safe_dump(simulation.parameters(scenario, str(camera))))
-        return pipeline.load_setup(read_parameter_file(params, ()))
+        return load_setup(read_parameter_file(params, ()))
 
 
-def observe(
-    scenario: Scenario, setup: pipeline.Setup, image: Image, index: int
-) -> StarObservations:
+def observe(scenario: Scenario, setup: Setup, image: Image, index: int) -> StarObservations:
     """The stars of one simulated image."""
     attitudes = AttitudeHistory()
     for sample in synthetic.attitude_samples(scenario, index):
         attitudes.add(sample.time_ns, sample)
-    return pipeline.observe(image, attitudes, setup, setup.prior)
+    return sequence.observe(image, attitudes, setup, setup.prior)
 
 
 def part_of(
@@ -125,9 +124,9 @@ def star_field(
     cv2.imwrite(str(file), picture // 16 * 17, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
-def focal_plane(ensemble: Ensemble, setup: pipeline.Setup, file: Path) -> None:
+def focal_plane(ensemble: Ensemble, setup: Setup, file: Path) -> None:
     """The distortion found, and where the stars stood that it was found from."""
-    calibration = pipeline.solve(ensemble, setup)
+    calibration = solution.solve(ensemble, setup)
     camera = calibration.geometry.camera
     figure = Figure(figsize=(11, 4.6), layout='constrained')
     left, right = figure.subplots(1, 2)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 import threading
 
-from starcal_ros import pipeline
+from starcal_ros import solution
 from starcal_ros.archive import Archive, InForce
+from starcal_ros.camera_setup import Setup
 from starcal_ros.errors import ArchiveError, OptionError, StarcalError
 from starcal_ros.node_options import CalibratorOptions
 from starcal_ros.records import Calibration, Ensemble, EnsembleStatus, StarObservations
@@ -52,7 +53,7 @@ class CalibratorState:
         self._archive: Archive | None = None
         self._folder = ''
 
-    def open(self, setup: pipeline.Setup, options: CalibratorOptions) -> None:
+    def open(self, setup: Setup, options: CalibratorOptions) -> None:
         """
         Take up what the state folder holds; without one, go on with what is in memory.
 
@@ -81,7 +82,7 @@ class CalibratorState:
                     if image.time_ns not in read:
                         ensemble = ensemble.add(image)
                 history = history or self._history
-            self._ensemble = pipeline.within_limit(ensemble, setup)
+            self._ensemble = solution.within_limit(ensemble, setup)
             self._history, self._folder = history, options.state_dir
             self._archive, self.damage = archive, tuple(archive.damage)
         self.save()
@@ -109,10 +110,10 @@ class CalibratorState:
         """Take one more image, or the reason why it was refused."""
         with self._records:
             ensemble = self._ensemble
-        grown = pipeline.add_to_ensemble(ensemble, observations, self._setup)
+        grown = solution.add_to_ensemble(ensemble, observations, self._setup)
         with self._records:
             if self._ensemble is not ensemble:  # emptied meanwhile: it starts with this image
-                grown = pipeline.add_to_ensemble(Ensemble(), observations, self._setup)
+                grown = solution.add_to_ensemble(Ensemble(), observations, self._setup)
             self._ensemble = grown
         self.save()
 
@@ -129,7 +130,7 @@ class CalibratorState:
         ensemble = self.ensemble
         with self._disk:
             saved = self._archive.saved(ensemble) if self._archive else 0
-        status = pipeline.ensemble_status(ensemble, self._setup)
+        status = solution.ensemble_status(ensemble, self._setup)
         return dataclasses.replace(status, images_saved=saved)
 
     def solve(
@@ -143,7 +144,7 @@ class CalibratorState:
         """Solve, and put in force what the gate accepts or ``force`` demands."""
         ensemble = self.ensemble
         try:
-            calibration, residuals = pipeline.solve_with_residuals(
+            calibration, residuals = solution.solve_with_residuals(
                 ensemble, self._setup, method, estimate, in_force=self.in_force
             )
         except StarcalError as error:
@@ -220,7 +221,7 @@ def summary(calibration: Calibration) -> str:
 
 
 def _check_size(
-    folder: str, ensemble: Ensemble, history: tuple[InForce, ...], setup: pipeline.Setup
+    folder: str, ensemble: Ensemble, history: tuple[InForce, ...], setup: Setup
 ) -> None:
     prior = setup.prior.camera
     sizes = {(image.width, image.height) for image in ensemble.images}

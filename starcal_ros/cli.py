@@ -31,7 +31,7 @@ from starcal_ros.terminal import print_verdict, progress_bar, with_progress
 # numpy, scipy, OpenCV and the like cost a second to import: each command takes what it needs, so
 # that --help answers at once.
 if TYPE_CHECKING:
-    from starcal_ros.pipeline import Setup
+    from starcal_ros.camera_setup import Setup
     from starcal_ros.records import Calibration, Ensemble
     from starcal_ros.sources import Topics
 
@@ -82,7 +82,7 @@ def _calibrate_into(
     folder: Path, bags: Sequence[Path], asked: Topics, setup: Setup, inputs: Mapping[str, str]
 ) -> Calibration:
     """Calibrate from bags; all that a report is made from goes into the folder."""
-    from starcal_ros import bag, pipeline, residuals, sources, thumbnails
+    from starcal_ros import bag, residuals, solution, sources, thumbnails
     from starcal_ros.product_files import OBSERVATIONS_FILE
     from starcal_ros.records import Ensemble
 
@@ -92,14 +92,14 @@ def _calibrate_into(
     observations = list(with_progress(records, sources.count(bags, topics), 'images'))
     ensemble = Ensemble()
     for record in observations:
-        ensemble = pipeline.add_to_ensemble(ensemble, record, setup)
+        ensemble = solution.add_to_ensemble(ensemble, record, setup)
     _make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     with bag.BagWriter(folder / OBSERVATIONS_FILE) as writer:
         for record in observations:
             writer.write_observations('/observations', record, setup.frames.camera_frame)
     try:
-        calibration, left = pipeline.solve_with_residuals(ensemble, setup, inputs=inputs)
+        calibration, left = solution.solve_with_residuals(ensemble, setup, inputs=inputs)
     except TooFewObservations as error:
         raise TooFewObservations(f'{error}{_refused_words(ensemble)}') from error
     _write_products(calibration, folder)
@@ -110,14 +110,14 @@ def _calibrate_into(
 
 def _setup(params: Path) -> Setup:
     """Every option of a parameter file, and what they name, loaded."""
-    from starcal_ros import pipeline
     from starcal_ros.camera_info import with_camera_url_from
+    from starcal_ros.camera_setup import load_setup
     from starcal_ros.node_options import NODE_OPTION_CLASSES
     from starcal_ros.options import read_parameter_file
 
     values = with_camera_url_from(read_parameter_file(params, NODES), params)
     try:
-        return pipeline.load_setup(values, others=NODE_OPTION_CLASSES)
+        return load_setup(values, others=NODE_OPTION_CLASSES)
     except OptionError as error:
         raise OptionError(f'{params}: {error}') from error
 
@@ -236,7 +236,8 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _demo(args: argparse.Namespace) -> int:
     """Calibrate the small bag with the real nodes and hold the result against the truth."""
-    from starcal_ros import comparison, demo, pipeline, report
+    from starcal_ros import comparison, demo, report
+    from starcal_ros.camera_setup import load_setup
     from starcal_ros.sources import Topics
 
     _make_folder(args.output)
@@ -256,7 +257,7 @@ def _demo(args: argparse.Namespace) -> int:
         + ('as chance has it' if good else f'over {_DEMO_SIGMAS:g}: something is wrong'),
     )
     # Nodes tell no residuals. The tool's are theirs where it finds the same calibration.
-    setup = pipeline.load_setup(bag.parameters)
+    setup = load_setup(bag.parameters)
     again = _calibrate_into(args.output, [bag.bag], Topics(), setup, {})
     _write_products(calibration, args.output)
     apart_px = float(comparison.compare(calibration, again).before.length_px.max())
@@ -283,7 +284,7 @@ def _campaign(args: argparse.Namespace) -> int:
         campaign,
         campaign_figures,
         campaign_workers,
-        pipeline,
+        provenance,
     )
     from starcal_ros.options import nearest
     from starcal_ros.product_files import write_atomically
@@ -314,7 +315,7 @@ def _campaign(args: argparse.Namespace) -> int:
     seconds = time.monotonic() - start
     found = campaign.conclude(design, rows)
     path = args.output / f'{design.study}.json'
-    software = f'starcal {pipeline.software_version()}'
+    software = f'starcal {provenance.software_version()}'
     write_atomically(path, campaign.content(found, software))
     path.with_suffix('.png').write_bytes(campaign_figures.png(found))
     print(f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s')
@@ -337,7 +338,7 @@ def _paper(args: argparse.Namespace) -> int:
     import dataclasses
     import functools
 
-    from starcal_ros import campaign, paper_figures, paper_study, pipeline
+    from starcal_ros import campaign, paper_figures, paper_study, provenance
     from starcal_ros.campaign_workers import run_each, run_trials
     from starcal_ros.product_files import write_atomically
     from starcal_ros.synthetic import scenario
@@ -356,7 +357,7 @@ def _paper(args: argparse.Namespace) -> int:
         rows = run_trials(table1, workers, args.scheduler, advance)
     observations = [frames_at for _, frames_at in sorted(frames, key=lambda item: item[0])]
     found = paper_study.study(observations, campaign.conclude(table1, rows), args.seed)
-    software = f'starcal {pipeline.software_version()}'
+    software = f'starcal {provenance.software_version()}'
     for name, png in paper_figures.pngs(found).items():
         write_atomically(args.output / 'images' / f'paper_{name}.png', png)
     path = args.output / 'paper.md'

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from starcal_ros import bag, message_fields, pipeline, sources
+from starcal_ros import bag, message_fields, sequence, solution, sources
 from starcal_ros.attitude import attitude_sample, AttitudeOptions
+from starcal_ros.camera_setup import Setup
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.image_messages import decode_png
@@ -126,7 +127,7 @@ class Inspection:
 def inspect(
     paths: Sequence[Path],
     asked: Topics,
-    setup: pipeline.Setup | None = None,
+    setup: Setup | None = None,
     on_image: Callable[[], None] = lambda: None,
 ) -> Inspection:
     """
@@ -164,8 +165,8 @@ def inspect(
     if setup and chosen:
         ensemble = Ensemble()
         for observations in seen:
-            ensemble = pipeline.add_to_ensemble(ensemble, observations, setup)
-        status = pipeline.ensemble_status(ensemble, setup)
+            ensemble = solution.add_to_ensemble(ensemble, observations, setup)
+        status = solution.ensemble_status(ensemble, setup)
     if chosen and not problems:
         problems += _shortages(used, status)
     return Inspection(
@@ -266,7 +267,7 @@ def _placed(
             continue
         height, width = image.pixels.shape
         try:
-            pipeline.check_order(image, latest_ns)
+            sequence.check_order(image, latest_ns)
             _, gap_s = attitudes.at(image.time_ns, options.max_attitude_gap_s)
         except ImageRefused as refused:
             yield refused_image(image.time_ns, width, height, refused.reason, refused.detail)

@@ -23,6 +23,7 @@ from starcal_ros.astrometry import SiteOptions
 from starcal_ros.attitude import AttitudeHistory, AttitudeOptions
 from starcal_ros.calibration import CalibrationOptions, Estimate, estimate_calibration
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid, project
+from starcal_ros.camera_setup import Setup, SetupOptions
 from starcal_ros.campaign import Campaign, Design, Row
 from starcal_ros.catalog import load_catalog
 from starcal_ros.centroiding import CentroidOptions
@@ -31,10 +32,10 @@ from starcal_ros.fixed_pattern import FixedPatternOptions
 from starcal_ros.identification import IdentificationOptions
 from starcal_ros.measurement import squared_sigmas, star_table
 from starcal_ros.observability import map_error_px
-from starcal_ros.pipeline import observe, Setup, SetupOptions
 from starcal_ros.records import Ensemble, Removal, StarObservations
 from starcal_ros.removal import removal_study
 from starcal_ros.screening import ScreeningOptions
+from starcal_ros.sequence import observe
 from starcal_ros.synthetic import attitude_samples, Scenario, scenario, scene
 from starcal_ros.synthetic_images import fixed_pattern, render
 

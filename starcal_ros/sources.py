@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from starcal_ros import bag, pipeline
+from starcal_ros import bag, sequence
+from starcal_ros.camera_setup import Setup
 from starcal_ros.errors import BagError
 from starcal_ros.message_types import (
     ATTITUDE_TYPE,
@@ -16,8 +17,8 @@ from starcal_ros.message_types import (
     TEMPERATURE_TYPE,
     VELOCITY_TYPE,
 )
-from starcal_ros.pipeline import OnImage, Setup
 from starcal_ros.records import StarObservations
+from starcal_ros.sequence import OnImage
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def read(
     """Observations of bags, measured in images that ``on_image`` is shown, or as recorded."""
     if topics.observations:
         return bag.read_observations(paths, topics.observations)
-    return pipeline.observe_bag(
+    return sequence.observe_bag(
         paths, topics.image, topics.attitude, setup, topics.velocity, topics.temperature, on_image
     )
 

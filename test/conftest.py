@@ -197,3 +197,15 @@ def tiny_observations() -> Any:
     synthetic = pytest.importorskip('starcal_ros.synthetic')
     centroids = pytest.importorskip('starcal_ros.synthetic_centroids')
     return centroids.true_observations(synthetic.scenario('tiny'))
+
+
+@pytest.fixture(scope='session')
+def camera_yaml(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The prior camera of `tiny_campaign` as a file."""
+    from tiny_campaign import SCENARIO  # type: ignore[import-not-found]
+
+    from starcal_ros.camera_info import write_camera_info
+
+    path = tmp_path_factory.mktemp('prior') / 'camera.yaml'
+    write_camera_info(SCENARIO.prior.camera, path)
+    return path

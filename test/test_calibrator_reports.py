@@ -14,11 +14,12 @@ from typing import Any
 
 import pytest
 
-from starcal_ros import cli, pipeline
+from starcal_ros import cli
 from starcal_ros.calibration_file import read_calibration
 from starcal_ros.calibrator_reports import CalibratorReports, CANDIDATE, IN_FORCE, Subject
 from starcal_ros.calibrator_state import CalibratorState
 from starcal_ros.camera_info import write_camera_info
+from starcal_ros.camera_setup import load_setup
 from starcal_ros.node_options import CalibratorOptions
 from starcal_ros.synthetic import scenario
 from starcal_ros.synthetic_centroids import true_observations
@@ -36,7 +37,7 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Subject:
     folder = tmp_path_factory.mktemp('setup')
     write_camera_info(SCENARIO.prior.camera, folder / 'camera.yaml')
     alignment = SCENARIO.prior.star_tracker_from_camera_xyzw.tolist()
-    setup = pipeline.load_setup(
+    setup = load_setup(
         {'camera_info_url': str(folder / 'camera.yaml'), 'prior_alignment': alignment}
     )
     state = CalibratorState()

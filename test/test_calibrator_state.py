@@ -9,9 +9,9 @@ import resource
 import numpy as np
 import pytest
 
-from starcal_ros import pipeline
 from starcal_ros.calibrator_state import Answer, CalibratorState
 from starcal_ros.camera_info import write_camera_info
+from starcal_ros.camera_setup import load_setup, Setup
 from starcal_ros.errors import ArchiveError, OptionError
 from starcal_ros.node_options import CalibratorOptions
 from starcal_ros.records import Ensemble, refused_image, StarObservations
@@ -26,10 +26,10 @@ def shown() -> tuple[StarObservations, ...]:
     return true_observations(SCENARIO).images
 
 
-def load(folder: Path, scenario_name: str = 'tiny', **values: object) -> pipeline.Setup:
+def load(folder: Path, scenario_name: str = 'tiny', **values: object) -> Setup:
     prior = scenario(scenario_name, seed=7).prior
     write_camera_info(prior.camera, folder / f'{scenario_name}.yaml')
-    return pipeline.load_setup(
+    return load_setup(
         {
             'camera_info_url': str(folder / f'{scenario_name}.yaml'),
             'prior_alignment': prior.star_tracker_from_camera_xyzw.tolist(),
@@ -39,18 +39,18 @@ def load(folder: Path, scenario_name: str = 'tiny', **values: object) -> pipelin
 
 
 @pytest.fixture(scope='module')
-def setup(tmp_path_factory: pytest.TempPathFactory) -> pipeline.Setup:
+def setup(tmp_path_factory: pytest.TempPathFactory) -> Setup:
     return load(tmp_path_factory.mktemp('setup'))
 
 
-def started(setup: pipeline.Setup, folder: Path | str = '', history: int = 20) -> CalibratorState:
+def started(setup: Setup, folder: Path | str = '', history: int = 20) -> CalibratorState:
     state = CalibratorState()
     state.open(setup, CalibratorOptions(state_dir=str(folder), calibration_history=history))
     return state
 
 
 def filled(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...], folder: Path | str = ''
+    setup: Setup, shown: tuple[StarObservations, ...], folder: Path | str = ''
 ) -> CalibratorState:
     state = started(setup, folder)
     for image in shown:
@@ -59,7 +59,7 @@ def filled(
 
 
 def test_a_restart_goes_on_where_it_stood(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     """The same solution to the last bit, and the same calibration in force."""
     first = filled(setup, shown, tmp_path)
@@ -82,7 +82,7 @@ def test_a_restart_goes_on_where_it_stood(
 
 
 def test_rollback_outlasts_a_restart(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     state = filled(setup, shown, tmp_path)
     for now_ns, estimate in ((1, ('fx', 'fy')), (2, ('fx', 'fy', 'k1')), (3, ('fx',))):
@@ -104,7 +104,7 @@ def test_rollback_outlasts_a_restart(
 
 
 def test_history_is_bounded(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     state = started(setup, tmp_path, history=2)
     for image in shown:
@@ -119,7 +119,7 @@ def test_history_is_bounded(
 
 
 def test_what_is_forced_says_so(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     gate = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
     state = filled(dataclasses.replace(setup, gate=gate), shown, tmp_path)
@@ -138,7 +138,7 @@ def test_what_is_forced_says_so(
 
 
 def test_what_would_count_twice_or_wrong_is_refused(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...]
+    setup: Setup, shown: tuple[StarObservations, ...]
 ) -> None:
     state = filled(setup, (*shown, shown[0]))
     state.add(dataclasses.replace(shown[0], time_ns=1, width=8))
@@ -148,7 +148,7 @@ def test_what_would_count_twice_or_wrong_is_refused(
 
 
 def test_the_first_of_a_stamp_stands_in_memory_and_on_disk(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     other = dataclasses.replace(shown[1], time_ns=shown[0].time_ns)
     before = filled(setup, (*shown[:2], other), tmp_path)
@@ -164,7 +164,7 @@ def test_the_first_of_a_stamp_stands_in_memory_and_on_disk(
 
 
 def test_the_limit_holds_on_disk_too(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     """A folder that a kill has left with an image too many is cut down when it is read."""
     filled(setup, shown, tmp_path).close()
@@ -179,7 +179,7 @@ def test_the_limit_holds_on_disk_too(
 
 
 def test_reset_and_the_image_after_it(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     state = filled(setup, shown, tmp_path)
     assert state.reset().message.startswith(f'{len(shown)} images dropped')
@@ -191,7 +191,7 @@ def test_reset_and_the_image_after_it(
 
 
 def test_a_full_disk_costs_nothing_that_memory_holds(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     state = filled(setup, shown[:-1], tmp_path)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -216,7 +216,7 @@ def test_a_full_disk_costs_nothing_that_memory_holds(
 
 
 def test_a_folder_of_another_camera_is_refused(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     filled(setup, shown[:1], tmp_path / 'state').close()
     other = load(tmp_path, 'small')
@@ -225,7 +225,7 @@ def test_a_folder_of_another_camera_is_refused(
     started(setup, tmp_path / 'state').close()  # it was let go of
 
 
-def test_two_on_one_folder(setup: pipeline.Setup, tmp_path: Path) -> None:
+def test_two_on_one_folder(setup: Setup, tmp_path: Path) -> None:
     first = started(setup, tmp_path)
     with pytest.raises(ArchiveError, match='in use by another calibrator'):
         started(setup, tmp_path)
@@ -235,7 +235,7 @@ def test_two_on_one_folder(setup: pipeline.Setup, tmp_path: Path) -> None:
 
 
 def test_damage_is_named(
-    setup: pipeline.Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
     filled(setup, shown, tmp_path).close()
     victim = tmp_path / 'ensemble' / '00000002.mcap'
@@ -246,7 +246,7 @@ def test_damage_is_named(
     state.close()
 
 
-def test_memory_alone(setup: pipeline.Setup, shown: tuple[StarObservations, ...]) -> None:
+def test_memory_alone(setup: Setup, shown: tuple[StarObservations, ...]) -> None:
     state = started(setup)
     assert state.rollback(1) == Answer(False, 'no calibration is in force')
     assert 'too few observations' in state.solve(1).message

@@ -332,7 +332,7 @@ def test_interrupt_is_one_line(run: Run, tmp_path: Path, monkeypatch: pytest.Mon
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr('starcal_ros.pipeline.load_setup', interrupted)
+    monkeypatch.setattr('starcal_ros.camera_setup.load_setup', interrupted)
     status, _, err = run('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', tmp_path)
     assert (status, err) == (130, 'starcal: interrupted\n')
 

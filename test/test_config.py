@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from starcal_ros import pipeline
 from starcal_ros.camera_info import read_camera_info, with_camera_url_from
+from starcal_ros.camera_setup import load_setup, OPTION_CLASSES
 from starcal_ros.node_options import NODE_OPTION_CLASSES
 from starcal_ros.options import check_value, read_parameter_file
 
@@ -34,7 +34,7 @@ def test_every_parameter_stands_with_its_default() -> None:
     listed = {name: value for body in sections.values() for name, value in body.items()}
     fields = [
         field
-        for options in (*pipeline.OPTION_CLASSES, *NODE_OPTION_CLASSES)
+        for options in (*OPTION_CLASSES, *NODE_OPTION_CLASSES)
         for field in dataclasses.fields(options)
     ]
     assert sorted(listed) == sorted(field.name for field in fields)
@@ -50,5 +50,5 @@ def test_examples_load(path: Path) -> None:
         assert read_camera_info(str(path)).width > 0
         return
     values = read_parameter_file(path, ('star_observer', 'calibrator'))
-    setup = pipeline.load_setup(with_camera_url_from(values, path), others=NODE_OPTION_CLASSES)
+    setup = load_setup(with_camera_url_from(values, path), others=NODE_OPTION_CLASSES)
     assert setup.prior.camera.width > 0

@@ -18,14 +18,15 @@ import cv2
 import numpy as np
 import pytest
 
-from starcal_ros import cli, pipeline
+from starcal_ros import cli
 from starcal_ros.arguments import parser
+from starcal_ros.camera_setup import load_setup, OPTION_CLASSES
 from starcal_ros.node_options import NODE_OPTION_CLASSES, PlayerOptions
 from starcal_ros.options import read_parameter_file
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').glob('*.md'), *ROOT.glob('bags/*/*.md')])
-OPTIONS = (*pipeline.OPTION_CLASSES, *NODE_OPTION_CLASSES, PlayerOptions)
+OPTIONS = (*OPTION_CLASSES, *NODE_OPTION_CLASSES, PlayerOptions)
 RUN_S = 60.0
 
 
@@ -242,7 +243,7 @@ def test_a_parameter_file_of_a_document_is_one(document: Path, text: str, tmp_pa
     params.write_text(text)
     values = read_parameter_file(params, ('star_observer', 'calibrator'))
     camera = ROOT / 'bags' / 'tiny' / 'camera.yaml'
-    setup = pipeline.load_setup({**values, 'camera_info_url': str(camera)}, OPTIONS)
+    setup = load_setup({**values, 'camera_info_url': str(camera)}, OPTIONS)
     assert setup.prior.camera.width > 0
 
 

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from starcal_ros import bag, cli, inspection, pipeline, simulation
+from starcal_ros import bag, cli, inspection, sequence, simulation
 from starcal_ros.camera_info import with_camera_url_from
+from starcal_ros.camera_setup import load_setup, Setup
 from starcal_ros.message_fields import make_header
 from starcal_ros.message_types import COMPRESSED_TYPE
 from starcal_ros.node_options import NODE_OPTION_CLASSES
@@ -27,9 +28,9 @@ IMAGE, ATTITUDE = simulation.IMAGE_TOPIC, simulation.ATTITUDE_TOPIC
 
 
 @pytest.fixture(scope='module')
-def setup() -> pipeline.Setup:
+def setup() -> Setup:
     values = with_camera_url_from(read_parameter_file(PARAMS, cli.NODES), PARAMS)
-    return pipeline.load_setup(values, NODE_OPTION_CLASSES)
+    return load_setup(values, NODE_OPTION_CLASSES)
 
 
 @pytest.fixture(scope='module')
@@ -69,7 +70,7 @@ def write_spoilt(path: Path, images: list[Image]) -> None:
 
 
 def test_verdicts_are_those_of_the_calibration(
-    tmp_path: Path, setup: pipeline.Setup, tiny_images: list[Image]
+    tmp_path: Path, setup: Setup, tiny_images: list[Image]
 ) -> None:
     path = tmp_path / 'spoilt.mcap'
     write_spoilt(path, tiny_images)
@@ -88,7 +89,7 @@ def test_verdicts_are_those_of_the_calibration(
     expected = {r.reason: r.count for r in quick.refused} | {'blank': 1, 'wrong_size': 1}
     assert by_reason == expected
     assert len(seen) == full.images == 12
-    observed = list(pipeline.observe_bag([path], IMAGE, ATTITUDE, setup))
+    observed = list(sequence.observe_bag([path], IMAGE, ATTITUDE, setup))
     assert by_reason == Counter(o.refusal for o in observed if o.refusal)
     assert full.stars_per_image == tuple(len(o) for o in observed if not o.refusal)
     gap = next(r for r in full.refused if r.reason == 'attitude_gap')

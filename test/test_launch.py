@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
+from starcal_ros.camera_setup import OPTION_CLASSES
 from starcal_ros.node_options import NODE_OPTION_CLASSES, PlayerOptions
 from starcal_ros.options import names_of
-from starcal_ros.pipeline import OPTION_CLASSES
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / 'launch').glob('*.launch.py'))

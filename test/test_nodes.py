@@ -40,13 +40,14 @@ from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal.srv import Calibrate
-from starcal_ros import bag, message_fields, pipeline
+from starcal_ros import bag, message_fields, solution
 from starcal_ros.calibration_file import CALIBRATION_FILE, read_calibration
 from starcal_ros.calibration_messages import (
     calibration_from_message,
     calibration_to_message,
     camera_info_to_message,
 )
+from starcal_ros.camera_setup import load_setup
 from starcal_ros.image_messages import image_from_message, image_to_message
 from starcal_ros.message_fields import make_header
 from starcal_ros.nodes.conversions import make_message
@@ -368,8 +369,8 @@ def test_camera_info_per_image(
 ) -> None:
     """The calibration in force with the header of each image; the prior and candidates never."""
     values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())['/**']['ros__parameters']
-    setup = pipeline.load_setup({**values, 'camera_info_url': str(tiny_bag / 'camera.yaml')})
-    in_force = pipeline.solve(tiny_observations, setup)
+    setup = load_setup({**values, 'camera_info_url': str(tiny_bag / 'camera.yaml')})
+    in_force = solution.solve(tiny_observations, setup)
     assert in_force.accepted
     candidate = dataclasses.replace(in_force, accepted=False, reasons=('bad',))
     observer = start_node(
@@ -519,7 +520,7 @@ import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
 class Interrupt:
     def find_spec(self, name, *_):
-        if name == 'starcal_ros.pipeline':
+        if name == 'starcal_ros.camera_setup':
             signal.raise_signal(signal.SIGINT)
 sys.meta_path.insert(0, Interrupt())
 from starcal_ros.nodes import start

@@ -17,7 +17,6 @@ from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import EnsembleStatus as StatusMessage
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal.srv import Calibrate
-from starcal_ros import pipeline
 from starcal_ros.calibration_messages import (
     alignment_to_message,
     calibration_to_message,
@@ -25,6 +24,7 @@ from starcal_ros.calibration_messages import (
 )
 from starcal_ros.calibrator_reports import CalibratorReports, CANDIDATE, IN_FORCE, Subject
 from starcal_ros.calibrator_state import Answer, CalibratorState
+from starcal_ros.camera_setup import load_setup
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.node_options import CalibratorOptions
 from starcal_ros.nodes.camera_driver import CameraDriver
@@ -63,7 +63,7 @@ class Calibrator(StarcalNode):
         """Load prior camera, options and the state folder, make the latched publishers."""
         values = self.options.values()
         self._own = from_mapping(CalibratorOptions, values)
-        self._setup = pipeline.load_setup(values, self.options.classes)
+        self._setup = load_setup(values, self.options.classes)
         self._state.open(self._setup, self._own)
         self._reports.open(
             self._own.state_dir if self._own.state_report else '',

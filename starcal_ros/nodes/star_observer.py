@@ -19,10 +19,11 @@ from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import StarObservations as ObservationsMessage
-from starcal_ros import pipeline
+from starcal_ros import sequence
 from starcal_ros.annotation import annotate
 from starcal_ros.attitude import attitude_sample, AttitudeHistory
 from starcal_ros.calibration_messages import calibration_from_message, camera_info_to_message
+from starcal_ros.camera_setup import load_setup
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.image_messages import color_image_to_message, image_from_message
@@ -79,7 +80,7 @@ class StarObserver(StarcalNode):
         """Load prior camera and catalog, make the publishers."""
         values = self.options.values()
         self._own = from_mapping(ObserverOptions, values)
-        self._setup = pipeline.load_setup(values, self.options.classes)
+        self._setup = load_setup(values, self.options.classes)
         self._geometry = self._setup.prior
         self._calibration_number = 0  # of the one that stars are predicted with; 0: the prior
         self._observations = self.create_lifecycle_publisher(
@@ -100,7 +101,7 @@ class StarObserver(StarcalNode):
         """Start to take images and attitudes, and the thread that measures."""
         jump_s = max(_JUMP_S, self._setup.attitude.max_attitude_gap_s)
         self._attitudes = AttitudeHistory(self._own.attitude_history_s, jump_s)
-        self._track = pipeline.Track(self._geometry)
+        self._track = sequence.Track(self._geometry)
         self._predicted_from = self._geometry
         self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
         self._temperatures: deque[tuple[int, float]] = deque(maxlen=_SAMPLES.depth)
@@ -279,13 +280,13 @@ class StarObserver(StarcalNode):
             self._predicted_from = self._geometry
             self._track = dataclasses.replace(self._track, geometry=self._geometry)
         before = self._track
-        observations, self._track = pipeline.observe_next(
+        observations, self._track = sequence.observe_next(
             image,
             self._attitudes,
             self._setup,
             before,
-            pipeline.latest_at(list(self._velocities), image.time_ns, None),
-            pipeline.latest_at(list(self._temperatures), image.time_ns, math.nan),
+            sequence.latest_at(list(self._velocities), image.time_ns, None),
+            sequence.latest_at(list(self._temperatures), image.time_ns, math.nan),
         )
         if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
             self._restarts += 1

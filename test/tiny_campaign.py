@@ -1,0 +1,50 @@
+"""The small simulated campaign that several tests measure and solve."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from starcal_ros.attitude import AttitudeHistory
+from starcal_ros.records import Ensemble, Image
+from starcal_ros.synthetic import attitude_samples, scenario, scene
+from starcal_ros.synthetic_centroids import true_observations
+from starcal_ros.synthetic_images import render
+
+SCENARIO = scenario('tiny', seed=7)
+TRUTH = SCENARIO.truth
+
+
+def values(camera_yaml: Path, **others: object) -> dict[str, object]:
+    """A parameter file's content that is complete."""
+    return {
+        'camera_info_url': str(camera_yaml),
+        'prior_alignment': SCENARIO.prior.star_tracker_from_camera_xyzw.tolist(),
+        'star_tracker_sigma_arcsec': [10.0, 10.0, 40.0],
+        **others,
+    }
+
+
+@functools.cache
+def ensemble() -> Ensemble:
+    return true_observations(SCENARIO)
+
+
+@functools.cache
+def image(index: int = 1) -> Image:
+    return render(SCENARIO, scene(SCENARIO, index), index)
+
+
+def attitudes(index: int = 1) -> AttitudeHistory:
+    held = AttitudeHistory()
+    for sample in attitude_samples(SCENARIO, index):
+        held.add(sample.time_ns, sample)
+    return held
+
+
+def write_png(path: Path, pixels: np.ndarray) -> str:
+    assert cv2.imwrite(str(path), pixels)
+    return str(path)
