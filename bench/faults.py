@@ -18,6 +18,9 @@ import sys
 import tempfile
 from typing import Any
 
+import cv2
+import numpy as np
+
 from bench import graph
 from bench.frames import history, render_frame, write_set_up
 from bench.table import Table
@@ -35,9 +38,15 @@ from starcal_ros.telemetry_messages import attitude_to_message
 
 COLUMNS = ('fault', 'node', 'times', 'what', 'answered', 'lost', 'wrong', 'died')
 _ANSWER_S = 60.0
-# What the documents allow: not known, and not observable.
+# What the documents allow: not known, not observable, and no number.
 _MAY_BE_INFINITE = frozenset(
-    ['temperature_degc', 'reference_temperature_degc', 'predicted_sigma', 'attitude_gap_s']
+    [
+        'temperature_degc',
+        'reference_temperature_degc',
+        'predicted_sigma',
+        'gate_found',
+        'gate_limit',
+    ]
 )
 
 
@@ -131,7 +140,7 @@ def _hostile_to_observer(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]
     from geometry_msgs.msg import QuaternionStamped, TwistStamped
     from sensor_msgs.msg import CompressedImage, Image, Temperature
 
-    from starcal.msg import Calibration, StarObservations
+    from starcal.msg import Calibration
     from starcal_ros.nodes.conversions import make_message
 
     image, samples = bench.frames[0]
@@ -140,68 +149,85 @@ def _hostile_to_observer(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]
     attitude = attitude_to_message(
         image.time_ns, samples[1].icrf_from_star_tracker_xyzw, 'icrf', make_message
     )
-    inputs: list[tuple[Any, str, Any]] = [
-        (Image, 'image', small),
+    others: list[tuple[Any, str, Any]] = [
         (QuaternionStamped, 'attitude', attitude),
         (TwistStamped, 'velocity', TwistStamped(header=small.header)),
         (Temperature, 'temperature', Temperature(header=small.header)),
         (Calibration, 'calibration', _calibration(bench)),
     ]
-    yield from _hostile(bench, 'star_observer', inputs, StarObservations, times)
-    png = CompressedImage(header=small.header, format='mono16; png compressed', data=bytes(64))
-    inputs = [(CompressedImage, 'image/compressed', png)]
-    values = ('image_transport:=compressed',)
-    yield from _hostile(bench, 'star_observer', inputs, StarObservations, times, *values)
+    yield from _hostile(bench, [(Image, 'image', small), *others], times)
+    png = CompressedImage(header=small.header, format='mono16; png compressed')
+    png.data = _png(image.pixels[:4, :4])
+    compressed = [(CompressedImage, 'image/compressed', png)]
+    yield from _hostile(bench, compressed, times, 'image_transport:=compressed')
+
+
+def _png(pixels: Any) -> bytes:
+    return cv2.imencode('.png', pixels)[1].tobytes()
 
 
 def _hostile(
-    bench: _Bench,
-    name: str,
-    inputs: list[tuple[Any, str, Any]],
-    answer: Any,
-    times: int,
-    *more: str,
+    bench: _Bench, inputs: list[tuple[Any, str, Any]], times: int, *more: str
 ) -> Iterator[tuple[Any, ...]]:
-    """Mutants on every input of a star observer; then a sound image must be measured."""
-    from lifecycle_msgs.srv import GetState
+    """Mutants on inputs and services of a star observer; then a sound image must be measured."""
+    from sensor_msgs.msg import CameraInfo
+
+    from starcal.msg import StarObservations
 
     answers: list[Any] = []
     bad: list[str] = []
-    values = ('attitude_timeout_s:=0.0', 'image_queue:=1000', *more)
-    with bench.running(name, *values) as process, graph.Client() as client:
-        client.collect(answer, 'observations', _finite(answers, bad), latched=False)
+    name = 'star_observer'
+    values = ('attitude_timeout_s:=0.0', 'image_queue:=1000', 'camera_info_per_image:=true')
+    with bench.running(name, *values, *more) as process, graph.Client() as client:
+        client.collect(StarObservations, 'observations', _finite(answers, bad), latched=False)
+        client.collect(CameraInfo, 'image_camera_info', _finite([], bad), latched=False)
+        count = _Taken(client, name)
         for kind, topic, template in inputs:
             is_image = topic.startswith('image')
             publisher = client.publisher(kind, topic, latched=topic == 'calibration')
-            before, bad_before = len(answers), len(bad)
-            sent = _send(client, publisher, template, times, is_image, answers)
-            died = process.poll() is not None
-            answered = len(answers) - before if is_image else sent
+            before = len(answers)
+            if is_image:
+                sent = _send_images(client, publisher, template, times, answers)
+                answered = len(answers) - before
+            else:
+                # Of a latched topic the reader holds one: each waits until the node is through.
+                held = 1 if topic == 'calibration' else 1500
+                sent, answered = times, _send(client, publisher, template, times, count, held)
+            died = int(process.poll() is not None)
             yield (
                 *('hostile messages', name, times, topic, answered),
-                *(sent - answered, len(bad) - bad_before, int(died)),
+                *(max(0, sent - answered), len(bad), died),
             )
+            bad.clear()
             if died:
                 return
-        assert client.call(GetState, f'{name}/get_state').current_state.label == 'active'
         if not more:
-            used = _measures_a_sound_image(bench, client, answers)
-            yield 'a sound image after these', name, 1, 'image', int(used), int(not used), 0, 0
+            yield from _hostile_requests(client, process, name, times)
+        used = _measures_a_sound_image(bench, client, answers, inputs[0][1])
+        yield (
+            *('a sound image after these', name, 1, inputs[0][1], int(used)),
+            *(int(not used), len(bad), int(process.poll() is not None)),
+        )
 
 
-def _measures_a_sound_image(bench: _Bench, client: graph.Client, answers: list[Any]) -> bool:
-    """Whether the node gives the stars of an image of a later time."""
+def _measures_a_sound_image(
+    bench: _Bench, client: graph.Client, answers: list[Any], topic: str
+) -> bool:
+    """Whether one of five sound images, far ahead of all that was sent, gives its stars."""
     from geometry_msgs.msg import QuaternionStamped
-    from sensor_msgs.msg import Image
+    from sensor_msgs.msg import CompressedImage, Image
 
     from starcal.msg import Calibration
     from starcal_ros.nodes.conversions import make_message
 
     client.publisher(Calibration, 'calibration', latched=True).publish(_calibration(bench))
     attitudes = client.publisher(QuaternionStamped, 'attitude')
-    images = client.publisher(Image, 'image')
+    images = client.publisher(Image if topic == 'image' else CompressedImage, topic)
     image, samples = bench.frames[0]
     message = image_to_message(image, 'camera', make_message)
+    if topic != 'image':
+        message = CompressedImage(format='mono16; png compressed', data=_png(image.pixels))
+    stars = set(bench.observations[0].catalog_id.tolist())
     for k in range(1, 6):  # the first ones may come before their attitude
         time_ns = image.time_ns + k * 10**12
         for sample_ns in range(time_ns - 10**9, time_ns + 2 * 10**9, 5 * 10**8 + 1):
@@ -212,47 +238,197 @@ def _measures_a_sound_image(bench: _Bench, client: graph.Client, answers: list[A
         before = len(answers)
         images.publish(message)
         client.holds(lambda: len(answers) > before, _ANSWER_S)  # noqa: B023
-        if len(answers) > before and not answers[-1].refusal:
+        if len(answers) == before or answers[-1].refusal:
+            continue
+        # Some of them stand at the limit, which is found anew.
+        if len(stars & set(answers[-1].catalog_id)) > 0.9 * len(stars):
             return True
     return False
 
 
-def _send(
-    client: graph.Client,
-    publisher: Any,
-    template: Any,
-    times: int,
-    is_image: bool,
-    answers: list[Any],
+class _Taken:
+    """How many messages a node says that it has taken, and what else its diagnostics say."""
+
+    def __init__(self, client: graph.Client, node: str) -> None:
+        from diagnostic_msgs.msg import DiagnosticArray
+        from lifecycle_msgs.srv import GetState
+
+        self._client, self._name = client, f'starcal: {node}'
+        self._values: dict[str, str] = {}
+        self._state = client.node.create_client(GetState, f'{node}/get_state')
+        self._ask = GetState.Request()
+        client.collect(DiagnosticArray, '/diagnostics', self._take, latched=False)
+        client.until(lambda: self._values, 'diagnostics')
+        client.until(self._state.service_is_ready, 'get_state')
+
+    def __call__(self) -> int:
+        """Messages taken; up to a second old."""
+        return int(self._values['messages'])
+
+    def pass_through(self) -> None:
+        """Wait until the node has answered one call: it looked at what came before."""
+        future = self._state.call_async(self._ask)
+        self._client.until(future.done, 'get_state')
+
+    def _take(self, message: Any) -> None:
+        status = message.status[0]
+        if status.name == self._name:
+            self._values = {value.key: value.value for value in status.values}
+
+
+def _send_images(
+    client: graph.Client, publisher: Any, template: Any, times: int, answers: list[Any]
 ) -> int:
-    """Publish mutants no faster than they are taken; how many of them a reader can decode."""
-    from rclpy.duration import Duration
+    """Publish mutants no faster than they are answered; how many of them a reader can decode."""
     from rclpy.serialization import deserialize_message
 
     from bench.hostile import send_mutants
 
-    before, count, sent = len(answers), 0, 0
+    before, sent = len(answers), 0
 
     def send(mutant: Any) -> None:
-        nonlocal count, sent
-        count += 1
-        if isinstance(mutant, bytes):
-            try:
-                deserialize_message(mutant, type(template))
-            except Exception:
-                sent -= 1
-        sent += 1
+        nonlocal sent
+        sent += _can_be_decoded(mutant, type(template), deserialize_message)
         publisher.publish(mutant)
-        if is_image:
-            client.holds(lambda: sent - (len(answers) - before) < 100, _ANSWER_S)
-        elif count % 200 == 0:
-            publisher.wait_for_all_acked(Duration(seconds=30))
+        client.holds(lambda: sent - (len(answers) - before) < 100, _ANSWER_S)
 
     send_mutants(template, times, send)
-    if is_image:
-        client.holds(lambda: len(answers) - before >= sent, _ANSWER_S)
-    publisher.wait_for_all_acked(Duration(seconds=30))
+    client.holds(lambda: len(answers) - before >= sent, _ANSWER_S)
     return sent
+
+
+def _send(
+    client: graph.Client, publisher: Any, template: Any, times: int, taken: _Taken, held: int
+) -> int:
+    """
+    Publish mutants until the node has taken so many; how many it has.
+
+    A reader that holds ``held`` messages loses none: no more than that are under way.
+    """
+    from rclpy.serialization import deserialize_message
+
+    from bench.hostile import send_mutants
+
+    before, sent = taken(), 0
+
+    def send(mutant: Any) -> None:
+        nonlocal sent
+        publisher.publish(mutant)
+        sent += _can_be_decoded(mutant, type(template), deserialize_message)
+        if held == 1:
+            taken.pass_through()  # at once; its acknowledgement comes with a heartbeat only
+        else:
+            client.holds(lambda: sent - (taken() - before) < held, _ANSWER_S)
+
+    for series in range(20):  # those that cannot be decoded are made up for
+        missing = times - (taken() - before)
+        if missing <= 0:
+            break
+        send_mutants(template, missing + missing // 10 + 2, send, series)
+        client.holds(lambda: taken() - before >= sent, 3.0)  # the diagnostics come every second
+    return taken() - before
+
+
+def _can_be_decoded(mutant: Any, kind: Any, deserialize: Callable[[bytes, Any], Any]) -> bool:
+    if not isinstance(mutant, bytes):
+        return True
+    try:
+        deserialize(mutant, kind)
+    except Exception:
+        return False
+    return True
+
+
+_AT_ONCE = 8  # requests under way
+_SHUTDOWNS = (5, 6, 7)  # which a node is right to obey
+
+
+def _hostile_requests(
+    client: graph.Client, process: Any, name: str, times: int
+) -> Iterator[tuple[Any, ...]]:
+    """Mutants of the requests that every node answers; it is active again afterwards."""
+    from lifecycle_msgs.srv import ChangeState, GetState
+    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+    from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+
+    value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=8.0)
+    parameters = [Parameter(name='magnitude_limit', value=value)]
+    change = ChangeState.Request()
+    change.transition.id = 1
+    for kind, service, request in (
+        (SetParameters, 'set_parameters', SetParameters.Request(parameters=parameters)),
+        (
+            SetParametersAtomically,
+            'set_parameters_atomically',
+            SetParametersAtomically.Request(parameters=parameters),
+        ),
+        (ChangeState, 'change_state', change),
+    ):
+        asked, answered, bad = _ask(client, kind, f'{name}/{service}', request, times)
+        died = int(process.poll() is not None)
+        yield (
+            *('hostile requests', name, asked, service, answered),
+            *(asked - answered, len(bad), died),
+        )
+        if died:
+            return
+    for transition in (1, 3):  # configure, activate: one of them or both may be refused
+        change = ChangeState.Request()
+        change.transition.id = transition
+        client.call(ChangeState, f'{name}/change_state', transition=change.transition)
+    state = client.call(GetState, f'{name}/get_state').current_state.label
+    wrong = int(state != 'active')
+    yield 'state after these', name, 1, state, 1, 0, wrong, int(process.poll() is not None)
+
+
+def _ask(
+    client: graph.Client, kind: Any, service: str, template: Any, times: int
+) -> tuple[int, int, list[str]]:
+    """Ask with mutants, a few at once; how often, how many were answered, what was wrong."""
+    from bench.hostile import not_finite, send_mutants
+
+    caller = client.node.create_client(kind, service)
+    client.until(caller.service_is_ready, service)
+    asked = answered = 0
+    bad: list[str] = []
+    waiting: list[Any] = []
+
+    def settle(most: int) -> bool:
+        """Take answers until no more than so many are waited for; whether that came to be."""
+        nonlocal waiting, answered
+
+        def few() -> bool:
+            return sum(not future.done() for future in waiting) <= most
+
+        in_time = client.holds(few, _ANSWER_S)
+        done = [future for future in waiting if future.done()]
+        waiting = [future for future in waiting if not future.done()]
+        answered += len(done)
+        for future in done:
+            bad.extend(not_finite(future.result(), _MAY_BE_INFINITE))
+        return in_time
+
+    is_heard = True
+
+    def ask(mutant: Any) -> None:
+        nonlocal asked, is_heard
+        # A client of rclpy sends no bytes; and where nobody answers no more is asked.
+        if isinstance(mutant, bytes) or not is_heard:
+            return
+        if hasattr(mutant, 'transition') and mutant.transition.id in _SHUTDOWNS:
+            return
+        if hasattr(mutant, 'dry_run'):
+            mutant.dry_run = True
+        asked += 1
+        waiting.append(caller.call_async(mutant))
+        is_heard = settle(_AT_ONCE - 1)
+
+    series = 0
+    while asked < times and is_heard:
+        send_mutants(template, (times - asked) * 16 // 15 + 1, ask, series)
+        series += 1
+    settle(0)
+    return asked, answered, bad
 
 
 def _calibration(bench: _Bench) -> Any:
@@ -273,58 +449,68 @@ def _finite(answers: list[Any], bad: list[str]) -> Callable[[Any], None]:
 
 
 def _hostile_to_calibrator(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
-    from bench.hostile import not_finite, send_mutants
+    from geometry_msgs.msg import TransformStamped
+    from sensor_msgs.msg import CameraInfo
+    from std_srvs.srv import Trigger
+
     from starcal.msg import Calibration, EnsembleStatus
     from starcal.msg import StarObservations as Observations
     from starcal.srv import Calibrate
 
     bad: list[str] = []
-    taken: list[Any] = []
-    with bench.running('calibrator', 'max_images:=30') as process, graph.Client() as client:
-        for kind, topic in (
-            (EnsembleStatus, 'ensemble_status'),
-            (Calibration, 'calibration'),
-            (Calibration, 'candidate_calibration'),
+    status: list[Any] = []
+    name = 'calibrator'
+    with bench.running(name, 'max_images:=30') as process, graph.Client() as client:
+        for kind, topic, taken in (
+            (EnsembleStatus, 'ensemble_status', status),
+            (Calibration, 'calibration', []),
+            (Calibration, 'candidate_calibration', []),
+            (CameraInfo, 'camera_info', []),
+            (TransformStamped, 'alignment', []),
         ):
             client.collect(kind, topic, _finite(taken, bad), latched=True)
+        count = _Taken(client, name)
         publisher = client.publisher(Observations, 'observations')
-        template = bench.message(bench.observations[0])
-        _send(client, publisher, template, times, False, [])
-        for k, record in enumerate(bench.observations):
-            publisher.publish(bench.message(record, (k + 1) * 10**9))
-        solved = client.call(Calibrate, 'calibrator/solve', _ANSWER_S, dry_run=True)
-        bad += not_finite(solved, _MAY_BE_INFINITE)
-        died = int(process.poll() is not None)
-        yield 'hostile messages', 'calibrator', times, 'observations', times, 0, len(bad), died
-
-        bad.clear()
-        solve = client.node.create_client(Calibrate, 'calibrator/solve')
-        client.until(solve.service_is_ready, 'solve')
-        answered = sent = 0
-
-        def ask(mutant: Any) -> None:
-            nonlocal answered, sent
-            if isinstance(mutant, bytes):
-                return
-            sent += 1
-            mutant.dry_run = True
-            future = solve.call_async(mutant)
-            if client.holds(future.done, _ANSWER_S):
-                answered += 1
-                bad.extend(not_finite(future.result(), _MAY_BE_INFINITE))
-
-        send_mutants(Calibrate.Request(method='magic', estimate=['fx', 'fz']), times // 2, ask)
+        template = bench.message(_brightest(bench.observations[0]))
+        answered = _send(client, publisher, template, times, count, 700)
         died = int(process.poll() is not None)
         yield (
-            'hostile requests',
-            'calibrator',
-            sent,
-            '~/solve',
-            answered,
-            sent - answered,
-            len(bad),
-            died,
+            *('hostile messages', name, times, 'observations', answered),
+            *(max(0, times - answered), len(bad), died),
         )
+        bad.clear()
+
+        def collect(records: list[StarObservations]) -> bool:
+            """Whether the ensemble is made of these alone."""
+            client.call(Trigger, f'{name}/reset')
+            client.holds(lambda: status and status[-1].images == 0)
+            for record in records:
+                publisher.publish(bench.message(record))
+            return client.holds(lambda: status and status[-1].images == len(records))
+
+        # Few stars: what is asked for is solved where the request is sound.
+        wrong = int(not collect([_brightest(record) for record in bench.observations]))
+        request = Calibrate.Request(method='magic', estimate=['fx', 'fz'])
+        asked, answered, found = _ask(client, Calibrate, f'{name}/solve', request, times)
+        wrong += len(found)
+        died = int(process.poll() is not None)
+        yield (
+            *('hostile requests', name, asked, 'solve', answered),
+            *(asked - answered, wrong, died),
+        )
+        yield from _hostile_requests(client, process, name, times)
+        wrong = int(not collect(bench.observations))
+        answer = client.call(Trigger, f'{name}/calibrate')
+        client.holds(lambda: False, 0.5)  # what it publishes is checked too
+        yield (
+            *('a sound ensemble after these', name, 1, 'calibrate', int(answer.success)),
+            *(int(not answer.success), wrong + len(bad), int(process.poll() is not None)),
+        )
+
+
+def _brightest(record: StarObservations) -> StarObservations:
+    """The same image with its 40 brightest stars."""
+    return record.select(np.argsort(np.argsort(-record.flux_dn)) < 40)
 
 
 def _killed(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
@@ -336,7 +522,10 @@ def _killed(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
         for k in range(times):
             flight.fly(choose.uniform(0.1, 2.5))
             # Either, or now and then both at once; the short form kills each.
-            flight.kill(*(('calibrator',), ('star_observer',), flight.NODES)[k % 3])
+            names = (('calibrator',), ('star_observer',), flight.NODES)[k % 3]
+            flight.kill(*names)
+            if k % 5 == 3:
+                flight.kill_at_start(names[0], choose.uniform(0.0, 3.0))
         flight.fly(0.5)
     for name in flight.NODES:
         yield (

@@ -16,11 +16,11 @@ _ARRAY = re.compile(r'(.+)\[(\d+)\]')
 _SEQUENCE = re.compile(r'sequence<(.+?)(?:, \d+)?>')
 
 
-def send_mutants(template: Any, count: int, send: Callable[[Any], None]) -> None:
+def send_mutants(template: Any, count: int, send: Callable[[Any], None], series: int = 0) -> None:
     """
     Hand ``count`` mutants of a message to ``send``: messages, or bytes, one in sixteen.
 
-    The same mutants each time.
+    The same mutants each time, others in each series.
     """
     from rclpy.serialization import serialize_message
 
@@ -30,7 +30,7 @@ def send_mutants(template: Any, count: int, send: Callable[[Any], None]) -> None
         if sent == count:
             return
 
-        @seed(round_number)
+        @seed(series * 1_000_000 + round_number)
         @settings(
             max_examples=count - sent,
             database=None,
@@ -79,6 +79,8 @@ def _values(kind: str, old: Any) -> st.SearchStrategy[Any]:
         size = int(fixed[2])
         return st.lists(_single(fixed[1]), min_size=size, max_size=size)
     if sequence:
+        if '/' in sequence[1]:
+            return st.lists(mutants(old[0]), max_size=4)
         element = _single(sequence[1])
         kept = list(old[:64])
         return st.one_of(

@@ -125,6 +125,12 @@ class Flight:
             if self._solving is None or self._solving.done():
                 self._solving = self._solve.call_async(Trigger.Request())
 
+    def kill_at_start(self, name: str, seconds: float) -> None:
+        """Kill a node that is just starting, before or after it has read its state."""
+        self._start(name)
+        self._client.holds(lambda: self._running[name].poll() is not None, seconds)
+        self.kill(name)
+
     def kill(self, *names: str) -> None:
         """Kill nodes at once, and look at what they have published before."""
         for name in names:

@@ -46,7 +46,8 @@ def test_no_fault_loses_or_kills(tmp_path: Path) -> None:
     assert made >= {('kill -9', 'star_observer'), ('kill -9', 'calibrator')}
     assert {row['fault'] for row in rows} >= {
         *('bits flipped, ends cut off', 'hostile messages', 'hostile requests', 'kill -9'),
-        *('a sound image after these', 'calls at once', 'caller killed', 'a second calibrator'),
+        *('a sound image after these', 'a sound ensemble after these', 'state after these'),
+        *('calls at once', 'caller killed', 'a second calibrator'),
     }
 
 

@@ -607,14 +607,15 @@ def test_parameters_while_running(client: Client, start_node: StartNode, tiny_ba
     assert change_state(client, Transition.TRANSITION_CLEANUP)
     assert set_gap(client, 1.0) == ''
     assert 'max_attitude_gap_s' in set_gap(client, -1.0)
+    assert 'Type' in set_gap(client, 1.0, 41)
     assert change_state(client, Transition.TRANSITION_CONFIGURE)
     assert change_state(client, Transition.TRANSITION_ACTIVATE)
     assert node.process.poll() is None
 
 
-def set_gap(client: Client, value: float) -> str:
+def set_gap(client: Client, value: float, kind: int = ParameterType.PARAMETER_DOUBLE) -> str:
     """Why the node refused the parameter; empty where it did not."""
-    number = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+    number = ParameterValue(type=kind, double_value=value)
     parameter = Parameter(name='max_attitude_gap_s', value=number)
     answer = client.call(SetParameters, '/star_observer/set_parameters', parameters=[parameter])
     return '' if answer.results[0].successful else str(answer.results[0].reason)

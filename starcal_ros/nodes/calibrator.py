@@ -99,7 +99,7 @@ class Calibrator(StarcalNode):
         listener = self.create_subscription(
             ObservationsMessage,
             'observations',
-            self.guarded(self._on_observations),
+            self.taking(self._on_observations),
             _OBSERVATIONS,
             callback_group=collecting,
         )

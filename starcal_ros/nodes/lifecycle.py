@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 import functools
 import resource
@@ -11,6 +12,8 @@ import threading
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 import rclpy
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.exceptions import ROSInterruptException
@@ -44,6 +47,7 @@ class StarcalNode(LifecycleNode):
             self.get_logger().warning(f'{unknown}: not a parameter of starcal')
         self.failure = ''  # why the last transition failed, one line
         self._errors = 0
+        self._taken: Counter[str] = Counter()
         self._level: bytes | None = None
         self._diagnostics_lock = threading.Lock()
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -51,6 +55,7 @@ class StarcalNode(LifecycleNode):
             1.0, self.guarded(self.publish_health), callback_group=MutuallyExclusiveCallbackGroup()
         )
         self._answer_invalid_transitions()
+        self._answer_invalid_parameters()
 
     def configure(self) -> None:
         """Read parameters and files, make the publishers; StarcalError when they are no good."""
@@ -86,6 +91,17 @@ class StarcalNode(LifecycleNode):
                 callback(*arguments)
             except Exception as error:
                 self.count_error(error)
+
+        return run
+
+    def taking(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Return the callback of an input, guarded; what it takes is counted."""
+        guarded = self.guarded(callback)
+
+        def run(message: Any) -> None:
+            # By input: the callbacks of one never run at once, those of two may.
+            self._taken[callback.__name__] += 1
+            guarded(message)
 
         return run
 
@@ -133,7 +149,11 @@ class StarcalNode(LifecycleNode):
             if self.failure:
                 level = ERROR
         peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # as Linux counts it
-        common = {'memory_peak_mb': peak_kb // 1000, 'callback_errors': self._errors}
+        common = {
+            'memory_peak_mb': peak_kb // 1000,
+            'messages': sum(list(self._taken.values())),
+            'callback_errors': self._errors,
+        }
         return level, text, {**numbers, **common}
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -207,6 +227,30 @@ class StarcalNode(LifecycleNode):
             return response
 
         service.callback = answer
+
+    def _answer_invalid_parameters(self) -> None:
+        """Answer a value of a type that is none with a refusal; rclpy raises, answering nobody."""
+
+        def answering(set_parameters: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+            def answer(request: Any, response: Any) -> Any:
+                try:
+                    return set_parameters(request, response)
+                except Exception as error:
+                    self.get_logger().error(f'parameters refused: {one_line(error)}')
+                    refused = SetParametersResult(successful=False, reason=one_line(error))
+                if isinstance(response, SetParametersAtomically.Response):
+                    response.result = refused
+                else:
+                    # Those before the bad one were answered, and may be set.
+                    left = len(request.parameters) - len(response.results)
+                    response.results = [*response.results, *[refused] * left]
+                return response
+
+            return answer
+
+        for service in self.services:
+            if service.srv_type in (SetParameters, SetParametersAtomically):
+                service.callback = answering(service.callback)
 
 
 def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | None) -> int:

@@ -131,7 +131,7 @@ class StarObserver(StarcalNode):
             listener = self.create_subscription(
                 kind,
                 topic,
-                self.guarded(callback),
+                self.taking(callback),
                 qos,
                 callback_group=MutuallyExclusiveCallbackGroup(),
             )
