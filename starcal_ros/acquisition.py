@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from scipy.stats import binom, poisson
+from scipy.special import bdtr, pdtrc
 
 from starcal_ros.camera import line_of_sight, project, project_jacobians
 from starcal_ros.detection import Sources
@@ -88,7 +88,7 @@ def _vote(
     votes, roll, low = _fullest_block(stars, seen, cell_px, half_cells, rolls_rad)
     expected = len(stars) * len(seen) * (2 * cell_px) ** 2 / sources.searched_px2
     trials = len(rolls_rad) * (2 * half_cells + 1) ** 2
-    if votes < 4 or poisson.sf(votes - 1, expected) * trials > 1e-2:
+    if votes < 4 or pdtrc(votes - 1, expected) * trials > 1e-2:
         raise ImageRefused(
             'no_match', f'{votes} of {min(len(stars), len(seen))} bright stars agree, as by chance'
         )
@@ -244,7 +244,8 @@ def _check_beyond_chance(
     density = len(sources.snr) / sources.searched_px2
     tried = int(np.count_nonzero(inside))
     expected = tried * -np.expm1(-density * np.pi * radius_px**2)
-    if matched < 6 or poisson.sf(matched - 1 - bought, expected) > _CHANCE:
+    few = max(6, 1 + bought)
+    if matched < few or pdtrc(matched - 1 - bought, expected) > _CHANCE:
         raise ImageRefused(
             'no_match',
             f'{matched} of {tried} predicted stars meet a source, {expected:.0f} would by chance',
@@ -273,7 +274,7 @@ def _matched_in_part(sources: Sources, met: NDArray[np.int64], width: int, heigh
         return False
     best = float((found[told] / (shown[told] + 1.0)).max())
     # Not by a little: a cosmic ray is several sources in one place.
-    missed = (binom.cdf(found[told], shown[told], best) < _PART_CHANCE) & (
+    missed = (bdtr(found[told], shown[told], best) < _PART_CHANCE) & (
         found[told] < best / 3 * shown[told]
     )
     return bool(2 * np.count_nonzero(missed) > np.count_nonzero(told))

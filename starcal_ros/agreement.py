@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from starcal_ros.calibration import CalibrationOptions, estimate_calibration
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
@@ -56,12 +56,12 @@ class Difference:
     @property
     def chance(self) -> float:
         """How often chance alone makes two calibrations of one camera differ as much."""
-        return float(chi2.sf(self.chi2, self.freedom)) if self.freedom else 1.0
+        return float(chdtrc(self.freedom, self.chi2)) if self.freedom else 1.0
 
     @property
     def shape_chance(self) -> float:
         """The same of the cameras alone."""
-        return float(chi2.sf(self.shape_chi2, self.shape_freedom)) if self.shape_freedom else 1.0
+        return float(chdtrc(self.shape_freedom, self.shape_chi2)) if self.shape_freedom else 1.0
 
 
 def lines_of_sight(geometry: CameraGeometry, columns: int, rows: int) -> Floats:

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, theilslopes
+from scipy.special import chdtri
 
 from starcal_ros.adjustment import (
     attitude_errors,
@@ -486,8 +486,11 @@ def _with_slope(problem: Problem, state: State) -> State:
     eta_rad = attitude_errors(problem, state, state.camera_from_icrf)
     # The frame turns by what is missing from the star tracker's side.
     turned = state.camera_from_star_tracker.apply(eta_rad)
-    slopes = [theilslopes(axis, problem.above_reference_k).slope for axis in turned.T]
-    return dataclasses.replace(state, rate=state.rate + np.array(slopes))
+    one, other = np.triu_indices(len(turned), 1)
+    apart_k = problem.above_reference_k[other] - problem.above_reference_k[one]
+    differ = apart_k != 0
+    slopes = (turned[other] - turned[one])[differ] / apart_k[differ, None]
+    return dataclasses.replace(state, rate=state.rate + np.median(slopes, axis=0))
 
 
 def _judge(
@@ -542,7 +545,7 @@ def _fitting(
     sightings = np.bincount(star)
     misses = np.bincount(star, ~fits)
     summed = np.bincount(star, np.where(fits, length2, 0.0))
-    bad_star = (2 * misses > sightings) | (summed > chi2.isf(_STAR_CHANCE, 2 * sightings))
+    bad_star = (2 * misses > sightings) | (summed > chdtri(2 * sightings, _STAR_CHANCE))
     fits &= ~(bad_star & (sightings >= _FEWEST_SIGHTINGS))[star]
     left = np.bincount(table.image[fits], minlength=table.image_count)
     return np.asarray(fits & (left[table.image] >= FEWEST_STARS))

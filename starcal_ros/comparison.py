@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from starcal_ros.agreement import alignment_difference_rad, lines_of_sight
 from starcal_ros.camera import PARAMETER_NAMES
@@ -118,7 +118,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         after=_map(new - turn.apply(old), a.geometry, shape_sigma_rad),
         chi2=total,
         degrees=degrees,
-        chance=float(chi2.sf(total, degrees)) if degrees else float('nan'),
+        chance=float(chdtrc(degrees, total)) if degrees else float('nan'),
         notes=_notes(a, b, difference, sigma),
     )
 

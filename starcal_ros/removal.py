@@ -11,7 +11,7 @@ import dataclasses
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from starcal_ros.adjustment import (
     image_blocks,
@@ -69,7 +69,7 @@ def removal_study(estimate: Estimate) -> tuple[Removal, ...]:
                 alone[least],
                 sigmas[least] ** 2,
                 rise,
-                within=bool(chi2.sf(rise, len(removals)) > _CHANCE),
+                within=bool(chdtrc(len(removals), rise) > _CHANCE),
             )
         )
         sigmas = _sigmas(problem, solution.state, measurements)

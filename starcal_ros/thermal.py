@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from starcal_ros.records import Calibration, CameraGeometry, Thermal
 
@@ -112,10 +112,10 @@ def weakest_term(thermal: Thermal, rate_covariance: Floats) -> str:
     chances = {}
     if thermal.focal_per_degc:
         sigmas = thermal.focal_per_degc[-1] / thermal.focal_sigma[-1]
-        chances['focal'] = float(chi2.sf(sigmas**2, 1))
+        chances['focal'] = float(chdtrc(1, sigmas**2))
     if thermal.alignment_rate_rad_per_degc:
         rate = np.array(thermal.alignment_rate_rad_per_degc)
-        chances['rate'] = float(chi2.sf(rate @ np.linalg.solve(rate_covariance, rate), 3))
+        chances['rate'] = float(chdtrc(3, rate @ np.linalg.solve(rate_covariance, rate)))
     weakest = max(chances, key=lambda name: chances[name], default='')
     return weakest if chances.get(weakest, 0.0) > _CHANCE else ''
 

@@ -190,7 +190,7 @@ def _find_turn(
     expected = len(guides) * np.pi * limit_px**2 / side_px**2
     trials = (side_px / limit_px) ** 2
     # Three angles were fitted: two parameters can buy one match.
-    if pdtrc(matched - 3, expected) * trials > _CHANCE:
+    if matched < 4 or pdtrc(matched - 3, expected) * trials > _CHANCE:
         raise lost
     return np.asarray(turn_rad)
 

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from scipy.stats import chi2
+from scipy.special import chdtr
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -132,7 +132,7 @@ def estimate_star_tracker_sigma(
     stars = own[good].mean(axis=0)
     freedom = count - fitted
     found = eta_rad[good].var(axis=0, ddof=fitted)
-    chance = chi2.cdf(freedom * found / (given_rad**2 + stars), freedom)
+    chance = chdtr(freedom, freedom * found / (given_rad**2 + stars))
     as_given = (chance > _GIVEN_CHANCE / 2) & (chance < 1 - _GIVEN_CHANCE / 2)
     hidden = stars * math.sqrt(2.0 / count)
     sigma2 = np.where(found - stars > hidden, found - stars, np.minimum(hidden, given_rad**2))

@@ -157,6 +157,13 @@ assert 'rclpy' not in sys.modules
 """
 
 
+def test_no_start_waits_for_scipy_stats() -> None:
+    """Of the second that a node or a calibration needs to start, it would make a third more."""
+    show = 'import sys; from starcal_ros import sequence, solution; print(*sys.modules)'
+    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
+    assert 'scipy.special' in done.stdout.split() and 'scipy.stats' not in done.stdout.split()
+
+
 def test_each_module_imports_alone() -> None:
     """No module needs another to have been imported first; none pulls ROS in."""
     names = [m for m in MODULES if not m.startswith('nodes.')]
