@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+import math
 import os
 from pathlib import Path
+import shutil
 import signal
 import socket
 import subprocess
@@ -16,6 +18,7 @@ import pytest
 
 START_S = 60.0  # a node imports and starts in 2 s; two busy cores make that much of it
 NODES = 'starcal_ros.nodes.'
+TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 
 
 def free_domain() -> int:
@@ -107,11 +110,25 @@ def start_node(tmp_path: Path) -> Iterator[StartNode]:
 
 @pytest.fixture(scope='session')
 def tiny_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small simulated bag: a folder with camera.yaml, params.yaml and truth.json in it."""
-    simulation = pytest.importorskip('starcal_ros.simulation')
-    synthetic = pytest.importorskip('starcal_ros.synthetic')
+    """The bag of the repository, its parameters such that a node anywhere finds the camera."""
     folder = tmp_path_factory.mktemp('bags') / 'tiny'
-    simulation.write_bag(synthetic.scenario('tiny'), folder)
+    shutil.copytree(TINY, folder)
+    relative = (TINY / 'params.yaml').read_text()
+    params = relative.replace('camera.yaml', f'file://{folder}/camera.yaml')
+    assert params != relative
+    (folder / 'params.yaml').write_text(params)
+    return folder
+
+
+@pytest.fixture(scope='session')
+def tiny_products(tiny_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the tool, a process of its own, makes of that bag; who changes it takes a copy."""
+    folder = tmp_path_factory.mktemp('tiny_products')
+    command = [sys.executable, '-m', 'starcal_ros.cli', 'calibrate', str(tiny_bag)]
+    command += ['--params', str(tiny_bag / 'params.yaml'), '-o', str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, ''), done.stderr
+    assert 'accepted' in done.stdout
     return folder
 
 
@@ -135,14 +152,32 @@ class Client:
             assert time.monotonic() < deadline_s, 'the condition did not come to hold'
             self._executor.spin_once(timeout_sec=0.05)
 
-    def call(self, kind: Any, name: str, timeout_s: float = 60.0, **fields: Any) -> Any:
-        """Answer of a service."""
+    def call(
+        self,
+        kind: Any,
+        name: str,
+        timeout_s: float = 60.0,
+        again_s: float = math.inf,
+        **fields: Any,
+    ) -> Any:
+        """
+        Answer of a service; asked once more if there is none after some time.
+
+        A node may take a request before it has found the reader of its answer, which is lost then.
+        """
         client = self.node.create_client(kind, name)
         try:
             self.until(client.service_is_ready, timeout_s)
-            future = client.call_async(kind.Request(**fields))
-            self.until(future.done, timeout_s)
-            return future.result()
+            asked = [client.call_async(kind.Request(**fields))]
+            again_s += time.monotonic()
+
+            def is_answered() -> bool:
+                if len(asked) == 1 and time.monotonic() > again_s:
+                    asked.append(client.call_async(kind.Request(**fields)))
+                return any(future.done() for future in asked)
+
+            self.until(is_answered, timeout_s)
+            return next(future.result() for future in asked if future.done())
         finally:
             self.node.destroy_client(client)
 

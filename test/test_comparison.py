@@ -19,16 +19,11 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.records import Calibration
 
-TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
-
 
 @pytest.fixture(scope='module')
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
+def tiny(tiny_products: Path) -> Calibration:
     """The calibration of the tiny bag: a real covariance."""
-    out = tmp_path_factory.mktemp('tiny')
-    arguments = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
-    assert cli.main(arguments) == 0
-    return read_calibration(out / 'calibration.json')
+    return read_calibration(tiny_products / 'calibration.json')
 
 
 def moved(

@@ -16,7 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 import yaml
 
-from starcal_ros import agreement, demo, simulation, synthetic
+from starcal_ros import agreement, cli, demo, simulation, synthetic
 from starcal_ros.bag import read_attitudes, read_images
 from starcal_ros.calibration_file import read_calibration
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project
@@ -42,6 +42,13 @@ def starcal(*arguments: object) -> subprocess.CompletedProcess[str]:
         [sys.executable, '-m', 'starcal_ros.cli', *map(str, arguments)],
         capture_output=True, text=True, cwd=ROOT, check=False,
     )  # fmt: skip
+
+
+def calibrated(made: simulation.SimulatedBag, folder: Path) -> Calibration:
+    """What the tool makes of a bag in this process, where its warnings are errors."""
+    arguments = ['calibrate', str(made.bag), '--params', str(made.params), '-o', str(folder)]
+    assert cli.main(arguments) == 0
+    return read_calibration(folder / 'calibration.json')
 
 
 def read_truth(path: Path) -> CameraGeometry:
@@ -82,19 +89,8 @@ def map_error_arcsec(calibration: Calibration, truth: CameraGeometry) -> float:
     return float(np.sqrt(np.mean(error**2)) / ARCSECOND_RAD)
 
 
-@pytest.fixture(scope='module')
-def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The products of the tiny bag."""
-    folder = tmp_path_factory.mktemp('tiny')
-    done = starcal('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', folder)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ''
-    assert 'accepted' in done.stdout
-    return folder
-
-
-def test_the_tiny_bag_gives_the_truth(tiny_run: Path) -> None:
-    calibration = read_calibration(tiny_run / 'calibration.json')
+def test_the_tiny_bag_gives_the_truth(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
     truth = read_truth(TINY / 'truth.json')
     assert calibration.accepted and calibration.reasons == ()
     assert calibration.images_used == 10 and calibration.images_refused == {}
@@ -107,9 +103,9 @@ def test_the_tiny_bag_gives_the_truth(tiny_run: Path) -> None:
     assert map_error_arcsec(calibration, truth) < 0.2 * map_error_arcsec(before, truth)
 
 
-def test_camera_info_is_the_calibration_without_skew(tiny_run: Path) -> None:
-    calibration = read_calibration(tiny_run / 'calibration.json')
-    camera = read_camera_info(tiny_run / 'camera_info.yaml')
+def test_camera_info_is_the_calibration_without_skew(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    camera = read_camera_info(tiny_products / 'camera_info.yaml')
     assert camera.parameters[1] == 0.0
     grid = pixel_grid(camera, 25, 25)
     error_px = project(camera, line_of_sight(calibration.geometry.camera, grid)) - grid
@@ -117,20 +113,23 @@ def test_camera_info_is_the_calibration_without_skew(tiny_run: Path) -> None:
     assert worst_px == pytest.approx(calibration.zero_skew_cost_px, rel=1e-6)
 
 
-def test_recorded_observations_give_the_same_calibration(tiny_run: Path, tmp_path: Path) -> None:
-    bag = tiny_run / 'observations.mcap'
+def test_recorded_observations_give_the_same_calibration(
+    tiny_products: Path, tmp_path: Path
+) -> None:
+    bag = tiny_products / 'observations.mcap'
     done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
     assert done.returncode == 0, done.stderr
     first, second = (
-        json.loads((folder / 'calibration.json').read_text()) for folder in (tiny_run, tmp_path)
+        json.loads((folder / 'calibration.json').read_text())
+        for folder in (tiny_products, tmp_path)
     )
     second['provenance'] = first['provenance']  # the one names images, the other observations
     assert first == second
 
 
-def test_observations_can_be_calibrated_in_place(tiny_run: Path, tmp_path: Path) -> None:
+def test_observations_can_be_calibrated_in_place(tiny_products: Path, tmp_path: Path) -> None:
     bag = tmp_path / 'observations.mcap'
-    bag.write_bytes((tiny_run / 'observations.mcap').read_bytes())
+    bag.write_bytes((tiny_products / 'observations.mcap').read_bytes())
     for _ in range(2):
         done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
         assert done.returncode == 0, done.stderr
@@ -203,18 +202,14 @@ def test_eight_bit_images_give_the_truth(tmp_path: Path) -> None:
     )
     scenario = dataclasses.replace(scenario, detector=detector)
     made = simulation.write_bag(scenario, tmp_path / 'bag')
-    done = starcal('calibrate', made.bag, '--params', made.params, '-o', tmp_path / 'out')
-    assert done.returncode == 0, done.stderr
-    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    calibration = calibrated(made, tmp_path / 'out')
     assert_close_to_truth(calibration, read_truth(made.truth))
 
 
 def test_a_zenith_campaign_gives_the_truth(tmp_path: Path) -> None:
     scenario = dataclasses.replace(synthetic.scenario('small', 2), image_count=12)
     made = simulation.write_bag(scenario, tmp_path / 'bag.mcap')
-    done = starcal('calibrate', made.bag, '--params', made.params, '-o', tmp_path / 'out')
-    assert done.returncode == 0, done.stderr
-    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    calibration = calibrated(made, tmp_path / 'out')
     assert_close_to_truth(calibration, read_truth(made.truth))
 
 
@@ -226,9 +221,7 @@ def test_a_launch_shift_of_a_degree_is_found(tmp_path: Path) -> None:
         scenario.prior, star_tracker_from_camera_xyzw=(mounting * shift).as_quat()
     )
     made = simulation.write_bag(dataclasses.replace(scenario, prior=prior), tmp_path / 'bag')
-    done = starcal('calibrate', made.bag, '--params', made.params, '-o', tmp_path / 'out')
-    assert done.returncode == 0, done.stdout + done.stderr
-    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    calibration = calibrated(made, tmp_path / 'out')
     assert calibration.images_used == 10
     assert_close_to_truth(calibration, read_truth(made.truth))
 
@@ -258,7 +251,7 @@ def test_a_flipped_bit_is_noticed_and_does_no_harm(tmp_path: Path) -> None:
 
 
 @needs_interfaces
-def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_run: Path) -> None:
+def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_products: Path) -> None:
     done = starcal('demo', '-o', tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert 'sigma' in done.stdout and 'alignment z' in done.stdout
@@ -266,7 +259,7 @@ def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_run: Path) -> 
     assert (tmp_path / 'report.html').stat().st_size > 100_000  # with its pictures
     # The nodes and the tool give the same calibration from the same bag.
     nodes = read_calibration(tmp_path / 'calibration.json')
-    tool = read_calibration(tiny_run / 'calibration.json')
+    tool = read_calibration(tiny_products / 'calibration.json')
     assert nodes.stars_used == tool.stars_used
     # The nodes predict with the newest attitude; where a stamp is the same, so is everything.
     sigma = np.where(tool.sigma > 0, tool.sigma, 1.0)

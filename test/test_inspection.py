@@ -157,9 +157,8 @@ def test_a_cut_bag_is_read_as_far_as_it_goes(tmp_path: Path, tiny_images: list[I
     assert 0 < images < 10 and found.images == images
 
 
-def test_recorded_observations_need_no_parameters(tmp_path: Path) -> None:
-    assert cli.main(['calibrate', str(TINY), '--params', str(PARAMS), '-o', str(tmp_path)]) == 0
-    found = inspection.inspect([tmp_path / 'observations.mcap'], ASKED)
+def test_recorded_observations_need_no_parameters(tiny_products: Path) -> None:
+    found = inspection.inspect([tiny_products / 'observations.mcap'], ASKED)
     assert found.measured and found.images == 10 and not found.refused
     assert found.chosen == Topics(observations='/observations')
 
