@@ -1,4 +1,5 @@
 # make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, test, bench, lint.
+# make test TESTS='-m nodes' runs a part: what follows is handed to pytest.
 ROS_DISTRO ?= jazzy
 VENV := $(if $(filter jazzy,$(ROS_DISTRO)),.venv,.venv-$(ROS_DISTRO))
 # An environment keeps the interpreter it was made with unless another is asked for.
@@ -14,7 +15,7 @@ demo: setup
 	$(RUN)/starcal demo
 
 test: setup
-	$(RUN)/python -m pytest
+	$(RUN)/python -m pytest $(TESTS)
 
 bench: setup
 	@$(RUN)/python -m pip install --quiet --requirement requirements/bench.txt

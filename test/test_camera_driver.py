@@ -25,6 +25,8 @@ from starcal.msg import EnsembleStatus, StarObservations
 from starcal_ros.nodes.conversions import make_message
 from starcal_ros.observation_messages import observations_to_message
 
+pytestmark = pytest.mark.nodes
+
 SERVICE = '/opnav/set_camera_info'
 
 

@@ -27,6 +27,8 @@ from starcal_ros.observation_messages import observations_from_message, observat
 from starcal_ros.records import Image
 from starcal_ros.status_messages import status_to_message
 
+pytestmark = pytest.mark.nodes
+
 
 def through_wire(message: Any) -> Any:
     """Return the message after serialisation and back."""

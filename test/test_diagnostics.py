@@ -29,6 +29,8 @@ from starcal_ros.nodes.conversions import make_message
 from starcal_ros.observation_messages import observations_to_message
 from starcal_ros.records import IMAGE_REFUSALS
 
+pytestmark = pytest.mark.nodes
+
 ICD = Path(__file__).parents[1] / 'docs' / 'icd.md'
 REMAPS = ('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude')
 

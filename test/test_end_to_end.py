@@ -251,6 +251,7 @@ def test_a_flipped_bit_is_noticed_and_does_no_harm(tmp_path: Path) -> None:
 
 
 @needs_interfaces
+@pytest.mark.nodes
 def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_products: Path) -> None:
     done = starcal('demo', '-o', tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr

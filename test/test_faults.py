@@ -51,6 +51,7 @@ def test_no_fault_loses_or_kills(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.nodes
 def test_a_bag_plays_again_by_its_clock(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
@@ -83,6 +84,7 @@ def test_a_bag_plays_again_by_its_clock(
 NODES = ('star_observer', 'calibrator', 'bag_player')
 
 
+@pytest.mark.nodes
 def test_the_policies_name_what_the_nodes_have(
     client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
 ) -> None:

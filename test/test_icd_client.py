@@ -30,6 +30,8 @@ from std_srvs.srv import Trigger  # noqa: E402
 from starcal.msg import Calibration, EnsembleStatus, StarObservations  # noqa: E402
 from starcal.srv import Calibrate  # noqa: E402
 
+pytestmark = pytest.mark.nodes
+
 ARCSECOND_RAD = np.pi / 648000
 
 

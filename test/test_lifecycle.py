@@ -17,6 +17,8 @@ pytest.importorskip('starcal.msg')
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 
+pytestmark = pytest.mark.nodes
+
 NUMBERS = sorted(
     {value for name in dir(Transition) if isinstance(value := getattr(Transition, name), int)}
 )

@@ -55,6 +55,8 @@ from starcal_ros.records import Image as ImageRecord
 from starcal_ros.records import refused_image
 from starcal_ros.telemetry_messages import attitude_to_message, temperature_to_message
 
+pytestmark = pytest.mark.nodes
+
 BOTH = ('star_observer', 'calibrator')
 REMAPS = ('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude')
 
