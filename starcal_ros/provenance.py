@@ -32,12 +32,22 @@ def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -
 
 
 def _digest(ensemble: Ensemble) -> str:
+    """
+    SHA-256 of all that an estimate reads of its images, in their order.
+
+    Of each image, little-endian: stamp (int64, ns), number of stars (int64), attitude, then by
+    columns catalog numbers (int64), directions, pixels and covariances, last the temperature where
+    it is known.  Whoever has the recorded observations can make it again.
+    """
     digest = hashlib.sha256()
     for image in ensemble.images:
-        for column in (image.catalog_id, image.measured_px, image.covariance_px2):
-            digest.update(np.ascontiguousarray(column).tobytes())
+        digest.update(np.array([image.time_ns, len(image)], '<i8').tobytes())
+        digest.update(image.icrf_from_star_tracker_xyzw.astype('<f8').tobytes())
+        digest.update(image.catalog_id.astype('<i8').tobytes())
+        for column in (image.direction_icrf, image.measured_px, image.covariance_px2):
+            digest.update(column.astype('<f8').tobytes())
         if not math.isnan(image.temperature_degc):
-            digest.update(np.float64(image.temperature_degc).tobytes())
+            digest.update(np.array(image.temperature_degc, '<f8').tobytes())
     return digest.hexdigest()
 
 
