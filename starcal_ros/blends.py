@@ -16,9 +16,7 @@ from starcal_ros.psf import neighbour_pull_px, stamp_radius_px
 
 Floats = NDArray[np.float64]
 
-# Of the pull of a star that is not measured itself: it is one linear step of several, and stars of
-# unlike colour differ by a quarter from their V.
-_PULL_UNCERTAINTY = 1.0
+_PULL_UNCERTAINTY = 0.25  # of a neighbour's light: stars of unlike colour differ so from their V
 _MODELLED_UNCERTAINTY = 0.05  # of that of a star measured itself: wings that are no Gaussian's
 _NEAR_SIGMA, _MODELLED_NEAR_SIGMA = 5.0, 3.0  # a bright neighbour nearer than this swamps
 _ALONE_SIGMA = 0.1  # a star whose neighbours pull it by less tells the PSF
@@ -59,10 +57,11 @@ def neighbour_pulls(
     known = np.zeros(len(star), bool) if modelled is None else modelled[other]
     # What two Gaussians have in common: all the light of one that stands behind the other.
     within = np.where(known, 0.0, np.exp(-((0.5 * distance_px / sigma_px) ** 2)))
+    own_flux = flux / (1.0 + ratio * within)
     pull_px = neighbour_pull_px(
-        flux,
+        own_flux,
         offset_px,
-        ratio * flux / (1.0 + ratio * within),
+        ratio * own_flux,
         sigma_px,
         model.background.noise_dn,
         model.pixel_noise,

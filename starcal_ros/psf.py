@@ -18,7 +18,6 @@ square of the brightness, and photon noise as the brightness: that tells one fro
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, fields
 import math
 
@@ -78,6 +77,16 @@ class PsfFit:
 def select(fit: PsfFit, stars: NDArray[np.intp] | NDArray[np.bool_]) -> PsfFit:
     """Return the fits of some stars, by row number or mask."""
     return PsfFit(**{field.name: getattr(fit, field.name)[stars] for field in fields(fit)})
+
+
+def replace_rows(fit: PsfFit, stars: NDArray[np.intp], by: PsfFit) -> PsfFit:
+    """Return the fits with those of some stars, by row number, replaced."""
+    changed = {}
+    for field in fields(fit):
+        column = getattr(fit, field.name).copy()
+        column[stars] = getattr(by, field.name)
+        changed[field.name] = column
+    return PsfFit(**changed)
 
 
 def stamp_radius_px(psf_sigma_px: float) -> int:
@@ -229,6 +238,15 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     )
 
 
+def expected_snr(
+    flux_dn: Floats, sigma_px: float | Floats, noise_dn: float | Floats, noise: PixelNoise
+) -> Floats:
+    """Signal-to-noise (n,) of stars of a flux, from their photons and 4 pi sigma^2 px of sky."""
+    flux = np.maximum(flux_dn, 0.0)
+    sky_dn2 = 4.0 * math.pi * sigma_px**2 * noise.background * noise_dn**2
+    return np.asarray(flux / np.sqrt(sky_dn2 + flux / noise.gain_e_per_dn))
+
+
 def first_guess(windows: Stamps) -> Floats:
     """Parameters (n, 4) from which the fit starts: the centre of the light next to the middle."""
     stamps, sigma_px, w = windows.data_dn, windows.sigma_px, windows.width
@@ -274,7 +292,7 @@ def neighbour_pull_px(
     """
     How far (k, 2) the light of a neighbour pulls the fitted place of a star.
 
-    One linear step of the fit, with the light of the neighbour as its residual.
+    That is where the fit ends on the light of both without noise.
 
     Parameters
     ----------
@@ -286,18 +304,12 @@ def neighbour_pull_px(
     """
     width = 2 * stamp_radius_px(sigma_px) + 1
     count = len(flux_dn)
-    zero, dark = np.zeros(count), np.zeros((count, width * width))
     sigma = np.full(count, sigma_px)
-    at = np.stack([*offset_px.T, neighbour_flux_dn, zero], axis=-1)
-    # What the neighbour takes away from a dark stamp is its light.
-    light = -_psf_rows(at, dark, sigma, width, 4)[:, 4]
-    rows = _psf_rows(np.stack([zero, zero, flux_dn, zero], axis=-1), dark, sigma, width, 4)
-    own = flux_dn[:, None] * rows[:, 2]
-    rows[:, 4] = light
-    zero_error = dataclasses.replace(pixel_noise, psf_error=0.0)
-    weight = 1.0 / zero_error.variance(own + light, np.full((count, 1), noise_dn), zero[:, None])
-    normal, gradient = _normal(rows, weight)
-    return np.asarray(np.linalg.solve(normal, gradient[:, :, None])[:, :2, 0])
+    light = light_in_stamps(np.zeros((count, 2)), flux_dn, sigma, width)
+    light += light_in_stamps(offset_px, neighbour_flux_dn, sigma, width)
+    stamps = Stamps(light.reshape(count, width, width), sigma, np.full((count, 1), noise_dn**2))
+    alone = np.stack([*np.zeros((2, count)), flux_dn, np.zeros(count)], axis=-1)
+    return approach(stamps, alone, pixel_noise)[:, :2]
 
 
 @dataclass(frozen=True)

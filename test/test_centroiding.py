@@ -148,7 +148,8 @@ def test_no_bias_with_the_phase_at_any_signal(flux: float) -> None:
     assert amplitude_px < 0.01
 
 
-def test_a_hot_pixel_takes_no_part_in_a_fit() -> None:
+@pytest.mark.parametrize('known', [True, False], ids=['known', 'unknown'])
+def test_a_hot_pixel_takes_no_part_in_a_fit(known: bool) -> None:
     squared = []
     for seed in range(4):
         xy = star_grid(40 + seed)
@@ -156,14 +157,12 @@ def test_a_hot_pixel_takes_no_part_in_a_fit() -> None:
         model = modelled(pixels)
         u, v = np.rint(xy + np.array([2.0, -1.0])).astype(int).T
         pixels[v, u] += 400
-        plain = measure_stars(pixels, xy, model, PSF)
-        assert np.mean(plain.refusal == '') < 0.1
-        hot = np.sort(v * pixels.shape[1] + u)
-        freed = measure_stars(pixels, xy, model, PSF, hot)
-        good = (freed.refusal == '') & (freed.snr > 10)
-        assert good.mean() > 0.8
-        squared.append((freed.xy_px - xy)[good] ** 2 / freed.covariance_px2[good][:, [0, 2]])
-    # Two coordinates of more than 1300 stars: known to 1.4 %.
+        hot = np.sort(v * pixels.shape[1] + u) if known else np.empty(0, np.int64)
+        found = measure_stars(pixels, xy, model, PSF, hot)
+        good = (found.refusal == '') & (found.snr > 10)
+        assert good.mean() > 0.75
+        squared.append((found.xy_px - xy)[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
+    # Two coordinates of more than 1200 stars: known to 1.4 %.
     assert np.sqrt(np.concatenate(squared).mean()) == pytest.approx(1.0, abs=0.05)
 
 
@@ -452,8 +451,8 @@ def test_lit_single_pixels_are_no_sources() -> None:
     assert len(sources.snr) <= 2
 
 
-@pytest.mark.parametrize('offset', [(1, 0), (1, 1), (2, -1)])
-def test_a_star_with_a_hot_pixel_in_it_is_refused(offset: tuple[int, int]) -> None:
+@pytest.mark.parametrize('offset', [(1, 0), (1, 1)])
+def test_a_star_with_a_hot_pixel_in_its_core_is_refused(offset: tuple[int, int]) -> None:
     hot = np.zeros(SHAPE)
     hot[201 + offset[1], 300 + offset[0]] = 1500.0
     pixels, place = one_star(more=hot)
