@@ -9,6 +9,7 @@ import math
 from pathlib import Path
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -18,6 +19,7 @@ from starcal_ros.attitude import AttitudeHistory
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera_setup import Setup
 from starcal_ros.centroiding import saturation_level
+from starcal_ros.detection import Pixels
 from starcal_ros.errors import ImageRefused
 from starcal_ros.fixed_pattern import HotPixels, learn_hot_pixels
 from starcal_ros.identification import observe_stars, Shot, tracked
@@ -124,14 +126,14 @@ def _without_dark(image: Image, setup: Setup) -> Image:
     if dark.dtype != pixels.dtype:
         raise ImageRefused('bad_encoding', f'{pixels.dtype} image, the dark frame is {dark.dtype}')
     # Noise below the dark level must not be cut off at zero: it would bias the background.
-    level = pixels.astype(np.int32) - dark + setup.dark_pedestal_dn
+    below = np.minimum(dark, dark.dtype.type(setup.dark_pedestal_dn))
+    raised = cv2.add(pixels, dark.dtype.type(setup.dark_pedestal_dn) - below)
+    # The types of OpenCV know of no image of whole numbers.
+    level: Pixels = cv2.subtract(raised, dark - below)  # type: ignore[assignment]
     # What is saturated stays at the end of the range, where it is known as such.
     peak = int(pixels.max())
-    level[pixels >= (saturation_level(pixels, setup.centroid) or np.inf)] = peak
-    level = np.clip(level, 0, peak)
-    if pixels.dtype == np.uint8:
-        return Image(image.time_ns, level.astype(np.uint8))
-    return Image(image.time_ns, level.astype(np.uint16))
+    level[(level > peak) | (pixels >= (saturation_level(pixels, setup.centroid) or np.inf))] = peak
+    return Image(image.time_ns, level)
 
 
 def _after_order(track: Track, time_ns: int) -> Track:
