@@ -24,6 +24,7 @@ _SCANNED_PX = 1 << 21  # of one image, in 0.3 ms; larger images are scanned in t
 _MOVED_PX = 5.0  # the light of a star that has moved so far has left its pixels
 _SPILT = 0.2  # mean of the four next pixels over the peak: 0.24 for a star of 0.45 px
 _CORE_PX = 1.5  # a star on a hot pixel itself has lost its peak
+_WIDE_PSF_PX = 1.5  # no pixel of a star so wide holds 7 % of its light: the fit goes without it
 _MOST = 100_000  # a detector with more has another fault, and the list stays small
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
@@ -151,12 +152,14 @@ def refuse_on_hot_pixels(
     hot: Indices,
     width: int,
     window_px: int,
+    psf_sigma_px: float,
 ) -> NDArray[np.str_]:
     """
     Refusals (n,) of stars at (n, 2), with ``hot_pixel`` where one is the cause.
 
-    A hot pixel at the peak spoils any star, as what is left of it tells little.  One elsewhere in
-    the window, half ``window_px`` wide, is the cause where the star was refused for its shape.
+    A hot pixel at the peak spoils a star of few pixels, as what is left of it tells little.  One
+    elsewhere in the window, half ``window_px`` wide, is the cause where the star was refused for
+    its shape.
     """
     if len(hot) == 0:
         return refusal
@@ -165,7 +168,8 @@ def refuse_on_hot_pixels(
     asked = np.flatnonzero(np.isin(refusal, ('', 'elongated', 'ambiguous')))
     core, _ = tree.query(xy_px[asked], distance_upper_bound=_CORE_PX)
     window, _ = tree.query(xy_px[asked], p=np.inf, distance_upper_bound=window_px + 0.5)
-    cause = np.isfinite(core) | (np.isfinite(window) & (refusal[asked] != ''))
+    at_peak = np.isfinite(core) & (psf_sigma_px < _WIDE_PSF_PX)
+    cause = at_peak | (np.isfinite(window) & (refusal[asked] != ''))
     changed = refusal.copy()
     changed[asked[cause]] = 'hot_pixel'
     return changed

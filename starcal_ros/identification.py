@@ -171,12 +171,14 @@ def measure_predicted(
     )
     centroids, alone = separate(shown, catalog, centroids, model, options.max_blend_sigma)
     _refuse_torn(shown.xy_px, centroids, (height, width))
+    psf_sigma_px = model.psf_sigma_px or 1.0
     refusal = refuse_on_hot_pixels(
         shown.xy_px,
         _refuse_displaced(shown.xy_px, centroids, width),
         shot.hot_pixels,
         width,
-        stamp_radius_px(model.psf_sigma_px or 1.0),
+        stamp_radius_px(psf_sigma_px),
+        psf_sigma_px,
     )
     centroids = dataclasses.replace(centroids, refusal=refusal)
     observations = _observations(
@@ -316,7 +318,7 @@ def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) ->
         predicted_px[good], centroids.xy_px[good], sigma_px[good], predicted_px[good], 0.5 * width
     )
     off_px = np.linalg.norm(centroids.xy_px[good] - predicted_px[good] - correction, axis=1)
-    limit_px = np.maximum(5.0 * np.hypot(sigma_px[good], 0.5 * scatter_px), 0.3)
+    limit_px = np.maximum(5.0 * np.hypot(sigma_px[good], 0.75 * scatter_px), 0.3)
     refusal[good[off_px > np.minimum(limit_px, 2.0)]] = 'ambiguous'
     return refusal
 

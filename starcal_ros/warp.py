@@ -42,10 +42,9 @@ def fit_warp(
         left = residual - A.T @ coefficients
         size = np.hypot(left[:, 0], left[:, 1])
         before = scatter
-        # Rayleigh median: 1.1774 sigma
-        scatter = max(1.4826 * float(np.median(size)) / 1.1774, 0.01)
+        scatter = max(float(np.median(size)) / 1.1774, 0.01)  # Rayleigh median: 1.1774 sigma
         spread2 = sigma_px**2 + scatter**2
-        weight = 1.0 / spread2 / (1.0 + size**2 / (4.0 * spread2)) ** 2
+        weight = 1.0 / spread2 / (1.0 + size**2 / (9.0 * spread2)) ** 2
         weighted = A * weight
         normal = weighted @ A.T
         # Powers up to 5 on -1 to 1 leave the normal matrix ten digits; a trace keeps the corner

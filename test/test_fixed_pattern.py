@@ -123,8 +123,16 @@ def test_stars_on_hot_pixels(offset: tuple[float, float], before: str, after: st
     """A PSF of one pixel, fitted in a window of four pixels about the star."""
     hot = np.array([50 * WIDTH + 70])
     star = np.array([[70.0, 50.0]]) + offset
-    found = refuse_on_hot_pixels(star, np.array([before], 'U16'), hot, WIDTH, 4)
+    found = refuse_on_hot_pixels(star, np.array([before], 'U16'), hot, WIDTH, 4, 1.0)
     assert found.tolist() == [after]
+
+
+def test_a_wide_star_on_a_hot_pixel_does_without_it() -> None:
+    """No pixel of a PSF of two pixels holds a twentieth of its light."""
+    hot, star = np.array([50 * WIDTH + 70]), np.array([[70.0, 50.0]])
+    for refusal, expected in (('', ''), ('elongated', 'hot_pixel')):
+        found = refuse_on_hot_pixels(star, np.array([refusal], 'U16'), hot, WIDTH, 7, 2.0)
+        assert found.tolist() == [expected]
 
 
 def test_a_quiet_detector_has_none() -> None:
