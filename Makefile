@@ -1,5 +1,6 @@
 # make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, test, bench, lint.
-# make test TESTS='-m nodes' runs a part: what follows is handed to pytest.
+# make test TESTS='-m nodes' runs a part: what follows is handed to pytest. The whole is two runs:
+# tests that start nodes have the machine to themselves.
 ROS_DISTRO ?= jazzy
 VENV := $(if $(filter jazzy,$(ROS_DISTRO)),.venv,.venv-$(ROS_DISTRO))
 # An environment keeps the interpreter it was made with unless another is asked for.
@@ -15,7 +16,16 @@ demo: setup
 	$(RUN)/starcal demo
 
 test: setup
+ifdef TESTS
 	$(RUN)/python -m pytest $(TESTS)
+else
+	@failed=0; \
+	for part in "-m 'not nodes' --numprocesses 2" "-m nodes"; do \
+		echo "$(RUN)/python -m pytest $$part"; \
+		eval $(RUN)/python -m pytest $$part || failed=1; \
+	done; \
+	exit $$failed
+endif
 
 bench: setup
 	@$(RUN)/python -m pip install --quiet --requirement requirements/bench.txt

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-import math
 import os
 from pathlib import Path
 import shutil
@@ -157,7 +156,7 @@ class Client:
         kind: Any,
         name: str,
         timeout_s: float = 60.0,
-        again_s: float = math.inf,
+        again_s: float = 20.0,
         **fields: Any,
     ) -> Any:
         """

@@ -615,7 +615,7 @@ def set_gap(client: Client, value: float, kind: int = ParameterType.PARAMETER_DO
 
 def state_of(client: Client, name: str = 'star_observer') -> str:
     """Lifecycle state of a node."""
-    answer = client.call(GetState, f'/{name}/get_state', again_s=10.0)
+    answer = client.call(GetState, f'/{name}/get_state')
     return str(answer.current_state.label)
 
 
