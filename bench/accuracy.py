@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 
 SIZE = (1296, 1024)
 IMAGES = 8
-SEEDS = 100
+SEEDS = 40
 TARGET = 1.15
 _APART_S = 1800.0  # from image to image: another sky each
 
