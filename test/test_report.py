@@ -128,8 +128,8 @@ def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: P
     limit = f'at most {not_checked.limit_text}'
     names = [f'{check.name} <code>{check.option}</code>' for check in shown.gate]
     assert rows == [
-        [names[0], '8.125 px', 'at most 1 px', 'not kept', ''],
-        [names[1], '', limit, 'not checked', not_checked.note],
+        [names[0], 'not kept', '8.125 px', 'at most 1 px', ''],
+        [names[1], 'not checked', '', limit, not_checked.note],
     ]
 
 
