@@ -24,7 +24,7 @@ from starcal_ros.detection import (
     stamps_at_edges,
     windows_inside,
 )
-from starcal_ros.fixed_pattern import hot_in_stamps, NO_HOT_PIXELS
+from starcal_ros.fixed_pattern import CORE_PX, hot_in_stamps, NO_HOT_PIXELS, SPILT
 from starcal_ros.instrument import Instrument, PsfWidth, uniform_width
 from starcal_ros.options import option
 from starcal_ros.psf import (
@@ -50,9 +50,8 @@ _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitiv
 _MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours
 _NEIGHBOUR_NOISE = 0.2  # of the noise of a pixel: less light of a neighbour changes nothing
 _FIRST_STEPS = 2  # of a fit, before the light of neighbours is taken off
+_IN_PLACE_PX = 1.5  # of a fit from the brightest pixel: beyond, it has gone elsewhere
 _WORST_SIGMA = 5.0  # 81 pixels of normal noise pass it once in 20,000 stars
-_SPILT = 0.2  # mean of the four next pixels over a peak: 0.24 for a star of 0.45 px
-_CORE_PX = 1.5  # nearer to a star a lit pixel is taken as its own
 _BRIGHTEST = 60  # stars that show the level of saturation
 _MIN_PSF_SIGMA_PX = 0.45
 _MAX_PSF_SIGMA_PX = 4.0
@@ -287,7 +286,6 @@ def _measure_by_psf(
     refusal = np.full(n, '', dtype='U16')
     centre = np.rint(np.nan_to_num(predicted_px, nan=-1e6)).astype(np.int64)
     inside = windows_inside(shape, centre, 1)
-    refusal[~inside] = 'border'
     innermost = np.array([shape[1] - 2, shape[0] - 2])
     centre = np.clip(centre, 1, innermost)
     # The window goes where the star is: the brightest pixel next to the prediction.
@@ -319,35 +317,33 @@ def _measure_by_psf(
     parameters = approach(windows, parameters, model.pixel_noise)
     fit = fit_at(windows, parameters, model.pixel_noise)
     fit = _without_single_pixels(windows, fit, model.pixel_noise)
-    x, y, flux, _ = fit.parameters.T
-    covariance = fit.covariance
-    snr = fit.snr
-
-    departure = np.abs(fit.shape_change - model.shape_median)
-    limit = np.maximum(options.max_shape_change, 4.0 * model.shape_scatter)
-    misshapen = ((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1)
-    misshapen |= fit.worst_pixel_sigma > _WORST_SIGMA
-    wandered = np.maximum(np.abs(x), np.abs(y)) > 1.5
     for bad, reason in (
+        (~inside, 'border'),
         (saturated_pixels > options.max_saturated_pixels, 'saturated'),
-        ((snr < options.min_snr) | ~np.isfinite(snr), 'faint'),
-        (wandered, 'not_detected'),
-        (misshapen, 'elongated'),
+        ((fit.snr < options.min_snr) | ~np.isfinite(fit.snr), 'faint'),
+        (np.abs(fit.parameters[:, :2]).max(axis=1) > _IN_PLACE_PX, 'not_detected'),
+        (_misshapen(fit, model, options), 'elongated'),
     ):
         refusal[bad & (refusal == '')] = reason
     return Centroids(
-        xy_px=centre + np.stack([x, y], axis=-1),
-        covariance_px2=np.stack(
-            [covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]], axis=-1
-        ),
-        flux_dn=flux,
-        snr=snr,
+        xy_px=centre + fit.parameters[:, :2],
+        covariance_px2=fit.covariance[:, [0, 0, 1], [0, 1, 1]],
+        flux_dn=fit.parameters[:, 2],
+        snr=fit.snr,
         refusal=refusal,
         fit=fit,
         psf_sigma_px=sigma_px,
         noise_dn=noise_dn,
         modelled=modelled,
     )
+
+
+def _misshapen(fit: PsfFit, model: ImageModel, options: CentroidOptions) -> NDArray[np.bool_]:
+    """Which stars (n,) are not of the shape that those of the image share."""
+    departure = np.abs(fit.shape_change - model.shape_median)
+    limit = np.maximum(options.max_shape_change, 4.0 * model.shape_scatter)
+    other = ((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1)
+    return np.asarray(other | (fit.worst_pixel_sigma > _WORST_SIGMA))
 
 
 def _without_neighbours(
@@ -365,7 +361,7 @@ def _without_neighbours(
     """
     flux, sigma_px = parameters[:, 2], stamps.sigma_px
     snr = expected_snr(flux, sigma_px, np.sqrt(stamps.noise2_dn2[:, 0]), noise)
-    in_place = np.abs(parameters[:, :2]).max(axis=1) < 1.5
+    in_place = np.abs(parameters[:, :2]).max(axis=1) < _IN_PLACE_PX
     modelled = usable & (snr > _MODELLED_SNR) & in_place
     if len(stamps) < 2:
         return stamps, parameters, modelled
@@ -423,7 +419,7 @@ def _without_single_pixels(stamps: Stamps, fit: PsfFit, noise: PixelNoise) -> Ps
     )
     reach = np.arange(stamps.width) - stamps.width // 2
     from_middle_px = np.hypot(reach[:, None], reach)
-    single = (0.25 * beside < _SPILT * above_dn) & (from_middle_px > _CORE_PX)
+    single = (0.25 * beside < SPILT * above_dn) & (from_middle_px > CORE_PX)
     brightest = np.where(single, above_dn, 0.0).reshape(len(hit), -1)
     peak = brightest.argmax(axis=1)
     row = np.arange(len(hit))

@@ -22,8 +22,8 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 _SCANNED_PX = 1 << 21  # of one image, in 0.3 ms; larger images are scanned in turns
 _MOVED_PX = 5.0  # the light of a star that has moved so far has left its pixels
-_SPILT = 0.2  # mean of the four next pixels over the peak: 0.24 for a star of 0.45 px
-_CORE_PX = 1.5  # a star on a hot pixel itself has lost its peak
+SPILT = 0.2  # mean of the four next pixels over the peak: 0.24 for a star of 0.45 px
+CORE_PX = 1.5  # a star on a hot pixel itself has lost its peak
 _WIDE_PSF_PX = 1.5  # no pixel of a star so wide holds 7 % of its light: the fit goes without it
 _MOST = 100_000  # a detector with more has another fault, and the list stays small
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
@@ -125,7 +125,7 @@ def _single_lit(
     peak = pixels[v, u] - background_dn
     beside = [pixels[v + b, u + a] for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))]
     spilt = np.mean(beside, axis=0) - background_dn
-    single = spilt < _SPILT * peak
+    single = spilt < SPILT * peak
     return np.asarray((v * width + u)[single][:_MOST], np.int64)
 
 
@@ -166,7 +166,7 @@ def refuse_on_hot_pixels(
     v, u = np.divmod(hot, width)
     tree = cKDTree(np.stack([u, v], axis=-1))
     asked = np.flatnonzero(np.isin(refusal, ('', 'elongated', 'ambiguous')))
-    core, _ = tree.query(xy_px[asked], distance_upper_bound=_CORE_PX)
+    core, _ = tree.query(xy_px[asked], distance_upper_bound=CORE_PX)
     window, _ = tree.query(xy_px[asked], p=np.inf, distance_upper_bound=window_px + 0.5)
     at_peak = np.isfinite(core) & (psf_sigma_px < _WIDE_PSF_PX)
     cause = at_peak | (np.isfinite(window) & (refusal[asked] != ''))

@@ -136,7 +136,7 @@ class Stamps:
         return None if self.out is None else ~self.out.reshape(len(self), self.width**2)
 
     def select(self, stars: NDArray[np.intp]) -> Stamps:
-        """Return the windows of some stars, by row number."""
+        """Return the windows of some stars, by row number, ascending and each once."""
         if len(stars) == len(self):
             return self
         return Stamps(
