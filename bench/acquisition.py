@@ -33,7 +33,7 @@ from starcal_ros.tracking import follow, Followed, following
 Floats = NDArray[np.float64]
 
 SEED = 20161
-IMAGES = 40  # rendered for each kind of field
+IMAGES = 45  # rendered for each kind of field
 ATTITUDES = 100  # tried on each of them
 TRUE_FIELDS = 100  # for each row of what is to be found
 QUICK = 12  # of a hundred

@@ -16,11 +16,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import bdtr, pdtrc
 
-from starcal_ros.camera import line_of_sight, project, project_jacobians
+from starcal_ros.camera import line_of_sight, project, project_rotation
 from starcal_ros.detection import Sources
 from starcal_ros.errors import ImageRefused
 from starcal_ros.prediction import in_image, Prediction
 from starcal_ros.records import CameraGeometry
+from starcal_ros.robust import median, medians
 from starcal_ros.warp import fit_warp, warp_powers
 
 Floats = NDArray[np.float64]
@@ -94,7 +95,7 @@ def _vote(
         )
     offset = seen[:, None] - _turn(stars, roll)[None]
     in_block = ((offset >= low) & (offset < low + 2 * cell_px)).all(axis=2)
-    shift_px = np.median(offset[in_block], axis=0)
+    shift_px = medians(offset[in_block])
     middle = line_of_sight(camera, np.stack([centre, centre + shift_px]))
     axis = np.cross(middle[0], middle[1])
     return Rotation.from_rotvec(axis) * Rotation.from_rotvec([0.0, 0.0, roll])
@@ -172,10 +173,10 @@ def _refine_rotation(
             break
         star = stars[pairs[:, 0]]
         residual = sources.xy_px[pairs[:, 1]] - xy[star]
-        _, _, J_rotation = project_jacobians(camera, directions[star])
+        _, J_rotation = project_rotation(camera, directions[star])
         J = np.concatenate([scale * J_rotation, (xy[star] - centre)[:, :, None]], axis=-1)
         size = np.linalg.norm(residual, axis=1)
-        weight = 1.0 / (1.0 + (size / max(float(np.median(size)), 0.3)) ** 2)
+        weight = 1.0 / (1.0 + (size / max(median(size), 0.3)) ** 2)
         root = np.sqrt(weight)[:, None]
         step = np.linalg.lstsq(
             (J * root[:, :, None]).reshape(-1, 4), (residual * root).ravel(), rcond=1e-10
@@ -262,7 +263,7 @@ def _matched_in_part(sources: Sources, met: NDArray[np.int64], width: int, heigh
     in one part and chance in the others, and beyond chance in all.  A part without stars, behind a
     cloud, shows no sources and says nothing.
     """
-    bright = sources.snr >= np.median(sources.snr[met])
+    bright = sources.snr >= median(sources.snr[met])
     meets = np.zeros(len(sources.snr), bool)
     meets[met] = True
     cell = np.clip((sources.xy_px * _PARTS / [width, height]).astype(np.int64), 0, _PARTS - 1)

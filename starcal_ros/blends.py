@@ -91,14 +91,12 @@ def unlisted_pull_px(magnitude: Floats, faintest: float, px_per_rad: float) -> F
     return np.asarray(0.58 * 0.65 * math.sqrt(0.5) * CLOSE_PAIR_RAD * px_per_rad * ratio)
 
 
-def _close(direction: Floats) -> NDArray[np.bool_]:
-    """Which (n,) of some directions have another of them within `CLOSE_PAIR_RAD`."""
-    close = np.zeros(len(direction), np.bool_)
-    pairs = cKDTree(direction).query_pairs(
-        2.0 * math.sin(CLOSE_PAIR_RAD / 2.0), output_type='ndarray'
-    )
-    close[pairs.ravel()] = True
-    return close
+def _alone(direction: Floats, asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which (n,) of the directions (n, 3) asked for have no other within `CLOSE_PAIR_RAD`."""
+    alone = asked.copy()
+    near = direction[asked] @ direction.T > math.cos(CLOSE_PAIR_RAD)
+    alone[asked] = np.count_nonzero(near, axis=1) == 1  # itself
+    return alone
 
 
 def separate(
@@ -119,7 +117,7 @@ def separate(
     pull_px, uncertain_px, swamped = neighbour_pulls(
         prediction.xy_px, magnitude, centroids.flux_dn, model, centroids.modelled
     )
-    unlisted = catalog.close_pair[prediction.catalog_index] & ~_close(prediction.direction_icrf)
+    unlisted = _alone(prediction.direction_icrf, catalog.close_pair[prediction.catalog_index])
     faintest = float(catalog.magnitude[-1])
     unlisted_px = np.where(
         unlisted, unlisted_pull_px(magnitude, faintest, prediction.px_per_rad), 0.0

@@ -165,9 +165,7 @@ def project_jacobians(
     J_rotation : (..., 2, 3)
         By the passive small rotation ``dtheta`` of the camera frame, rad (Eqs. 31, 34-37).
     """
-    e = np.asarray(directions_camera, np.float64)
-    z_inverse = 1.0 / e[..., 2]
-    xy = e[..., :2] * z_inverse[..., None]
+    xy = _image_plane(directions_camera)
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     fx, skew, fy, cx, cy = camera.intrinsics
@@ -187,6 +185,30 @@ def project_jacobians(
         J_parameters[..., 0, k] = fx * column_x + skew * column_y
         J_parameters[..., 1, k] = fy * column_y
 
+    return pixels, J_parameters, _rotation_jacobian(camera, xy)
+
+
+def project_rotation(camera: CameraModel, directions_camera: Floats) -> tuple[Floats, Floats]:
+    """
+    Pixels (..., 2) and their derivatives (..., 2, 3) by a small rotation, as `project_jacobians`.
+
+    Directions (..., 3) in the camera frame, Z > 0.
+    """
+    xy = _image_plane(directions_camera)
+    return project(camera, directions_camera), _rotation_jacobian(camera, xy)
+
+
+def _image_plane(directions_camera: Floats) -> Floats:
+    """Ideal points (..., 2) of directions (..., 3)."""
+    e = np.asarray(directions_camera, np.float64)
+    z_inverse = 1.0 / e[..., 2]
+    return np.asarray(e[..., :2] * z_inverse[..., None])
+
+
+def _rotation_jacobian(camera: CameraModel, xy: Floats) -> Floats:
+    """Derivative (..., 2, 3) of pixels by a small rotation, at ideal points (..., 2)."""
+    x, y = xy[..., 0], xy[..., 1]
+    fx, skew, fy, _, _ = camera.intrinsics
     J_xy = distort_jacobian(xy, camera.distortion)
     J_u = fx * J_xy[..., 0, :] + skew * J_xy[..., 1, :]
     J_v = fy * J_xy[..., 1, :]
@@ -194,14 +216,13 @@ def project_jacobians(
     one = np.ones_like(x)
     x_theta = np.stack([x * y, -(one + x * x), y], axis=-1)
     y_theta = np.stack([one + y * y, -x * y, -x], axis=-1)
-    J_rotation = np.stack(
+    return np.stack(
         [
             J_u[..., 0, None] * x_theta + J_u[..., 1, None] * y_theta,
             J_v[..., 0, None] * x_theta + J_v[..., 1, None] * y_theta,
         ],
         axis=-2,
     )
-    return pixels, J_parameters, J_rotation
 
 
 def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:

@@ -7,7 +7,6 @@ PSF, pixel noise and saturation, is found from its own brighter stars where the 
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 import math
 
@@ -22,13 +21,15 @@ from starcal_ros.detection import (
     Sources,
     stamps_about,
     stamps_at_edges,
+    windows_about,
     windows_inside,
 )
-from starcal_ros.fixed_pattern import CORE_PX, hot_in_stamps, NO_HOT_PIXELS, SPILT
+from starcal_ros.fixed_pattern import CORE_PX, hot_in_stamps, lit_alone, NO_HOT_PIXELS
 from starcal_ros.instrument import Instrument, PsfWidth, uniform_width
 from starcal_ros.options import option
 from starcal_ros.psf import (
     approach,
+    border_level_dn,
     expected_snr,
     first_guess,
     fit_at,
@@ -37,19 +38,16 @@ from starcal_ros.psf import (
     noise_sums,
     PixelNoise,
     PsfFit,
-    replace_rows,
-    select,
     stamp_radius_px,
     Stamps,
 )
+from starcal_ros.robust import centre_and_scatter, median
 
 Floats = NDArray[np.float64]
 
-_MAD_TO_SIGMA = 1.4826  # of a normal distribution
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitive than another
 _MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours
 _NEIGHBOUR_NOISE = 0.2  # of the noise of a pixel: less light of a neighbour changes nothing
-_FIRST_STEPS = 2  # of a fit, before the light of neighbours is taken off
 _IN_PLACE_PX = 1.5  # of a fit from the brightest pixel: beyond, it has gone elsewhere
 _WORST_SIGMA = 5.0  # 81 pixels of normal noise pass it once in 20,000 stars
 _BRIGHTEST = 60  # stars that show the level of saturation
@@ -196,14 +194,13 @@ def model_image(
             return unknown
         noise_dn = sample_mesh(background.noise_mesh, shape, xy)
         fit = fit_psf(stamps, sigma, noise_dn, noise_model)
-        change = float(np.median(fit.shape_change[:, :2].mean(axis=1)))
+        change = median(fit.shape_change[:, :2].mean(axis=1))
         sigma_before = sigma
         sigma *= float(np.sqrt(np.clip(1.0 + change, 0.5, 2.0)))
         sigma = float(np.clip(sigma, _MIN_PSF_SIGMA_PX, _MAX_PSF_SIGMA_PX))
         if abs(sigma - sigma_before) < 1e-3 * sigma:
             break
-    shape_median = np.median(fit.shape_change, axis=0)
-    shape_scatter = _MAD_TO_SIGMA * np.median(np.abs(fit.shape_change - shape_median), axis=0)
+    shape_median, shape_scatter = centre_and_scatter(fit.shape_change)
     limit = np.maximum(options.max_shape_change, 3.0 * shape_scatter)
     star_like = (np.abs(fit.shape_change - shape_median) < limit).all(axis=1)
     stamps, noise_dn = stamps[star_like], noise_dn[star_like]
@@ -229,7 +226,7 @@ def known_model(
     shape = (pixels.shape[0], pixels.shape[1])
     centre = np.rint(predicted_px).astype(np.int64)
     centre = centre[windows_inside(shape, centre, 2)][:_BRIGHTEST]
-    cores: Pixels = stamps_about(pixels, centre, 2).astype(pixels.dtype)  # type: ignore[assignment]
+    cores = windows_about(pixels, centre, 2)
     saturation_dn = saturation_level(cores, options)
     if saturation_dn == 0 and _BELOW_PLATEAU * cores.max(initial=0) <= known.saturation_dn:
         saturation_dn = known.saturation_dn
@@ -289,8 +286,8 @@ def _measure_by_psf(
     innermost = np.array([shape[1] - 2, shape[0] - 2])
     centre = np.clip(centre, 1, innermost)
     # The window goes where the star is: the brightest pixel next to the prediction.
-    near = stamps_about(pixels, centre, 1)
-    near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0.0
+    near = windows_about(pixels, centre, 1)
+    near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0
     best = near.reshape(n, 9).argmax(axis=1)
     centre = np.clip(centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1), 1, innermost)
     stamps, outside = stamps_at_edges(pixels, centre, radius)
@@ -299,12 +296,14 @@ def _measure_by_psf(
     sigma_px = psf.at(at_px)
     saturated = (stamps >= model.saturation_dn) & ~outside
     hot = hot_in_stamps(hot_pixels, centre, radius, shape[1]) & ~outside
+    level_dn = border_level_dn(stamps)
+    hot |= _single_pixels(pixels, stamps, centre, level_dn, noise_dn, model.pixel_noise)
     # The first guess looks at all pixels; to the fit itself these say nothing.
     if hot.any():
-        stamps[hot] = np.median(stamps, axis=(1, 2))[np.nonzero(hot)[0]]
+        stamps[hot] = level_dn[np.nonzero(hot)[0]]
     out = saturated | hot | outside
     windows = Stamps(stamps, sigma_px, noise_dn[:, None] ** 2, out if out.any() else None)
-    parameters = approach(windows, first_guess(windows), model.pixel_noise, _FIRST_STEPS)
+    parameters = approach(windows, first_guess(windows), model.pixel_noise)
     saturated_pixels = np.count_nonzero(saturated & ~hot, axis=(1, 2))
     windows, parameters, modelled = _without_neighbours(
         windows,
@@ -314,9 +313,7 @@ def _measure_by_psf(
         inside & (saturated_pixels == 0),
         model.pixel_noise,
     )
-    parameters = approach(windows, parameters, model.pixel_noise)
     fit = fit_at(windows, parameters, model.pixel_noise)
-    fit = _without_single_pixels(windows, fit, model.pixel_noise)
     for bad, reason in (
         (~inside, 'border'),
         (saturated_pixels > options.max_saturated_pixels, 'saturated'),
@@ -377,6 +374,7 @@ def _without_neighbours(
     star, other = star[told], other[told]
     away_px = (centre[other] - centre[star]).astype(np.float64)
     freed = stamps
+    touched = np.zeros(len(stamps), bool)
     # Twice: the light of a neighbour is known better once it is freed from that of its own.
     for _ in range(2):
         light = light_in_stamps(
@@ -385,52 +383,53 @@ def _without_neighbours(
         lit = light.max(axis=1, initial=0.0) > _NEIGHBOUR_NOISE * np.sqrt(
             stamps.noise2_dn2[star, 0]
         )
-        again, row = np.unique(star[lit], return_inverse=True)
+        # Also those that light was taken from before and is given back to.
+        touched[star[lit]] = True
+        again = np.flatnonzero(touched)
         if len(again) == 0:
             break
-        neighbours = np.zeros((len(again), stamps.width**2))
-        np.add.at(neighbours, row, light[lit])
-        data_dn = stamps.data_dn.copy()
-        data_dn[again] -= neighbours.reshape(-1, stamps.width, stamps.width)
+        neighbours = np.zeros((len(stamps), stamps.width**2))
+        np.add.at(neighbours, star[lit], light[lit])
         # The light is taken off, its photon noise stays.
-        noise2_dn2 = np.repeat(stamps.noise2_dn2, stamps.width**2, axis=1)
-        noise2_dn2[again] += neighbours / (noise.gain_e_per_dn * noise.background)
-        freed = Stamps(data_dn, sigma_px, noise2_dn2, stamps.out)
+        freed = Stamps(
+            stamps.data_dn - neighbours.reshape(stamps.data_dn.shape),
+            sigma_px,
+            stamps.noise2_dn2 + neighbours / (noise.gain_e_per_dn * noise.background),
+            stamps.out,
+        )
         parameters = parameters.copy()
-        parameters[again] = approach(freed.select(again), parameters[again], noise, _FIRST_STEPS)
+        parameters[again] = approach(freed.select(again), parameters[again], noise)
     return freed, parameters, modelled
 
 
-def _without_single_pixels(stamps: Stamps, fit: PsfFit, noise: PixelNoise) -> PsfFit:
+def _single_pixels(
+    pixels: Pixels,
+    stamps: Floats,
+    centre: NDArray[np.int64],
+    level_dn: Floats,
+    noise_dn: Floats,
+    noise: PixelNoise,
+) -> NDArray[np.bool_]:
     """
-    The fits without a pixel that is lit alone, away from the core of its star.
+    Which pixels (n, w, w) of the stamps are lit alone, away from the core of the star.
 
-    A cosmic ray, or a hot pixel not known yet: light of another star lights those next to it too.
-    The fit may have gone after it, so it is looked for in what the stamp holds.
+    Cosmic rays, and hot pixels not known yet: the light of a star lights those next to it too.
     """
-    hit = np.flatnonzero(fit.worst_pixel_sigma > _WORST_SIGMA)
-    if len(hit) == 0:
-        return fit
-    spoilt = stamps.select(hit)
-    above_dn = spoilt.data_dn - np.median(spoilt.data_dn, axis=(1, 2), keepdims=True)
-    rimmed = np.pad(above_dn, ((0, 0), (1, 1), (1, 1)))
-    beside = (
-        rimmed[:, 2:, 1:-1] + rimmed[:, :-2, 1:-1] + rimmed[:, 1:-1, 2:] + rimmed[:, 1:-1, :-2]
-    )
-    reach = np.arange(stamps.width) - stamps.width // 2
-    from_middle_px = np.hypot(reach[:, None], reach)
-    single = (0.25 * beside < SPILT * above_dn) & (from_middle_px > CORE_PX)
-    brightest = np.where(single, above_dn, 0.0).reshape(len(hit), -1)
-    peak = brightest.argmax(axis=1)
-    row = np.arange(len(hit))
-    out = np.zeros(spoilt.data_dn.shape, bool) if spoilt.out is None else spoilt.out.copy()
-    out.reshape(len(hit), -1)[row, peak] = True
-    data_dn = spoilt.data_dn.copy()
-    data_dn.reshape(len(hit), -1)[row, peak] -= brightest[row, peak]
-    spoilt = dataclasses.replace(spoilt, data_dn=data_dn, out=out)
-    freed = fit_at(spoilt, approach(spoilt, first_guess(spoilt), noise), noise)
-    better = (brightest[row, peak] > 0.0) & (freed.worst_pixel_sigma < _WORST_SIGMA)
-    return replace_rows(fit, hit[better], select(freed, better))
+    above_dn = stamps - level_dn[:, None, None]
+    radius = stamps.shape[1] // 2
+    reach = np.arange(-radius, radius + 1)
+    away = np.hypot(reach[:, None], reach) > CORE_PX
+    least_dn = _WORST_SIGMA * math.sqrt(noise.background) * noise_dn
+    star, row, column = np.nonzero((above_dn > least_dn[:, None, None]) & away)
+    v, u = centre[star, 1] + row - radius, centre[star, 0] + column - radius
+    lit_dn = above_dn[star, row, column]
+    inner = (u >= 1) & (u < pixels.shape[1] - 1) & (v >= 1) & (v < pixels.shape[0] - 1)
+    inner &= lit_dn**2 > least_dn[star] ** 2 + _WORST_SIGMA**2 * lit_dn / noise.gain_e_per_dn
+    star, row, column, v, u = (of[inner] for of in (star, row, column, v, u))
+    alone = lit_alone(pixels, v, u, level_dn[star])
+    single = np.zeros(stamps.shape, bool)
+    single[star[alone], row[alone], column[alone]] = True
+    return single
 
 
 def _measure_by_moments(

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
+
+from starcal_ros.robust import median, medians
 
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
@@ -87,7 +90,8 @@ def sample_background(pixels: Pixels) -> Background:
     apart = samples[:, :width] - beside[:, :width]
     rank = int(width * 0.6827)
     _, noise = _clipped(apart, np.partition(np.abs(apart), rank, axis=1)[:, rank])
-    return _background(np.median(samples[:, ::2], axis=1), noise / math.sqrt(2.0), mesh_shape)
+    level = medians(samples[:, ::2].T).astype(np.float32)
+    return _background(level, noise / math.sqrt(2.0), mesh_shape)
 
 
 def _cells(
@@ -121,9 +125,7 @@ def _background(
     """Smooth level and noise of the cells; no noise is under that of rounding to whole DN."""
     level_mesh = _smooth_mesh(level.reshape(mesh_shape))
     noise_mesh = _smooth_mesh(np.maximum(noise, math.sqrt(1.0 / 12.0)).reshape(mesh_shape))
-    return Background(
-        level_mesh, noise_mesh, float(np.median(level_mesh)), float(np.median(noise_mesh))
-    )
+    return Background(level_mesh, noise_mesh, median(level_mesh), median(noise_mesh))
 
 
 def _smooth_mesh(mesh: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -236,7 +238,7 @@ def _brightest(
     """Place (n, 2) and signal-to-noise (n,) of the star-like maximum of windows; 0 for none."""
     shape = (pixels.shape[0], pixels.shape[1])
     half = reach_px + _RIM_PX
-    windows = stamps_about(pixels, centre, half).astype(np.float32)
+    windows = windows_about(pixels, centre, half).astype(np.float32)
     level = sample_mesh(background.level_mesh, shape, centre.astype(np.float64))
     windows -= level[:, None, None].astype(np.float32)
     filtered = np.zeros_like(windows)
@@ -276,11 +278,18 @@ def _parabola_vertex(
     return np.asarray(np.clip(vertex, -0.5, 0.5), np.float64)
 
 
-def stamps_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Floats:
+def windows_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Pixels:
     """Square windows (n, 2 radius + 1, 2 radius + 1) about integer pixels (n, 2), inside."""
     side = 2 * radius + 1
-    windows = np.lib.stride_tricks.sliding_window_view(pixels, (side, side))
-    return windows[centre[:, 1] - radius, centre[:, 0] - radius].astype(np.float64)
+    # The types of NumPy forget what the pixels are.
+    every: Any = np.lib.stride_tricks.sliding_window_view(pixels, (side, side))
+    windows: Pixels = every[centre[:, 1] - radius, centre[:, 0] - radius]
+    return windows
+
+
+def stamps_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Floats:
+    """As `windows_about`, to reckon with."""
+    return windows_about(pixels, centre, radius).astype(np.float64)
 
 
 def stamps_at_edges(

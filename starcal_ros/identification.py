@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.acquisition import acquire
 from starcal_ros.astrometry import SiteOptions
 from starcal_ros.blends import separate
+from starcal_ros.brightness import refuse_unlike
 from starcal_ros.camera import line_of_sight
 from starcal_ros.catalog import StarCatalog
 from starcal_ros.centroiding import (
@@ -162,7 +163,8 @@ def measure_predicted(
     Raises
     ------
     ImageRefused
-        ``incomplete`` where the stars show that some rows were lost.
+        ``incomplete`` where the stars show that some rows were lost, ``no_match`` where they are
+        not as bright as those of the catalog.
     """
     height, width = shot.image.pixels.shape
     shown = within_image(prediction, width, height)
@@ -180,6 +182,8 @@ def measure_predicted(
         stamp_radius_px(psf_sigma_px),
         psf_sigma_px,
     )
+    magnitude = catalog.magnitude[shown.catalog_index]
+    refusal = refuse_unlike(magnitude, centroids.flux_dn, refusal)
     centroids = dataclasses.replace(centroids, refusal=refusal)
     observations = _observations(
         shot, shown, catalog, centroids, model, options.min_stars_per_image
@@ -314,10 +318,11 @@ def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) ->
     good = np.nonzero(refusal == '')[0]
     if len(good) < 4:
         return refusal
+    expected_px, measured_px = predicted_px[good], centroids.xy_px[good]
     correction, scatter_px = fit_warp(
-        predicted_px[good], centroids.xy_px[good], sigma_px[good], predicted_px[good], 0.5 * width
+        expected_px, measured_px, sigma_px[good], expected_px, 0.5 * width
     )
-    off_px = np.linalg.norm(centroids.xy_px[good] - predicted_px[good] - correction, axis=1)
+    off_px = np.hypot(*(measured_px - expected_px - correction).T)
     limit_px = np.maximum(5.0 * np.hypot(sigma_px[good], 0.75 * scatter_px), 0.3)
     refusal[good[off_px > np.minimum(limit_px, 2.0)]] = 'ambiguous'
     return refusal

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.psf import noise_sums, NoiseSums, PixelNoise, PsfFit, select
+from starcal_ros.robust import centre_and_scatter
 
 Floats = NDArray[np.float64]
 
@@ -22,7 +23,6 @@ _BRIGHT_SNR = 15.0  # of stars that tell the shape of the PSF
 _MOST = 60  # brightest of them, which know all the rest do
 _FEWEST = 5  # such stars, or an image tells nothing
 _MAP_CHI2 = 30.0  # five normal deviates squared come to that once in 80,000 times
-_MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
 
 @dataclass(frozen=True)
@@ -136,8 +136,7 @@ def learn(
         return before
     fit, noise_dn = select(fit, bright), stars.noise_dn[bright]
     variance = stars.sigma_px[bright] ** 2
-    median = np.median(fit.shape_change, axis=0)
-    scatter = _MAD_TO_SIGMA * np.median(np.abs(fit.shape_change - median), axis=0)
+    median, scatter = centre_and_scatter(fit.shape_change)
     change = fit.shape_change[:, :2].mean(axis=1)
     # One star may be off by the scatter of all, or by more: a companion or a cosmic ray.
     spread2 = 0.25 * (fit.shape_sigma[:, :2] ** 2).sum(axis=1) + 0.5 * scatter[:2].mean() ** 2

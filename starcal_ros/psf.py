@@ -28,8 +28,9 @@ from scipy.special import erf, ndtr
 Floats = NDArray[np.float64]
 
 _FIT_STEPS = 4  # stars settle in two or three; what has not by then is no star
-# Gauss-Newton divides what is left of the way by ten and more with each step, and takes one more.
-_SETTLED_SIGMA = 0.3
+# A step of s leaves s / SNR of the way for faint stars and s^2 / sigma_px for bright ones.  Below
+# this part of sigma_px and of the noise of the place, squared, the last step leaves 0.1 of that.
+_SETTLED = 0.3
 _SIGNIFICANT = 3.0  # sigma
 
 
@@ -79,19 +80,9 @@ def select(fit: PsfFit, stars: NDArray[np.intp] | NDArray[np.bool_]) -> PsfFit:
     return PsfFit(**{field.name: getattr(fit, field.name)[stars] for field in fields(fit)})
 
 
-def replace_rows(fit: PsfFit, stars: NDArray[np.intp], by: PsfFit) -> PsfFit:
-    """Return the fits with those of some stars, by row number, replaced."""
-    changed = {}
-    for field in fields(fit):
-        column = getattr(fit, field.name).copy()
-        column[stars] = getattr(by, field.name)
-        changed[field.name] = column
-    return PsfFit(**changed)
-
-
 def stamp_radius_px(psf_sigma_px: float) -> int:
     """Half width of the fitting window: beyond 3.5 sigma lies under 0.3 % of a star's light."""
-    return int(np.clip(np.ceil(3.5 * psf_sigma_px), 3, 12))
+    return int(np.clip(np.ceil(3.0 * psf_sigma_px), 3, 12))
 
 
 @dataclass(frozen=True)
@@ -176,8 +167,8 @@ def approach(
     Parameters (n, 4) after some steps towards the fit: x, y (px), flux, background (DN).
 
     Gauss-Newton with the weights renewed from the model at each step, so that the noise of the
-    data does not bias them; a step in position is at most half a pixel.  Stars that have settled
-    are left alone.
+    data does not bias them; a step in position is at most half a pixel.  Stars that one more step
+    brings to the fit, such as `fit_at` takes, are left alone.
     """
     parameters = parameters.copy()
     half_px = stamps.width / 2
@@ -189,13 +180,14 @@ def approach(
         rows = _psf_rows(at, chosen.flat_dn, chosen.sigma_px, chosen.width, 4)
         normal, gradient = _normal(rows, _weights(rows, at, chosen, pixel_noise))
         step = np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
-        step[:, :2] = np.clip(step[:, :2], -0.5, 0.5)
+        step[:, :2].clip(-0.5, 0.5, out=step[:, :2])
         at = at + step
-        at[:, :2] = np.clip(at[:, :2], -half_px, half_px)
+        at[:, :2].clip(-half_px, half_px, out=at[:, :2])
         parameters[active] = at
-        # Against the sigma of the place with flux and background known, the smaller one.
-        moving = step[:, :2] ** 2 * np.einsum('nii->ni', normal)[:, :2] > _SETTLED_SIGMA**2
-        active = active[moving.any(axis=1)]
+        # The noise of the place with flux and background known, the smaller one.
+        place_sigma_px = 1.0 / np.sqrt(np.einsum('nii->ni', normal)[:, :2])
+        limit_px2 = _SETTLED * place_sigma_px * chosen.sigma_px[:, None]
+        active = active[(step[:, :2] ** 2 > limit_px2).any(axis=1)]
     return parameters
 
 
@@ -208,10 +200,12 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     normal, gradient = _normal(rows, weight)
     covariance = np.asarray(np.linalg.inv(normal[:, :4, :4]), np.float64)
     last = (covariance @ gradient[:, :4, None])[:, :, 0]
-    last[:, :2] = np.clip(last[:, :2], -0.5, 0.5)
-    shape_covariance = np.linalg.inv(normal)
-    shape_step = (shape_covariance @ gradient[:, :, None])[:, :, 0]
-    residual = rows[:, 7]
+    last[:, :2].clip(-0.5, 0.5, out=last[:, :2])
+    # Of the inverse of the whole only the columns of the moments are wanted.
+    of_shape = np.linalg.solve(normal, np.broadcast_to(np.eye(7)[:, 4:], (len(normal), 7, 3)))
+    shape_step = (gradient[:, None, :] @ of_shape)[:, 0]
+    shape_variance = of_shape[:, [4, 5, 6], [0, 1, 2]]
+    residual = rows[:, 7] - (last[:, None, :] @ rows[:, :4])[:, 0]
     leverage = ((covariance @ rows[:, :4]) * rows[:, :4]).sum(axis=1) * weight
     signal = parameters[:, 2, None] * rows[:, 2]
     parameters = parameters + last
@@ -224,14 +218,14 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
         trust = weight / (1.0 + excess)
         scatter = (rows[:, :7] * (excess * weight)[:, None, :]) @ rows[:, :7].transpose(0, 2, 1)
         covariance = covariance + covariance @ scatter[:, :4, :4] @ covariance
-        shape_covariance = shape_covariance + shape_covariance @ scatter @ shape_covariance
+        shape_variance = shape_variance + (of_shape * (scatter @ of_shape)).sum(axis=1)
     return PsfFit(
         parameters=parameters,
         covariance=covariance,
         snr=snr,
         worst_pixel_sigma=np.sqrt((trust * residual**2).max(axis=1, initial=0.0)),
-        shape_change=shape_step[:, 4:],
-        shape_sigma=np.sqrt(np.einsum('nii->ni', shape_covariance)[:, 4:]),
+        shape_change=shape_step,
+        shape_sigma=np.sqrt(shape_variance),
         signal_dn=signal,
         residual_dn=residual if valid is None else np.where(valid, residual, np.nan),
         freedom=np.maximum(1.0 - leverage, 0.05),
@@ -250,11 +244,7 @@ def expected_snr(
 def first_guess(windows: Stamps) -> Floats:
     """Parameters (n, 4) from which the fit starts: the centre of the light next to the middle."""
     stamps, sigma_px, w = windows.data_dn, windows.sigma_px, windows.width
-    border = np.concatenate(
-        [stamps[:, 0], stamps[:, -1], stamps[:, 1:-1, 0], stamps[:, 1:-1, -1]], axis=1
-    )
-    middle = border.shape[1] // 2
-    background = np.partition(border, middle, axis=1)[:, middle]
+    background = border_level_dn(stamps)
     c = w // 2
     core = stamps[:, c - 1 : c + 2, c - 1 : c + 2] - background[:, None, None]
     along_x, along_y = core.sum(axis=1), core.sum(axis=2)
@@ -266,6 +256,15 @@ def first_guess(windows: Stamps) -> Floats:
     y = np.clip((along_y[:, 2] - along_y[:, 0]) / total * share / slope, -0.7, 0.7)
     flux = core.sum(axis=(1, 2)) / share**2
     return np.stack([x, y, flux, background], axis=-1)
+
+
+def border_level_dn(stamps: Floats) -> Floats:
+    """Medians (n,) of the outermost pixels of windows (n, w, w)."""
+    border = np.concatenate(
+        [stamps[:, 0], stamps[:, -1], stamps[:, 1:-1, 0], stamps[:, 1:-1, -1]], axis=1
+    )
+    middle = border.shape[1] // 2
+    return np.asarray(np.partition(border, middle, axis=1)[:, middle])
 
 
 def light_in_stamps(place_px: Floats, flux_dn: Floats, sigma_px: Floats, width: int) -> Floats:
@@ -309,7 +308,10 @@ def neighbour_pull_px(
     light += light_in_stamps(offset_px, neighbour_flux_dn, sigma, width)
     stamps = Stamps(light.reshape(count, width, width), sigma, np.full((count, 1), noise_dn**2))
     alone = np.stack([*np.zeros((2, count)), flux_dn, np.zeros(count)], axis=-1)
-    return approach(stamps, alone, pixel_noise)[:, :2]
+    # The second step leaves a hundredth of the pull.
+    for _ in range(2):
+        alone = approach(stamps, alone, pixel_noise, steps=1)
+    return alone[:, :2]
 
 
 @dataclass(frozen=True)
@@ -365,16 +367,17 @@ def noise_sums(fit: PsfFit, noise_dn: Floats, expected: PixelNoise) -> NoiseSums
     ``noise_dn`` (n,).  Each residual is freed from what the fit itself has taken of it; one of
     more than five sigma is something else.
     """
-    noise2 = np.broadcast_to(noise_dn[:, None] ** 2, fit.signal_dn.shape)
+    noise2 = noise_dn[:, None] ** 2
     signal = np.maximum(fit.signal_dn, 0.0)
-    flux = np.broadcast_to(np.maximum(fit.parameters[:, 2, None], 0.0), signal.shape)
+    flux = np.maximum(fit.parameters[:, 2, None], 0.0)
     variance = expected.variance(signal, noise_dn[:, None], flux)
-    squared = np.nan_to_num(fit.residual_dn**2 / fit.freedom, nan=np.inf)
+    squared = fit.residual_dn**2 / fit.freedom
+    # NaN, a pixel that took no part, is not below either.
     keep = squared < 25.0 * variance
-    weight = (1.0 / variance)[keep]
-    signal = signal[keep] * weight
-    A = np.stack([noise2[keep] * weight, signal, signal * flux[keep]])
-    return NoiseSums(A @ A.T, A @ (squared[keep] * weight))
+    weight = keep / variance
+    signal = signal * weight
+    A = np.stack([noise2 * weight, signal, signal * flux]).reshape(3, -1)
+    return NoiseSums(A @ A.T, A @ np.where(keep, squared * weight, 0.0).ravel())
 
 
 def _gauss(t: Floats) -> Floats:
@@ -419,9 +422,9 @@ def _psf_rows(
     rows = np.empty((n, count + 1, width * width))
     flux = flux[:, None]
     # Spread over the stamp first: products of long rows take a third of those of short ones.
-    px, py = np.tile(value[:n], width), np.repeat(value[n:], width, axis=1)
-    flux_px1 = np.tile(flux * first[:n], width)
-    py1 = np.repeat(first[n:], width, axis=1)
+    px, py = _in_each_row(value[:n]), value[n:].repeat(width, axis=1)
+    flux_px1 = _in_each_row(flux * first[:n])
+    py1 = first[n:].repeat(width, axis=1)
     np.multiply(py, flux_px1, out=rows[:, 0])
     np.multiply(py, px, out=rows[:, 2])
     px *= flux
@@ -429,8 +432,8 @@ def _psf_rows(
     rows[:, 3] = 1.0
     if count == 7:
         variance = sigma_px[:, None] ** 2
-        np.multiply(py, np.tile(0.5 * flux * variance * second[:n], width), out=rows[:, 4])
-        np.multiply(px, np.repeat(0.5 * variance * second[n:], width, axis=1), out=rows[:, 5])
+        np.multiply(py, _in_each_row(0.5 * flux * variance * second[:n]), out=rows[:, 4])
+        np.multiply(px, (0.5 * variance * second[n:]).repeat(width, axis=1), out=rows[:, 5])
         py1 *= variance
         np.multiply(py1, flux_px1, out=rows[:, 6])
     residual = rows[:, count]
@@ -438,6 +441,14 @@ def _psf_rows(
     residual += data
     residual -= level[:, None]
     return rows
+
+
+def _in_each_row(of_columns: Floats) -> Floats:
+    """Values (n, w) of columns, spread over the pixels (n, w * w) of a stamp."""
+    n, width = of_columns.shape
+    spread = np.empty((n, width, width))
+    spread[:] = of_columns[:, None, :]
+    return spread.reshape(n, width * width)
 
 
 def _weights(rows: Floats, parameters: Floats, stamps: Stamps, pixel_noise: PixelNoise) -> Floats:

@@ -11,7 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.polynomial import polyvander2d
 from numpy.typing import NDArray
+
+from starcal_ros.robust import median, RAYLEIGH_TO_SIGMA
 
 Floats = NDArray[np.float64]
 
@@ -45,6 +48,10 @@ def find_tear(
     axis.  The differences are fitted by a polynomial in u and v and a step at each of some rows,
     robustly.  A prior that is wrong by a smooth function of any size makes no tear.
     """
+    # A jump between two sides takes one of them off by half of it.
+    away_px = np.hypot(*(measured_px - predicted_px).T) - 2.0 * sigma_px
+    if np.count_nonzero(away_px > 0.5 * _LEAST_PX) < _EACH_SIDE // 2:
+        return None
     if len(predicted_px) > _BRIGHTEST:
         best = np.argpartition(sigma_px, _BRIGHTEST)[:_BRIGHTEST]
         predicted_px, measured_px, sigma_px = predicted_px[best], measured_px[best], sigma_px[best]
@@ -61,9 +68,9 @@ def find_tear(
         return None
     rows, steps = rows[told], below[:, told].astype(np.float64)
     u, v = ((predicted_px - np.array([width, height]) / 2.0) / (max(width, height) / 2.0)).T
-    smooth = np.stack(
-        [u**i * v**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1
-    )
+    smooth = polyvander2d(u, v, [degree, degree])
+    powers = np.arange(degree + 1)
+    smooth = smooth[:, np.add.outer(powers, powers).ravel() <= degree]
     root = 1.0 / np.hypot(sigma_px, _FLOOR_PX)
     weight = root
     for power in (0.5, 1.0, 1.0, 1.0):
@@ -79,7 +86,7 @@ def find_tear(
         if rise[k] < _LEAST_RISE:
             return None
         off_sigma = np.hypot(*(left - jump[:, [k]] * off_px[k]).T) * root / weight
-        scatter = max(1.0, float(np.median(off_sigma)) / 1.1774)  # Rayleigh median: 1.1774 sigma
+        scatter = max(1.0, median(off_sigma) * RAYLEIGH_TO_SIGMA)
         weight = root / scatter / (1.0 + (off_sigma / (3.0 * scatter)) ** 2) ** power
     agree = off_sigma < 4.0 * scatter
     side = steps[:, k] == (2.0 * steps[:, k].mean() < 1.0)  # the one of fewer stars

@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import pdtrc
 
-from starcal_ros.camera import CameraModel, field_radius_rad, project, project_jacobians
+from starcal_ros.camera import (
+    CameraModel,
+    field_radius_rad,
+    project,
+    project_jacobians,
+    project_rotation,
+)
 from starcal_ros.catalog import cone, StarCatalog
 from starcal_ros.centroiding import CentroidOptions, known_model
 from starcal_ros.detection import (
@@ -33,10 +39,11 @@ from starcal_ros.identification import IdentificationOptions, measure_predicted,
 from starcal_ros.instrument import Instrument
 from starcal_ros.prediction import Prediction, seen
 from starcal_ros.records import CameraGeometry, StarObservations
+from starcal_ros.robust import median
 
 Floats = NDArray[np.float64]
 
-_GUIDES = 32  # brightest predictions that are looked for in windows
+_GUIDES = 24  # brightest predictions that are looked for in windows
 _NEIGHBOUR_PX = 3.0  # a small turn moves the guides alike; a roll of 0.1 degrees, by 3 px
 _CHANCE = 1e-9  # greatest probability that the windows bear out a wrong prediction
 _GOOD_SNR = 10.0  # of stars that correct the prediction
@@ -168,8 +175,8 @@ def _find_turn(
     lost = ImageRefused('no_match', f'{len(guides)} of the brightest stars meet a source')
     if len(guides) < 4:
         raise lost
-    offset_px, _, J = project_jacobians(camera, prediction.direction_camera[guides])
-    offset_px = place_px - offset_px
+    predicted_px, J = project_rotation(camera, prediction.direction_camera[guides])
+    offset_px = place_px - predicted_px
     apart2 = ((offset_px[:, None] - offset_px[None]) ** 2).sum(axis=2)
     common = int((apart2 < _NEIGHBOUR_PX**2).sum(axis=1).argmax())
     near = apart2[common] < _NEIGHBOUR_PX**2
@@ -183,7 +190,7 @@ def _find_turn(
         normal = A.T @ A
         turn_rad = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(3), A.T @ b)
         left_px = np.hypot(*(offset_px - J @ turn_rad).T)
-        limit_px = float(np.clip(4.0 * np.median(left_px[near]), 0.75, _NEIGHBOUR_PX))
+        limit_px = float(np.clip(4.0 * median(left_px[near]), 0.75, _NEIGHBOUR_PX))
         near = left_px < limit_px
     matched = int(np.count_nonzero(near))
     side_px = 2 * reach_px + 1
@@ -210,7 +217,7 @@ def _corrected(geometry: CameraGeometry, observations: StarObservations) -> Came
     directions, measured_px = directions[bright], observations.measured_px[bright]
     # No prediction needs to be better than a twentieth of a pixel.
     weight = 1.0 / (variance_px2[bright] + 0.05**2)
-    pixels, _, J = project_jacobians(camera, directions)
+    pixels, J = project_rotation(camera, directions)
     step = _step(J, measured_px - pixels, weight, np.zeros(3), np.zeros(3))
     turn = Rotation.from_rotvec(-step)
     left_px = measured_px - pixels - J @ step
@@ -244,7 +251,7 @@ def _corrected_camera(
 def _step(J: Floats, residual_px: Floats, weight: Floats, held: Floats, pull: Floats) -> Floats:
     """Robust step (k,) of ``J`` (n, 2, k), with a prior of weight ``held`` (k,) at ``pull``."""
     off2 = weight * (residual_px**2).sum(axis=1)
-    root = np.sqrt(weight) / (1.0 + off2 / max(9.0, 9.0 * float(np.median(off2))))
+    root = np.sqrt(weight) / (1.0 + off2 / max(9.0, 9.0 * median(off2)))
     A = (J * root[:, None, None]).reshape(-1, J.shape[-1])
     b = (residual_px * root[:, None]).ravel()
     return np.asarray(np.linalg.solve(A.T @ A + np.diag(held), A.T @ b + held * pull))

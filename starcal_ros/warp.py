@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.robust import median, medians, RAYLEIGH_TO_SIGMA
+
 Floats = NDArray[np.float64]
 
 
@@ -36,13 +38,13 @@ def fit_warp(
 
     A = basis(predicted_px)
     residual = measured_px - predicted_px
-    coefficients = np.median(residual, axis=0)[None] * (np.arange(len(powers)) == 0)[:, None]
+    coefficients = medians(residual)[None] * (np.arange(len(powers)) == 0)[:, None]
     scatter = 1.0
     for _ in range(8):
         left = residual - A.T @ coefficients
         size = np.hypot(left[:, 0], left[:, 1])
         before = scatter
-        scatter = max(float(np.median(size)) / 1.1774, 0.01)  # Rayleigh median: 1.1774 sigma
+        scatter = max(median(size) * RAYLEIGH_TO_SIGMA, 0.01)
         spread2 = sigma_px**2 + scatter**2
         weight = 1.0 / spread2 / (1.0 + size**2 / (9.0 * spread2)) ** 2
         weighted = A * weight
@@ -53,4 +55,5 @@ def fit_warp(
         coefficients = np.linalg.solve(normal, weighted @ residual)
         if abs(scatter - before) < 0.03 * scatter:
             break
-    return basis(at_px).T @ coefficients, scatter
+    at = A if at_px is predicted_px else basis(at_px)
+    return at.T @ coefficients, scatter

@@ -511,9 +511,8 @@ def test_the_fit_itself_is_exact_on_its_own_model() -> None:
     )
     fit = fit_psf(stamps, 1.1, np.full(50, 2.0), PixelNoise(4.0, 0.0))
     expected = np.concatenate([centre, flux[:, None], level[:, None]], axis=1)
-    # The iteration ends where a step is 0.3 sigma, takes one more, and leaves some thousandth of a
-    # sigma, which is 0.01 px here.  The residual is that before
-    # the last step: a tenth of the noise.
+    # The last step leaves some thousandth of a sigma, which is 0.01 px here, and the residual is
+    # followed through it to first order: a tenth of the noise is left.
     np.testing.assert_allclose(fit.parameters, expected, rtol=1e-5, atol=1e-5)
     assert np.abs(fit.residual_dn).max() < 0.1 * 2.0
     assert np.abs(fit.shape_change).max() < 1e-4

@@ -1,0 +1,37 @@
+"""
+Medians, and the standard deviations of normal noise that they stand for.
+
+NumPy's own median takes twenty times as long on the hundred numbers of one image: of an even count
+it forms the mean of two, and it looks for NaN.  These take the upper one of the two.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution
+RAYLEIGH_TO_SIGMA = 1.0 / 1.1774  # median length of a vector of two normal components
+
+
+def median(values: NDArray[Any]) -> float:
+    """Middle one of all values, the upper of two; there must be one."""
+    flat = values.ravel()
+    middle = flat.size // 2
+    return float(np.partition(flat, middle)[middle])
+
+
+def medians(values: NDArray[Any]) -> Floats:
+    """Medians (k,) of the columns of (n, k)."""
+    middle = len(values) // 2
+    return np.asarray(np.partition(values, middle, axis=0)[middle], np.float64)
+
+
+def centre_and_scatter(values: Floats) -> tuple[Floats, Floats]:
+    """Median (k,) and 1-sigma scatter (k,) of the columns of (n, k), from absolute deviations."""
+    centre = medians(values)
+    return centre, MAD_TO_SIGMA * medians(np.abs(values - centre))
