@@ -35,6 +35,7 @@ from starcal_ros.psf import (
     fit_at,
     fit_psf,
     light_in_stamps,
+    MISFIT_SIGMA,
     noise_sums,
     PixelNoise,
     PsfFit,
@@ -49,7 +50,6 @@ _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitiv
 _MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours
 _NEIGHBOUR_NOISE = 0.2  # of the noise of a pixel: less light of a neighbour changes nothing
 _IN_PLACE_PX = 1.5  # of a fit from the brightest pixel: beyond, it has gone elsewhere
-_WORST_SIGMA = 5.0  # 81 pixels of normal noise pass it once in 20,000 stars
 _BRIGHTEST = 60  # stars that show the level of saturation
 _MIN_PSF_SIGMA_PX = 0.45
 _MAX_PSF_SIGMA_PX = 4.0
@@ -288,7 +288,9 @@ def _measure_by_psf(
     # The window goes where the star is: the brightest pixel next to the prediction.
     near = windows_about(pixels, centre, 1)
     near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0
-    best = near.reshape(n, 9).argmax(axis=1)
+    near = near.reshape(n, 9)
+    best = near.argmax(axis=1)
+    best[near[:, 4] == near.max(axis=1)] = 4  # of a saturated plateau, the pixel predicted
     centre = np.clip(centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1), 1, innermost)
     stamps, outside = stamps_at_edges(pixels, centre, radius)
     at_px = centre.astype(np.float64)
@@ -340,7 +342,7 @@ def _misshapen(fit: PsfFit, model: ImageModel, options: CentroidOptions) -> NDAr
     departure = np.abs(fit.shape_change - model.shape_median)
     limit = np.maximum(options.max_shape_change, 4.0 * model.shape_scatter)
     other = ((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1)
-    return np.asarray(other | (fit.worst_pixel_sigma > _WORST_SIGMA))
+    return np.asarray(other | (fit.worst_pixel_sigma > MISFIT_SIGMA))
 
 
 def _without_neighbours(
@@ -375,19 +377,20 @@ def _without_neighbours(
     away_px = (centre[other] - centre[star]).astype(np.float64)
     freed = stamps
     touched = np.zeros(len(stamps), bool)
+    little_dn = _NEIGHBOUR_NOISE * np.sqrt(stamps.noise2_dn2[star, 0])
+    light: Floats = np.zeros((len(star), stamps.width**2))
     # Twice: the light of a neighbour is known better once it is freed from that of its own.
     for _ in range(2):
+        before = light
         light = light_in_stamps(
             away_px + parameters[other, :2], parameters[other, 2], sigma_px[other], stamps.width
         )
-        lit = light.max(axis=1, initial=0.0) > _NEIGHBOUR_NOISE * np.sqrt(
-            stamps.noise2_dn2[star, 0]
-        )
+        if not (np.abs(light - before).max(axis=1, initial=0.0) > little_dn).any():
+            break
+        lit = light.max(axis=1, initial=0.0) > little_dn
         # Also those that light was taken from before and is given back to.
         touched[star[lit]] = True
         again = np.flatnonzero(touched)
-        if len(again) == 0:
-            break
         neighbours = np.zeros((len(stamps), stamps.width**2))
         np.add.at(neighbours, star[lit], light[lit])
         # The light is taken off, its photon noise stays.
@@ -419,12 +422,12 @@ def _single_pixels(
     radius = stamps.shape[1] // 2
     reach = np.arange(-radius, radius + 1)
     away = np.hypot(reach[:, None], reach) > CORE_PX
-    least_dn = _WORST_SIGMA * math.sqrt(noise.background) * noise_dn
+    least_dn = MISFIT_SIGMA * math.sqrt(noise.background) * noise_dn
     star, row, column = np.nonzero((above_dn > least_dn[:, None, None]) & away)
     v, u = centre[star, 1] + row - radius, centre[star, 0] + column - radius
     lit_dn = above_dn[star, row, column]
     inner = (u >= 1) & (u < pixels.shape[1] - 1) & (v >= 1) & (v < pixels.shape[0] - 1)
-    inner &= lit_dn**2 > least_dn[star] ** 2 + _WORST_SIGMA**2 * lit_dn / noise.gain_e_per_dn
+    inner &= lit_dn**2 > least_dn[star] ** 2 + MISFIT_SIGMA**2 * lit_dn / noise.gain_e_per_dn
     star, row, column, v, u = (of[inner] for of in (star, row, column, v, u))
     alone = lit_alone(pixels, v, u, level_dn[star])
     single = np.zeros(stamps.shape, bool)

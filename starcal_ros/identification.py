@@ -76,7 +76,7 @@ class IdentificationOptions:
         8, 'fewest measured stars with which an image is used', low=3, high=1000
     )
     max_blend_sigma: float = option(
-        1.0,
+        3.0,
         'largest error left of the pull of catalog neighbours on a centroid, in its sigma',
         low=0.0,
         high=100.0,

@@ -25,6 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf, ndtr
 
+from starcal_ros.fixed_pattern import CORE_PX, SPILT
+
 Floats = NDArray[np.float64]
 
 _FIT_STEPS = 4  # stars settle in two or three; what has not by then is no star
@@ -32,6 +34,7 @@ _FIT_STEPS = 4  # stars settle in two or three; what has not by then is no star
 # this part of sigma_px and of the noise of the place, squared, the last step leaves 0.1 of that.
 _SETTLED = 0.3
 _SIGNIFICANT = 3.0  # sigma
+MISFIT_SIGMA = 5.0  # 81 pixels of normal noise pass it once in 20,000 stars
 
 
 @dataclass(frozen=True)
@@ -192,8 +195,12 @@ def approach(
 
 
 def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFit:
-    """Fits to stamps whose parameters (n, 4) are near: the last step, and what is known of it."""
-    valid = stamps.valid
+    """
+    Fits to stamps whose parameters (n, 4) are near: the last step, and what is known of it.
+
+    A pixel that alone does not fit, such as a cosmic ray on the flank of a bright star, takes no
+    part.
+    """
     # Second moments: one linear step from the solution, in units of the PSF variance.
     rows = _psf_rows(parameters, stamps.flat_dn, stamps.sigma_px, stamps.width, 7)
     weight = _weights(rows, parameters, stamps, pixel_noise)
@@ -205,7 +212,14 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     of_shape = np.linalg.solve(normal, np.broadcast_to(np.eye(7)[:, 4:], (len(normal), 7, 3)))
     shape_step = (gradient[:, None, :] @ of_shape)[:, 0]
     shape_variance = of_shape[:, [4, 5, 6], [0, 1, 2]]
-    residual = rows[:, 7] - (last[:, None, :] @ rows[:, :4])[:, 0]
+    residual = _after(last, rows)
+    spoilt, pixel = _single_misfits(residual, weight, parameters, stamps.width)
+    if len(spoilt):
+        weight[spoilt, pixel] = 0.0
+        normal[spoilt], gradient[spoilt] = _normal(rows[spoilt], weight[spoilt])
+        covariance[spoilt] = np.linalg.inv(normal[spoilt, :4, :4])
+        last[spoilt] = (covariance[spoilt] @ gradient[spoilt, :4, None])[:, :, 0]
+        residual[spoilt] = _after(last[spoilt], rows[spoilt])
     leverage = ((covariance @ rows[:, :4]) * rows[:, :4]).sum(axis=1) * weight
     signal = parameters[:, 2, None] * rows[:, 2]
     parameters = parameters + last
@@ -227,9 +241,35 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
         shape_change=shape_step,
         shape_sigma=np.sqrt(shape_variance),
         signal_dn=signal,
-        residual_dn=residual if valid is None else np.where(valid, residual, np.nan),
+        residual_dn=np.where(weight > 0.0, residual, np.nan),
         freedom=np.maximum(1.0 - leverage, 0.05),
     )
+
+
+def _after(step: Floats, rows: Floats) -> Floats:
+    """Residuals (n, p) that a step (n, 4) leaves of those of `_psf_rows`, to first order."""
+    return np.asarray(rows[:, -1] - (step[:, None, :] @ rows[:, :4])[:, 0])
+
+
+def _single_misfits(
+    residual: Floats, weight: Floats, parameters: Floats, width: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """
+    Rows (k,) of stars with one pixel lit too much that does not spill over, and that pixel.
+
+    Not of the core: a star that has lost its peak is hardly measured.
+    """
+    misfit = residual * np.sqrt(weight)
+    worst = misfit.argmax(axis=1)
+    star = np.flatnonzero(misfit[np.arange(len(misfit)), worst] > MISFIT_SIGMA)
+    pixel = worst[star]
+    row, (v, u) = np.arange(len(star)), np.divmod(pixel, width)
+    rimmed = np.zeros((len(star), width + 2, width + 2))
+    rimmed[:, 1:-1, 1:-1] = residual[star].reshape(-1, width, width)
+    beside = [rimmed[row, v + b, u + a] for b, a in ((0, 1), (2, 1), (1, 0), (1, 2))]
+    alone = np.mean(beside, axis=0) < SPILT * residual[star, pixel]
+    alone &= np.hypot(*(np.stack([u, v]) - width // 2 - parameters[star, :2].T)) > CORE_PX
+    return star[alone], pixel[alone]
 
 
 def expected_snr(

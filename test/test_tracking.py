@@ -145,7 +145,9 @@ def test_noise_of_the_star_tracker_is_followed() -> None:
     # 8 px, where the window reaches 12.
     jumped, after = followed(shot(1, np.radians(0.25)), known)
     np.testing.assert_array_equal(jumped.catalog_id, quiet.catalog_id)
-    np.testing.assert_allclose(jumped.measured_px, quiet.measured_px, rtol=0, atol=0.01)
+    # Fits that start from elsewhere end within what their last step leaves: 0.1 sigma.
+    sigma_px = np.sqrt(quiet.covariance_px2[:, [0, 2]])
+    assert np.abs((jumped.measured_px - quiet.measured_px) / sigma_px).max() < 0.1
     before = Rotation.from_quat(straight.geometry.star_tracker_from_camera_xyzw)
     turned = before.inv() * Rotation.from_quat(after.geometry.star_tracker_from_camera_xyzw)
     assert turned.magnitude() == pytest.approx(np.radians(0.25), rel=0.001)
