@@ -266,16 +266,31 @@ def _matched_in_part(sources: Sources, met: NDArray[np.int64], width: int, heigh
     bright = sources.snr >= median(sources.snr[met])
     meets = np.zeros(len(sources.snr), bool)
     meets[met] = True
-    cell = np.clip((sources.xy_px * _PARTS / [width, height]).astype(np.int64), 0, _PARTS - 1)
-    cell_of = cell[:, 1] * _PARTS + cell[:, 0]
-    shown = np.bincount(cell_of[bright], minlength=_PARTS**2)
-    found = np.bincount(cell_of[bright & meets], minlength=_PARTS**2)
+    _, told, missed = missed_parts(sources.xy_px[bright], meets[bright], width, height)
+    return bool(2 * np.count_nonzero(missed) > np.count_nonzero(told))
+
+
+def missed_parts(
+    xy_px: Floats, met: NDArray[np.bool_], width: int, height: int
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """
+    Parts of the image of which far fewer points are met than of the best one.
+
+    Returns
+    -------
+    part : (n,)
+        Number of the part that each of the points (n, 2) stands in.
+    told, missed : (9,)
+        Parts with points enough to tell, and those of them that are missed.
+    """
+    cell = np.clip((xy_px * _PARTS / [width, height]).astype(np.int64), 0, _PARTS - 1)
+    part = cell[:, 1] * _PARTS + cell[:, 0]
+    shown = np.bincount(part, minlength=_PARTS**2)
+    found = np.bincount(part[met], minlength=_PARTS**2)
     told = shown >= 4
     if np.count_nonzero(told) < 2:
-        return False
+        return part, told, np.zeros_like(told)
     best = float((found[told] / (shown[told] + 1.0)).max())
     # Not by a little: a cosmic ray is several sources in one place.
-    missed = (bdtr(found[told], shown[told], best) < _PART_CHANCE) & (
-        found[told] < best / 3 * shown[told]
-    )
-    return bool(2 * np.count_nonzero(missed) > np.count_nonzero(told))
+    few = (bdtr(found, shown, best) < _PART_CHANCE) & (found < best / 3 * shown)
+    return part, told, told & few

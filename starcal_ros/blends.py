@@ -127,6 +127,8 @@ def separate(
     beyond = size_px > max_blend_sigma * sigma_px
     refusal = centroids.refusal.copy()
     refusal[(swamped | beyond) & (refusal == '')] = 'blend'
+    # Its light was taken for that of the brighter one.
+    refusal[swamped & (refusal == 'faint')] = 'blend'
     u, v = uncertain_px.T
     separated = dataclasses.replace(
         centroids,

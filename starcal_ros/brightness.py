@@ -10,35 +10,55 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.acquisition import missed_parts
+from starcal_ros.centroiding import Centroids, ImageModel
 from starcal_ros.errors import ImageRefused
+from starcal_ros.psf import expected_snr
 from starcal_ros.robust import MAD_TO_SIGMA, median
 
 Floats = NDArray[np.float64]
 
 _FEWEST = 4  # stars whose scatter means anything
-# A camera's band is not V: stars of a real sky scatter by 0.15 to 0.3 mag and none is off by more
-# than 1.5.  Stars met by chance scatter by 1.0 to 1.7 mag.
+# A camera's band is not V: stars of a real sky scatter by 0.15 to 0.3 mag, none of 2000 was off
+# by 1.5; a lens may dim its corners by 1.  Stars met by chance scatter by 1.0 to 1.7 mag.
 _MOST_SCATTER_MAG = 0.75
 _MOST_OFF_MAG = 1.5
 
 
 def refuse_unlike(
-    magnitude: NDArray[np.floating], flux_dn: Floats, refusal: NDArray[np.str_]
+    magnitude: NDArray[np.floating],
+    predicted_px: Floats,
+    centroids: Centroids,
+    model: ImageModel,
+    min_snr: float,
+    shape: tuple[int, int],
 ) -> NDArray[np.str_]:
     """
-    Refusals (n,) with ``ambiguous`` for stars that are not as bright as the others make them.
+    Refusals (n,) of stars whose brightness, or lack of it, contradicts the match.
 
-    ``magnitude``, ``flux_dn`` (n,); only stars without a refusal are judged.
+    A good star that is brighter or fainter than the others make it is ``ambiguous``.  A faint one
+    that should not be is ``not_detected``.  Where almost all that should be there is not, while
+    other parts of the image have theirs, the few that are there are ``ambiguous`` too.
+
+    Parameters
+    ----------
+    magnitude, predicted_px : (n,), (n, 2)
+        What the catalog says of the stars.
+    min_snr : float
+        From which a star is no more faint.
+    shape : (int, int)
+        Height and width of the image.
 
     Raises
     ------
     ImageRefused
-        ``no_match`` where most of the stars are not.
+        ``no_match`` where the brightnesses of most stars contradict it.
     """
+    refusal = centroids.refusal.copy()
     good = np.flatnonzero(refusal == '')
     if len(good) < _FEWEST:
         return refusal
-    zero_point = magnitude[good] + 2.5 * np.log10(flux_dn[good])
+    zero_point = magnitude[good] + 2.5 * np.log10(centroids.flux_dn[good])
     off_mag = np.abs(zero_point - median(zero_point))
     scatter_mag = MAD_TO_SIGMA * median(off_mag)
     if scatter_mag > _MOST_SCATTER_MAG:
@@ -47,6 +67,17 @@ def refuse_unlike(
             f'{len(good)} stars stand where catalog stars should,'
             f' but their brightnesses scatter by {scatter_mag:.1f} mag',
         )
-    changed = refusal.copy()
-    changed[good[off_mag > max(_MOST_OFF_MAG, 5.0 * scatter_mag)]] = 'ambiguous'
-    return changed
+    most_mag = max(_MOST_OFF_MAG, 5.0 * scatter_mag)
+    refusal[good[off_mag > most_mag]] = 'ambiguous'
+    # Even so much fainter they would be seen.
+    faintest = median(zero_point) - most_mag
+    least_dn = 10.0 ** (0.4 * (faintest - magnitude.astype(np.float64)))
+    psf_sigma_px, noise_dn = model.psf_sigma_px or 1.0, model.background.noise_dn
+    seen = expected_snr(least_dn, psf_sigma_px, noise_dn, model.pixel_noise) > min_snr
+    refusal[seen & (refusal == 'faint')] = 'not_detected'
+    kept = refusal == ''
+    asked = seen & (kept | (refusal == 'not_detected') | (refusal == 'ambiguous'))
+    height, width = shape
+    part, _, missed = missed_parts(predicted_px[asked], kept[asked], width, height)
+    refusal[np.flatnonzero(asked)[missed[part] & kept[asked]]] = 'ambiguous'
+    return refusal

@@ -183,7 +183,10 @@ def measure_predicted(
         psf_sigma_px,
     )
     magnitude = catalog.magnitude[shown.catalog_index]
-    refusal = refuse_unlike(magnitude, centroids.flux_dn, refusal)
+    centroids = dataclasses.replace(centroids, refusal=refusal)
+    refusal = refuse_unlike(
+        magnitude, shown.xy_px, centroids, model, centroid_options.min_snr, (height, width)
+    )
     centroids = dataclasses.replace(centroids, refusal=refusal)
     observations = _observations(
         shot, shown, catalog, centroids, model, options.min_stars_per_image

@@ -46,7 +46,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
 """Why an image can be refused: stable name -> meaning."""
 
 STAR_REFUSALS: Mapping[str, str] = {
-    'not_detected': 'predicted inside the image but no source stands there',
+    'not_detected': 'bright enough to be seen, but no source stands there',
     'border': 'the core of the star, or its window by moments, leaves the image',
     'blend': 'another catalog star or source is in the measuring window',
     'saturated': 'a pixel of the star is saturated',
@@ -54,7 +54,7 @@ STAR_REFUSALS: Mapping[str, str] = {
     'elongated': 'not the shape of a star: smear, cosmic ray, hot pixel or galaxy',
     'hot_pixel': 'the light of the star falls on a hot pixel',
     'faint': 'signal-to-noise below the limit',
-    'ambiguous': 'two sources claim the star, or two stars the source',
+    'ambiguous': 'off the place or the brightness that the other stars give it',
 }
 """Why a single predicted star can be left out: stable name -> meaning."""
 

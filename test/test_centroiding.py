@@ -349,6 +349,21 @@ def test_a_saturated_star_can_be_measured_by_what_is_left_of_it() -> None:
     assert (np.abs(found.xy_px - place)[0] < 4 * sigma + 0.005).all()
 
 
+@pytest.mark.parametrize('off', [(0.4, 0.4), (-0.4, 0.4), (0.4, -0.4)])
+def test_a_saturated_plateau_is_found_where_it_was_predicted(off: tuple[float, float]) -> None:
+    """No pixel of a plateau is the brightest: a window moved to one of them may lose the star."""
+    wide = dataclasses.replace(QUIET, psf_sigma_px=1.6)
+    at = np.array([[300.3, 200.6]])
+    xy = np.concatenate([at, [p for p in star_grid(3) if np.abs(p - at).max() > 25.0]])
+    flux = np.r_[1.2e6, unlike_fluxes(3, len(xy) - 1)]
+    pixels = exposed(3, xy, flux, wide)
+    assert (pixels[195:206, 295:306] == 4095).sum() >= 9
+    found = measured(pixels, at + np.array(off), PSF)
+    assert found.refusal[0] == ''
+    sigma_px = np.sqrt(found.covariance_px2[0, [0, 2]])
+    assert (np.abs(found.xy_px - at)[0] < 4.0 * sigma_px + 0.005).all()
+
+
 @pytest.mark.parametrize(
     ('dtype', 'peak', 'count', 'expected'),
     [
@@ -457,6 +472,23 @@ def test_a_star_with_a_hot_pixel_in_its_core_is_refused(offset: tuple[int, int])
     hot[201 + offset[1], 300 + offset[0]] = 1500.0
     pixels, place = one_star(more=hot)
     assert measured(pixels, place).refusal[0] == 'elongated'
+
+
+@pytest.mark.parametrize(('flux', 'lit'), [(3000.0, 2e4), (2e5, 3000.0)])
+@pytest.mark.parametrize('away', [(2, 0), (-2, 1), (-1, -2)])
+def test_a_star_beside_a_single_lit_pixel_is_measured(
+    away: tuple[int, int], flux: float, lit: float
+) -> None:
+    """Lit far above a faint star, and as bright as the flank of a bright one."""
+    ray = np.zeros(SHAPE)
+    ray[201 + away[1], 300 + away[0]] = lit
+    clean = measured(*one_star(flux=flux))
+    found = measured(*one_star(flux=flux, more=ray))
+    assert found.refusal[0] == ''
+    # Without one pixel of its flank a star is hardly worse, and where it was.
+    sigma_px = np.sqrt(found.covariance_px2[0, [0, 2]])
+    assert (sigma_px < 1.3 * np.sqrt(clean.covariance_px2[0, [0, 2]])).all()
+    assert (np.abs(found.xy_px - clean.xy_px)[0] < 2.0 * sigma_px).all()
 
 
 def test_a_star_with_a_cosmic_ray_through_it_is_refused() -> None:
