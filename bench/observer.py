@@ -76,7 +76,7 @@ def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tupl
         graph.running('star_observer', params, params.with_name('log')) as process,
         rclpy.Context() as context,
     ):
-        number = process.pid
+        process_id = process.pid
         node = rclpy.create_node('bench', context=context)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
@@ -84,14 +84,14 @@ def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tupl
         def take(message: Any) -> None:
             time_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
             arrived[time_ns] = (time.monotonic(), message.refusal, len(message.catalog_id))
-            resident_mb[len(arrived)] = graph.resident_mb(number)
+            resident_mb[len(arrived)] = graph.resident_mb(process_id)
 
         node.create_subscription(StarObservations, 'observations', take, 1000)
         spawn = multiprocessing.get_context('spawn')
         receiver, sender = spawn.Pipe(duplex=False)
         publisher = spawn.Process(target=_publish, args=(frames, rate_hz, count, sender))
         publisher.start()
-        start_s, start_cpu_s = time.monotonic(), graph.processor_s(number)
+        start_s, start_cpu_s = time.monotonic(), graph.processor_s(process_id)
         deadline_s = start_s + 2 * START_S + count / rate_hz
         while not receiver.poll() and time.monotonic() < deadline_s:
             executor.spin_once(timeout_sec=0.02)
@@ -106,9 +106,12 @@ def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tupl
         publisher.join()
         if not arrived:
             raise RuntimeError('the star observer has not answered')
-        processor_ms = 1e3 * (graph.processor_s(number) - start_cpu_s) / len(arrived)
+        processor_ms = 1e3 * (graph.processor_s(process_id) - start_cpu_s) / len(arrived)
         executor.shutdown()
         node.destroy_node()
+    for number, time_ns in enumerate(sent_s):
+        if time_ns not in arrived:
+            print(f'observer: frame {number} of {count} was not answered', flush=True)
     late_ms = [1e3 * (arrived[t][0] - sent_s[t]) for t in sent_s if t in arrived]
     refusals = Counter(refusal for _, refusal, _ in arrived.values())
     refused = ', '.join(f'{n} {name}' for name, n in refusals.items() if name) or '0'

@@ -18,7 +18,7 @@ from starcal_ros.robust import MAD_TO_SIGMA, median
 
 Floats = NDArray[np.float64]
 
-_FEWEST = 4  # stars whose scatter means anything
+_FEWEST = 4  # stars whose scatter, or the share of which, means anything
 # A camera's band is not V: stars of a real sky scatter by 0.15 to 0.3 mag, none of 2000 was off
 # by 1.5; a lens may dim its corners by 1.  Stars met by chance scatter by 1.0 to 1.7 mag.
 _MOST_SCATTER_MAG = 0.75
@@ -76,7 +76,10 @@ def refuse_unlike(
     seen = expected_snr(least_dn, psf_sigma_px, noise_dn, model.pixel_noise) > min_snr
     refusal[seen & (refusal == 'faint')] = 'not_detected'
     kept = refusal == ''
-    asked = seen & (kept | (refusal == 'not_detected') | (refusal == 'ambiguous'))
+    gone = seen & ((refusal == 'not_detected') | (refusal == 'ambiguous'))
+    if np.count_nonzero(gone) < _FEWEST - 1:
+        return refusal
+    asked = gone | (seen & kept)
     height, width = shape
     part, _, missed = missed_parts(predicted_px[asked], kept[asked], width, height)
     refusal[np.flatnonzero(asked)[missed[part] & kept[asked]]] = 'ambiguous'

@@ -51,7 +51,7 @@ def fit_warp(
         normal = weighted @ A.T
         # Powers up to 5 on -1 to 1 leave the normal matrix ten digits; a trace keeps the corner
         # without stars at rest.
-        normal[np.diag_indices_from(normal)] *= 1.0 + 1e-9
+        normal.flat[:: len(normal) + 1] *= 1.0 + 1e-9
         coefficients = np.linalg.solve(normal, weighted @ residual)
         if abs(scatter - before) < 0.03 * scatter:
             break
