@@ -21,8 +21,7 @@ Floats = NDArray[np.float64]
 _FEWEST = 4  # stars whose scatter, or the share of which, means anything
 # A camera's band is not V: stars of a real sky scatter by 0.15 to 0.3 mag, none of 2000 was off
 # by 1.5; a lens may dim its corners by 1.  Stars met by chance scatter by 1.0 to 1.7 mag.
-_MOST_SCATTER_MAG = 0.75
-_MOST_OFF_MAG = 1.5
+_MOST_OFF = 2.0  # of one star, in the largest scatter of all
 
 
 def refuse_unlike(
@@ -31,6 +30,7 @@ def refuse_unlike(
     centroids: Centroids,
     model: ImageModel,
     min_snr: float,
+    max_scatter_mag: float,
     shape: tuple[int, int],
 ) -> NDArray[np.str_]:
     """
@@ -46,6 +46,8 @@ def refuse_unlike(
         What the catalog says of the stars.
     min_snr : float
         From which a star is no more faint.
+    max_scatter_mag : float
+        Largest scatter of brightnesses that are those of the catalog.
     shape : (int, int)
         Height and width of the image.
 
@@ -61,13 +63,13 @@ def refuse_unlike(
     zero_point = magnitude[good] + 2.5 * np.log10(centroids.flux_dn[good])
     off_mag = np.abs(zero_point - median(zero_point))
     scatter_mag = MAD_TO_SIGMA * median(off_mag)
-    if scatter_mag > _MOST_SCATTER_MAG:
+    if scatter_mag > max_scatter_mag:
         raise ImageRefused(
             'no_match',
             f'{len(good)} stars stand where catalog stars should,'
             f' but their brightnesses scatter by {scatter_mag:.1f} mag',
         )
-    most_mag = max(_MOST_OFF_MAG, 5.0 * scatter_mag)
+    most_mag = max(_MOST_OFF * max_scatter_mag, 5.0 * scatter_mag)
     refusal[good[off_mag > most_mag]] = 'ambiguous'
     # Even so much fainter they would be seen.
     faintest = median(zero_point) - most_mag

@@ -81,6 +81,13 @@ class IdentificationOptions:
         low=0.0,
         high=100.0,
     )
+    max_brightness_scatter_mag: float = option(
+        0.75,
+        'largest scatter of the brightnesses of the stars about those of the catalog, mag, that is'
+        ' no chance match; more for a camera whose band is far from V, 100 not to ask',
+        low=0.3,
+        high=100.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -185,7 +192,13 @@ def measure_predicted(
     magnitude = catalog.magnitude[shown.catalog_index]
     centroids = dataclasses.replace(centroids, refusal=refusal)
     refusal = refuse_unlike(
-        magnitude, shown.xy_px, centroids, model, centroid_options.min_snr, (height, width)
+        magnitude,
+        shown.xy_px,
+        centroids,
+        model,
+        centroid_options.min_snr,
+        options.max_brightness_scatter_mag,
+        (height, width),
     )
     centroids = dataclasses.replace(centroids, refusal=refusal)
     observations = _observations(

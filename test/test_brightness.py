@@ -52,7 +52,8 @@ def sky(count: int, scatter_mag: float, seed: int = 1) -> tuple[np.ndarray, np.n
 
 
 def judged(magnitude: np.ndarray, place: np.ndarray, centroids: Centroids) -> np.ndarray:
-    return refuse_unlike(magnitude, place, centroids, MODEL, MIN_SNR, SHAPE)
+    most_mag = IdentificationOptions().max_brightness_scatter_mag
+    return refuse_unlike(magnitude, place, centroids, MODEL, MIN_SNR, most_mag, SHAPE)
 
 
 @pytest.mark.parametrize('scatter_mag', [0.0, 0.15, 0.3])
@@ -70,6 +71,10 @@ def test_brightnesses_drawn_anew_are_no_match() -> None:
         shuffled = dataclasses.replace(centroids, flux_dn=rng.permutation(centroids.flux_dn))
         with pytest.raises(ImageRefused, match='no_match: .* brightnesses scatter by'):
             judged(magnitude, place, shuffled)
+
+
+def test_a_camera_far_from_the_band_of_the_catalog_need_not_be_asked() -> None:
+    assert (refuse_unlike(*sky(60, 1.5), MODEL, MIN_SNR, 100.0, SHAPE) == '').all()
 
 
 def test_one_star_unlike_the_others_is_ambiguous() -> None:
