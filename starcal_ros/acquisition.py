@@ -28,7 +28,9 @@ Floats = NDArray[np.float64]
 
 # Brightest predictions and sources that vote: their pairs fill one histogram at once.
 _VOTERS = 100
-_PARTS = 3  # of the image along each side, in which a match must hold
+_SIDE = 3  # parts of the image along each side, in which a match must hold
+PARTS = _SIDE**2
+_TELLING = 4  # points of a part whose share means anything
 _PART_CHANCE = 1e-3  # greatest probability that a right match misses so many in a part
 _CHANCE = 1e-9  # greatest probability that a match is accepted by chance
 
@@ -266,31 +268,30 @@ def _matched_in_part(sources: Sources, met: NDArray[np.int64], width: int, heigh
     bright = sources.snr >= median(sources.snr[met])
     meets = np.zeros(len(sources.snr), bool)
     meets[met] = True
-    _, told, missed = missed_parts(sources.xy_px[bright], meets[bright], width, height)
-    return bool(2 * np.count_nonzero(missed) > np.count_nonzero(told))
+    part = part_of(sources.xy_px, width, height)
+    shown = np.bincount(part[bright], minlength=PARTS)
+    found = np.bincount(part[bright & meets], minlength=PARTS)
+    missed = missed_parts(shown, found)
+    return bool(2 * np.count_nonzero(missed) > np.count_nonzero(shown >= _TELLING))
 
 
-def missed_parts(
-    xy_px: Floats, met: NDArray[np.bool_], width: int, height: int
-) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """
-    Parts of the image of which far fewer points are met than of the best one.
+def part_of(xy_px: Floats, width: int, height: int) -> NDArray[np.int64]:
+    """Number (n,) of the part of the image, below `PARTS`, that points (n, 2) stand in."""
+    cell = np.clip((xy_px * _SIDE / [width, height]).astype(np.int64), 0, _SIDE - 1)
+    return np.asarray(cell[:, 1] * _SIDE + cell[:, 0])
 
-    Returns
-    -------
-    part : (n,)
-        Number of the part that each of the points (n, 2) stands in.
-    told, missed : (9,)
-        Parts with points enough to tell, and those of them that are missed.
-    """
-    cell = np.clip((xy_px * _PARTS / [width, height]).astype(np.int64), 0, _PARTS - 1)
-    part = cell[:, 1] * _PARTS + cell[:, 0]
-    shown = np.bincount(part, minlength=_PARTS**2)
-    found = np.bincount(part[met], minlength=_PARTS**2)
-    told = shown >= 4
+
+def best_share(shown: NDArray[np.int64], found: NDArray[np.int64]) -> float:
+    """Share found of the points shown (PARTS,) in the part where it is largest."""
+    return float((found / (shown + 1.0)).max(where=shown >= _TELLING, initial=0.0))
+
+
+def missed_parts(shown: NDArray[np.int64], found: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Parts (PARTS,) in which far fewer are found of the points shown than in the best one."""
+    told = shown >= _TELLING
     if np.count_nonzero(told) < 2:
-        return part, told, np.zeros_like(told)
-    best = float((found[told] / (shown[told] + 1.0)).max())
+        return np.zeros_like(told)
+    best = best_share(shown, found)
     # Not by a little: a cosmic ray is several sources in one place.
     few = (bdtr(found, shown, best) < _PART_CHANCE) & (found < best / 3 * shown)
-    return part, told, told & few
+    return np.asarray(told & few)

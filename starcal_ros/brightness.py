@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.acquisition import missed_parts
+from starcal_ros.acquisition import best_share, missed_parts, part_of, PARTS
 from starcal_ros.centroiding import Centroids, ImageModel
 from starcal_ros.errors import ImageRefused
 from starcal_ros.psf import expected_snr
@@ -37,8 +37,8 @@ def refuse_unlike(
     Refusals (n,) of stars whose brightness, or lack of it, contradicts the match.
 
     A good star that is brighter or fainter than the others make it is ``ambiguous``.  A faint one
-    that should not be is ``not_detected``.  Where almost all that should be there is not, while
-    other parts of the image have theirs, the few that are there are ``ambiguous`` too.
+    that should not be is ``not_detected``.  Where a part of the image misses almost all that
+    should be there while another has its stars, the few in parts like it are ``ambiguous`` too.
 
     Parameters
     ----------
@@ -81,8 +81,12 @@ def refuse_unlike(
     gone = seen & ((refusal == 'not_detected') | (refusal == 'ambiguous'))
     if np.count_nonzero(gone) < _FEWEST - 1:
         return refusal
-    asked = gone | (seen & kept)
     height, width = shape
-    part, _, missed = missed_parts(predicted_px[asked], kept[asked], width, height)
-    refusal[np.flatnonzero(asked)[missed[part] & kept[asked]]] = 'ambiguous'
+    part = part_of(predicted_px, width, height)
+    found = np.bincount(part[seen & kept], minlength=PARTS)
+    shown = found + np.bincount(part[gone], minlength=PARTS)
+    if missed_parts(shown, found).any():
+        # Then a part has to prove itself: by half of what the best one finds.
+        believed = (shown > 0) & (found >= 0.5 * best_share(shown, found) * shown)
+        refusal[kept & ~believed[part]] = 'ambiguous'
     return refusal

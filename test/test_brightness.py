@@ -116,25 +116,32 @@ def test_stars_missing_everywhere_are_no_sign_of_a_wrong_match() -> None:
     np.testing.assert_array_equal(found, refusal)
 
 
-def test_a_part_of_a_field_in_the_milky_way_is_no_match() -> None:
-    """Found by the bench: 64 stars were matched, one in five of them rightly."""
+MILKY_WAY_DEG = (161.94901981780527, -55.051149601523775, 299.2849682686139)
+FAR_OFF_XYZW = [
+    [-0.3640004666929939, 0.7960811713571763, 0.11566626102097124, -0.46944621089033983],
+    [-0.36370486341319447, 0.7950893149955164, 0.12266456105136878, -0.4695797684862766],
+]
+
+
+@pytest.mark.parametrize('attitude_xyzw', FAR_OFF_XYZW)
+def test_no_star_of_a_field_that_is_there_in_part_is_wrong(attitude_xyzw: list[float]) -> None:
+    """
+    2.3 degrees off, where 1.5 are searched: found by the bench of acquisition.
+
+    By places alone 64 and 54 stars were matched, one and three of five rightly.
+    """
     base = synthetic.scenario('tiny', seed=367)
-    field = synthetic.Inertial(
-        ((161.94901981780527, -55.051149601523775, 299.2849682686139),) * 12
-    )
+    field = synthetic.Inertial((MILKY_WAY_DEG,) * 12)
     scenario = dataclasses.replace(base, pointing=field, image_count=12)
     drawn = synthetic.scene(scenario, 11)
     image = synthetic_images.render(scenario, drawn, 11)
-    # 2.4 degrees off, where 1.5 are searched.
-    attitude = np.array(
-        [-0.3640004666929939, 0.7960811713571763, 0.11566626102097124, -0.46944621089033983]
-    )
     options = IdentificationOptions()
-    with pytest.raises(ImageRefused, match='no_match'):
-        observe_stars(
-            Shot(image, attitude, 0.0),
-            scenario.prior,
-            load_catalog(None, options.magnitude_limit),
-            CentroidOptions(),
-            options,
-        )
+    shot = Shot(image, np.array(attitude_xyzw), 0.0)
+    catalog = load_catalog(None, options.magnitude_limit)
+    try:
+        found, _ = observe_stars(shot, scenario.prior, catalog, CentroidOptions(), options)
+    except ImageRefused:
+        return
+    place = dict(zip(drawn.catalog_id.tolist(), drawn.pixel_px, strict=True))
+    true_px = np.array([place[number] for number in found.catalog_id.tolist()])
+    assert np.abs(found.measured_px - true_px).max() < 2.0
