@@ -128,7 +128,7 @@ def spoilt_stars() -> tuple[Image, StarObservations]:
     inside = ((places > 40) & (places < np.array([SHAPE[1], SHAPE[0]]) - 41)).all(axis=1)
     burnt, crossed, hot, moved = np.rint(places[inside][[3, 30, 40, 20]]).astype(int)
     mean = electrons()
-    mean[burnt[1] - 1 : burnt[1] + 2, burnt[0] - 1 : burnt[0] + 2] += 1e6
+    mean[burnt[1] - 3 : burnt[1] + 4, burnt[0] - 3 : burnt[0] + 4] += 1e6  # 49 pixels, of 40
     for k in range(-5, 6):
         mean[crossed[1] + k // 2, crossed[0] + k] += 600.0
     star = np.s_[moved[1] - 4 : moved[1] + 5, moved[0] - 4 : moved[0] + 5]

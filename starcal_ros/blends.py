@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -22,13 +23,29 @@ _NEAR_SIGMA, _MODELLED_NEAR_SIGMA = 5.0, 3.0  # a bright neighbour nearer than t
 _ALONE_SIGMA = 0.1  # a star whose neighbours pull it by less tells the PSF
 
 
+@dataclass(frozen=True)
+class Pulls:
+    """
+    What the neighbours of each star do to its centroid.
+
+    ``pull_px`` (n, 2) of those whose light is not taken off; ``uncertain_px`` (n, 2) what the pull
+    of all of them may be wrong by once it is taken off; ``swamped`` (n,) whether one is too near
+    and too bright for that; ``outshone`` (n,) whether a brighter one is near, measured or not.
+    """
+
+    pull_px: Floats
+    uncertain_px: Floats
+    swamped: NDArray[np.bool_]
+    outshone: NDArray[np.bool_]
+
+
 def neighbour_pulls(
     xy_px: Floats,
     magnitude: Floats,
     flux_dn: Floats,
     model: ImageModel,
     modelled: NDArray[np.bool_] | None = None,
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+) -> Pulls:
     """
     How the neighbours of each star pull its centroid.
 
@@ -36,15 +53,6 @@ def neighbour_pulls(
     from the difference of the magnitudes.  Where the two are too close to be told apart, the pull
     is from the star to the centre of their light.  The light of stars that are ``modelled`` (n,)
     is taken off already.
-
-    Returns
-    -------
-    pull_px : (n, 2)
-        By those that are not modelled.
-    uncertain_px : (n, 2)
-        What the pull of all neighbours may be wrong by once it is taken off.
-    swamped : (n,)
-        Whether a neighbour is too near and too bright for that.
     """
     sigma_px = model.psf_sigma_px or 1.0
     reach_px = stamp_radius_px(sigma_px) * math.sqrt(2.0) + 2.0 * sigma_px
@@ -74,9 +82,10 @@ def neighbour_pulls(
     # is the centre of a double of like stars used: their orbits, which no catalog of places has,
     # move it by arcseconds (zeta Herculis).
     near = distance_px < np.where(known, _MODELLED_NEAR_SIGMA, _NEAR_SIGMA) * sigma_px
-    swamped = np.zeros(len(xy_px), bool)
+    swamped, outshone = np.zeros((2, len(xy_px)), bool)
     swamped[star[near & (ratio > 0.5)]] = True
-    return total_px, uncertain_px, swamped
+    outshone[star[(distance_px < _NEAR_SIGMA * sigma_px) & (ratio > 1.0)]] = True
+    return Pulls(total_px, uncertain_px, swamped, outshone)
 
 
 def unlisted_pull_px(magnitude: Floats, faintest: float, px_per_rad: float) -> Floats:
@@ -114,7 +123,7 @@ def separate(
     the catalog marks but does not hold.  Also says (n,) which stars stand alone.
     """
     magnitude = catalog.magnitude[prediction.catalog_index]
-    pull_px, uncertain_px, swamped = neighbour_pulls(
+    pulls = neighbour_pulls(
         prediction.xy_px, magnitude, centroids.flux_dn, model, centroids.modelled
     )
     unlisted = _alone(prediction.direction_icrf, catalog.close_pair[prediction.catalog_index])
@@ -123,16 +132,16 @@ def separate(
         unlisted, unlisted_pull_px(magnitude, faintest, prediction.px_per_rad), 0.0
     )
     sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
-    size_px = np.sqrt((uncertain_px**2).sum(axis=1) + 2.0 * unlisted_px**2)
+    size_px = np.sqrt((pulls.uncertain_px**2).sum(axis=1) + 2.0 * unlisted_px**2)
     beyond = size_px > max_blend_sigma * sigma_px
     refusal = centroids.refusal.copy()
-    refusal[(swamped | beyond) & (refusal == '')] = 'blend'
+    refusal[(pulls.swamped | beyond) & (refusal == '')] = 'blend'
     # Its light was taken for that of the brighter one.
-    refusal[swamped & (refusal == 'faint')] = 'blend'
-    u, v = uncertain_px.T
+    refusal[pulls.outshone & (refusal == 'faint')] = 'blend'
+    u, v = pulls.uncertain_px.T
     separated = dataclasses.replace(
         centroids,
-        xy_px=centroids.xy_px - pull_px,
+        xy_px=centroids.xy_px - pulls.pull_px,
         covariance_px2=centroids.covariance_px2
         + np.stack([u * u + unlisted_px**2, u * v, v * v + unlisted_px**2], axis=-1),
         refusal=refusal,

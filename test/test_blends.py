@@ -48,7 +48,8 @@ def pulls(
     pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
     magnitude = np.array([5.0, 5.0 - 2.5 * np.log10(ratio)])
     flux = flux_dn * np.array([1.0, ratio])
-    return neighbour_pulls(pair, magnitude, flux, image_model(noise_dn))
+    found = neighbour_pulls(pair, magnitude, flux, image_model(noise_dn))
+    return found.pull_px, found.uncertain_px, found.swamped
 
 
 @pytest.mark.parametrize('flux_dn', [500.0, 20000.0])
@@ -88,7 +89,7 @@ def test_of_two_stars_that_look_like_one_the_centre_of_light_is_measured(ratio: 
     total = 2000.0 * np.array([1.0 + ratio, 1.0 + ratio])
     pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
     magnitude = np.array([5.0, 5.0 - 2.5 * np.log10(ratio)])
-    found, _, _ = neighbour_pulls(pair, magnitude, total, image_model(2.1))
+    found = neighbour_pulls(pair, magnitude, total, image_model(2.1)).pull_px
     # To first order in the distance; the second is (distance / sigma)^2, 1 %.
     assert found[0, 0] == pytest.approx(ratio / (1.0 + ratio) * distance_px, rel=0.02)
 
@@ -109,14 +110,17 @@ def test_what_a_companion_that_the_catalog_has_not_may_pull() -> None:
 def test_only_the_fainter_of_two_unlike_stars_is_swamped() -> None:
     pair = np.array([[100.0, 100.0], [104.0, 100.0], [300.0, 300.0]])
     flux = np.array([5000.0, 50.0, 800.0])
-    pull_px, _, swamped = neighbour_pulls(pair, np.array([4.0, 9.0, 6.0]), flux, image_model(2.1))
+    found = neighbour_pulls(pair, np.array([4.0, 9.0, 6.0]), flux, image_model(2.1))
+    pull_px, swamped = found.pull_px, found.swamped
     np.testing.assert_array_equal(swamped, [False, True, False])
+    np.testing.assert_array_equal(found.outshone, [False, True, False])
     assert 0 < pull_px[0, 0] < 0.05 and not pull_px[2].any()
 
 
 def test_no_neighbours_no_pulls() -> None:
     model = image_model(2.1)
-    pull_px, _, swamped = neighbour_pulls(np.empty((0, 2)), np.empty(0), np.empty(0), model)
+    none = neighbour_pulls(np.empty((0, 2)), np.empty(0), np.empty(0), model)
+    pull_px, swamped = none.pull_px, none.swamped
     assert pull_px.shape == (0, 2) and swamped.shape == (0,)
     alone = np.array([[5.0, 5.0]])
-    assert not neighbour_pulls(alone, np.array([3.0]), np.array([90.0]), model)[0].any()
+    assert not neighbour_pulls(alone, np.array([3.0]), np.array([90.0]), model).pull_px.any()
