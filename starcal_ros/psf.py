@@ -208,10 +208,6 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     covariance = np.asarray(np.linalg.inv(normal[:, :4, :4]), np.float64)
     last = (covariance @ gradient[:, :4, None])[:, :, 0]
     last[:, :2].clip(-0.5, 0.5, out=last[:, :2])
-    # Of the inverse of the whole only the columns of the moments are wanted.
-    of_shape = np.linalg.solve(normal, np.broadcast_to(np.eye(7)[:, 4:], (len(normal), 7, 3)))
-    shape_step = (gradient[:, None, :] @ of_shape)[:, 0]
-    shape_variance = of_shape[:, [4, 5, 6], [0, 1, 2]]
     residual = _after(last, rows)
     spoilt, pixel = _single_misfits(residual, weight, parameters, stamps.width)
     if len(spoilt):
@@ -220,7 +216,11 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
         covariance[spoilt] = np.linalg.inv(normal[spoilt, :4, :4])
         last[spoilt] = (covariance[spoilt] @ gradient[spoilt, :4, None])[:, :, 0]
         residual[spoilt] = _after(last[spoilt], rows[spoilt])
-    leverage = ((covariance @ rows[:, :4]) * rows[:, :4]).sum(axis=1) * weight
+    # Of the inverse of the whole only the columns of the moments are wanted.
+    of_shape = np.linalg.solve(normal, np.broadcast_to(np.eye(7)[:, 4:], (len(normal), 7, 3)))
+    shape_step = (gradient[:, None, :] @ of_shape)[:, 0]
+    shape_variance = of_shape[:, [4, 5, 6], [0, 1, 2]]
+    leverage = np.einsum('nkp,nkp->np', covariance @ rows[:, :4], rows[:, :4]) * weight
     signal = parameters[:, 2, None] * rows[:, 2]
     parameters = parameters + last
     snr = parameters[:, 2] / np.sqrt(covariance[:, 2, 2])
@@ -259,15 +259,15 @@ def _single_misfits(
 
     Not of the core: a star that has lost its peak is hardly measured.
     """
-    misfit = residual * np.sqrt(weight)
-    worst = misfit.argmax(axis=1)
-    star = np.flatnonzero(misfit[np.arange(len(misfit)), worst] > MISFIT_SIGMA)
-    pixel = worst[star]
+    worst = (weight * residual**2).max(axis=1, initial=0.0)
+    star = np.flatnonzero(worst > MISFIT_SIGMA**2)
+    pixel = (residual[star] * np.sqrt(weight[star])).argmax(axis=1)
     row, (v, u) = np.arange(len(star)), np.divmod(pixel, width)
     rimmed = np.zeros((len(star), width + 2, width + 2))
     rimmed[:, 1:-1, 1:-1] = residual[star].reshape(-1, width, width)
     beside = [rimmed[row, v + b, u + a] for b, a in ((0, 1), (2, 1), (1, 0), (1, 2))]
-    alone = np.mean(beside, axis=0) < SPILT * residual[star, pixel]
+    lit = residual[star, pixel] * np.sqrt(weight[star, pixel]) > MISFIT_SIGMA
+    alone = lit & (np.mean(beside, axis=0) < SPILT * residual[star, pixel])
     alone &= np.hypot(*(np.stack([u, v]) - width // 2 - parameters[star, :2].T)) > CORE_PX
     return star[alone], pixel[alone]
 
