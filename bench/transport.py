@@ -7,6 +7,8 @@ reader in another process.  Stock Fast DDS holds the small one back until its he
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import contextlib
 import importlib.util
 import os
 from pathlib import Path
@@ -40,12 +42,8 @@ def run(quick: bool) -> list[Table]:
     graph.own_domain()
     count = 10 if quick else 60
     for reliability in ('reliable', 'best_effort'):
-        for profile in ('none', 'fastdds.xml'):
-            environment = dict(os.environ)
-            if profile != 'none':
-                for name in ('FASTRTPS', 'FASTDDS'):
-                    environment[f'{name}_DEFAULT_PROFILES_FILE'] = str(PROFILE)
-                environment['RMW_FASTRTPS_USE_QOS_FROM_XML'] = '1'
+        for profile in ('stock', 'fastdds.xml'):
+            environment = {**os.environ, **settings(profile)}
             command = [sys.executable, '-m', 'bench.transport']
             sender = subprocess.Popen([*command, 'send', reliability, str(count)], env=environment)
             done = subprocess.run(
@@ -64,6 +62,26 @@ def run(quick: bool) -> list[Table]:
             table.add(profile, reliability, count, *cells)
     print(table.text())
     return [table]
+
+
+def settings(profile: str) -> dict[str, str]:
+    """Environment of a process that runs Fast DDS as it is, or by the profile of the package."""
+    if profile == 'stock':
+        return {}
+    files = {f'{name}_DEFAULT_PROFILES_FILE': str(PROFILE) for name in ('FASTRTPS', 'FASTDDS')}
+    return {**files, 'RMW_FASTRTPS_USE_QOS_FROM_XML': '1'}
+
+
+@contextlib.contextmanager
+def profile(name: str) -> Iterator[None]:
+    """Let the processes that are started meanwhile run by a profile."""
+    values = settings(name)
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for value in values:
+            del os.environ[value]
 
 
 def _qos(reliability: str, depth: int) -> Any:
