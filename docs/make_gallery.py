@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Mapping
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -148,13 +149,12 @@ def star_sheet(image: Image, observations: StarObservations) -> Picture:
     magnitude = dict(zip(SETUP.catalog.id.tolist(), SETUP.catalog.magnitude, strict=True))
     brightness = np.array([magnitude[star] for star in observations.refused_catalog_id.tolist()])
     usable = observations.measured_px[np.argsort(-observations.snr)]
-    shown = {'used': usable[[12]], **observations.refused_places()}
-    cells = []
-    for code, (reason, places) in enumerate(shown.items(), start=-1):
-        if reason != 'used':
-            of_reason = brightness[observations.refused_reason == code]
-            places = places[np.argsort(of_reason, kind='stable')]
-        cells.append(_close_up(image, observations, reason, np.rint(places[0]).astype(int)))
+    cells = [_close_up(image, observations, 'used', np.rint(usable[12]).astype(int))]
+    for code, (reason, places) in enumerate(observations.refused_places().items()):
+        brightest = brightness[observations.refused_reason == code].argmin()
+        cells.append(
+            _close_up(image, observations, reason, np.rint(places[brightest]).astype(int))
+        )
     blank = np.full_like(cells[0], 255)
     cells += [blank] * (-len(cells) % 4)
     rows = [np.hstack(cells[k : k + 4]) for k in range(0, len(cells), 4)]
@@ -166,11 +166,11 @@ def _close_up(
 ) -> Picture:
     """The pixels about a star, with its mark, under its reason."""
     side = 2 * ABOUT_PX + 1
-    around = cv2.copyMakeBorder(
-        image.pixels, *[ABOUT_PX] * 4, cv2.BORDER_CONSTANT, value=float(observations.background_dn)
-    )
+    rim = (ABOUT_PX,) * 2
+    background = round(observations.background_dn)
+    around = np.pad(image.pixels, (rim, rim), constant_values=background)
     u, v = centre
-    pixels = around[v : v + side, u : u + side]
+    pixels: Any = around[v : v + side, u : u + side]
     size = (side * ENLARGED, side * ENLARGED)
     large = cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST)
     low, high = observations.background_dn - 2, observations.background_dn + 20

@@ -70,8 +70,8 @@ def part_of(
     scale = width / size[0]
     shape = (width, round(size[1] * scale))
 
-    def drawn(xy_px: Floats) -> Floats:
-        return (xy_px - first + 0.5) * scale - 0.5
+    def drawn(xy_px: NDArray[np.floating]) -> Floats:
+        return np.asarray((xy_px - first + 0.5) * scale - 0.5, np.float64)
 
     u, v = first
     pixels = image.pixels[v : v + size[1], u : u + size[0]]

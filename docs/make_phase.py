@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from starcal_ros.centroiding import CentroidOptions, measure_stars, model_image
 from starcal_ros.detection import detect, measure_background
-from starcal_ros.synthetic import Detector, expose, star_electrons
+from starcal_ros.synthetic import Detector
+from starcal_ros.synthetic_images import expose, star_electrons
 
 Floats = NDArray[np.float64]
 
