@@ -84,7 +84,7 @@ def select(fit: PsfFit, stars: NDArray[np.intp] | NDArray[np.bool_]) -> PsfFit:
 
 
 def stamp_radius_px(psf_sigma_px: float) -> int:
-    """Half width of the fitting window: beyond 3.5 sigma lies under 0.3 % of a star's light."""
+    """Half width of the fitting window: beyond 3 sigma nothing tells the place of a star."""
     return int(np.clip(np.ceil(3.0 * psf_sigma_px), 3, 12))
 
 
@@ -377,14 +377,13 @@ class NoiseSums:
         found = np.array([1.0, per_signal, 0.0])
         right = self.right - self.normal[:, 1] * per_signal
         free = [0, 2] if gain_e_per_dn else [0, 1, 2]
+        scale = 1.0 / np.sqrt(np.maximum(self.normal.diagonal(), 1e-300))
+        correlation = self.normal * scale * scale[:, None] + 1e-9 * np.eye(3)
         while free:
-            normal = self.normal[np.ix_(free, free)]
-            scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-            scales = np.outer(scale, scale)
-            inverse = np.linalg.inv(normal * scales + 1e-9 * np.eye(len(free))) * scales
-            value = inverse @ right[free]
+            inverse = np.linalg.inv(correlation[free][:, free])
+            value = scale[free] * (inverse @ (scale * right)[free])
             # A squared normal residual over its variance has a variance of 2.
-            sigma = np.sqrt(2.0 * np.diag(inverse))
+            sigma = scale[free] * np.sqrt(2.0 * inverse.diagonal())
             if free[-1] == 2 and value[-1] < _SIGNIFICANT * sigma[-1]:
                 free = free[:-1]
             elif 1 in free and value[free.index(1)] < 0.0:

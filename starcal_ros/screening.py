@@ -8,6 +8,7 @@ five-megapixel frame.  Noise makes a row of a sound frame unlike every other row
 from __future__ import annotations
 
 from dataclasses import dataclass
+import functools
 import hashlib
 import math
 import zlib
@@ -86,7 +87,7 @@ class RowSample:
     noisy: NDArray[np.bool_]
     constant: NDArray[np.bool_]
 
-    @property
+    @functools.cached_property
     def telling(self) -> NDArray[np.bool_]:
         """Rows (k,) that no other row equals by chance."""
         return np.asarray(self.noisy.mean(axis=1) >= 0.5)
@@ -136,7 +137,7 @@ def fingerprint(image: Image, sample: RowSample) -> Fingerprint:
     """What a frame is known by when it comes again."""
     telling = sample.telling
     rows = np.zeros(len(sample.row), np.uint32)
-    rows[telling] = [zlib.crc32(row) for row in sample.pixels[telling]]
+    rows[telling] = [zlib.crc32(sample.pixels[k]) for k in np.flatnonzero(telling)]
     # Without noise a few rows may well be those of another frame: only all pixels tell.
     whole = b'' if telling.any() else hashlib.blake2b(image.pixels.tobytes()).digest()
     return Fingerprint(image.time_ns, rows, whole)

@@ -188,7 +188,8 @@ def _find_turn(
         A, b = J[near].reshape(-1, 3), offset_px[near].ravel()
         # A trace keeps the roll at rest where all guides stand in one place.
         normal = A.T @ A
-        turn_rad = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(3), A.T @ b)
+        normal.flat[::4] += 1e-9 * np.trace(normal)
+        turn_rad = np.linalg.solve(normal, A.T @ b)
         left_px = np.hypot(*(offset_px - J @ turn_rad).T)
         limit_px = float(np.clip(4.0 * median(left_px[near]), 0.75, _NEIGHBOUR_PX))
         near = left_px < limit_px

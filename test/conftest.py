@@ -167,18 +167,24 @@ class Client:
         client = self.node.create_client(kind, name)
         try:
             self.until(client.service_is_ready, timeout_s)
-            asked = [client.call_async(kind.Request(**fields))]
-            again_s += time.monotonic()
-
-            def is_answered() -> bool:
-                if len(asked) == 1 and time.monotonic() > again_s:
-                    asked.append(client.call_async(kind.Request(**fields)))
-                return any(future.done() for future in asked)
-
-            self.until(is_answered, timeout_s)
-            return next(future.result() for future in asked if future.done())
+            return self.ask(client, kind.Request(**fields), timeout_s, again_s)
         finally:
             self.node.destroy_client(client)
+
+    def ask(
+        self, service: Any, request: Any, timeout_s: float = 60.0, again_s: float = 20.0
+    ) -> Any:
+        """Answer of a service that is ready; asked once more if there is none after some time."""
+        asked = [service.call_async(request)]
+        again_s += time.monotonic()
+
+        def is_answered() -> bool:
+            if len(asked) == 1 and time.monotonic() > again_s:
+                asked.append(service.call_async(request))
+            return any(future.done() for future in asked)
+
+        self.until(is_answered, timeout_s)
+        return next(future.result() for future in asked if future.done())
 
     def collect(self, kind: Any, topic: str, qos: Any = 1000) -> list[Any]:
         """A list that grows with the messages of a topic."""

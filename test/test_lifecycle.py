@@ -22,6 +22,7 @@ pytestmark = pytest.mark.nodes
 NUMBERS = sorted(
     {value for name in dir(Transition) if isinstance(value := getattr(Transition, name), int)}
 )
+NO_TRANSITION = 200
 CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
 SHUTDOWN = {
@@ -47,6 +48,9 @@ class Manager:
         self._change = client.node.create_client(ChangeState, f'/{name}/change_state')
         self._get = client.node.create_client(GetState, f'/{name}/get_state')
         client.until(lambda: self._change.service_is_ready() and self._get.service_is_ready())
+        # The first answer may be lost, before the node has found its reader: what changes nothing.
+        client.ask(self._change, _to(NO_TRANSITION), again_s=5.0)
+        client.ask(self._get, GetState.Request(), again_s=5.0)
 
     def _call(self, service: Any, request: Any) -> Any:
         future = service.call_async(request)
@@ -55,18 +59,21 @@ class Manager:
 
     def change(self, number: int) -> bool:
         """Whether the node made a transition."""
-        request = ChangeState.Request(transition=Transition(id=number))
-        return bool(self._call(self._change, request).success)
+        return bool(self._call(self._change, _to(number)).success)
 
     def state(self) -> str:
         """Label of the state the node is in."""
         return str(self._call(self._get, GetState.Request()).current_state.label)
 
 
+def _to(number: int) -> Any:
+    return ChangeState.Request(transition=Transition(id=number))
+
+
 def try_everything(manager: Manager, state: str) -> None:
     """Every transition there is: the state's own are made, the others refused without effect."""
     own = {number for number, _, _ in ALLOWED[state]} | {SHUTDOWN.get(state)}
-    for number in (*NUMBERS, 200):
+    for number in (*NUMBERS, NO_TRANSITION):
         if number not in own:
             assert not manager.change(number), number
             assert manager.state() == state, number
