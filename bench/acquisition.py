@@ -51,7 +51,7 @@ class Found:
 
 
 def run(quick: bool) -> list[Table]:
-    """Scrambled fields, then fields to be found; twenty minutes, or one."""
+    """Scrambled fields, then fields to be found; ten minutes, or one."""
     share = QUICK / 100 if quick else 1.0
     images, attitudes = max(3, round(IMAGES * share)), max(4, round(ATTITUDES * share))
     refused = scrambled(images, attitudes)
