@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+import functools
+import inspect
 import os
 from pathlib import Path
 import shutil
@@ -131,6 +133,20 @@ def tiny_products(tiny_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return folder
 
 
+def _seen(condition: Callable[..., object]) -> str:
+    """What a condition looks at, the newest of each list, cut to what can be read."""
+    function = condition.func if isinstance(condition, functools.partial) else condition
+    arguments = condition.args if isinstance(condition, functools.partial) else ()
+    looked_at = inspect.signature(function).bind(*arguments).arguments
+    if inspect.isfunction(function):
+        looked_at |= inspect.getclosurevars(function).nonlocals
+    newest = {
+        name: (len(value), value[-1:]) if isinstance(value, list) else value
+        for name, value in looked_at.items()
+    }
+    return ', '.join(f'{name} = {str(value)[:600]}' for name, value in newest.items())
+
+
 class Client:
     """A bare rclpy node that waits on conditions, never for a time."""
 
@@ -148,7 +164,7 @@ class Client:
         """Spin until a condition holds; fail where it does not within the time."""
         deadline_s = time.monotonic() + timeout_s
         while not condition():
-            assert time.monotonic() < deadline_s, 'the condition did not come to hold'
+            assert time.monotonic() < deadline_s, f'did not come to hold with {_seen(condition)}'
             self._executor.spin_once(timeout_sec=0.05)
 
     def call(
@@ -204,6 +220,24 @@ class Client:
         publisher = self.node.create_publisher(kind, topic, depth)
         self.until(publisher.get_subscription_count)
         return publisher
+
+    def until_listened(self, name: str = 'star_observer', listeners: int = 1) -> None:
+        """
+        Wait until an observer itself knows who listens to its observations.
+
+        That the client has matched the observer says nothing of the other way round, and of a
+        third node nothing at all; what a volatile publisher sends before its match is lost.
+        """
+        from diagnostic_msgs.msg import DiagnosticArray
+
+        told: list[Any] = self.collect(DiagnosticArray, '/diagnostics')
+
+        def is_listened() -> bool:
+            mine = [m.status[0] for m in told if m.status[0].name == f'starcal: {name}']
+            values = {v.key: v.value for status in mine[-1:] for v in status.values}
+            return int(values.get('listeners', 0)) >= listeners
+
+        self.until(is_listened)
 
     def close(self) -> None:
         """Leave the graph."""

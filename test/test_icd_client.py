@@ -64,7 +64,7 @@ def test_calibrates_through_the_icd(client: Client, start_node: StartNode, tiny_
     observations: list[Any] = client.collect(StarObservations, 'observations')
     images = client.publisher(Image, 'image', 20)
     attitudes = client.publisher(QuaternionStamped, 'attitude')
-    client.until(lambda: client.node.count_subscribers('/observations') == 2)
+    client.until_listened(listeners=2)
 
     sent = 0
     for message in bag_messages(tiny_bag):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 import sys
+import threading
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped
@@ -58,6 +59,8 @@ class Calibrator(StarcalNode):
         self._last_answer = Answer(True, '')
         self._last_gate = 'none'
         self._driver: CameraDriver | None = None
+        self._status_due = threading.Event()
+        self._status_thread: threading.Thread | None = None
 
     def configure(self) -> None:
         """Load prior camera, options and the state folder, make the latched publishers."""
@@ -113,14 +116,11 @@ class Calibrator(StarcalNode):
         ):
             service = self.create_service(kind, name, self._answered(answer), callback_group=group)
             self._listeners.append((self.destroy_service, service))
-        # In a thread of its own, and once for a burst: the newest status stands for all.
-        self._status_due = self.create_guard_condition(
-            self.guarded(self._publish_status), callback_group=MutuallyExclusiveCallbackGroup()
-        )
-        self._listeners.append((self.destroy_guard_condition, self._status_due))
         retry = self.create_timer(_RETRY_S, self.guarded(self._save_again), collecting)
         self._listeners.append((self.destroy_timer, retry))
-        self._status_due.trigger()
+        self._status_due.set()
+        self._status_thread = threading.Thread(target=self._tell_status, name='status')
+        self._status_thread.start()
         in_force = self._state.in_force
         if in_force is not None:
             self._publish_calibration(in_force)
@@ -134,6 +134,10 @@ class Calibrator(StarcalNode):
         while listeners:
             destroy, entity = listeners.pop()
             destroy(entity)
+        thread, self._status_thread = self._status_thread, None
+        if thread is not None:
+            self._status_due.set()
+            thread.join()
 
     def cleanup(self) -> None:
         """Let go of the publishers and the state folder; what is in memory stays."""
@@ -187,12 +191,21 @@ class Calibrator(StarcalNode):
 
     def _on_observations(self, message: Any) -> None:
         self._state.add(observations_from_message(message))
-        self._status_due.trigger()
+        self._status_due.set()
 
     def _save_again(self) -> None:
         if self._state.trouble:
             self._state.save()
-            self._status_due.trigger()
+            self._status_due.set()
+
+    def _tell_status(self) -> None:
+        # Once for a burst: the newest status stands for all. Not by a guard condition: one that is
+        # triggered while the executor looks at it is lost before ros2/rmw_fastrtps#895, and with
+        # it the status of the last image.
+        tell = self.guarded(self._publish_status)
+        while self._status_due.wait() and self._status_thread is not None:
+            self._status_due.clear()
+            tell()
 
     def _publish_status(self) -> None:
         frame_id = self._setup.frames.camera_frame
@@ -218,7 +231,7 @@ class Calibrator(StarcalNode):
 
     def _on_reset(self, _request: Any, response: Any) -> Any:
         answer = self._state.reset()
-        self._status_due.trigger()
+        self._status_due.set()
         return self._told(answer, response)
 
     def _on_rollback(self, _request: Any, response: Any) -> Any:

@@ -14,6 +14,7 @@ from pathlib import Path
 import sys
 import time
 
+from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -38,9 +39,17 @@ class DemoClient(Node):
         super().__init__('starcal_demo')
         self.status: EnsembleStatus | None = None
         self.calibration: Calibration | None = None
+        self.is_heard = False  # the observer by the calibrator, as it says itself
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
         self.create_subscription(EnsembleStatus, 'ensemble_status', self._on_status, _LATCHED)
         self.create_subscription(Calibration, 'calibration', self._on_calibration, _LATCHED)
         self.calibrate = self.create_client(Trigger, 'calibrator/calibrate')
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == 'starcal: star_observer':
+                values = {value.key: value.value for value in status.values}
+                self.is_heard = int(values.get('listeners', 0)) > 0
 
     def _on_status(self, message: EnsembleStatus) -> None:
         self.status = message
@@ -72,8 +81,11 @@ def run(client: DemoClient, args: argparse.Namespace) -> int:
     listening = (args.image_topic, args.attitude_topic, 'observations')
 
     def ready() -> bool:
-        return client.calibrate.service_is_ready() and all(
-            client.count_subscribers(topic) for topic in listening
+        # What the observer sends before it has found the calibrator is lost.
+        return (
+            client.is_heard
+            and client.calibrate.service_is_ready()
+            and all(client.count_subscribers(topic) for topic in listening)
         )
 
     if not client.spin_until(ready, args.timeout):

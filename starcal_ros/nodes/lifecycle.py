@@ -29,7 +29,7 @@ from starcal_ros.nodes.parameters import OptionParameters
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Health = tuple[bytes, str, dict[str, object]]
 
-# Images, attitudes, services, solve, status, driver, its answer, a spare: none waits for another.
+# Images, attitudes, services, solve, driver, its answer, two spare: none waits for another.
 _THREADS = 8
 
 
