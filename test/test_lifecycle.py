@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 import signal
+import subprocess
+import sys
 from typing import Any, TYPE_CHECKING
 
 import pytest
@@ -107,3 +109,29 @@ def test_every_transition_in_every_state(
             try_everything(manager, reached)
         assert node.stop(number) == 0, node.said()
         assert 'Traceback' not in node.said()
+
+
+SIGNALLED = """
+import os, signal, sys, time
+import rclpy
+from starcal_ros.nodes.lifecycle import end_quietly, until_told_to_end
+
+def work():
+    if 'told' in sys.argv:
+        os.kill(os.getpid(), signal.SIGTERM)
+        while rclpy.ok():
+            time.sleep(0.01)
+    raise RuntimeError('the context\\nis invalid')
+
+sys.exit(until_told_to_end('maker', [], work, lambda: end_quietly(None)))
+"""
+
+
+@pytest.mark.parametrize(
+    ('argument', 'status', 'said'), [('', 2, 'maker: the context is invalid\n'), ('told', 0, '')]
+)
+def test_what_fails_after_a_signal_is_no_error(argument: str, status: int, said: str) -> None:
+    """ROS is gone at once under whatever is just being made; otherwise one line and status 2."""
+    command = [sys.executable, '-c', SIGNALLED, argument]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (status, '', said)

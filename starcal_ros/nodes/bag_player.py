@@ -11,7 +11,6 @@ from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
-from rclpy.exceptions import ROSInterruptException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -20,7 +19,7 @@ from rosgraph_msgs.msg import Clock
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal_ros import bag
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import BagError, StarcalError
+from starcal_ros.errors import BagError
 from starcal_ros.message_types import (
     ATTITUDE_TYPE,
     CALIBRATION_TYPE,
@@ -31,7 +30,7 @@ from starcal_ros.message_types import (
 )
 from starcal_ros.node_options import PlayerOptions
 from starcal_ros.nodes.conversions import message_class
-from starcal_ros.nodes.lifecycle import end_quietly, one_line
+from starcal_ros.nodes.lifecycle import end_quietly, until_told_to_end
 from starcal_ros.nodes.parameters import OptionParameters
 from starcal_ros.options import from_mapping
 
@@ -195,29 +194,23 @@ def main(args: Sequence[str] | None = None) -> int:
 
     A signal ends it with 0.
     """
-    player = None
-    listener = None
-    try:
-        rclpy.init(args=None if args is None else [NAME, *args])
+    player: BagPlayer | None = None
+    listener: threading.Thread | None = None
+
+    def work() -> int:
+        nonlocal player, listener
         player = BagPlayer()
         listener = threading.Thread(target=_listen, args=[player])
         listener.start()
         return player.play()
-    except StarcalError as error:
-        print(f'{NAME}: {one_line(error)}', file=sys.stderr)
-        return 2
-    except (KeyboardInterrupt, ExternalShutdownException, ROSInterruptException):
-        return 0
-    except Exception as error:
-        if player is not None and not rclpy.ok():
-            return 0
-        print(f'{NAME}: {one_line(error)}', file=sys.stderr)
-        return 2
-    finally:
+
+    def end() -> None:
         rclpy.try_shutdown()
         if listener is not None:
             listener.join()
         end_quietly(player)
+
+    return until_told_to_end(NAME, args, work, end)
 
 
 if __name__ == '__main__':

@@ -259,38 +259,44 @@ def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | N
 
     0 after SIGINT or SIGTERM; 2 for bad parameters or files, with one line that names them.
     """
-    node = None
-    is_up = False
+    node: StarcalNode | None = None
 
-    def is_told_to_end() -> bool:
-        # A signal shuts ROS down at once; what the node was just making then fails.
-        return is_up and not rclpy.ok()
-
-    try:
-        rclpy.init(args=None if args is None else [name, *args])
-        is_up = True
+    def work() -> int:
+        nonlocal node
         node = make_node()
         executor = MultiThreadedExecutor(_THREADS)
         executor.add_node(node)
         if node.options.values()['autostart'] and not _start(node):
-            if is_told_to_end():
-                return 0
-            print(f'{name}: {node.failure}', file=sys.stderr)
-            return 2
+            raise StarcalError(node.failure)
         _spin(node, executor)
-    except StarcalError as error:
-        print(f'{name}: {one_line(error)}', file=sys.stderr)
-        return 2
+        return 0
+
+    return until_told_to_end(name, args, work, lambda: _end(node))
+
+
+def until_told_to_end(
+    name: str, args: Sequence[str] | None, work: Callable[[], int], end: Callable[[], None]
+) -> int:
+    """
+    Exit status of work between `rclpy.init` and an end that is always come to.
+
+    Its own, or 0 after SIGINT or SIGTERM, or 2 after an error, with one line that names it.
+    """
+    is_up = False
+    try:
+        rclpy.init(args=None if args is None else [name, *args])
+        is_up = True
+        return work()
     except (KeyboardInterrupt, ExternalShutdownException, ROSInterruptException):
-        pass
+        return 0
     except Exception as error:
-        if is_told_to_end():
+        # A signal shuts ROS down at once; what was just being made then fails.
+        if is_up and not rclpy.ok():
             return 0
         print(f'{name}: {one_line(error)}', file=sys.stderr)
         return 2
     finally:
-        _end(node)
-    return 0
+        end()
 
 
 def end_quietly(node: Node | None) -> None:
