@@ -281,7 +281,7 @@ def _measure_by_psf(
     radius = stamp_radius_px(psf.sigma_px)
     n = len(predicted_px)
     refusal = np.full(n, '', dtype='U16')
-    centre = np.rint(np.nan_to_num(predicted_px, nan=-1e6)).astype(np.int64)
+    centre = np.rint(np.where(np.isnan(predicted_px), -1e6, predicted_px)).astype(np.int64)
     inside = windows_inside(shape, centre, 1)
     innermost = np.array([shape[1] - 2, shape[0] - 2])
     centre = np.clip(centre, 1, innermost)
@@ -305,7 +305,7 @@ def _measure_by_psf(
         stamps[hot] = level_dn[np.nonzero(hot)[0]]
     out = saturated | hot | outside
     windows = Stamps(stamps, sigma_px, noise_dn[:, None] ** 2, out if out.any() else None)
-    parameters = approach(windows, first_guess(windows), model.pixel_noise)
+    parameters = approach(windows, first_guess(windows, level_dn), model.pixel_noise)
     saturated_pixels = np.count_nonzero(saturated & ~hot, axis=(1, 2))
     windows, parameters, modelled = _without_neighbours(
         windows,
@@ -423,7 +423,8 @@ def _single_pixels(
     reach = np.arange(-radius, radius + 1)
     away = np.hypot(reach[:, None], reach) > CORE_PX
     least_dn = MISFIT_SIGMA * math.sqrt(noise.background) * noise_dn
-    star, row, column = np.nonzero((above_dn > least_dn[:, None, None]) & away)
+    beyond = (above_dn > least_dn[:, None, None]) & away
+    star, row, column = np.unravel_index(np.flatnonzero(beyond), beyond.shape)
     v, u = centre[star, 1] + row - radius, centre[star, 0] + column - radius
     lit_dn = above_dn[star, row, column]
     inner = (u >= 1) & (u < pixels.shape[1] - 1) & (v >= 1) & (v < pixels.shape[0] - 1)

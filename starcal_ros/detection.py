@@ -29,6 +29,7 @@ _DETECTION_SIGMA_PX = (
 )
 # A Gaussian filter of sigma s leaves white noise at 1 / (2 s sqrt(pi)) of its strength.
 _NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
+_ALONG_U, _ALONG_V = np.array([[[1], [0]], [[0], [1]]])  # a step along either axis, (2, 1)
 _RIM_PX = 4  # the filter's own reach, and one pixel for the place of the maximum
 _HOT_PEAK_RATIO = 4.0  # peak over filtered peak: 6.3 for one lit pixel, 2.7 for a 0.7 px star
 
@@ -179,12 +180,11 @@ def detect(pixels: Pixels, background: Background, detection_sigma: float) -> So
     v, u, centre, noise = v[keep], u[keep], centre[keep], noise[keep]
     sharp = image[v, u] > _HOT_PEAK_RATIO * centre
     v, u, centre, noise = v[~sharp], u[~sharp], centre[~sharp], noise[~sharp]
-    offset = [
-        _parabola_vertex(filtered[v - b, u - a], centre, filtered[v + b, u + a])
-        for a, b in ((1, 0), (0, 1))
-    ]
+    place = _parabola_vertex(
+        filtered[v - _ALONG_V, u - _ALONG_U], centre, filtered[v + _ALONG_V, u + _ALONG_U]
+    )
     order = np.argsort(-centre, kind='stable')
-    xy = np.stack([u + offset[0], v + offset[1]], axis=-1).astype(np.float64)
+    xy = place.T + np.stack([u, v], axis=-1)
     snr = (centre / (_NOISE_LEFT * noise)).astype(np.float64)
     return Sources(xy[order], snr[order], float(width * height))
 
@@ -260,17 +260,16 @@ def _brightest(
     v, u = best // side + _RIM_PX, best % side + _RIM_PX
     n = np.arange(len(centre))
     peak = filtered[n, v, u]
+    place = _parabola_vertex(
+        filtered[n, v - _ALONG_V, u - _ALONG_U], peak, filtered[n, v + _ALONG_V, u + _ALONG_U]
+    )
     xy = centre + np.stack([u, v], axis=-1) - half
     noise = sample_mesh(background.noise_mesh, shape, xy.astype(np.float64))
-    offset = [
-        _parabola_vertex(filtered[n, v - b, u - a], peak, filtered[n, v + b, u + a])
-        for a, b in ((1, 0), (0, 1))
-    ]
     # At the rim of the window it is the flank of something outside.
     star_like = (np.abs(xy - centre) < reach_px).all(axis=1)
     star_like &= windows[n, v, u] < _HOT_PEAK_RATIO * peak
     snr = np.where(star_like, peak / (_NOISE_LEFT * noise), 0.0)
-    return xy + np.stack(offset, axis=-1), snr
+    return xy + place.T, snr
 
 
 def _parabola_vertex(
@@ -279,7 +278,7 @@ def _parabola_vertex(
     """Place of the maximum of the parabola through three equidistant values, in their step."""
     curvature = 2 * centre - before - after
     vertex = 0.5 * (after - before) / np.maximum(curvature, 1e-12)
-    return np.asarray(np.clip(vertex, -0.5, 0.5), np.float64)
+    return np.asarray(vertex.clip(-0.5, 0.5), np.float64)
 
 
 def windows_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Pixels:

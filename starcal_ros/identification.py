@@ -104,6 +104,7 @@ class Shot:
     velocity_m_s: Floats | None = None
     site: SiteOptions = SPACE
     hot_pixels: NDArray[np.int64] = dataclasses.field(default_factory=lambda: NO_HOT_PIXELS.index)
+    temperature_degc: float = math.nan
 
 
 def observe_stars(
@@ -260,6 +261,7 @@ def _observations(
         noise_dn=model.background.noise_dn,
         psf_sigma_px=model.psf_sigma_px,
         catalog_digest=catalog.digest,
+        temperature_degc=shot.temperature_degc,
     )
 
 

@@ -9,6 +9,7 @@ of focus is followed.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import functools
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,7 @@ class PsfWidth:
         variance = width_basis(xy_px, self.width, self.height) @ self.coefficients
         return np.asarray(np.sqrt(np.clip(variance, middle / 2.25, middle * 2.25)))
 
-    @property
+    @functools.cached_property
     def sigma_px(self) -> float:
         """Width in px that is the mean of the variance over the detector."""
         return float(np.sqrt(self.coefficients @ [1.0, 0.0, 0.0, 1 / 3, 0.0, 1 / 3]))

@@ -34,6 +34,7 @@ _FIT_STEPS = 4  # stars settle in two or three; what has not by then is no star
 # this part of sigma_px and of the noise of the place, squared, the last step leaves 0.1 of that.
 _SETTLED = 0.3
 _SIGNIFICANT = 3.0  # sigma
+_MOMENTS = np.array([[-1, 0, 1] * 3, [-1] * 3 + [0] * 3 + [1] * 3, [1] * 9], np.float64).T
 MISFIT_SIGMA = 5.0  # 81 pixels of normal noise pass it once in 20,000 stars
 
 
@@ -85,7 +86,7 @@ def select(fit: PsfFit, stars: NDArray[np.intp] | NDArray[np.bool_]) -> PsfFit:
 
 def stamp_radius_px(psf_sigma_px: float) -> int:
     """Half width of the fitting window: beyond 3 sigma nothing tells the place of a star."""
-    return int(np.clip(np.ceil(3.0 * psf_sigma_px), 3, 12))
+    return min(max(math.ceil(3.0 * psf_sigma_px), 3), 12)
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,8 @@ def fit_psf(
     """
     sigma_px = np.broadcast_to(np.asarray(sigma_px, np.float64), (len(stamps),))
     windows = Stamps(stamps, sigma_px, noise_dn[:, None] ** 2)
-    return fit_at(windows, approach(windows, first_guess(windows), pixel_noise), pixel_noise)
+    guess = first_guess(windows, border_level_dn(stamps))
+    return fit_at(windows, approach(windows, guess, pixel_noise), pixel_noise)
 
 
 def approach(
@@ -259,16 +261,20 @@ def _single_misfits(
 
     Not of the core: a star that has lost its peak is hardly measured.
     """
-    worst = (weight * residual**2).max(axis=1, initial=0.0)
-    star = np.flatnonzero(worst > MISFIT_SIGMA**2)
-    pixel = (residual[star] * np.sqrt(weight[star])).argmax(axis=1)
-    row, (v, u) = np.arange(len(star)), np.divmod(pixel, width)
+    sigmas = residual * np.sqrt(weight)
+    star = np.flatnonzero(sigmas.max(axis=1, initial=0.0) > MISFIT_SIGMA)
+    pixel = sigmas[star].argmax(axis=1)
+    v, u = np.divmod(pixel, width)
+    x, y = parameters[star, :2].T + width // 2
+    away = np.hypot(u - x, v - y) > CORE_PX
+    if not away.any():
+        return star[away], pixel[away]
+    star, pixel, v, u = star[away], pixel[away], v[away], u[away]
     rimmed = np.zeros((len(star), width + 2, width + 2))
     rimmed[:, 1:-1, 1:-1] = residual[star].reshape(-1, width, width)
-    beside = [rimmed[row, v + b, u + a] for b, a in ((0, 1), (2, 1), (1, 0), (1, 2))]
-    lit = residual[star, pixel] * np.sqrt(weight[star, pixel]) > MISFIT_SIGMA
-    alone = lit & (np.mean(beside, axis=0) < SPILT * residual[star, pixel])
-    alone &= np.hypot(*(np.stack([u, v]) - width // 2 - parameters[star, :2].T)) > CORE_PX
+    row = np.arange(len(star))
+    beside = sum(rimmed[row, v + b, u + a] for b, a in ((0, 1), (2, 1), (1, 0), (1, 2)))
+    alone = 0.25 * beside < SPILT * residual[star, pixel]
     return star[alone], pixel[alone]
 
 
@@ -281,21 +287,23 @@ def expected_snr(
     return np.asarray(flux / np.sqrt(sky_dn2 + flux / noise.gain_e_per_dn))
 
 
-def first_guess(windows: Stamps) -> Floats:
-    """Parameters (n, 4) from which the fit starts: the centre of the light next to the middle."""
-    stamps, sigma_px, w = windows.data_dn, windows.sigma_px, windows.width
-    background = border_level_dn(stamps)
-    c = w // 2
-    core = stamps[:, c - 1 : c + 2, c - 1 : c + 2] - background[:, None, None]
-    along_x, along_y = core.sum(axis=1), core.sum(axis=2)
-    total = np.maximum(core.sum(axis=(1, 2)), 1e-12)
+def first_guess(windows: Stamps, background: Floats) -> Floats:
+    """
+    Parameters (n, 4) from which the fit starts: the centre of the light next to the middle.
+
+    ``background`` (n,) is that of `border_level_dn`.
+    """
+    stamps, sigma_px, c = windows.data_dn, windows.sigma_px, windows.width // 2
+    core = stamps[:, c - 1 : c + 2, c - 1 : c + 2].reshape(-1, 9)
+    off_x, off_y, total = (core @ _MOMENTS).T
+    total = total - 9.0 * background
     share = erf(1.5 / (math.sqrt(2.0) * sigma_px))  # of the light in three pixels
     # The outer two of three pixels differ by this much for each pixel of the way.
     slope = 2.0 * (_gauss(0.5 / sigma_px) - _gauss(1.5 / sigma_px)) / sigma_px
-    x = np.clip((along_x[:, 2] - along_x[:, 0]) / total * share / slope, -0.7, 0.7)
-    y = np.clip((along_y[:, 2] - along_y[:, 0]) / total * share / slope, -0.7, 0.7)
-    flux = core.sum(axis=(1, 2)) / share**2
-    return np.stack([x, y, flux, background], axis=-1)
+    per_light = share / slope / np.maximum(total, 1e-12)
+    guess = np.stack([off_x * per_light, off_y * per_light, total / share**2, background], axis=-1)
+    guess[:, :2].clip(-0.7, 0.7, out=guess[:, :2])
+    return guess
 
 
 def border_level_dn(stamps: Floats) -> Floats:
@@ -393,9 +401,9 @@ class NoiseSums:
                 break
         background, per_signal, error2 = found
         return PixelNoise(
-            1.0 / float(np.clip(per_signal, 1e-4, 1e4)),
-            float(np.sqrt(np.clip(error2, 0.0, 0.25))),
-            float(np.clip(background, 0.25, 4.0)),
+            1.0 / min(max(float(per_signal), 1e-4), 1e4),
+            math.sqrt(min(max(float(error2), 0.0), 0.25)),
+            min(max(float(background), 0.25), 4.0),
         )
 
 

@@ -74,7 +74,7 @@ def observe_next(
     of the image before are refused, used or not, when they come again under another stamp.
     """
     track = _after_order(track, image.time_ns)
-    attitude: dict[str, object] = {}
+    known: dict[str, object] = {'temperature_degc': temperature_degc}
     remembered = track
     try:
         check_order(image, track.latest_ns)
@@ -83,7 +83,7 @@ def observe_next(
         seen = fingerprint(image, sample)
         remembered = dataclasses.replace(track, seen=seen)
         quaternion, gap_s = attitudes.at(image.time_ns, setup.attitude.max_attitude_gap_s)
-        attitude = {
+        known |= {
             'icrf_from_star_tracker_xyzw': quaternion,
             'attitude_gap_s': gap_s,
             'catalog_digest': setup.catalog.digest,
@@ -91,15 +91,22 @@ def observe_next(
         saturation_dn = setup.centroid.saturation_dn
         screen(sample, seen, track.seen, saturation_dn, setup.dark, setup.screening)
         hot = (track.hot or setup.hot).index
-        shot = Shot(_without_dark(image, setup), quaternion, gap_s, velocity_m_s, setup.site, hot)
-        observations, after = _stars(shot, setup, remembered)
+        shot = Shot(
+            _without_dark(image, setup),
+            quaternion,
+            gap_s,
+            velocity_m_s,
+            setup.site,
+            hot,
+            temperature_degc,
+        )
+        return _stars(shot, setup, remembered)
     except ImageRefused as refused:
         height, width = image.pixels.shape
         observations = refused_image(
-            image.time_ns, width, height, refused.reason, refused.detail, **attitude
+            image.time_ns, width, height, refused.reason, refused.detail, **known
         )
-        after = remembered
-    return dataclasses.replace(observations, temperature_degc=temperature_degc), after
+        return observations, remembered
 
 
 def observe(

@@ -187,11 +187,10 @@ def _find_turn(
             raise lost
         A, b = J[near].reshape(-1, 3), offset_px[near].ravel()
         # A trace keeps the roll at rest where all guides stand in one place.
-        normal = A.T @ A
-        normal.flat[::4] += 1e-9 * np.trace(normal)
+        normal = A.T @ A + 1e-9 * float((A * A).sum()) * np.eye(3)
         turn_rad = np.linalg.solve(normal, A.T @ b)
         left_px = np.hypot(*(offset_px - J @ turn_rad).T)
-        limit_px = float(np.clip(4.0 * median(left_px[near]), 0.75, _NEIGHBOUR_PX))
+        limit_px = min(max(4.0 * median(left_px[near]), 0.75), _NEIGHBOUR_PX)
         near = left_px < limit_px
     matched = int(np.count_nonzero(near))
     side_px = 2 * reach_px + 1
