@@ -47,6 +47,7 @@ _GUIDES = 24  # brightest predictions that are looked for in windows
 _NEIGHBOUR_PX = 3.0  # a small turn moves the guides alike; a roll of 0.1 degrees, by 3 px
 _CHANCE = 1e-9  # greatest probability that the windows bear out a wrong prediction
 _GOOD_SNR = 10.0  # of stars that correct the prediction
+_STEADY_PX = 1.0  # turn that the next image finds anew as well, from wherever it starts
 _SYSTEMATIC_PX = 0.15  # rms from which the camera of the prediction is corrected
 # How far the camera that predicts may be from the one before, 1-sigma: a part of the focal length
 # for the intrinsics, and the distortion of a lens that is not quite known.
@@ -104,7 +105,8 @@ def follow(
     turn_rad = _find_turn(
         pixels, background, prediction, before.geometry.camera, centroid_options, options
     )
-    direction_camera = Rotation.from_rotvec(-turn_rad).apply(prediction.direction_camera)
+    turn = Rotation.from_rotvec(-turn_rad)
+    direction_camera = turn.apply(prediction.direction_camera)
     prediction = dataclasses.replace(
         prediction,
         direction_camera=direction_camera,
@@ -116,11 +118,15 @@ def follow(
     )
     if observations.refusal:
         raise ImageRefused(observations.refusal, observations.detail)
+    instrument = instrument or before.instrument
+    turn_px = turn.magnitude() * prediction.px_per_rad
+    if turn_px < _STEADY_PX and _fits(before.geometry, turn, observations):
+        return observations, dataclasses.replace(before, instrument=instrument)
     corrected = _corrected(before.geometry, observations)
     radius_rad = before.field_radius_rad
     if corrected.camera is not before.geometry.camera:
         radius_rad = field_radius_rad(corrected.camera)
-    return observations, Followed(corrected, radius_rad, instrument or before.instrument)
+    return observations, Followed(corrected, radius_rad, instrument)
 
 
 def _predict(
@@ -202,13 +208,19 @@ def _find_turn(
     return np.asarray(turn_rad)
 
 
+def _fits(geometry: CameraGeometry, turn: Rotation, observations: StarObservations) -> bool:
+    """Whether the stars stand where the camera shows them once it is turned."""
+    camera_from_icrf = turn * _icrf_from_camera(geometry, observations).inv()
+    predicted_px = project(
+        geometry.camera, observations.direction_icrf @ camera_from_icrf.as_matrix().T
+    )
+    return _rms_px(observations.measured_px - predicted_px) < _SYSTEMATIC_PX
+
+
 def _corrected(geometry: CameraGeometry, observations: StarObservations) -> CameraGeometry:
     """The geometry turned to where this image shows its stars, its camera corrected if need be."""
     camera = geometry.camera
-    icrf_from_star_tracker = Rotation.from_quat(observations.icrf_from_star_tracker_xyzw)
-    icrf_from_camera = icrf_from_star_tracker * Rotation.from_quat(
-        geometry.star_tracker_from_camera_xyzw
-    )
+    icrf_from_camera = _icrf_from_camera(geometry, observations)
     directions = observations.direction_icrf @ icrf_from_camera.as_matrix()
     variance_px2 = 0.5 * (observations.covariance_px2[:, 0] + observations.covariance_px2[:, 2])
     bright = observations.snr > _GOOD_SNR
@@ -221,10 +233,22 @@ def _corrected(geometry: CameraGeometry, observations: StarObservations) -> Came
     step = _step(J, measured_px - pixels, weight, np.zeros(3), np.zeros(3))
     turn = Rotation.from_rotvec(-step)
     left_px = measured_px - pixels - J @ step
-    if np.sqrt(np.mean(np.minimum(left_px**2, 9.0))) > _SYSTEMATIC_PX:
+    if _rms_px(left_px) > _SYSTEMATIC_PX:
         camera, turn = _corrected_camera(camera, turn, directions, measured_px, weight)
+    icrf_from_star_tracker = Rotation.from_quat(observations.icrf_from_star_tracker_xyzw)
     camera_from_star_tracker = turn * icrf_from_camera.inv() * icrf_from_star_tracker
     return CameraGeometry(camera, camera_from_star_tracker.inv().as_quat())
+
+
+def _icrf_from_camera(geometry: CameraGeometry, observations: StarObservations) -> Rotation:
+    return Rotation.from_quat(observations.icrf_from_star_tracker_xyzw) * Rotation.from_quat(
+        geometry.star_tracker_from_camera_xyzw
+    )
+
+
+def _rms_px(off_px: Floats) -> float:
+    """Root mean square per axis of (n, 2), with what is beyond 3 px as 3 px."""
+    return float(np.sqrt(np.mean(np.minimum(off_px**2, 9.0))))
 
 
 def _corrected_camera(
