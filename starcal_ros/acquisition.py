@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import bdtr, pdtrc
 
-from starcal_ros.camera import line_of_sight, project, project_rotation
+from starcal_ros.camera import line_of_sight, project, rotation_jacobian
 from starcal_ros.detection import Sources
 from starcal_ros.errors import ImageRefused
 from starcal_ros.prediction import in_image, Prediction
@@ -175,7 +175,7 @@ def _refine_rotation(
             break
         star = stars[pairs[:, 0]]
         residual = sources.xy_px[pairs[:, 1]] - xy[star]
-        _, J_rotation = project_rotation(camera, directions[star])
+        J_rotation = rotation_jacobian(camera, directions[star])
         J = np.concatenate([scale * J_rotation, (xy[star] - centre)[:, :, None]], axis=-1)
         size = np.linalg.norm(residual, axis=1)
         weight = 1.0 / (1.0 + (size / max(median(size), 0.3)) ** 2)

@@ -188,14 +188,13 @@ def project_jacobians(
     return pixels, J_parameters, _rotation_jacobian(camera, xy)
 
 
-def project_rotation(camera: CameraModel, directions_camera: Floats) -> tuple[Floats, Floats]:
+def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
     """
-    Pixels (..., 2) and their derivatives (..., 2, 3) by a small rotation, as `project_jacobians`.
+    Derivatives (..., 2, 3) of pixels by a small rotation, as of `project_jacobians`.
 
     Directions (..., 3) in the camera frame, Z > 0.
     """
-    xy = _image_plane(directions_camera)
-    return project(camera, directions_camera), _rotation_jacobian(camera, xy)
+    return _rotation_jacobian(camera, _image_plane(directions_camera))
 
 
 def _image_plane(directions_camera: Floats) -> Floats:

@@ -284,14 +284,15 @@ def _measure_by_psf(
     centre = np.rint(np.where(np.isnan(predicted_px), -1e6, predicted_px)).astype(np.int64)
     inside = windows_inside(shape, centre, 1)
     innermost = np.array([shape[1] - 2, shape[0] - 2])
-    centre = np.clip(centre, 1, innermost)
+    centre = np.minimum(np.maximum(centre, 1), innermost)
     # The window goes where the star is: the brightest pixel next to the prediction.
     near = windows_about(pixels, centre, 1)
     near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0
     near = near.reshape(n, 9)
     best = near.argmax(axis=1)
     best[near[:, 4] == near.max(axis=1)] = 4  # of a saturated plateau, the pixel predicted
-    centre = np.clip(centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1), 1, innermost)
+    centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
+    centre = np.minimum(np.maximum(centre, 1), innermost)
     stamps, outside = stamps_at_edges(pixels, centre, radius)
     at_px = centre.astype(np.float64)
     noise_dn = sample_mesh(model.background.noise_mesh, shape, at_px)

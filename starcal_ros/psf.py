@@ -352,9 +352,13 @@ def neighbour_pull_px(
     width = 2 * stamp_radius_px(sigma_px) + 1
     count = len(flux_dn)
     sigma = np.full(count, sigma_px)
-    light = light_in_stamps(np.zeros((count, 2)), flux_dn, sigma, width)
-    light += light_in_stamps(offset_px, neighbour_flux_dn, sigma, width)
-    stamps = Stamps(light.reshape(count, width, width), sigma, np.full((count, 1), noise_dn**2))
+    own, other = light_in_stamps(
+        np.concatenate([np.zeros((count, 2)), offset_px]),
+        np.concatenate([flux_dn, neighbour_flux_dn]),
+        np.full(2 * count, sigma_px),
+        width,
+    ).reshape(2, count, width, width)
+    stamps = Stamps(own + other, sigma, np.full((count, 1), noise_dn**2))
     alone = np.stack([*np.zeros((2, count)), flux_dn, np.zeros(count)], axis=-1)
     # The second step leaves a hundredth of the pull.
     for _ in range(2):

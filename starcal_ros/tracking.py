@@ -23,7 +23,7 @@ from starcal_ros.camera import (
     field_radius_rad,
     project,
     project_jacobians,
-    project_rotation,
+    rotation_jacobian,
 )
 from starcal_ros.catalog import cone, StarCatalog
 from starcal_ros.centroiding import CentroidOptions, known_model
@@ -181,8 +181,8 @@ def _find_turn(
     lost = ImageRefused('no_match', f'{len(guides)} of the brightest stars meet a source')
     if len(guides) < 4:
         raise lost
-    predicted_px, J = project_rotation(camera, prediction.direction_camera[guides])
-    offset_px = place_px - predicted_px
+    J = rotation_jacobian(camera, prediction.direction_camera[guides])
+    offset_px = place_px - xy[guides]
     apart2 = ((offset_px[:, None] - offset_px[None]) ** 2).sum(axis=2)
     common = int((apart2 < _NEIGHBOUR_PX**2).sum(axis=1).argmax())
     near = apart2[common] < _NEIGHBOUR_PX**2
@@ -229,10 +229,11 @@ def _corrected(geometry: CameraGeometry, observations: StarObservations) -> Came
     directions, measured_px = directions[bright], observations.measured_px[bright]
     # No prediction needs to be better than a twentieth of a pixel.
     weight = 1.0 / (variance_px2[bright] + 0.05**2)
-    pixels, J = project_rotation(camera, directions)
-    step = _step(J, measured_px - pixels, weight, np.zeros(3), np.zeros(3))
+    off_px = measured_px - project(camera, directions)
+    J = rotation_jacobian(camera, directions)
+    step = _step(J, off_px, weight, np.zeros(3), np.zeros(3))
     turn = Rotation.from_rotvec(-step)
-    left_px = measured_px - pixels - J @ step
+    left_px = off_px - J @ step
     if _rms_px(left_px) > _SYSTEMATIC_PX:
         camera, turn = _corrected_camera(camera, turn, directions, measured_px, weight)
     icrf_from_star_tracker = Rotation.from_quat(observations.icrf_from_star_tracker_xyzw)
