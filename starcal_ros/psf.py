@@ -182,8 +182,7 @@ def approach(
         if len(active) == 0:
             break
         chosen, at = stamps.select(active), parameters[active]
-        rows = _psf_rows(at, chosen.flat_dn, chosen.sigma_px, chosen.width, 4)
-        normal, gradient = _normal(rows, _weights(rows, at, chosen, pixel_noise))
+        normal, gradient = _normal(_whitened_rows(at, chosen, pixel_noise, 4)[0])
         step = np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
         step[:, :2].clip(-0.5, 0.5, out=step[:, :2])
         at = at + step
@@ -204,17 +203,16 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     part.
     """
     # Second moments: one linear step from the solution, in units of the PSF variance.
-    rows = _psf_rows(parameters, stamps.flat_dn, stamps.sigma_px, stamps.width, 7)
-    weight = _weights(rows, parameters, stamps, pixel_noise)
-    normal, gradient = _normal(rows, weight)
+    rows, light, root_weight = _whitened_rows(parameters, stamps, pixel_noise, 7)
+    normal, gradient = _normal(rows)
     covariance = np.asarray(np.linalg.inv(normal[:, :4, :4]), np.float64)
     last = (covariance @ gradient[:, :4, None])[:, :, 0]
     last[:, :2].clip(-0.5, 0.5, out=last[:, :2])
     residual = _after(last, rows)
-    spoilt, pixel = _single_misfits(residual, weight, parameters, stamps.width)
+    spoilt, pixel = _single_misfits(residual, light, parameters, stamps)
     if len(spoilt):
-        weight[spoilt, pixel] = 0.0
-        normal[spoilt], gradient[spoilt] = _normal(rows[spoilt], weight[spoilt])
+        root_weight[spoilt, pixel], rows[spoilt, :, pixel] = 0.0, 0.0
+        normal[spoilt], gradient[spoilt] = _normal(rows[spoilt])
         covariance[spoilt] = np.linalg.inv(normal[spoilt, :4, :4])
         last[spoilt] = (covariance[spoilt] @ gradient[spoilt, :4, None])[:, :, 0]
         residual[spoilt] = _after(last[spoilt], rows[spoilt])
@@ -222,46 +220,48 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     of_shape = np.linalg.solve(normal, np.broadcast_to(np.eye(7)[:, 4:], (len(normal), 7, 3)))
     shape_step = (gradient[:, None, :] @ of_shape)[:, 0]
     shape_variance = of_shape[:, [4, 5, 6], [0, 1, 2]]
-    leverage = np.einsum('nkp,nkp->np', covariance @ rows[:, :4], rows[:, :4]) * weight
-    signal = parameters[:, 2, None] * rows[:, 2]
+    leverage = np.einsum('nkp,nkp->np', covariance @ rows[:, :4], rows[:, :4])
     parameters = parameters + last
     snr = parameters[:, 2] / np.sqrt(covariance[:, 2, 2])
-    trust = weight
+    misfit = residual
     if pixel_noise.psf_error > 0:
         # Of a pixel's variance, this many times what its weight holds is the error of the PSF.
         flux = np.maximum(parameters[:, 2, None], 0.0)
-        excess = pixel_noise.psf_error**2 * flux * np.maximum(signal, 0.0) * weight
-        trust = weight / (1.0 + excess)
-        scatter = (rows[:, :7] * (excess * weight)[:, None, :]) @ rows[:, :7].transpose(0, 2, 1)
+        excess = pixel_noise.psf_error**2 * flux * light * root_weight**2
+        misfit = residual / np.sqrt(1.0 + excess)
+        scatter = (rows[:, :7] * excess[:, None, :]) @ rows[:, :7].transpose(0, 2, 1)
         covariance = covariance + covariance @ scatter[:, :4, :4] @ covariance
         shape_variance = shape_variance + (of_shape * (scatter @ of_shape)).sum(axis=1)
+    with np.errstate(invalid='ignore'):
+        residual_dn = residual / root_weight
     return PsfFit(
         parameters=parameters,
         covariance=covariance,
         snr=snr,
-        worst_pixel_sigma=np.sqrt((trust * residual**2).max(axis=1, initial=0.0)),
+        worst_pixel_sigma=np.abs(misfit).max(axis=1, initial=0.0),
         shape_change=shape_step,
         shape_sigma=np.sqrt(shape_variance),
-        signal_dn=signal,
-        residual_dn=np.where(weight > 0.0, residual, np.nan),
+        signal_dn=light,
+        residual_dn=residual_dn,
         freedom=np.maximum(1.0 - leverage, 0.05),
     )
 
 
 def _after(step: Floats, rows: Floats) -> Floats:
-    """Residuals (n, p) that a step (n, 4) leaves of those of `_psf_rows`, to first order."""
+    """Residuals (n, p) that a step (n, 4) leaves of those of the rows, to first order."""
     return np.asarray(rows[:, -1] - (step[:, None, :] @ rows[:, :4])[:, 0])
 
 
 def _single_misfits(
-    residual: Floats, weight: Floats, parameters: Floats, width: int
+    sigmas: Floats, light: Floats, parameters: Floats, stamps: Stamps
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """
     Rows (k,) of stars with one pixel lit too much that does not spill over, and that pixel.
 
-    Not of the core: a star that has lost its peak is hardly measured.
+    Not of the core: a star that has lost its peak is hardly measured.  ``sigmas`` (n, p) are the
+    residuals in the noise of each pixel, ``light`` (n, p) is that of the stars.
     """
-    sigmas = residual * np.sqrt(weight)
+    width = stamps.width
     star = np.flatnonzero(sigmas.max(axis=1, initial=0.0) > MISFIT_SIGMA)
     pixel = sigmas[star].argmax(axis=1)
     v, u = np.divmod(pixel, width)
@@ -271,10 +271,11 @@ def _single_misfits(
         return star[away], pixel[away]
     star, pixel, v, u = star[away], pixel[away], v[away], u[away]
     rimmed = np.zeros((len(star), width + 2, width + 2))
-    rimmed[:, 1:-1, 1:-1] = residual[star].reshape(-1, width, width)
+    left_dn = stamps.flat_dn[star] - light[star] - parameters[star, 3, None]
+    rimmed[:, 1:-1, 1:-1] = left_dn.reshape(-1, width, width)
     row = np.arange(len(star))
     beside = sum(rimmed[row, v + b, u + a] for b, a in ((0, 1), (2, 1), (1, 0), (1, 2)))
-    alone = 0.25 * beside < SPILT * residual[star, pixel]
+    alone = 0.25 * beside < SPILT * left_dn[row, pixel]
     return star[alone], pixel[alone]
 
 
@@ -502,24 +503,34 @@ def _in_each_row(of_columns: Floats) -> Floats:
     return spread.reshape(n, width * width)
 
 
-def _weights(rows: Floats, parameters: Floats, stamps: Stamps, pixel_noise: PixelNoise) -> Floats:
-    """Inverse noise variance (n, p) of pixels, 0 for those that take no part."""
-    variance = np.maximum(parameters[:, 2, None], 0.0) * rows[:, 2]
-    variance /= pixel_noise.gain_e_per_dn
-    variance += pixel_noise.background * stamps.noise2_dn2
+def _whitened_rows(
+    parameters: Floats, stamps: Stamps, pixel_noise: PixelNoise, count: int
+) -> tuple[Floats, Floats, Floats]:
+    """
+    The rows of `_psf_rows` over the noise of each pixel, 0 for those that take no part.
+
+    Also the light (n, p) of the stars, and (n, p) one over that noise.
+    """
+    rows = _psf_rows(parameters, stamps.flat_dn, stamps.sigma_px, stamps.width, count)
+    light = np.maximum(parameters[:, 2, None], 0.0) * rows[:, 2]
+    root_weight = light / pixel_noise.gain_e_per_dn
+    root_weight += pixel_noise.background * stamps.noise2_dn2
+    np.sqrt(root_weight, out=root_weight)
     valid = stamps.valid
-    return np.asarray(1.0 / variance if valid is None else valid / variance)
+    np.divide(1.0 if valid is None else valid, root_weight, out=root_weight)
+    rows *= root_weight[:, None, :]
+    return rows, light, root_weight
 
 
-def _normal(rows: Floats, weight: Floats) -> tuple[Floats, Floats]:
+def _normal(rows: Floats) -> tuple[Floats, Floats]:
     """
     Normal matrices (n, k, k) and gradients (n, k) of many small least-squares problems.
 
-    ``rows`` (n, k + 1, p) are the derivatives and the residual.  A trace on the diagonal keeps a
-    stamp without light solvable.
+    ``rows`` (n, k + 1, p) are the derivatives and the residual, whitened.  A trace on the diagonal
+    keeps a stamp without light solvable.
     """
     k = rows.shape[1] - 1
-    product = (rows[:, :k] * weight[:, None, :]) @ rows.transpose(0, 2, 1)
+    product = rows[:, :k] @ rows.transpose(0, 2, 1)
     normal, gradient = product[:, :, :k], product[:, :, k]
     diagonal = np.einsum('nii->ni', normal)
     diagonal += 1e-9 * diagonal + 1e-12
