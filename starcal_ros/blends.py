@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from starcal_ros.catalog import CLOSE_PAIR_RAD, StarCatalog
-from starcal_ros.centroiding import Centroids, ImageModel
+from starcal_ros.centroiding import Centroids, ImageModel, SWAMPED_SIGMA
 from starcal_ros.prediction import Prediction
 from starcal_ros.psf import neighbour_pull_px, stamp_radius_px
 
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 _PULL_UNCERTAINTY = 0.25  # of a neighbour's light: stars of unlike colour differ so from their V
 _MODELLED_UNCERTAINTY = 0.05  # of that of a star measured itself: wings that are no Gaussian's
-_NEAR_SIGMA, _MODELLED_NEAR_SIGMA = 5.0, 3.0  # a bright neighbour nearer than this swamps
+_NEAR_SIGMA = 5.0  # a bright neighbour nearer than this swamps, if it is not measured itself
 _ALONE_SIGMA = 0.1  # a star whose neighbours pull it by less tells the PSF
 
 
@@ -81,7 +81,7 @@ def neighbour_pulls(
     # A neighbour half as bright takes part of the window for itself: no small pull any more.  Nor
     # is the centre of a double of like stars used: their orbits, which no catalog of places has,
     # move it by arcseconds (zeta Herculis).
-    near = distance_px < np.where(known, _MODELLED_NEAR_SIGMA, _NEAR_SIGMA) * sigma_px
+    near = distance_px < np.where(known, SWAMPED_SIGMA, _NEAR_SIGMA) * sigma_px
     swamped, outshone = np.zeros((2, len(xy_px)), bool)
     swamped[star[near & (ratio > 0.5)]] = True
     outshone[star[(distance_px < _NEAR_SIGMA * sigma_px) & (ratio > 1.0)]] = True

@@ -212,16 +212,18 @@ def _rotation_jacobian(camera: CameraModel, xy: Floats) -> Floats:
     J_u = fx * J_xy[..., 0, :] + skew * J_xy[..., 1, :]
     J_v = fy * J_xy[..., 1, :]
     # d(x, y)/d(dtheta) = d(x, y)/de [e x] depends on x and y alone (Eqs. 34, 35).
-    one = np.ones_like(x)
-    x_theta = np.stack([x * y, -(one + x * x), y], axis=-1)
-    y_theta = np.stack([one + y * y, -x * y, -x], axis=-1)
-    return np.stack(
-        [
-            J_u[..., 0, None] * x_theta + J_u[..., 1, None] * y_theta,
-            J_v[..., 0, None] * x_theta + J_v[..., 1, None] * y_theta,
-        ],
-        axis=-2,
-    )
+    theta = np.empty((2, *x.shape, 3))
+    theta[0, ..., 0] = x * y
+    theta[0, ..., 1] = -1.0 - x * x
+    theta[0, ..., 2] = y
+    theta[1, ..., 0] = 1.0 + y * y
+    theta[1, ..., 1] = -theta[0, ..., 0]
+    theta[1, ..., 2] = -x
+    x_theta, y_theta = theta
+    J = np.empty((*x.shape, 2, 3))
+    J[..., 0, :] = J_u[..., 0, None] * x_theta + J_u[..., 1, None] * y_theta
+    J[..., 1, :] = J_v[..., 0, None] * x_theta + J_v[..., 1, None] * y_theta
+    return J
 
 
 def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:

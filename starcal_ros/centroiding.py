@@ -48,6 +48,7 @@ Floats = NDArray[np.float64]
 
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitive than another
 _MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours
+SWAMPED_SIGMA = 3.0  # a brighter star nearer than this swamps, though it is measured itself
 _NEIGHBOUR_NOISE = 0.2  # of the noise of a pixel: less light of a neighbour changes nothing
 _IN_PLACE_PX = 1.5  # of a fit from the brightest pixel: beyond, it has gone elsewhere
 _BRIGHTEST = 60  # stars that show the level of saturation
@@ -369,12 +370,16 @@ def _without_neighbours(
     # A star out of the stamp lights it with its wing.
     reach_px = math.sqrt(2.0) * (stamps.width // 2) + 2.0 * widest_px
     pairs = cKDTree(centre).query_pairs(reach_px, output_type='ndarray')
-    apart_px = np.linalg.norm(predicted_px[pairs[:, 0]] - predicted_px[pairs[:, 1]], axis=1)
+    apart_px = np.hypot(*(predicted_px[pairs[:, 0]] - predicted_px[pairs[:, 1]]).T)
     # Both would be fitted to the light of the brighter one, which comes first.
     modelled[pairs[apart_px < max(3.0, 3.0 * widest_px)].max(axis=1)] = False
+    # Nothing frees the fainter of two that look like one: `blends` refuses it.
+    pairs = pairs[apart_px >= SWAMPED_SIGMA * float(sigma_px.min())]
     star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     told = modelled[other]
     star, other = star[told], other[told]
+    if not len(star):
+        return stamps, parameters, modelled
     away_px = (centre[other] - centre[star]).astype(np.float64)
     freed = stamps
     touched = np.zeros(len(stamps), bool)

@@ -165,9 +165,7 @@ def fit_psf(
     return fit_at(windows, approach(windows, guess, pixel_noise), pixel_noise)
 
 
-def approach(
-    stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise, steps: int = _FIT_STEPS
-) -> Floats:
+def approach(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> Floats:
     """
     Parameters (n, 4) after some steps towards the fit: x, y (px), flux, background (DN).
 
@@ -176,23 +174,30 @@ def approach(
     brings to the fit, such as `fit_at` takes, are left alone.
     """
     parameters = parameters.copy()
-    half_px = stamps.width / 2
     active = np.arange(len(stamps))
-    for _ in range(steps):
+    for _ in range(_FIT_STEPS):
         if len(active) == 0:
             break
-        chosen, at = stamps.select(active), parameters[active]
-        normal, gradient = _normal(_whitened_rows(at, chosen, pixel_noise, 4)[0])
-        step = np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
-        step[:, :2].clip(-0.5, 0.5, out=step[:, :2])
-        at = at + step
-        at[:, :2].clip(-half_px, half_px, out=at[:, :2])
-        parameters[active] = at
+        chosen = stamps.select(active)
+        parameters[active], step, normal = _nearer(chosen, parameters[active], pixel_noise)
         # The noise of the place with flux and background known, the smaller one.
         place_sigma_px = 1.0 / np.sqrt(np.einsum('nii->ni', normal)[:, :2])
         limit_px2 = _SETTLED * place_sigma_px * chosen.sigma_px[:, None]
         active = active[(step[:, :2] ** 2 > limit_px2).any(axis=1)]
     return parameters
+
+
+def _nearer(
+    stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise
+) -> tuple[Floats, Floats, Floats]:
+    """Parameters (n, 4) after a step towards the fit, the step, and normal matrices (n, 4, 4)."""
+    normal, gradient = _normal(_whitened_rows(parameters, stamps, pixel_noise, 4)[0])
+    step = np.asarray(np.linalg.solve(normal, gradient[:, :, None])[:, :, 0], np.float64)
+    step[:, :2].clip(-0.5, 0.5, out=step[:, :2])
+    half_px = stamps.width / 2
+    parameters = parameters + step
+    parameters[:, :2].clip(-half_px, half_px, out=parameters[:, :2])
+    return parameters, step, normal
 
 
 def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFit:
@@ -363,7 +368,7 @@ def neighbour_pull_px(
     alone = np.stack([*np.zeros((2, count)), flux_dn, np.zeros(count)], axis=-1)
     # The second step leaves a hundredth of the pull.
     for _ in range(2):
-        alone = approach(stamps, alone, pixel_noise, steps=1)
+        alone, _, _ = _nearer(stamps, alone, pixel_noise)
     return alone[:, :2]
 
 
