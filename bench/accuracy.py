@@ -72,11 +72,12 @@ def run(quick: bool) -> list[Table]:
         f'From pixels, {IMAGES} images of {SIZE[0]} x {SIZE[1]}, {seeds} seeds',
         (
             *('field deg', 'PSF px', 'tracker "', 'map / bound rms', 'median', 'worst', 'target'),
-            *('star / bound', 'star / sigma', 'stars', 'not solved'),
+            *('its sigma / bound', 'star / bound', 'star / sigma', 'stars', 'not solved'),
         ),
         notes=[
-            'map: rms over the detector after the best common turn.  star: rms error per axis',
-            'over the bound of each star and over its own sigma, signal-to-noise above 10.',
+            'map: rms over the detector after the best common turn; its sigma: the same by the',
+            'covariance of the calibration.  star: rms error per axis over the bound of each star',
+            'and over its own sigma, signal-to-noise above 10.',
             'not solved: campaigns without a calibration; no other column knows of them.',
         ],
     )
@@ -100,8 +101,8 @@ def _summary(case: Case, rows: Iterable[Floats]) -> tuple[float | str, ...]:
     unsolved = int(np.count_nonzero(~solved))
     before = (case.field_deg, case.psf_sigma_px, case.tracker_arcsec)
     if not solved.any():
-        return (*before, *([math.nan] * 3), 'MISSED', math.nan, math.nan, 0, unsolved)
-    ratio, over_bound2, over_sigma2, stars = table[solved].T
+        return (*before, *([math.nan] * 3), 'MISSED', *([math.nan] * 3), 0, unsolved)
+    ratio, told_ratio, over_bound2, over_sigma2, stars = table[solved].T
     rms = math.sqrt(float(np.mean(ratio**2)))
     return (
         *before,
@@ -109,6 +110,7 @@ def _summary(case: Case, rows: Iterable[Floats]) -> tuple[float | str, ...]:
         float(np.median(ratio)),
         float(ratio.max()),
         'met' if rms <= TARGET and not unsolved else 'MISSED',
+        float(told_ratio.mean()),
         math.sqrt(float(over_bound2.mean())),
         math.sqrt(float(over_sigma2.mean())),
         int(stars.mean()),
@@ -152,7 +154,7 @@ def scenario_of(case: Case, seed: int) -> Scenario:
 
 def trial(case: Case, seed: int) -> Floats:
     """
-    Map error by its bound; mean squares of star errors by bound and by sigma; stars: (4,).
+    Map error and its sigma by the bound; squares of star errors by bound and sigma; stars: (5,).
 
     NaN where the campaign gives no calibration.
     """
@@ -169,14 +171,17 @@ def trial(case: Case, seed: int) -> Floats:
     try:
         found = solution.solve(ensemble, setup)
     except TooFewObservations:
-        return np.full(4, np.nan)
+        return np.full(5, np.nan)
     bound = np.zeros((13, 13))
     columns = [CALIBRATION_PARAMETER_NAMES.index(name) for name in synthetic_centroids.BOUND_NAMES]
     bound[np.ix_(columns, columns)] = synthetic_centroids.cramer_rao_covariance(scenario)
     error_px = map_error_px(found.geometry.camera, scenario.truth.camera)
     over_bound2, over_sigma2 = np.concatenate(stars, axis=1).mean(axis=1)
-    ratio = error_px / map_bound_px(scenario.truth.camera, bound)
-    return np.array([ratio, over_bound2, over_sigma2, found.stars_used])
+    bound_px = map_bound_px(scenario.truth.camera, bound)
+    sigma_px = map_bound_px(scenario.truth.camera, found.covariance)
+    return np.array(
+        [error_px / bound_px, sigma_px / bound_px, over_bound2, over_sigma2, found.stars_used]
+    )
 
 
 def _star_errors(scenario: Scenario, index: int, observed: StarObservations) -> Floats:
