@@ -89,10 +89,8 @@ def sample_background(pixels: Pixels) -> Background:
     beside, _ = _cells(pixels[:, 2:], _SPARSE_PX, _SPARSE_STEP_PX, mesh_shape)
     width = min(samples.shape[1], beside.shape[1])
     apart = samples[:, :width] - beside[:, :width]
-    # A third of them tells well enough what is far off.
-    some = np.abs(apart[:, ::3])
-    rank = int(some.shape[1] * 0.6827)
-    _, noise = _clipped(apart, np.partition(some, rank, axis=1)[:, rank])
+    rank = int(width * 0.6827)
+    _, noise = _clipped(apart, np.partition(np.abs(apart), rank, axis=1)[:, rank])
     level = medians(samples[:, ::4].T).astype(np.float32)
     return _background(level, noise / math.sqrt(2.0), mesh_shape)
 
