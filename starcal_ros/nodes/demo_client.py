@@ -80,17 +80,17 @@ def run(client: DemoClient, args: argparse.Namespace) -> int:
     """The whole exchange; returns the exit status: 0 accepted, 3 refused, 2 no result."""
     listening = (args.image_topic, args.attitude_topic, 'observations')
 
-    def ready() -> bool:
+    def missing() -> list[str]:
+        found = [topic for topic in listening if not client.count_subscribers(topic)]
+        if not client.calibrate.service_is_ready():
+            found.append('no service')
         # What the observer sends before it has found the calibrator is lost.
-        return (
-            client.is_heard
-            and client.calibrate.service_is_ready()
-            and all(client.count_subscribers(topic) for topic in listening)
-        )
+        if not client.is_heard:
+            found.append('nobody hears the observer')
+        return found
 
-    if not client.spin_until(ready, args.timeout):
-        silent = ', '.join(t for t in listening if not client.count_subscribers(t)) or 'no service'
-        print(f'failed the nodes did not come up: {silent}', flush=True)
+    if not client.spin_until(lambda: not missing(), args.timeout):
+        print(f'failed the nodes did not come up: {", ".join(missing())}', flush=True)
         return 2
     print('ready', flush=True)
     for count in range(1, args.images + 1):
