@@ -210,11 +210,11 @@ def _find_turn(
 
 def _fits(geometry: CameraGeometry, turn: Rotation, observations: StarObservations) -> bool:
     """Whether the stars stand where the camera shows them once it is turned."""
+    bright = _bright(observations)
     camera_from_icrf = turn * _icrf_from_camera(geometry, observations).inv()
-    predicted_px = project(
-        geometry.camera, observations.direction_icrf @ camera_from_icrf.as_matrix().T
-    )
-    return _rms_px(observations.measured_px - predicted_px) < _SYSTEMATIC_PX
+    directions = observations.direction_icrf[bright] @ camera_from_icrf.as_matrix().T
+    off_px = observations.measured_px[bright] - project(geometry.camera, directions)
+    return _rms_px(off_px) < _SYSTEMATIC_PX
 
 
 def _corrected(geometry: CameraGeometry, observations: StarObservations) -> CameraGeometry:
@@ -223,9 +223,7 @@ def _corrected(geometry: CameraGeometry, observations: StarObservations) -> Came
     icrf_from_camera = _icrf_from_camera(geometry, observations)
     directions = observations.direction_icrf @ icrf_from_camera.as_matrix()
     variance_px2 = 0.5 * (observations.covariance_px2[:, 0] + observations.covariance_px2[:, 2])
-    bright = observations.snr > _GOOD_SNR
-    if np.count_nonzero(bright) < 4:
-        bright = np.ones(len(observations), bool)
+    bright = _bright(observations)
     directions, measured_px = directions[bright], observations.measured_px[bright]
     # No prediction needs to be better than a twentieth of a pixel.
     weight = 1.0 / (variance_px2[bright] + 0.05**2)
@@ -239,6 +237,12 @@ def _corrected(geometry: CameraGeometry, observations: StarObservations) -> Came
     icrf_from_star_tracker = Rotation.from_quat(observations.icrf_from_star_tracker_xyzw)
     camera_from_star_tracker = turn * icrf_from_camera.inv() * icrf_from_star_tracker
     return CameraGeometry(camera, camera_from_star_tracker.inv().as_quat())
+
+
+def _bright(observations: StarObservations) -> NDArray[np.bool_]:
+    """Which stars (n,) correct a prediction: all, where there are too few bright ones."""
+    bright = observations.snr > _GOOD_SNR
+    return np.asarray(bright | (np.count_nonzero(bright) < 4))
 
 
 def _icrf_from_camera(geometry: CameraGeometry, observations: StarObservations) -> Rotation:

@@ -141,16 +141,35 @@ def test_the_camera_that_predicts_is_corrected(scale: float, k1: float) -> None:
 
 def test_noise_of_the_star_tracker_is_followed() -> None:
     _, known = searched(0)
-    quiet, straight = followed(shot(1), known)
+    quiet, _ = followed(shot(1), known)
     # 8 px, where the window reaches 12.
     jumped, after = followed(shot(1, np.radians(0.25)), known)
+    _, before = followed(shot(1, np.radians(-0.25)), known)
     np.testing.assert_array_equal(jumped.catalog_id, quiet.catalog_id)
     # Fits that start from elsewhere end within what their last step leaves: 0.1 sigma.
     sigma_px = np.sqrt(quiet.covariance_px2[:, [0, 2]])
     assert np.abs((jumped.measured_px - quiet.measured_px) / sigma_px).max() < 0.1
-    before = Rotation.from_quat(straight.geometry.star_tracker_from_camera_xyzw)
-    turned = before.inv() * Rotation.from_quat(after.geometry.star_tracker_from_camera_xyzw)
-    assert turned.magnitude() == pytest.approx(np.radians(0.25), rel=0.001)
+    one, other = (
+        Rotation.from_quat(each.geometry.star_tracker_from_camera_xyzw) for each in (before, after)
+    )
+    assert (one.inv() * other).magnitude() == pytest.approx(np.radians(0.5), rel=0.001)
+
+
+def test_an_alignment_that_creeps_is_followed() -> None:
+    _, known = searched(0)
+    first = Rotation.from_quat(known.geometry.star_tracker_from_camera_xyzw)
+    focal_px = PRIOR.camera.intrinsics[0]
+    kept = []
+    for turned_px in np.arange(0.0, 4.0, 0.4):
+        before = known
+        observations, known = followed(shot(1, turned_px / focal_px), known)
+        assert len(observations) > 0.95 * len(searched(1)[0])
+        kept.append(known.geometry is before.geometry)
+    # Under a pixel nothing is corrected, as the next image finds its turn anyway; beyond it is.
+    assert 4 <= kept.count(True) <= 8
+    last = Rotation.from_quat(known.geometry.star_tracker_from_camera_xyzw)
+    # Of 3.6 px one may be left, and the star tracker's noise has turned the first image by 0.9.
+    assert abs((first.inv() * last).magnitude() * focal_px - 3.6) < 2.0
 
 
 @pytest.mark.parametrize('turn_deg', [0.6, 1.5, 40.0])
