@@ -10,7 +10,7 @@ import threading
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
@@ -238,7 +238,4 @@ class _Run:
         # Times relative to the first sample: seconds since 1970 would lose 0.1 us in a double.
         gap_s = (self._times_ns[j] - self._times_ns[i]) / NANOSECONDS_PER_SECOND
         since_s = (time_ns - self._times_ns[i]) / NANOSECONDS_PER_SECOND
-        # As SciPy's Slerp, which takes four times as long over two.
-        first, second = Rotation.from_quat(ends)
-        turn = (first.inv() * second).as_rotvec()
-        return np.asarray((first * Rotation.from_rotvec(since_s / gap_s * turn)).as_quat())
+        return np.asarray(Slerp([0.0, gap_s], Rotation.from_quat(ends))(since_s).as_quat())

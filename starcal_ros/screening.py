@@ -111,7 +111,8 @@ def sample_rows(pixels: Pixels) -> RowSample:
         pixels=picked,
         below=pixels[np.minimum(row + 1, height - 1), ::_BELOW_STEP_PX],
         step=step,
-        # A quarter: noise of a third of the quantisation step gives it, a star or two do not.
+        # A quarter, less what a mean is rounded by: noise of a third of the quantisation step
+        # gives it, a star or two do not.
         noisy=unlike > 0.249,
         constant=unlike == 0.0,
     )
