@@ -12,6 +12,7 @@ import sys
 import time
 from typing import Any
 
+import psutil  # type: ignore[import-untyped]
 import pytest
 
 from starcal_ros import cli
@@ -64,8 +65,7 @@ def reports(told: Told, tmp_path: Path) -> Iterator[CalibratorReports]:
 
 def children() -> set[int]:
     """Processes that this one has started and not yet seen the end of."""
-    tasks = Path('/proc/self/task').glob('*/children')
-    return {int(number) for task in tasks for number in task.read_text().split()}
+    return {child.pid for child in psutil.Process().children()}
 
 
 def until(condition: Callable[[], bool]) -> None:
