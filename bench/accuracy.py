@@ -1,7 +1,7 @@
 """
 From pixels to a calibration, against the Cramer-Rao bound: cameras, PSF widths, star trackers.
 
-Every seed renders a campaign of its own, measures it through `sequence.observe_next`, solves it,
+Every seed renders a campaign of its own, measures it through `observe.observe_next`, solves it,
 and compares the lines of sight over the detector with the truth, the best common turn removed.
 The bound is that of every star above a signal-to-noise ratio of 5, the attitude of each image
 free.  One draw scatters by about 30 %: the figure is the rms over the seeds.
@@ -22,17 +22,19 @@ from numpy.typing import NDArray
 
 from bench.frames import history, load_set_up, render_frame
 from bench.table import Table
-from starcal_ros import sequence, solution, synthetic, synthetic_centroids
-from starcal_ros.campaign_trials import map_bound_px
+from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.observability import map_error_px
+from starcal_ros.pipeline import observe, solve
 from starcal_ros.records import (
     CALIBRATION_PARAMETER_NAMES,
     CameraGeometry,
     Ensemble,
     StarObservations,
 )
-from starcal_ros.synthetic import Scenario
+from starcal_ros.simulation import centroids as simulated_centroids
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.scenario import Scenario
+from starcal_ros.studies.trials import map_bound_px
 
 Floats = NDArray[np.float64]
 
@@ -119,7 +121,7 @@ def _summary(case: Case, rows: Iterable[Floats]) -> tuple[float | str, ...]:
 
 
 def scenario_of(case: Case, seed: int) -> Scenario:
-    """A campaign of a case: the camera of `synthetic.scenario` with another lens."""
+    """A campaign of a case: the camera of `scenario.scenario` with another lens."""
     base = synthetic.scenario('small', seed)
     assert (base.truth.camera.width, base.truth.camera.height) == SIZE
     focal_px = SIZE[0] / 2 / math.tan(math.radians(case.field_deg / 2))
@@ -160,21 +162,21 @@ def trial(case: Case, seed: int) -> Floats:
     """
     scenario = scenario_of(case, seed)
     setup = load_set_up(scenario)
-    track = sequence.Track(setup.prior)
+    track = observe.Track(setup.prior)
     ensemble, stars = Ensemble(), []
     for index in range(scenario.image_count):
         image, samples = render_frame(scenario, index)
-        observed, track = sequence.observe_next(image, history(samples), setup, track)
-        ensemble = solution.add_to_ensemble(ensemble, observed, setup)
+        observed, track = observe.observe_next(image, history(samples), setup, track)
+        ensemble = solve.add_to_ensemble(ensemble, observed, setup)
         if len(observed):
             stars.append(_star_errors(scenario, index, observed))
     try:
-        found = solution.solve(ensemble, setup)
+        found = solve.solve(ensemble, setup)
     except TooFewObservations:
         return np.full(5, np.nan)
     bound = np.zeros((13, 13))
-    columns = [CALIBRATION_PARAMETER_NAMES.index(name) for name in synthetic_centroids.BOUND_NAMES]
-    bound[np.ix_(columns, columns)] = synthetic_centroids.cramer_rao_covariance(scenario)
+    columns = [CALIBRATION_PARAMETER_NAMES.index(name) for name in simulated_centroids.BOUND_NAMES]
+    bound[np.ix_(columns, columns)] = simulated_centroids.cramer_rao_covariance(scenario)
     error_px = map_error_px(found.geometry.camera, scenario.truth.camera)
     over_bound2, over_sigma2 = np.concatenate(stars, axis=1).mean(axis=1)
     bound_px = map_bound_px(scenario.truth.camera, bound)
@@ -190,7 +192,7 @@ def _star_errors(scenario: Scenario, index: int, observed: StarObservations) -> 
     order = np.argsort(shown.catalog_id)
     row = order[np.searchsorted(shown.catalog_id[order], observed.catalog_id)]
     camera = scenario.truth.camera
-    covariance, snr = synthetic_centroids.centroid_bound(
+    covariance, snr = simulated_centroids.centroid_bound(
         shown.pixel_px[row],
         shown.flux_electrons[row],
         scenario.detector,

@@ -1,7 +1,7 @@
 """
 Acquisition: how often a field is matched that should not be, and one that should is found.
 
-Every trial is a rendered image of 640 x 512, pixels to stars: `identification.observe_stars`, from
+Every trial is a rendered image of 640 x 512, pixels to stars: `star_finder.observe_stars`, from
 the search beside the predictions to the whole one of 1.5 degrees and 5 degrees of roll, and in one
 row `tracking.follow`.  Seeds are fixed; a match is wrong where more than one star in ten stands
 where another was drawn.
@@ -21,14 +21,20 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import beta
 
 from bench.table import Table
-from starcal_ros import synthetic, synthetic_images
-from starcal_ros.catalog import load_catalog, StarCatalog
-from starcal_ros.centroiding import CentroidOptions
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification import IdentificationOptions, observe_stars, Shot, tracked
+from starcal_ros.identification.star_finder import (
+    IdentificationOptions,
+    observe_stars,
+    Shot,
+    tracked,
+)
+from starcal_ros.identification.tracking import follow, Followed, following
+from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image
-from starcal_ros.synthetic import Inertial, Scenario, Scene
-from starcal_ros.tracking import follow, Followed, following
+from starcal_ros.simulation import images as simulated_images
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.scenario import Inertial, Scenario, Scene
+from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 Floats = NDArray[np.float64]
 
@@ -105,7 +111,7 @@ def to_be_found(fields: int) -> Table:
         found = []
         for index in range(fields):
             drawn = synthetic.scene(scenario, index)
-            image = synthetic_images.render(scenario, changed(drawn, rng, missing, strange), index)
+            image = simulated_images.render(scenario, changed(drawn, rng, missing, strange), index)
             off = turned(scenario.prior, error_within_the_search(rng))
             found.append(trial(image, drawn, drawn.icrf_from_star_tracker_xyzw, off, catalog))
         wrong = sum(one.wrong for one in found)
@@ -223,7 +229,7 @@ def random_attitudes(
     """True stars, and an attitude from anywhere."""
     for index in range(scenario.image_count):
         drawn = synthetic.scene(scenario, index)
-        yield synthetic_images.render(scenario, drawn, index), drawn, _anywhere(rng, count)
+        yield simulated_images.render(scenario, drawn, index), drawn, _anywhere(rng, count)
 
 
 def beyond_the_search(
@@ -241,7 +247,7 @@ def beyond_the_search(
         )
         angle_rad = np.radians(rng.uniform(2.0, 8.0, count))
         wrong = right * Rotation.from_rotvec(angle_rad[:, None] * axis)
-        yield synthetic_images.render(scenario, drawn, index), drawn, list(wrong.as_quat())
+        yield simulated_images.render(scenario, drawn, index), drawn, list(wrong.as_quat())
 
 
 def random_sources(
@@ -250,7 +256,7 @@ def random_sources(
     """The brightnesses of true stars, each anywhere in the image."""
     for index in range(scenario.image_count):
         drawn = synthetic.scene(scenario, index)
-        image = synthetic_images.render(
+        image = simulated_images.render(
             scenario,
             dataclasses.replace(drawn, pixel_px=scattered(rng, len(drawn.pixel_px))),
             index,
@@ -273,7 +279,7 @@ def dense_fields(
             pixel_px=np.concatenate([drawn.pixel_px, scattered(rng, more)]),
             flux_electrons=np.concatenate([drawn.flux_electrons, 10 ** rng.uniform(2.5, 4, more)]),
         )
-        yield synthetic_images.render(scenario, crowded, index), drawn, _anywhere(rng, count)
+        yield simulated_images.render(scenario, crowded, index), drawn, _anywhere(rng, count)
 
 
 def shifted_copies(
@@ -288,7 +294,7 @@ def shifted_copies(
             pixel_px=(drawn.pixel_px[None] + shifts[:, None]).reshape(-1, 2),
             flux_electrons=np.tile(drawn.flux_electrons, 4),
         )
-        yield synthetic_images.render(scenario, doubled, index), drawn, _anywhere(rng, count)
+        yield simulated_images.render(scenario, doubled, index), drawn, _anywhere(rng, count)
 
 
 FOLLOWED = ('followed, attitude from anywhere', 'followed, attitude 2 to 8 degrees off')

@@ -12,7 +12,8 @@ import tempfile
 import time
 
 from bench.table import Table
-from starcal_ros import simulation, synthetic
+from starcal_ros.simulation import bag as simulated_bag
+from starcal_ros.simulation import scenario as synthetic
 
 TARGET_S = 6.0
 # What a call takes with all that it calls; the stages indented below one are parts of it.
@@ -38,9 +39,9 @@ def run(quick: bool) -> list[Table]:
     print(f'calibrate: rendering scenario {name}', flush=True)
     with tempfile.TemporaryDirectory() as folder:
         scenario = synthetic.scenario(name)
-        made = simulation.write_bag(scenario, Path(folder, 'bag'))
+        made = simulated_bag.write_bag(scenario, Path(folder, 'bag'))
         out = Path(folder, 'out')
-        command = ['starcal_ros.cli', 'calibrate', str(made.bag)]
+        command = ['starcal_ros.cli.main', 'calibrate', str(made.bag)]
         command += ['--params', str(made.params), '-o', str(out)]
         wall = time_command(name, scenario.image_count, ['-m', *command], 1 if quick else 3)
         profile = Path(folder, 'profile')

@@ -19,14 +19,14 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.adjustment import minimise, Problem, State
-from starcal_ros.calibration import CalibrationOptions, estimate_calibration
 from starcal_ros.camera import PARAMETER_NAMES, project_jacobians, project_parameters
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.measurement import arrange, star_table, StarTable
+from starcal_ros.estimation.calibrate import CalibrationOptions, estimate_calibration
+from starcal_ros.estimation.normal_equations import arrange, star_table, StarTable
+from starcal_ros.estimation.problem import minimise, Problem, State
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.synthetic import scenario
-from starcal_ros.synthetic_centroids import BOUND_NAMES, true_observations
+from starcal_ros.simulation.centroids import BOUND_NAMES, true_observations
+from starcal_ros.simulation.scenario import scenario
 
 Floats = NDArray[np.float64]
 

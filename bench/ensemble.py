@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from bench.competitors import make_ensemble
 from bench.table import Table
-from starcal_ros.calibration import CalibrationOptions
-from starcal_ros.observability import (
+from starcal_ros.assessment.observability import (
     image_information,
     keep_most_informative,
     predicted_sigma,
 )
+from starcal_ros.estimation.calibrate import CalibrationOptions
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.synthetic import scenario
-from starcal_ros.synthetic_centroids import true_observations
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
 
 Floats = NDArray[np.float64]
 

@@ -24,17 +24,20 @@ import numpy as np
 from bench import graph
 from bench.frames import history, render_frame, write_set_up
 from bench.table import Table
-from starcal_ros import bag, sequence, simulation, solution, synthetic
-from starcal_ros.archive import Archive
-from starcal_ros.calibration_messages import calibration_to_message
-from starcal_ros.camera_setup import load_setup
+from starcal_ros.bag import reader
+from starcal_ros.calibrator.archive import Archive
 from starcal_ros.errors import BagError
-from starcal_ros.image_messages import image_to_message
-from starcal_ros.message_fields import make_header
-from starcal_ros.observation_messages import observations_to_message
+from starcal_ros.messages.calibration import calibration_to_message
+from starcal_ros.messages.fields import make_header
+from starcal_ros.messages.images import image_to_message
+from starcal_ros.messages.observations import observations_to_message
+from starcal_ros.messages.telemetry import attitude_to_message
 from starcal_ros.options import read_parameter_file
+from starcal_ros.pipeline import observe, solve
+from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import Ensemble, StarObservations
-from starcal_ros.telemetry_messages import attitude_to_message
+from starcal_ros.simulation import bag as simulated_bag
+from starcal_ros.simulation import scenario
 
 COLUMNS = ('fault', 'node', 'times', 'what', 'answered', 'lost', 'wrong', 'died')
 _ANSWER_S = 60.0
@@ -80,22 +83,22 @@ class _Bench:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.scenario = synthetic.scenario('tiny')
+        self.scenario = scenario.scenario('tiny')
         self.params = write_set_up(self.scenario, folder)
         self.log = folder / 'log'
         self.frames = [render_frame(self.scenario, index) for index in range(10)]
         self.setup = load_setup(read_parameter_file(self.params, ()))
         self.observations: list[StarObservations] = []
-        track = sequence.Track(self.setup.prior)
+        track = observe.Track(self.setup.prior)
         for image, samples in self.frames:
-            found, track = sequence.observe_next(image, history(samples), self.setup, track)
+            found, track = observe.observe_next(image, history(samples), self.setup, track)
             self.observations.append(found)
         ensemble = functools.reduce(Ensemble.add, self.observations, Ensemble())
-        self.calibration = solution.solve(ensemble, self.setup)
+        self.calibration = solve.solve(ensemble, self.setup)
 
     def message(self, record: StarObservations, time_ns: int | None = None) -> Any:
         """Observations as a message, with another stamp where one is given."""
-        from starcal_ros.nodes.conversions import make_message
+        from starcal_ros.nodes.message_factory import make_message
 
         message = observations_to_message(record, 'camera', make_message)
         if time_ns is not None:
@@ -110,9 +113,9 @@ class _Bench:
 def _damaged_bags(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
     """Bits flipped and ends cut off: what is read was written, what is missing is said."""
     folder = bench.folder / 'bag'
-    simulation.write_bag(bench.scenario, folder)
+    simulated_bag.write_bag(bench.scenario, folder)
     whole = next(folder.glob('*.mcap')).read_bytes()
-    sound = list(bag.read_raw([folder]))
+    sound = list(reader.read_raw([folder]))
     choose = random.Random(1)
     silent = wrong = failed = 0
     file = bench.folder / 'damaged.mcap'
@@ -124,7 +127,7 @@ def _damaged_bags(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
         file.write_bytes(damaged[:size])
         said: list[str] = []
         try:
-            read = list(bag.read_raw([file], on_damage=said.append))
+            read = list(reader.read_raw([file], on_damage=said.append))
         except BagError:
             continue
         except Exception:
@@ -141,7 +144,7 @@ def _hostile_to_observer(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]
     from sensor_msgs.msg import CompressedImage, Image, Temperature
 
     from starcal.msg import Calibration
-    from starcal_ros.nodes.conversions import make_message
+    from starcal_ros.nodes.message_factory import make_message
 
     image, samples = bench.frames[0]
     small = image_to_message(image, 'camera', make_message)
@@ -218,7 +221,7 @@ def _measures_a_sound_image(
     from sensor_msgs.msg import CompressedImage, Image
 
     from starcal.msg import Calibration
-    from starcal_ros.nodes.conversions import make_message
+    from starcal_ros.nodes.message_factory import make_message
 
     client.publisher(Calibration, 'calibration', latched=True).publish(_calibration(bench))
     attitudes = client.publisher(QuaternionStamped, 'attitude')
@@ -432,7 +435,7 @@ def _ask(
 
 
 def _calibration(bench: _Bench) -> Any:
-    from starcal_ros.nodes.conversions import make_message
+    from starcal_ros.nodes.message_factory import make_message
 
     return calibration_to_message(bench.calibration, make_message)
 

@@ -8,20 +8,22 @@ import tempfile
 
 import yaml
 
-from starcal_ros import simulation, synthetic, synthetic_images
-from starcal_ros.attitude import AttitudeHistory
-from starcal_ros.camera_info import write_camera_info
-from starcal_ros.camera_setup import load_setup, Setup
 from starcal_ros.options import read_parameter_file
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.products.camera_yaml import write_camera_info
 from starcal_ros.records import AttitudeSample, Image
-from starcal_ros.synthetic import Scenario
+from starcal_ros.simulation import bag as simulated_bag
+from starcal_ros.simulation import images as simulated_images
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.scenario import Scenario
+from starcal_ros.sky.attitude import AttitudeHistory
 
 
 def write_set_up(scenario: Scenario, folder: Path, **values: object) -> Path:
     """Prior camera and parameter file of a scenario in a folder; returns the latter."""
     camera, params = folder / 'camera.yaml', folder / 'params.yaml'
     write_camera_info(scenario.prior.camera, camera)
-    content = simulation.parameters(scenario, f'file://{camera}')
+    content = simulated_bag.parameters(scenario, f'file://{camera}')
     content['/**']['ros__parameters'].update(values)  # type: ignore[index]
     params.write_text(yaml.safe_dump(content))
     return params
@@ -41,7 +43,7 @@ def paper_scenario(magnitude_limit: float) -> Scenario:
 
 def render_frame(scenario: Scenario, index: int) -> tuple[Image, list[AttitudeSample]]:
     """A frame and the star tracker's samples about it."""
-    image = synthetic_images.render(scenario, synthetic.scene(scenario, index), index)
+    image = simulated_images.render(scenario, synthetic.scene(scenario, index), index)
     return image, list(synthetic.attitude_samples(scenario, index))
 
 

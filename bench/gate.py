@@ -16,19 +16,19 @@ from scipy.spatial.transform import Rotation
 
 from bench.frames import load_set_up
 from bench.table import Table
-from starcal_ros import solution
+from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import project
-from starcal_ros.camera_setup import Setup
-from starcal_ros.campaign_trials import (
+from starcal_ros.errors import TooFewObservations
+from starcal_ros.pipeline import solve
+from starcal_ros.pipeline.setup import Setup
+from starcal_ros.records import CameraGeometry, Ensemble
+from starcal_ros.simulation.scenario import scenario
+from starcal_ros.studies.trials import (
     draw_star_field,
     observe,
     pointing_error_arcsec,
     StarField,
 )
-from starcal_ros.errors import TooFewObservations
-from starcal_ros.observability import map_error_px
-from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.synthetic import scenario
 
 SIZES = ((6, 80), (12, 30), (12, 80), (30, 80))  # images and stars of an image
 TRACKER_ARCSEC = (5.0, 20.0, 40.0)
@@ -99,7 +99,7 @@ def _judged(
     options = dataclasses.replace(setup.calibration, star_tracker_sigma_arcsec=told)
     setup = dataclasses.replace(setup, prior=field.prior, calibration=options)
     try:
-        found = solution.solve(ensemble, setup)
+        found = solve.solve(ensemble, setup)
     except TooFewObservations:
         return ['cannot be solved'], np.nan, np.nan
     names = [check.option or check.note for check in found.gate if check.kept is False]

@@ -10,9 +10,9 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from bench import graph
-from starcal_ros.image_messages import image_to_message
-from starcal_ros.message_fields import make_header, stamp_ns
-from starcal_ros.telemetry_messages import attitude_to_message
+from starcal_ros.messages.fields import make_header, stamp_ns
+from starcal_ros.messages.images import image_to_message
+from starcal_ros.messages.telemetry import attitude_to_message
 
 if TYPE_CHECKING:
     from bench.faults import _Bench
@@ -195,7 +195,7 @@ class Flight:
         return instead if value == none else value
 
     def _send(self) -> None:
-        from starcal_ros.nodes.conversions import make_message
+        from starcal_ros.nodes.message_factory import make_message
 
         image, samples = self._bench.frames[self.sent % len(self._bench.frames)]
         time_ns = _FIRST_NS + self.sent * _STEP_NS

@@ -1,5 +1,5 @@
 """
-The stars of one frame: `sequence.observe_next` against the detectors of sep and photutils.
+The stars of one frame: `observe.observe_next` against the detectors of sep and photutils.
 
 Those two only detect and centroid; ours also predicts, identifies, fits the PSF and judges every
 star.  All take the same mono16 frame of 2592 x 2048.
@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from bench.frames import history, load_set_up, paper_scenario, render_frame
 from bench.table import Table
-from starcal_ros import sequence
-from starcal_ros.detection import Pixels
+from starcal_ros.image.detection import Pixels
+from starcal_ros.pipeline import observe
 
 MAGNITUDE_LIMIT = 7.35  # leaves 122 stars
 AT_LEAST_S = 0.1  # of calls in a row: one of 6 ms after another way would time its caches
@@ -35,7 +35,7 @@ def run(quick: bool) -> list[Table]:
     setup = load_set_up(scenario, magnitude_limit=MAGNITUDE_LIMIT)
     image, samples = render_frame(scenario, 0)
     attitudes = history(samples)
-    _, track = sequence.observe_next(image, attitudes, setup, sequence.Track(setup.prior))
+    _, track = observe.observe_next(image, attitudes, setup, observe.Track(setup.prior))
     track = dataclasses.replace(track, latest_ns=None)  # the same image once more
     prior = Rotation.from_quat(setup.prior.star_tracker_from_camera_xyzw)
     turn = Rotation.from_rotvec(np.radians(ACQUISITION_DEG) * np.array([0.6, -0.8, 0.0]))
@@ -43,12 +43,10 @@ def run(quick: bool) -> list[Table]:
         setup.prior, star_tracker_from_camera_xyzw=(prior * turn).as_quat()
     )
     ways: dict[str, Callable[[], int]] = {
-        'starcal, tracking': lambda: len(sequence.observe_next(image, attitudes, setup, track)[0]),
-        'starcal, first image': lambda: len(
-            sequence.observe(image, attitudes, setup, setup.prior)
-        ),
+        'starcal, tracking': lambda: len(observe.observe_next(image, attitudes, setup, track)[0]),
+        'starcal, first image': lambda: len(observe.observe(image, attitudes, setup, setup.prior)),
         f'starcal, alignment {ACQUISITION_DEG} deg off': lambda: len(
-            sequence.observe(image, attitudes, setup, shifted)
+            observe.observe(image, attitudes, setup, shifted)
         ),
     }
     if importlib.util.find_spec('sep'):

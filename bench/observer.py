@@ -145,9 +145,9 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import Image as ImageMessage
 
-    from starcal_ros.image_messages import image_to_message
-    from starcal_ros.nodes.conversions import make_message
-    from starcal_ros.telemetry_messages import attitude_to_message
+    from starcal_ros.messages.images import image_to_message
+    from starcal_ros.messages.telemetry import attitude_to_message
+    from starcal_ros.nodes.message_factory import make_message
 
     sent_s: dict[int, float] = {}
     # Serialized once: what the publisher takes of the two cores is not of the node.

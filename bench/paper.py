@@ -13,7 +13,8 @@ import tempfile
 
 from bench.calibrate import time_command
 from bench.table import Table
-from starcal_ros import simulation, synthetic
+from starcal_ros.simulation import bag as simulated_bag
+from starcal_ros.simulation import scenario as synthetic
 
 TARGET_S = 60.0
 
@@ -27,8 +28,8 @@ def run(quick: bool) -> list[Table]:
         print(f'paper: rendering {count} images', flush=True)
         with tempfile.TemporaryDirectory() as folder:
             shorter = dataclasses.replace(scenario, image_count=count)
-            made = simulation.write_bag(shorter, Path(folder, 'bag'))
-            command = ['-m', 'starcal_ros.cli', 'calibrate', str(made.bag)]
+            made = simulated_bag.write_bag(shorter, Path(folder, 'bag'))
+            command = ['-m', 'starcal_ros.cli.main', 'calibrate', str(made.bag)]
             command += ['--params', str(made.params), '-o', str(Path(folder, 'out'))]
             tables.append(time_command('paper', count, command, 1, TARGET_S))
         print(tables[-1].text(), flush=True)

@@ -18,10 +18,10 @@ from typing import Any
 from bench import graph
 from bench.frames import render_frame, write_set_up
 from bench.table import Table
-from starcal_ros import synthetic
-from starcal_ros.image_messages import image_to_message
-from starcal_ros.message_fields import make_header
-from starcal_ros.telemetry_messages import attitude_to_message
+from starcal_ros.messages.fields import make_header
+from starcal_ros.messages.images import image_to_message
+from starcal_ros.messages.telemetry import attitude_to_message
+from starcal_ros.simulation import scenario as synthetic
 
 FRAMES = 10
 MAX_IMAGES = 50
@@ -51,7 +51,7 @@ def _soak(folder: Path, count: int) -> Table:
     from std_srvs.srv import Trigger
 
     from starcal.msg import EnsembleStatus, StarObservations
-    from starcal_ros.nodes.conversions import make_message
+    from starcal_ros.nodes.message_factory import make_message
 
     scenario = synthetic.scenario('tiny')
     params = write_set_up(scenario, folder)

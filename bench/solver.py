@@ -35,9 +35,9 @@ from bench.competitors import (
     solve_starcal,
 )
 from bench.table import Table, verdict
-from starcal_ros.adjustment import minimise, State
-from starcal_ros.least_squares import covariance
-from starcal_ros.measurement import arrange, normal_blocks, RESIDUAL, ROTATION
+from starcal_ros.estimation.levenberg_marquardt import covariance
+from starcal_ros.estimation.normal_equations import arrange, normal_blocks, RESIDUAL, ROTATION
+from starcal_ros.estimation.problem import minimise, State
 from starcal_ros.records import CameraGeometry, Ensemble
 
 Floats = NDArray[np.float64]

@@ -17,15 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from docs.make_images import FOLDER, setup_of
-from starcal_ros import sequence, synthetic, synthetic_images
-from starcal_ros.annotation import annotate
-from starcal_ros.attitude import AttitudeHistory
+from starcal_ros.pipeline import observe
 from starcal_ros.records import Image, StarObservations
+from starcal_ros.report.annotation import annotate
+from starcal_ros.simulation import images as simulated_images
+from starcal_ros.simulation import scenario
+from starcal_ros.sky.attitude import AttitudeHistory
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
-SCENARIO = synthetic.scenario('tiny')
+SCENARIO = scenario.scenario('tiny')
 PLAIN = setup_of(SCENARIO)
 # Fainter stars would cover the pictures with their marks.
 SETUP = dataclasses.replace(
@@ -41,27 +43,27 @@ ENLARGED = 7
 
 def electrons(smear_px: float = 0.0, field: int = FIELD) -> Floats:
     """Mean signal of a field, its stars smeared along a line."""
-    shown, psf_px = synthetic.scene(SCENARIO, field), SCENARIO.detector.psf_sigma_px
+    shown, psf_px = scenario.scene(SCENARIO, field), SCENARIO.detector.psf_sigma_px
     steps = max(1, round(4 * smear_px))
-    mean = synthetic_images.fixed_pattern(SCENARIO)
+    mean = simulated_images.fixed_pattern(SCENARIO)
     for k in range(steps):
         moved = shown.pixel_px + ((k + 0.5) / steps - 0.5) * smear_px * np.array([0.8, 0.6])
         flux = shown.flux_electrons / steps
-        mean = mean + synthetic_images.star_electrons(moved, flux, psf_px, SHAPE)
+        mean = mean + simulated_images.star_electrons(moved, flux, psf_px, SHAPE)
     return mean
 
 
 def expose(mean: Floats) -> NDArray[np.uint16]:
     """A frame of a mean signal, always with the same noise."""
-    pixels = synthetic_images.expose(mean, SCENARIO.detector, np.random.default_rng(8))
+    pixels = simulated_images.expose(mean, SCENARIO.detector, np.random.default_rng(8))
     return pixels.astype(np.uint16)
 
 
 def attitudes(field: int = FIELD, reported: int | None = None) -> AttitudeHistory:
     """What the star tracker says about a frame: the truth, or the attitude of another field."""
     held = AttitudeHistory()
-    told = synthetic.attitude_samples(SCENARIO, field if reported is None else reported)
-    for sample, at in zip(told, synthetic.attitude_samples(SCENARIO, field), strict=True):
+    told = scenario.attitude_samples(SCENARIO, field if reported is None else reported)
+    for sample, at in zip(told, scenario.attitude_samples(SCENARIO, field), strict=True):
         held.add(at.time_ns, dataclasses.replace(sample, time_ns=at.time_ns))
     return held
 
@@ -84,21 +86,21 @@ def whole_frames() -> Mapping[str, tuple[Image, StarObservations]]:
         'glare': expose(sound + 1.2e4 * np.exp(-np.hypot(u + 60.0, v + 60.0) / 350.0)),
         'incomplete_lost': lost,
         'incomplete_torn': torn,
-        'no_stars': expose(synthetic_images.fixed_pattern(SCENARIO)),
+        'no_stars': expose(simulated_images.fixed_pattern(SCENARIO)),
         'too_few_stars': expose(electrons(25.0)),
     }
     found = {}
     earlier = Image(SCENARIO.time_ns(FIELD - 1), before)
     held = attitudes()
-    _, track = sequence.observe_next(earlier, held, SETUP, sequence.Track(SETUP.prior))
+    _, track = observe.observe_next(earlier, held, SETUP, observe.Track(SETUP.prior))
     for name, spoilt in frames.items():
         image = Image(time_ns, spoilt)
-        found[name] = (image, sequence.observe_next(image, held, SETUP, track)[0])
+        found[name] = (image, observe.observe_next(image, held, SETUP, track)[0])
     frozen = Image(time_ns, before)
-    found['frozen'] = (frozen, sequence.observe_next(frozen, held, SETUP, track)[0])
+    found['frozen'] = (frozen, observe.observe_next(frozen, held, SETUP, track)[0])
     image = Image(time_ns, pixels)
     jumped = attitudes(reported=FIELD + 1)
-    found['no_match'] = (image, sequence.observe(image, jumped, SETUP, SETUP.prior))
+    found['no_match'] = (image, observe.observe(image, jumped, SETUP, SETUP.prior))
     return found
 
 
@@ -122,7 +124,7 @@ def drawn(image: Image, observations: StarObservations) -> Picture:
 
 def spoilt_stars() -> tuple[Image, StarObservations]:
     """A frame in which single stars have met with an accident each, and what became of them."""
-    plain = sequence.observe(
+    plain = observe.observe(
         Image(SCENARIO.time_ns(FIELD), expose(electrons())), attitudes(), SETUP, SETUP.prior
     )
     places = plain.measured_px[np.argsort(-plain.snr)]
@@ -141,7 +143,7 @@ def spoilt_stars() -> tuple[Image, StarObservations]:
         SETUP, hot=dataclasses.replace(SETUP.hot, index=np.array([number], np.int64))
     )
     image = Image(SCENARIO.time_ns(FIELD), bright)
-    return image, sequence.observe(image, attitudes(), known, known.prior)
+    return image, observe.observe(image, attitudes(), known, known.prior)
 
 
 def star_sheet(image: Image, observations: StarObservations) -> Picture:

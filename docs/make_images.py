@@ -20,16 +20,21 @@ import numpy as np
 from numpy.typing import NDArray
 import yaml
 
-from starcal_ros import cli, sequence, simulation, solution, synthetic, synthetic_images
-from starcal_ros.annotation import annotate
-from starcal_ros.attitude import AttitudeHistory
+from starcal_ros.assessment.observability import coverage
 from starcal_ros.camera import distortion_px, pixel_grid
-from starcal_ros.camera_info import write_camera_info
-from starcal_ros.camera_setup import load_setup, Setup
-from starcal_ros.observability import coverage
+from starcal_ros.cli import main as cli
 from starcal_ros.options import read_parameter_file
+from starcal_ros.pipeline import observe as observing
+from starcal_ros.pipeline import solve
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.products.camera_yaml import write_camera_info
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
-from starcal_ros.synthetic import Scenario
+from starcal_ros.report.annotation import annotate
+from starcal_ros.simulation import bag as simulated_bag
+from starcal_ros.simulation import images as simulated_images
+from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.simulation.scenario import Scenario
+from starcal_ros.sky.attitude import AttitudeHistory
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -46,7 +51,7 @@ def setup_of(scenario: Scenario) -> Setup:
     with tempfile.TemporaryDirectory() as folder:
         camera, params = Path(folder, 'camera.yaml'), Path(folder, 'params.yaml')
         write_camera_info(scenario.prior.camera, camera)
-        params.write_text(yaml.safe_dump(simulation.parameters(scenario, str(camera))))
+        params.write_text(yaml.safe_dump(simulated_bag.parameters(scenario, str(camera))))
         return load_setup(read_parameter_file(params, ()))
 
 
@@ -55,7 +60,7 @@ def observe(scenario: Scenario, setup: Setup, image: Image, index: int) -> StarO
     attitudes = AttitudeHistory()
     for sample in synthetic.attitude_samples(scenario, index):
         attitudes.add(sample.time_ns, sample)
-    return sequence.observe(image, attitudes, setup, setup.prior)
+    return observing.observe(image, attitudes, setup, setup.prior)
 
 
 def part_of(
@@ -126,7 +131,7 @@ def star_field(
 
 def focal_plane(ensemble: Ensemble, setup: Setup, file: Path) -> None:
     """The distortion found, and where the stars stood that it was found from."""
-    calibration = solution.solve(ensemble, setup)
+    calibration = solve.solve(ensemble, setup)
     camera = calibration.geometry.camera
     figure = Figure(figsize=(11, 4.6), layout='constrained')
     left, right = figure.subplots(1, 2)
@@ -182,7 +187,7 @@ def main() -> None:
     scenario = synthetic.scenario('small')
     setup = setup_of(scenario)
     ensemble = Ensemble()
-    for index, image in enumerate(synthetic_images.images(scenario)):
+    for index, image in enumerate(simulated_images.images(scenario)):
         observations = observe(scenario, setup, image, index)
         ensemble = ensemble.add(observations)
         if index == SHOWN_IMAGE:

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.centroiding import CentroidOptions, measure_stars, model_image
-from starcal_ros.detection import detect, measure_background
-from starcal_ros.synthetic import Detector
-from starcal_ros.synthetic_images import expose, star_electrons
+from starcal_ros.image.centroiding import CentroidOptions, measure_stars, model_image
+from starcal_ros.image.detection import detect, measure_background
+from starcal_ros.simulation.images import expose, star_electrons
+from starcal_ros.simulation.scenario import Detector
 
 Floats = NDArray[np.float64]
 

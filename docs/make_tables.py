@@ -15,13 +15,13 @@ import re
 import sys
 from typing import Any
 
-from starcal_ros.camera_setup import OPTION_CLASSES
-from starcal_ros.node_options import (
+from starcal_ros.pipeline.node_options import (
     CalibratorOptions,
     NodeOptions,
     ObserverOptions,
     PlayerOptions,
 )
+from starcal_ros.pipeline.setup import OPTION_CLASSES
 from starcal_ros.records import IMAGE_REFUSALS, STAR_REFUSALS
 from tools.write_parameters import allowed, as_yaml
 

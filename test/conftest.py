@@ -125,7 +125,7 @@ def tiny_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny_products(tiny_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the tool, a process of its own, makes of that bag; who changes it takes a copy."""
     folder = tmp_path_factory.mktemp('tiny_products')
-    command = [sys.executable, '-m', 'starcal_ros.cli', 'calibrate', str(tiny_bag)]
+    command = [sys.executable, '-m', 'starcal_ros.cli.main', 'calibrate', str(tiny_bag)]
     command += ['--params', str(tiny_bag / 'params.yaml'), '-o', str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, ''), done.stderr
@@ -268,8 +268,8 @@ def other_client() -> Iterator[Client]:
 @pytest.fixture(scope='session')
 def tiny_observations() -> Any:
     """An ensemble of the tiny bag's sky as if measured, without pixels."""
-    synthetic = pytest.importorskip('starcal_ros.synthetic')
-    centroids = pytest.importorskip('starcal_ros.synthetic_centroids')
+    synthetic = pytest.importorskip('starcal_ros.simulation.scenario')
+    centroids = pytest.importorskip('starcal_ros.simulation.centroids')
     return centroids.true_observations(synthetic.scenario('tiny'))
 
 
@@ -278,7 +278,7 @@ def camera_yaml(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The prior camera of `tiny_campaign` as a file."""
     from tiny_campaign import SCENARIO  # type: ignore[import-not-found]
 
-    from starcal_ros.camera_info import write_camera_info
+    from starcal_ros.products.camera_yaml import write_camera_info
 
     path = tmp_path_factory.mktemp('prior') / 'camera.yaml'
     write_camera_info(SCENARIO.prior.camera, path)

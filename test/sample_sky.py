@@ -6,12 +6,12 @@ import dataclasses
 
 import numpy as np
 
-from starcal_ros.catalog import StarCatalog
-from starcal_ros.synthetic import (
+from starcal_ros.simulation.scenario import (
     Detector,
     Scenario,
     Scene,
 )
+from starcal_ros.sky.catalog import StarCatalog
 
 QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcal_ros.camera_setup import OPTION_CLASSES
 from starcal_ros.errors import OptionError
 from starcal_ros.options import from_mapping, names_of, option, read_parameter_file
+from starcal_ros.pipeline.setup import OPTION_CLASSES
 
 
 @dataclass(frozen=True)

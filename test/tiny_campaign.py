@@ -8,11 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from starcal_ros.attitude import AttitudeHistory
 from starcal_ros.records import Ensemble, Image
-from starcal_ros.synthetic import attitude_samples, scenario, scene
-from starcal_ros.synthetic_centroids import true_observations
-from starcal_ros.synthetic_images import render
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.images import render
+from starcal_ros.simulation.scenario import attitude_samples, scenario, scene
+from starcal_ros.sky.attitude import AttitudeHistory
 
 SCENARIO = scenario('tiny', seed=7)
 TRUTH = SCENARIO.truth

@@ -7,8 +7,8 @@ from pathlib import Path
 import textwrap
 from typing import Any
 
-from starcal_ros.camera_setup import OPTION_CLASSES
-from starcal_ros.node_options import CalibratorOptions, NodeOptions, ObserverOptions
+from starcal_ros.pipeline.node_options import CalibratorOptions, NodeOptions, ObserverOptions
+from starcal_ros.pipeline.setup import OPTION_CLASSES
 
 FILE = Path(__file__).parents[1] / 'config' / 'starcal.yaml'
 HEAD = """\

@@ -17,10 +17,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from starcal.msg import StarObservations as ObservationsMessage
-from starcal_ros import bag
+from starcal_ros.bag import reader
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError
-from starcal_ros.message_types import (
+from starcal_ros.messages.types import (
     ATTITUDE_TYPE,
     CALIBRATION_TYPE,
     CAMERA_INFO_TYPE,
@@ -28,11 +28,11 @@ from starcal_ros.message_types import (
     OBSERVATIONS_TYPE,
     STATUS_TYPE,
 )
-from starcal_ros.node_options import PlayerOptions
-from starcal_ros.nodes.conversions import message_class
 from starcal_ros.nodes.lifecycle import end_quietly, until_told_to_end
+from starcal_ros.nodes.message_factory import message_class
 from starcal_ros.nodes.parameters import OptionParameters
 from starcal_ros.options import from_mapping
+from starcal_ros.pipeline.node_options import PlayerOptions
 
 NAME = 'bag_player'
 # A writer that overtakes its readers by more than its history loses messages, reliable or not.
@@ -53,7 +53,7 @@ class BagPlayer(Node):
         self.own = from_mapping(PlayerOptions, OptionParameters(self, [PlayerOptions]).values())
         if not self.own.bag:
             raise BagError('bag: the bag to play must be given')
-        self._topics = bag.topics([self.own.bag])
+        self._topics = reader.topics([self.own.bag])
         self._players = {}
         for topic in self._topics:
             if self.own.clock and topic.name == '/clock':
@@ -102,7 +102,7 @@ class BagPlayer(Node):
         sent_images, small_s = 0, time.monotonic()
         with self._observed:
             self._observed_count = 0
-        for raw in bag.read_raw([self.own.bag], self._players, self._on_damage):
+        for raw in reader.read_raw([self.own.bag], self._players, self._on_damage):
             if first_ns is None:
                 first_ns = raw.log_time_ns
             if self.own.rate:
@@ -165,7 +165,7 @@ class BagPlayer(Node):
         self.get_logger().warning(text)
 
 
-def _offer(topic: bag.Topic) -> QoSProfile:
+def _offer(topic: reader.Topic) -> QoSProfile:
     if topic.type_name in _LATCHED_TYPES:
         return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     return QoSProfile(depth=_IMAGE_DEPTH if topic.type_name == IMAGE_TYPE else _OTHER_DEPTH)

@@ -18,23 +18,23 @@ from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import EnsembleStatus as StatusMessage
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal.srv import Calibrate
-from starcal_ros.calibration_messages import (
+from starcal_ros.calibrator.reports import CalibratorReports, CANDIDATE, IN_FORCE, Subject
+from starcal_ros.calibrator.state import Answer, CalibratorState
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.messages.calibration import (
     alignment_to_message,
     calibration_to_message,
     camera_info_to_message,
 )
-from starcal_ros.calibrator_reports import CalibratorReports, CANDIDATE, IN_FORCE, Subject
-from starcal_ros.calibrator_state import Answer, CalibratorState
-from starcal_ros.camera_setup import load_setup
-from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.node_options import CalibratorOptions
-from starcal_ros.nodes.camera_driver import CameraDriver
-from starcal_ros.nodes.conversions import make_message, message_class
+from starcal_ros.messages.observations import observations_from_message
+from starcal_ros.messages.status import status_to_message
 from starcal_ros.nodes.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
-from starcal_ros.observation_messages import observations_from_message
+from starcal_ros.nodes.message_factory import make_message, message_class
+from starcal_ros.nodes.set_camera_info_client import CameraDriver
 from starcal_ros.options import from_mapping
+from starcal_ros.pipeline.node_options import CalibratorOptions
+from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import Calibration, IMAGE_REFUSALS
-from starcal_ros.status_messages import status_to_message
 
 NAME = 'calibrator'
 _NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)

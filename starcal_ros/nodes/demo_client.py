@@ -22,8 +22,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus
-from starcal_ros.calibration_file import write_calibration
-from starcal_ros.calibration_messages import calibration_from_message
+from starcal_ros.messages.calibration import calibration_from_message
+from starcal_ros.products.calibration_json import write_calibration
 
 _LATCHED = QoSProfile(
     depth=1,

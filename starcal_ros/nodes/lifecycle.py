@@ -21,10 +21,10 @@ from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 
-from starcal_ros.camera_setup import OPTION_CLASSES
 from starcal_ros.errors import StarcalError
-from starcal_ros.node_options import NODE_OPTION_CLASSES
 from starcal_ros.nodes.parameters import OptionParameters
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
+from starcal_ros.pipeline.setup import OPTION_CLASSES
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Health = tuple[bytes, str, dict[str, object]]

@@ -19,22 +19,25 @@ from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import StarObservations as ObservationsMessage
-from starcal_ros import sequence
-from starcal_ros.annotation import annotate
-from starcal_ros.attitude import attitude_sample, AttitudeHistory
-from starcal_ros.calibration_messages import calibration_from_message, camera_info_to_message
-from starcal_ros.camera_setup import load_setup
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
-from starcal_ros.image_messages import color_image_to_message, image_from_message
-from starcal_ros.message_fields import offset_ns, stamp_ns
-from starcal_ros.node_options import ObserverOptions
-from starcal_ros.nodes.conversions import make_message
+from starcal_ros.messages.calibration import calibration_from_message, camera_info_to_message
+from starcal_ros.messages.fields import offset_ns, stamp_ns
+from starcal_ros.messages.images import color_image_to_message, image_from_message
+from starcal_ros.messages.observations import observations_to_message
+from starcal_ros.messages.telemetry import (
+    attitude_from_message,
+    temperature_from_message,
+    velocity_from_message,
+)
 from starcal_ros.nodes.image_queue import ImageQueue, Waiting
 from starcal_ros.nodes.lifecycle import Health, OK, run, StarcalNode, WARN
-from starcal_ros.nodes.recent import Recent
-from starcal_ros.observation_messages import observations_to_message
+from starcal_ros.nodes.message_factory import make_message
+from starcal_ros.nodes.sliding_window import Recent
 from starcal_ros.options import from_mapping
+from starcal_ros.pipeline import observe
+from starcal_ros.pipeline.node_options import ObserverOptions
+from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import (
     CameraGeometry,
     Image,
@@ -42,11 +45,8 @@ from starcal_ros.records import (
     refused_image,
     StarObservations,
 )
-from starcal_ros.telemetry_messages import (
-    attitude_from_message,
-    temperature_from_message,
-    velocity_from_message,
-)
+from starcal_ros.report.annotation import annotate
+from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
 
 NAME = 'star_observer'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -101,7 +101,7 @@ class StarObserver(StarcalNode):
         """Start to take images and attitudes, and the thread that measures."""
         jump_s = max(_JUMP_S, self._setup.attitude.max_attitude_gap_s)
         self._attitudes = AttitudeHistory(self._own.attitude_history_s, jump_s)
-        self._track = sequence.Track(self._geometry)
+        self._track = observe.Track(self._geometry)
         self._predicted_from = self._geometry
         self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
         self._temperatures: deque[tuple[int, float]] = deque(maxlen=_SAMPLES.depth)
@@ -280,13 +280,13 @@ class StarObserver(StarcalNode):
             self._predicted_from = self._geometry
             self._track = dataclasses.replace(self._track, geometry=self._geometry)
         before = self._track
-        observations, self._track = sequence.observe_next(
+        observations, self._track = observe.observe_next(
             image,
             self._attitudes,
             self._setup,
             before,
-            sequence.latest_at(list(self._velocities), image.time_ns, None),
-            sequence.latest_at(list(self._temperatures), image.time_ns, math.nan),
+            observe.latest_at(list(self._velocities), image.time_ns, None),
+            observe.latest_at(list(self._temperatures), image.time_ns, math.nan),
         )
         if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
             self._restarts += 1

@@ -1,0 +1,1 @@
+"""Whether a calibration is good: gate, observability, comparison, residuals."""

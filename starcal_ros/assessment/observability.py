@@ -1,0 +1,319 @@
+"""What an ensemble can tell: information, predicted sigmas, coverage, line-of-sight map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.camera import (
+    CameraModel,
+    line_of_sight,
+    PARAMETER_NAMES,
+    pixel_grid,
+    project_jacobians,
+    project_parameters,
+)
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.estimation.calibrate import CalibrationOptions, FEWEST_STARS, problem_of, start_of
+from starcal_ros.estimation.covariance import shared_covariance, shared_names
+from starcal_ros.estimation.levenberg_marquardt import NotObservable
+from starcal_ros.estimation.normal_equations import arrange, star_table
+from starcal_ros.estimation.problem import image_blocks, information_of_images, Problem, State
+from starcal_ros.estimation.temperature import why_unsupported
+from starcal_ros.records import (
+    CameraGeometry,
+    Correlation,
+    DetectorMaps,
+    Ensemble,
+    EnsembleStatus,
+    StarObservations,
+)
+
+Floats = NDArray[np.float64]
+
+COVERAGE_ROWS, COVERAGE_COLS = 8, 10  # cells of 2 degrees on the paper's camera
+GRID = 25  # pixels along each side of the detector at which maps are compared
+MAP_ROWS, MAP_COLS = 16, 20  # of a smooth surface of degree seven
+
+
+def coverage(ensemble: Ensemble, camera: CameraModel) -> NDArray[np.int64]:
+    """Star observations in each focal-plane cell, (8, 10)."""
+    return stars_in_cells(star_table(ensemble.images).measured_px, camera)
+
+
+def stars_in_cells(pixels: Floats, camera: CameraModel) -> NDArray[np.int64]:
+    """Pixels (n, 2) in each focal-plane cell, (8, 10)."""
+    counts, _, _ = np.histogram2d(
+        pixels[:, 1],
+        pixels[:, 0],
+        bins=(COVERAGE_ROWS, COVERAGE_COLS),
+        range=((-0.5, camera.height - 0.5), (-0.5, camera.width - 0.5)),
+    )
+    return counts.astype(np.int64)
+
+
+def image_information(
+    images: tuple[StarObservations, ...], prior: CameraGeometry, options: CalibrationOptions
+) -> Floats:
+    """
+    Information (m, k, k) of each image on the k unknowns that all images share, at the prior.
+
+    Those are the estimated camera parameters, then the terms of temperature where these images
+    carry them, and the alignment where the method has one; the rotation of the image is
+    eliminated.  An image with fewer than three stars before the camera tells nothing.
+    """
+    ensemble = Ensemble(images)
+    order, with_rate = _supported_terms(ensemble, options)
+    problem, state, blocks, _ = _at_the_prior(ensemble, prior, options, order, with_rate)
+    information = information_of_images(problem, state, blocks)
+    shared = np.concatenate([problem.free, np.arange(10, information.shape[1])])
+    return information[:, shared][:, :, shared] * blocks.any(axis=(1, 2), keepdims=True)
+
+
+def estimated_names(options: CalibrationOptions) -> tuple[str, ...]:
+    """Names of all that is to be estimated: camera, terms of temperature, alignment, its rate."""
+    names = shared_names(options.focal_temperature_order, options.alignment_temperature)
+    return tuple(name for name in names if name not in PARAMETER_NAMES or name in options.estimate)
+
+
+def predicted_sigma(
+    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
+) -> Floats:
+    """
+    1-sigma (k,) of `estimated_names`, as a calibration would report it, before it is made.
+
+    From the covariances of centroids and star tracker as given, at the prior geometry; infinite
+    where not observable yet.  Terms of temperature that the images carry are among what is
+    estimated, so all sigmas account for them.
+    """
+    names = estimated_names(options)
+    if not ensemble.images:
+        return np.full(len(names), np.inf)
+    terms = _supported_terms(ensemble, options)
+    found = _sigma_with(ensemble, prior, options, *terms)
+    if not found and terms != (0, False):
+        # So would the calibration: without them, where they are not observable.
+        found = _sigma_with(ensemble, prior, options, 0, False)
+    return np.array([found.get(name, np.inf) for name in names])
+
+
+def _supported_terms(ensemble: Ensemble, options: CalibrationOptions) -> tuple[int, bool]:
+    """Order of the focal terms and whether a rate, as asked for and carried by the images."""
+    order, with_rate = options.focal_temperature_order, options.alignment_temperature
+    temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
+    if (order or with_rate) and why_unsupported(temperatures_degc, order):
+        return 0, False
+    return order, with_rate
+
+
+def _at_the_prior(
+    ensemble: Ensemble,
+    prior: CameraGeometry,
+    options: CalibrationOptions,
+    order: int,
+    with_rate: bool,
+) -> tuple[Problem, State, Floats, bool]:
+    """What the estimate starts from, its normal matrices, and whether all stars are in front."""
+    problem = problem_of(ensemble, prior, options)
+    state = start_of(problem, prior, order, with_rate)
+    table = star_table(ensemble.images)
+    enough = np.array([len(image) >= FEWEST_STARS for image in ensemble.images])
+    measurements = arrange(table, enough[table.image], table.covariance_px2)
+    cost, blocks = image_blocks(problem, state, measurements)
+    return problem, state, blocks, math.isfinite(cost)
+
+
+def _sigma_with(
+    ensemble: Ensemble,
+    prior: CameraGeometry,
+    options: CalibrationOptions,
+    order: int,
+    with_rate: bool,
+) -> dict[str, float]:
+    """1-sigma by name; none where not observable."""
+    problem, state, blocks, in_front = _at_the_prior(ensemble, prior, options, order, with_rate)
+    seen = np.einsum('mii->m', blocks) > 0
+    try:
+        if not in_front:
+            return {}
+        _, covariance = shared_covariance(
+            problem, state, blocks, seen, problem.star_tracker_sigma_rad[0]
+        )
+    except (NotObservable, np.linalg.LinAlgError):
+        return {}
+    return dict(zip(shared_names(order, with_rate), np.sqrt(np.diag(covariance)), strict=True))
+
+
+def ensemble_status(
+    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
+) -> EnsembleStatus:
+    """What has been collected and what a calibration from it would be worth."""
+    return EnsembleStatus(
+        time_ns=ensemble.images[-1].time_ns if ensemble.images else 0,
+        images=len(ensemble.images),
+        stars=ensemble.star_count,
+        min_images=options.min_images,
+        min_stars=options.min_stars,
+        refused=dict(ensemble.refused),
+        coverage=coverage(ensemble, prior.camera),
+        parameter_names=estimated_names(options),
+        predicted_sigma=predicted_sigma(ensemble, prior, options),
+    )
+
+
+def weakest_direction(information: Floats, names: tuple[str, ...]) -> tuple[Floats, str]:
+    """
+    Singular values of scaled information, and what it tells least of, in words.
+
+    Parameters
+    ----------
+    information : (k, k)
+        On the named parameters.
+
+    Returns
+    -------
+    singular_values : (k,)
+        Of the information scaled to a unit diagonal, largest first: square roots of its
+        eigenvalues.
+    text : str
+        Which parameters can hardly be told apart.
+    """
+    scale = 1.0 / np.sqrt(np.diag(information))
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
+    singular = np.sqrt(np.maximum(values, 0.0))[::-1]
+    direction = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
+    largest = [i for i in np.argsort(-np.abs(direction)) if abs(direction[i]) > 0.3]
+    terms = ', '.join(f'{names[i]} ({direction[i]:+.2f})' for i in largest)
+    if len(largest) < 2:
+        return singular, f'{terms} is known least, and by itself'
+    worse = 1.0 / max(float(singular[-1]), 1e-300)
+    return singular, (
+        f'{terms} can hardly be told apart: together they are known {worse:.0f} times worse than '
+        'each would be alone'
+    )
+
+
+def keep_most_informative(
+    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
+) -> Ensemble:
+    """
+    The ensemble without its least informative images, down to ``max_images``.
+
+    One by one the image goes whose information weighs least against that of all:
+    ``trace(total^-1 information_k)``.
+    """
+    if len(ensemble.images) <= options.max_images:
+        return ensemble
+    images = ensemble.images
+    information = image_information(images, prior, options)
+    while len(images) > options.max_images:
+        total = information.sum(axis=0)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))
+        inverse = np.linalg.pinv(total * scale[:, None] * scale[None, :], hermitian=True)
+        worth = np.einsum('ij,mji->m', inverse * scale[:, None] * scale[None, :], information)
+        least = int(worth.argmin())
+        images = images[:least] + images[least + 1 :]
+        information = np.delete(information, least, axis=0)
+    return replace(ensemble, images=images)
+
+
+def line_of_sight_sigma_arcsec(
+    camera: CameraModel, covariance: Floats, columns: int = 25, rows: int = 20
+) -> Floats:
+    """
+    1-sigma (rows, columns) of the line of sight of pixels in the star tracker frame, arcsec.
+
+    Root of the summed variance of the two angles, from the (13, 13) covariance of camera and
+    alignment.
+    """
+    _, J = _line_of_sight_jacobian(camera, columns, rows)
+    variance = np.einsum('nij,jk,nik->n', J, covariance, J)
+    return np.asarray(np.sqrt(variance).reshape(rows, columns) / ARCSECOND_RAD)
+
+
+def map_sigma_px(camera: CameraModel, covariance: Floats, columns: int = 25) -> Floats:
+    """1-sigma (columns * columns,) of `shape_sigma_rad`, in pixels at the centre."""
+    sigma_rad = shape_sigma_rad(camera, covariance, columns, columns)
+    return np.asarray(sigma_rad.ravel() * camera.parameters[0])
+
+
+def shape_sigma_rad(
+    camera: CameraModel, covariance: Floats, columns: int = 25, rows: int = 20
+) -> Floats:
+    """
+    1-sigma (rows, columns) of the shape of the distortion map at a grid of pixels, rad.
+
+    What a turn common to all pixels can take up (pointing, and most of a moved principal point) is
+    removed: it belongs to the alignment.
+    """
+    directions, J = _line_of_sight_jacobian(camera, columns, rows)
+    J = J[:, :, :10].reshape(-1, 10)
+    turns = np.stack([np.cross(axis, directions) for axis in np.eye(3)], axis=-1)
+    Q, _ = np.linalg.qr(turns.reshape(-1, 3))
+    J = (J - Q @ (Q.T @ J)).reshape(-1, 3, 10)
+    variance = np.einsum('nij,jk,nik->n', J, covariance[:10, :10], J)
+    return np.asarray(np.sqrt(variance).reshape(rows, columns))
+
+
+def map_error_px(found: CameraModel, true: CameraModel) -> float:
+    """
+    RMS over the detector between the lines of sight of two cameras, px at the focal length.
+
+    The turn of all lines of sight that brings the two closest is removed: a calibration puts it
+    into the alignment.
+    """
+    grid = pixel_grid(true, GRID, GRID)
+    of_found, of_true = line_of_sight(found, grid), line_of_sight(true, grid)
+    turn, _ = Rotation.align_vectors(of_true, of_found)
+    angle = np.linalg.norm(turn.apply(of_found) - of_true, axis=1)
+    return float(np.sqrt(np.mean(angle**2)) * true.parameters[0])
+
+
+def detector_maps(camera: CameraModel, covariance: Floats, pixels: Floats) -> DetectorMaps:
+    """Maps of a camera with a covariance (13, 13) that is from stars at pixels (n, 2)."""
+    return DetectorMaps(
+        stars_in_cells(pixels, camera),
+        line_of_sight_sigma_arcsec(camera, covariance, MAP_COLS, MAP_ROWS),
+        shape_sigma_rad(camera, covariance, MAP_COLS, MAP_ROWS) / ARCSECOND_RAD,
+    )
+
+
+def correlation(covariance: Floats, names: tuple[str, ...]) -> Correlation:
+    """Correlations of the named numbers of a covariance (k, k), those left out that have none."""
+    sigma = np.sqrt(np.diag(covariance))
+    known = np.nonzero(sigma > 0)[0]
+    matrix = covariance[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])
+    return Correlation(tuple(names[i] for i in known), matrix)
+
+
+def movement_px(camera: CameraModel, changes: Floats) -> Floats:
+    """
+    Worst movement (k,) over the detector of the image of a direction, px.
+
+    When the k-th of the camera parameters alone is less by ``changes`` (k,).
+    """
+    pixels = pixel_grid(camera, 25, 20)
+    directions = line_of_sight(camera, pixels)
+    moved = camera.parameters - np.diag(changes)
+    found = np.stack([project_parameters(row, directions) for row in moved])
+    return np.asarray(np.linalg.norm(pixels - found, axis=-1).max(axis=1))
+
+
+def _line_of_sight_jacobian(camera: CameraModel, columns: int, rows: int) -> tuple[Floats, Floats]:
+    """
+    Lines of sight (n, 3) of a grid of pixels, and their derivatives (n, 3, 13).
+
+    By the camera parameters and the alignment angles, in the camera frame.  For a fixed pixel:
+    a direction moves so as to undo what the parameter does to its image.
+    """
+    directions = line_of_sight(camera, pixel_grid(camera, columns, rows))
+    _, J_parameters, J_rotation = project_jacobians(camera, directions)
+    # A turn about the line of sight itself moves nothing: the pseudo-inverse leaves it out.
+    angles = np.linalg.pinv(J_rotation) @ J_parameters
+    angles = np.concatenate([angles, np.broadcast_to(np.eye(3), (len(angles), 3, 3))], axis=-1)
+    moved = np.cross(directions[:, None, :], np.swapaxes(angles, 1, 2))
+    return directions, -np.swapaxes(moved, 1, 2)

@@ -1,0 +1,99 @@
+"""Residuals of a calibration, star by star and image by image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.estimation.calibrate import Estimate
+from starcal_ros.records import Ensemble
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """
+    Residuals of a calibration, m images in time order and n stars in image order.
+
+    Attributes
+    ----------
+    image_time_ns : (m,) int64
+    image_misfit : (m,) bool
+        Images whose attitude does not fit, or that lost their stars.
+    attitude_error_arcsec : (m, 3)
+        Of the star tracker, by the stars of the image alone and the common alignment: the passive
+        small rotation about its own axes that takes the truth to what it reports.  NaN where the
+        image has too few stars to tell.
+    attitude_sigma_arcsec : (m, 3)
+        1-sigma of it from the centroids, the camera taken as known.
+    image : (n,) int64
+        Which image the star is in.
+    catalog_id : (n,) int64
+    magnitude, colour_bp_rp : (n,) float64
+        V, and Gaia BP - RP; NaN where the catalog has none.
+    measured_px : (n, 2)
+    residual_px : (n, 2)
+        Measured less predicted.
+    covariance_px2 : (n, 3)
+        uu, uv, vv of the centroids, as the last search has weighted them.
+    used : (n,) bool
+        False for outliers and stars of images that were left out.
+    """
+
+    image_time_ns: NDArray[np.int64]
+    image_misfit: NDArray[np.bool_]
+    attitude_error_arcsec: Floats
+    attitude_sigma_arcsec: Floats
+    image: NDArray[np.int64]
+    catalog_id: NDArray[np.int64]
+    magnitude: Floats
+    colour_bp_rp: Floats
+    measured_px: Floats
+    residual_px: Floats
+    covariance_px2: Floats
+    used: NDArray[np.bool_]
+
+    def image_rms_px(self) -> Floats:
+        """RMS per axis (m,) over the stars used of each image; NaN where none was."""
+        m = len(self.image_time_ns)
+        image = self.image[self.used]
+        squares = np.bincount(image, (self.residual_px[self.used] ** 2).mean(axis=1), m)
+        count = np.bincount(image, minlength=m)
+        mean: Floats = np.divide(squares, count, out=np.full(m, np.nan), where=count > 0)
+        return np.asarray(np.sqrt(mean))
+
+
+def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -> Residuals:
+    """
+    Residuals of an estimate.
+
+    Parameters
+    ----------
+    ensemble : Ensemble
+        That the estimate was made from.
+    colour_bp_rp : (n,)
+        Of the stars of the estimate's table.
+    """
+    table = estimate.table
+    seen = estimate.attitude_seen[:, None]
+    # The estimation counts from what was reported to the truth.
+    error_arcsec = -estimate.attitude_error_rad / ARCSECOND_RAD
+    sigma_rad = np.sqrt(np.einsum('mii->mi', estimate.attitude_covariance_rad2))
+    return Residuals(
+        image_time_ns=np.array([image.time_ns for image in ensemble.images], np.int64),
+        image_misfit=estimate.misfit_image,
+        attitude_error_arcsec=np.where(seen, error_arcsec, np.nan),
+        attitude_sigma_arcsec=np.where(seen, sigma_rad / ARCSECOND_RAD, np.nan),
+        image=table.image,
+        catalog_id=table.catalog_id,
+        magnitude=np.concatenate([image.magnitude for image in ensemble.images]).astype(float),
+        colour_bp_rp=colour_bp_rp,
+        measured_px=table.measured_px,
+        residual_px=estimate.residual_px,
+        covariance_px2=estimate.variance.of(table.covariance_px2),
+        used=estimate.kept,
+    )

@@ -1,0 +1,1 @@
+"""MCAP bags: reading and writing."""

@@ -1,0 +1,1 @@
+"""What a calibrator keeps between requests, without ROS."""

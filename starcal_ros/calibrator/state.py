@@ -1,0 +1,236 @@
+"""What a calibrator has collected and what is in force, in memory and on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+import threading
+
+from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.calibrator.archive import Archive, InForce
+from starcal_ros.errors import ArchiveError, OptionError, StarcalError
+from starcal_ros.pipeline import solve as solving
+from starcal_ros.pipeline.node_options import CalibratorOptions
+from starcal_ros.pipeline.setup import Setup
+from starcal_ros.records import Calibration, Ensemble, EnsembleStatus, StarObservations
+
+
+@dataclass(frozen=True)
+class Answer:
+    """
+    What came of a request: ``calibration`` is the solution, where there is one.
+
+    ``observations`` are those that it was solved from, and ``residuals`` what it left of them; a
+    calibration that came back by a roll-back has neither.
+    """
+
+    success: bool
+    message: str
+    calibration: Calibration | None = None
+    in_force: bool = False
+    residuals: Residuals | None = None
+    observations: tuple[StarObservations, ...] = ()
+
+
+class CalibratorState:
+    """
+    Ensemble and calibrations of one calibrator, safe to use from several threads.
+
+    Both are frozen records: a solve works on the ensemble it began with while the next grows.
+    With a state folder both are on disk before anybody is told of them; while the disk fails they
+    are in memory, `trouble` says why, and `save` tries again.
+    """
+
+    def __init__(self) -> None:
+        self.trouble = ''  # why the last attempt to save has failed
+        self.damage: tuple[str, ...] = ()  # what was found damaged when the folder was read
+        self._records = threading.Lock()  # of the records below; never held during a solve
+        self._ensemble = Ensemble()
+        self._history: tuple[InForce, ...] = ()
+        self._disk = threading.Lock()  # of the archive; taken before the other
+        self._archive: Archive | None = None
+        self._folder = ''
+
+    def open(self, setup: Setup, options: CalibratorOptions) -> None:
+        """
+        Take up what the state folder holds; without one, go on with what is in memory.
+
+        Raises
+        ------
+        ArchiveError
+            When the folder cannot be used.
+        OptionError
+            When what it holds is of another camera.
+        """
+        self._setup, self._options = setup, options
+        if not options.state_dir:
+            self._folder = ''
+            return
+        archive = Archive(Path(options.state_dir), setup.frames.camera_frame)
+        try:
+            ensemble, history = archive.read_ensemble(), archive.read_history()
+            _check_size(options.state_dir, ensemble, history, setup)
+        except StarcalError:
+            archive.close()
+            raise
+        with self._disk, self._records:
+            if self._folder == options.state_dir:  # what a failing disk did not take before
+                read = {image.time_ns for image in ensemble.images}
+                for image in self._ensemble.images:
+                    if image.time_ns not in read:
+                        ensemble = ensemble.add(image)
+                history = history or self._history
+            self._ensemble = solving.within_limit(ensemble, setup)
+            self._history, self._folder = history, options.state_dir
+            self._archive, self.damage = archive, tuple(archive.damage)
+        self.save()
+
+    def close(self) -> None:
+        """Let go of the state folder; safe to call twice."""
+        with self._disk:
+            if self._archive is not None:
+                self._archive.close()
+            self._archive = None
+
+    @property
+    def ensemble(self) -> Ensemble:
+        """What is collected."""
+        with self._records:
+            return self._ensemble
+
+    @property
+    def in_force(self) -> Calibration | None:
+        """The calibration in force."""
+        with self._records:
+            return self._history[-1].calibration if self._history else None
+
+    def add(self, observations: StarObservations) -> None:
+        """Take one more image, or the reason why it was refused."""
+        with self._records:
+            ensemble = self._ensemble
+        grown = solving.add_to_ensemble(ensemble, observations, self._setup)
+        with self._records:
+            if self._ensemble is not ensemble:  # emptied meanwhile: it starts with this image
+                grown = solving.add_to_ensemble(Ensemble(), observations, self._setup)
+            self._ensemble = grown
+        self.save()
+
+    def reset(self) -> Answer:
+        """Empty the ensemble."""
+        with self._records:
+            images = len(self._ensemble.images)
+            self._ensemble = Ensemble()
+        self.save()
+        return self._answer(f'{images} images dropped; the calibration in force stays')
+
+    def status(self) -> EnsembleStatus:
+        """What has been collected and what a calibration from it would be worth."""
+        ensemble = self.ensemble
+        with self._disk:
+            saved = self._archive.saved(ensemble) if self._archive else 0
+        status = solving.ensemble_status(ensemble, self._setup)
+        return dataclasses.replace(status, images_saved=saved)
+
+    def solve(
+        self,
+        now_ns: int,
+        method: str = '',
+        estimate: Sequence[str] = (),
+        dry_run: bool = False,
+        force: bool = False,
+    ) -> Answer:
+        """Solve, and put in force what the gate accepts or ``force`` demands."""
+        ensemble = self.ensemble
+        try:
+            calibration, residuals = solving.solve_with_residuals(
+                ensemble, self._setup, method, estimate, in_force=self.in_force
+            )
+        except StarcalError as error:
+            return Answer(False, str(error))
+        if not calibration.accepted and not force:
+            refused = f'refused by the gate: {"; ".join(calibration.reasons)}'
+            return Answer(False, refused, calibration, False, residuals, ensemble.images)
+        if not calibration.accepted:
+            why = (*calibration.reasons, 'put in force by request all the same')
+            calibration = dataclasses.replace(calibration, reasons=why, forced=True)
+        if dry_run:
+            return Answer(True, f'would be in force: {summary(calibration)}', calibration)
+        with self._disk, self._records:
+            before = self._history[-1].event if self._history else 0
+            event = self._next_event()
+            calibration = dataclasses.replace(calibration, number=event, in_force_since_ns=now_ns)
+            self._append(InForce(event, before, calibration))
+        self.save()
+        message = self._answer(f'in force: {summary(calibration)}').message
+        return Answer(True, message, calibration, True, residuals, ensemble.images)
+
+    def rollback(self, now_ns: int) -> Answer:
+        """Return to the calibration before the one in force."""
+        with self._disk, self._records:
+            if not self._history:
+                return Answer(False, 'no calibration is in force')
+            wanted = self._history[-1].before
+            found = [record for record in self._history if record.event == wanted]
+            if not found:
+                kept = ' any more' if wanted else ''
+                return Answer(False, f'there is no calibration before the one in force{kept}')
+            calibration = dataclasses.replace(found[0].calibration, in_force_since_ns=now_ns)
+            self._append(InForce(self._next_event(), found[0].before, calibration))
+        self.save()
+        answer = self._answer(f'back in force: {summary(calibration)}')
+        return dataclasses.replace(answer, calibration=calibration, in_force=True)
+
+    def save(self) -> None:
+        """Have the disk hold what memory holds; done at once where it does."""
+        with self._disk:
+            if self._archive is None:
+                return
+            with self._records:
+                ensemble, history = self._ensemble, self._history
+            try:
+                self._archive.keep(ensemble, history)
+                self.trouble = ''
+            except ArchiveError as error:
+                self.trouble = str(error)
+
+    def disk_free_bytes(self) -> int | None:
+        """Room left for the state folder; None without one."""
+        with self._disk:
+            return self._archive.free_bytes() if self._archive else None
+
+    def _next_event(self) -> int:
+        last = self._history[-1].event if self._history else 0
+        return 1 + max(last, self._archive.last_event if self._archive else 0)
+
+    def _append(self, record: InForce) -> None:
+        self._history = (*self._history, record)[-self._options.calibration_history :]
+
+    def _answer(self, message: str) -> Answer:
+        unsaved = f'; not on disk: {self.trouble}' if self.trouble else ''
+        return Answer(True, message + unsaved)
+
+
+def summary(calibration: Calibration) -> str:
+    """A calibration in a few words."""
+    return (
+        f'{calibration.residual_rms_px:.3f} px rms per axis over {calibration.stars_used} stars'
+        f' in {calibration.images_used} images'
+    )
+
+
+def _check_size(
+    folder: str, ensemble: Ensemble, history: tuple[InForce, ...], setup: Setup
+) -> None:
+    prior = setup.prior.camera
+    sizes = {(image.width, image.height) for image in ensemble.images}
+    sizes |= {
+        (record.calibration.geometry.camera.width, record.calibration.geometry.camera.height)
+        for record in history
+    }
+    for width, height in sizes - {(prior.width, prior.height)}:
+        raise OptionError(
+            f'state_dir: {folder} is of a camera of {width} x {height}, '
+            f'the prior camera has {prior.width} x {prior.height}'
+        )

@@ -1,0 +1,239 @@
+"""The demonstration: the real nodes as processes, a small bag played to them, the truth beside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+import contextlib
+from dataclasses import dataclass
+import json
+import os
+from pathlib import Path
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+
+import numpy as np
+import yaml
+
+from starcal_ros.assessment.agreement import alignment_difference_rad
+from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import StarcalError
+from starcal_ros.products.calibration_json import read_calibration
+from starcal_ros.products.camera_yaml import read_camera_info
+from starcal_ros.products.files import write_atomically
+from starcal_ros.records import Calibration, CameraGeometry
+from starcal_ros.simulation import bag as simulated_bag
+from starcal_ros.simulation import scenario
+
+Process = subprocess.Popen[bytes]
+
+RATE = 5.0  # ten images in eight seconds
+_NODES = ('star_observer', 'calibrator')
+
+
+class NodeError(StarcalError):
+    """A node did not come up, or did not last."""
+
+
+@dataclass(frozen=True)
+class DemoBag:
+    """A bag folder with its parameter file, what was believed and what is true."""
+
+    bag: Path
+    parameters: dict[str, object]
+    prior: CameraGeometry
+    truth: CameraGeometry
+    image_count: int
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """An estimate beside the truth: a table as lines, and the largest difference in sigmas."""
+
+    lines: tuple[str, ...]
+    worst_sigmas: float
+
+
+def tiny_bag(spare: Path) -> DemoBag:
+    """The small bag of the source tree or the installed package, or one rendered under `spare`."""
+    prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+    places = [Path(__file__).parents[2], *(Path(p, 'share/starcal') for p in prefixes if p)]
+    folders = (place / 'bags' / 'tiny' for place in places)
+    folder = next((f for f in folders if (f / 'truth.json').is_file()), None)
+    if folder is None:
+        folder = simulated_bag.write_bag(scenario.scenario('tiny'), spare / 'tiny').bag
+    truth = json.loads((folder / 'truth.json').read_text())
+    parameters = yaml.safe_load((folder / 'params.yaml').read_text())['/**']['ros__parameters']
+    # The nodes run anywhere: they need the whole URL.
+    parameters['camera_info_url'] = f'file://{(folder / "camera.yaml").resolve()}'
+    prior = CameraGeometry(
+        read_camera_info(folder / 'camera.yaml'), np.array(parameters['prior_alignment'])
+    )
+    return DemoBag(folder, parameters, prior, simulated_bag.true_geometry(truth), truth['images'])
+
+
+def run(
+    bag: DemoBag, folder: Path, on_image: Callable[[], None] = lambda: None
+) -> tuple[Calibration | None, str]:
+    """
+    Start the nodes, play the bag, ask for the calibration; what came of it, and what was said.
+
+    Log files go to the folder.  All processes have ended when this returns.
+
+    Raises
+    ------
+    NodeError
+        When a node does not come up, or ends before the calibration.
+    """
+    params = folder / 'params.yaml'
+    content = {'/**': {'ros__parameters': bag.parameters}}
+    write_atomically(params, yaml.safe_dump(content, sort_keys=False))
+    environment = {**os.environ, **_own_domain()}
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_ended_like_interrupted())
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        result = scratch / 'calibration.json'
+        nodes: dict[str, Process] = {}
+
+        def start(name: str, command: list[str], output: int | None = None) -> Process:
+            log = stack.enter_context((folder / f'{name}.log').open('wb'))
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log if output is None else output,
+                stderr=log,
+                env=environment,
+                bufsize=0,  # so that select() and readline() see the same bytes
+            )
+            stack.callback(_stop, process)
+            return process
+
+        for name in _NODES:
+            nodes[name] = start(name, _nodes_command(name, params))
+        client = start('demo_client', _client_command(bag, result), subprocess.PIPE)
+        for line in _lines(client, nodes):
+            word, _, rest = line.partition(' ')
+            if word == 'ready':
+                nodes['bag_player'] = start('bag_player', player_command(bag.bag, RATE, []))
+            elif word == 'collected':
+                on_image()
+            elif word == 'result':
+                client.wait()
+                return (read_calibration(result) if result.exists() else None), rest
+            elif word == 'failed':
+                raise NodeError(f'{rest} (see the log files in {folder})')
+        dead = next((name for name, node in nodes.items() if node.poll()), 'demo_client')
+        last = (folder / f'{dead}.log').read_text(errors='replace').strip().rpartition('\n')[2]
+        raise NodeError(f'{dead} ended before the calibration: {last}')
+
+
+def player_command(path: Path, rate: float, remaps: Sequence[str]) -> list[str]:
+    """The command that plays a bag on the graph."""
+    parameters = ['-p', f'bag:={path.resolve()}', '-p', f'rate:={rate!r}']
+    renamed = [part for remap in remaps for part in ('-r', remap)]
+    return [*_module_command('bag_player'), '--ros-args', *parameters, *renamed]
+
+
+def _nodes_command(name: str, params: Path) -> list[str]:
+    topics = (f'image:={simulated_bag.IMAGE_TOPIC}', f'attitude:={simulated_bag.ATTITUDE_TOPIC}')
+    remaps = [part for topic in topics for part in ('-r', topic)]
+    return [*_module_command(name), '--ros-args', '--params-file', str(params), *remaps]
+
+
+def _client_command(bag: DemoBag, result: Path) -> list[str]:
+    topics = [
+        '--image-topic',
+        simulated_bag.IMAGE_TOPIC,
+        '--attitude-topic',
+        simulated_bag.ATTITUDE_TOPIC,
+    ]
+    asked = ['--images', str(bag.image_count), '--output', str(result)]
+    return [*_module_command('demo_client'), *asked, *topics]
+
+
+def _module_command(name: str) -> list[str]:
+    return [sys.executable, '-m', f'starcal_ros.nodes.{name}']
+
+
+def _lines(client: Process, nodes: dict[str, Process]) -> Iterator[str]:
+    """What the client says, as long as it and the nodes live."""
+    assert client.stdout is not None  # it was started with a pipe
+    while True:
+        if select.select([client.stdout], [], [], 0.2)[0]:
+            line = client.stdout.readline()
+            if not line:
+                return
+            yield line.decode(errors='replace').strip()
+        elif any(node.poll() for node in nodes.values()):
+            return  # status 0 is the player's end, which is no accident
+
+
+@contextlib.contextmanager
+def _ended_like_interrupted() -> Iterator[None]:
+    """Let a polite kill take the way of Ctrl-C, so that it stops the nodes too."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _stop(process: Process) -> None:
+    """Ask to end, then insist."""
+    for ask in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+        if process.poll() is None:
+            process.send_signal(ask)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(5.0)
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+def _own_domain() -> dict[str, str]:
+    """A ROS domain that nobody on this machine uses, unless the caller has chosen one."""
+    if 'ROS_DOMAIN_ID' in os.environ:
+        return {}
+    first = os.getpid() % 100
+    for domain in (1 + (first + k) % 100 for k in range(100)):
+        # The first participant of a domain holds UDP port 7400 + 250 domain + 10 (RTPS 9.6.1.1).
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(('', 7410 + 250 * domain))
+            except OSError:
+                continue
+        return {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    raise NodeError('no free ROS domain on this machine: set ROS_DOMAIN_ID')
+
+
+def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeometry) -> Comparison:
+    """Every estimated parameter and the alignment, beside prior and truth."""
+    names = [name for name in PARAMETER_NAMES if name in calibration.estimated]
+    columns = [PARAMETER_NAMES.index(name) for name in names]
+    before, estimate, true = (
+        geometry.camera.parameters[columns] for geometry in (prior, calibration.geometry, truth)
+    )
+    sigma = calibration.sigma
+    off = (estimate - true) / sigma[columns]
+    rows = zip(names, before, estimate, sigma[columns], true, off, strict=True)
+    header = ('parameter', 'prior', 'estimate', '1-sigma', 'truth', 'off by')
+    lines = ['{:<12}{:>13}{:>13}{:>11}{:>13}{:>12}'.format(*header)]
+    lines += [
+        f'{name:<12}{b:>13.6g}{e:>13.6g}{s:>11.2g}{t:>13.6g}{o:>+6.1f} sigma'
+        for name, b, e, s, t, o in rows
+    ]
+    # Angles are counted from the truth.
+    prior_arcsec = alignment_difference_rad(prior, truth) / ARCSECOND_RAD
+    error_arcsec = alignment_difference_rad(calibration.geometry, truth) / ARCSECOND_RAD
+    sigma_arcsec = sigma[10:] / ARCSECOND_RAD
+    angles_off = error_arcsec / sigma_arcsec
+    lines += [
+        f'{"alignment " + axis:<12}{b:>+12.2f}"{e:>+12.2f}"{s:>10.2f}"{0:>12}"{o:>+6.1f} sigma'
+        for axis, b, e, s, o in zip(
+            'xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=True
+        )
+    ]
+    return Comparison(tuple(lines), float(np.abs([*off, *angles_off]).max()))

@@ -1,0 +1,206 @@
+"""What the tool prints of a calibration, a bag and a comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from starcal_ros.assessment.agreement import alignment_difference_rad
+from starcal_ros.assessment.comparison import Comparison, DifferenceMap
+from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.cli.terminal import print_table, print_verdict
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.estimation import temperature
+from starcal_ros.pipeline.inspect import Inspection, TopicContent
+from starcal_ros.records import Calibration, CameraGeometry
+from starcal_ros.utc import utc_text
+
+
+def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
+    """Print parameters, statistics and verdict; changes are against the prior."""
+    camera, sigma = calibration.geometry.camera, calibration.sigma
+    rows = []
+    for k, name in enumerate(PARAMETER_NAMES):
+        value, change = camera.parameters[k], camera.parameters[k] - prior.camera.parameters[k]
+        free = name in calibration.estimated
+        rows.append(
+            (
+                name,
+                f'{value:.8g}',
+                f'{sigma[k]:.2g}' if free else 'held',
+                f'{change:+.4g}',
+                _sigmas(change, sigma[k]) if free else '',
+            )
+        )
+    angles = alignment_difference_rad(calibration.geometry, prior) / ARCSECOND_RAD
+    for axis, angle, error in zip('xyz', angles, sigma[10:] / ARCSECOND_RAD, strict=True):
+        rows.append(
+            (f'alignment {axis}', '', f'{error:.2f}"', f'{angle:+.2f}"', _sigmas(angle, error))
+        )
+    print_table(('parameter', 'value', '1-sigma', 'from prior', 'in sigmas'), rows)
+    quaternion = calibration.geometry.star_tracker_from_camera_xyzw
+    print(f'alignment xyzw  {np.array2string(quaternion, precision=9, separator=", ")}')
+    print(f'images          {calibration.images_used} used, refused: ', end='')
+    print(_counted(calibration.images_refused))
+    print(f'stars           {calibration.stars_used} used, {calibration.stars_rejected} rejected')
+    print(f'residual        {calibration.residual_rms_px:.4f} px rms per axis')
+    print(f'method          {calibration.method}')
+    print(f'solver          {calibration.iterations} iterations, {calibration.termination}')
+    if calibration.thermal is not None:
+        print(f'temperature     {temperature.summary(calibration.thermal)}')
+    if calibration.accepted:
+        print_verdict(True, 'verdict         accepted')
+    else:
+        print_verdict(False, f'verdict         refused: {"; ".join(calibration.reasons)}')
+
+
+def print_inspection(inspection: Inspection) -> None:
+    """Print topics, images, attitudes and what would be refused."""
+    print_table(
+        ('topic', 'type', 'messages', 'rate', 'longest gap'),
+        [
+            (
+                topic.name,
+                topic.type_name.replace('/msg/', '/'),
+                str(topic.count),
+                f'{topic.rate_hz:.3g} Hz' if topic.rate_hz else '',
+                f'{topic.longest_gap_s:.3g} s' if topic.count > 1 else '',
+            )
+            for topic in inspection.topics
+        ],
+        left=2,
+    )
+    for topic in inspection.topics:
+        print(f'{topic.name}: {"; ".join(_topic_notes(topic))}')
+    for text in inspection.damage:
+        print(f'damage: {text}')
+    if inspection.images:
+        _print_images(inspection)
+    if inspection.status is not None:
+        print_table(
+            ('a calibration now', '1-sigma'),
+            [
+                (name, _predicted(name, value))
+                for name, value in zip(
+                    inspection.status.parameter_names,
+                    inspection.status.predicted_sigma,
+                    strict=True,
+                )
+            ],
+        )
+    if inspection.problems:
+        print_verdict(False, 'cannot be calibrated: ' + '; '.join(inspection.problems))
+    elif inspection.measured:
+        print_verdict(True, 'can be calibrated')
+    else:
+        print_verdict(True, 'nothing speaks against it so far; --params measures the stars too')
+
+
+def _print_images(inspection: Inspection) -> None:
+    bad = sum(refused.count for refused in inspection.refused)
+    chosen = inspection.chosen
+    assert chosen is not None  # images come from a chosen topic
+    print(
+        f'{inspection.images - bad} of {inspection.images} images of '
+        f'{chosen.image or chosen.observations} can be used'
+        + (f', with the attitudes of {chosen.attitude}' if chosen.attitude else '')
+    )
+    if inspection.longest_attitude_gap_s >= 0:
+        print(f'longest gap of attitudes about one: {inspection.longest_attitude_gap_s:.3g} s')
+    if inspection.refused:
+        print_table(
+            ('refused', 'images', 'meaning', 'the first'),
+            [
+                (r.reason, str(r.count), r.meaning, f'{_clock(r.first_ns)}: {r.detail}')
+                for r in inspection.refused
+            ],
+            left=4,
+        )
+    if inspection.stars_per_image:
+        stars = inspection.stars_per_image
+        print(
+            f'stars per image: {min(stars)} to {max(stars)}, {sum(stars)} in all; '
+            f'left out: {_counted(inspection.refused_stars)}'
+        )
+
+
+def print_comparison(comparison: Comparison) -> None:
+    """Print the differences of parameters, alignment and lines of sight."""
+    a, b = (c.geometry.camera.parameters for c in (comparison.a, comparison.b))
+    difference, sigma = comparison.difference, comparison.sigma
+    rows = [
+        (
+            name,
+            f'{a[k]:.8g}',
+            f'{b[k]:.8g}',
+            f'{difference[k]:+.4g}',
+            f'{sigma[k]:.2g}' if sigma[k] else 'held',
+            _sigmas(difference[k], sigma[k]),
+        )
+        for k, name in enumerate(PARAMETER_NAMES)
+    ]
+    arcsec, sigma_arcsec = difference[10:] / ARCSECOND_RAD, sigma[10:] / ARCSECOND_RAD
+    rows += [
+        (f'alignment {axis}', '', '', f'{d:+.2f}"', f'{s:.2f}"', _sigmas(d, s))
+        for axis, d, s in zip('xyz', arcsec, sigma_arcsec, strict=True)
+    ]
+    print_table(('parameter', 'A', 'B', 'B - A', '1-sigma', 'in sigmas'), rows)
+    print_table(
+        ('lines of sight', 'worst', 'rms', 'worst', 'rms'),
+        [
+            ('as they are', *_map_cells(comparison.before)),
+            ('less their common turn', *_map_cells(comparison.after)),
+        ],
+    )
+    print(f'common turn     {comparison.turn_rad / ARCSECOND_RAD:.2f}"')
+    if comparison.degrees:
+        print(
+            f'all together    chi2 {comparison.chi2:.1f} of {comparison.degrees} degrees of '
+            f'freedom: chance alone does as much in {_percent(comparison.chance)}'
+        )
+    for note in comparison.notes:
+        print(f'note: {note}')
+
+
+def _map_cells(found: DifferenceMap) -> Sequence[str]:
+    length = found.length_px
+    cells = [f'{length.max():.4f} px', f'{np.sqrt(np.mean(length**2)):.4f} px']
+    known = found.sigmas[np.isfinite(found.sigmas)]
+    if not known.size:
+        return [*cells, '', '']
+    worst, rms = known.max(), np.sqrt(np.mean(known**2))
+    return [*cells, f'{worst:.2f} sigma', f'{rms:.2f} sigma']
+
+
+def _percent(chance: float) -> str:
+    return f'{100 * chance:.3g} % of cases' if chance >= 1e-4 else 'under 0.01 % of cases'
+
+
+def _sigmas(difference: float, sigma: float) -> str:
+    return f'{difference / sigma:+.1f}' if sigma > 0 else ''
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ', '.join(f'{count} {reason}' for reason, count in counts.items()) or 'none'
+
+
+def _predicted(name: str, sigma: float) -> str:
+    if not np.isfinite(sigma):
+        return 'not observable yet'
+    return f'{sigma / ARCSECOND_RAD:.2f}"' if name.startswith('alignment') else f'{sigma:.2g}'
+
+
+def _topic_notes(topic: TopicContent) -> list[str]:
+    notes = [f'{utc_text(topic.first_ns)} to {_clock(topic.last_ns)}']
+    if topic.kinds:
+        notes.append(', '.join(f'{count} of {kind}' for kind, count in topic.kinds.items()))
+    if topic.bad:
+        notes.append(f'{topic.bad} of {topic.count} messages are not valid')
+    if topic.backward:
+        notes.append(f'stamps go back {topic.backward} times')
+    return notes
+
+
+def _clock(time_ns: int) -> str:
+    return utc_text(time_ns).partition(' ')[2]

@@ -1,0 +1,1 @@
+"""From observations to camera, alignment and covariance."""

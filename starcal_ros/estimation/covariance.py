@@ -1,0 +1,118 @@
+"""
+Covariance of what the images share: camera, focal terms, alignment and its rate.
+
+From the normal matrices of the images at a state; it needs no residuals, so a calibration that has
+not been made yet has one too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.estimation.problem import by_shared, Problem, reduced_information, State
+from starcal_ros.records import ALIGNMENT_NAMES
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def shared_names(focal_terms: int, with_rate: bool) -> tuple[str, ...]:
+    """Names of the ten camera parameters, the focal terms, the alignment angles and their rate."""
+    return (
+        *PARAMETER_NAMES,
+        *(f'focal_temperature_{i}' for i in range(1, focal_terms + 1)),
+        *ALIGNMENT_NAMES,
+        *(f'{name}_temperature' for name in ALIGNMENT_NAMES if with_rate),
+    )
+
+
+def shared_covariance(
+    problem: Problem, state: State, blocks: Floats, good: Mask, tracker_sigma_rad: Floats
+) -> tuple[Rotation, Floats]:
+    """
+    The alignment, and the covariance (s, s) of `shared_names`.
+
+    Parameters
+    ----------
+    blocks : (m, 14, 14)
+        Of `problem.image_blocks`.
+    good : (m,) bool
+        Images whose attitudes count in the mean of ``per_image``; the other methods do not ask.
+    tracker_sigma_rad : (3,)
+        Of those attitudes.
+
+    Raises
+    ------
+    NotObservable
+        When the images do not determine all that is estimated.
+    """
+    shared = considered_covariance(problem, reduced_information(problem, state, blocks))
+    if problem.method != 'per_image':
+        return state.camera_from_star_tracker, shared
+    if not good.any():
+        raise NotObservable('no attitude of an image fits the others')
+    full = np.zeros((len(shared) + 3, len(shared) + 3))
+    full[:-3, :-3] = shared
+    return _mean_alignment(problem, state, blocks, good, full, tracker_sigma_rad)
+
+
+def considered_covariance(problem: Problem, information: Floats) -> Floats:
+    """
+    Covariance (p, p) of all camera parameters, and of what else the information has.
+
+    A held parameter with a prior sigma is considered: its uncertainty is its own, and what it does
+    to the estimated ones is added to theirs; one without stays at zero.
+    """
+    p = len(information)
+    estimated = np.concatenate([problem.free, np.arange(10, p)])
+    held = np.setdiff1d(np.arange(10), problem.free)
+    held_variance = np.where(
+        np.isfinite(problem.prior_sigma[held]), problem.prior_sigma[held], 0.0
+    )
+    held_variance = held_variance**2
+    noise = inverse(information[np.ix_(estimated, estimated)])
+    to_estimated = -noise @ information[np.ix_(estimated, held)]
+    result = np.zeros((p, p))
+    result[np.ix_(estimated, estimated)] = noise + (to_estimated * held_variance) @ to_estimated.T
+    result[np.ix_(estimated, held)] = to_estimated * held_variance
+    result[np.ix_(held, estimated)] = result[np.ix_(estimated, held)].T
+    result[held, held] = held_variance
+    return 0.5 * (result + result.T)
+
+
+def _mean_alignment(
+    problem: Problem,
+    state: State,
+    blocks: Floats,
+    good: Mask,
+    full: Floats,
+    tracker_sigma_rad: Floats,
+) -> tuple[Rotation, Floats]:
+    """
+    Quaternion mean of the alignments of the images (Markley et al. 2007), completing ``full``.
+
+    SciPy's mean is the dominant eigenvector of sum w q q'; weighted by the covariances of the
+    images.  The mean is linear in the rotations, and those in the camera parameters.
+    """
+    alignments = (state.camera_from_icrf * problem.star_tracker_from_icrf.inv())[good]
+    tracker = np.diag(tracker_sigma_rad**2)
+    k = len(full) - 3
+    rows = by_shared(problem, state, blocks)[good][:, k : k + 3]
+    C, B = rows[:, :, k : k + 3], rows[:, :, :k]
+    stars, by_camera = np.linalg.inv(C), np.linalg.solve(C, B)
+    within = stars + by_camera @ full[:k, :k] @ by_camera.transpose(0, 2, 1)
+    weight = 1.0 / np.trace(within + tracker, axis1=1, axis2=2)
+    alignment = alignments.mean(weight)
+    weight = weight / weight.sum()
+    A = alignment.as_matrix()
+    F = np.einsum('m,mij->ij', weight, by_camera)
+    scattered = np.einsum('m,mij->ij', weight**2, stars + A @ tracker @ A.T)
+    full = full.copy()
+    full[k:, k:] = scattered + F @ full[:k, :k] @ F.T
+    full[k:, :k] = -F @ full[:k, :k]
+    full[:k, k:] = full[k:, :k].T
+    return alignment, full

@@ -1,0 +1,1 @@
+"""From measured stars to catalog stars."""

@@ -1,0 +1,297 @@
+"""
+Which source is which star, where the prior alignment may be far off.
+
+The common shift and roll is found by a vote of bright sources against bright predictions; then
+rotation, scale and a smooth correction are fitted, and the match is checked against chance.
+Sources that no match explains are refused, never matched wrongly.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from scipy.special import bdtr, pdtrc
+
+from starcal_ros.camera import line_of_sight, project, rotation_jacobian
+from starcal_ros.errors import ImageRefused
+from starcal_ros.identification.polynomial_warp import fit_warp, warp_powers
+from starcal_ros.identification.prediction import in_image, Prediction
+from starcal_ros.image.detection import Sources
+from starcal_ros.records import CameraGeometry
+from starcal_ros.robust_statistics import median, medians
+
+Floats = NDArray[np.float64]
+
+# Brightest predictions and sources that vote: their pairs fill one histogram at once.
+_VOTERS = 100
+_SIDE = 3  # parts of the image along each side, in which a match must hold
+PARTS = _SIDE**2
+_TELLING = 4  # points of a part whose share means anything
+_PART_CHANCE = 1e-3  # greatest probability that a right match misses so many in a part
+_CHANCE = 1e-9  # greatest probability that a match is accepted by chance
+
+
+def acquire(
+    prediction: Prediction,
+    sources: Sources,
+    geometry: CameraGeometry,
+    reach_px: float,
+    roll_rad: float,
+) -> Floats:
+    """
+    Predicted pixels (n, 2) brought onto the sources of the image.
+
+    They may be off by up to ``reach_px``, and rolled by up to ``roll_rad``.
+
+    Raises
+    ------
+    ImageRefused
+        ``no_match`` where no more of them meet a source than chance explains.
+    """
+    turn = _vote(prediction, sources, geometry, reach_px, roll_rad)
+    return _match(prediction, sources, geometry, turn)
+
+
+def _vote(
+    prediction: Prediction,
+    sources: Sources,
+    geometry: CameraGeometry,
+    reach_px: float,
+    roll_rad: float,
+) -> Rotation:
+    """
+    Small rotation of the camera frame that brings the predictions near their sources.
+
+    For each roll within the limit, the pixel offsets of all pairs of bright sources and bright
+    predictions are counted in cells; true pairs share one cell, false ones spread.
+
+    Raises
+    ------
+    ImageRefused
+        ``no_match`` when the best cell holds no more than chance would put there.
+    """
+    camera = geometry.camera
+    half_diagonal_px = 0.5 * np.hypot(camera.width, camera.height)
+    # Wide enough for what the prior focal length and the roll step leave at the edge, but a small
+    # part of what is searched: a cell as large as the search would count everything.
+    cell_px = min(max(3.0, 0.008 * half_diagonal_px), reach_px / 4)
+    half_cells = int(np.ceil(reach_px / cell_px)) + 1
+    roll_step = cell_px / half_diagonal_px
+    roll_steps = int(np.ceil(roll_rad / roll_step))
+    # Nearest to zero first: of equal votes the smallest turn wins.
+    rolls_rad = [k * roll_step for k in sorted(range(-roll_steps, roll_steps + 1), key=abs)]
+
+    centre = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
+    stars = prediction.xy_px[:_VOTERS] - centre
+    seen = sources.xy_px[:_VOTERS] - centre
+    votes, roll, low = _fullest_block(stars, seen, cell_px, half_cells, rolls_rad)
+    expected = len(stars) * len(seen) * (2 * cell_px) ** 2 / sources.searched_px2
+    trials = len(rolls_rad) * (2 * half_cells + 1) ** 2
+    if votes < 4 or pdtrc(votes - 1, expected) * trials > 1e-2:
+        raise ImageRefused(
+            'no_match', f'{votes} of {min(len(stars), len(seen))} bright stars agree, as by chance'
+        )
+    offset = seen[:, None] - _turn(stars, roll)[None]
+    in_block = ((offset >= low) & (offset < low + 2 * cell_px)).all(axis=2)
+    shift_px = medians(offset[in_block])
+    middle = line_of_sight(camera, np.stack([centre, centre + shift_px]))
+    axis = np.cross(middle[0], middle[1])
+    return Rotation.from_rotvec(axis) * Rotation.from_rotvec([0.0, 0.0, roll])
+
+
+def _fullest_block(
+    stars_px: Floats, sources_px: Floats, cell_px: float, half_cells: int, rolls_rad: list[float]
+) -> tuple[int, float, Floats]:
+    """
+    Votes of the two by two cells that most offsets fall into, and their roll and corner.
+
+    ``stars_px`` (n, 2) and ``sources_px`` (m, 2) count from the point of the roll; the corner (2,)
+    is the one of the least offset, px.
+    """
+    cells = 2 * half_cells + 1
+    most, best_roll, best = -1, 0.0, (0, 0)
+    for roll in rolls_rad:
+        offset = sources_px[:, None] - _turn(stars_px, roll)[None]
+        cell = np.floor(offset / cell_px).astype(np.int64).reshape(-1, 2) + half_cells
+        inside = ((cell >= 0) & (cell < cells)).all(axis=1)
+        flat = cell[inside, 1] * cells + cell[inside, 0]
+        votes = np.bincount(flat, minlength=cells * cells).reshape(cells, cells)
+        blocks = votes[:-1, :-1] + votes[1:, :-1] + votes[:-1, 1:] + votes[1:, 1:]
+        k = int(blocks.argmax())
+        if blocks.flat[k] > most:
+            most, best_roll = int(blocks.flat[k]), roll
+            best = k % (cells - 1), k // (cells - 1)
+    return most, best_roll, (np.array(best) - half_cells) * cell_px
+
+
+def _turn(xy_px: Floats, angle_rad: float) -> Floats:
+    """Points (n, 2) turned about the origin from +u towards +v."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.asarray(xy_px @ np.array([[c, s], [-s, c]]))
+
+
+def _pairs(predicted_px: Floats, sources_px: Floats, radius_px: float) -> NDArray[np.int64]:
+    """
+    Pairs (k, 2) of prediction and source that are each other's nearest within a radius.
+
+    Only mutual nearest neighbours count, so no source and no star is used twice.
+    """
+    if len(predicted_px) == 0 or len(sources_px) == 0:
+        return np.empty((0, 2), np.int64)
+    distance, source = cKDTree(sources_px).query(predicted_px, distance_upper_bound=radius_px)
+    star = np.nonzero(np.isfinite(distance))[0]
+    _, back = cKDTree(predicted_px).query(sources_px[source[star]])
+    mutual = back == star
+    return np.stack([star[mutual], source[star[mutual]]], axis=-1)
+
+
+def _refine_rotation(
+    prediction: Prediction,
+    sources: Sources,
+    geometry: CameraGeometry,
+    start: Rotation,
+    stars: NDArray[np.int64],
+) -> tuple[Floats, NDArray[np.int64]]:
+    """
+    Predicted pixels (n, 2) after rotation and focal scale fit the sources, and their pairs (k, 2).
+
+    Robust Gauss-Newton on the small rotation and one common scale, the radius of matching closing
+    in; only ``stars`` (rows of the prediction) and the sources take part.
+    """
+    camera = geometry.camera
+    rotation, scale = start, 1.0
+    pairs: NDArray[np.int64] = np.empty((0, 2), np.int64)
+    centre = camera.parameters[3:5]
+    widest = max(8.0, 0.012 * np.hypot(camera.width, camera.height))
+    for radius_px in (widest, widest, widest, widest / 2, widest / 2, widest / 3, widest / 3):
+        directions = rotation.apply(prediction.direction_camera)
+        xy = (project(camera, directions) - centre) * scale + centre
+        pairs = _pairs(xy[stars], sources.xy_px, radius_px)
+        if len(pairs) < 4:
+            break
+        star = stars[pairs[:, 0]]
+        residual = sources.xy_px[pairs[:, 1]] - xy[star]
+        J_rotation = rotation_jacobian(camera, directions[star])
+        J = np.concatenate([scale * J_rotation, (xy[star] - centre)[:, :, None]], axis=-1)
+        size = np.linalg.norm(residual, axis=1)
+        weight = 1.0 / (1.0 + (size / max(median(size), 0.3)) ** 2)
+        root = np.sqrt(weight)[:, None]
+        step = np.linalg.lstsq(
+            (J * root[:, :, None]).reshape(-1, 4), (residual * root).ravel(), rcond=1e-10
+        )[0]
+        rotation = Rotation.from_rotvec(-step[:3]) * rotation
+        scale = float(np.clip(scale * (1.0 + step[3]), 0.75, 1.3))
+    directions = rotation.apply(prediction.direction_camera)
+    xy = (project(camera, directions) - centre) * scale + centre
+    return xy, pairs
+
+
+def _match(
+    prediction: Prediction, sources: Sources, geometry: CameraGeometry, turn: Rotation
+) -> Floats:
+    """
+    Predicted pixels (n, 2) refined onto the sources, once the match is beyond chance.
+
+    Raises
+    ------
+    ImageRefused
+        ``no_match`` when the refined predictions meet no more sources than chance explains.
+    """
+    camera = geometry.camera
+    # As many predictions as sources and the other way round: the fainter surplus matches nothing.
+    bright = np.arange(min(len(prediction.xy_px), 4 * len(sources.snr), 400))
+    first = 4 * len(bright)
+    seen = dataclasses.replace(sources, xy_px=sources.xy_px[:first], snr=sources.snr[:first])
+    xy, pairs = _refine_rotation(prediction, seen, geometry, turn, bright)
+    half_px = 0.5 * max(camera.width, camera.height)
+    for radius_px in (max(4.0, 0.003 * half_px * 2), 3.0, 2.0):
+        if len(pairs) < 4:
+            break
+        correction, _ = fit_warp(
+            xy[bright[pairs[:, 0]]],
+            seen.xy_px[pairs[:, 1]],
+            np.full(len(pairs), 0.2),
+            xy,
+            half_px,
+        )
+        pairs = _pairs((xy + correction)[bright], seen.xy_px, radius_px)
+    if len(pairs) >= 4:
+        xy = xy + correction
+    # Rotation, scale and warp were fitted to the pairs: two parameters can buy one pair.
+    bought = 2 + len(warp_powers(len(pairs)))
+    _check_beyond_chance(xy[bright], seen, bought, camera.width, camera.height)
+    return xy
+
+
+def _check_beyond_chance(
+    predicted_px: Floats, sources: Sources, bought: int, width: int, height: int
+) -> None:
+    """
+    Nothing, where more predictions (n, 2) meet a source than chance explains.
+
+    ``bought`` is how many may meet one because a fit has bent them there.
+
+    Raises
+    ------
+    ImageRefused
+        ``no_match``.
+    """
+    inside = in_image(predicted_px, width, height)
+    radius_px = 2.0
+    met = _pairs(predicted_px[inside], sources.xy_px, radius_px)
+    matched = len(met)
+    density = len(sources.snr) / sources.searched_px2
+    tried = int(np.count_nonzero(inside))
+    expected = tried * -np.expm1(-density * np.pi * radius_px**2)
+    few = max(6, 1 + bought)
+    if matched < few or pdtrc(matched - 1 - bought, expected) > _CHANCE:
+        raise ImageRefused(
+            'no_match',
+            f'{matched} of {tried} predicted stars meet a source, {expected:.0f} would by chance',
+        )
+    if _matched_in_part(sources, met[:, 1], width, height):
+        raise ImageRefused('no_match', 'stars agree in a part of the image only')
+
+
+def _matched_in_part(sources: Sources, met: NDArray[np.int64], width: int, height: int) -> bool:
+    """
+    Whether the bright sources of most parts of the image meet far fewer predictions than of one.
+
+    ``met`` are the sources that meet one.  In a crowded field a wrong scale or shape can be right
+    in one part and chance in the others, and beyond chance in all.  A part without stars, behind a
+    cloud, shows no sources and says nothing.
+    """
+    bright = sources.snr >= median(sources.snr[met])
+    meets = np.zeros(len(sources.snr), bool)
+    meets[met] = True
+    part = part_of(sources.xy_px, width, height)
+    shown = np.bincount(part[bright], minlength=PARTS)
+    found = np.bincount(part[bright & meets], minlength=PARTS)
+    missed = missed_parts(shown, found)
+    return bool(2 * np.count_nonzero(missed) > np.count_nonzero(shown >= _TELLING))
+
+
+def part_of(xy_px: Floats, width: int, height: int) -> NDArray[np.int64]:
+    """Number (n,) of the part of the image, below `PARTS`, that points (n, 2) stand in."""
+    cell = np.clip((xy_px * _SIDE / [width, height]).astype(np.int64), 0, _SIDE - 1)
+    return np.asarray(cell[:, 1] * _SIDE + cell[:, 0])
+
+
+def best_share(shown: NDArray[np.int64], found: NDArray[np.int64]) -> float:
+    """Share found of the points shown (PARTS,) in the part where it is largest."""
+    return float((found / (shown + 1.0)).max(where=shown >= _TELLING, initial=0.0))
+
+
+def missed_parts(shown: NDArray[np.int64], found: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Parts (PARTS,) in which far fewer are found of the points shown than in the best one."""
+    told = shown >= _TELLING
+    if np.count_nonzero(told) < 2:
+        return np.zeros_like(told)
+    best = best_share(shown, found)
+    # Not by a little: a cosmic ray is several sources in one place.
+    few = (bdtr(found, shown, best) < _PART_CHANCE) & (found < best / 3 * shown)
+    return np.asarray(told & few)

@@ -1,0 +1,92 @@
+"""
+Whether the stars of an image are as bright as the catalog says.
+
+Where stars are many, or a part of a field agrees with another field, places can meet by chance.
+Brightnesses then do not: they are a second witness that the search of places has not heard.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.errors import ImageRefused
+from starcal_ros.identification.acquisition import best_share, missed_parts, part_of, PARTS
+from starcal_ros.image.centroiding import Centroids, ImageModel
+from starcal_ros.image.psf_fit import expected_snr
+from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
+
+Floats = NDArray[np.float64]
+
+_FEWEST = 4  # stars whose scatter, or the share of which, means anything
+# A camera's band is not V: stars of a real sky scatter by 0.15 to 0.3 mag, none of 2000 was off
+# by 1.5; a lens may dim its corners by 1.  Stars met by chance scatter by 1.0 to 1.7 mag.
+_MOST_OFF = 2.0  # of one star, in the largest scatter of all
+
+
+def refuse_unlike(
+    magnitude: NDArray[np.floating],
+    predicted_px: Floats,
+    centroids: Centroids,
+    model: ImageModel,
+    min_snr: float,
+    max_scatter_mag: float,
+    shape: tuple[int, int],
+) -> NDArray[np.str_]:
+    """
+    Refusals (n,) of stars whose brightness, or lack of it, contradicts the match.
+
+    A good star that is brighter or fainter than the others make it is ``ambiguous``.  A faint one
+    that should not be is ``not_detected``.  Where a part of the image misses almost all that
+    should be there while another has its stars, the few in parts like it are ``ambiguous`` too.
+
+    Parameters
+    ----------
+    magnitude, predicted_px : (n,), (n, 2)
+        What the catalog says of the stars.
+    min_snr : float
+        From which a star is no more faint.
+    max_scatter_mag : float
+        Largest scatter of brightnesses that are those of the catalog.
+    shape : (int, int)
+        Height and width of the image.
+
+    Raises
+    ------
+    ImageRefused
+        ``no_match`` where the brightnesses of most stars contradict it.
+    """
+    refusal = centroids.refusal.copy()
+    good = np.flatnonzero(refusal == '')
+    if len(good) < _FEWEST:
+        return refusal
+    zero_point = magnitude[good] + 2.5 * np.log10(centroids.flux_dn[good])
+    off_mag = np.abs(zero_point - median(zero_point))
+    scatter_mag = MAD_TO_SIGMA * median(off_mag)
+    if scatter_mag > max_scatter_mag:
+        raise ImageRefused(
+            'no_match',
+            f'{len(good)} stars stand where catalog stars should,'
+            f' but their brightnesses scatter by {scatter_mag:.1f} mag',
+        )
+    most_mag = max(_MOST_OFF * max_scatter_mag, 5.0 * scatter_mag)
+    refusal[good[off_mag > most_mag]] = 'ambiguous'
+    # Even so much fainter they would be seen.
+    faintest = median(zero_point) - most_mag
+    least_dn = 10.0 ** (0.4 * (faintest - magnitude.astype(np.float64)))
+    psf_sigma_px, noise_dn = model.psf_sigma_px or 1.0, model.background.noise_dn
+    seen = expected_snr(least_dn, psf_sigma_px, noise_dn, model.pixel_noise) > min_snr
+    refusal[seen & (refusal == 'faint')] = 'not_detected'
+    kept = refusal == ''
+    gone = seen & ((refusal == 'not_detected') | (refusal == 'ambiguous'))
+    if np.count_nonzero(gone) < _FEWEST - 1:
+        return refusal
+    height, width = shape
+    part = part_of(predicted_px, width, height)
+    found = np.bincount(part[seen & kept], minlength=PARTS)
+    shown = found + np.bincount(part[gone], minlength=PARTS)
+    if missed_parts(shown, found).any():
+        # Then a part has to prove itself: by half of what the best one finds.
+        believed = (shown > 0) & (found >= 0.5 * best_share(shown, found) * shown)
+        refusal[kept & ~believed[part]] = 'ambiguous'
+    return refusal

@@ -1,0 +1,328 @@
+"""
+Where light stands in an image: background, and star-like sources above it.
+
+Nothing here knows which star is which, nor measures one to better than a fifth of a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from starcal_ros.robust_statistics import median, medians
+
+Floats = NDArray[np.float64]
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+_MESH_PX = 64  # glare and vignetting vary slowly over it
+_MESH_STEP_PX = (4, 4)  # down and across: 256 samples of a cell give its noise to 5 %
+_SPARSE_PX = 256
+_SPARSE_STEP_PX = (32, 8)  # a row that is read is read whole: few rows, many of their pixels
+_DETECTION_SIGMA_PX = (
+    1.0  # matched filter of detection; 0.7 to 1.5 px stars lose under 10 % of S/N
+)
+# A Gaussian filter of sigma s leaves white noise at 1 / (2 s sqrt(pi)) of its strength.
+_NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
+_ALONG_U, _ALONG_V = np.array([[[1], [0]], [[0], [1]]])  # a step along either axis, (2, 1)
+_RIM_PX = 4  # the filter's own reach, and one pixel for the place of the maximum
+_HOT_PEAK_RATIO = 4.0  # peak over filtered peak: 6.3 for one lit pixel, 2.7 for a 0.7 px star
+
+
+@dataclass(frozen=True)
+class Background:
+    """
+    Background level and 1-sigma noise on a coarse mesh, DN, with what the whole image shows.
+
+    ``level_mesh`` and ``noise_mesh`` are (rows, cols) float32 over equal parts of the image.
+    """
+
+    level_mesh: NDArray[np.float32]
+    noise_mesh: NDArray[np.float32]
+    level_dn: float
+    noise_dn: float
+
+
+@dataclass(frozen=True)
+class Sources:
+    """
+    Star-like local maxima of an image, brightest first.
+
+    ``xy_px`` (n, 2); ``snr`` (n,); ``searched_px2`` the area of the image that was looked at.
+    """
+
+    xy_px: Floats
+    snr: Floats
+    searched_px2: float
+
+
+def measure_background(pixels: Pixels) -> Background:
+    """
+    Background level and noise of an image from the median and the clipped spread of each cell.
+
+    One pixel in sixteen is read.  The noise is at least that of the quantisation to whole DN.
+    """
+    samples, mesh_shape = _cells(pixels, _MESH_PX, _MESH_STEP_PX)
+    samples.sort(axis=1)
+    count = samples.shape[1]
+    median = samples[:, count // 2].copy()
+    # Below the median lies no star: the lower quantiles alone give the spread.
+    spread = median - samples[:, int(count * 0.1587)]
+    samples -= median[:, None]
+    mean, noise = _clipped(samples, spread)
+    return _background(mean + median, noise, mesh_shape)
+
+
+def sample_background(pixels: Pixels) -> Background:
+    """
+    Background level and noise of an image from one pixel in 128, for fits that find their level.
+
+    The noise is that of the differences of near pixels, which a gradient in the large cells does
+    not touch.
+    """
+    samples, mesh_shape = _cells(pixels, _SPARSE_PX, _SPARSE_STEP_PX)
+    beside, _ = _cells(pixels[:, 2:], _SPARSE_PX, _SPARSE_STEP_PX, mesh_shape)
+    width = min(samples.shape[1], beside.shape[1])
+    apart = samples[:, :width] - beside[:, :width]
+    rank = int(width * 0.6827)
+    _, noise = _clipped(apart, np.partition(np.abs(apart), rank, axis=1)[:, rank])
+    level = medians(samples[:, ::4].T).astype(np.float32)
+    return _background(level, noise / math.sqrt(2.0), mesh_shape)
+
+
+def _cells(
+    pixels: Pixels,
+    cell_px: int,
+    step_px: tuple[int, int],
+    mesh_shape: tuple[int, int] | None = None,
+) -> tuple[NDArray[np.float32], tuple[int, int]]:
+    """Every so many pixels of equal cells of an image, one row for each cell; rows, columns."""
+    height, width = pixels.shape
+    rows, cols = mesh_shape or (max(1, height // cell_px), max(1, width // cell_px))
+    cell_v, cell_u = height // rows, width // cols
+    cells = pixels[: rows * cell_v, : cols * cell_u].reshape(rows, cell_v, cols, cell_u)
+    down, across = step_px
+    thinned = cells[:, ::down, :, ::across].transpose(0, 2, 1, 3)
+    return thinned.reshape(rows * cols, -1).astype(np.float32), (rows, cols)
+
+
+def _clipped(
+    samples: NDArray[np.float32], spread: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and 1-sigma of the rows of samples about zero, without those beyond three spreads."""
+    inside = np.abs(samples) <= 3.0 * np.maximum(spread, 1.0)[:, None]
+    kept = np.maximum(np.count_nonzero(inside, axis=1), 1)
+    samples = samples * inside
+    mean = samples.sum(axis=1) / kept
+    variance = np.einsum('ij,ij->i', samples, samples) / kept - mean**2
+    # 0.9733 of the variance of a normal distribution lies within 3 sigma.
+    return mean, np.sqrt(np.maximum(variance, 0.0) / 0.9733)
+
+
+def _background(
+    level: NDArray[np.float32], noise: NDArray[np.float32], mesh_shape: tuple[int, int]
+) -> Background:
+    """Smooth level and noise of the cells; no noise is under that of rounding to whole DN."""
+    level_mesh = _smooth_mesh(level.reshape(mesh_shape))
+    noise_mesh = _smooth_mesh(np.maximum(noise, math.sqrt(1.0 / 12.0)).reshape(mesh_shape))
+    return Background(level_mesh, noise_mesh, median(level_mesh), median(noise_mesh))
+
+
+def _smooth_mesh(mesh: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the mesh after a 3 x 3 median, which takes out cells that hold a bright star."""
+    mesh = np.ascontiguousarray(mesh, np.float32)
+    return np.asarray(cv2.medianBlur(mesh, 3), np.float32) if min(mesh.shape) >= 3 else mesh
+
+
+def sample_mesh(mesh: NDArray[np.float32], shape: tuple[int, int], xy_px: Floats) -> Floats:
+    """Values (n,) of a mesh over an image of ``shape`` at pixels (n, 2), bilinear."""
+    rows, cols = mesh.shape
+    row = (xy_px[:, 1] + 0.5) * rows / shape[0] - 0.5
+    column = (xy_px[:, 0] + 0.5) * cols / shape[1] - 0.5
+    # SciPy's, as cv2.remap takes at most 32767 points.
+    return np.asarray(map_coordinates(mesh, [row, column], np.float64, order=1, mode='nearest'))
+
+
+def detect(pixels: Pixels, background: Background, detection_sigma: float) -> Sources:
+    """
+    Star-like sources of an image above a signal-to-noise ratio, brightest first.
+
+    Local maxima of the background-free image under a Gaussian matched filter; single lit pixels
+    (hot pixels, cosmic rays) are left out by their sharpness.  Positions are good to about 0.2 px.
+    """
+    height, width = pixels.shape
+    level = cv2.resize(background.level_mesh, (width, height), interpolation=cv2.INTER_LINEAR)
+    image: NDArray[np.float32] = np.subtract(pixels, level, dtype=np.float32)
+    filtered: NDArray[np.float32] = np.asarray(
+        cv2.GaussianBlur(image, (0, 0), _DETECTION_SIGMA_PX, borderType=cv2.BORDER_REFLECT),
+        np.float32,
+    )
+    lowest = detection_sigma * _NOISE_LEFT * float(background.noise_mesh.min())
+    # Few pixels pass the lowest threshold: everything after looks at those alone.
+    v, u = np.nonzero(filtered > lowest)
+    inner = (u >= 2) & (u < width - 2) & (v >= 2) & (v < height - 2)
+    v, u = v[inner], u[inner]
+    centre = filtered[v, u]
+    noise = sample_mesh(
+        background.noise_mesh, (height, width), np.stack([u, v], axis=-1).astype(np.float64)
+    )
+    keep = centre > detection_sigma * _NOISE_LEFT * noise
+    for dv in (-1, 0, 1):
+        for du in (-1, 0, 1):
+            if (dv, du) != (0, 0):
+                other = filtered[v + dv, u + du]
+                keep &= centre >= other if (dv, du) > (0, 0) else centre > other
+    v, u, centre, noise = v[keep], u[keep], centre[keep], noise[keep]
+    sharp = image[v, u] > _HOT_PEAK_RATIO * centre
+    v, u, centre, noise = v[~sharp], u[~sharp], centre[~sharp], noise[~sharp]
+    place = _parabola_vertex(
+        filtered[v - _ALONG_V, u - _ALONG_U], centre, filtered[v + _ALONG_V, u + _ALONG_U]
+    )
+    order = np.argsort(-centre, kind='stable')
+    xy = place.T + np.stack([u, v], axis=-1)
+    snr = (centre / (_NOISE_LEFT * noise)).astype(np.float64)
+    return Sources(xy[order], snr[order], float(width * height))
+
+
+def detect_near(
+    pixels: Pixels,
+    background: Background,
+    predicted_px: Floats,
+    reach_px: int,
+    detection_sigma: float,
+) -> Sources:
+    """
+    The brightest star-like source in a square window about each predicted pixel (n, 2).
+
+    The paper's way ("Extracting star centroids"): its cost does not grow with the image.  Same
+    filter, threshold and rejection of single lit pixels as `detect`; a source that several windows
+    share is listed once.
+    """
+    shape = (pixels.shape[0], pixels.shape[1])
+    centre = np.rint(predicted_px).astype(np.int64)
+    inside = windows_inside(shape, centre, reach_px + _RIM_PX)
+    xy, snr = _brightest(pixels, background, centre[inside], reach_px)
+    good = snr > detection_sigma
+    nearest = np.rint(xy).astype(np.int64)
+    _, first = np.unique(nearest[:, 1] * shape[1] + nearest[:, 0], return_index=True)
+    once = np.zeros(len(xy), bool)
+    once[first] = True
+    good &= once
+    order = np.nonzero(good)[0]
+    order = order[np.argsort(-snr[order], kind='stable')]
+    area = min(len(xy) * (2 * reach_px + 1) ** 2, shape[0] * shape[1])
+    return Sources(xy[order], snr[order], float(area))
+
+
+def brightest_near(
+    pixels: Pixels,
+    background: Background,
+    predicted_px: Floats,
+    reach_px: int,
+    detection_sigma: float,
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """
+    Place (n, 2) of the brightest source in a window about each predicted pixel, and if there is.
+
+    As `detect_near`, but row by row.  The windows must lie in the image with 4 px to spare.
+    """
+    centre = np.rint(predicted_px).astype(np.int64)
+    xy, snr = _brightest(pixels, background, centre, reach_px)
+    return xy, snr > detection_sigma
+
+
+def _brightest(
+    pixels: Pixels, background: Background, centre: NDArray[np.int64], reach_px: int
+) -> tuple[Floats, Floats]:
+    """Place (n, 2) and signal-to-noise (n,) of the star-like maximum of windows; 0 for none."""
+    shape = (pixels.shape[0], pixels.shape[1])
+    half = reach_px + _RIM_PX
+    windows = windows_about(pixels, centre, half).astype(np.float32)
+    level = sample_mesh(background.level_mesh, shape, centre.astype(np.float64))
+    windows -= level[:, None, None].astype(np.float32)
+    filtered = np.zeros_like(windows)
+    if len(windows):
+        # One above the other: what the filter takes over the joints stays in the rim.
+        cv2.GaussianBlur(
+            windows.reshape(-1, 2 * half + 1),
+            (7, 7),
+            _DETECTION_SIGMA_PX,
+            dst=filtered.reshape(-1, 2 * half + 1),
+        )
+    within = slice(_RIM_PX, _RIM_PX + 2 * reach_px + 1)
+    side = 2 * reach_px + 1
+    best = filtered[:, within, within].reshape(len(centre), side * side).argmax(axis=1)
+    v, u = best // side + _RIM_PX, best % side + _RIM_PX
+    n = np.arange(len(centre))
+    peak = filtered[n, v, u]
+    place = _parabola_vertex(
+        filtered[n, v - _ALONG_V, u - _ALONG_U], peak, filtered[n, v + _ALONG_V, u + _ALONG_U]
+    )
+    xy = centre + np.stack([u, v], axis=-1) - half
+    noise = sample_mesh(background.noise_mesh, shape, xy.astype(np.float64))
+    # At the rim of the window it is the flank of something outside.
+    star_like = (np.abs(xy - centre) < reach_px).all(axis=1)
+    star_like &= windows[n, v, u] < _HOT_PEAK_RATIO * peak
+    snr = np.where(star_like, peak / (_NOISE_LEFT * noise), 0.0)
+    return xy + place.T, snr
+
+
+def _parabola_vertex(
+    before: NDArray[np.floating], centre: NDArray[np.floating], after: NDArray[np.floating]
+) -> Floats:
+    """Place of the maximum of the parabola through three equidistant values, in their step."""
+    curvature = 2 * centre - before - after
+    vertex = 0.5 * (after - before) / np.maximum(curvature, 1e-12)
+    return np.asarray(vertex.clip(-0.5, 0.5), np.float64)
+
+
+def windows_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Pixels:
+    """Square windows (n, 2 radius + 1, 2 radius + 1) about integer pixels (n, 2), inside."""
+    side = 2 * radius + 1
+    # The types of NumPy forget what the pixels are.
+    every: Any = np.lib.stride_tricks.sliding_window_view(pixels, (side, side))
+    windows: Pixels = every[centre[:, 1] - radius, centre[:, 0] - radius]
+    return windows
+
+
+def stamps_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Floats:
+    """As `windows_about`, to reckon with."""
+    return windows_about(pixels, centre, radius).astype(np.float64)
+
+
+def stamps_at_edges(
+    pixels: Pixels, centre: NDArray[np.int64], radius: int
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """
+    As `stamps_about`, for windows that may leave the image, and which of their pixels do.
+
+    What lies outside repeats the pixel at the edge.
+    """
+    shape = (pixels.shape[0], pixels.shape[1])
+    largest = np.array([shape[1] - 1, shape[0] - 1])
+    stamps = stamps_about(pixels, np.clip(centre, radius, largest - radius), radius)
+    outside = np.zeros(stamps.shape, bool)
+    leaves = np.nonzero(~windows_inside(shape, centre, radius))[0]
+    if len(leaves):
+        reach = np.arange(-radius, radius + 1)
+        u, v = (centre[leaves, axis, None] + reach for axis in (0, 1))
+        outside[leaves] = ((u < 0) | (u > largest[0]))[:, None] | ((v < 0) | (v > largest[1]))[
+            :, :, None
+        ]
+        u, v = np.clip(u, 0, largest[0]), np.clip(v, 0, largest[1])
+        stamps[leaves] = pixels[v[:, :, None], u[:, None]]
+    return stamps, outside
+
+
+def windows_inside(
+    shape: tuple[int, int], centre: NDArray[np.int64], radius: int
+) -> NDArray[np.bool_]:
+    """Return (n,) whether a window about each integer pixel lies within the image."""
+    height, width = shape
+    u, v = centre[:, 0], centre[:, 1]
+    return (u >= radius) & (u < width - radius) & (v >= radius) & (v < height - radius)

@@ -1,0 +1,286 @@
+"""
+Whether a frame as a whole can be measured, judged before any star is looked for.
+
+A sample of rows, each with the row below it, tells all that is asked here: 5 % of the pixels of a
+five-megapixel frame.  Noise makes a row of a sound frame unlike every other row, of any frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import functools
+import hashlib
+import math
+from typing import Any
+import zlib
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import ImageRefused
+from starcal_ros.options import option
+from starcal_ros.records import Image
+from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
+
+Floats = NDArray[np.float64]
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+_ROWS = 64
+_GOLDEN = 0.618034
+_BELOW_STEP_PX = 8  # of the row below, which is compared only
+_SEGMENT_PX = 64  # a piece of a row: as wide as a cell in which a background is taken as flat
+# Where converters of 8 to 16 bits end, in the low or in the high bits of 16.
+_ENDS_DN = (255, 1023, 4095, 16383, 65472, 65520, 65532, 65535)
+
+
+@dataclass(frozen=True)
+class ScreeningOptions:
+    """What makes a frame unfit as a whole."""
+
+    max_saturated_fraction: float = option(
+        0.2, 'largest part of an image that is saturated', low=0.0, high=1.0
+    )
+    max_lost_fraction: float = option(
+        0.02,
+        'largest part of an image without its pixels: constant, repeated or of an image before',
+        low=0.0,
+        high=1.0,
+    )
+    max_gradient: float = option(
+        0.05,
+        'steepest background that more than half of an image may have, in pixel noise per pixel',
+        low=0.0,
+        high=100.0,
+    )
+
+
+@dataclass(frozen=True)
+class Fingerprint:
+    """
+    What a frame is known by when it comes again.
+
+    ``rows`` (k,) are checksums of the rows that hold noise, 0 of the others; ``whole`` is a digest
+    of all pixels where no row does, else empty.
+    """
+
+    time_ns: int
+    rows: NDArray[np.uint32]
+    whole: bytes
+
+
+@dataclass(frozen=True)
+class RowSample:
+    """
+    Every so many rows of a frame.
+
+    ``row`` (k,) their numbers, ``step`` their mean distance; ``pixels`` (k, width) they, and
+    ``below`` every eighth pixel of the rows below them;
+    ``noisy`` (k, m) whether a segment holds noise; ``constant`` (k, m) whether all its pixels have
+    one value.
+    """
+
+    row: NDArray[np.int64]
+    step: int
+    pixels: Pixels
+    below: Pixels
+    noisy: NDArray[np.bool_]
+    constant: NDArray[np.bool_]
+
+    @functools.cached_property
+    def telling(self) -> NDArray[np.bool_]:
+        """Rows (k,) that no other row equals by chance."""
+        return np.asarray(self.noisy.mean(axis=1) >= 0.5)
+
+
+def sample_rows(pixels: Pixels) -> RowSample:
+    """Rows of a frame (height, width), each with the row below it."""
+    height = len(pixels)
+    step = max(1, height // _ROWS)
+    count = max(1, (height - 1) // step)
+    # Spread within their steps, so that packets lost at a regular distance do not all fall
+    # between; the same in each quarter, so that a quarter that is shown twice is known again.
+    within = (np.arange(count) % (_ROWS // 4)) * _GOLDEN % 1.0
+    row = np.arange(count) * step + (within * step).astype(np.int64)
+    picked = pixels[row]
+    segments = _segments(picked)
+    unlike = _mean_of_each(segments != segments[:, :, :1])
+    return RowSample(
+        row=row,
+        pixels=picked,
+        below=pixels[np.minimum(row + 1, height - 1), ::_BELOW_STEP_PX],
+        step=step,
+        # A quarter, less what a mean is rounded by: noise of a third of the quantisation step
+        # gives it, a star or two do not.
+        noisy=unlike > 0.249,
+        constant=unlike == 0.0,
+    )
+
+
+def _segments(rows: Pixels) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Rows (k, width) cut into segments (k, m, length), without what is left over at the end."""
+    k, width = rows.shape
+    length = min(_SEGMENT_PX, width)
+    count = width // length
+    return rows[:, : count * length].reshape(k, count, length)
+
+
+def _means(rows: Pixels) -> NDArray[np.float32]:
+    """Means (k, m) of the segments of rows."""
+    return _mean_of_each(_segments(rows))
+
+
+def _mean_of_each(segments: NDArray[Any]) -> NDArray[np.float32]:
+    """Means (k, m) of (k, m, length)."""
+    length = segments.shape[2]
+    # As a product: the sum of many short rows of whole numbers takes ten times as long.
+    return segments.astype(np.float32) @ np.full(length, 1.0 / length, np.float32)
+
+
+def fingerprint(image: Image, sample: RowSample) -> Fingerprint:
+    """What a frame is known by when it comes again."""
+    telling = sample.telling
+    rows = np.array([zlib.crc32(row) for row in sample.pixels], np.uint32) * telling
+    # Without noise a few rows may well be those of another frame: only all pixels tell.
+    whole = b'' if telling.any() else hashlib.blake2b(image.pixels.tobytes()).digest()
+    return Fingerprint(image.time_ns, rows, whole)
+
+
+def screen(
+    sample: RowSample,
+    seen: Fingerprint,
+    before: Fingerprint | None,
+    saturation_dn: float,
+    dark: Pixels | None,
+    options: ScreeningOptions,
+) -> None:
+    """
+    Refuse a frame that cannot be measured.
+
+    Parameters
+    ----------
+    before : Fingerprint or None
+        Of the frame before, whether it was used or not.
+    saturation_dn : float
+        Pixel value from which a pixel counts as saturated; 0: the end of the converter's range.
+    dark : (height, width) or None
+        Its slopes are no glare.
+
+    Raises
+    ------
+    ImageRefused
+        ``overexposed``, ``blank``, ``frozen``, ``incomplete`` or ``glare``.
+    """
+    saturated = _saturated(sample, saturation_dn, options)
+    if sample.constant.all() and np.ptp(sample.pixels) == 0:
+        raise ImageRefused('blank', f'every pixel is {int(sample.pixels[0, 0])}')
+    if before is not None:
+        _refuse_repeated(seen, before, options)
+    _refuse_incomplete(sample, seen, saturated, options)
+    _refuse_glare(sample, dark, options)
+
+
+def _saturated(
+    sample: RowSample, saturation_dn: float, options: ScreeningOptions
+) -> NDArray[np.bool_]:
+    """Segments (k, m) that are saturated throughout, unless the frame is refused."""
+    peak = int(sample.pixels.max())
+    if not saturation_dn:
+        saturation_dn = 0.98 * peak if peak in _ENDS_DN else peak + 1.0
+    # Whole numbers: against a float every pixel would be made one.
+    least_dn = math.ceil(saturation_dn)
+    if least_dn > peak:
+        return np.zeros(sample.constant.shape, bool)
+    part = np.count_nonzero(sample.pixels >= least_dn) / sample.pixels.size
+    if part > options.max_saturated_fraction:
+        raise ImageRefused('overexposed', f'{part:.0%} of the pixels are at {saturation_dn:.0f}')
+    return np.asarray(_segments(sample.pixels).min(axis=2) >= least_dn)
+
+
+def _refuse_repeated(seen: Fingerprint, before: Fingerprint, options: ScreeningOptions) -> None:
+    """Refuse what the frame before has shown: all of it, or some rows."""
+    if len(before.rows) != len(seen.rows):
+        return
+    since_s = (seen.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
+    telling = seen.rows != 0
+    same = telling & (before.rows == seen.rows)
+    everywhere = telling.any() and same.sum() == telling.sum()
+    if everywhere or (seen.whole and seen.whole == before.whole):
+        if since_s == 0.0:
+            return  # the same frame delivered twice is no camera that is stuck
+        raise ImageRefused('frozen', f'the pixels of the image {since_s:.3f} s before')
+    part = float(same.mean())
+    if part > options.max_lost_fraction:
+        detail = f'{part:.0%} of its rows are of the image {since_s:.3f} s before'
+        raise ImageRefused('incomplete', detail)
+
+
+def _refuse_incomplete(
+    sample: RowSample,
+    seen: Fingerprint,
+    saturated: NDArray[np.bool_],
+    options: ScreeningOptions,
+) -> None:
+    """Refuse a frame of which a part did not come through."""
+    telling = sample.telling
+    _, first = np.unique(seen.rows, return_index=True)
+    again = np.ones(len(telling), bool)
+    again[first] = False
+    again |= (sample.pixels[:, ::_BELOW_STEP_PX] == sample.below).all(axis=1)
+    repeated = float((telling & again).mean())
+    if repeated > options.max_lost_fraction:
+        raise ImageRefused('incomplete', f'{repeated:.0%} of its rows repeat others')
+    values = _segments(sample.pixels)[:, :, 0].astype(np.float64)
+    alive = ~sample.constant
+    if alive.all() or not alive.any():
+        return
+    # A dark sky that the converter cuts off at zero is constant too, but fades into noise.
+    off_px = np.abs(values - median(values[alive])) > 5.0 * _noise_dn(sample, alive)
+    sharp = sample.noisy[alive].mean() > 0.9
+    lost = float((sample.constant & ~saturated & (off_px | sharp)).mean())
+    if lost > options.max_lost_fraction:
+        raise ImageRefused('incomplete', f'{lost:.0%} of it is constant')
+
+
+def _noise_dn(sample: RowSample, alive: NDArray[np.bool_]) -> float:
+    """1-sigma noise of a pixel, from differences to the pixel below: no slope enters them."""
+    # One of a segment: 2500 of five megapixels tell the noise to 2 %.
+    here = _segments(sample.pixels)[:, :, 0].astype(np.int32)
+    below = sample.below[:, :: _SEGMENT_PX // _BELOW_STEP_PX][:, : here.shape[1]]
+    spread = median(np.abs(here - below)[alive])
+    # The second is the noise of rounding to whole DN.
+    return max(MAD_TO_SIGMA * spread / math.sqrt(2.0), math.sqrt(1.0 / 12.0))
+
+
+def _refuse_glare(sample: RowSample, dark: Pixels | None, options: ScreeningOptions) -> None:
+    """Refuse a frame whose background is steep over more than half of it."""
+    gradient = background_gradient(sample, dark)
+    if gradient > options.max_gradient:
+        raise ImageRefused(
+            'glare', f'the background rises by {gradient:.2f} of its noise per pixel'
+        )
+
+
+def background_gradient(sample: RowSample, dark: Pixels | None = None) -> float:
+    """
+    Median slope of the background over a frame, in pixel noise per pixel.
+
+    A slope g pulls the centroid of a star of any flux by up to 5 sigma_px^2 g of its own sigma
+    (Gaussian of width sigma_px, white noise) where the fit does not know of it.
+    """
+    level = _means(sample.pixels)
+    if dark is not None:
+        level -= _means(dark[sample.row])
+    height = len(level) * sample.step
+    rows = max(1, height // _SEGMENT_PX)
+    mesh = cv2.resize(level, (level.shape[1], rows), interpolation=cv2.INTER_AREA)
+    mesh = mesh.reshape(rows, level.shape[1])
+    if min(mesh.shape) < 3:
+        return 0.0  # too small to tell a slope from its stars
+    # A 3 x 3 median takes out what holds a bright star.
+    mesh = np.asarray(cv2.medianBlur(mesh, 3), np.float32)
+    down = (mesh[2:, 1:-1] - mesh[:-2, 1:-1]) * (0.5 * rows / height)
+    across = (mesh[1:-1, 2:] - mesh[1:-1, :-2]) * (0.5 / _SEGMENT_PX)
+    everywhere = np.ones(sample.constant.shape, bool)
+    return median(np.hypot(down, across)) / _noise_dn(sample, everywhere)

@@ -1,0 +1,182 @@
+"""
+Hot pixels: from a dark frame, and learnt from images as the stars move over the detector.
+
+A single lit pixel that is lit again after the sky has moved on belongs to the detector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.options import option
+from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+_SCANNED_PX = 1 << 19  # of one image, in 0.1 ms; larger images are scanned in turns
+_MOVED_PX = 5.0  # the light of a star that has moved so far has left its pixels
+SPILT = 0.2  # mean of the four next pixels over the peak: 0.24 for a star of 0.45 px
+_BESIDE = np.array([[1, -1, 0, 0], [0, 0, 1, -1]])[:, :, None]  # rows and columns away
+CORE_PX = 1.5  # a star on a hot pixel itself has lost its peak
+_WIDE_PSF_PX = 1.5  # no pixel of a star so wide holds 7 % of its light: the fit goes without it
+_MOST = 100_000  # a detector with more has another fault, and the list stays small
+
+
+@dataclass(frozen=True)
+class FixedPatternOptions:
+    """What counts as a hot pixel."""
+
+    hot_pixel_sigma: float = option(
+        10.0,
+        'how far above the background a single pixel must stand, in pixel noise, to be hot: in '
+        'the dark frame, or at the same place in two images between which the stars have moved',
+        low=3.0,
+        high=10000.0,
+    )
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Single lit pixels of one part of the detector, sorted, and where the camera looked."""
+
+    lit: Indices
+    icrf_from_camera: Rotation
+
+
+@dataclass(frozen=True)
+class HotPixels:
+    """
+    What is known of a detector's hot pixels.
+
+    ``index`` (n,) are their numbers, row by row from 0, sorted; ``strips`` the parts of the
+    detector as they were last seen, and ``turn`` which of them is to be looked at next.
+    """
+
+    index: Indices
+    strips: tuple[Strip | None, ...] = ()
+    turn: int = 0
+
+
+NO_HOT_PIXELS = HotPixels(np.empty(0, np.int64))
+
+
+def hot_in_dark(dark: Pixels | None, options: FixedPatternOptions) -> HotPixels:
+    """Hot pixels of a dark frame: those far above its median, by the spread of all its pixels."""
+    if dark is None:
+        return NO_HOT_PIXELS
+    level = median(dark)
+    spread = MAD_TO_SIGMA * median(np.abs(dark[::4, ::4] - level))
+    limit = level + options.hot_pixel_sigma * max(spread, math.sqrt(1.0 / 12.0))
+    return HotPixels(np.flatnonzero(dark > limit)[:_MOST])
+
+
+def learn_hot_pixels(
+    known: HotPixels,
+    pixels: Pixels,
+    background_dn: float,
+    noise_dn: float,
+    icrf_from_camera: Rotation,
+    focal_px: float,
+    options: FixedPatternOptions,
+) -> HotPixels:
+    """
+    What is known after one more image, of which one strip is looked at.
+
+    ``pixels`` (height, width) are without the dark frame.  ``icrf_from_camera`` says where the
+    camera looked: a strip tells once that has moved since it was last seen.
+    """
+    height = pixels.shape[0]
+    count = -(-pixels.size // _SCANNED_PX)
+    strips = known.strips or (None,) * count
+    before = strips[known.turn]
+    turn = (known.turn + 1) % count
+    if before is not None:
+        moved_px = (before.icrf_from_camera.inv() * icrf_from_camera).magnitude() * focal_px
+        if moved_px < _MOVED_PX:
+            return HotPixels(known.index, strips, turn)
+    rows = (known.turn * height // count, (known.turn + 1) * height // count)
+    lit = _single_lit(pixels, rows, background_dn, options.hot_pixel_sigma * noise_dn)
+    index = known.index
+    if before is not None:
+        again = np.intersect1d(before.lit, lit, assume_unique=True)
+        index = np.union1d(index, again)[:_MOST]
+    seen = Strip(lit, icrf_from_camera)
+    return HotPixels(index, (*strips[: known.turn], seen, *strips[known.turn + 1 :]), turn)
+
+
+def _single_lit(
+    pixels: Pixels, rows: tuple[int, int], background_dn: float, threshold_dn: float
+) -> Indices:
+    """Numbers of the pixels of some rows that are lit while the four next to them are not."""
+    height, width = pixels.shape
+    # Whole numbers: against a float every pixel would be made one.
+    floor_dn = min(max(math.floor(background_dn + threshold_dn), 0), np.iinfo(pixels.dtype).max)
+    lit = np.flatnonzero(pixels[rows[0] : rows[1]] > floor_dn)
+    v, u = np.divmod(lit + rows[0] * width, width)
+    inner = (u >= 1) & (u < width - 1) & (v >= 1) & (v < height - 1)
+    v, u = v[inner], u[inner]
+    single = lit_alone(pixels, v, u, background_dn)
+    return np.asarray((v * width + u)[single][:_MOST], np.int64)
+
+
+def lit_alone(
+    pixels: Pixels, v: Indices, u: Indices, background_dn: float | Floats
+) -> NDArray[np.bool_]:
+    """Which pixels (k,), none at the rim, stand out from the four next to them as no star does."""
+    beside = pixels[v + _BESIDE[0], u + _BESIDE[1]].sum(axis=0, dtype=np.float64)
+    peak = pixels[v, u] - background_dn
+    return np.asarray(0.25 * beside - background_dn < SPILT * peak)
+
+
+def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> NDArray[np.bool_]:
+    """Which pixels (n, 2 radius + 1, 2 radius + 1) of windows about pixels (n, 2) are hot."""
+    side = 2 * radius + 1
+    found = np.zeros((len(centre), side, side), bool)
+    if len(hot) == 0:
+        return found
+    row = centre[:, 1, None] + np.arange(-radius, radius + 1)
+    first = row * width + centre[:, 0, None] - radius
+    low, high = np.searchsorted(hot, first), np.searchsorted(hot, first + side)
+    star, line = np.nonzero(high > low)
+    low, high, first = low[star, line], high[star, line], first[star, line]
+    for k in range(int((high - low).max(initial=0))):
+        more = low + k < high
+        found[star[more], line[more], hot[low[more] + k] - first[more]] = True
+    return found
+
+
+def refuse_on_hot_pixels(
+    xy_px: Floats,
+    refusal: NDArray[np.str_],
+    hot: Indices,
+    width: int,
+    window_px: int,
+    psf_sigma_px: float,
+) -> NDArray[np.str_]:
+    """
+    Refusals (n,) of stars at (n, 2), with ``hot_pixel`` where one is the cause.
+
+    A hot pixel at the peak spoils a star of few pixels, as what is left of it tells little.  One
+    elsewhere in the window, half ``window_px`` wide, is the cause where the star was refused for
+    its shape.
+    """
+    if len(hot) == 0:
+        return refusal
+    v, u = np.divmod(hot, width)
+    tree = cKDTree(np.stack([u, v], axis=-1))
+    asked = np.flatnonzero(np.isin(refusal, ('', 'elongated', 'ambiguous')))
+    core, _ = tree.query(xy_px[asked], distance_upper_bound=CORE_PX)
+    window, _ = tree.query(xy_px[asked], p=np.inf, distance_upper_bound=window_px + 0.5)
+    at_peak = np.isfinite(core) & (psf_sigma_px < _WIDE_PSF_PX)
+    cause = at_peak | (np.isfinite(window) & (refusal[asked] != ''))
+    changed = refusal.copy()
+    changed[asked[cause]] = 'hot_pixel'
+    return changed

@@ -1,0 +1,542 @@
+"""
+Gaussian fits to stars, all stars of an image at once.
+
+A pixel-integrated circular Gaussian with free position, flux and local background, weighted by the
+noise of each pixel, attains the Cramer-Rao bound of the stamp.
+
+Noise of a pixel with background-free signal S of a star of flux F, in digital numbers (DN)::
+
+    variance = background noise_dn^2 + S / gain + psf_error^2 S F
+
+``background`` is how much more a pixel beside a star scatters than one of the open sky, and
+``psf_error`` is how far the real PSF is from the Gaussian.  That error is of one sign over several
+pixels, and largest beside the core: no noise that weights could hold down.  A fit that trusts the
+core less for its sake leans on the wings, where the Gaussian is worst.  So the weights are of the
+noise alone, and the error of the PSF is in the covariance.  With F in its term it grows as the
+square of the brightness, and photon noise as the brightness: that tells one from the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf, ndtr
+
+from starcal_ros.image.hot_pixels import CORE_PX, SPILT
+
+Floats = NDArray[np.float64]
+
+_FIT_STEPS = 4  # stars settle in two or three; what has not by then is no star
+# A step of s leaves s / SNR of the way for faint stars and s^2 / sigma_px for bright ones.  Below
+# this part of sigma_px and of the noise of the place, squared, the last step leaves 0.1 of that.
+_SETTLED = 0.3
+_SIGNIFICANT = 3.0  # sigma
+_MOMENTS = np.array([[-1, 0, 1] * 3, [-1] * 3 + [0] * 3 + [1] * 3, [1] * 9], np.float64).T
+MISFIT_SIGMA = 5.0  # 81 pixels of normal noise pass it once in 20,000 stars
+
+
+@dataclass(frozen=True)
+class PixelNoise:
+    """Noise of a pixel: ``background noise^2 + S / gain + psf_error^2 S F``, S of it, F of all."""
+
+    gain_e_per_dn: float
+    psf_error: float
+    background: float = 1.0
+
+    def variance(self, signal_dn: Floats, noise_dn: Floats, flux_dn: Floats) -> Floats:
+        """Variance in DN^2; negative signal counts as none."""
+        signal = np.maximum(signal_dn, 0.0)
+        per_signal = 1.0 / self.gain_e_per_dn + self.psf_error**2 * np.maximum(flux_dn, 0.0)
+        return np.asarray(self.background * noise_dn**2 + per_signal * signal)
+
+
+@dataclass(frozen=True)
+class PsfFit:
+    """
+    Gaussian fits to stamps: position relative to the stamp's centre, flux, background.
+
+    ``parameters`` (n, 4): x, y (px), flux, background (DN).  ``covariance`` (n, 4, 4) of them.
+    ``snr`` (n,): flux over its 1-sigma from the noise alone.
+    ``worst_pixel_sigma`` (n,): the pixel that fits worst, in its own noise.
+    ``shape_change`` and ``shape_sigma`` (n, 3): departure of the second moments xx, yy, xy from
+    those of the PSF as a fraction of its variance, and their 1-sigma.
+    ``signal_dn`` and ``residual_dn`` (n, p): the light of the star in each pixel of its stamp and
+    what the fit leaves, NaN where the pixel took no part; ``freedom`` (n, p): the part of the
+    variance of a pixel that the fit has left in its residual.
+    """
+
+    parameters: Floats
+    covariance: Floats
+    snr: Floats
+    worst_pixel_sigma: Floats
+    shape_change: Floats
+    shape_sigma: Floats
+    signal_dn: Floats
+    residual_dn: Floats
+    freedom: Floats
+
+
+def select(fit: PsfFit, stars: NDArray[np.intp] | NDArray[np.bool_]) -> PsfFit:
+    """Return the fits of some stars, by row number or mask."""
+    return PsfFit(**{field.name: getattr(fit, field.name)[stars] for field in fields(fit)})
+
+
+def stamp_radius_px(psf_sigma_px: float) -> int:
+    """Half width of the fitting window: beyond 3 sigma nothing tells the place of a star."""
+    return min(max(math.ceil(3.0 * psf_sigma_px), 3), 12)
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """
+    Square windows about stars, and what a fit needs to know of each pixel.
+
+    Parameters
+    ----------
+    data_dn : (n, w, w)
+        Pixel values; the star within a pixel or so of the middle.
+    sigma_px : (n,)
+        Width of the PSF at each star.
+    noise2_dn2 : (n, 1) or (n, w * w)
+        Variance of each star's pixels, or of each pixel, without the star's own light.
+    out : (n, w, w), optional
+        Pixels that say nothing of the star, saturated or hot, and take no part.
+    """
+
+    data_dn: Floats
+    sigma_px: Floats
+    noise2_dn2: Floats
+    out: NDArray[np.bool_] | None = None
+
+    def __len__(self) -> int:
+        """Return the number of stars."""
+        return len(self.data_dn)
+
+    @property
+    def width(self) -> int:
+        """Pixels along each side of a window."""
+        return self.data_dn.shape[1]
+
+    @property
+    def flat_dn(self) -> Floats:
+        """Pixel values, (n, w * w)."""
+        return self.data_dn.reshape(len(self), self.width**2)
+
+    @property
+    def valid(self) -> NDArray[np.bool_] | None:
+        """Which pixels (n, w * w) take part; None: all."""
+        return None if self.out is None else ~self.out.reshape(len(self), self.width**2)
+
+    def select(self, stars: NDArray[np.intp]) -> Stamps:
+        """Return the windows of some stars, by row number, ascending and each once."""
+        if len(stars) == len(self):
+            return self
+        return Stamps(
+            self.data_dn[stars],
+            self.sigma_px[stars],
+            self.noise2_dn2[stars],
+            None if self.out is None else self.out[stars],
+        )
+
+
+def fit_psf(
+    stamps: Floats, sigma_px: float | Floats, noise_dn: Floats, pixel_noise: PixelNoise
+) -> PsfFit:
+    """
+    Weighted least-squares fit of the pixel-integrated Gaussian to every stamp at once.
+
+    Parameters
+    ----------
+    stamps : (n, w, w)
+        Pixel values, DN; the star within a pixel or so of the centre.
+    sigma_px : float or (n,)
+        Width of the PSF, at each star.
+    noise_dn : (n,)
+        Noise at each star, without its own light.
+    pixel_noise : PixelNoise
+        How the noise grows with signal.
+    """
+    sigma_px = np.broadcast_to(np.asarray(sigma_px, np.float64), (len(stamps),))
+    windows = Stamps(stamps, sigma_px, noise_dn[:, None] ** 2)
+    guess = first_guess(windows, border_level_dn(stamps))
+    return fit_at(windows, approach(windows, guess, pixel_noise), pixel_noise)
+
+
+def approach(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> Floats:
+    """
+    Parameters (n, 4) after some steps towards the fit: x, y (px), flux, background (DN).
+
+    Gauss-Newton with the weights renewed from the model at each step, so that the noise of the
+    data does not bias them; a step in position is at most half a pixel.  Stars that one more step
+    brings to the fit, such as `fit_at` takes, are left alone.
+    """
+    parameters = parameters.copy()
+    active = np.arange(len(stamps))
+    for _ in range(_FIT_STEPS):
+        if len(active) == 0:
+            break
+        chosen = stamps.select(active)
+        parameters[active], step, normal = _nearer(chosen, parameters[active], pixel_noise)
+        # The noise of the place with flux and background known, the smaller one.
+        place_sigma_px = 1.0 / np.sqrt(np.einsum('nii->ni', normal)[:, :2])
+        limit_px2 = _SETTLED * place_sigma_px * chosen.sigma_px[:, None]
+        active = active[(step[:, :2] ** 2 > limit_px2).any(axis=1)]
+    return parameters
+
+
+def _nearer(
+    stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise
+) -> tuple[Floats, Floats, Floats]:
+    """Parameters (n, 4) after a step towards the fit, the step, and normal matrices (n, 4, 4)."""
+    normal, gradient = _normal(_whitened_rows(parameters, stamps, pixel_noise, 4)[0])
+    step = np.asarray(np.linalg.solve(normal, gradient[:, :, None])[:, :, 0], np.float64)
+    step[:, :2].clip(-0.5, 0.5, out=step[:, :2])
+    half_px = stamps.width / 2
+    parameters = parameters + step
+    parameters[:, :2].clip(-half_px, half_px, out=parameters[:, :2])
+    return parameters, step, normal
+
+
+def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFit:
+    """
+    Fits to stamps whose parameters (n, 4) are near: the last step, and what is known of it.
+
+    A pixel that alone does not fit, such as a cosmic ray on the flank of a bright star, takes no
+    part.
+    """
+    # Second moments: one linear step from the solution, in units of the PSF variance.
+    rows, light, root_weight = _whitened_rows(parameters, stamps, pixel_noise, 7)
+    normal, gradient = _normal(rows)
+    covariance = np.asarray(np.linalg.inv(normal[:, :4, :4]), np.float64)
+    last = (covariance @ gradient[:, :4, None])[:, :, 0]
+    last[:, :2].clip(-0.5, 0.5, out=last[:, :2])
+    residual = _after(last, rows)
+    spoilt, pixel = _single_misfits(residual, light, parameters, stamps)
+    if len(spoilt):
+        root_weight[spoilt, pixel], rows[spoilt, :, pixel] = 0.0, 0.0
+        normal[spoilt], gradient[spoilt] = _normal(rows[spoilt])
+        covariance[spoilt] = np.linalg.inv(normal[spoilt, :4, :4])
+        last[spoilt] = (covariance[spoilt] @ gradient[spoilt, :4, None])[:, :, 0]
+        residual[spoilt] = _after(last[spoilt], rows[spoilt])
+    # Of the inverse of the whole only the columns of the moments are wanted.
+    of_shape = np.linalg.solve(normal, np.broadcast_to(np.eye(7)[:, 4:], (len(normal), 7, 3)))
+    shape_step = (gradient[:, None, :] @ of_shape)[:, 0]
+    shape_variance = of_shape[:, [4, 5, 6], [0, 1, 2]]
+    leverage = np.einsum('nkp,nkp->np', covariance @ rows[:, :4], rows[:, :4])
+    parameters = parameters + last
+    snr = parameters[:, 2] / np.sqrt(covariance[:, 2, 2])
+    misfit = residual
+    if pixel_noise.psf_error > 0:
+        # Of a pixel's variance, this many times what its weight holds is the error of the PSF.
+        flux = np.maximum(parameters[:, 2, None], 0.0)
+        excess = pixel_noise.psf_error**2 * flux * light * root_weight**2
+        misfit = residual / np.sqrt(1.0 + excess)
+        scatter = (rows[:, :7] * excess[:, None, :]) @ rows[:, :7].transpose(0, 2, 1)
+        covariance = covariance + covariance @ scatter[:, :4, :4] @ covariance
+        shape_variance = shape_variance + (of_shape * (scatter @ of_shape)).sum(axis=1)
+    with np.errstate(invalid='ignore'):
+        residual_dn = residual / root_weight
+    return PsfFit(
+        parameters=parameters,
+        covariance=covariance,
+        snr=snr,
+        worst_pixel_sigma=np.abs(misfit).max(axis=1, initial=0.0),
+        shape_change=shape_step,
+        shape_sigma=np.sqrt(shape_variance),
+        signal_dn=light,
+        residual_dn=residual_dn,
+        freedom=np.maximum(1.0 - leverage, 0.05),
+    )
+
+
+def _after(step: Floats, rows: Floats) -> Floats:
+    """Residuals (n, p) that a step (n, 4) leaves of those of the rows, to first order."""
+    return np.asarray(rows[:, -1] - (step[:, None, :] @ rows[:, :4])[:, 0])
+
+
+def _single_misfits(
+    sigmas: Floats, light: Floats, parameters: Floats, stamps: Stamps
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """
+    Rows (k,) of stars with one pixel lit too much that does not spill over, and that pixel.
+
+    Not of the core: a star that has lost its peak is hardly measured.  ``sigmas`` (n, p) are the
+    residuals in the noise of each pixel, ``light`` (n, p) is that of the stars.
+    """
+    width = stamps.width
+    star = np.flatnonzero(sigmas.max(axis=1, initial=0.0) > MISFIT_SIGMA)
+    pixel = sigmas[star].argmax(axis=1)
+    v, u = np.divmod(pixel, width)
+    x, y = parameters[star, :2].T + width // 2
+    away = np.hypot(u - x, v - y) > CORE_PX
+    if not away.any():
+        return star[away], pixel[away]
+    star, pixel, v, u = star[away], pixel[away], v[away], u[away]
+    rimmed = np.zeros((len(star), width + 2, width + 2))
+    left_dn = stamps.flat_dn[star] - light[star] - parameters[star, 3, None]
+    rimmed[:, 1:-1, 1:-1] = left_dn.reshape(-1, width, width)
+    row = np.arange(len(star))
+    beside = sum(rimmed[row, v + b, u + a] for b, a in ((0, 1), (2, 1), (1, 0), (1, 2)))
+    alone = 0.25 * beside < SPILT * left_dn[row, pixel]
+    return star[alone], pixel[alone]
+
+
+def expected_snr(
+    flux_dn: Floats, sigma_px: float | Floats, noise_dn: float | Floats, noise: PixelNoise
+) -> Floats:
+    """Signal-to-noise (n,) of stars of a flux, from their photons and 4 pi sigma^2 px of sky."""
+    flux = np.maximum(flux_dn, 0.0)
+    sky_dn2 = 4.0 * math.pi * sigma_px**2 * noise.background * noise_dn**2
+    return np.asarray(flux / np.sqrt(sky_dn2 + flux / noise.gain_e_per_dn))
+
+
+def first_guess(windows: Stamps, background: Floats) -> Floats:
+    """
+    Parameters (n, 4) from which the fit starts: the centre of the light next to the middle.
+
+    ``background`` (n,) is that of `border_level_dn`.
+    """
+    stamps, sigma_px, c = windows.data_dn, windows.sigma_px, windows.width // 2
+    core = stamps[:, c - 1 : c + 2, c - 1 : c + 2].reshape(-1, 9)
+    off_x, off_y, total = (core @ _MOMENTS).T
+    total = total - 9.0 * background
+    share = erf(1.5 / (math.sqrt(2.0) * sigma_px))  # of the light in three pixels
+    # The outer two of three pixels differ by this much for each pixel of the way.
+    slope = 2.0 * (_gauss(0.5 / sigma_px) - _gauss(1.5 / sigma_px)) / sigma_px
+    per_light = share / slope / np.maximum(total, 1e-12)
+    guess = np.stack([off_x * per_light, off_y * per_light, total / share**2, background], axis=-1)
+    guess[:, :2].clip(-0.7, 0.7, out=guess[:, :2])
+    return guess
+
+
+def border_level_dn(stamps: Floats) -> Floats:
+    """Medians (n,) of the outermost pixels of windows (n, w, w)."""
+    border = np.concatenate(
+        [stamps[:, 0], stamps[:, -1], stamps[:, 1:-1, 0], stamps[:, 1:-1, -1]], axis=1
+    )
+    middle = border.shape[1] // 2
+    return np.asarray(np.partition(border, middle, axis=1)[:, middle])
+
+
+def light_in_stamps(place_px: Floats, flux_dn: Floats, sigma_px: Floats, width: int) -> Floats:
+    """Light (k, width^2) in stamps of stars at (k, 2) from their middles, in or out of them."""
+    count = len(flux_dn)
+    value, _, _ = _profile(
+        np.concatenate([place_px[:, 0], place_px[:, 1]]),
+        np.concatenate([sigma_px, sigma_px]),
+        width,
+        False,
+    )
+    light = value[count:, :, None] * (flux_dn[:, None] * value[:count])[:, None, :]
+    return np.asarray(light.reshape(count, width * width))
+
+
+def neighbour_pull_px(
+    flux_dn: Floats,
+    offset_px: Floats,
+    neighbour_flux_dn: Floats,
+    sigma_px: float,
+    noise_dn: float,
+    pixel_noise: PixelNoise,
+) -> Floats:
+    """
+    How far (k, 2) the light of a neighbour pulls the fitted place of a star.
+
+    That is where the fit ends on the light of both without noise.
+
+    Parameters
+    ----------
+    flux_dn, neighbour_flux_dn : (k,)
+    offset_px : (k, 2)
+        From the star to its neighbour.
+    sigma_px, noise_dn, pixel_noise
+        Width of the PSF, and the noise as in `fit_psf`.
+    """
+    width = 2 * stamp_radius_px(sigma_px) + 1
+    count = len(flux_dn)
+    sigma = np.full(count, sigma_px)
+    own, other = light_in_stamps(
+        np.concatenate([np.zeros((count, 2)), offset_px]),
+        np.concatenate([flux_dn, neighbour_flux_dn]),
+        np.full(2 * count, sigma_px),
+        width,
+    ).reshape(2, count, width, width)
+    stamps = Stamps(own + other, sigma, np.full((count, 1), noise_dn**2))
+    alone = np.stack([*np.zeros((2, count)), flux_dn, np.zeros(count)], axis=-1)
+    # The second step leaves a hundredth of the pull.
+    for _ in range(2):
+        alone, _, _ = _nearer(stamps, alone, pixel_noise)
+    return alone[:, :2]
+
+
+@dataclass(frozen=True)
+class NoiseSums:
+    """
+    What residuals say of the pixel noise: a regression of their squares on noise_dn^2, S and S F.
+
+    ``normal`` (3, 3) and ``right`` (3,), with each pixel weighted by its own expected spread.
+    Sums of several images can be added.
+    """
+
+    normal: Floats
+    right: Floats
+
+    def pixel_noise(self, gain_e_per_dn: float = 0.0) -> PixelNoise:
+        """
+        Noise with which the squared residuals are their variance.
+
+        A gain that is given (not 0) is kept.  An error of the PSF that is not significant is
+        none: it would take its share of the photon noise with it.
+        """
+        per_signal = 1.0 / gain_e_per_dn if gain_e_per_dn else 0.0
+        found = np.array([1.0, per_signal, 0.0])
+        right = self.right - self.normal[:, 1] * per_signal
+        free = [0, 2] if gain_e_per_dn else [0, 1, 2]
+        scale = 1.0 / np.sqrt(np.maximum(self.normal.diagonal(), 1e-300))
+        correlation = self.normal * scale * scale[:, None] + 1e-9 * np.eye(3)
+        while free:
+            inverse = np.linalg.inv(correlation[free][:, free])
+            value = scale[free] * (inverse @ (scale * right)[free])
+            # A squared normal residual over its variance has a variance of 2.
+            sigma = scale[free] * np.sqrt(2.0 * inverse.diagonal())
+            if free[-1] == 2 and value[-1] < _SIGNIFICANT * sigma[-1]:
+                free = free[:-1]
+            elif 1 in free and value[free.index(1)] < 0.0:
+                free.remove(1)
+            else:
+                found[free] = value
+                break
+        background, per_signal, error2 = found
+        return PixelNoise(
+            1.0 / min(max(float(per_signal), 1e-4), 1e4),
+            math.sqrt(min(max(float(error2), 0.0), 0.25)),
+            min(max(float(background), 0.25), 4.0),
+        )
+
+
+def noise_sums(fit: PsfFit, noise_dn: Floats, expected: PixelNoise) -> NoiseSums:
+    """
+    Sums from the pixels of the stars of a fit, weighted by the noise expected of them.
+
+    ``noise_dn`` (n,).  Each residual is freed from what the fit itself has taken of it; one of
+    more than five sigma is something else.
+    """
+    noise2 = noise_dn[:, None] ** 2
+    signal = np.maximum(fit.signal_dn, 0.0)
+    flux = np.maximum(fit.parameters[:, 2, None], 0.0)
+    variance = expected.variance(signal, noise_dn[:, None], flux)
+    squared = fit.residual_dn**2 / fit.freedom
+    # NaN, a pixel that took no part, is not below either.
+    keep = squared < 25.0 * variance
+    weight = keep / variance
+    signal = signal * weight
+    A = np.stack([noise2 * weight, signal, signal * flux]).reshape(3, -1)
+    return NoiseSums(A @ A.T, A @ np.where(keep, squared * weight, 0.0).ravel())
+
+
+def _gauss(t: Floats) -> Floats:
+    return np.asarray(np.exp(-0.5 * t * t) / math.sqrt(2.0 * math.pi))
+
+
+def _profile(
+    centre: Floats, sigma_px: Floats, width: int, second: bool
+) -> tuple[Floats, Floats, Floats]:
+    """
+    Pixel-integrated Gaussian along one axis with its first and second derivative by the centre.
+
+    ``centre`` and ``sigma_px`` (n,), from the middle of ``width`` pixels; results are (n, width).
+    The derivative by sigma^2 is half of the second one by the centre (heat equation).
+    """
+    edges = np.arange(width + 1) - width / 2.0
+    t = (edges - centre[:, None]) / sigma_px[:, None]
+    density = _gauss(t)
+    cumulative = ndtr(t)
+    value = cumulative[:, 1:] - cumulative[:, :-1]
+    first = (density[:, :-1] - density[:, 1:]) / sigma_px[:, None]
+    if not second:
+        return value, first, first
+    density *= t
+    return value, first, (density[:, :-1] - density[:, 1:]) / sigma_px[:, None] ** 2
+
+
+def _psf_rows(
+    parameters: Floats, data: Floats, sigma_px: Floats, width: int, count: int
+) -> Floats:
+    """
+    Derivatives of stamps by x, y, flux, background, and last their residual.
+
+    ``data`` is (n, width^2); the result (n, count + 1, width^2).  With a count of 7, after the
+    background by the second moments xx, yy, xy as fractions of the PSF's variance.
+    """
+    n = len(parameters)
+    x, y, flux, level = parameters.T
+    value, first, second = _profile(
+        np.concatenate([x, y]), np.concatenate([sigma_px, sigma_px]), width, count == 7
+    )
+    rows = np.empty((n, count + 1, width * width))
+    flux = flux[:, None]
+    # Spread over the stamp first: products of long rows take a third of those of short ones.
+    px, py = _in_each_row(value[:n]), value[n:].repeat(width, axis=1)
+    flux_px1 = _in_each_row(flux * first[:n])
+    py1 = first[n:].repeat(width, axis=1)
+    np.multiply(py, flux_px1, out=rows[:, 0])
+    np.multiply(py, px, out=rows[:, 2])
+    px *= flux
+    np.multiply(py1, px, out=rows[:, 1])
+    rows[:, 3] = 1.0
+    if count == 7:
+        variance = sigma_px[:, None] ** 2
+        np.multiply(py, _in_each_row(0.5 * flux * variance * second[:n]), out=rows[:, 4])
+        np.multiply(px, (0.5 * variance * second[n:]).repeat(width, axis=1), out=rows[:, 5])
+        py1 *= variance
+        np.multiply(py1, flux_px1, out=rows[:, 6])
+    residual = rows[:, count]
+    np.multiply(rows[:, 2], -flux, out=residual)
+    residual += data
+    residual -= level[:, None]
+    return rows
+
+
+def _in_each_row(of_columns: Floats) -> Floats:
+    """Values (n, w) of columns, spread over the pixels (n, w * w) of a stamp."""
+    n, width = of_columns.shape
+    spread = np.empty((n, width, width))
+    spread[:] = of_columns[:, None, :]
+    return spread.reshape(n, width * width)
+
+
+def _whitened_rows(
+    parameters: Floats, stamps: Stamps, pixel_noise: PixelNoise, count: int
+) -> tuple[Floats, Floats, Floats]:
+    """
+    The rows of `_psf_rows` over the noise of each pixel, 0 for those that take no part.
+
+    Also the light (n, p) of the stars, and (n, p) one over that noise.
+    """
+    rows = _psf_rows(parameters, stamps.flat_dn, stamps.sigma_px, stamps.width, count)
+    light = np.maximum(parameters[:, 2, None], 0.0) * rows[:, 2]
+    root_weight = light / pixel_noise.gain_e_per_dn
+    root_weight += pixel_noise.background * stamps.noise2_dn2
+    np.sqrt(root_weight, out=root_weight)
+    valid = stamps.valid
+    np.divide(1.0 if valid is None else valid, root_weight, out=root_weight)
+    rows *= root_weight[:, None, :]
+    return rows, light, root_weight
+
+
+def _normal(rows: Floats) -> tuple[Floats, Floats]:
+    """
+    Normal matrices (n, k, k) and gradients (n, k) of many small least-squares problems.
+
+    ``rows`` (n, k + 1, p) are the derivatives and the residual, whitened.  A trace on the diagonal
+    keeps a stamp without light solvable.
+    """
+    k = rows.shape[1] - 1
+    product = rows[:, :k] @ rows.transpose(0, 2, 1)
+    normal, gradient = product[:, :, :k], product[:, :, k]
+    diagonal = np.einsum('nii->ni', normal)
+    diagonal += 1e-9 * diagonal + 1e-12
+    return normal, gradient

@@ -1,0 +1,1 @@
+"""Records to ROS message objects and back, without ROS."""

@@ -1,0 +1,162 @@
+"""Images from messages of any encoding that is taken, and to messages."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.errors import ImageRefused
+from starcal_ros.messages.fields import make_header, offset_ns, stamp_ns
+from starcal_ros.messages.types import IMAGE_TYPE, Make, Message
+from starcal_ros.records import Image, refused_image, StarObservations
+
+_PNG_MAGIC = b'\x89PNG\r\n\x1a\n'
+_PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
+
+
+def decode_image(
+    encoding: str,
+    width: int,
+    height: int,
+    step: int,
+    is_bigendian: bool,
+    data: Any,
+    time_ns: int,
+) -> Image:
+    """
+    Pixels of an image message in native byte order, without its row padding.
+
+    No copy where the message holds them so already.
+
+    Parameters
+    ----------
+    encoding, width, height, step, is_bigendian, data
+        As in sensor_msgs/Image; ``data`` is anything with a buffer of bytes.
+    time_ns : int
+        Middle of the exposure.
+
+    Raises
+    ------
+    ImageRefused
+        ``bad_encoding`` or ``bad_layout``.
+    """
+    pixel_bytes = _PIXEL_BYTES.get(encoding)
+    if pixel_bytes is None:
+        raise ImageRefused(
+            'bad_encoding', f'{encoding[:40]!r} is not one of {", ".join(_PIXEL_BYTES)}'
+        )
+    # An empty buffer has no shape that frombuffer would take.
+    flat = np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
+    row_bytes = width * pixel_bytes
+    if width < 1 or height < 1:
+        raise ImageRefused('bad_layout', f'{width} x {height} is not an image')
+    if step < row_bytes:
+        raise ImageRefused('bad_layout', f'step {step} is less than a row of {row_bytes} bytes')
+    if flat.size != step * height:
+        raise ImageRefused(
+            'bad_layout', f'{flat.size} bytes of data, not {step * height} for {height} rows'
+        )
+    dtype = np.dtype(np.uint8 if pixel_bytes == 1 else '>u2' if is_bigendian else '<u2')
+    # Strides rather than a slice: a step need not be a whole number of 16-bit pixels.
+    rows: NDArray[Any] = np.ndarray(
+        (height, width), dtype, buffer=flat, strides=(step, pixel_bytes)
+    )
+    pixels: NDArray[Any] = np.ascontiguousarray(rows, dtype.newbyteorder('='))
+    pixels.setflags(write=False)
+    return Image(time_ns, pixels)
+
+
+def decode_png(data: Any, time_ns: int) -> Image:
+    """
+    Pixels of a PNG of one channel, 8 or 16 bit.
+
+    Raises
+    ------
+    ImageRefused
+        ``bad_encoding`` for what is no such PNG; ``bad_layout`` for one that cannot be decoded.
+    """
+    # A JPEG would decode too, but what it does to a star of two pixels is no measurement.
+    if bytes(data[: len(_PNG_MAGIC)]) != _PNG_MAGIC:
+        raise ImageRefused('bad_encoding', 'the compressed image is not a PNG')
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise ImageRefused('bad_layout', f'{len(data)} bytes of PNG cannot be decoded')
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
+        raise ImageRefused(
+            'bad_encoding', f'the PNG is {pixels.dtype} of shape {pixels.shape}, not one channel'
+        )
+    pixels.setflags(write=False)
+    return Image(time_ns, pixels)  # type: ignore[arg-type]
+
+
+def image_from_message(message: Message, stamp_offset_s: float = 0.0) -> Image:
+    """
+    Image of a sensor_msgs/Image or CompressedImage, its time shifted to the middle of exposure.
+
+    Raises
+    ------
+    ImageRefused
+        ``bad_encoding`` or ``bad_layout``.
+    """
+    if not hasattr(message, 'encoding'):
+        time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
+        return decode_png(message.data, time_ns)
+    return decode_image(
+        message.encoding,
+        message.width,
+        message.height,
+        message.step,
+        bool(message.is_bigendian),
+        message.data,
+        stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s),
+    )
+
+
+def refused_from_message(
+    message: Message, stamp_offset_s: float, refused: ImageRefused
+) -> StarObservations:
+    """Return the observations of an image message that cannot be used."""
+    return refused_image(
+        stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s),
+        int(getattr(message, 'width', 0)),  # a compressed image does not say
+        int(getattr(message, 'height', 0)),
+        refused.reason,
+        refused.detail,
+    )
+
+
+def image_to_message(image: Image, frame_id: str, make: Make) -> Message:
+    """Return a sensor_msgs/Image, mono8 or mono16 in the byte order of this machine."""
+    pixels = np.ascontiguousarray(image.pixels)
+    height, width = pixels.shape
+    return make(
+        IMAGE_TYPE,
+        header=make_header(image.time_ns, frame_id, make),
+        height=height,
+        width=width,
+        encoding='mono8' if pixels.itemsize == 1 else 'mono16',
+        is_bigendian=int(sys.byteorder == 'big'),
+        step=width * pixels.itemsize,
+        data=pixels.reshape(-1).view(np.uint8),
+    )
+
+
+def color_image_to_message(
+    time_ns: int, bgr: NDArray[np.uint8], frame_id: str, make: Make
+) -> Message:
+    """Return a sensor_msgs/Image bgr8 of a (height, width, 3) picture."""
+    height, width, _ = bgr.shape
+    return make(
+        IMAGE_TYPE,
+        header=make_header(time_ns, frame_id, make),
+        height=height,
+        width=width,
+        encoding='bgr8',
+        is_bigendian=0,
+        step=width * 3,
+        data=np.ascontiguousarray(bgr).reshape(-1),
+    )

@@ -1,0 +1,1 @@
+"""The steps that the nodes and the tool share."""

@@ -1,0 +1,308 @@
+"""What a bag holds, and what a calibration would make of it: by the code that would make it."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from starcal_ros.bag import reader
+from starcal_ros.bag.mcap_reader import Damage
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.messages import fields as message_fields
+from starcal_ros.messages.images import decode_png
+from starcal_ros.messages.telemetry import attitude_from_message
+from starcal_ros.messages.types import (
+    ATTITUDE_TYPE,
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    Message,
+    OBSERVATIONS_TYPE,
+    TEMPERATURE_TYPE,
+    VELOCITY_TYPE,
+)
+from starcal_ros.pipeline import observe, solve
+from starcal_ros.pipeline import topics as bag_topics
+from starcal_ros.pipeline.setup import Setup
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.records import (
+    Ensemble,
+    EnsembleStatus,
+    IMAGE_REFUSALS,
+    refused_image,
+    StarObservations,
+)
+from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
+
+_IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
+_STAMPED = (
+    *_IMAGES,
+    ATTITUDE_TYPE,
+    VELOCITY_TYPE,
+    TEMPERATURE_TYPE,
+    OBSERVATIONS_TYPE,
+)
+
+
+@dataclass(frozen=True)
+class TopicContent:
+    """
+    The messages of a topic.
+
+    ``first_ns``, ``last_ns``, the median rate and the longest gap are of the stamps in the
+    messages, or of the times of recording where the type is none that starcal reads; a rate is 0
+    where there are not two.  ``kinds`` counts the images by encoding and size.  ``bad`` counts
+    messages that cannot be decoded, and attitudes that are no rotations.
+    """
+
+    name: str
+    type_name: str
+    count: int
+    rate_hz: float
+    first_ns: int
+    last_ns: int
+    longest_gap_s: float
+    backward: int
+    kinds: Mapping[str, int]
+    bad: int
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Images refused for one reason: how many, what it means, and the first of them."""
+
+    reason: str
+    count: int
+    meaning: str
+    first_ns: int
+    detail: str
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """
+    A bag as a calibration sees it.
+
+    Attributes
+    ----------
+    bags : tuple of str
+    topics : tuple of TopicContent
+    chosen : Topics or None
+        What a calibration would read; None where it could not tell.
+    images : int
+        Of the chosen topic.
+    refused : tuple of Refused
+        Those that cannot be used, most frequent first.
+    longest_attitude_gap_s : float
+        Between the attitude samples about an image that is not refused; -1 where there is none.
+    measured : bool
+        Whether the stars were measured; if not, an image may still be refused for its stars.
+    stars_per_image : tuple of int
+        Of the images that are not refused, where measured.
+    refused_stars : mapping
+        Reason -> count, where measured.
+    status : EnsembleStatus or None
+        What a calibration from it would be worth, where measured.
+    damage : tuple of str
+    problems : tuple of str
+        Why a calibration would have nothing to work with; empty where it would.
+    """
+
+    bags: tuple[str, ...]
+    topics: tuple[TopicContent, ...]
+    chosen: Topics | None
+    images: int
+    refused: tuple[Refused, ...]
+    longest_attitude_gap_s: float
+    measured: bool
+    stars_per_image: tuple[int, ...]
+    refused_stars: Mapping[str, int]
+    status: EnsembleStatus | None
+    damage: tuple[str, ...]
+    problems: tuple[str, ...]
+
+
+def inspect(
+    paths: Sequence[Path],
+    asked: Topics,
+    setup: Setup | None = None,
+    on_image: Callable[[], None] = lambda: None,
+) -> Inspection:
+    """
+    What bags hold and which of their images would be refused.
+
+    With a setup, stars are measured as for a calibration; without one, images are held against
+    the attitudes at the default limits.
+
+    Raises
+    ------
+    BagError
+        When a bag is missing or none.
+    """
+    damage: dict[str, None] = {}  # in order, each once
+    topics = _contents(paths, lambda text: damage.setdefault(text))
+    options = setup.attitude if setup else AttitudeOptions()
+    problems = []
+    chosen, seen = None, []
+    try:
+        chosen = bag_topics.choose_topics(paths, asked, setup)
+        if setup:
+            found = bag_topics.read(paths, chosen, setup)
+        elif chosen.observations:
+            found = reader.read_observations(paths, chosen.observations)
+        else:
+            found = _placed(paths, chosen, options)
+        for observations in found:
+            seen.append(observations)
+            on_image()
+    except BagError as error:
+        problems.append(str(error))
+    used = [observations for observations in seen if not observations.refusal]
+    measured = setup is not None or bool(chosen and chosen.observations)
+    status = None
+    if setup and chosen:
+        ensemble = Ensemble()
+        for observations in seen:
+            ensemble = solve.add_to_ensemble(ensemble, observations, setup)
+        status = solve.ensemble_status(ensemble, setup)
+    if chosen and not problems:
+        problems += _shortages(used, status)
+    return Inspection(
+        bags=tuple(map(str, paths)),
+        topics=topics,
+        chosen=chosen,
+        images=len(seen),
+        refused=_refused(seen),
+        longest_attitude_gap_s=max((o.attitude_gap_s for o in used), default=-1.0),
+        measured=measured,
+        stars_per_image=tuple(len(o) for o in used) if measured else (),
+        refused_stars=dict(sum((Counter(o.refused_stars) for o in used), Counter())),
+        status=status,
+        damage=tuple(damage),
+        problems=tuple(problems),
+    )
+
+
+def content(inspection: Inspection) -> dict[str, object]:
+    """An inspection as a JSON object; a number that is not finite is null."""
+    made = dataclasses.asdict(inspection)
+    if inspection.status is not None:
+        status = made['status']
+        status['coverage'] = inspection.status.coverage.tolist()
+        status['predicted_sigma'] = [
+            float(s) if np.isfinite(s) else None for s in inspection.status.predicted_sigma
+        ]
+    return made
+
+
+def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, ...]:
+    """Every topic, by name, from one pass over the files."""
+    types: dict[str, str] = {}
+    stamps: defaultdict[str, list[int]] = defaultdict(list)
+    kinds: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    bad: Counter[str] = Counter()
+    for raw in reader.read_raw(paths, on_damage=on_damage):
+        types[raw.topic] = raw.type_name
+        stamp_ns = raw.log_time_ns
+        if raw.type_name in _STAMPED:
+            try:
+                message = reader.decode(raw)
+            except BagError:
+                bad[raw.topic] += 1
+            else:
+                stamp_ns = message_fields.stamp_ns(message.header.stamp)
+                if raw.type_name in _IMAGES:
+                    kinds[raw.topic][_kind(message)] += 1
+                elif raw.type_name == ATTITUDE_TYPE:
+                    sample = attitude_sample(*attitude_from_message(message), '')
+                    bad[raw.topic] += sample is None
+        stamps[raw.topic].append(stamp_ns)
+    return tuple(
+        _topic_content(name, types[name], stamps[name], kinds[name], bad[name])
+        for name in sorted(types)
+    )
+
+
+def _topic_content(
+    name: str, type_name: str, stamps_ns: list[int], kinds: Mapping[str, int], bad: int
+) -> TopicContent:
+    steps_s = np.diff(sorted(stamps_ns)) / NANOSECONDS_PER_SECOND
+    middle_s = float(np.median(steps_s)) if steps_s.size else 0.0
+    return TopicContent(
+        name=name,
+        type_name=type_name,
+        count=len(stamps_ns),
+        rate_hz=1.0 / middle_s if middle_s > 0 else 0.0,
+        first_ns=min(stamps_ns),
+        last_ns=max(stamps_ns),
+        longest_gap_s=float(steps_s.max()) if steps_s.size else 0.0,
+        backward=int((np.diff(stamps_ns) < 0).sum()),
+        kinds=dict(kinds),
+        bad=bad,
+    )
+
+
+def _kind(message: Message) -> str:
+    """Encoding and size of an image message, in words."""
+    if hasattr(message, 'encoding'):
+        return f'{message.encoding} {message.width} x {message.height}'
+    try:
+        pixels = decode_png(message.data, 0).pixels
+    except ImageRefused:
+        return f'{message.format or "compressed"}, not a PNG of one channel'
+    return f'PNG {8 * pixels.itemsize} bit {pixels.shape[1]} x {pixels.shape[0]}'
+
+
+def _placed(
+    paths: Sequence[Path], topics: Topics, options: AttitudeOptions
+) -> Iterator[StarObservations]:
+    """Images without their stars: refused where decoding, order or attitude refuses them."""
+    attitudes = reader.read_attitudes(paths, topics.attitude, options)
+    latest_ns = None
+    for image in reader.read_images(paths, topics.image, options.stamp_offset_s):
+        if isinstance(image, StarObservations):
+            yield image
+            continue
+        height, width = image.pixels.shape
+        try:
+            observe.check_order(image, latest_ns)
+            _, gap_s = attitudes.at(image.time_ns, options.max_attitude_gap_s)
+        except ImageRefused as refused:
+            yield refused_image(image.time_ns, width, height, refused.reason, refused.detail)
+            continue
+        latest_ns = image.time_ns
+        yield refused_image(image.time_ns, width, height, '', '', attitude_gap_s=gap_s)
+
+
+def _refused(seen: Iterable[StarObservations]) -> tuple[Refused, ...]:
+    groups: dict[str, list[StarObservations]] = {}
+    for observations in seen:
+        if observations.refusal:
+            groups.setdefault(observations.refusal, []).append(observations)
+    return tuple(
+        Refused(
+            reason, len(group), IMAGE_REFUSALS.get(reason, ''), group[0].time_ns, group[0].detail
+        )
+        for reason, group in sorted(groups.items(), key=lambda item: -len(item[1]))
+    )
+
+
+def _shortages(used: Sequence[StarObservations], status: EnsembleStatus | None) -> list[str]:
+    """What is missing for a calibration."""
+    if not used:
+        return ['no image can be used']
+    if status is None:
+        return []
+    found = []
+    for what, there, wanted in (
+        ('images', status.images, status.min_images),
+        ('stars', status.stars, status.min_stars),
+    ):
+        if there < wanted:
+            found.append(f'{there} {what} can be used, {wanted} are needed (min_{what})')
+    return found

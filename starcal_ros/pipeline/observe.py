@@ -1,0 +1,289 @@
+"""A sequence of images, each measured with what those before it have shown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+import dataclasses
+from dataclasses import dataclass
+import math
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.bag import reader
+from starcal_ros.camera import CameraModel
+from starcal_ros.errors import ImageRefused
+from starcal_ros.identification.star_finder import observe_stars, Shot, tracked
+from starcal_ros.identification.tracking import follow, Followed, following
+from starcal_ros.image.centroiding import saturation_level
+from starcal_ros.image.detection import Pixels
+from starcal_ros.image.frame_checks import Fingerprint, fingerprint, sample_rows, screen
+from starcal_ros.image.hot_pixels import HotPixels, learn_hot_pixels
+from starcal_ros.pipeline.setup import Setup
+from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.sky.attitude import AttitudeHistory
+
+Floats = NDArray[np.float64]
+T = TypeVar('T')
+OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
+
+
+_IMAGES_OF_A_RESTART = 3  # two images may have changed places on their way; three do not
+
+
+@dataclass(frozen=True)
+class Track:
+    """
+    Where a sequence of images stands.
+
+    ``geometry`` is what an image is searched with; ``latest_ns`` stamps the last one used.
+    ``followed`` is what the images so far have shown, with which the next is measured without a
+    search; None before the first.  ``behind`` images in a row, the last of them at ``behind_ns``,
+    were stamped before the last one used.  ``seen`` is the last frame of all, used or not,
+    which a stuck camera shows again; ``hot`` the hot pixels found so far.
+    """
+
+    geometry: CameraGeometry
+    latest_ns: int | None = None
+    followed: Followed | None = None
+    behind: int = 0
+    behind_ns: int = 0
+    seen: Fingerprint | None = None
+    hot: HotPixels | None = None
+
+
+def observe_next(
+    image: Image,
+    attitudes: AttitudeHistory,
+    setup: Setup,
+    track: Track,
+    velocity_m_s: Floats | None = None,
+    temperature_degc: float = math.nan,
+) -> tuple[StarObservations, Track]:
+    """
+    The stars of the next image of a sequence, and where the sequence stands then.
+
+    A sequence starts with the prior, or with the calibration in force.  An image stamped at or
+    before one that was used is refused; a refused image moves nothing, so that one wrong stamp
+    costs one image.  The third such image in a row, in order among themselves, is believed: a
+    clock was set back, or a recording plays again.  The sequence starts anew with it.  The pixels
+    of the image before are refused, used or not, when they come again under another stamp.
+    """
+    track = _after_order(track, image.time_ns)
+    known: dict[str, object] = {'temperature_degc': temperature_degc}
+    remembered = track
+    try:
+        check_order(image, track.latest_ns)
+        _check_size(image, track.geometry.camera)
+        sample = sample_rows(image.pixels)
+        seen = fingerprint(image, sample)
+        remembered = dataclasses.replace(track, seen=seen)
+        quaternion, gap_s = attitudes.at(image.time_ns, setup.attitude.max_attitude_gap_s)
+        known |= {
+            'icrf_from_star_tracker_xyzw': quaternion,
+            'attitude_gap_s': gap_s,
+            'catalog_digest': setup.catalog.digest,
+        }
+        saturation_dn = setup.centroid.saturation_dn
+        screen(sample, seen, track.seen, saturation_dn, setup.dark, setup.screening)
+        hot = (track.hot or setup.hot).index
+        shot = Shot(
+            _without_dark(image, setup),
+            quaternion,
+            gap_s,
+            velocity_m_s,
+            setup.site,
+            hot,
+            temperature_degc,
+        )
+        return _stars(shot, setup, remembered)
+    except ImageRefused as refused:
+        height, width = image.pixels.shape
+        observations = refused_image(
+            image.time_ns, width, height, refused.reason, refused.detail, **known
+        )
+        return observations, remembered
+
+
+def observe(
+    image: Image,
+    attitudes: AttitudeHistory,
+    setup: Setup,
+    geometry: CameraGeometry,
+    velocity_m_s: Floats | None = None,
+) -> StarObservations:
+    """
+    The stars of one image, or the record of why it is refused; never raises for a bad image.
+
+    ``geometry`` is what the stars are predicted with: the prior or a calibration in force.
+    ``velocity_m_s`` (3,) is the observer's barycentric velocity, ICRF axes; None: the Earth's.
+    """
+    return observe_next(image, attitudes, setup, Track(geometry), velocity_m_s)[0]
+
+
+def _without_dark(image: Image, setup: Setup) -> Image:
+    """The image less the dark frame, kept positive by the dark frame's own median."""
+    pixels, dark = image.pixels, setup.dark
+    if dark is None:
+        return image
+    if dark.dtype != pixels.dtype:
+        raise ImageRefused('bad_encoding', f'{pixels.dtype} image, the dark frame is {dark.dtype}')
+    # Noise below the dark level must not be cut off at zero: it would bias the background.
+    below = np.minimum(dark, dark.dtype.type(setup.dark_pedestal_dn))
+    raised = cv2.add(pixels, dark.dtype.type(setup.dark_pedestal_dn) - below)
+    # The types of OpenCV know of no image of whole numbers.
+    level: Pixels = cv2.subtract(raised, dark - below)  # type: ignore[assignment]
+    # What is saturated stays at the end of the range, where it is known as such.
+    peak = int(pixels.max())
+    level[(level > peak) | (pixels >= (saturation_level(pixels, setup.centroid) or np.inf))] = peak
+    return Image(image.time_ns, level)
+
+
+def _after_order(track: Track, time_ns: int) -> Track:
+    """Where a sequence stands when an image has come; the third from the past starts it anew."""
+    if track.latest_ns is None or time_ns > track.latest_ns:
+        return dataclasses.replace(track, behind=0)
+    behind = track.behind + 1 if track.behind and time_ns > track.behind_ns else 1
+    if behind < _IMAGES_OF_A_RESTART:
+        return dataclasses.replace(track, behind=behind, behind_ns=time_ns)
+    return Track(track.geometry, hot=track.hot)
+
+
+def _stars(shot: Shot, setup: Setup, track: Track) -> tuple[StarObservations, Track]:
+    """The stars where the images before say, or else where a search of the image finds them."""
+    time_ns = shot.image.time_ns
+    if track.followed is not None:
+        try:
+            observations, followed = follow(
+                shot, track.followed, setup.catalog, setup.centroid, setup.identification
+            )
+            # Good to a few pixels for the camera of the search, which searches over many.
+            geometry = dataclasses.replace(
+                track.geometry,
+                star_tracker_from_camera_xyzw=followed.geometry.star_tracker_from_camera_xyzw,
+            )
+            after = dataclasses.replace(
+                track, geometry=geometry, latest_ns=time_ns, followed=followed
+            )
+            return observations, _with_hot_pixels(after, shot, observations, setup)
+        except ImageRefused:
+            pass  # the search says what is wrong with the image
+    observations, instrument = observe_stars(
+        shot, track.geometry, setup.catalog, setup.centroid, setup.identification
+    )
+    if observations.refusal:
+        return observations, track
+    geometry = tracked(track.geometry, observations)
+    after = dataclasses.replace(
+        track,
+        geometry=geometry,
+        latest_ns=time_ns,
+        followed=following(geometry, observations, instrument),
+    )
+    return observations, _with_hot_pixels(after, shot, observations, setup)
+
+
+def _with_hot_pixels(
+    track: Track, shot: Shot, observations: StarObservations, setup: Setup
+) -> Track:
+    """The track with the hot pixels that an image shows, which is aligned as the track says."""
+    icrf_from_star_tracker = Rotation.from_quat(shot.icrf_from_star_tracker_xyzw)
+    hot = learn_hot_pixels(
+        track.hot or setup.hot,
+        shot.image.pixels,
+        observations.background_dn,
+        observations.noise_dn,
+        icrf_from_star_tracker * Rotation.from_quat(track.geometry.star_tracker_from_camera_xyzw),
+        float(track.geometry.camera.parameters[0]),
+        setup.fixed_pattern,
+    )
+    return dataclasses.replace(track, hot=hot)
+
+
+def check_order(image: Image, latest_ns: int | None) -> None:
+    """
+    Hold the stamp of an image against that of the last one used, None where there is none.
+
+    Raises
+    ------
+    ImageRefused
+        ``out_of_order``.
+    """
+    if latest_ns is not None and image.time_ns <= latest_ns:
+        late_s = (latest_ns - image.time_ns) * 1e-9
+        raise ImageRefused('out_of_order', f'{late_s:.6f} s before the last image used')
+
+
+def _check_size(image: Image, camera: CameraModel) -> None:
+    height, width = image.pixels.shape
+    if (width, height) != (camera.width, camera.height):
+        raise ImageRefused(
+            'wrong_size', f'{width} x {height}, the camera has {camera.width} x {camera.height}'
+        )
+
+
+def latest_at(samples: Sequence[tuple[int, T]], time_ns: int, without: T) -> T:
+    """
+    The last sample at or before a time, else the first after it; ``without`` where there is none.
+
+    A spacecraft's velocity changes by under 10 m/s (0.007 arcsec) between the samples of a minute,
+    and a camera's temperature by less than its sensor tells.
+    """
+    before = [sample for stamp_ns, sample in samples if stamp_ns <= time_ns]
+    if before:
+        return before[-1]
+    return samples[0][1] if samples else without
+
+
+def observe_bag(
+    paths: Sequence[Path],
+    image_topic: str,
+    attitude_topic: str,
+    setup: Setup,
+    velocity_topic: str = '',
+    temperature_topic: str = '',
+    on_image: OnImage | None = None,
+) -> Iterator[StarObservations]:
+    """
+    Observations of every image of a bag, in the order of the bag; one image in memory at a time.
+
+    ``on_image`` is shown each image that could be decoded, with its observations and what the
+    stars were predicted with.
+
+    Raises
+    ------
+    BagError
+        When the bag cannot be read or a topic is not in it.
+    """
+    attitudes = reader.read_attitudes(paths, attitude_topic, setup.attitude)
+    velocities = (
+        sorted(reader.read_velocities(paths, velocity_topic), key=lambda sample: sample[0])
+        if velocity_topic
+        else []
+    )
+    temperatures = (
+        sorted(reader.read_temperatures(paths, temperature_topic), key=lambda sample: sample[0])
+        if temperature_topic
+        else []
+    )
+    track = Track(setup.prior)
+    for image in reader.read_images(paths, image_topic, setup.attitude.stamp_offset_s):
+        if isinstance(image, StarObservations):
+            yield image
+            continue
+        predicted_with = track.geometry
+        observations, track = observe_next(
+            image,
+            attitudes,
+            setup,
+            track,
+            latest_at(velocities, image.time_ns, None),
+            latest_at(temperatures, image.time_ns, math.nan),
+        )
+        if on_image is not None:
+            on_image(image, observations, predicted_with)
+        yield observations

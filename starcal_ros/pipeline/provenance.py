@@ -1,0 +1,59 @@
+"""Where a calibration comes from: software, options, catalog, prior and observations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import hashlib
+import importlib.metadata
+import json
+import math
+
+import numpy as np
+
+from starcal_ros.pipeline.setup import Setup
+from starcal_ros.records import Ensemble
+
+
+def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -> dict[str, str]:
+    """
+    Where a calibration comes from, enough to repeat it.
+
+    ``inputs`` names what the observations came from.
+    """
+    prior = np.r_[setup.prior.camera.parameters, setup.prior.star_tracker_from_camera_xyzw]
+    return {
+        'software': f'starcal {software_version()}',
+        'catalog': setup.catalog.digest,
+        'options': json.dumps(setup.options(), sort_keys=True),
+        'prior': json.dumps(prior.tolist()),
+        'observations_sha256': _digest(ensemble),
+        **{f'input {name}': value for name, value in inputs.items()},
+    }
+
+
+def _digest(ensemble: Ensemble) -> str:
+    """
+    SHA-256 of all that an estimate reads of its images, in their order.
+
+    Of each image, little-endian: stamp (int64, ns), number of stars (int64), attitude, then by
+    columns catalog numbers (int64), directions, pixels and covariances, last the temperature where
+    it is known.  Whoever has the recorded observations can make it again.
+    """
+    digest = hashlib.sha256()
+    for image in ensemble.images:
+        digest.update(np.array([image.time_ns, len(image)], '<i8').tobytes())
+        digest.update(image.icrf_from_star_tracker_xyzw.astype('<f8').tobytes())
+        digest.update(image.catalog_id.astype('<i8').tobytes())
+        for column in (image.direction_icrf, image.measured_px, image.covariance_px2):
+            digest.update(column.astype('<f8').tobytes())
+        if not math.isnan(image.temperature_degc):
+            digest.update(np.array(image.temperature_degc, '<f8').tobytes())
+    return digest.hexdigest()
+
+
+def software_version() -> str:
+    """Version of the installed package; 'unknown' where it runs from a bare source tree."""
+    try:
+        return importlib.metadata.version('starcal_ros')
+    except importlib.metadata.PackageNotFoundError:
+        return 'unknown'

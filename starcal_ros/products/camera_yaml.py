@@ -1,0 +1,139 @@
+"""The ROS camera YAML, ``camera_info.yaml``, both ways, and the URLs that name one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import os
+from pathlib import Path
+import re
+from urllib.parse import unquote
+
+import numpy as np
+import yaml
+
+from starcal_ros.camera import CameraModel, DISTORTION_NAMES, zero_skew_fit
+from starcal_ros.errors import ProductError
+from starcal_ros.products.fields import CheckedValues, row_of_numbers, whole_number
+from starcal_ros.products.files import read_text, write_atomically
+
+CAMERA_INFO_FILE = 'camera_info.yaml'
+# plumb_bob's order of coefficients, by our names; ROS puts k3 last.
+_PLUMB_BOB = ('k1', 'k2', 'p1', 'p2', 'k3')
+
+
+def write_camera_info(camera: CameraModel, path: Path, camera_name: str = 'camera') -> None:
+    """
+    Write a ROS camera YAML as camera_info_manager reads it, with the zero-skew fit of the camera.
+
+    Readers of ``CameraInfo`` ignore K[0,1] without a word, so it is 0 and the other parameters
+    make up for it as well as they can (`zero_skew_fit`).
+
+    Raises
+    ------
+    ProductError
+        When the file cannot be written.
+    """
+    fitted, _ = zero_skew_fit(camera)
+    fx, _, fy, cx, cy = fitted.intrinsics.tolist()
+    distortion = dict(zip(DISTORTION_NAMES, fitted.distortion.tolist(), strict=True))
+    content = {
+        'image_width': fitted.width,
+        'image_height': fitted.height,
+        'camera_name': camera_name,
+        'camera_matrix': _matrix(3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        'distortion_model': 'plumb_bob',
+        'distortion_coefficients': _matrix(1, 5, [distortion[name] for name in _PLUMB_BOB]),
+        'rectification_matrix': _matrix(3, 3, np.eye(3).ravel().tolist()),
+        'projection_matrix': _matrix(
+            3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+        ),
+    }
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
+    write_atomically(path, text)
+
+
+def read_camera_info(location: str | Path) -> CameraModel:
+    """
+    The camera in a ROS camera YAML; K[0,1], where a file has one, is its skew.
+
+    Parameters
+    ----------
+    location : str or Path
+        A path, or a ``file://`` or ``package://`` URL.
+
+    Raises
+    ------
+    ProductError
+        Naming the file and the key that is missing, wrong or not supported.
+    """
+    path = resolve_url(location) if isinstance(location, str) else location
+    try:
+        content = yaml.safe_load(read_text(path))
+    except yaml.YAMLError as error:
+        raise ProductError(f'{path}: not YAML: {" ".join(str(error).split())}') from error
+    if not isinstance(content, dict):
+        raise ProductError(f'{path}: not a camera YAML (no keys)')
+    reader = CheckedValues(path, content)
+    width, height = (reader.get(f'image_{side}', whole_number) for side in ('width', 'height'))
+    K = reader.get('camera_matrix.data', row_of_numbers(9))
+    fx, skew, cx, zero, fy, cy = K[:6]
+    if zero != 0.0 or K[6:] != [0.0, 0.0, 1.0]:
+        raise ProductError(f'{path}: camera_matrix.data: {K} is not [fx s cx 0 fy cy 0 0 1]')
+    model = content.get('distortion_model', 'plumb_bob')
+    if model != 'plumb_bob':
+        raise ProductError(f'{path}: distortion_model: {model!r} is not plumb_bob')
+    D = reader.get('distortion_coefficients.data', row_of_numbers(4, 5))
+    distortion = dict(zip(_PLUMB_BOB, [*D, 0.0][:5], strict=True))
+    parameters = [fx, skew, fy, cx, cy, *(distortion[name] for name in DISTORTION_NAMES)]
+    try:
+        return CameraModel(width, height, np.array(parameters))
+    except ValueError as error:
+        raise ProductError(f'{path}: {error}') from error
+
+
+def resolve_url(url: str) -> Path:
+    """
+    The path that a ``file://`` or ``package://`` URL, or a plain path, names.
+
+    Packages are looked for as ament does, in ``share/<package>`` of each prefix of
+    AMENT_PREFIX_PATH, but without ROS.
+
+    Raises
+    ------
+    ProductError
+        For another scheme, an empty URL or a package that no prefix has.
+    """
+    scheme, separator, rest = url.partition('://')
+    if not separator:
+        if not url:
+            raise ProductError('the camera YAML is not named (empty URL)')
+        return Path(url)
+    if scheme == 'file':
+        return _as_written_or_decoded(Path(rest))
+    if scheme != 'package':
+        raise ProductError(f'{url}: only file:// and package:// URLs can be read')
+    package, _, inside = rest.partition('/')
+    if not re.fullmatch(r'\w+', package) or not inside:
+        raise ProductError(f'{url}: not package://<package>/<path>')
+    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        share = Path(prefix, 'share', package)
+        if prefix and share.is_dir():
+            return _as_written_or_decoded(share / inside)
+    raise ProductError(f'{url}: package {package} is not in AMENT_PREFIX_PATH')
+
+
+def with_camera_url_from(values: Mapping[str, object], params: Path) -> dict[str, object]:
+    """Parameters of a file; a `camera_info_url` that is no URL is relative to that file."""
+    url = values.get('camera_info_url')
+    if isinstance(url, str) and url and '://' not in url:
+        return {**values, 'camera_info_url': str(params.parent / url)}
+    return dict(values)
+
+
+def _as_written_or_decoded(path: Path) -> Path:
+    """The path; ROS does not decode %20 in its URLs but others do, so both are taken."""
+    return path if path.exists() else Path(unquote(str(path)))
+
+
+def _matrix(rows: int, cols: int, data: list[float]) -> dict[str, object]:
+    return {'rows': rows, 'cols': cols, 'data': data}

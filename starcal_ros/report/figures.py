@@ -1,0 +1,452 @@
+"""
+Figures of the report as inline SVG.
+
+They show what the products hold.  Colours that must change with the theme of the page are drawn
+as marks of this module and become CSS variables, so one drawing serves light, dark and paper;
+text stays text and takes the font of the page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import html
+import io
+import re
+
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binned_statistic, norm
+
+from starcal_ros.assessment.agreement import movement
+from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.camera import CameraModel, distortion_px, pixel_grid
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.estimation.normal_equations import whitening
+from starcal_ros.records import CameraGeometry, DetectorMaps, Removal
+
+Floats = NDArray[np.float64]
+
+# Colours nothing else draws with -> CSS variables of report.css.
+INK, MUTED, GRID, PAPER = '#010203', '#010204', '#010205', '#010206'
+SERIES = ('#010207', '#010208', '#010209')
+_VARIABLES = {
+    INK: '--ink',
+    MUTED: '--muted',
+    GRID: '--grid',
+    PAPER: '--paper',
+    SERIES[0]: '--series-1',
+    SERIES[1]: '--series-2',
+    SERIES[2]: '--series-3',
+}
+# In pictures of thousands of points, which are pixels: readable on white and on black.
+_POINTS = '#3d8bd4'
+STYLE = {
+    'svg.fonttype': 'none',
+    'svg.hashsalt': 'starcal',
+    'font.size': 9.5,
+    'axes.edgecolor': MUTED,
+    'axes.labelcolor': INK,
+    'axes.titlesize': 9.5,
+    'axes.linewidth': 0.8,
+    'axes.grid': True,
+    'axes.axisbelow': True,
+    'axes.spines.top': False,
+    'axes.spines.right': False,
+    'axes.facecolor': 'none',
+    'figure.facecolor': 'none',
+    'savefig.facecolor': 'none',
+    'grid.color': GRID,
+    'grid.linewidth': 0.7,
+    'text.color': INK,
+    'xtick.color': MUTED,
+    'ytick.color': MUTED,
+    'xtick.labelcolor': INK,
+    'ytick.labelcolor': INK,
+    'legend.frameon': False,
+    'legend.fontsize': 9,
+    'patch.linewidth': 0.0,
+}
+_SIZE = (4.7, 3.5)
+_TITLED = 'titled'  # group id of the points that `_svg` gives titles, which a browser shows
+
+
+def _figure(width: float = _SIZE[0], height: float = _SIZE[1]) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(width, height), layout='constrained')
+    return figure, figure.subplots()
+
+
+def _svg(figure: Figure, name: str, titles: Sequence[str] = ()) -> Markup:
+    """
+    SVG element of a figure, its identifiers made unique by a name.
+
+    ``titles`` are those of the points drawn under the group id `_TITLED`, in order.
+    """
+    memory = io.StringIO()
+    figure.savefig(memory, format='svg', dpi=144, metadata={'Date': None, 'Creator': None})
+    text = memory.getvalue()
+    text = text[text.index('<svg') :]
+    # Sizes come from the page, the proportion from viewBox.
+    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r'\1', text, count=1)
+    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r'\1', text, count=1)
+    text = text.replace('<svg', '<svg aria-hidden="true"', 1)
+    text = re.sub(r'<metadata>.*?</metadata>', '', text, flags=re.DOTALL)
+    for colour, variable in _VARIABLES.items():
+        text = text.replace(colour, f'var({variable})')
+    text = re.sub(r'font: ([\d.]+px) [^;\"]*', r'font: \1 var(--font)', text)
+    if titles:
+        text = _with_titles(text, titles)
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = re.sub(r'(xlink:href="#|url\(#)', rf'\g<1>{name}-', text)
+    return Markup(text)
+
+
+def _with_titles(text: str, titles: Sequence[str]) -> str:
+    """Points of the group with titles as children, which a browser shows under the pointer."""
+    first = text.index(f'id="{_TITLED}"')
+    last = first + text[first:].index('</g>\n   </g>') if '</g>\n   </g>' in text[first:] else None
+    group = text[first:last]
+    count = iter(titles)
+    titled = re.sub(
+        r'<use ([^>]*?)/>',
+        lambda use: f'<use {use[1]}><title>{html.escape(next(count))}</title></use>',
+        group,
+        count=len(titles),
+    )
+    return text[:first] + titled + ('' if last is None else text[last:])
+
+
+def _rms_in_bins(x: Floats, values: Floats, edges: Floats) -> tuple[Floats, Floats]:
+    """Centres of the bins that hold ten values or more, and the RMS of their values."""
+    square, _, which = binned_statistic(x, values**2, 'mean', edges)
+    enough = np.bincount(which, minlength=len(edges) + 1)[1:-1] >= 10
+    return (0.5 * (edges[1:] + edges[:-1]))[enough], np.sqrt(square[enough])
+
+
+def _on_detector(axes: Axes, camera: CameraModel) -> None:
+    axes.set(
+        xlim=(-0.5, camera.width - 0.5),
+        ylim=(camera.height - 0.5, -0.5),
+        aspect='equal',
+        xlabel='column u (px)',
+        ylabel='row v (px)',
+    )
+    axes.grid(False)
+    for side in ('top', 'right'):
+        axes.spines[side].set_visible(True)
+
+
+def _detector_figure(camera: CameraModel, beside: float = 0.0) -> tuple[Figure, Axes]:
+    """A figure with the proportion of the detector; ``beside`` is what its right side takes."""
+    height = 0.75 + (3.9 - beside) * camera.height / camera.width
+    figure, axes = _figure(_SIZE[0], min(height, 5.5))
+    _on_detector(axes, camera)
+    return figure, axes
+
+
+def star_coverage(residuals: Residuals, camera: CameraModel) -> Markup:
+    """Every star that was used, where it stood on the detector (paper, Fig. 5)."""
+    figure, axes = _detector_figure(camera)
+    u, v = residuals.measured_px[residuals.used].T
+    size = np.clip(4000.0 / max(len(u), 1), 0.6, 5.0)
+    axes.scatter(u, v, s=size, color=_POINTS, linewidths=0, rasterized=True)
+    return _svg(figure, 'coverage')
+
+
+def cell_counts(maps: DetectorMaps, camera: CameraModel) -> Markup:
+    """Stars in equal cells of the detector."""
+    figure, axes = _detector_figure(camera)
+    counts = maps.stars
+    rows, columns = counts.shape
+    share = counts / max(int(counts.max()), 1)
+    u = (np.arange(columns) + 0.5) * camera.width / columns - 0.5
+    v = (np.arange(rows) + 0.5) * camera.height / rows - 0.5
+    extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
+    axes.imshow(share, extent=extent, cmap='Blues', vmin=-0.15, vmax=1.1, aspect='equal')
+    size = min(9.0, 90.0 / columns)
+    for (row, column), count in np.ndenumerate(counts):
+        dark = share[row, column] > 0.55
+        colour = '#ffffff' if dark else '#12324f'
+        if count == 0:
+            colour = '#b3261e'
+        axes.text(u[column], v[row], str(count), ha='center', va='center', color=colour,
+                  fontsize=size)  # fmt: skip
+    return _svg(figure, 'cells')
+
+
+def _contours(axes: Axes, camera: CameraModel, length: Floats, unit: str) -> None:
+    """Labelled contours of a grid (48, 60) of values over the detector."""
+    u, v = (a.reshape(48, 60) for a in pixel_grid(camera, 60, 48).T)
+    # No more lines than can be labelled, at round numbers.
+    lines = axes.contour(u, v, length, levels=7, cmap='viridis', linewidths=1.4)
+    axes.clabel(lines, fmt=lambda level: f'{level:g}{unit}', fontsize=9, colors=[INK])
+
+
+def distortion_vectors(camera: CameraModel) -> Markup:
+    """How the lens moves what an ideal one would show, as arrows (paper, Fig. 6 left)."""
+    return _arrows(camera, pixel_grid(camera, 17, 13), None, 'vectors')
+
+
+def distortion_contours(camera: CameraModel) -> Markup:
+    """The length of those arrows in pixels (paper, Fig. 6 right)."""
+    figure, axes = _detector_figure(camera)
+    shift = distortion_px(camera, pixel_grid(camera, 60, 48))
+    _contours(axes, camera, np.hypot(*shift.T).reshape(48, 60), ' px')
+    return _svg(figure, 'contours')
+
+
+def change_contours(before: CameraGeometry, after: CameraGeometry) -> Markup:
+    """How far the lines of sight moved once a common turn is removed, in pixels."""
+    figure, axes = _detector_figure(after.camera)
+    _, moved_px = movement(before, after, 60, 48)
+    _contours(axes, after.camera, moved_px.reshape(48, 60), ' px')
+    return _svg(figure, 'change')
+
+
+def _arrows(camera: CameraModel, places: Floats, arrows: Floats | None, name: str) -> Markup:
+    shift = distortion_px(camera, places) if arrows is None else arrows
+    figure, axes = _detector_figure(camera)
+    longest = float(np.nanmax(np.hypot(*shift.T), initial=0.0))
+    key = _round_length(longest)
+    # The longest is as long as a step of the grid of seventeen.
+    scale = (longest or 1.0) / (0.9 * camera.width / 16)
+    quiver = axes.quiver(
+        *places.T, *shift.T, angles='xy', scale_units='xy', scale=scale, color=SERIES[0],
+        width=0.0035, headwidth=4,
+    )  # fmt: skip
+    axes.plot(*places.T, '.', color=MUTED, markersize=1.2)
+    # Set by hand: a key of matplotlib would take its text's colour from the arrows.
+    axes.quiverkey(
+        quiver, 0.9, 1.05, key, f'{key:g} px', labelpos='W', color=SERIES[1], labelcolor=INK,
+        coordinates='axes',
+    )  # fmt: skip
+    return _svg(figure, name)
+
+
+def _round_length(longest: float) -> float:
+    """1, 2 or 5 times a power of ten, not over a length."""
+    if not longest > 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(longest))
+    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= longest))
+
+
+def residual_field(residuals: Residuals, camera: CameraModel) -> Markup:
+    """Mean residual of the stars in cells of the detector: what the model does not follow."""
+    u, v = residuals.measured_px[residuals.used].T
+    edges_u = np.linspace(-0.5, camera.width - 0.5, 13)
+    edges_v = np.linspace(-0.5, camera.height - 0.5, 11)
+    mean = [
+        np.histogram2d(u, v, (edges_u, edges_v), weights=component)[0]
+        for component in residuals.residual_px[residuals.used].T
+    ]
+    count = np.histogram2d(u, v, (edges_u, edges_v))[0]
+    enough = count >= 5
+    centre_u, centre_v = (0.5 * (e[1:] + e[:-1]) for e in (edges_u, edges_v))
+    places = np.stack(np.meshgrid(centre_u, centre_v, indexing='ij'), axis=-1)[enough]
+    arrows = np.stack([m[enough] / count[enough] for m in mean], axis=-1)
+    return _arrows(camera, places, arrows, 'field')
+
+
+def residuals_of_images(residuals: Residuals) -> Markup:
+    """RMS of the stars used of each image, in order of time."""
+    figure, axes = _figure()
+    rms = residuals.image_rms_px()
+    number = np.arange(1, len(rms) + 1)
+    stars = np.bincount(residuals.image[residuals.used], minlength=len(rms))
+    points = axes.scatter(number, rms, s=26, color=SERIES[0], linewidths=0)
+    points.set_gid(_TITLED)
+    top = 1.15 * float(np.nanmax(rms, initial=0.0)) or 1.0
+    axes.set(xlabel='image', ylabel='residual, rms per axis (px)', ylim=(0, top))
+    axes.margins(x=0.04)
+    _whole_numbers(axes, len(rms))
+    shown = np.isfinite(rms)
+    titles = [
+        f'image {n}: {r:.4f} px rms, {s} stars'
+        for n, r, s in zip(number[shown], rms[shown], stars[shown], strict=True)
+    ]
+    return _svg(figure, 'images', titles)
+
+
+def _whole_numbers(axes: Axes, count: int) -> None:
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlim(0.5 - 0.02 * count, count + 0.5 + 0.02 * count)
+
+
+def histogram(residuals: Residuals) -> Markup:
+    """Residuals in their own sigmas against the normal distribution (paper, Fig. 7)."""
+    figure, axes = _figure()
+    edges = np.linspace(-5, 5, 51)
+    whitened = whitened_residuals(residuals)
+    for values, colour, name in zip(whitened, SERIES, 'uv', strict=False):
+        axes.hist(
+            np.clip(values, -4.999, 4.999), edges.tolist(), density=True, histtype='step',
+            color=colour, linewidth=1.5, label=f'{name}: std {values.std():.2f}',
+        )  # fmt: skip
+    x = np.linspace(-5, 5, 201)
+    axes.plot(x, norm.pdf(x), color=INK, linewidth=1.0, linestyle='--', label='normal')
+    axes.set(xlabel='residual (its own sigma)', ylabel='density', xlim=(-5, 5))
+    axes.legend(loc='upper right', handlelength=1.4)
+    return _svg(figure, 'histogram')
+
+
+def whitened_residuals(residuals: Residuals) -> tuple[Floats, Floats]:
+    """Residuals of the stars used, independent and of unit variance if all is as assumed."""
+    used = residuals.used
+    uu, uv, vv = whitening(residuals.covariance_px2[used])
+    r_u, r_v = residuals.residual_px[used].T
+    return uu * r_u + uv * r_v, vv * r_v
+
+
+def residuals_against_magnitude(residuals: Residuals) -> Markup:
+    """Lengths of the residuals against V, with the RMS of bins and what the sigmas promise."""
+    used = residuals.used & np.isfinite(residuals.magnitude)
+    V, r = residuals.magnitude[used], residuals.residual_px[used]
+    figure, axes = _figure()
+    sigma = np.sqrt(residuals.covariance_px2[used][:, [0, 2]].mean(axis=1))
+    # An axis of each star: 1-sigma and RMS mean the same for the points, the dots and the line.
+    axes.scatter(V, np.sqrt((r**2).mean(axis=1)), s=3, color=_POINTS, alpha=0.35, linewidths=0,
+                 rasterized=True)  # fmt: skip
+    if len(V):
+        edges = np.arange(np.floor(2 * V.min()) / 2, V.max() + 0.5, 0.5)
+        if len(edges) > 1:
+            axes.plot(*_rms_in_bins(np.r_[V, V], r.T.ravel(), edges), 'o-', color=SERIES[1],
+                      markersize=4, linewidth=1.3, label='rms of half a magnitude')  # fmt: skip
+            axes.plot(*_rms_in_bins(V, sigma, edges), '--', color=INK, linewidth=1.2,
+                      label='1-sigma expected')  # fmt: skip
+        axes.set_ylim(0, 1.15 * float(np.percentile(np.sqrt((r**2).mean(axis=1)), 99.5)) + 1e-6)
+        axes.legend(loc='upper left', handlelength=1.6)
+    axes.set(xlabel='magnitude V', ylabel='residual, rms of u and v (px)')
+    return _svg(figure, 'magnitude')
+
+
+def _means(axes: Axes, x: Floats, y: Floats, edges: Floats, side: int, label: str) -> None:
+    """Means with their standard errors in bins of ten values or more."""
+    mean, _, which = binned_statistic(x, y, 'mean', edges)
+    std, _, _ = binned_statistic(x, y, 'std', edges)
+    count = np.bincount(which, minlength=len(edges) + 1)[1:-1]
+    enough = count >= 10
+    centre = 0.5 * (edges[1:] + edges[:-1])[enough] + (side - 0.5) * 0.12 * (edges[1] - edges[0])
+    axes.errorbar(
+        centre, mean[enough], std[enough] / np.sqrt(count[enough]), fmt='os'[side],
+        color=SERIES[side], markersize=4, linewidth=1.2, capsize=2, label=label,
+    )  # fmt: skip
+
+
+def _about_zero(axes: Axes) -> None:
+    axes.axhline(0, color=MUTED, linewidth=0.8)
+    top = max(abs(limit) for limit in axes.get_ylim())
+    axes.set_ylim(-top, 1.25 * top)
+    axes.set_ylabel('mean residual (px), 1-sigma bars')
+    axes.legend(loc='upper right', ncols=2, handlelength=1.2)
+
+
+def residuals_against_colour(residuals: Residuals) -> Markup:
+    """Mean residual against BP - RP: lateral colour of the lens would show in it; '' if none."""
+    used = residuals.used & np.isfinite(residuals.colour_bp_rp)
+    if np.count_nonzero(used) < 30:
+        return Markup()
+    colour = residuals.colour_bp_rp[used]
+    low, high = np.percentile(colour, [1.0, 99.0]).tolist()
+    edges = np.linspace(low, high, 9, dtype=np.float64)
+    if not edges[-1] > edges[0]:
+        return Markup()
+    figure, axes = _figure()
+    for side, letter in enumerate('uv'):
+        _means(axes, colour, residuals.residual_px[used, side], edges, side, letter)
+    axes.set_xlabel('colour BP \N{MINUS SIGN} RP (mag)')
+    _about_zero(axes)
+    return _svg(figure, 'colour')
+
+
+def residuals_against_pixel_phase(residuals: Residuals) -> Markup:
+    """Mean residual in u, and in v, against where in its pixel the star's centre stood."""
+    figure, axes = _figure()
+    for side, letter in enumerate('uv'):
+        place = residuals.measured_px[residuals.used, side]
+        residual = residuals.residual_px[residuals.used, side]
+        edges = np.linspace(-0.5, 0.5, 11, dtype=np.float64)
+        _means(axes, place - np.rint(place), residual, edges, side, f'{letter} against {letter}')
+    axes.set_xlabel('place of the centre in its pixel (px)')
+    _about_zero(axes)
+    return _svg(figure, 'phase')
+
+
+def line_of_sight_sigma(sigma_arcsec: Floats, camera: CameraModel, name: str) -> Markup:
+    """1-sigma of lines of sight at a regular grid of pixels, corner to corner, arcsec."""
+    figure, axes = _detector_figure(camera, beside=0.8)
+    rows, columns = sigma_arcsec.shape
+    u = np.linspace(0, camera.width - 1, columns)
+    v = np.linspace(0, camera.height - 1, rows)
+    # Each band is an eighth of the grid: corners would take up equal steps.
+    levels = np.unique(np.quantile(sigma_arcsec, np.linspace(0, 1, 9)))
+    if len(levels) > 1:
+        filled = axes.contourf(
+            u, v, sigma_arcsec, levels, cmap='viridis', norm=BoundaryNorm(levels, 256)
+        )
+        bar = figure.colorbar(filled, cax=axes.inset_axes((1.03, 0, 0.045, 1)), spacing='uniform')
+        bar.set_ticks(levels.tolist(), labels=_told_apart(levels))
+        bar.ax.tick_params(size=0)
+        bar.set_label('1-sigma (arcsec)')
+    return _svg(figure, name)
+
+
+def _told_apart(levels: Floats) -> list[str]:
+    """Numbers with three digits, or as many as it takes to tell them apart."""
+    for digits in range(3, 7):
+        labels = [f'{level:.{digits}g}' for level in levels]
+        if len(set(labels)) == len(labels):
+            break
+    return labels
+
+
+def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Markup:
+    """What the star tracker was off in each image by its stars, about its three axes."""
+    figure = Figure(figsize=(_SIZE[0], 4.6), layout='constrained')
+    panels = figure.subplots(3, 1, sharex=True)
+    minutes = (residuals.image_time_ns - residuals.image_time_ns.min()) / (
+        60.0 * NANOSECONDS_PER_SECOND
+    )
+    for k, (axes, axis) in enumerate(zip(panels, 'xyz', strict=True)):
+        axes.axhspan(-sigma_arcsec[k], sigma_arcsec[k], color=GRID, alpha=0.6, linewidth=0)
+        axes.axhline(0, color=MUTED, linewidth=0.8)
+        for chosen, colour, marker in (
+            (~residuals.image_misfit, SERIES[0], 'o'),
+            (residuals.image_misfit, SERIES[1], 'x'),
+        ):
+            axes.errorbar(
+                minutes[chosen], residuals.attitude_error_arcsec[chosen, k],
+                residuals.attitude_sigma_arcsec[chosen, k], fmt=marker, color=colour,
+                markersize=4.5, linewidth=1.1, capsize=2,
+            )  # fmt: skip
+        axes.set_ylabel(f'{axis} (arcsec)')
+        good = residuals.attitude_error_arcsec[~residuals.image_misfit, k]
+        top = max(np.nanmax(np.abs(good), initial=0.0), sigma_arcsec[k]) * 1.25
+        axes.set_ylim(-top, top)
+    panels[-1].set_xlabel('time from the first image (min)')
+    return _svg(figure, 'alignment')
+
+
+def term_worth(removals: Sequence[Removal]) -> Markup:
+    """Residual and map as terms are left out one after the other (paper, Fig. 8)."""
+    figure, axes = _figure()
+    steps = np.arange(len(removals))
+    chance = [k for k, removal in enumerate(removals) if removal.within_chance]
+    if len(chance) > 1:
+        axes.axvspan(-0.5, max(chance) + 0.5, color=GRID, alpha=0.6, linewidth=0)
+    axes.plot(steps, [removal.residual_rms_px for removal in removals], 'o-', color=SERIES[0],
+              markersize=4, linewidth=1.4, label='residual, rms per axis')  # fmt: skip
+    axes.plot(steps[1:], [removal.map_change_px for removal in removals[1:]], 's--',
+              color=SERIES[1], markersize=4, linewidth=1.4, label='change of the map')  # fmt: skip
+    axes.set_yscale('log')
+    axes.set_xlim(-0.5, len(removals) - 0.5)
+    axes.set_xticks(
+        steps, ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])]
+    )
+    axes.set(xlabel='left out, one after the other', ylabel='px')
+    axes.legend(loc='lower right')
+    return _svg(figure, 'terms')

@@ -1,0 +1,359 @@
+"""
+The products of a calibration as one self-contained HTML file, ``report.html``.
+
+It arranges what the files of a folder hold and what functions of this package say of it; a section
+whose file is not there says so.  The page needs no network: styles, script and pictures are in it.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+import json
+import math
+from pathlib import Path
+
+import jinja2
+from markupsafe import Markup
+import matplotlib
+import numpy as np
+
+from starcal_ros.assessment.agreement import alignment_difference_rad
+from starcal_ros.assessment.observability import movement_px
+from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.bag import reader
+from starcal_ros.camera import INTRINSIC_NAMES, PARAMETER_NAMES
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.estimation.temperature import summary as thermal_summary
+from starcal_ros.messages.types import OBSERVATIONS_TYPE
+from starcal_ros.products.calibration_json import CALIBRATION_FILE, prior_of, read_calibration
+from starcal_ros.products.files import OBSERVATIONS_FILE, REPORT_FILE, write_atomically
+from starcal_ros.products.residuals_npz import read_residuals, RESIDUALS_FILE
+from starcal_ros.records import (
+    Calibration,
+    CameraGeometry,
+    IMAGE_REFUSALS,
+    STAR_REFUSALS,
+    StarObservations,
+)
+from starcal_ros.report import figures as report_figures
+from starcal_ros.report.charts import charts_of
+from starcal_ros.report.thumbnails import read_thumbnails, Thumbnail, THUMBNAILS_FOLDER
+from starcal_ros.utc import utc_text
+
+_SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
+_LISTED_REFUSED = 200
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a folder holds; ``residuals`` and ``observations`` are None where it has none."""
+
+    calibration: Calibration
+    residuals: Residuals | None
+    observations: tuple[StarObservations, ...] | None
+    thumbnails: tuple[Thumbnail, ...]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table of parameters; numbers as text, empty where there is none."""
+
+    name: str
+    unit: str
+    value: str
+    sigma: str
+    prior: str
+    change: str
+    change_sigmas: str
+    moves_px: str
+    sigma_px: str
+
+
+def write_report(folder: Path) -> Path:
+    """
+    Write ``report.html`` of a folder with a calibration, from the files there; returns its path.
+
+    Raises
+    ------
+    ProductError, BagError
+        When a file cannot be read or the report not be written.
+    """
+    path = folder / REPORT_FILE
+    write_atomically(path, render(read_folder(folder)))
+    return path
+
+
+def read_folder(folder: Path) -> Found:
+    """
+    What the files of a folder hold.
+
+    Raises
+    ------
+    ProductError, BagError
+        When there is no calibration, or another file is damaged.
+    """
+    calibration = read_calibration(folder / CALIBRATION_FILE)
+    residuals = folder / RESIDUALS_FILE
+    observations = folder / OBSERVATIONS_FILE
+    recorded = None
+    if observations.is_file():
+        topic = reader.choose_topic([observations], OBSERVATIONS_TYPE)
+        recorded = tuple(reader.read_observations([observations], topic))
+    return Found(
+        calibration,
+        read_residuals(residuals) if residuals.is_file() else None,
+        recorded,
+        read_thumbnails(folder / THUMBNAILS_FOLDER),
+    )
+
+
+def render(found: Found) -> str:
+    """The page."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader('starcal_ros.report'),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    with matplotlib.rc_context(report_figures.STYLE):
+        return environment.get_template('report.html').render(_context(found))
+
+
+def _context(found: Found) -> Mapping[str, object]:
+    calibration, residuals = found.calibration, found.residuals
+    prior = prior_of(calibration)
+    return {
+        'calibration': calibration,
+        'time': utc_text(calibration.time_ns),
+        'in_force_since': utc_text(calibration.in_force_since_ns),
+        'parameters': _parameter_rows(calibration, prior),
+        'alignment': _alignment_rows(calibration, prior),
+        'tiles': _tiles(calibration),
+        'thermal': thermal_summary(calibration.thermal) if calibration.thermal else '',
+        'charts': charts_of(calibration, residuals),
+        'correlation': calibration.correlation,
+        'slider': _slider(calibration, residuals),
+        'refused_images': _refused_images(found),
+        'refused_stars': _refused_stars(found),
+        'has_images': any(not thumbnail.reason for thumbnail in found.thumbnails),
+        'used_images': _used_images(found),
+        'provenance': _provenance(calibration),
+    }
+
+
+def _options_of(calibration: Calibration) -> Mapping[str, object]:
+    try:
+        options = json.loads(calibration.provenance['options'])
+    except (KeyError, ValueError):
+        return {}
+    return options if isinstance(options, dict) else {}
+
+
+def _significant(value: float, sigma: float) -> str:
+    """A value with the digits that its sigma gives a meaning, and one more."""
+    if not (math.isfinite(sigma) and sigma > 0 and math.isfinite(value)):
+        return f'{value:.8g}'
+    decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    return f'{value:.{min(decimals, 12)}f}'.replace('-', '\N{MINUS SIGN}')
+
+
+def _signed(value: float, digits: int = 3) -> str:
+    return f'{value:+.{digits}g}'.replace('-', '\N{MINUS SIGN}')
+
+
+def _parameter_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
+    camera, sigma = calibration.geometry.camera, calibration.sigma[:10]
+    changes = camera.parameters - prior.camera.parameters if prior else np.zeros(10)
+    moves, sigma_moves = movement_px(camera, changes), movement_px(camera, sigma)
+    rows = []
+    for k, name in enumerate(PARAMETER_NAMES):
+        value, known = camera.parameters[k], sigma[k] > 0
+        rows.append(
+            Row(
+                name,
+                'px' if name in INTRINSIC_NAMES else '',
+                _significant(value, sigma[k]),
+                (f'{sigma[k]:.2g}' if known else '')
+                if name in calibration.estimated
+                else ('held' if not known else f'held, {sigma[k]:.2g}'),
+                f'{prior.camera.parameters[k]:.8g}'.replace('-', '\N{MINUS SIGN}')
+                if prior
+                else '',
+                _signed(changes[k]) if prior and changes[k] else '',
+                f'{changes[k] / sigma[k]:+.1f}'.replace('-', '\N{MINUS SIGN}')
+                if prior and known and changes[k]
+                else '',
+                f'{moves[k]:.3f}' if prior and changes[k] else '',
+                f'{sigma_moves[k]:.3f}' if known else '',
+            )
+        )
+    return rows
+
+
+def _alignment_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
+    sigma = calibration.sigma[10:] / ARCSECOND_RAD
+    changes = (
+        alignment_difference_rad(calibration.geometry, prior) / ARCSECOND_RAD
+        if prior
+        else np.zeros(3)
+    )
+    return [
+        Row(
+            axis,
+            'arcsec',
+            '',
+            f'{sigma[k]:.2f}',
+            '',
+            f'{changes[k]:+.2f}'.replace('-', '\N{MINUS SIGN}') if prior else '',
+            f'{changes[k] / sigma[k]:+.1f}'.replace('-', '\N{MINUS SIGN}')
+            if prior and sigma[k] > 0
+            else '',
+            '',
+            '',
+        )
+        for k, axis in enumerate('xyz')
+    ]
+
+
+def _none(count: int) -> str:
+    return f'{count:,}' if count else 'none'
+
+
+def _tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """(what, number, note) of what one looks for first."""
+    rms_px = calibration.residual_rms_px
+    pixel_arcsec = 1.0 / calibration.geometry.camera.parameters[0] / ARCSECOND_RAD
+    in_arcsec = f'{rms_px * pixel_arcsec:.2f}″ at {pixel_arcsec:.1f}″ a pixel'
+    refused = _none(sum(calibration.images_refused.values()))
+    misfits = _none(len(calibration.misfit_images_ns))
+    outliers = _none(calibration.stars_rejected)
+    tiles = [
+        ('Residual', f'{rms_px:.3f} px', f'rms per axis; {in_arcsec}'),
+        (
+            'Images',
+            f'{calibration.images_used:,}',
+            f'used; {refused} refused, {misfits} of those used misfits',
+        ),
+        ('Stars', f'{calibration.stars_used:,}', f'used; {outliers} left out as outliers'),
+    ]
+    maps = calibration.maps
+    if maps is not None:
+        for what, sigma, words in (
+            ('Line of sight', maps.line_of_sight_sigma_arcsec, 'in the star tracker frame'),
+            ('Camera alone', maps.shape_sigma_arcsec, 'a turn of all pixels removed'),
+        ):
+            note = f'1-sigma, rms over the detector, {words}; {sigma.max():.3g}″ at its worst'
+            tiles.append((what, f'{np.sqrt(np.mean(sigma**2)):.3g}″', note))
+    return tiles
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """At most so many of a count, evenly."""
+    return [round(place) for place in np.linspace(0, count - 1, min(count, most)).tolist()]
+
+
+def _slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str, object] | None:
+    """What the page draws of single images: places in px, residuals in 0.001 px."""
+    if residuals is None or len(residuals.image_time_ns) == 0:
+        return None
+    camera, typical_px = calibration.geometry.camera, max(calibration.residual_rms_px, 1e-6)
+    count = len(residuals.image_time_ns)
+    mean_stars = max(1.0, len(residuals.image) / count)
+    chosen = _spread(count, max(1, min(_SLIDER_IMAGES, int(_SLIDER_STARS / mean_stars))))
+    rms = residuals.image_rms_px()
+    images = []
+    for k in chosen:
+        here = residuals.image == k
+        place = np.rint(residuals.measured_px[here]).astype(int)
+        residual = np.rint(1000 * np.clip(residuals.residual_px[here], -99, 99)).astype(int)
+        stars = np.c_[place, residual, residuals.used[here].astype(int)]
+        error = residuals.attitude_error_arcsec[k]
+        images.append(
+            {
+                'number': k + 1,
+                'time': utc_text(int(residuals.image_time_ns[k])),
+                'rms': None if math.isnan(rms[k]) else round(float(rms[k]), 4),
+                'misfit': bool(residuals.image_misfit[k]),
+                'tracker': [None if math.isnan(e) else round(float(e), 2) for e in error],
+                'stars': stars.ravel().tolist(),
+            }
+        )
+    return {
+        'width': camera.width,
+        'height': camera.height,
+        'count': count,
+        'images': images,
+        # A line of typical length is a fiftieth of the picture.
+        'enlarge': round(float(np.clip(np.log10(0.02 * camera.width / typical_px), 0, 4)), 1),
+    }
+
+
+def _picture(thumbnail: Thumbnail) -> Markup:
+    """Data URL of a picture."""
+    kind = 'image/jpeg' if thumbnail.name.endswith('.jpg') else 'image/png'
+    # Made of base64's letters alone.
+    return Markup(f'data:{kind};base64,{base64.b64encode(thumbnail.encoded).decode("ascii")}')
+
+
+def _refused_images(found: Found) -> list[Mapping[str, object]]:
+    """Each reason with its count, the images it took and pictures of some."""
+    pictures = {t.time_ns: t for t in found.thumbnails if not t.reason}
+    groups: list[Mapping[str, object]] = []
+    for reason, count in sorted(found.calibration.images_refused.items(), key=lambda i: -i[1]):
+        images = [o for o in found.observations or () if o.refusal == reason]
+        groups.append(
+            {
+                'reason': reason,
+                'meaning': IMAGE_REFUSALS.get(reason, ''),
+                'count': count,
+                'images': [(utc_text(o.time_ns), o.detail) for o in images[:_LISTED_REFUSED]],
+                'pictures': [
+                    (_picture(pictures[o.time_ns]), utc_text(o.time_ns), o.detail)
+                    for o in images
+                    if o.time_ns in pictures
+                ],
+            }
+        )
+    return groups
+
+
+def _refused_stars(found: Found) -> list[Mapping[str, object]]:
+    counts: dict[str, int] = {}
+    for observed in found.observations or ():
+        for reason, count in observed.refused_stars.items():
+            counts[reason] = counts.get(reason, 0) + count
+    return [
+        {
+            'reason': reason,
+            'meaning': STAR_REFUSALS.get(reason, ''),
+            'count': count,
+            'pictures': [
+                (_picture(t), utc_text(t.time_ns)) for t in found.thumbnails if t.reason == reason
+            ],
+        }
+        for reason, count in sorted(counts.items(), key=lambda item: -item[1])
+        if count
+    ]
+
+
+def _used_images(found: Found) -> list[tuple[Markup, str, int]]:
+    stars = {o.time_ns: len(o) for o in found.observations or () if not o.refusal}
+    return [
+        (_picture(t), utc_text(t.time_ns), stars[t.time_ns])
+        for t in found.thumbnails
+        if not t.reason and t.time_ns in stars
+    ]
+
+
+def _provenance(calibration: Calibration) -> Mapping[str, object]:
+    known = dict(calibration.provenance)
+    options = _options_of(calibration)
+    known.pop('options', None)
+    known.pop('prior', None)
+    return {
+        'entries': sorted(known.items()),
+        'options': sorted((name, json.dumps(value)) for name, value in options.items()),
+    }

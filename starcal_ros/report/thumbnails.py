@@ -1,0 +1,139 @@
+"""Small pictures of a few images and refused stars, kept beside the products for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+import re
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.products.files import write_atomically
+from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.report.annotation import annotate, stretch
+
+THUMBNAILS_FOLDER = 'thumbnails'
+_USED = 6  # images that were used, spread over all; between this and twice as many are kept
+_REFUSED_OF_A_REASON = 2
+_STARS_OF_A_REASON = 6
+_WIDTH_PX = 480
+_STAR_HALF_PX = 12
+_NAME = re.compile(r'(?P<kind>image|star)_(?P<time_ns>-?\d+)(?:_(?P<reason>[a-z_]+)_(?P<n>\d+))?')
+
+
+@dataclass(frozen=True)
+class Thumbnail:
+    """A small picture; ``reason`` is empty for a whole image."""
+
+    time_ns: int
+    reason: str
+    number: int
+    encoded: bytes
+
+    @property
+    def name(self) -> str:
+        """File name, from which `read_thumbnails` knows what it shows."""
+        if self.reason:
+            return f'star_{self.time_ns}_{self.reason}_{self.number}.png'
+        return f'image_{self.time_ns}.jpg'
+
+
+@dataclass
+class Album:
+    """
+    Chooses which images to keep a picture of while they go by, however many there will be.
+
+    Some that were used, evenly spread; the first of each reason of refusal, of images and stars.
+    """
+
+    used: list[Thumbnail] = field(default_factory=list)
+    refused: dict[str, list[Thumbnail]] = field(default_factory=dict)
+    stars: dict[str, list[Thumbnail]] = field(default_factory=dict)
+    _stride: int = 1
+    _seen: int = 0
+
+    def show(self, image: Image, observations: StarObservations, geometry: CameraGeometry) -> None:
+        """Look at an image, its observations, and what its stars were predicted with."""
+        if observations.refusal:
+            of_reason = self.refused.setdefault(observations.refusal, [])
+            if len(of_reason) < _REFUSED_OF_A_REASON:
+                of_reason.append(_whole(image, observations, geometry))
+        else:
+            if self._seen % self._stride == 0:
+                self.used.append(_whole(image, observations, geometry))
+                if len(self.used) == 2 * _USED:
+                    self.used, self._stride = self.used[::2], 2 * self._stride
+            self._seen += 1
+        self._show_stars(image, observations)
+
+    def _show_stars(self, image: Image, observations: StarObservations) -> None:
+        for reason, places in observations.refused_places().items():
+            of_reason = self.stars.setdefault(reason, [])
+            # One star of an image: another image shows something else.
+            if len(of_reason) < _STARS_OF_A_REASON and len(places):
+                number = len(of_reason)
+                encoded = _cut_out(image.pixels, places[number % len(places)])
+                of_reason.append(Thumbnail(image.time_ns, reason, number, encoded))
+
+    def thumbnails(self) -> tuple[Thumbnail, ...]:
+        """All that were kept."""
+        groups = [self.used, *self.refused.values(), *self.stars.values()]
+        return tuple(thumbnail for group in groups for thumbnail in group)
+
+
+def write_thumbnails(thumbnails: Iterable[Thumbnail], folder: Path) -> None:
+    """
+    Write pictures into a folder, in place of those that another calibration has left there.
+
+    Raises
+    ------
+    OSError, ProductError
+        When a file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in folder.iterdir():
+        if _NAME.fullmatch(path.stem):
+            path.unlink()
+    for thumbnail in thumbnails:
+        write_atomically(folder / thumbnail.name, thumbnail.encoded)
+
+
+def read_thumbnails(folder: Path) -> tuple[Thumbnail, ...]:
+    """Thumbnails of a folder, in order of time; none where there is no such folder."""
+    found = []
+    for path in folder.iterdir() if folder.is_dir() else ():
+        name = _NAME.fullmatch(path.stem)
+        if name is not None:
+            number, reason = int(name['n'] or 0), name['reason'] or ''
+            found.append(Thumbnail(int(name['time_ns']), reason, number, path.read_bytes()))
+    return tuple(sorted(found, key=lambda t: (t.time_ns, t.reason, t.number)))
+
+
+def _whole(image: Image, observations: StarObservations, geometry: CameraGeometry) -> Thumbnail:
+    picture = annotate(image, observations, geometry, legend=False)
+    height, width = picture.shape[:2]
+    if width > _WIDTH_PX:
+        size = (_WIDTH_PX, max(1, round(height * _WIDTH_PX / width)))
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    _, encoded = cv2.imencode('.jpg', picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    return Thumbnail(image.time_ns, '', 0, encoded.tobytes())
+
+
+def _cut_out(
+    pixels: NDArray[np.uint8] | NDArray[np.uint16], place_px: NDArray[np.float32]
+) -> bytes:
+    """PNG of the pixels about a place; black where that leaves the image."""
+    u, v = np.rint(np.nan_to_num(np.clip(place_px, -1e4, 1e5), nan=-1e4)).astype(int)
+    size = 2 * _STAR_HALF_PX + 1
+    picture = np.zeros((size, size), np.uint8)
+    first = np.array([v - _STAR_HALF_PX, u - _STAR_HALF_PX])
+    low, high = np.maximum(first, 0), np.minimum(first + size, pixels.shape)
+    if (low < high).all():
+        part = pixels[low[0] : high[0], low[1] : high[1]]
+        inside = tuple(slice(a, b) for a, b in zip(low - first, high - first, strict=True))
+        picture[inside] = stretch(part)
+    _, encoded = cv2.imencode('.png', picture)
+    return encoded.tobytes()

@@ -1,0 +1,1 @@
+"""Synthetic skies, images and bags with known truth."""

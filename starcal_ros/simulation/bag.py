@@ -1,0 +1,150 @@
+"""A synthetic scenario as a bag, with its truth and what a calibration starts from beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+import yaml
+
+from starcal_ros.bag.reader import BagWriter
+from starcal_ros.camera import CameraModel, PARAMETER_NAMES
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.products.camera_yaml import write_camera_info
+from starcal_ros.products.files import write_atomically
+from starcal_ros.records import AttitudeSample, CameraGeometry
+from starcal_ros.simulation.centroids import (
+    BOUND_NAMES,
+    BOUND_SNR,
+    centroid_bound,
+    cramer_rao_covariance,
+)
+from starcal_ros.simulation.images import images
+from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenes
+
+Floats = NDArray[np.float64]
+
+IMAGE_TOPIC = '/opnav/image_raw'
+ATTITUDE_TOPIC = '/star_tracker/attitude'
+
+
+@dataclass(frozen=True)
+class SimulatedBag:
+    """A bag with known truth, and what `starcal calibrate` needs to start from it."""
+
+    bag: Path
+    truth: Path
+    params: Path
+    camera: Path
+
+
+def truth_content(scenario: Scenario, bag_name: str) -> dict[str, object]:
+    """The truth of a bag as the JSON object that stands beside it."""
+    true, prior = scenario.truth, scenario.prior
+    stars = stars_above = 0
+    for shown in scenes(scenario):
+        shape = (true.camera.height, true.camera.width)
+        _, snr = centroid_bound(shown.pixel_px, shown.flux_electrons, scenario.detector, shape)
+        stars += len(snr)
+        stars_above += int((snr > BOUND_SNR).sum())
+    return {
+        'scenario': scenario.name,
+        'seed': scenario.seed,
+        'bag': bag_name,
+        'width': true.camera.width,
+        'height': true.camera.height,
+        'k_true': true.camera.intrinsics.tolist(),
+        'd_true': true.camera.distortion.tolist(),
+        'k_prior': prior.camera.intrinsics.tolist(),
+        'd_prior': prior.camera.distortion.tolist(),
+        'A_true': _camera_from_star_tracker(true).tolist(),
+        'A_prior': _camera_from_star_tracker(prior).tolist(),
+        'sigma_st_arcsec': max(scenario.star_tracker_sigma_arcsec),
+        'sigma_st_axes_arcsec': list(scenario.star_tracker_sigma_arcsec),
+        'images': scenario.image_count,
+        'stars': stars,
+        'stars_snr5': stars_above,
+        'crlb_keep': [PARAMETER_NAMES.index(name) for name in BOUND_NAMES],
+        'crlb_cov': cramer_rao_covariance(scenario).tolist(),
+        't0': scenario.start_ns / NANOSECONDS_PER_SECOND,
+        'step': scenario.cadence_s,
+    }
+
+
+def true_geometry(content: Mapping[str, Any]) -> CameraGeometry:
+    """The true camera and alignment of a truth file's JSON object."""
+    camera = CameraModel(
+        content['width'], content['height'], np.array([*content['k_true'], *content['d_true']])
+    )
+    star_tracker_from_camera = Rotation.from_matrix(np.array(content['A_true']).T)
+    return CameraGeometry(camera, star_tracker_from_camera.as_quat())
+
+
+def _camera_from_star_tracker(geometry: CameraGeometry) -> Floats:
+    quaternion = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
+    return np.asarray(quaternion.inv().as_matrix())
+
+
+def write_bag(
+    scenario: Scenario,
+    path: Path,
+    camera_url: str = '',
+    on_image: Callable[[int], None] = lambda index: None,
+) -> SimulatedBag:
+    """
+    Render a scenario into a bag, with its truth and the files to calibrate it beside it.
+
+    A folder holds ``truth.json``, ``params.yaml`` and ``camera.yaml``; beside a single file
+    ``NAME.mcap`` they are ``NAME.json``, ``NAME_params.yaml`` and ``NAME_camera.yaml``.
+
+    Parameters
+    ----------
+    camera_url : str
+        Of the prior camera in the parameter file, instead of a ``file://`` URL.
+    on_image : callable
+        Told the number of each image that was written.
+    """
+    writer = BagWriter(path)
+    with writer:
+        for index, image in enumerate(images(scenario)):
+            samples = attitude_samples(scenario, index)
+            for sample in (s for s in samples if s.time_ns <= image.time_ns):
+                _write_attitude(writer, sample)
+            writer.write_image(IMAGE_TOPIC, image, 'camera')
+            for sample in (s for s in samples if s.time_ns > image.time_ns):
+                _write_attitude(writer, sample)
+            on_image(index)
+    if path.suffix == '.mcap':
+        beside = (f'{path.stem}.json', f'{path.stem}_params.yaml', f'{path.stem}_camera.yaml')
+    else:
+        beside = ('truth.json', 'params.yaml', 'camera.yaml')
+    truth, params, camera = (writer.file.with_name(name) for name in beside)
+    write_atomically(truth, json.dumps(truth_content(scenario, writer.file.name), indent=1) + '\n')
+    write_camera_info(scenario.prior.camera, camera, 'opnav')
+    content = parameters(scenario, camera_url or f'file://{camera.resolve()}')
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
+    write_atomically(params, text)
+    return SimulatedBag(path, truth, params, camera)
+
+
+def _write_attitude(writer: BagWriter, sample: AttitudeSample) -> None:
+    quaternion = sample.icrf_from_star_tracker_xyzw
+    writer.write_attitude(ATTITUDE_TOPIC, sample.time_ns, quaternion, 'icrf')
+
+
+def parameters(scenario: Scenario, camera_url: str) -> dict[str, object]:
+    """The ROS parameter file of a scenario's prior knowledge."""
+    values = {
+        'camera_info_url': camera_url,
+        'prior_alignment': scenario.prior.star_tracker_from_camera_xyzw.tolist(),
+        'star_tracker_frame': 'star_tracker',
+        'camera_frame': 'camera',
+        'star_tracker_sigma_arcsec': list(scenario.star_tracker_sigma_arcsec),
+    }
+    return {'/**': {'ros__parameters': values}}

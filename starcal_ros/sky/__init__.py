@@ -1,0 +1,1 @@
+"""Where the stars are: catalog, apparent directions, attitudes."""

@@ -1,0 +1,264 @@
+"""
+Where a catalog star appears to an observer: motion, parallax, light bending, aberration, air.
+
+The chain of the IAU astrometric model in the order of ERFA's ``atciq``: ICRS place at epoch ->
+proper motion and parallax (``pmpx``) -> bending of light by the Sun (``ldsun``) -> aberration
+(``ab``), stopped before precession and nutation so that the axes stay those of the ICRS.
+
+For a camera on the ground the aberration by the Earth's turning and refraction follow (``atioq``);
+what comes out is turned back to the axes of the ICRS.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import erfa
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.constants import AU_M, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
+from starcal_ros.options import option
+from starcal_ros.sky.catalog import StarCatalog
+
+Floats = NDArray[np.float64]
+
+_UNIX_EPOCH_JD = 2440587.5  # 1970-01-01T00:00 UTC, POSIX
+_DAY_S = 86400
+_TT_MINUS_TAI_S = 32.184  # IAU 1991 Resolution A4, recommendation IV
+_J2000_JD = 2451545.0  # IAU 1994, epoch J2000.0
+_JULIAN_YEAR_DAYS = 365.25  # IAU, definition
+_UTC_START_JD = 2436934.5  # 1960-01-01, where UTC and ERFA's dat begin
+
+
+@dataclass(frozen=True)
+class SiteOptions:
+    """Whether the camera is in space or on the ground, and where the light comes through."""
+
+    observer: str = option(
+        'space',
+        'where the camera is; on the ground refraction and the turning of the Earth count, and a'
+        ' velocity that is given does not',
+        choices=('space', 'ground'),
+    )
+    latitude_deg: float = option(
+        0.0, 'geodetic latitude of the site (WGS84), degrees', low=-90.0, high=90.0
+    )
+    longitude_deg: float = option(
+        0.0, 'longitude of the site, east positive, degrees', low=-180.0, high=360.0
+    )
+    height_m: float = option(
+        0.0, 'height of the site above the ellipsoid, m', low=-500.0, high=100000.0
+    )
+    air_pressure_hpa: float = option(
+        0.0,
+        'air pressure at the site itself, not reduced to sea level, hPa; 0: the usual one at its'
+        ' height',
+        low=0.0,
+        high=1200.0,
+    )
+    air_temperature_degc: float = option(
+        10.0, 'air temperature at the site, degC', low=-100.0, high=60.0
+    )
+    relative_humidity: float = option(0.5, 'of the air at the site, 0 to 1', low=0.0, high=1.0)
+    wavelength_um: float = option(
+        0.55, 'of the light that the camera sees, micrometres', low=0.1, high=100.0
+    )
+    min_elevation_deg: float = option(
+        10.0,
+        'elevation from which stars are used, degrees; nearer to the horizon refraction is not'
+        ' what the air at the site says',
+        low=3.0,
+        high=90.0,
+    )
+
+
+@dataclass(frozen=True)
+class Observer:
+    """
+    Place and motion of the observer at one instant, along the axes of the ICRS.
+
+    Attributes
+    ----------
+    tdb_jyear : float
+        Julian epoch, for proper motion.
+    barycentric_au : (3,)
+        From the solar-system barycentre.
+    sun_direction : (3,)
+        Unit vector from the Sun to the observer.
+    sun_distance_au : float
+    velocity_c : (3,)
+        Barycentric velocity in units of the speed of light.
+    """
+
+    tdb_jyear: float
+    barycentric_au: Floats
+    sun_direction: Floats
+    sun_distance_au: float
+    velocity_c: Floats
+
+
+def tt_julian_date(time_unix_ns: int) -> tuple[float, float]:
+    """
+    Terrestrial time as a two-part Julian date (whole days and a half, rest), good to 0.1 ns.
+
+    After the last leap second that ERFA knows, its TAI - UTC is used; ERFA would do the same, but
+    with a warning for dates more than five years on.
+
+    Parameters
+    ----------
+    time_unix_ns : int
+        UTC as a ROS stamp counts it: nanoseconds since 1970, leap seconds left out.
+
+    Raises
+    ------
+    ValueError
+        Before 1960, where UTC does not exist.
+    """
+    day, in_day_ns = divmod(int(time_unix_ns), _DAY_S * NANOSECONDS_PER_SECOND)
+    day_jd = _UNIX_EPOCH_JD + day
+    if day_jd < _UTC_START_JD:
+        raise ValueError(f'time_unix_ns is {time_unix_ns}, expected a time from 1960 on')
+    year, month, day_of_month, _ = erfa.jd2cal(day_jd, 0.0)
+    last = erfa.leap_seconds.get()[-1]
+    if (year, month) >= (last['year'], last['month']):
+        tai_minus_utc_s = float(last['tai_utc'])
+    else:
+        fraction = in_day_ns / (_DAY_S * NANOSECONDS_PER_SECOND)
+        tai_minus_utc_s = float(erfa.dat(year, month, day_of_month, fraction))
+    rest_s = in_day_ns / NANOSECONDS_PER_SECOND + tai_minus_utc_s + _TT_MINUS_TAI_S
+    return day_jd, rest_s / _DAY_S
+
+
+def observer_at(time_unix_ns: int, velocity_m_s: Floats | None = None) -> Observer:
+    """
+    Observer at a time: at the centre of the Earth, moving with it or as told.
+
+    The place matters to parallax only: 6 mas for the nearest star at the distance of the Moon.
+    TT stands for TDB, 2 ms apart at most: 60 m along the Earth's way.
+
+    Parameters
+    ----------
+    time_unix_ns : int
+        As for `tt_julian_date`.
+    velocity_m_s : (3,), optional
+        Velocity of the observer relative to the solar-system barycentre along the axes of the
+        ICRS; the Earth's where not given.
+    """
+    jd = tt_julian_date(time_unix_ns)
+    heliocentric, barycentric = erfa.epv00(*jd)
+    if velocity_m_s is None:
+        velocity_c = barycentric['v'] * (AU_M / _DAY_S / SPEED_OF_LIGHT_M_S)
+    else:
+        velocity_c = np.asarray(velocity_m_s, np.float64) / SPEED_OF_LIGHT_M_S
+        if velocity_c.shape != (3,) or not np.linalg.norm(velocity_c) < 1:
+            raise ValueError(
+                f'velocity_m_s is {velocity_m_s!r}, expected three numbers below light speed'
+            )
+    sun_distance_au = float(np.linalg.norm(heliocentric['p']))
+    return Observer(
+        tdb_jyear=2000.0 + (jd[0] - _J2000_JD + jd[1]) / _JULIAN_YEAR_DAYS,
+        barycentric_au=np.asarray(barycentric['p']),
+        sun_direction=np.asarray(heliocentric['p']) / sun_distance_au,
+        sun_distance_au=sun_distance_au,
+        velocity_c=np.asarray(velocity_c),
+    )
+
+
+def directions_from(observer: Observer, stars: StarCatalog) -> Floats:
+    """Apparent directions of stars, as `apparent_directions`, from an observer already known."""
+    natural = erfa.pmpx(
+        stars.ra_rad,
+        stars.dec_rad,
+        # ERFA counts the motion in right ascension along the equator.
+        stars.pm_ra_cosdec_rad_per_year / np.cos(stars.dec_rad),
+        stars.pm_dec_rad_per_year,
+        stars.parallax_rad / erfa.DAS2R,  # ERFA takes parallax alone in arcseconds
+        0.0,
+        observer.tdb_jyear - stars.epoch_jyear,
+        observer.barycentric_au,
+    )
+    bent = erfa.ldsun(natural, observer.sun_direction, observer.sun_distance_au)
+    inverse_gamma = math.sqrt(1.0 - float(observer.velocity_c @ observer.velocity_c))
+    return np.asarray(erfa.ab(bent, observer.velocity_c, observer.sun_distance_au, inverse_gamma))
+
+
+def standard_pressure_hpa(height_m: float, temperature_degc: float) -> float:
+    """
+    Usual air pressure at a height.
+
+    Allen, Astrophysical Quantities, 3rd ed., section 52, as ERFA's ``apco13`` gives it.
+    """
+    at_sea_level_k = 273.15 + temperature_degc + 0.0065 * height_m
+    return 1013.25 * math.exp(-height_m / (29.3 * at_sea_level_k))
+
+
+def through_the_air(
+    direction_icrf: Floats, time_unix_ns: int, site: SiteOptions
+) -> tuple[Floats, Floats]:
+    """
+    Directions (n, 3) as a camera on the ground sees them, and their elevations (n,), rad.
+
+    Aberration by the turning of the Earth (0.3 arcsec) and refraction are put on.  The axes stay
+    those of the ICRF, as if the Earth stood between them and the star: an attitude in the ICRF
+    takes the result to the camera.  UT1 is taken as UTC: 0.9 s apart at most, which at 30 degrees
+    of elevation moves a star by 0.02 arcsec.  Polar motion is left out: 0.001 arcsec there.
+
+    Parameters
+    ----------
+    direction_icrf : (n, 3)
+        Apparent directions for an observer who moves with the centre of the Earth.
+    time_unix_ns : int
+        As for `tt_julian_date`.
+    site : SiteOptions
+
+    Notes
+    -----
+    ERFA's ``refco`` and ``atioq``: A tan z + B tan^3 z, within 1 arcsec of a model atmosphere down
+    to 15 degrees of elevation.
+    """
+    tt_jd = tt_julian_date(time_unix_ns)
+    day, in_day_ns = divmod(int(time_unix_ns), _DAY_S * NANOSECONDS_PER_SECOND)
+    utc_jd = (_UNIX_EPOCH_JD + day, in_day_ns / (_DAY_S * NANOSECONDS_PER_SECOND))
+    cirs_from_icrf = erfa.c2i06a(*tt_jd)
+    pressure_hpa = site.air_pressure_hpa or standard_pressure_hpa(
+        site.height_m, site.air_temperature_degc
+    )
+    refraction = erfa.refco(
+        pressure_hpa, site.air_temperature_degc, site.relative_humidity, site.wavelength_um
+    )
+    local = erfa.apio(
+        erfa.sp00(*tt_jd),
+        erfa.era00(*utc_jd),
+        math.radians(site.longitude_deg),
+        math.radians(site.latitude_deg),
+        site.height_m,
+        0.0,
+        0.0,
+        *refraction,
+    )
+    place = erfa.c2s(direction_icrf @ cirs_from_icrf.T)
+    _, zenith_distance, _, dec, ra = erfa.atioq(*place, local)
+    return np.asarray(erfa.s2c(ra, dec) @ cirs_from_icrf), np.asarray(np.pi / 2 - zenith_distance)
+
+
+def apparent_directions(
+    stars: StarCatalog, time_unix_ns: int, observer_velocity_m_s: Floats | None = None
+) -> Floats:
+    """
+    Unit vectors (n, 3), axes of the ICRS, along which an observer sees catalog stars.
+
+    Proper motion, parallax, bending of light by the Sun and stellar aberration are applied; the
+    radial velocity is taken as zero.  0.05 ms, and 0.1 ms per thousand stars.
+
+    Parameters
+    ----------
+    stars : StarCatalog
+        n stars.
+    time_unix_ns : int
+        UTC as a ROS stamp: integer nanoseconds since 1970, from 1960 on.
+    observer_velocity_m_s : (3,), optional
+        Barycentric velocity of the spacecraft, axes of the ICRS; the Earth's where not given.
+    """
+    return directions_from(observer_at(time_unix_ns, observer_velocity_m_s), stars)

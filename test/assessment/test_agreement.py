@@ -1,0 +1,122 @@
+"""Differences of calibrations: chance is chance, and what changes midway shows."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.assessment.agreement import Difference, difference, halves, movement
+from starcal_ros.camera import project
+from starcal_ros.estimation.calibrate import CalibrationOptions
+from starcal_ros.records import CameraGeometry, Ensemble
+from starcal_ros.studies.trials import (
+    calibration_options,
+    draw_star_field,
+    observe,
+    StarField,
+)
+
+ESTIMATED = CalibrationOptions().estimate
+OPTIONS = calibration_options('hierarchical', 20.0)
+
+
+def drawn(trial: int, images: int = 8) -> StarField:
+    return draw_star_field(np.random.default_rng([41, trial]), images, 60)
+
+
+def test_differences_of_random_calibrations_are_chi2() -> None:
+    """Two draws from one covariance: the mean of chi^2 is its freedom, of camera and of all."""
+    truth = drawn(0).truth
+    random = np.random.default_rng(3)
+    sigma = np.r_[0.5, 0.1, 0.5, 0.0, 0.0, 1e-4, 1e-3, 1e-2, 1e-5, 1e-5, [2e-5] * 3]
+    mixed = np.eye(13) + 0.3 * random.normal(size=(13, 13))
+    factor = sigma[:, None] * mixed
+    covariance = factor @ factor.T
+
+    def draw() -> CameraGeometry:
+        errors = factor @ random.normal(size=13)
+        camera = dataclasses.replace(
+            truth.camera, parameters=truth.camera.parameters + errors[:10]
+        )
+        turn = Rotation.from_quat(truth.star_tracker_from_camera_xyzw)
+        turn = turn * Rotation.from_rotvec(errors[10:])
+        return CameraGeometry(camera, turn.as_quat())
+
+    found = [difference(draw(), covariance, draw(), covariance, ESTIMATED) for _ in range(400)]
+    assert {(one.shape_freedom, one.freedom) for one in found} == {(8, 11)}
+    # 400 draws know the mean of chi^2 with f degrees to sqrt(2 f / 400): four of these.
+    for values, freedom in (
+        ([one.shape_chi2 for one in found], 8),
+        ([one.chi2 for one in found], 11),
+    ):
+        assert abs(np.mean(values) - freedom) < 4 * np.sqrt(2 * freedom / 400)
+    assert np.median([one.chance for one in found]) == pytest.approx(0.5, abs=0.1)
+    assert np.mean([one.rms_sigma**2 for one in found]) == pytest.approx(1.0, abs=0.1)
+
+
+def test_what_is_not_estimated_is_not_compared() -> None:
+    geometry = drawn(0).truth
+    held = difference(geometry, np.zeros((13, 13)), geometry, np.zeros((13, 13)), ())
+    assert (held.freedom, held.chance, held.shape_chance, held.rms_sigma) == (0, 1.0, 1.0, 0.0)
+
+
+def seen_from_the_middle(field: StarField, truth: CameraGeometry) -> StarField:
+    """The later half of the images is taken with another camera on another mounting."""
+    half = len(field.pixel_px) // 2
+    icrf_from_star_tracker = field.camera_from_icrf.inv() * (
+        Rotation.from_quat(field.truth.star_tracker_from_camera_xyzw).inv()
+    )
+    camera_from_icrf = (
+        icrf_from_star_tracker * Rotation.from_quat(truth.star_tracker_from_camera_xyzw)
+    ).inv()
+    pixels = field.pixel_px.copy()
+    for k in range(half, len(pixels)):
+        directions = camera_from_icrf[k].apply(field.direction_icrf[k])
+        pixels[k] = project(truth.camera, directions)
+    return dataclasses.replace(field, pixel_px=pixels)
+
+
+def test_halves_of_one_camera_differ_by_chance() -> None:
+    chances = []
+    for trial in range(30):
+        found = halves(observe(drawn(trial), 20.0), drawn(trial).prior, OPTIONS)
+        assert isinstance(found, Difference)
+        chances += [found.chance, found.shape_chance]
+    # Of sixty chances the least is under 1e-4 once in 170 such tests; the seed is fixed.
+    assert min(chances) > 1e-4
+    assert 0.3 < np.median(chances) < 0.7
+
+
+def test_a_change_midway_shows() -> None:
+    """A focal length in the shape, a mounting in the turn alone, each as large as it is."""
+    field = drawn(1)
+    camera = field.truth.camera
+    fx, skew, fy = camera.intrinsics[:3] * 1.002
+    zoomed = dataclasses.replace(field.truth, camera=camera.replace(fx=fx, skew=skew, fy=fy))
+    found = halves(observe(seen_from_the_middle(field, zoomed), 20.0), field.prior, OPTIONS)
+    assert isinstance(found, Difference) and found.shape_chance < 1e-9
+    # 0.2 % at the corner, 1650 px from the centre; halves know it to 0.1 px.
+    assert found.shape_px == pytest.approx(movement(field.truth, zoomed)[1].max(), abs=0.4)
+
+    turn = Rotation.from_rotvec([1e-3, 0.0, 0.0])
+    mounting = Rotation.from_quat(field.truth.star_tracker_from_camera_xyzw) * turn
+    turned = dataclasses.replace(field.truth, star_tracker_from_camera_xyzw=mounting.as_quat())
+    found = halves(observe(seen_from_the_middle(field, turned), 20.0), field.prior, OPTIONS)
+    assert isinstance(found, Difference) and found.chance < 1e-9 < 1e-4 < found.shape_chance
+    # 20 arcsec, 1e-4 rad, for each image: four of these in each half know it to 7e-5.
+    assert found.turn_rad == pytest.approx(1e-3, abs=3e-4)
+
+
+def test_what_cannot_be_halved_is_not_compared() -> None:
+    field = drawn(2)
+    ensemble = observe(field, 20.0)
+    assert halves(Ensemble(ensemble.images[:5]), field.prior, OPTIONS) == (
+        '5 images, 6 make two halves'
+    )
+    thermal = dataclasses.replace(OPTIONS, focal_temperature_order=1)
+    assert halves(ensemble, field.prior, thermal) == 'the halves are of other temperatures'
+    few = Ensemble(tuple(image.select(np.arange(60) < 20) for image in ensemble.images))
+    assert str(halves(few, field.prior, OPTIONS)).startswith('a half alone cannot be solved: ')

@@ -1,0 +1,194 @@
+"""Two calibrations against each other: known differences, OpenCV's lines of sight, chance."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.assessment import comparison
+from starcal_ros.assessment.comparison import compare, GRID
+from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
+from starcal_ros.cli import main
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError, ProductError
+from starcal_ros.products.calibration_json import read_calibration, write_calibration
+from starcal_ros.records import Calibration
+from starcal_ros.report import comparison_figure
+
+
+@pytest.fixture(scope='module')
+def tiny(tiny_products: Path) -> Calibration:
+    """The calibration of the tiny bag: a real covariance."""
+    return read_calibration(tiny_products / 'calibration.json')
+
+
+def moved(
+    calibration: Calibration, turned_rad: tuple[float, ...] = (0.0, 0.0, 0.0), **by: float
+) -> Calibration:
+    """A calibration with some parameters changed, and the camera frame turned."""
+    camera, quaternion = (
+        calibration.geometry.camera,
+        calibration.geometry.star_tracker_from_camera_xyzw,
+    )
+    parameters = camera.parameters.copy()
+    for name, change in by.items():
+        parameters[PARAMETER_NAMES.index(name)] += change
+    turned = Rotation.from_quat(quaternion) * Rotation.from_rotvec(turned_rad)
+    geometry = dataclasses.replace(
+        calibration.geometry,
+        camera=CameraModel(camera.width, camera.height, parameters),
+        star_tracker_from_camera_xyzw=turned.as_quat(),
+    )
+    return dataclasses.replace(calibration, geometry=geometry)
+
+
+def test_nothing_differs_from_itself(tiny: Calibration) -> None:
+    found = compare(tiny, tiny)
+    assert not found.difference.any()
+    assert found.chi2 == 0 and found.chance == 1
+    # Rounding of unit vectors, 1e-16, times a focal length of 1800 px.
+    assert found.before.length_px.max() < 1e-11
+    assert found.after.length_px.max() < 1e-11
+
+
+def opencv_sight(calibration: Calibration) -> np.ndarray:
+    """Lines of sight of the grid in the star tracker frame by OpenCV, which knows no skew."""
+    fx, skew, fy, cx, cy, k1, k2, k3, p1, p2 = calibration.geometry.camera.parameters
+    assert skew == 0
+    xy = cv2.undistortPointsIter(
+        pixel_grid(calibration.geometry.camera, GRID, GRID)[:, None, :],
+        np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+        np.array([k1, k2, p1, p2, k3]),
+        np.eye(3),
+        np.eye(3),
+        (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-15),
+    )[:, 0]
+    directions = np.c_[xy, np.ones(len(xy))]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.asarray(
+        Rotation.from_quat(calibration.geometry.star_tracker_from_camera_xyzw).apply(directions)
+    )
+
+
+def test_the_map_is_what_opencv_says(tiny: Calibration) -> None:
+    a = moved(tiny, skew=-tiny.geometry.camera.parameters[1])
+    b = moved(a, (2e-5, -1e-5, 4e-5), fx=1.0, cy=-0.5, k1=0.01, p2=1e-4)
+    expected_px = np.linalg.norm(opencv_sight(b) - opencv_sight(a), axis=1) * float(
+        a.geometry.camera.parameters[0]
+    )
+    found = compare(a, b)
+    # OpenCV's iteration ends at 1e-15 or so of x, y: 1e-11 px; its own path to there costs more.
+    np.testing.assert_allclose(found.before.length_px.ravel(), expected_px, atol=1e-8)
+    names = [*PARAMETER_NAMES]
+    assert found.difference[names.index('fx')] == pytest.approx(1.0)
+    np.testing.assert_allclose(found.difference[10:], [2e-5, -1e-5, 4e-5], atol=1e-15)
+
+
+def test_a_turn_is_taken_off(tiny: Calibration) -> None:
+    found = compare(tiny, moved(tiny, (100 * ARCSECOND_RAD, 0.0, 0.0)))
+    assert found.turn_rad == pytest.approx(100 * ARCSECOND_RAD)
+    middle = GRID // 2
+    # A pixel at the axis moves by 100 arcsec of 1/fx: a lens of 1801 px.
+    expected_px = 100 * ARCSECOND_RAD * tiny.geometry.camera.parameters[0]
+    assert found.before.length_px[middle, middle] == pytest.approx(expected_px, rel=1e-3)
+    assert found.after.length_px.max() < 1e-9
+
+
+def test_sigmas_are_those_of_chance(tiny: Calibration) -> None:
+    """B drawn from the covariance of A: chi2 has its degrees as mean, each map a square of 1."""
+    rng = np.random.default_rng(3)
+    count = 100
+    draws = rng.multivariate_normal(np.zeros(13), tiny.covariance, count)
+    certain = dataclasses.replace(tiny, covariance=np.zeros((13, 13)))
+    found = [
+        compare(
+            tiny,
+            moved(certain, tuple(draw[10:]), **dict(zip(PARAMETER_NAMES, draw[:10], strict=True))),
+        )
+        for draw in draws
+    ]
+    degrees = 11  # eight camera parameters and three angles
+    assert all(one.degrees == degrees for one in found)
+    # The mean of 100 draws of chi2: sigma sqrt(2 * 11 / 100) = 0.47; four of them.
+    assert np.mean([one.chi2 for one in found]) == pytest.approx(degrees, abs=1.9)
+    assert np.mean([one.chance < 0.5 for one in found]) == pytest.approx(0.5, abs=0.2)
+    for squares in (
+        [one.before.sigmas**2 for one in found],
+        [one.after.sigmas**2 for one in found],
+    ):
+        # E|d|^2 = trace C at every pixel.  A few directions rule the map, so that the mean over it
+        # scatters by up to sqrt(2) for one draw: 0.14 for a hundred, four of them.
+        assert np.mean(squares) == pytest.approx(1.0, abs=0.57)
+
+
+def test_what_was_held_has_no_sigma(tiny: Calibration) -> None:
+    other = moved(tiny, cx=1.0)
+    found = compare(tiny, other)
+    assert np.isnan(found.sigmas[PARAMETER_NAMES.index('cx')])
+    assert any('held in both' in note and 'cx' in note for note in found.notes)
+    exact = dataclasses.replace(tiny, covariance=np.zeros((13, 13)))
+    nothing = compare(exact, exact)
+    assert nothing.degrees == 0 and np.isnan(nothing.chi2)
+    assert np.isnan(nothing.before.sigmas).all()
+    made = json.dumps(comparison.content(nothing), allow_nan=False)
+    assert json.loads(made)['chi2'] is None
+
+
+def test_notes_say_what_weakens_the_sigmas(tiny: Calibration) -> None:
+    assert any('the same stars' in note for note in compare(tiny, tiny).notes)
+    refused = dataclasses.replace(
+        tiny, accepted=False, reasons=('too bad',), parent_frame='other', provenance={}
+    )
+    notes = compare(tiny, refused).notes
+    assert any('refused B: too bad' in note for note in notes)
+    assert any('other' in note for note in notes)
+    assert not any('the same stars' in note for note in notes)
+
+
+def test_cameras_of_other_sizes_are_refused(tiny: Calibration) -> None:
+    camera = tiny.geometry.camera
+    bigger = dataclasses.replace(
+        tiny.geometry, camera=CameraModel(camera.width + 1, camera.height, camera.parameters)
+    )
+    with pytest.raises(ProductError, match='640 x 512.*641 x 512'):
+        compare(tiny, dataclasses.replace(tiny, geometry=bigger))
+
+
+def test_the_figure_is_drawn(tiny: Calibration, tmp_path: Path) -> None:
+    comparison_figure.write(compare(tiny, tiny), tmp_path / 'same.png')  # and no warning
+    found = compare(tiny, moved(tiny, fx=1.0))
+    comparison_figure.write(found, tmp_path / 'a.png')
+    picture = cv2.imread(str(tmp_path / 'a.png'))
+    assert picture is not None and np.ptp(picture) > 200
+    comparison_figure.write(found, tmp_path / 'a.svg')
+    assert '<svg' in (tmp_path / 'a.svg').read_text()
+    with pytest.raises(OptionError, match='a.jpg'):
+        comparison_figure.write(found, tmp_path / 'a.jpg')
+    with pytest.raises(ProductError, match='cannot be written'):
+        comparison_figure.write(found, tmp_path / 'none' / 'a.png')
+
+
+def test_the_tool_compares(
+    tiny: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, calibration in (('a', tiny), ('b', moved(tiny, fx=0.5))):
+        (tmp_path / name).mkdir()
+        write_calibration(calibration, tmp_path / name / 'calibration.json')
+    folders = [str(tmp_path / 'a'), str(tmp_path / 'b' / 'calibration.json')]
+    assert main.main(['compare', *folders, '-o', str(tmp_path / 'c.png')]) == 0
+    out = capsys.readouterr().out
+    (row,) = (line.split() for line in out.splitlines() if line.startswith('fx '))
+    sigma = np.sqrt(2) * tiny.sigma[0]
+    assert row[3:] == ['+0.5', f'{sigma:.2g}', f'{0.5 / sigma:+.1f}']
+    assert (tmp_path / 'c.png').is_file() and str(tmp_path / 'c.png') in out
+    assert main.main(['compare', *folders, '--json']) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made['difference'][0] == pytest.approx(0.5)
+    # The outermost column lies 319.5 px from cx: half a pixel of focal length moves it by this.
+    assert made['lines_of_sight']['worst_px'] == pytest.approx(0.5 * 319.5 / 1801, rel=0.1)

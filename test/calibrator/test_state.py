@@ -1,0 +1,260 @@
+"""What a calibrator keeps: in memory, on disk, across restarts, and what it answers."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+import resource
+
+import numpy as np
+import pytest
+
+from starcal_ros.calibrator.state import Answer, CalibratorState
+from starcal_ros.errors import ArchiveError, OptionError
+from starcal_ros.pipeline.node_options import CalibratorOptions
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.products.camera_yaml import write_camera_info
+from starcal_ros.records import Ensemble, refused_image, StarObservations
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
+
+SCENARIO = scenario('tiny', seed=7)
+
+
+@pytest.fixture(scope='module')
+def shown() -> tuple[StarObservations, ...]:
+    return true_observations(SCENARIO).images
+
+
+def load(folder: Path, scenario_name: str = 'tiny', **values: object) -> Setup:
+    prior = scenario(scenario_name, seed=7).prior
+    write_camera_info(prior.camera, folder / f'{scenario_name}.yaml')
+    return load_setup(
+        {
+            'camera_info_url': str(folder / f'{scenario_name}.yaml'),
+            'prior_alignment': prior.star_tracker_from_camera_xyzw.tolist(),
+            **values,
+        }
+    )
+
+
+@pytest.fixture(scope='module')
+def setup(tmp_path_factory: pytest.TempPathFactory) -> Setup:
+    return load(tmp_path_factory.mktemp('setup'))
+
+
+def started(setup: Setup, folder: Path | str = '', history: int = 20) -> CalibratorState:
+    state = CalibratorState()
+    state.open(setup, CalibratorOptions(state_dir=str(folder), calibration_history=history))
+    return state
+
+
+def filled(
+    setup: Setup, shown: tuple[StarObservations, ...], folder: Path | str = ''
+) -> CalibratorState:
+    state = started(setup, folder)
+    for image in shown:
+        state.add(image)
+    return state
+
+
+def test_a_restart_goes_on_where_it_stood(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    """The same solution to the last bit, and the same calibration in force."""
+    first = filled(setup, shown, tmp_path)
+    first.add(refused_image(5, 8, 8, 'no_stars', ''))
+    answer = first.solve(1_000)
+    assert answer.success and answer.in_force and answer.calibration is not None
+    assert (answer.calibration.number, answer.calibration.in_force_since_ns) == (1, 1_000)
+    status = first.status()
+    assert status.images == status.images_saved == len(shown)
+    first.close()
+    second = started(setup, tmp_path)
+    assert dict(second.status().refused) == {'no_stars': 1}
+    in_force, again = second.in_force, second.solve(2_000).calibration
+    assert in_force is not None and again is not None
+    for found in (in_force, again):
+        assert found.covariance.tobytes() == answer.calibration.covariance.tobytes()
+        assert found.provenance == answer.calibration.provenance
+    assert (in_force.number, again.number) == (1, 2)
+    second.close()
+
+
+def test_rollback_outlasts_a_restart(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    state = filled(setup, shown, tmp_path)
+    for now_ns, estimate in ((1, ('fx', 'fy')), (2, ('fx', 'fy', 'k1')), (3, ('fx',))):
+        assert state.solve(now_ns, estimate=estimate, force=True).success
+    assert state.rollback(4).success
+    state.close()
+    state = started(setup, tmp_path)
+    in_force = state.in_force
+    assert in_force is not None and in_force.estimated == ('fx', 'fy', 'k1')
+    assert (in_force.number, in_force.in_force_since_ns) == (2, 4)
+    back = state.rollback(5)
+    assert back.calibration is not None and back.calibration.number == 1
+    assert state.rollback(6) == Answer(False, 'there is no calibration before the one in force')
+    # A new one goes back to what was in force when it came.
+    assert state.solve(7, estimate=('fx', 'fy'), force=True).success
+    back = state.rollback(8)
+    assert back.calibration is not None and back.calibration.number == 1
+    state.close()
+
+
+def test_history_is_bounded(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    state = started(setup, tmp_path, history=2)
+    for image in shown:
+        state.add(image)
+    for now_ns in range(1, 5):
+        assert state.solve(now_ns).success
+    assert len(list((tmp_path / 'calibrations').iterdir())) == 2
+    assert state.rollback(9).success
+    gone = state.rollback(10)
+    assert gone.message == 'there is no calibration before the one in force any more'
+    state.close()
+
+
+def test_what_is_forced_says_so(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    gate = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    state = filled(dataclasses.replace(setup, gate=gate), shown, tmp_path)
+    refused = state.solve(1)
+    assert not refused.success and refused.calibration is not None
+    assert (refused.calibration.number, refused.calibration.forced) == (0, False)
+    assert state.in_force is None
+    assert state.solve(1, dry_run=True, force=True).success and state.in_force is None
+    assert state.solve(2, force=True).success
+    state.close()
+    state = started(setup, tmp_path)
+    in_force = state.in_force
+    assert in_force is not None and in_force.forced and not in_force.accepted
+    assert in_force.reasons[-1] == 'put in force by request all the same'
+    state.close()
+
+
+def test_what_would_count_twice_or_wrong_is_refused(
+    setup: Setup, shown: tuple[StarObservations, ...]
+) -> None:
+    state = filled(setup, (*shown, shown[0]))
+    state.add(dataclasses.replace(shown[0], time_ns=1, width=8))
+    status = state.status()
+    assert status.images == len(shown) and status.images_saved == 0
+    assert dict(status.refused) == {'duplicate': 1, 'wrong_size': 1}
+
+
+def test_the_first_of_a_stamp_stands_in_memory_and_on_disk(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    other = dataclasses.replace(shown[1], time_ns=shown[0].time_ns)
+    before = filled(setup, (*shown[:2], other), tmp_path)
+    before.close()
+    after = started(setup, tmp_path)
+    after.add(other)
+    for state in (before, after):
+        stars = [image.catalog_id.tolist() for image in state.ensemble.images]
+        assert stars == [image.catalog_id.tolist() for image in shown[:2]]
+    assert dict(before.ensemble.refused) == {'duplicate': 1}
+    assert dict(after.ensemble.refused) == {'duplicate': 2}
+    after.close()
+
+
+def test_the_limit_holds_on_disk_too(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    """A folder that a kill has left with an image too many is cut down when it is read."""
+    filled(setup, shown, tmp_path).close()
+    few = dataclasses.replace(
+        setup, calibration=dataclasses.replace(setup.calibration, max_images=4)
+    )
+    state = started(few, tmp_path)
+    status = state.status()
+    assert status.images == status.images_saved == 4
+    assert len(list((tmp_path / 'ensemble').glob('*.mcap'))) == 4
+    state.close()
+
+
+def test_reset_and_the_image_after_it(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    state = filled(setup, shown, tmp_path)
+    assert state.reset().message.startswith(f'{len(shown)} images dropped')
+    state.add(shown[3])
+    state.close()
+    state = started(setup, tmp_path)
+    assert [image.time_ns for image in state.ensemble.images] == [shown[3].time_ns]
+    state.close()
+
+
+def test_a_full_disk_costs_nothing_that_memory_holds(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    state = filled(setup, shown[:-1], tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        state.add(shown[-1])
+        answer = state.solve(1)
+        status = state.status()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert answer.success and 'not on disk: state_dir:' in answer.message
+    assert (status.images, status.images_saved) == (len(shown), len(shown) - 1)
+    assert 'cannot be written: File too large' in state.trouble
+    # The folder is let go of and taken up again before the disk has room: nothing is lost.
+    state.close()
+    state.open(setup, CalibratorOptions(state_dir=str(tmp_path)))
+    assert state.trouble == '' and state.status().images_saved == len(shown)
+    state.close()
+    state = started(setup, tmp_path)
+    assert len(state.ensemble.images) == len(shown) and state.in_force is not None
+    state.close()
+
+
+def test_a_folder_of_another_camera_is_refused(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    filled(setup, shown[:1], tmp_path / 'state').close()
+    other = load(tmp_path, 'small')
+    with pytest.raises(OptionError, match=f'state_dir: {tmp_path / "state"} is of a camera of'):
+        started(other, tmp_path / 'state')
+    started(setup, tmp_path / 'state').close()  # it was let go of
+
+
+def test_two_on_one_folder(setup: Setup, tmp_path: Path) -> None:
+    first = started(setup, tmp_path)
+    with pytest.raises(ArchiveError, match='in use by another calibrator'):
+        started(setup, tmp_path)
+    first.close()
+    first.close()
+    started(setup, tmp_path).close()
+
+
+def test_damage_is_named(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    filled(setup, shown, tmp_path).close()
+    victim = tmp_path / 'ensemble' / '00000002.mcap'
+    victim.write_bytes(victim.read_bytes()[:-100])
+    state = started(setup, tmp_path)
+    assert len(state.damage) == 1 and '00000002.mcap.damaged' in state.damage[0]
+    assert len(state.ensemble.images) == len(shown) - 1
+    state.close()
+
+
+def test_memory_alone(setup: Setup, shown: tuple[StarObservations, ...]) -> None:
+    state = started(setup)
+    assert state.rollback(1) == Answer(False, 'no calibration is in force')
+    assert 'too few observations' in state.solve(1).message
+    assert state.ensemble == Ensemble() and state.disk_free_bytes() is None
+    for image in shown:
+        state.add(image)
+    assert state.solve(1).success
+    state.close()
+    state.open(setup, CalibratorOptions())
+    in_force = state.in_force
+    assert in_force is not None and np.isfinite(in_force.covariance).all()

@@ -1,0 +1,178 @@
+"""Frames that are unfit as a whole are refused by name; sound ones of any kind are not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+from starcal_ros.errors import ImageRefused
+from starcal_ros.image.frame_checks import (
+    background_gradient,
+    Fingerprint,
+    fingerprint,
+    Pixels,
+    sample_rows,
+    screen,
+    ScreeningOptions,
+)
+from starcal_ros.records import Image
+from starcal_ros.simulation import images as simulated_images
+from starcal_ros.simulation import scenario
+
+SCENARIO = scenario.scenario('tiny', seed=3)
+HEIGHT, WIDTH = SCENARIO.truth.camera.height, SCENARIO.truth.camera.width
+HALF = HEIGHT // 2
+S = 1_000_000_000
+
+
+@functools.cache
+def frame(index: int = 0) -> NDArray[np.uint16]:
+    """A frame of the simulator."""
+    return simulated_images.render(SCENARIO, scenario.scene(SCENARIO, index), index).pixels  # type: ignore[return-value]
+
+
+def refusal(
+    pixels: Pixels,
+    before: Fingerprint | None = None,
+    time_ns: int = S,
+    saturation_dn: float = 0.0,
+    dark: Pixels | None = None,
+    **options: float,
+) -> str:
+    """The reason for which a frame is refused; empty for a sound one."""
+    sample = sample_rows(pixels)
+    seen = fingerprint(Image(time_ns, pixels), sample)
+    try:
+        screen(sample, seen, before, saturation_dn, dark, ScreeningOptions(**options))
+    except ImageRefused as refused:
+        return refused.reason if refused.detail else 'without a word'
+    return ''
+
+
+def known(pixels: Pixels, time_ns: int = 0) -> Fingerprint:
+    """What a frame before leaves behind."""
+    return fingerprint(Image(time_ns, pixels), sample_rows(pixels))
+
+
+@pytest.mark.parametrize('index', range(SCENARIO.image_count))
+def test_sound_frames_pass(index: int) -> None:
+    before = known(frame(index - 1)) if index else None
+    assert refusal(frame(index), before) == ''
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (2, 3), (63, 70), (64, 64), (129, 1000)])
+def test_frames_of_any_size_are_judged(shape: tuple[int, int]) -> None:
+    noise = np.random.default_rng(1).poisson(100.0, shape).astype(np.uint16)
+    assert refusal(noise) in ('', 'blank')
+    assert refusal(np.zeros(shape, np.uint8)) == 'blank'
+
+
+def part(value: int, rows: slice = slice(None), columns: slice = slice(None)) -> Pixels:
+    """A frame of which a part has one value."""
+    pixels = frame().copy()
+    pixels[rows, columns] = value
+    return pixels
+
+
+def placed(where: slice, source: Pixels) -> Pixels:
+    """A frame of which some rows are replaced."""
+    pixels = frame().copy()
+    pixels[where] = source
+    return pixels
+
+
+LOWER, UPPER = slice(HALF, None), slice(None, HALF)
+
+
+@pytest.mark.parametrize(
+    ('reason', 'made'),
+    [
+        ('blank', lambda: np.zeros((HEIGHT, WIDTH), np.uint8)),
+        ('blank', lambda: np.full((HEIGHT, WIDTH), 300, np.uint16)),
+        ('overexposed', lambda: np.full((HEIGHT, WIDTH), 255, np.uint8)),
+        ('overexposed', lambda: np.full((HEIGHT, WIDTH), 4095, np.uint16)),
+        ('overexposed', lambda: part(65535, rows=slice(None, HEIGHT // 3))),
+        ('incomplete', lambda: part(0, rows=LOWER)),
+        ('incomplete', lambda: part(0, rows=UPPER)),
+        ('incomplete', lambda: part(0, columns=slice(WIDTH // 2, None))),
+        # A value like the sky's own is no sky either: it has no noise.
+        ('incomplete', lambda: part(int(np.median(frame())), rows=LOWER)),
+        ('incomplete', lambda: part(0, rows=slice(100, 100 + HEIGHT // 20))),
+        ('incomplete', lambda: placed(LOWER, frame()[HALF - 1])),
+        ('incomplete', lambda: placed(LOWER, frame()[:HALF])),
+    ],
+)
+def test_a_lost_frame_is_refused(reason: str, made: Callable[[], Pixels]) -> None:
+    assert refusal(made()) == reason
+
+
+def test_packets_lost_at_a_regular_distance_are_noticed() -> None:
+    """Two rows in sixteen: an eighth, wherever the sampled rows fall."""
+    for first in range(16):
+        pixels = frame().copy()
+        pixels[first::16] = pixels[first + 1 :: 16] = 0
+        assert refusal(pixels) == 'incomplete'
+
+
+def test_a_frame_shown_again_is_frozen() -> None:
+    assert refusal(frame(), known(frame())) == 'frozen'
+    assert refusal(frame(), known(frame(), time_ns=S)) == ''  # delivered twice
+    assert refusal(frame(1), known(frame())) == ''
+    assert refusal(frame()[:100], known(frame())) == ''
+
+
+def test_a_frame_without_noise_is_known_again() -> None:
+    """Eight bits, no light but the stars: only all pixels tell two frames apart."""
+    one, other = (np.zeros((HEIGHT, WIDTH), np.uint8) for _ in range(2))
+    one[::50, ::70], other[::50, 3::70] = 200, 200
+    assert refusal(one, known(one)) == 'frozen'
+    assert refusal(other, known(one)) == ''
+
+
+def test_a_frame_half_of_the_one_before_is_incomplete() -> None:
+    assert refusal(placed(LOWER, frame(1)[HALF:]), known(frame(1))) == 'incomplete'
+    # Whichever stamp it carries.
+    assert refusal(placed(LOWER, frame(1)[HALF:]), known(frame(1), S)) == 'incomplete'
+
+
+@pytest.mark.parametrize('noise_dn', [0.3, 1.0, 4.0])
+def test_a_dark_sky_cut_off_at_zero_is_sound(noise_dn: float) -> None:
+    """An eight-bit camera without offset: darker corners read zero, without a fault."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    falls = 1.5 * noise_dn * np.hypot(u - WIDTH / 2, v - HEIGHT / 2) / HALF
+    sky = np.random.default_rng(2).normal(noise_dn - falls, noise_dn)
+    assert refusal(np.clip(np.rint(sky), 0, 255).astype(np.uint8)) == ''
+
+
+def test_a_bright_disc_is_no_loss() -> None:
+    """The Moon over a tenth of the field: constant, but saturated, and the rest is sound."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    pixels = frame().copy()
+    pixels[np.hypot(u - WIDTH / 2, v - HALF) < 0.178 * np.sqrt(HEIGHT * WIDTH)] = 4095
+    assert refusal(pixels) == ''
+    assert refusal(pixels, max_saturated_fraction=0.05) == 'overexposed'
+    assert refusal(pixels, saturation_dn=4200.0) == 'incomplete'
+
+
+def ramp(slope: float) -> Pixels:
+    """Noise of 5 DN on a sky that rises by a slope in that noise per pixel, across."""
+    noise = np.random.default_rng(4).normal(200.0, 5.0, (HEIGHT, WIDTH))
+    return np.rint(noise + 5.0 * slope * np.arange(WIDTH)).astype(np.uint16)
+
+
+@pytest.mark.parametrize('slope', [0.0, 0.01, 0.03, 0.1, 0.5])
+def test_the_slope_of_a_sky_is_measured(slope: float) -> None:
+    # Means of 512 pixels 128 px apart tell it to 0.0005 noise per pixel; the noise of 5 DN itself
+    # is told by the steps of 1 DN between its quantiles, to a tenth.
+    assert background_gradient(sample_rows(ramp(slope))) == pytest.approx(slope, 0.12, 0.001)
+    assert refusal(ramp(slope)) == ('glare' if slope > 0.05 else '')
+
+
+def test_what_the_dark_frame_explains_is_no_glare() -> None:
+    glow = np.rint(0.5 * np.arange(WIDTH) + np.zeros((HEIGHT, 1))).astype(np.uint16)
+    assert refusal(ramp(0.1)) == 'glare'
+    assert refusal(ramp(0.1), dark=glow) == ''

@@ -1,0 +1,52 @@
+"""A state folder that is filled, for tests that kill the process which fills it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import dataclasses
+import functools
+import itertools
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from sample_records import calibration  # type: ignore[import-not-found]
+
+from starcal_ros.calibrator.archive import Archive, InForce
+from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import scenario
+
+
+@functools.cache
+def images() -> tuple[StarObservations, ...]:
+    return true_observations(scenario('tiny', seed=7)).images
+
+
+def in_force(event: int, before: int = 0, number: int = 0) -> InForce:
+    """A record whose calibration tells its number by its residual."""
+    number = number or event
+    changed = dataclasses.replace(calibration(), number=number, residual_rms_px=number / 7)
+    return InForce(event, before, changed)
+
+
+@contextlib.contextmanager
+def opened(folder: Path) -> Iterator[Archive]:
+    archive = Archive(folder, 'camera')
+    try:
+        yield archive
+    finally:
+        archive.close()
+
+
+def collect(folder: Path, shown: tuple[StarObservations, ...], told: Connection) -> None:
+    """In a process of its own: keep images and calibrations; tell when each call is done."""
+    with opened(folder) as archive:
+        have, history = archive.read_ensemble(), archive.read_history()
+        assert not archive.damage, archive.damage
+        for k in itertools.count(len(have.images)):
+            image = dataclasses.replace(shown[k % len(shown)], time_ns=k)
+            have = Ensemble((*have.images, image), {'no_stars': k})
+            history = (*history, in_force(archive.last_event + 1))[-3:]
+            archive.keep(have, history)
+            told.send((k, history[-1].event))

@@ -1,0 +1,61 @@
+"""Messages of star observations: round trips, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from sample_records import assert_same, observations, plain, TIME_NS  # type: ignore[import-not-found]
+
+from starcal_ros.bag.reader import make_message
+from starcal_ros.messages.observations import observations_from_message, observations_to_message
+from starcal_ros.records import refused_image
+
+
+@pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
+def test_observations_round_trip(make: Any) -> None:
+    """Every number of a record survives its message, bit for bit."""
+    refused = refused_image(TIME_NS, 1, 2, 'no_stars', 'three')
+    for record in (observations(), refused):
+        message = observations_to_message(record, 'cam', make)
+        assert_same(record, observations_from_message(message))
+
+
+@pytest.mark.parametrize(
+    ('field', 'value', 'text'),
+    [
+        ('measured_px', np.zeros(9), 'measured_px: 9 numbers, not 5 x 2'),
+        ('measured_px', np.full(10, np.nan), 'measured_px: not finite'),
+        ('covariance_px2', np.zeros(15), 'not positive definite'),
+        ('refused_star_counts', np.zeros(1, np.uint32), '2 reasons but 1 counts'),
+        ('refused_star_px', np.zeros(7), 'refused_star_px: 7 numbers, not 4 x 2'),
+        ('refused_star_px', np.full(8, np.inf), 'refused_px: not finite'),
+        ('refused_star_reason', np.full(4, 2), 'refused_star_reason: 2 is none of 2 reasons'),
+    ],
+)
+def test_bad_observations_are_refused(field: str, value: Any, text: str) -> None:
+    """Observations that do not fit together are refused by the name of the field."""
+    message = observations_to_message(observations(), 'cam', plain)
+    setattr(message, field, value)
+    with pytest.raises(ValueError, match=text):
+        observations_from_message(message)
+
+
+def test_refused_stars_are_found_by_reason() -> None:
+    record = observations()
+    places = record.refused_places()
+    assert list(places) == ['blend', 'saturated']
+    np.testing.assert_array_equal(places['blend'], record.refused_px[[0, 2, 3]])
+    np.testing.assert_array_equal(places['saturated'], record.refused_px[[1]])
+
+
+def test_older_observations_are_read() -> None:
+    """Fields that were added since are as if nothing was known."""
+    message = observations_to_message(observations(), 'cam', plain)
+    del message.temperature_degc
+    del message.refused_star_id, message.refused_star_px, message.refused_star_reason
+    record = observations_from_message(message)
+    assert np.isnan(record.temperature_degc)
+    assert record.refused_stars == {'blend': 3, 'saturated': 1}
+    assert record.refused_px.shape == (0, 2)

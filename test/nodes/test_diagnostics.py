@@ -1,0 +1,143 @@
+"""What the running nodes say of themselves: keys and levels as docs/icd.md has them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+import re
+from typing import Any, TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+    from starcal_ros.records import Ensemble
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import QuaternionStamped
+from sensor_msgs.msg import Image
+from std_srvs.srv import Trigger
+
+from starcal.msg import EnsembleStatus, StarObservations
+from starcal_ros.bag import reader
+from starcal_ros.messages.observations import observations_to_message
+from starcal_ros.nodes.message_factory import make_message
+from starcal_ros.records import IMAGE_REFUSALS
+
+pytestmark = pytest.mark.nodes
+
+ICD = Path(__file__).parents[2] / 'docs' / 'icd.md'
+REMAPS = ('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude')
+
+
+def documented(*tables: str) -> set[str]:
+    """Keys that the document names, those with a reason in them once for each reason."""
+    keys: set[str] = set()
+    for table in ('both nodes', *tables):
+        marks = f'<!-- diagnostics of {table} -->\n(.*?)<!-- end -->'
+        found = re.search(marks, ICD.read_text(), re.DOTALL)
+        assert found, table
+        keys |= set(re.findall(r'^\| `(.*?)`', found[1], re.MULTILINE))
+    if 'refused_…' in keys:
+        keys.remove('refused_…')
+        keys |= {f'refused_{reason}' for reason in IMAGE_REFUSALS}
+    return keys
+
+
+def newest(diagnostics: list[Any], name: str) -> tuple[bytes, str, dict[str, str]]:
+    """Level, message and values that a node published last; none before it did."""
+    for message in reversed(diagnostics):
+        for status in message.status:
+            if status.name == f'starcal: {name}':
+                pairs = [(value.key, value.value) for value in status.values]
+                assert len(dict(pairs)) == len(pairs), 'a key twice'
+                return status.level, status.message, dict(pairs)
+    return b'', '', {}
+
+
+def test_observer_says_what_the_document_says(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), *REMAPS)
+    start_node('star_observer', ros=(*ros, '-p', 'attitude_timeout_s:=60.0'))
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: newest(diagnostics, 'star_observer')[1] == 'waiting for images')
+    level, _, values = newest(diagnostics, 'star_observer')
+    assert level == b'\x00' and set(values) == documented('star_observer')
+    assert values['latency_median_s'] == values['attitude_gap_s'] == 'none'
+
+    images = client.publisher(Image, '/opnav/image_raw', 10)
+    attitudes = client.publisher(QuaternionStamped, '/star_tracker/attitude')
+    samples = list(reader.read_raw([tiny_bag], ['/star_tracker/attitude']))
+    images.publish(next(reader.read_raw([tiny_bag], ['/opnav/image_raw'])).data)
+    for sample in samples:
+        attitudes.publish(sample.data)
+    client.until(lambda: newest(diagnostics, 'star_observer')[2].get('images_used') == '1')
+    client.until(
+        lambda: newest(diagnostics, 'star_observer')[2].get('attitudes') == str(len(samples))
+    )
+    level, text, values = newest(diagnostics, 'star_observer')
+    assert (level, text) == (b'\x00', 'observing')
+    assert set(values) == documented('star_observer')
+    stamps_ns = [sample.log_time_ns for sample in samples]
+    steps_s = [(b - a) / 1e9 for a, b in itertools.pairwise(stamps_ns)]
+    assert float(values['attitude_gap_s']) == pytest.approx(max(steps_s), abs=0.001)
+    assert 0 < float(values['image_rate_hz']) < float(values['attitude_rate_hz'])
+    assert 0 < float(values['latency_median_s']) == float(values['latency_worst_s'])
+    assert int(values['memory_peak_mb']) > 10
+    assert values['callback_errors'] == '0'
+
+
+def test_calibrator_says_what_the_document_says(
+    client: Client,
+    start_node: StartNode,
+    tiny_bag: Path,
+    tiny_observations: Ensemble,
+    tmp_path: Path,
+) -> None:
+    """Collecting, with a file of its state damaged, then with a calibration in force."""
+    history = tmp_path / 'state' / 'calibrations'
+    history.mkdir(parents=True)
+    (history / '00000001_calibration_00000001.json').write_text('{"schema": 1}')
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'))
+    start_node('calibrator', ros=(*ros, '-p', f'state_dir:={tmp_path / "state"}'))
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: 'images' in newest(diagnostics, 'calibrator')[2])
+    level, text, values = newest(diagnostics, 'calibrator')
+    assert set(values) == documented('calibrator')
+    assert level == b'\x01' and text.startswith('set aside as damaged: ')
+    assert '00000001_calibration_00000001.json' in text
+    assert values['state_damaged_files'] == '1'
+    assert (values['in_force'], values['calibration_age_s']) == ('none', 'none')
+    assert (values['last_gate'], values['camera_driver']) == ('none', 'none')
+
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    observations = client.publisher(StarObservations, 'observations')
+    for image in tiny_observations.images:
+        observations.publish(observations_to_message(image, 'camera', make_message))
+    client.until(lambda: status and status[-1].images == len(tiny_observations.images))
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    client.until(lambda: newest(diagnostics, 'calibrator')[2].get('in_force') != 'none')
+    _, _, values = newest(diagnostics, 'calibrator')
+    assert set(values) == documented('calibrator')
+    assert values['last_gate'] == 'accepted'
+    # On this machine's clock, within the time a test may take.
+    assert 0 <= float(values['calibration_age_s']) < 600
+    assert math.isfinite(float(values['disk_free_mb']))
+
+
+def test_nodes_that_are_not_active(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'autostart:=false')
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    for name in ('star_observer', 'calibrator'):
+        start_node(name, ros=ros)
+    for name in ('star_observer', 'calibrator'):
+        client.until(lambda name=name: newest(diagnostics, name)[0])
+        level, text, values = newest(diagnostics, name)
+        assert (level, text) == (b'\x01', 'not active: unconfigured')
+        assert set(values) == documented()

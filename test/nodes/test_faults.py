@@ -1,0 +1,145 @@
+"""Faults on real processes: the short form of the bench, and a bag that plays again by /clock."""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from diagnostic_msgs.msg import DiagnosticArray
+
+from starcal.msg import EnsembleStatus
+from starcal_ros.bag import reader
+from starcal_ros.messages.fields import stamp_ns
+from starcal_ros.records import Image
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.timeout(
+    400
+)  # fifteen node starts of 2 s; on a busy machine each takes ten times that
+def test_no_fault_loses_or_kills(tmp_path: Path) -> None:
+    """Hostile messages, kills, no room, doubles, callers that go: nothing lost, wrong or dead."""
+    found = tmp_path / 'found.json'
+    command = [sys.executable, '-m', 'bench', 'faults', '--quick', '--json', str(found)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=380)
+    assert done.returncode == 0, done.stderr
+    (table,) = json.loads(found.read_text())['faults']
+    rows = table['rows']
+    for row in rows:
+        assert (row['lost'], row['wrong'], row['died']) == (0, 0, 0), row
+    made = {(row['fault'], row['node']) for row in rows}
+    assert made >= {('kill -9', 'star_observer'), ('kill -9', 'calibrator')}
+    assert {row['fault'] for row in rows} >= {
+        *('bits flipped, ends cut off', 'hostile messages', 'hostile requests', 'kill -9'),
+        *('a sound image after these', 'a sound ensemble after these', 'state after these'),
+        *('calls at once', 'caller killed', 'a second calibrator'),
+    }
+
+
+@pytest.mark.nodes
+def test_a_bag_plays_again_by_its_clock(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """As replay.launch.py starts them: in a namespace, by /clock; the second pass counts once."""
+    given = ('-r', '__ns:=/cam', '--params-file', str(tiny_bag / 'params.yaml'))
+    common = (*given, '-p', 'autostart:=true', '-p', 'use_sim_time:=true', '--log-level', 'info')
+    remaps = ('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude')
+    start_node('star_observer', ros=(*common, '-r', '__node:=star_observer', *remaps))
+    start_node('calibrator', ros=(*common, '-r', '__node:=calibrator'))
+    client.until(lambda: client.node.count_subscribers('/cam/observations'))
+    status = client.latched(EnsembleStatus, '/cam/ensemble_status')
+    health = client.collect(DiagnosticArray, '/diagnostics')
+    player = ('-r', '__ns:=/cam', '-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0', '-p', 'loop:=true')
+    start_node('bag_player', ros=(*player, '-p', 'clock:=true'))
+
+    def restarts() -> int:
+        told = (one.status[0] for one in health if 'star_observer' in one.status[0].name)
+        values = [int(v.value) for s in told for v in s.values if v.key == 'restarts']
+        return max(values, default=0)
+
+    client.until(lambda: restarts() >= 1, 60.0)
+    images = len(list(reader.read_images([tiny_bag], '/opnav/image_raw')))
+    client.until(lambda: status and status[-1].images == images)
+    stamps = [raw.log_time_ns for raw in reader.read_raw([tiny_bag])]
+    last_ns = stamp_ns(health[-1].header.stamp)
+    # Within the bag, whatever pass of it: the diagnostics take the time from /clock.
+    assert min(stamps) <= last_ns <= max(stamps) + 10**9
+
+
+NODES = ('star_observer', 'calibrator', 'bag_player')
+
+
+@pytest.mark.nodes
+def test_the_policies_name_what_the_nodes_have(
+    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
+) -> None:
+    """Least privilege: each policy allows the topics and services of its node, and no others."""
+    with reader.BagWriter(tmp_path / 'bag') as writer:
+        writer.write_image('/image', Image(1, np.zeros((2, 2), np.uint8)), 'camera')
+        writer.write_attitude('/attitude', 1, np.array([0, 0, 0, 1.0]), 'icrf')
+        writer.write_velocity('/velocity', 1, np.zeros(3), 'icrf')
+        writer.write_temperature('/temperature', 1, 20.0, 'camera')
+    start_node('bag_player', ros=('-p', f'bag:={tmp_path / "bag"}', '-p', 'clock:=true', *WAIT))
+    for name in NODES[:2]:
+        # Nobody may listen to the player, or it plays and ends.
+        remaps = ('-r', 'image:=/elsewhere') if name == 'star_observer' else ()
+        start_node(name, ros=('--params-file', str(tiny_bag / 'params.yaml'), *remaps))
+    for name in NODES:
+        path = ROOT / 'config' / 'security' / f'{name}.policy.xml'
+        profile = ElementTree.parse(path).getroot().find('contexts/context/profiles/profile')
+        assert profile is not None and profile.get('node') == name and profile.get('ns') == '/'
+        allowed = {
+            (kind, full_name(name, str(element.text)))
+            for group in profile
+            for kind in ('publish', 'subscribe', 'reply', 'request')
+            if group.get(kind) == 'ALLOW'
+            for element in group
+        }
+        client.until(functools.partial(shows, client, name, allowed))
+        assert of_graph(client, name) == allowed, name
+
+
+WAIT = ('-p', 'wait_for_subscribers_s:=100.0')
+
+
+def full_name(node: str, name: str) -> str:
+    """A name of a policy, resolved for a node in the root."""
+    if name.startswith('~/'):
+        return f'/{node}/{name[2:]}'
+    return name if name.startswith('/') else f'/{name}'
+
+
+def of_graph(client: Client, name: str) -> set[tuple[str, str]]:
+    """What a node has on the graph, by what a policy calls it."""
+    node = client.node
+    found = set()
+    for kind, ask in (
+        ('publish', node.get_publisher_names_and_types_by_node),
+        ('subscribe', node.get_subscriber_names_and_types_by_node),
+        ('reply', node.get_service_names_and_types_by_node),
+        ('request', node.get_client_names_and_types_by_node),
+    ):
+        found |= {(kind, topic) for topic, _ in ask(name, '/')}
+    if ('subscribe', '/elsewhere') in found:
+        found = {*found - {('subscribe', '/elsewhere')}, ('subscribe', '/image')}
+    return found
+
+
+def shows(client: Client, name: str, allowed: set[tuple[str, str]]) -> bool:
+    """Whether the graph shows by now all that a node may have."""
+    return name in client.node.get_node_names() and of_graph(client, name) >= allowed

@@ -1,0 +1,120 @@
+"""A calibration in force is handed to the camera's driver: a real service, and its failures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+    from starcal_ros.records import Ensemble
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import CameraInfo
+from sensor_msgs.srv import SetCameraInfo
+from std_srvs.srv import Trigger
+
+from starcal.msg import EnsembleStatus, StarObservations
+from starcal_ros.messages.observations import observations_to_message
+from starcal_ros.nodes.message_factory import make_message
+
+pytestmark = pytest.mark.nodes
+
+SERVICE = '/opnav/set_camera_info'
+
+
+def fill(client: Client, ensemble: Ensemble) -> None:
+    """Hand a calibrator the observations of an ensemble."""
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    observations = client.publisher(StarObservations, 'observations')
+    for image in ensemble.images:
+        observations.publish(observations_to_message(image, 'camera', make_message))
+    client.until(lambda: status and status[-1].images == len(ensemble.images))
+
+
+def told(diagnostics: list[Any], outcome: str, level: bytes) -> Callable[[], bool]:
+    """Whether the newest diagnostics say so of the driver."""
+
+    def is_so() -> bool:
+        newest = [status for message in diagnostics[-1:] for status in message.status]
+        return any(
+            status.level == level
+            and {v.key: v.value for v in status.values}.get('camera_driver') == outcome
+            for status in newest
+        )
+
+    return is_so
+
+
+def test_driver_is_told_and_its_failures_are_seen(
+    client: Client,
+    other_client: Client,
+    start_node: StartNode,
+    tiny_bag: Path,
+    tiny_observations: Ensemble,
+) -> None:
+    """Absent, silent, refusing, accepting: each is named, counted, and sent again as promised."""
+    calibrator = start_node(
+        'calibrator',
+        ros=(
+            *('--params-file', str(tiny_bag / 'params.yaml')),
+            *('-p', f'set_camera_info_service:={SERVICE}'),
+            *('-p', 'set_camera_info_timeout_s:=1.0'),
+        ),
+    )
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    nothing = client.call(Trigger, '/calibrator/send_camera_info')
+    assert (nothing.success, nothing.message) == (False, 'no calibration is in force')
+    fill(client, tiny_observations)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    client.until(told(diagnostics, 'not there; sent when it comes', b'\x01'))
+
+    # A driver that takes the call and never answers: nobody spins its node.
+    silent = other_client.node.create_service(SetCameraInfo, SERVICE, lambda _, answer: answer)
+    client.until(told(diagnostics, 'no answer within 1 s', b'\x01'))
+    values = {v.key: v.value for v in diagnostics[-1].status[0].values}
+    assert int(values['camera_driver_failures']) >= 2
+    other_client.node.destroy_service(silent)
+
+    received: list[Any] = []
+    accepts = False
+
+    def answer(request: Any, response: Any) -> Any:
+        received.append(request.camera_info)
+        response.success = accepts
+        response.status_message = '' if accepts else 'sensor\nbusy'
+        return response
+
+    client.node.create_service(SetCameraInfo, SERVICE, answer)
+    refused = client.call(Trigger, '/calibrator/send_camera_info')
+    assert not refused.success and refused.message == f'{SERVICE}: refused: sensor busy'
+    client.until(told(diagnostics, 'refused: sensor busy', b'\x01'))
+
+    accepts = True
+    taken = client.call(Trigger, '/calibrator/send_camera_info')
+    assert taken.success, taken.message
+    client.until(told(diagnostics, 'accepted', b'\x00'))
+    published = client.latched(CameraInfo, 'camera_info')
+    client.until(lambda: published)
+    assert received[-1] == published[-1]
+
+    before = len(received)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    client.until(lambda: len(received) > before)
+    said = calibrator.said()
+    for outcome in ('not there', 'no answer within 1 s', 'refused: sensor busy', 'accepted'):
+        assert f'{SERVICE}: {outcome}' in said
+    assert 'Traceback' not in said
+
+
+def test_without_a_driver(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    start_node('calibrator', ros=('--params-file', str(tiny_bag / 'params.yaml')))
+    answer = client.call(Trigger, '/calibrator/send_camera_info')
+    assert not answer.success and 'set_camera_info_service' in answer.message

@@ -1,0 +1,339 @@
+"""A sequence of images: what is measured, what is refused, and where it stands after."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import erfa
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tiny_campaign import attitudes, image, SCENARIO, TRUTH, values, write_png  # type: ignore[import-not-found]
+
+from starcal_ros.camera import project
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.pipeline import observe
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.records import CameraGeometry, Ensemble, Image
+from starcal_ros.simulation.images import render, star_electrons
+from starcal_ros.simulation.scenario import attitude_samples, scene
+from starcal_ros.sky.astrometry import through_the_air
+from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
+
+S = 1_000_000_000
+
+
+@pytest.fixture(scope='module')
+def setup(camera_yaml: Path) -> Setup:
+    return load_setup(values(camera_yaml))
+
+
+def test_stars_are_observed(setup: Setup) -> None:
+    found = observe.observe(image(), attitudes(), setup, setup.prior)
+    assert found.refusal == '' and len(found) > 100
+    assert found.attitude_gap_s == 0.5
+    assert found.time_ns == image().time_ns
+    one = scene(SCENARIO, 1)
+    attitude_error = (
+        Rotation.from_quat(found.icrf_from_star_tracker_xyzw).inv()
+        * Rotation.from_quat(one.icrf_from_star_tracker_xyzw)
+    ).magnitude()
+    # One error for all samples of an image, which do not move: the interpolation adds nothing.
+    assert attitude_error < 1e-9
+
+
+def test_from_the_ground_stars_are_where_the_air_puts_them(camera_yaml: Path) -> None:
+    drawn = scene(SCENARIO, 1)
+    # A site that sees the middle of the image 20 degrees above its northern or southern horizon.
+    _, _, ahead = drawn.camera_from_icrf
+    sidereal_rad = erfa.era00(2440587.5, drawn.time_ns / (86400 * S))
+    longitude = np.degrees(np.arctan2(ahead[1], ahead[0]) - sidereal_rad) % 360
+    declination = np.degrees(np.arcsin(ahead[2]))
+    ground = {
+        'observer': 'ground',
+        'latitude_deg': declination - np.copysign(70.0, declination),
+        'longitude_deg': longitude,
+        'height_m': 500.0,
+    }
+    made = load_setup(values(camera_yaml, **ground))
+    bent_icrf, elevation_rad = through_the_air(drawn.direction_icrf, drawn.time_ns, made.site)
+    assert np.degrees(np.median(elevation_rad)) == pytest.approx(20.0, abs=2.0)
+    pixel_px = project(TRUTH.camera, bent_icrf @ drawn.camera_from_icrf.T)
+    moved_px = pixel_px - drawn.pixel_px
+    assert np.linalg.norm(moved_px, axis=1).min() > 0.5 and np.ptp(moved_px, axis=0).max() > 1.0
+    seen = render(SCENARIO, dataclasses.replace(drawn, pixel_px=pixel_px), 1)
+    found = observe.observe(seen, attitudes(), made, TRUTH)
+    place = {
+        number: (pixel, direction)
+        for number, pixel, direction in zip(
+            drawn.catalog_id.tolist(), pixel_px, bent_icrf, strict=True
+        )
+    }
+    assert found.refusal == '' and len(found) > 100
+    uu, _, vv = found.covariance_px2.T
+    off_px = found.measured_px - [place[number][0] for number in found.catalog_id.tolist()]
+    in_sigma = off_px / np.sqrt(np.stack([uu, vv], axis=-1))
+    assert np.sqrt((in_sigma**2).mean()) < 1.2  # as of stars in space
+    # What is recorded is the bent direction, so that a calibration from the record is the same.
+    recorded = [place[number][1] for number in found.catalog_id.tolist()]
+    np.testing.assert_allclose(found.direction_icrf, recorded, rtol=0, atol=1e-12)
+    higher = load_setup(values(camera_yaml, **ground, min_elevation_deg=20.0))
+    upper = observe.observe(seen, attitudes(), higher, TRUTH)
+    _, elevation_rad = through_the_air(
+        drawn.direction_icrf[np.isin(drawn.catalog_id, upper.catalog_id)],
+        drawn.time_ns,
+        made.site,
+    )
+    assert 30 < len(upper) < len(found) and np.degrees(elevation_rad.min()) >= 20.0
+
+
+def test_an_image_of_another_size_is_refused(setup: Setup) -> None:
+    small = Image(image().time_ns, image().pixels[:-2].copy())
+    found = observe.observe(small, attitudes(), setup, setup.prior)
+    assert (found.refusal, found.detail) == ('wrong_size', '640 x 510, the camera has 640 x 512')
+    assert (found.width, found.height) == (640, 510)
+    assert len(found) == 0
+
+
+def test_an_image_without_attitude_is_refused(setup: Setup) -> None:
+    samples = attitude_samples(SCENARIO, 1)
+    wide = AttitudeHistory()
+    for sign in (-5, 5):
+        time_ns = image().time_ns + sign * S
+        wide.add(time_ns, attitude_sample(time_ns, np.array([0, 0, 0, 1.0]), 'st_to_inertial'))
+    half = AttitudeHistory()
+    half.add(samples[0].time_ns, samples[0])
+    spoilt = AttitudeHistory()
+    spoilt.add(image().time_ns, None)
+    for held, reason in (
+        (AttitudeHistory(), 'no_attitude'),
+        (half, 'no_attitude'),
+        (wide, 'attitude_gap'),
+        (spoilt, 'bad_attitude'),
+    ):
+        found = observe.observe(image(), held, setup, setup.prior)
+        assert found.refusal == reason and found.detail
+        assert found.attitude_gap_s == -1.0
+
+
+def test_an_image_that_nothing_explains_keeps_its_attitude(setup: Setup) -> None:
+    noise = np.random.default_rng(5).normal(40.0, 3.0, image().pixels.shape)
+    found = observe.observe(
+        Image(image().time_ns, noise.astype(np.uint16)), attitudes(), setup, setup.prior
+    )
+    assert found.refusal == 'no_stars'
+    assert found.attitude_gap_s == 0.5
+    assert found.catalog_digest == setup.catalog.digest
+    assert abs(found.icrf_from_star_tracker_xyzw[3]) < 1.0
+
+
+def test_out_of_order_images_say_by_how_much(setup: Setup) -> None:
+    track = observe.Track(setup.prior, image().time_ns + 250_000_000)
+    found, after = observe.observe_next(image(), attitudes(), setup, track)
+    assert found.refusal == 'out_of_order'
+    assert found.detail == '0.250000 s before the last image used'
+    assert (after.geometry, after.latest_ns) == (track.geometry, track.latest_ns)
+
+
+def passed(setup: Setup, track: observe.Track, *offsets_s: int) -> list[str]:
+    """Refusals of one image at several times about that of the last used; no attitudes come."""
+    found = []
+    for offset_s in offsets_s:
+        one = dataclasses.replace(image(), time_ns=image().time_ns + offset_s * 10**9)
+        observations, track = observe.observe_next(one, AttitudeHistory(), setup, track)
+        found.append(observations.refusal)
+    return found
+
+
+def test_the_third_image_in_a_row_from_the_past_starts_anew(setup: Setup) -> None:
+    """A clock set back costs two images; two that have changed places do not start anything."""
+    late, taken = 'out_of_order', 'no_attitude'
+    track = observe.Track(setup.prior, image().time_ns)
+    assert passed(setup, track, -90, -80, -70, -60) == [late, late, taken, taken]
+    assert passed(setup, track, -90, -80, -85, -70) == [late, late, late, late]
+    assert passed(setup, track, -90, -80, 5, -70, -60, 6) == [late, late, taken, late, late, taken]
+
+
+def test_a_recording_that_plays_twice_counts_once(setup: Setup) -> None:
+    first, _ = observe.observe_next(image(), attitudes(), setup, observe.Track(setup.prior))
+    assert not first.refusal
+    later = dataclasses.replace(first, time_ns=first.time_ns + 1)
+    ensemble = Ensemble().add(first).add(later)
+    again = dataclasses.replace(first, attitude_gap_s=0.125)
+    ensemble = ensemble.add(again)
+    assert ensemble.images == (first, later) and dict(ensemble.refused) == {'duplicate': 1}
+
+
+def test_a_refused_image_does_not_put_those_after_it_out_of_order(
+    setup: Setup,
+) -> None:
+    track = observe.Track(setup.prior)
+    future = dataclasses.replace(image(2), time_ns=image().time_ns + 10**15)
+    refused, track = observe.observe_next(future, attitudes(), setup, track)
+    assert refused.refusal == 'no_attitude'
+    found, track = observe.observe_next(image(), attitudes(), setup, track)
+    assert found.refusal == '' and track.latest_ns == image().time_ns
+
+
+@pytest.mark.parametrize('jump_deg', [1.0, 6.0])
+def test_a_star_tracker_that_jumped_and_came_back(setup: Setup, jump_deg: float) -> None:
+    turned = CameraGeometry(
+        setup.prior.camera,
+        (
+            Rotation.from_quat(setup.prior.star_tracker_from_camera_xyzw)
+            * Rotation.from_euler('xyz', [0.7, -0.5, 3.0], degrees=True)
+        ).as_quat(),
+    )
+    off = np.array([0.6, -0.8, 0.0]) * np.radians(jump_deg)
+    track, lengths, seen = observe.Track(turned), [], []
+    for index in range(5):
+        held = AttitudeHistory()
+        for sample in attitude_samples(SCENARIO, index):
+            right = Rotation.from_quat(sample.icrf_from_star_tracker_xyzw)
+            reported = right * Rotation.from_rotvec(off) if index == 2 else right
+            held.add(
+                sample.time_ns,
+                attitude_sample(sample.time_ns, reported.as_quat(), 'st_to_inertial'),
+            )
+        before = track
+        found, track = observe.observe_next(image(index), held, setup, track)
+        lengths.append(len(found))
+        seen.append(found.refusal)
+        if found.refusal:
+            assert track.geometry is before.geometry and track.followed is before.followed
+            assert track.latest_ns == before.latest_ns
+    # Beyond the search the jump is refused, within it the stars are still the right ones.
+    assert seen == ['', '', '' if jump_deg < 1.5 else 'no_match', '', '']
+    used = [length for length, refusal in zip(lengths, seen, strict=True) if not refusal]
+    assert min(used) > 60
+    # What the first image found of the turned alignment has carried to the last.
+    left = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw).inv() * Rotation.from_quat(
+        track.geometry.star_tracker_from_camera_xyzw
+    )
+    # One error of the tracker, (10, 10, 40) arcsec, and what the prior camera is off by.
+    assert left.magnitude() < 200 * ARCSECOND_RAD
+
+
+def test_the_last_sample_at_or_before_an_image_counts() -> None:
+    samples = [(10, 'a'), (20, 'b'), (30, 'c')]
+    for time_ns, sample in ((5, 'a'), (10, 'a'), (29, 'b'), (30, 'c'), (99, 'c')):
+        assert observe.latest_at(samples, time_ns, 'none') == sample
+    assert observe.latest_at([], 5, 'none') == 'none'
+
+
+def test_a_dark_frame_takes_a_pattern_away(camera_yaml: Path, tmp_path: Path) -> None:
+    # Every second row 30 DN up, and hot pixels in many stars.
+    rng = np.random.default_rng(9)
+    pattern = np.full((512, 640), 40.0)
+    pattern[::2] += 30.0
+    pattern.flat[rng.choice(pattern.size, 3000, replace=False)] += 300.0
+    one = scene(SCENARIO, 1)
+    light = star_electrons(one.pixel_px, one.flux_electrons, 0.95, (512, 640)) / 8.0
+    noise = rng.normal(0, 1.2, pattern.shape)
+    pixels = np.clip(np.rint(pattern + light + noise), 0, 4095).astype(np.uint16)
+    dark = np.rint(pattern).astype(np.uint16)
+    one_image = Image(image().time_ns, pixels)
+    without = load_setup(values(camera_yaml))
+    url = write_png(tmp_path / 'dark.png', dark)
+    with_dark = load_setup(values(camera_yaml, dark_frame='file://' + url))
+    np.testing.assert_array_equal(with_dark.dark, dark)
+    spoilt = observe.observe(one_image, attitudes(), without, without.prior)
+    found = observe.observe(one_image, attitudes(), with_dark, with_dark.prior)
+    assert found.refusal == '' and len(found) > max(150, 2 * len(spoilt))
+    # The noise of the image alone is left, and nothing is cut off at zero below the dark level.
+    assert found.noise_dn == pytest.approx(1.2, rel=0.1)
+    assert found.background_dn == pytest.approx(np.median(dark), abs=0.3)
+    place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
+    off_px = found.measured_px - np.array([place[number] for number in found.catalog_id])
+    sigma_px = np.sqrt(found.covariance_px2[:, [0, 2]])
+    assert np.sqrt(np.mean((off_px / sigma_px) ** 2)) < 1.3
+
+
+def test_a_dark_frame_of_a_byte(camera_yaml: Path, tmp_path: Path) -> None:
+    url = write_png(tmp_path / 'dark.png', np.full((512, 640), 7, np.uint8))
+    made = load_setup(values(camera_yaml, dark_frame=url))
+    assert made.dark is not None and made.dark.dtype == np.uint8
+    found = observe.observe(image(), attitudes(), made, made.prior)
+    assert found.refusal == 'bad_encoding'
+    assert found.detail == 'uint16 image, the dark frame is uint8'
+    one = scene(SCENARIO, 1)
+    light = star_electrons(one.pixel_px, one.flux_electrons, 0.95, (512, 640)) / 100.0
+    noise = np.random.default_rng(1).normal(0, 1.0, light.shape)
+    pixels = np.clip(np.rint(light + 7 + noise), 0, 255).astype(np.uint8)
+    byte = observe.observe(Image(image().time_ns, pixels), attitudes(), made, made.prior)
+    assert byte.refusal == '' and byte.background_dn == pytest.approx(7.0, abs=0.2)
+
+
+def test_a_frame_that_is_shown_again_is_refused_once_its_stamp_is_new(
+    setup: Setup,
+) -> None:
+    held = attitudes(1)
+    for sample in attitude_samples(SCENARIO, 2):
+        held.add(sample.time_ns, sample)
+    first, track = observe.observe_next(image(1), held, setup, observe.Track(setup.prior))
+    stuck = Image(image(2).time_ns, image(1).pixels)
+    again, track = observe.observe_next(stuck, held, setup, track)
+    assert (first.refusal, again.refusal) == ('', 'frozen')
+    assert again.attitude_gap_s == 0.5
+    next_one, _ = observe.observe_next(image(2), held, setup, track)
+    assert next_one.refusal == ''
+
+
+def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
+    setup: Setup,
+) -> None:
+    """One is put under a star of the third image: bright or dim, the star is left out for it."""
+    track = observe.Track(setup.prior)
+    held = AttitudeHistory()
+    for index in range(1, 4):
+        for sample in attitude_samples(SCENARIO, index):
+            held.add(sample.time_ns, sample)
+    plain = observe.observe(image(3), held, setup, setup.prior)
+    star = np.argsort(plain.snr)[len(plain) // 2]
+    u, v = np.rint(plain.measured_px[star] + [1.0, 0.0]).astype(int)
+    for index in (1, 2, 3):
+        pixels = image(index).pixels.copy()
+        # 15 sigma, one pixel off the centre of a star, pull it by several of its own sigma.
+        pixels[v, u] += round(15.0 * plain.noise_dn)
+        found, track = observe.observe_next(
+            dataclasses.replace(image(index), pixels=pixels), held, setup, track
+        )
+        assert found.refusal == ''
+    assert plain.catalog_id[star] not in found.catalog_id
+    reason = found.refused_reason[found.refused_catalog_id == plain.catalog_id[star]]
+    assert [list(found.refused_stars)[code] for code in reason] == ['hot_pixel']
+
+
+def test_hot_pixels_of_the_dark_frame_are_known_from_the_first_image(
+    camera_yaml: Path, tmp_path: Path, setup: Setup
+) -> None:
+    plain = observe.observe(image(), attitudes(), setup, setup.prior)
+    u, v = np.rint(plain.measured_px[0]).astype(int)
+    dark = np.full(image().pixels.shape, 32, np.uint16)
+    dark[v, u] = 60
+    cv2.imwrite(str(tmp_path / 'dark.png'), dark)
+    made = load_setup(values(camera_yaml, dark_frame=str(tmp_path / 'dark.png')))
+    found = observe.observe(image(), attitudes(), made, made.prior)
+    assert found.refused_stars['hot_pixel'] == 1
+    assert plain.catalog_id[0] not in found.catalog_id
+
+
+def test_a_saturated_star_is_known_as_such_under_a_dark_frame(
+    camera_yaml: Path, tmp_path: Path
+) -> None:
+    """What the dark frame takes away must not hide that the converter was at its end."""
+    dark = np.random.default_rng(4).normal(32.0, 2.0, image().pixels.shape).astype(np.uint16)
+    path = write_png(tmp_path / 'dark.png', dark)
+    made = load_setup(values(camera_yaml, dark_frame=path, max_saturated_pixels=0))
+    pixels = image().pixels.copy()
+    plain = observe.observe(image(), attitudes(), made, made.prior)
+    u, v = np.rint(plain.measured_px[plain.snr.argmax()]).astype(int)
+    pixels[v - 1 : v + 2, u - 1 : u + 2] = 4095
+    found = observe.observe(
+        dataclasses.replace(image(), pixels=pixels), attitudes(), made, made.prior
+    )
+    brightest = plain.catalog_id[plain.snr.argmax()]
+    reason = found.refused_reason[found.refused_catalog_id == brightest]
+    assert [list(found.refused_stars)[code] for code in reason] == ['saturated']

@@ -1,0 +1,127 @@
+"""The setup: what it holds of the parameters, and what it refuses."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_campaign import SCENARIO, values, write_png  # type: ignore[import-not-found]
+
+from starcal_ros.errors import CatalogError, OptionError, ProductError
+from starcal_ros.options import holds_options
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
+from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, Setup
+
+
+@pytest.fixture(scope='module')
+def setup(camera_yaml: Path) -> Setup:
+    return load_setup(values(camera_yaml))
+
+
+def test_a_setup_holds_what_the_parameters_say(camera_yaml: Path) -> None:
+    made = load_setup(
+        values(
+            camera_yaml,
+            centroid='moment',
+            method='single',
+            estimate=['fx', 'fy'],
+            max_attitude_gap_s=7,
+            magnitude_limit=6.0,
+            max_residual_rms_px=0.3,
+            camera_frame='left_eye',
+            use_sim_time=True,
+        )
+    )
+    assert made.centroid.centroid == 'moment'
+    assert made.calibration.method == 'single'
+    assert made.calibration.estimate == ('fx', 'fy')
+    assert made.attitude.max_attitude_gap_s == 7.0
+    assert made.gate.max_residual_rms_px == 0.3
+    assert made.frames.camera_frame == 'left_eye'
+    assert made.catalog.magnitude.max() <= 6.0
+    assert made.dark is None
+    np.testing.assert_array_equal(made.prior.camera.parameters, SCENARIO.prior.camera.parameters)
+
+
+def test_a_setup_holds_the_options_of_every_stage(setup: Setup) -> None:
+    """None that one of its fields has is missing where parameters are declared and told."""
+    held = [value for value in vars(setup).values() if holds_options(type(value))]
+    assert tuple(map(type, held)) == OPTION_CLASSES and len(held) == 9
+    for group in held:
+        assert dataclasses.asdict(group).items() <= setup.options().items()
+
+
+def test_a_rounded_alignment_is_made_unit(camera_yaml: Path) -> None:
+    q = np.round(SCENARIO.prior.star_tracker_from_camera_xyzw, 4)
+    made = load_setup(values(camera_yaml, prior_alignment=q.tolist()))
+    assert np.linalg.norm(made.prior.star_tracker_from_camera_xyzw) == pytest.approx(1, abs=1e-15)
+
+
+def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> None:
+    both = values(camera_yaml, autostart=False)
+    load_setup(both, NODE_OPTION_CLASSES)
+    with pytest.raises(OptionError, match='autostart: no such parameter'):
+        load_setup(both)
+
+
+@pytest.mark.parametrize(
+    ('wrong', 'says'),
+    [
+        ({'max_residual_rms': 1.0}, 'max_residual_rms: no such parameter'),
+        ({'camera_info_url': ''}, 'camera_info_url: the prior camera must be given'),
+        (
+            {'prior_alignment': [0.0, 0.0, 0.0, 0.9]},
+            'prior_alignment: .* is not a unit quaternion',
+        ),
+        (
+            {'prior_alignment': [0.0, 0.0, 0.0, 0.0]},
+            'prior_alignment: .* is not a unit quaternion',
+        ),
+        ({'prior_alignment': [0.0, 0.0, 1.0]}, 'prior_alignment: .* is not a list of 4'),
+        ({'method': 'best'}, "method: 'best' is not one of hierarchical, per_image, single"),
+        ({'estimate': ['fx', 'fz']}, 'estimate: .* is not one of fx, skew'),
+        ({'min_images': 2.5}, 'min_images: 2.5 is not a whole number'),
+        (
+            {'dark_frame': '/no/such/dark.png'},
+            'dark_frame: /no/such/dark.png is not an image file',
+        ),
+    ],
+)
+def test_a_wrong_parameter_is_named(
+    camera_yaml: Path, wrong: dict[str, object], says: str
+) -> None:
+    with pytest.raises(OptionError, match=says):
+        load_setup(values(camera_yaml, **wrong))
+
+
+def test_a_wrong_file_is_named(camera_yaml: Path, tmp_path: Path) -> None:
+    with pytest.raises(ProductError, match='missing.yaml'):
+        load_setup(values(tmp_path / 'missing.yaml'))
+    (tmp_path / 'stars.csv').write_text('these are no stars')
+    for name in ('stars.csv', 'missing.csv'):
+        with pytest.raises(CatalogError, match=name):
+            load_setup(values(camera_yaml, catalog=str(tmp_path / name)))
+
+
+def test_options_that_do_not_go_together(camera_yaml: Path) -> None:
+    with pytest.raises(OptionError, match='alignment_temperature: the method per_image'):
+        load_setup(values(camera_yaml, method='per_image', alignment_temperature=True))
+
+
+@pytest.mark.parametrize(
+    'pixels',
+    [
+        np.zeros((512, 639), np.uint16),
+        np.zeros((512, 640, 3), np.uint8),
+        np.zeros((512, 640), np.float32),
+    ],
+)
+def test_a_dark_frame_that_does_not_fit(
+    camera_yaml: Path, tmp_path: Path, pixels: np.ndarray
+) -> None:
+    suffix = 'tiff' if pixels.dtype == np.float32 else 'png'
+    url = write_png(tmp_path / f'dark.{suffix}', pixels)
+    with pytest.raises(OptionError, match='not one channel of 640 x 512'):
+        load_setup(values(camera_yaml, dark_frame=url))

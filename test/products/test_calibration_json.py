@@ -1,0 +1,210 @@
+"""File calibration.json: round trips, damaged files, errors."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from sample_records import assert_same, calibration, plain_calibration  # type: ignore[import-not-found]
+
+from starcal_ros.camera import CameraModel
+from starcal_ros.errors import ProductError
+from starcal_ros.products.calibration_json import read_calibration, write_calibration
+from starcal_ros.records import (
+    CALIBRATION_PARAMETER_NAMES,
+    CameraGeometry,
+    GateCheck,
+    Removal,
+    Thermal,
+)
+
+REMOVALS = (
+    Removal('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
+    Removal('k3', -1 / 3, 0.5, 1 / 7, True, 0.1 + 0.2, (0.1, 1 / 3), 1e-17),
+    Removal('fx', 4e5, 1.6e11, 1.7e11, False, 700.5, (500.0, 600.0), 12.0),
+)
+GATE = (
+    GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 1.0, 'px', True),
+    GateCheck('solver converged', '', math.nan, math.nan, '', False, 'no_descent'),
+    GateCheck('turn', 'max_step_turn_deg', math.nan, 0.5, 'deg', None, 'nothing was in force'),
+)
+
+
+def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    cases: tuple[dict[str, Any], ...] = (
+        {},
+        {'accepted': False, 'reasons': ('too few stars', 'weak: k3')},
+        {'thermal': Thermal(20.0, note='left out: everything')},
+        {'removals': REMOVALS},
+    )
+    records = (dataclasses.replace(plain_calibration(), **changes) for changes in cases)
+    for record in (calibration(), *records):
+        write_calibration(record, tmp_path / 'calibration.json')
+        assert_same(record, read_calibration(tmp_path / 'calibration.json'))
+
+
+def test_what_the_gate_has_looked_at_comes_back(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    write_calibration(dataclasses.replace(calibration(), gate=GATE), path)
+    assert [check['kept'] for check in json.loads(path.read_text())['gate']] == [True, False, None]
+    assert repr(read_calibration(path).gate) == repr(GATE)  # NaN is not equal to itself
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@settings(
+    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    focal=st.tuples(st.floats(1e-300, 1e300), st.floats(1e-300, 1e300)),
+    others=st.lists(finite, min_size=8, max_size=8),
+    covariance=st.lists(finite, min_size=169, max_size=169),
+    quaternion=st.tuples(finite, finite, finite, finite),
+    number=finite,
+)
+def test_any_finite_number_comes_back(
+    tmp_path: Path,
+    focal: tuple[float, float],
+    others: list[float],
+    covariance: list[float],
+    quaternion: tuple[float, ...],
+    number: float,
+) -> None:
+    parameters = np.array([focal[0], others[0], focal[1], *others[1:]])
+    record = dataclasses.replace(
+        plain_calibration(),
+        geometry=CameraGeometry(CameraModel(1296, 1024, parameters), np.array(quaternion)),
+        covariance=np.array(covariance).reshape(13, 13),
+        residual_rms_px=number,
+    )
+    write_calibration(record, tmp_path / 'c.json')
+    assert_same(record, read_calibration(tmp_path / 'c.json'))
+
+
+def test_numbers_that_are_not_finite_are_null_and_come_back_nan(tmp_path: Path) -> None:
+    covariance = np.eye(13)
+    covariance[3, 3] = np.inf
+    path = tmp_path / 'c.json'
+    record = dataclasses.replace(calibration(), covariance=covariance, variance_factor=math.nan)
+    write_calibration(record, path)
+    content = json.loads(path.read_text(), parse_constant=pytest.fail)  # strict JSON
+    assert content['covariance'][3][3] is None
+    back = read_calibration(path)
+    assert math.isnan(back.covariance[3, 3]) and math.isnan(back.variance_factor)
+
+
+def test_json_has_the_keys_of_the_interface_document(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    record = plain_calibration()
+    write_calibration(record, path)
+    content = json.loads(path.read_text())
+    assert content['schema'] == 1
+    assert list(content['intrinsics']) == ['fx', 'skew', 'fy', 'cx', 'cy']
+    assert list(content['distortion']) == ['k1', 'k2', 'k3', 'p1', 'p2']
+    assert content['alignment']['parent'] == 'st'
+    assert content['alignment']['child'] == 'cam'
+    assert len(content['alignment']['quaternion_xyzw']) == 4
+    assert tuple(content['parameter_names']) == CALIBRATION_PARAMETER_NAMES
+    assert content['alignment_covariance_rad2'] == record.covariance[10:, 10:].tolist()
+    assert {
+        'method', 'estimated', 'residual_rms_px', 'images_used', 'images_refused', 'stars_used',
+        'stars_rejected', 'accepted', 'reasons', 'provenance', 'time_ns', 'variance_factor',
+        'alignment_scatter_arcsec', 'zero_skew_cost_px', 'iterations', 'termination',
+    } <= set(content)  # fmt: skip
+    assert content['image'] == {'width': 1296, 'height': 1024}
+    assert content['temperature'] is content['maps'] is content['correlation'] is None
+    write_calibration(calibration(), path)
+    assert list(json.loads(path.read_text())['temperature']) == [
+        'reference_degc', 'focal_per_degc', 'focal_per_degc_sigma',
+        'alignment_rate_rad_per_degc', 'alignment_rate_rad_per_degc_sigma', 'note',
+    ]  # fmt: skip
+
+
+def test_a_row_of_a_grid_is_a_line(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    provenance = {'note': 'a [\n 1,\n 2\n ] in a text'}
+    written = dataclasses.replace(calibration(), provenance=provenance)
+    write_calibration(written, path)
+    assert '   [0, 1, 2],\n   [3, 4, 5]\n' in path.read_text()
+    assert_same(written, read_calibration(path))
+
+
+def test_an_older_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / 'c.json'
+    write_calibration(calibration(), path)
+    content = json.loads(path.read_text())
+    del content['temperature'], content['maps'], content['correlation'], content['removals']
+    del content['halves'], content['gate']
+    path.write_text(json.dumps(content))
+    assert_same(plain_calibration(), read_calibration(path))
+
+
+@pytest.mark.parametrize(
+    ('change', 'says'),
+    [
+        (lambda c: c.update(schema=2), 'schema 2 is not 1'),
+        (lambda c: c.pop('covariance'), "key 'covariance' is missing"),
+        (lambda c: c['intrinsics'].pop('fy'), "key 'intrinsics.fy' is missing"),
+        (lambda c: c['intrinsics'].update(fx=-1.0), 'not positive'),
+        (lambda c: c['distortion'].update(k1='a'), "distortion.k1: 'a' is not a number"),
+        (lambda c: c['distortion'].update(k1=None), 'distortion.k1: None is not a number'),
+        (lambda c: c['covariance'].pop(), 'covariance is not 13 x 13'),
+        (lambda c: c['covariance'][0].pop(), 'covariance: .* is not 13 numbers'),
+        (lambda c: c.update(parameter_names=['fx']), 'parameter_names are not fx, skew'),
+        (lambda c: c.update(stars_used=1.5), 'stars_used: 1.5 is not a whole number'),
+        (lambda c: c.update(accepted=1), 'accepted: 1 is not true or false'),
+        (lambda c: c.update(reasons='none'), "reasons: 'none' is not a list"),
+        (lambda c: c.update(provenance=[]), r'provenance: \[\] is not a mapping'),
+        (lambda c: c['alignment'].update(parent=3), 'alignment.parent: 3 is not a text'),
+        (lambda c: c.update(intrinsics=3), "key 'intrinsics.fx' is missing"),
+        (lambda c: c.update(temperature={}), "key 'temperature.focal_per_degc' is missing"),
+        (
+            lambda c: c['temperature'].update(alignment_rate_rad_per_degc=[1.0]),
+            'temperature.alignment_rate_rad_per_degc: .* is not 0 or 3 numbers',
+        ),
+        (lambda c: c['maps'].pop('stars'), "key 'maps.stars' is missing"),
+        (lambda c: c['maps']['stars'][0].pop(), 'maps.stars: .* is not a grid of rows alike'),
+        (lambda c: c.update(removals=[1]), r'removals: \[1\] is not a mapping'),
+        (lambda c: c['removals'][1].pop('wald'), "key 'removals.wald' is missing"),
+        (lambda c: c['removals'][1].update(within_chance=1), 'within_chance: 1 is not true or'),
+        (lambda c: c['gate'][0].pop('note'), "key 'gate.note' is missing"),
+        (lambda c: c['gate'][0].update(kept=1), 'gate.kept: 1 is not true or false'),
+        (lambda c: c['correlation']['matrix'].pop(), 'correlation.matrix is not of the size'),
+    ],
+)
+def test_a_damaged_calibration_is_refused_by_file_and_key(tmp_path, change, says) -> None:
+    path = tmp_path / 'c.json'
+    write_calibration(calibration(), path)
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(ProductError, match=says) as caught:
+        read_calibration(path)
+    assert str(path) in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('content', [b'', b'{', b'[]', b'\xff\xfe\x00', b'3'])
+def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / 'c.json'
+    path.write_bytes(content)
+    with pytest.raises(ProductError, match='not') as caught:
+        read_calibration(path)
+    assert str(path) in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ProductError, match='none.*cannot be read: No such file'):
+        read_calibration(tmp_path / 'none')
+    with pytest.raises(ProductError, match='cannot be read: Is a directory'):
+        read_calibration(tmp_path)
+    with pytest.raises(ProductError, match='cannot be written'):
+        write_calibration(calibration(), tmp_path / 'none' / 'c.json')

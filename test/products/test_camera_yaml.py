@@ -1,0 +1,186 @@
+"""File camera_info.yaml: round trips, hand-written files, errors, URLs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, zero_skew_fit
+from starcal_ros.errors import ProductError
+from starcal_ros.products.camera_yaml import read_camera_info, resolve_url, write_camera_info
+
+PARAMETERS = np.array(
+    [3641.5121868491606, -0.74, 3642.3, 647.5, 511.5, -0.0512, 0.1167, 0.01, 5.1e-4, 3.2e-5]
+)
+CAMERA = CameraModel(1296, 1024, PARAMETERS)
+ROS_YAML = """\
+image_width: 640
+image_height: 480
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [500.0, 0.5, 319.5, 0, 501, 239.5, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [500, 0, 319.5, 0, 0, 501, 239.5, 0, 0, 0, 1, 0]
+"""
+
+
+def test_camera_without_skew_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    camera = CAMERA.replace(skew=0.0)
+    write_camera_info(camera, tmp_path / 'camera_info.yaml')
+    back = read_camera_info(tmp_path / 'camera_info.yaml')
+    assert (back.width, back.height) == (1296, 1024)
+    assert back.parameters.tobytes() == camera.parameters.tobytes()
+
+
+def test_camera_info_carries_the_zero_skew_fit(tmp_path: Path) -> None:
+    path = tmp_path / 'camera_info.yaml'
+    write_camera_info(CAMERA, path, 'opnav')
+    back = read_camera_info(path)
+    fitted, worst_px = zero_skew_fit(CAMERA)
+    assert back.parameters.tobytes() == fitted.parameters.tobytes()
+    assert back.parameters[1] == 0.0
+    grid = pixel_grid(CAMERA, 25, 25)
+    error = np.linalg.norm(project(back, line_of_sight(CAMERA, grid)) - grid, axis=-1).max()
+    assert error == pytest.approx(worst_px, rel=1e-9)  # the same grid, rounding only
+
+
+def test_camera_info_is_what_camera_info_manager_reads(tmp_path: Path) -> None:
+    path = tmp_path / 'camera_info.yaml'
+    write_camera_info(CAMERA, path, 'opnav')
+    content = yaml.safe_load(path.read_text())
+    assert list(content) == [
+        'image_width', 'image_height', 'camera_name', 'camera_matrix', 'distortion_model',
+        'distortion_coefficients', 'rectification_matrix', 'projection_matrix',
+    ]  # fmt: skip
+    fitted, _ = zero_skew_fit(CAMERA)
+    fx, _, fy, cx, cy, k1, k2, k3, p1, p2 = fitted.parameters.tolist()
+    assert content['camera_name'] == 'opnav'
+    assert content['camera_matrix'] == {
+        'rows': 3,
+        'cols': 3,
+        'data': [fx, 0, cx, 0, fy, cy, 0, 0, 1],
+    }
+    assert content['distortion_coefficients'] == {
+        'rows': 1,
+        'cols': 5,
+        'data': [k1, k2, p1, p2, k3],
+    }
+    assert content['rectification_matrix']['data'] == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    assert content['projection_matrix'] == {
+        'rows': 3, 'cols': 4, 'data': [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
+    }  # fmt: skip
+    # Each key on a line of its own: ROS's Python parsers split nothing, people's greps do.
+    assert all(len(line) < 400 for line in path.read_text().splitlines())
+
+
+def test_hand_written_ros_yaml(tmp_path: Path) -> None:
+    path = tmp_path / 'left.yaml'
+    path.write_text(ROS_YAML)
+    expected = [500.0, 0.5, 501.0, 319.5, 239.5, -0.1, 1e-2, 0.003, 1e-5, -2e-4]
+    for location in (path, str(path), f'file://{path}'):
+        camera = read_camera_info(location)
+        assert (camera.width, camera.height) == (640, 480)
+        assert camera.parameters.tolist() == expected
+    path.write_text(ROS_YAML.replace(', 0.003]', ']').replace('cols: 5', 'cols: 4'))
+    assert read_camera_info(path).parameters.tolist() == [*expected[:7], 0.0, *expected[8:]]
+    # Files older than the key are plumb_bob, as camera_calibration_parsers takes them.
+    path.write_text(ROS_YAML.replace('distortion_model: plumb_bob\n', ''))
+    assert read_camera_info(path).parameters.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'says'),
+    [
+        ('plumb_bob', 'equidistant', "distortion_model: 'equidistant' is not plumb_bob"),
+        ('plumb_bob', 'rational_polynomial', "'rational_polynomial' is not plumb_bob"),
+        ('plumb_bob', '[1]', r'distortion_model: \[1\] is not plumb_bob'),
+        ('image_width: 640', '', "key 'image_width' is missing"),
+        ('image_height: 480', 'image_height: tall', "image_height: 'tall' is not a whole number"),
+        ('image_height: 480', 'image_height: 0', '640 x 0 is not an image'),
+        ('0, 501, 239.5, 0, 0, 1]', '0, 501]', 'camera_matrix.data: .* is not 9 numbers'),
+        ('[500.0, 0.5', '[0, 0.5', 'not positive'),
+        ('[500.0, 0.5', '[.nan, 0.5', 'camera_matrix.data: .* is not a finite number'),
+        ('239.5, 0, 0, 1]', '239.5, 0, 0, 2]', 'camera_matrix.data: .* is not'),
+        ('[-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]', '[]', 'data: .* is not 4 or 5 numbers'),
+        ('-0.1, 1e-2', 'true, 1e-2', 'distortion_coefficients.data: .* is not a number'),
+        ('-0.1, 1e-2', 'big, 1e-2', 'distortion_coefficients.data: .* is not a number'),
+        ('camera_matrix', 'matrix', "key 'camera_matrix.data' is missing"),
+        ('image_width: 640', 'image_width: [', 'not YAML'),
+    ],
+)
+def test_a_bad_camera_yaml_is_refused_by_file_and_key(tmp_path, old, new, says) -> None:
+    path = tmp_path / 'left.yaml'
+    path.write_text(ROS_YAML.replace(old, new))
+    with pytest.raises(ProductError, match=says) as caught:
+        read_camera_info(path)
+    assert str(path) in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_package_urls_follow_ament_prefixes(tmp_path, monkeypatch) -> None:
+    first, second = tmp_path / 'first', tmp_path / 'second'
+    (first / 'share' / 'other').mkdir(parents=True)
+    (second / 'share' / 'my_cameras' / 'config').mkdir(parents=True)
+    file = second / 'share' / 'my_cameras' / 'config' / 'a camera.yaml'
+    file.write_text(ROS_YAML)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{first}::{second}')
+    assert resolve_url('package://my_cameras/config/a camera.yaml') == file
+    assert resolve_url('package://my_cameras/config/a%20camera.yaml') == file
+    assert read_camera_info('package://my_cameras/config/a camera.yaml').width == 640
+    with pytest.raises(ProductError, match='package absent is not in AMENT_PREFIX_PATH'):
+        resolve_url('package://absent/a.yaml')
+    monkeypatch.delenv('AMENT_PREFIX_PATH')
+    with pytest.raises(ProductError, match='package my_cameras is not in'):
+        resolve_url('package://my_cameras/config/a.yaml')
+
+
+@pytest.mark.parametrize(
+    ('url', 'says'),
+    [
+        ('', 'empty'),
+        ('http://example.org/a.yaml', 'only file:// and package://'),
+        ('package://', 'not package://<package>/<path>'),
+        ('package://name', 'not package://<package>/<path>'),
+        ('package://../a', 'not package://<package>/<path>'),
+    ],
+)
+def test_urls_that_cannot_be_read(url: str, says: str) -> None:
+    with pytest.raises(ProductError, match=says):
+        resolve_url(url)
+
+
+def test_file_urls_with_and_without_percent_encoding(tmp_path: Path) -> None:
+    for name, url_name in (('a b.yaml', 'a%20b.yaml'), ('100%25.yaml', '100%25.yaml')):
+        (tmp_path / name).write_text(ROS_YAML)
+        assert resolve_url(f'file://{tmp_path}/{url_name}') == tmp_path / name
+
+
+def test_missing_camera_yaml_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ProductError, match='none.*cannot be read: No such file'):
+        read_camera_info(tmp_path / 'none')
+    with pytest.raises(ProductError, match='cannot be read: Is a directory'):
+        read_camera_info(tmp_path)
+
+
+@pytest.mark.parametrize('content', [b'', b'{', b'[]', b'\xff\xfe\x00', b'3'])
+def test_a_file_that_is_no_camera_yaml_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / 'c.yaml'
+    path.write_bytes(content)
+    with pytest.raises(ProductError, match='not') as caught:
+        read_camera_info(path)
+    assert str(path) in str(caught.value) and '\n' not in str(caught.value)

@@ -1,0 +1,84 @@
+"""Small pictures: how many are kept, what they show, and that they come back from a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from starcal_ros.camera import CameraModel
+from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.report.thumbnails import Album, read_thumbnails, write_thumbnails
+
+CAMERA = CameraModel(640, 512, np.array([1800.0, 0, 1800, 319.5, 255.5, 0, 0, 0, 0, 0]))
+GEOMETRY = CameraGeometry(CAMERA, np.array([0.0, 0, 0, 1]))
+RNG = np.random.default_rng(5)
+PIXELS = RNG.poisson(40, (512, 640)).astype(np.uint8)
+PIXELS[100, 200] = 255
+
+
+def observed(time_ns: int, refusal: str = '') -> StarObservations:
+    """An image without stars used and with one left out."""
+    return refused_image(
+        time_ns,
+        640,
+        512,
+        refusal,
+        '',
+        refused_stars={'saturated': 1},
+        refused_catalog_id=np.array([7]),
+        refused_px=np.array([[200.0, 100.0]], np.float32),
+        refused_reason=np.array([0], np.uint8),
+    )
+
+
+def album_of(count: int, refused_every: int) -> Album:
+    album = Album()
+    for k in range(count):
+        refusal = 'no_stars' if k % refused_every == 0 else ''
+        album.show(Image(k, PIXELS), observed(k, refusal), GEOMETRY)
+    return album
+
+
+def test_few_are_kept_of_many_and_evenly() -> None:
+    album = album_of(400, refused_every=50)
+    used = [t.time_ns for t in album.used]
+    assert 6 <= len(used) < 12
+    steps = np.diff(used)
+    # The images between have been refused now and then: a step is longer by those at most.
+    assert steps.max() - steps.min() <= 2
+    assert used[-1] > 400 - 2 * steps.max()
+    assert [t.time_ns for t in album.refused['no_stars']] == [0, 50]
+    assert len(album.stars['saturated']) == 6
+
+
+def test_all_are_kept_of_few() -> None:
+    assert [t.time_ns for t in album_of(5, refused_every=100).used] == [1, 2, 3, 4]
+
+
+def test_a_star_is_in_the_middle_of_its_picture() -> None:
+    thumbnail = album_of(1, refused_every=2).stars['saturated'][0]
+    picture = cv2.imdecode(np.frombuffer(thumbnail.encoded, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    assert picture.argmax() == 12 * 25 + 12 and picture.shape == (25, 25)
+
+
+def test_a_star_outside_the_image_does_no_harm() -> None:
+    album = Album()
+    for place in ([-5.0, 3.0], [639.0, 511.0], [1e9, -1e9], [float('nan'), 4.0]):
+        record = observed(1)
+        record.refused_px[0] = place
+        album.show(Image(1, PIXELS), record, GEOMETRY)
+    assert len(album.stars['saturated']) == 4
+
+
+def test_a_folder_keeps_what_was_written_and_nothing_older(tmp_path: Path) -> None:
+    folder = tmp_path / 'thumbnails'
+    write_thumbnails(album_of(40, refused_every=10).thumbnails(), folder)
+    (folder / 'notes.txt').write_text('mine')
+    album = album_of(3, refused_every=2)
+    write_thumbnails(album.thumbnails(), folder)
+    assert set(read_thumbnails(folder)) == set(album.thumbnails())
+    assert (folder / 'notes.txt').read_text() == 'mine'
+    assert read_thumbnails(tmp_path / 'nowhere') == ()

@@ -1,0 +1,288 @@
+"""Attitude samples: checked, sorted, interpolated, and refused with the right reason."""
+
+from __future__ import annotations
+
+import math
+import tracemalloc
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.errors import ImageRefused
+from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
+
+S = 1_000_000_000  # nanoseconds
+START_NS = 1_778_829_600 * S + 123_456_789  # a stamp of today: seconds in a double are 0.2 us off
+DIRECT = 'st_to_inertial'
+
+
+def history(samples: list[tuple[int, np.ndarray]], **kwargs: float) -> AttitudeHistory:
+    made = AttitudeHistory(**kwargs)
+    for time_ns, q in samples:
+        made.add(time_ns, attitude_sample(time_ns, q, DIRECT))
+    return made
+
+
+def random_quaternions(seed: int, n: int) -> np.ndarray:
+    q = np.random.default_rng(seed).normal(size=(n, 4))
+    return np.asarray(q / np.linalg.norm(q, axis=1)[:, None])
+
+
+def slerp(q0: np.ndarray, q1: np.ndarray, t: float) -> np.ndarray:
+    """Shoemake's formula, by the shorter way."""
+    cosine = float(q0 @ q1)
+    if cosine < 0:
+        q1, cosine = -q1, -cosine
+    angle = math.acos(min(cosine, 1.0))
+    if angle < 1e-12:
+        return q0
+    return (math.sin((1 - t) * angle) * q0 + math.sin(t * angle) * q1) / math.sin(angle)
+
+
+def angle_between(q0: np.ndarray, q1: np.ndarray) -> float:
+    return float((Rotation.from_quat(q0).inv() * Rotation.from_quat(q1)).magnitude())
+
+
+def refusal(held: AttitudeHistory, time_ns: int, max_gap_s: float = 2.0) -> str:
+    with pytest.raises(ImageRefused) as refused:
+        held.at(time_ns, max_gap_s)
+    assert refused.value.detail
+    return refused.value.reason
+
+
+@pytest.mark.parametrize('seed', range(10))
+@pytest.mark.parametrize('t', [1e-9, 0.25, 0.5, 0.9])
+def test_interpolation_is_slerp(seed: int, t: float) -> None:
+    q0, q1 = random_quaternions(seed, 2)
+    between_ns = START_NS + round(t * S)
+    found, gap_s = history([(START_NS, q0), (START_NS + S, q1)]).at(between_ns, 2.0)
+    assert gap_s == 1.0
+    # acos loses half its digits next to 1; these quaternions are far apart: 1e-13 rad.
+    assert angle_between(found, slerp(q0, q1, round(t * S) / S)) < 1e-12
+    assert np.linalg.norm(found) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_interpolation_to_the_nanosecond() -> None:
+    # 1 rad/s: a nanosecond is 1e-9 rad, 0.2 us of lost digits would be 2e-7.
+    q0 = np.array([0.0, 0.0, 0.0, 1.0])
+    q1 = np.array([0.0, 0.0, math.sin(0.5), math.cos(0.5)])
+    held = history([(START_NS, q0), (START_NS + S, q1)])
+    for dt_ns in (1, 17, 500_000_001, 999_999_999):
+        found, _ = held.at(START_NS + dt_ns, 2.0)
+        assert 2 * math.atan2(found[2], found[3]) == pytest.approx(dt_ns * 1e-9, abs=1e-12)
+
+
+def test_both_directions_mean_one_rotation() -> None:
+    q = random_quaternions(1, 1)[0]
+    inverse = Rotation.from_quat(q).inv().as_quat()
+    direct = attitude_sample(START_NS, q, 'st_to_inertial')
+    other = attitude_sample(START_NS, inverse, 'inertial_to_st')
+    assert direct is not None and other is not None
+    v = np.array([0.3, -0.5, 0.8])
+    of_direct, of_other = (
+        Rotation.from_quat(sample.icrf_from_star_tracker_xyzw).apply(v)
+        for sample in (direct, other)
+    )
+    np.testing.assert_allclose(of_direct, Rotation.from_quat(q).apply(v), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(of_other, of_direct, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    'q',
+    [
+        [0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, 1.002],
+        [0.0, 0.0, 0.0, 0.998],
+        [math.nan, 0.0, 0.0, 1.0],
+        [math.inf, 0.0, 0.0, 1.0],
+        [1e200, 1e200, 0.0, 0.0],
+    ],
+)
+@pytest.mark.filterwarnings('ignore:overflow encountered')
+def test_no_rotation_is_no_sample(q: list[float]) -> None:
+    for direction in ('st_to_inertial', 'inertial_to_st'):
+        assert attitude_sample(START_NS, np.array(q), direction) is None
+
+
+def test_a_rounded_quaternion_is_made_unit() -> None:
+    q = random_quaternions(2, 1)[0]
+    sample = attitude_sample(START_NS, 1.0005 * q, DIRECT)
+    assert sample is not None
+    # Two units in the last place: one of the product, one of the division.
+    np.testing.assert_allclose(sample.icrf_from_star_tracker_xyzw, q, rtol=0, atol=2.3e-16)
+
+
+def test_the_order_of_arrival_does_not_matter() -> None:
+    quaternions = random_quaternions(3, 40)
+    samples = [(START_NS + k * S // 2, q) for k, q in enumerate(quaternions)]
+    in_order = history(samples)
+    rng = np.random.default_rng(4)
+    shuffled = history([samples[k] for k in rng.permutation(40)])
+    assert len(shuffled) == len(in_order) == 40
+    assert shuffled.latest_ns == in_order.latest_ns == START_NS + 39 * S // 2
+    for time_ns in START_NS + rng.integers(0, 39 * S // 2, 100):
+        one, gap_one = in_order.at(int(time_ns), 2.0)
+        other, gap_other = shuffled.at(int(time_ns), 2.0)
+        np.testing.assert_array_equal(one, other)
+        assert gap_one == gap_other == 0.5
+
+
+def test_of_two_samples_with_one_stamp_the_first_stands() -> None:
+    q0, q1, q2 = random_quaternions(5, 3)
+    once = history([(START_NS, q0), (START_NS + S, q1)])
+    twice = history([(START_NS, q0), (START_NS, q2), (START_NS + S, q1), (START_NS + S, q2)])
+    assert len(twice) == 2
+    for dt_ns in (0, S // 3, S):
+        a, b = (held.at(START_NS + dt_ns, 2.0)[0] for held in (once, twice))
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_valid_sample_takes_the_place_of_an_invalid_one_of_its_stamp() -> None:
+    q0 = random_quaternions(6, 1)[0]
+    held = AttitudeHistory()
+    held.add(START_NS, None)
+    assert refusal(held, START_NS) == 'bad_attitude'
+    held.add(START_NS, attitude_sample(START_NS, q0, DIRECT))
+    # Made unit once more: two roundings.
+    np.testing.assert_allclose(held.at(START_NS, 2.0)[0], q0, rtol=4e-16)
+    held.add(START_NS, None)
+    np.testing.assert_allclose(held.at(START_NS, 2.0)[0], q0, rtol=4e-16)
+
+
+def test_a_sample_at_the_image_needs_no_other() -> None:
+    q0 = random_quaternions(7, 1)[0]
+    found, gap_s = history([(START_NS, q0)]).at(START_NS, 0.0)
+    np.testing.assert_allclose(found, q0, rtol=4e-16)
+    assert gap_s == 0.0
+
+
+def test_the_same_rotation_with_the_other_sign_is_no_turn() -> None:
+    q0 = random_quaternions(8, 1)[0]
+    found, _ = history([(START_NS, q0), (START_NS + S, -q0)]).at(START_NS + S // 3, 2.0)
+    assert angle_between(found, q0) < 1e-15
+
+
+def test_outside_the_samples_there_is_no_attitude() -> None:
+    q0, q1 = random_quaternions(9, 2)
+    held = history([(START_NS, q0), (START_NS + S, q1)])
+    assert refusal(held, START_NS - 1) == 'no_attitude'
+    assert refusal(held, START_NS + S + 1) == 'no_attitude'
+    assert refusal(AttitudeHistory(), START_NS) == 'no_attitude'
+
+
+def test_samples_too_far_apart_are_a_gap() -> None:
+    q0, q1 = random_quaternions(10, 2)
+    held = history([(START_NS, q0), (START_NS + 2 * S, q1)])
+    _, gap_s = held.at(START_NS + S, 2.0)
+    assert gap_s == 2.0
+    assert refusal(held, START_NS + S, 2.0 - 1e-9) == 'attitude_gap'
+
+
+def test_invalid_samples_are_told_from_missing_ones() -> None:
+    q0, q1 = random_quaternions(11, 2)
+    held = history([(START_NS, q0), (START_NS + 2 * S, q1)])
+    held.add(START_NS + S, None)
+    # The neighbours on both sides are near enough: the invalid one is passed over.
+    _, gap_s = held.at(START_NS + S + 1, 2.0)
+    assert gap_s == 2.0
+    assert refusal(held, START_NS + S) == 'bad_attitude'
+    assert refusal(held, START_NS + S + 1, 1.5) == 'bad_attitude'
+    held.add(START_NS + 3 * S, None)
+    assert refusal(held, START_NS + 3 * S - 1) == 'bad_attitude'
+    held.add(START_NS - S, None)
+    assert refusal(held, START_NS - 1) == 'bad_attitude'
+
+
+def test_only_the_last_seconds_are_kept() -> None:
+    quaternions = random_quaternions(12, 20)
+    samples = [(START_NS + k * S, q) for k, q in enumerate(quaternions)]
+    held = history(samples, keep_s=5.0)
+    assert len(held) == 6
+    assert held.at(START_NS + 14 * S, 2.0)[1] == 0.0
+    assert refusal(held, START_NS + 14 * S - 1) == 'no_attitude'
+    # A straggler from before the horizon is let go again.
+    held.add(START_NS + 2 * S, attitude_sample(START_NS + 2 * S, quaternions[2], DIRECT))
+    assert len(held) == 6
+    assert refusal(held, START_NS + 2 * S) == 'no_attitude'
+
+
+def steady(
+    rate_hz: float, seconds: float, start_ns: int = START_NS
+) -> list[tuple[int, np.ndarray]]:
+    """Samples of a slow turn about z, 1 mrad/s, at a rate."""
+    count = int(rate_hz * seconds) + 1
+    stamps = [start_ns + round(k / rate_hz * S) for k in range(count)]
+    return [(stamp, turned(stamp)) for stamp in stamps]
+
+
+def turned(time_ns: int) -> np.ndarray:
+    half = 0.5e-3 * (time_ns - START_NS) / S
+    return np.array([0.0, 0.0, math.sin(half), math.cos(half)])
+
+
+@pytest.mark.parametrize('rate_hz', [0.5, 1.0, 10.0, 100.0])
+def test_any_rate_late_doubled_and_out_of_order(rate_hz: float) -> None:
+    """What a steady turn gives at any time does not depend on how its samples came."""
+    rng = np.random.default_rng(13)
+    samples = steady(rate_hz, 60.0)
+    late_s = rng.uniform(0.0, 8.0, len(samples))  # some overtake hundreds of others
+    order = np.argsort([t for t, _ in samples] + late_s * S)
+    came = [samples[k] for k in order]
+    came += [came[k] for k in rng.integers(0, len(came), 20)]  # the doubled ones, very late
+    held = history(came, keep_s=3600.0, jump_s=10.0)
+    for time_ns in START_NS + rng.integers(S, 59 * S, 50):
+        # Slerp of a steady turn is exact; half angles of 0.06 rad have 1e-17 in a double.
+        assert angle_between(held.at(int(time_ns), 2.0)[0], turned(time_ns)) < 1e-14
+
+
+def test_a_dropout_of_minutes_costs_its_own_images_alone() -> None:
+    before, after = steady(10.0, 20.0), steady(10.0, 20.0, START_NS + 300 * S)
+    held = history([*before, *after], keep_s=3600.0, jump_s=10.0)
+    assert refusal(held, START_NS + 100 * S) == 'attitude_gap'
+    assert refusal(held, START_NS - S) == 'no_attitude'
+    for dt_s in (19, 301):
+        assert held.at(START_NS + dt_s * S + 1, 2.0)[1] == pytest.approx(0.1)
+    assert held.latest_ns == START_NS + 320 * S
+
+
+@pytest.mark.parametrize('wrong_s', [-(10**9), -4000, -60, 60, 4000, 10**9, 9 * 10**8])
+def test_one_wrong_stamp_costs_nothing(wrong_s: int) -> None:
+    """A sample stamped in the future must not make the true ones too old to keep."""
+    samples = steady(10.0, 60.0)
+    k = 300
+    wrong = (samples[k][0] + wrong_s * S, random_quaternions(14, 1)[0])
+    held = history([*samples[:k], wrong, *samples[k + 1 :]], keep_s=3600.0, jump_s=10.0)
+    assert held.latest_ns == samples[-1][0]
+    for dt_s in (1, 29, 31, 59):
+        time_ns = START_NS + dt_s * S + S // 3
+        found, gap_s = held.at(time_ns, 2.0)
+        assert gap_s == pytest.approx(0.1)
+        assert angle_between(found, turned(time_ns)) < 1e-14
+
+
+@pytest.mark.parametrize('back_s', [30, 600, 100_000])
+def test_a_clock_set_back_is_believed(back_s: int) -> None:
+    """Samples of the clock before do not mix with those of the clock now, which come first."""
+    other = random_quaternions(15, 1)[0]
+    before = [(t, other) for t, _ in steady(10.0, 60.0, START_NS + (back_s - 30) * S)]
+    now = steady(10.0, 60.0)
+    held = history([*before, *now], keep_s=3600.0, jump_s=10.0)
+    assert held.latest_ns == now[-1][0]
+    for dt_s in (1, 31, 59):
+        time_ns = START_NS + dt_s * S + S // 3
+        assert angle_between(held.at(time_ns, 2.0)[0], turned(time_ns)) < 1e-14
+
+
+def test_memory_of_a_fast_tracker_is_bounded() -> None:
+    """Five minutes at 100 Hz, 20 s kept: 2000 samples of 40 bytes, and four times that at most."""
+    held = AttitudeHistory(keep_s=20.0, jump_s=10.0)
+    sample = attitude_sample(START_NS, np.array([0.0, 0.0, 0.0, 1.0]), DIRECT)
+    tracemalloc.start()
+    for k in range(30_000):
+        held.add(START_NS + k * S // 100, sample)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(held) == 2001
+    # Twice for what is forgotten but not yet moved, twice for the copy that moves the rest.
+    assert peak_bytes < 2000 * 40 * 4

@@ -1,0 +1,336 @@
+"""Monte Carlo studies: the same from any number of workers, and true to what is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import dataclasses
+import functools
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+from distributed import LocalCluster
+import numpy as np
+import psutil  # type: ignore[import-untyped]
+import pytest
+from scipy.stats import chi2
+
+from starcal_ros.assessment.observability import map_error_px
+from starcal_ros.camera import line_of_sight, pixel_grid
+from starcal_ros.cli import main
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.studies import figures as study_figures
+from starcal_ros.studies import monte_carlo
+from starcal_ros.studies import trials as campaign_trials
+from starcal_ros.studies import workers as campaign_workers
+from starcal_ros.studies.monte_carlo import Campaign, Design, Row
+
+METHODS = ('per_image', 'single', 'hierarchical')
+ARGUMENTS = ('coverage', '--trials', '4', '--images', '4', '--stars', '20', '--seed', '5')
+SMALL = {
+    'table1': {'trials': 2, 'images': (4,), 'stars': (20, 30), 'tracker_arcsec': (0.0, 20.0)},
+    'images': {'trials': 2, 'images': (2, 5), 'stars': (30,)},
+    'terms': {'trials': 2, 'images': (4,)},
+    'coverage': {'trials': 4, 'images': (4,), 'stars': (20,), 'seed': 5},
+    'start': {'trials': 3},
+}
+each_study = pytest.mark.parametrize('study', SMALL)
+
+
+def small(study: str) -> Design:
+    return dataclasses.replace(monte_carlo.STUDIES[study][1], **SMALL[study])  # type: ignore[arg-type]
+
+
+@functools.cache
+def here(design: Design) -> Campaign:
+    """Run in this process."""
+    return monte_carlo.conclude(design, campaign_workers.run_trials(design))
+
+
+def only(rows: tuple[Row, ...], **values: object) -> Row:
+    (row,) = (row for row in rows if all(row[k] == v for k, v in values.items()))
+    return row
+
+
+def tool(*arguments: object) -> subprocess.Popen[str]:
+    """Start the tool as a person would, in a terminal's process group."""
+    return subprocess.Popen(
+        [sys.executable, '-m', 'starcal_ros.cli.main', 'campaign', *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def test_json_is_the_same_bytes_from_any_number_of_workers(tmp_path: Path) -> None:
+    written = []
+    for workers in (0, 1, 2):
+        folder = tmp_path / str(workers)
+        done = tool(*ARGUMENTS, '-o', folder, '--workers', workers)
+        out, err = done.communicate(timeout=100)
+        assert done.returncode == 0, err
+        assert err == ''  # neither progress nor the words of Dask
+        assert 'hierarchical' in out
+        written.append((folder / 'coverage.json').read_bytes())
+    assert written[0] == written[1] == written[2]
+
+
+@pytest.fixture
+def scheduler() -> Iterator[str]:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol='tcp://',
+        host='127.0.0.1', dashboard_address=None,
+        scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
+    ) as cluster:  # fmt: skip
+        yield str(cluster.scheduler_address)
+
+
+def test_a_cluster_that_is_there_gives_the_same_rows(scheduler: str) -> None:
+    design = small('coverage')
+    rows = campaign_workers.run_trials(design, scheduler=scheduler)
+    assert monte_carlo.conclude(design, rows) == here(design)
+
+
+def test_workers_listen_on_loopback_only() -> None:
+    listening = set()
+
+    def look() -> None:
+        us = psutil.Process()
+        for process in (us, *us.children(recursive=True)):
+            for connection in process.net_connections('inet'):
+                if connection.status == psutil.CONN_LISTEN:
+                    listening.add(connection.laddr.ip)
+
+    campaign_workers.run_trials(small('coverage'), workers=1, on_trial=look)
+    assert listening == {'127.0.0.1'}
+
+
+def test_interrupted_leaves_in_one_line(tmp_path: Path) -> None:
+    started = tool('coverage', '--trials', 100000, '--workers', 1, '-o', tmp_path / 'out')
+    deadline = time.monotonic() + 60
+    while len(psutil.Process(started.pid).children()) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(1.0)  # as far as the trials, mostly; what is asserted holds before too
+    children = psutil.Process(started.pid).children(recursive=True)
+    os.killpg(started.pid, signal.SIGINT)
+    try:
+        out, err = started.communicate(timeout=60)
+    except subprocess.TimeoutExpired:
+        os.killpg(started.pid, signal.SIGKILL)
+        started.communicate()
+        raise
+    assert (started.returncode, out, err) == (130, '', 'starcal: interrupted\n')
+    assert not psutil.wait_procs(children, timeout=10)[1]
+    assert not list((tmp_path / 'out').iterdir())
+
+
+def test_a_trial_hangs_on_nothing_but_seed_study_and_number() -> None:
+    design = small('coverage')
+    more = dataclasses.replace(design, trials=1000)
+    assert monte_carlo.run_trial(design, 3) == monte_carlo.run_trial(more, 3)
+    for other in (
+        monte_carlo.run_trial(design, 2),
+        monte_carlo.run_trial(dataclasses.replace(design, seed=6), 3),
+    ):
+        assert monte_carlo.run_trial(design, 3)[0]['map_px'] != other[0]['map_px']
+    rows = [row for trial in (3, 0, 2, 1) for row in monte_carlo.run_trial(design, trial)]
+    assert monte_carlo.conclude(design, rows) == here(design)
+
+
+@each_study
+def test_results_and_figure(study: str) -> None:
+    found = here(small(study))
+    content = json.loads(monte_carlo.content(found, 'starcal 0'))
+    assert content['study'] == study and content['parameters']['trials'] == found.design.trials
+    assert {len(column) for column in content['trials'].values()} == {len(found.rows)}
+    assert len(content['summary']) == len(found.summary)
+    lines = monte_carlo.table(found)
+    assert len(lines) == 1 + len(found.summary) and len({len(line) for line in lines}) == 1
+    picture = cv2.imdecode(np.frombuffer(study_figures.png(found), np.uint8), 0)
+    assert picture is not None and picture.shape[0] > 300 and picture.shape[1] > 600
+    assert np.mean(np.less(picture, 100)) > 0.005  # more than a frame
+
+
+def test_per_image_beats_single_where_the_star_tracker_is_bad() -> None:
+    """Table 1 of the paper; and hierarchical is as good as the better of the two."""
+    found = here(
+        Design('table1', 12, (16,), (8, 80), tracker_arcsec=(0.0, 5.0, 40.0), methods=METHODS)
+    )
+    for stars in (8, 80):
+        cell = functools.partial(only, found.summary, stars=stars)
+        noisy = {m: cell(tracker_arcsec=40.0, method=m) for m in METHODS}
+        # The bounds say 14 and 13 times; the rms of 12 trials of some 5 free directions of a map
+        # is known to 10 %.
+        assert float(noisy['single']['map_px']) > 8 * float(noisy['per_image']['map_px'])
+        for tracker in (0.0, 5.0, 40.0):
+            of = {m: float(cell(tracker_arcsec=tracker, method=m)['map_px']) for m in METHODS}
+            # The errors are paired (same stars, same noise): what differs is far under their
+            # scatter.  Measured over 200 trials: 0.5 % at most.
+            assert of['hierarchical'] < 1.02 * min(of['per_image'], of['single'])
+
+
+def test_hierarchical_gains_where_stars_are_few_and_the_star_tracker_good() -> None:
+    """Eight stars place an image to some 4 arcsec: a star tracker of 1 arcsec knows better."""
+    found = here(Design('table1', 20, (16,), (8,), tracker_arcsec=(1.0,), methods=METHODS))
+    per_image, _, hierarchical = (only(found.summary, method=m) for m in METHODS)
+    gain = float(per_image['to_bound']) / float(hierarchical['to_bound'])
+    bounds = float(per_image['to_bound']) / float(per_image['to_per_image_bound'])
+    # Three sigma of the ratio of paired errors over 20 trials.
+    assert gain == pytest.approx(bounds, abs=0.10) and gain > 1.0
+
+
+@pytest.mark.parametrize('method', ['per_image', 'hierarchical'])
+def test_errors_are_as_large_as_the_covariance_says(method: str) -> None:
+    found = here(Design('coverage', 60, (16,), (80,), (20.0,), ('per_image', 'hierarchical')))
+    for share in (0.0, monte_carlo.OUTLIER_SHARE):
+        row = only(found.summary, method=method, outlier_share=share)
+        low, high = chi2.ppf([0.005, 0.995], 11 * 60) / 60
+        assert (row['low'], row['high']) == pytest.approx((low, high))
+        assert low < float(row['normalised']) < high
+        # Of 60 trials the rms of the map is known to 4 %; three of those.
+        assert float(row['to_reported']) == pytest.approx(1.0, abs=0.12)
+        assert float(row['to_bound']) == pytest.approx(1.0, abs=0.12)
+        # The mean of 60 errors of one sigma: four of its own sigmas, for 11 of them.
+        assert abs(float(row['worst_bias_sigmas'])) < 4 / np.sqrt(60)
+
+
+def test_a_prior_far_off_leads_to_the_same_minimum() -> None:
+    """Alignment 0.3 degrees, focal length 20 %, principal point 100 px off; 10 % outliers too."""
+    for row in here(small('start')).summary:
+        assert row['same_minimum'] == row['trials']
+        if row['outlier_share']:
+            assert int(row['outliers']) > 300
+        if row['method'] != 'single':
+            # Of outliers within 20 px, one in 4000 is within 3.5 sigma of 0.1 px by chance.
+            # `single` takes the star tracker's 20 arcsec for noise of 0.7 px: more stay in.
+            assert int(row['outliers_kept']) <= 3
+
+
+def test_unused_images_fit_better_the_more_are_used() -> None:
+    found = here(Design('images', 10, (2, 15), (80,), (20.0,), ('per_image',)))
+    few, many = (float(only(found.summary, images=m)['unused_to_true']) for m in (2, 15))
+    # 8 parameters from 2 n residuals add 8 / 2n to the variance, here 0.2 % to the rms at 15
+    # images and 1.3 % at two; a map weighs the corners more than the stars do.
+    assert 1.005 < few < 1.03
+    assert 1.0 < many < 1.005
+
+
+def test_bound_is_the_inverse_of_the_whole_normal_matrix() -> None:
+    field = campaign_trials.draw_star_field(np.random.default_rng(1), 3, 20)
+    N = campaign_trials.information_blocks(field)
+    tracker_arcsec, f, m = 7.0, 8, 3
+    rows = campaign_trials.ESTIMATED[:f]
+    G = np.eye(3) / (tracker_arcsec * ARCSECOND_RAD) ** 2
+    dense = np.zeros((f + 3 + 3 * m, f + 3 + 3 * m))
+    for k in range(m):
+        at = slice(f + 3 + 3 * k, f + 6 + 3 * k)
+        dense[:f, :f] += N[k][np.ix_(rows, rows)]
+        dense[at, :f] = N[k][np.ix_(np.arange(10, 13), rows)]
+        dense[:f, at] = dense[at, :f].T
+        dense[at, at] = N[k][10:, 10:] + G
+        dense[at, f : f + 3] = dense[f : f + 3, at] = -G
+        dense[f : f + 3, f : f + 3] += G
+    scale = 1 / np.sqrt(np.diag(dense))
+    expected = (np.linalg.inv(dense * np.outer(scale, scale)) * np.outer(scale, scale))[:11, :11]
+    found = campaign_trials.bound('hierarchical', N, tracker_arcsec)
+    estimated = np.ix_(campaign_trials.ESTIMATED, campaign_trials.ESTIMATED)
+    sigma = np.sqrt(np.diag(expected))
+    # Condition 1e6 of the scaled matrix times a rounding.
+    np.testing.assert_allclose(
+        found[estimated] / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-8
+    )
+
+
+def test_per_image_and_single_bound_the_hierarchical() -> None:
+    """Nothing known of the attitude, and all: the limits of the star tracker's sigma."""
+    field = campaign_trials.draw_star_field(np.random.default_rng(2), 5, 20)
+    blocks = campaign_trials.information_blocks(field)
+    for method, tracker_arcsec in (('per_image', 3e5), ('single', 0.0)):
+        limit = campaign_trials.bound('hierarchical', blocks, tracker_arcsec)
+        own = campaign_trials.bound(method, blocks, tracker_arcsec)
+        # 0.001 arcsec, which stands for none, against the 1 arcsec that the stars know: squared.
+        np.testing.assert_allclose(
+            np.diag(limit)[:10], np.diag(own)[:10], rtol=1e-5, err_msg=method
+        )
+
+
+def test_map_error_leaves_out_a_common_turn() -> None:
+    field = campaign_trials.draw_star_field(np.random.default_rng(3), 1, 1)
+    camera = field.truth.camera
+    assert map_error_px(camera, camera) < 1e-9  # rounding of the inverse
+    # A moved principal point is a turn but for its second order: 5 px of tilt times the
+    # squared tangent at the corners, 0.05.
+    moved = camera.replace(cx=camera.parameters[3] + 5)
+    assert 0.01 < map_error_px(moved, camera) < 0.1
+    # A longer focal length brings every direction to the axis, by sin(2 angle) / 2 of its change.
+    _, _, fy, _, _ = camera.intrinsics
+    longer = camera.replace(fx=camera.parameters[0] * 1.001, fy=fy * 1.001)
+    directions = line_of_sight(camera, pixel_grid(camera, 25, 25))
+    radius = np.linalg.norm(directions[:, :2], axis=1) * directions[:, 2]
+    expected = 1e-3 * np.sqrt(np.mean(radius**2)) * camera.parameters[0]
+    # The distortion in the denominator is some per cent of a few per cent.
+    assert map_error_px(longer, camera) == pytest.approx(expected, rel=0.01)
+
+
+def test_one_trial_and_unsolvable_cells_are_taken() -> None:
+    design = Design('images', 1, (2, 4), (4,), (20.0,), ('per_image',))
+    found = here(design)
+    # Eight stars are under the ten that a calibration takes.
+    assert [row['images'] for row in found.rows] == [4]
+    json.loads(monte_carlo.content(found, ''))
+    with pytest.raises(TooFewObservations, match='none of the 1 trials'):
+        here(dataclasses.replace(design, images=(2,)))
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['table2'], "'table2' is not one of table1, images, terms, coverage"),
+        (['table1', '--trials', '0'], '--trials: 0 is not within 1 to'),
+        (['table1', '--trials', 'many'], "--trials: invalid int value: 'many'"),
+        (['table1', '--seed', '-1'], '--seed: -1'),
+        (['table1', '--images', '1'], '--images: 1 is not within 2 to'),
+        (['table1', '--images', '5', '5'], '--images: 5 5 says one thing twice'),
+        (['table1', '--stars', '2'], '--stars: 2'),
+        (['terms', '--stars', '20'], '--stars: the images of the study terms'),
+        (['table1', '--tracker', '-3'], '-3.0 is not within 0 to 3600'),
+        (['table1', '--tracker', 'nan'], 'nan is not within 0 to 3600'),
+        (['table1', '--tracker-told', '4000'], '4000.0 is not within'),
+        (['table1', '--methods', 'all'], "--methods: 'all' is not one of per_image, single"),
+        (['table1', '--workers', '-1'], '--workers: -1 is not within 0'),
+        (['table1', '--workers', '1', '--scheduler', 'x'], 'not allowed with'),
+        (['table1', '--scheduler', 'tcp://127.0.0.1:1'], '--scheduler: tcp://127.0.0.1:1: '),
+        (['table1', '--scheduler', 'nonsense'], '--scheduler: nonsense: '),
+    ],
+)
+def test_bad_arguments_are_one_line(
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(campaign_workers, '_CONNECT_S', 0.5)
+    monkeypatch.setattr(os, 'environ', dict(os.environ))
+    try:
+        status = main.main(['campaign', *arguments, '-o', str(tmp_path / 'out')])
+    except SystemExit as error:
+        status = int(error.code or 0)
+    out, err = capsys.readouterr()
+    assert status == 2 and out == ''
+    assert err.startswith('starcal: ') and err.count('\n') == 1 and words in err
+
+
+def test_check_takes_every_study_as_it_stands() -> None:
+    for name, (_, design) in monte_carlo.STUDIES.items():
+        assert design.study == name
+        monte_carlo.check(design)
+    with pytest.raises(OptionError, match='study'):
+        monte_carlo.check(dataclasses.replace(design, study='none'))

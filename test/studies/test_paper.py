@@ -1,0 +1,100 @@
+"""The paper's night: frames as any image, judging by images not seen, the page."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+import re
+
+import numpy as np
+import pytest
+
+from starcal_ros.cli import main
+from starcal_ros.records import Ensemble
+from starcal_ros.simulation import centroids as simulated_centroids
+from starcal_ros.simulation import scenario
+from starcal_ros.studies import monte_carlo, paper, paper_figures, workers
+from starcal_ros.studies.paper import judge, PaperStudy, spread
+
+NIGHT = scenario.scenario(paper.NIGHT, seed=3)
+
+
+@pytest.fixture(scope='module')
+def ensemble() -> Ensemble:
+    """Observations of eighteen frames of the night, without pixels."""
+    return simulated_centroids.true_observations(
+        dataclasses.replace(NIGHT, cadence_s=200.0, image_count=18)
+    )
+
+
+@pytest.fixture(scope='module')
+def found(ensemble: Ensemble) -> PaperStudy:
+    design = monte_carlo.Design('table1', 2, (15,), (20,), (0.0, 20.0), ('per_image', 'single'))
+    table1 = monte_carlo.conclude(design, workers.run_trials(design))
+    return paper.study(ensemble.images, table1, seed=3)
+
+
+def test_a_frame_is_measured_in_its_pixels() -> None:
+    observed = paper.observe_frame(3, 100)
+    assert observed.refusal == '' and len(observed) > 200
+    truth = scenario.scene(NIGHT, 100)
+    order = np.argsort(truth.catalog_id)
+    row = order[np.searchsorted(truth.catalog_id, observed.catalog_id, sorter=order)]
+    off = observed.measured_px - truth.pixel_px[row]
+    sigma = np.sqrt(observed.covariance_px2[:, [0, 2]])
+    # Of five hundred numbers of unit variance, the spread is known to 3 %.
+    assert np.median(np.abs(off / sigma)) == pytest.approx(0.674, abs=0.1)
+
+
+def test_the_true_camera_leaves_the_noise(ensemble: Ensemble) -> None:
+    judged = judge(NIGHT.truth.camera, ensemble.images, 4.5)
+    sigma2 = np.concatenate([i.covariance_px2[:, [0, 2]] for i in ensemble.images])
+    # 10^4 numbers; the rotation of an image takes three of its 600 degrees of freedom.
+    assert judged.rms_px(range(len(ensemble.images))) == pytest.approx(
+        np.sqrt(sigma2.mean()), rel=0.03
+    )
+    assert judged.fits.mean() > 0.999  # 4.5 sigma: 4 in 10^5
+    wrong = judge(NIGHT.prior.camera, ensemble.images, 1e9)
+    assert wrong.rms_px([0]) > 2 * judged.rms_px([0])
+
+
+def test_images_are_spread_over_the_night() -> None:
+    assert spread(3, 359) == (0, 179, 358)
+    assert len(spread(15, 359)) == 15
+    assert spread(15, 4) == (0, 1, 2, 3)
+
+
+def test_the_study_shows_what_the_paper_concludes(found: PaperStudy) -> None:
+    assert len(found.used) == 15
+    rows = {str(row['method']): row for row in found.methods}
+    # Three images of 300 stars that were not used: 2.4 % is the 1-sigma of such a ratio.
+    assert float(rows['per_image']['others_px']) == pytest.approx(found.noise_rms_px, rel=0.02)
+    assert float(rows['single']['map_error_px']) > 2 * float(rows['per_image']['map_error_px'])
+    gone = [removal.removed for removal in found.removals[1:]]
+    assert {'k3', 'cx', 'cy'} <= set(gone[:4])
+    assert not {'k1', 'fx', 'fy'} & set(gone[:5])
+
+
+def test_the_page_and_its_figures(found: PaperStudy) -> None:
+    text = paper.page(found, 'starcal 0')
+    figures = paper_figures.pngs(found)
+    assert set(re.findall(r'\(images/paper_(\w+)\.png\)', text)) == set(figures)
+    assert all(png.startswith(b'\x89PNG') for png in figures.values())
+    assert 'nan' not in text
+
+
+def test_one_command_makes_it_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command as it is, with a worker of its own, on the first five frames of the night."""
+    short = dataclasses.replace(paper.TABLE_1, stars=(20,), tracker_arcsec=(20.0,))
+    night = dataclasses.replace(NIGHT, image_count=5)
+    monkeypatch.setattr(paper, 'TABLE_1', short)
+    monkeypatch.setattr(paper, 'CALIBRATED_WITH', 4)
+    monkeypatch.setattr(scenario, 'scenario', lambda *_: night)  # what counts the frames
+    asked = ['campaign', 'paper', '--trials', '1', '--seed', '3', '--workers', '1']
+    assert main.main([*asked, '-o', str(tmp_path)]) == 0
+    numbers = json.loads((tmp_path / 'paper.json').read_text())
+    assert (numbers['images'], numbers['used'], numbers['others']) == (5, 4, 1)
+    text = (tmp_path / 'paper.md').read_text()
+    linked = re.findall(r'\((images/paper_\w+\.png)\)', text)
+    assert linked and all((tmp_path / name).read_bytes()[:4] == b'\x89PNG' for name in linked)

@@ -1,0 +1,151 @@
+"""The package in a ROS workspace: colcon builds it, its messages and a node run from there."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+from lifecycle_msgs.msg import State
+from lifecycle_msgs.srv import GetState
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+
+ROOT = Path(__file__).resolve().parents[2]
+BUILT = ('CMakeLists.txt', 'package.xml', 'setup.cfg', 'msg', 'srv', 'starcal_ros')
+INSTALLED = ('launch', 'config', 'bags/tiny')
+NODE_ANSWERS_WITHIN_S = 30.0
+NODE_STOPS_WITHIN_S = 15.0
+
+pytestmark = pytest.mark.timeout(240)  # colcon takes 15 s on two free cores
+
+# The messages in use, not only the Python files that wrap them, must be those of the workspace.
+ORIGINS = """
+from rclpy.serialization import serialize_message
+import starcal
+from starcal.msg import Calibration
+import starcal_ros
+
+serialize_message(Calibration())
+print(starcal.__file__)
+print(starcal_ros.__file__)
+print(*{line.split()[-1] for line in open('/proc/self/maps') if 'libstarcal__' in line}, sep='\\n')
+"""
+
+
+@pytest.fixture(scope='module')
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a workspace with a copy of this package, built on the environment as underlay."""
+    workspace = tmp_path_factory.mktemp('workspace')
+    package = workspace / 'src' / 'starcal'
+    package.mkdir(parents=True)
+    for name in filter(lambda name: (ROOT / name).exists(), BUILT + INSTALLED):
+        if (ROOT / name).is_dir():
+            ignore = shutil.ignore_patterns('__pycache__')
+            shutil.copytree(ROOT / name, package / name, ignore=ignore)
+        else:
+            shutil.copy(ROOT / name, package)
+    colcon = [sys.executable, '-m', 'colcon', 'build', '--base-paths', 'src', '--cmake-args']
+    definitions = ['-DBUILD_TESTING=OFF', f'-DPython3_EXECUTABLE={sys.executable}']
+    underlay = {'AMENT_PREFIX_PATH': sys.prefix, 'CMAKE_PREFIX_PATH': sys.prefix}
+    built = subprocess.run(
+        [*colcon, *definitions],
+        cwd=workspace,
+        env=os.environ | underlay | {'COLCON_HOME': str(workspace)},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    return workspace
+
+
+def in_workspace(workspace: Path, *command: str | Path) -> list[str]:
+    """Return the command that runs another one with the workspace sourced, as one process."""
+    sourced = f'. {workspace}/install/local_setup.sh && exec "$@"'
+    return ['sh', '-c', sourced, 'sh', *map(str, command)]
+
+
+def test_imports_come_from_the_install_space(workspace: Path) -> None:
+    command = in_workspace(workspace, sys.executable, '-c', ORIGINS)
+    shown = subprocess.run(command, capture_output=True, text=True, cwd=workspace)
+    assert shown.returncode == 0, shown.stderr
+    origins = shown.stdout.split()
+    assert len(origins) > 3  # the two packages and the libraries of the messages
+    assert [o for o in origins if not o.startswith(f'{workspace}/install/starcal/')] == []
+
+
+def test_everything_is_installed_that_the_package_reads(workspace: Path) -> None:
+    prefix = workspace / 'install' / 'starcal'
+    executables = {path.name for path in (prefix / 'lib' / 'starcal').iterdir()}
+    assert executables == {'starcal', 'star_observer', 'calibrator', 'bag_player'}
+    for folder in INSTALLED:
+        there = {path.name for path in (prefix / 'share/starcal' / folder).iterdir()}
+        assert there == {path.name for path in (ROOT / folder).iterdir()} - {'__pycache__'}
+    sources = next(prefix.glob('lib/python3.*/site-packages/starcal_ros'))
+    for path in (ROOT / 'starcal_ros/sky/data').iterdir():
+        if path.is_file():
+            assert (sources / 'sky/data' / path.name).read_bytes() == path.read_bytes()
+
+
+def test_node_from_the_install_space_comes_up_and_stops(
+    workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    domain_id = 1 + os.getpid() % 100
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    monkeypatch.setenv('ROS_LOG_DIR', str(workspace / 'log'))
+    executable = workspace / 'install/starcal/lib/starcal/star_observer'
+    arguments = ('--ros-args', '-r', '__ns:=/from_colcon', '-p', 'autostart:=false')
+    command = in_workspace(workspace, executable, *arguments)
+    node = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        state = lifecycle_state('/from_colcon/star_observer', domain_id, node)
+        assert state == State.PRIMARY_STATE_UNCONFIGURED
+        node.send_signal(signal.SIGINT)
+        output = node.communicate(timeout=NODE_STOPS_WITHIN_S)[0]
+    finally:
+        node.kill()
+        node.wait()
+    assert node.returncode == 0, output
+    assert 'Traceback' not in output
+
+
+def lifecycle_state(name: str, domain_id: int, process: subprocess.Popen) -> int:
+    """
+    Return the state that a node answers with when asked.
+
+    Its name is in the graph before its constructor is through; its answer says that it spins.
+    """
+    context = Context()
+    rclpy.init(context=context, domain_id=domain_id)
+    asking = rclpy.create_node('asking', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(asking)
+    client = asking.create_client(GetState, f'{name}/get_state')
+    deadline = time.monotonic() + NODE_ANSWERS_WITHIN_S
+    try:
+        while not client.wait_for_service(timeout_sec=0.2):
+            assert process.poll() is None, process.communicate()[0]
+            assert time.monotonic() < deadline, asking.get_node_names_and_namespaces()
+        answer = client.call_async(GetState.Request())
+        executor.spin_until_future_complete(answer, timeout_sec=NODE_ANSWERS_WITHIN_S)
+        assert answer.done(), f'{name} does not answer'
+        state: int = answer.result().current_state.id
+        return state
+    finally:
+        executor.shutdown()
+        asking.destroy_node()
+        rclpy.shutdown(context=context)

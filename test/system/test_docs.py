@@ -1,0 +1,343 @@
+"""The documents: their commands run, their links lead somewhere, their tables are the code's."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib
+import itertools
+from pathlib import Path
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+
+from starcal_ros.cli import main
+from starcal_ros.cli.arguments import parser
+from starcal_ros.options import read_parameter_file
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES, PlayerOptions
+from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCUMENTS = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').glob('*.md'), *ROOT.glob('bags/*/*.md')])
+OPTIONS = (*OPTION_CLASSES, *NODE_OPTION_CLASSES, PlayerOptions)
+RUN_S = 60.0
+
+
+def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*map(str, command)], cwd=ROOT, capture_output=True, text=True, timeout=RUN_S
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """A line of shell in a document; ``runs``: here and now, not only read."""
+
+    document: Path
+    words: tuple[str, ...]
+    runs: bool
+
+
+FENCE = re.compile(r'(<!-- not run: [^\n]+ -->\n+)?^```(\w*)\n(.*?)^```', re.DOTALL | re.MULTILINE)
+# A command indented by four: the older documents have such.
+INDENTED = re.compile(r'^ {4}((?:starcal|make|ros2|\.venv/bin/\S+) [a-z\-].*)$', re.MULTILINE)
+
+
+def shell_lines(document: Path) -> list[Line]:
+    """Lines of shell in a document, continued ones joined, comments cut."""
+    text = document.read_text()
+    blocks = [
+        (body, not marked) for marked, kind, body in FENCE.findall(text) if kind in ('sh', 'bash')
+    ]
+    blocks += [(line, False) for line in INDENTED.findall(FENCE.sub('', text))]
+    return [
+        Line(document, tuple(words), runs)
+        for body, runs in blocks
+        for line in body.replace('\\\n', ' ').splitlines()
+        if (words := shlex.split(line, comments=True))
+    ]
+
+
+LINES = [line for document in DOCUMENTS for line in shell_lines(document)]
+
+
+def lines_of(command: str) -> list[Line]:
+    """The lines that call a program, wherever it stands."""
+    return [line for line in LINES if Path(line.words[0]).name == command]
+
+
+TOOL_LINES = lines_of('starcal')
+MAKE_TARGETS = sorted(
+    {word for line in lines_of('make') for word in line.words[1:] if '=' not in word}
+)
+# What the documents call besides, on the reader's machine: nothing of ours to hold it against.
+OTHERS = {
+    'git',
+    'cd',
+    'rosdep',
+    'colcon',
+    '.',
+    'eval',
+    'apt',
+    'sudo',
+    'xdg-open',
+    'export',
+    'kill',
+}
+
+
+def links(document: Path) -> list[str]:
+    return re.findall(r'\]\(([^)\s]+)\)', document.read_text())
+
+
+def heading_anchors(document: Path) -> set[str]:
+    headings = re.findall(r'^#+ (.+)$', document.read_text(), re.MULTILINE)
+    return {re.sub(r'[^\w\- ]', '', text).lower().replace(' ', '-') for text in headings}
+
+
+def test_the_documents_are_there() -> None:
+    names = {str(document.relative_to(ROOT)) for document in DOCUMENTS}
+    assert names >= {
+        'README.md',
+        'CONTRIBUTING.md',
+        'docs/icd.md',
+        'docs/algorithm.md',
+        'docs/design.md',
+        'docs/performance.md',
+        'docs/tutorial.md',
+        'QUALITY_DECLARATION.md',
+        'bags/tiny/README.md',
+    }
+
+
+@pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_somewhere(document: Path) -> None:
+    for link in links(document):
+        if link.startswith('https://'):
+            continue
+        name, _, anchor = link.partition('#')
+        target = document.parent / name if name else document
+        assert target.exists(), link
+        assert not anchor or anchor in heading_anchors(target), link
+
+
+def test_pictures_show_something() -> None:
+    shown = {
+        str((document.parent / link).resolve().relative_to(ROOT))
+        for document in DOCUMENTS
+        for link in links(document)
+        if link.endswith('.png')
+    }
+    there = {str(path.relative_to(ROOT)) for path in (ROOT / 'docs' / 'images').glob('*.png')}
+    assert shown == there
+    for name in there:
+        picture = cv2.imread(str(ROOT / name))
+        assert picture is not None and min(picture.shape[:2]) >= 300, name
+        assert np.ptp(picture) > 200, name
+
+
+def test_tables_are_as_the_code_has_them() -> None:
+    checked = run(sys.executable, '-m', 'docs.make_tables', '--check')
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+
+
+def test_every_parameter_is_in_the_interface_document_and_none_else() -> None:
+    text = (ROOT / 'docs' / 'icd.md').read_text()
+    rows = re.findall(r'^\| `(\w+)` \| `[^|]*` \|', text, re.MULTILINE)
+    assert sorted(rows) == sorted(f.name for cls in OPTIONS for f in dataclasses.fields(cls))
+
+
+FILE_ENDINGS = ('html', 'json', 'mcap', 'md', 'npz', 'py', 'yaml')
+
+
+@pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_named_functions_exist(document: Path) -> None:
+    homes: dict[str, list[str]] = {}
+    for path in (ROOT / 'starcal_ros').rglob('*.py'):
+        dotted = '.'.join(path.relative_to(ROOT).with_suffix('').parts)
+        homes.setdefault(path.stem, []).append(dotted)
+    for module, name in re.findall(r'`(\w+)\.(\w+)`', document.read_text()):
+        if module in homes and name not in FILE_ENDINGS:
+            found = (importlib.import_module(home) for home in homes[module])
+            assert any(hasattr(home, name) for home in found), f'{module}.{name}'
+
+
+def test_topics_and_services_are_names_that_the_nodes_use() -> None:
+    text = (ROOT / 'docs' / 'icd.md').read_text()
+    documented = re.findall(r'^\| (?:sub|pub|srv) \| `([^`]+)` \|', text, re.MULTILINE)
+    assert len(documented) >= 15
+    nodes = (ROOT / 'starcal_ros' / 'nodes').glob('*.py')
+    constants = {
+        node.value
+        for path in nodes
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    for name in documented:
+        base = name.removesuffix('/compressed')
+        assert name in constants or {base, '/compressed'} <= constants, name
+
+
+def test_no_command_is_unknown() -> None:
+    known = {'starcal', 'make', 'ros2', 'pip', 'python', *OTHERS}
+    for line in LINES:
+        assert (Path(line.words[0]).name or line.words[0]) in known, line
+
+
+@pytest.mark.parametrize('line', TOOL_LINES, ids=lambda line: ' '.join(line.words)[:60])
+def test_the_tool_takes_the_line(line: Line) -> None:
+    """Every command and option that a document shows is one that the tool has."""
+    words = [re.sub(r'^[NMS]$', '1', word) for word in line.words]  # a number to be given
+    args = parser().parse_args(words[1:])  # ends the test where it does not understand
+    assert args.command in main._COMMANDS
+
+
+RUNNING = sorted({line.document for line in TOOL_LINES if line.runs})
+
+
+@pytest.mark.parametrize('document', RUNNING, ids=lambda path: path.name)
+def test_the_commands_of_a_document_run(
+    document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One after the other, as a reader would."""
+    shutil.copytree(ROOT / 'bags' / 'tiny', tmp_path / 'bags' / 'tiny')
+    monkeypatch.chdir(tmp_path)
+    for line in TOOL_LINES:
+        if line.document == document and line.runs:
+            assert main.main(line.words[1:]) == 0, line.words
+    for name in ('calibration.json', 'camera_info.yaml', 'observations.mcap', 'report.html'):
+        assert (tmp_path / 'out' / name).is_file()
+
+
+def test_readme_and_tutorial_run() -> None:
+    assert {path.name for path in RUNNING} >= {'README.md', 'tutorial.md'}
+    ran = {line.words[1] for line in TOOL_LINES if line.runs}
+    assert ran >= {'inspect', 'calibrate', 'compare'}
+
+
+def test_subcommands_in_the_interface_document_are_those_of_the_tool() -> None:
+    text = (ROOT / 'docs' / 'icd.md').read_text()
+    documented = set(re.findall(r'^\| `starcal (\w+)', text, re.MULTILINE))
+    assert documented == set(main._COMMANDS)
+
+
+PARAMETER_BLOCKS = [
+    (document, text)
+    for document in DOCUMENTS
+    for _, kind, text in FENCE.findall(document.read_text())
+    if kind == 'yaml' and 'ros__parameters' in text
+]
+
+
+@pytest.mark.parametrize(
+    ('document', 'text'), PARAMETER_BLOCKS, ids=[path.name for path, _ in PARAMETER_BLOCKS]
+)
+def test_a_parameter_file_of_a_document_is_one(document: Path, text: str, tmp_path: Path) -> None:
+    params = tmp_path / 'params.yaml'
+    params.write_text(text)
+    values = read_parameter_file(params, ('star_observer', 'calibrator'))
+    camera = ROOT / 'bags' / 'tiny' / 'camera.yaml'
+    setup = load_setup({**values, 'camera_info_url': str(camera)}, OPTIONS)
+    assert setup.prior.camera.width > 0
+
+
+def test_readme_and_tutorial_show_a_parameter_file() -> None:
+    assert {path.name for path, _ in PARAMETER_BLOCKS} >= {'README.md', 'tutorial.md'}
+
+
+@pytest.mark.parametrize('target', MAKE_TARGETS)
+def test_make_knows_the_target(target: str) -> None:
+    assert run('make', '--dry-run', target).returncode == 0
+
+
+def test_scripts_that_are_named_exist() -> None:
+    lines = [line.words for line in lines_of('python') if line.words[1:2] == ('-m',)]
+    assert lines
+    for words in lines:
+        module = ROOT / words[2].replace('.', '/')
+        ours = module.with_suffix('.py').is_file() or (module / '__main__.py').is_file()
+        assert ours or words[2] in ('pytest', 'cProfile'), words
+
+
+def interface(directions: str) -> dict[str, str]:
+    """Name -> type of topics or services, from the tables of the interface document."""
+    text = (ROOT / 'docs' / 'icd.md').read_text()
+    rows = re.findall(rf'^\| (?:{directions}) \| `([^`]+)` \| \[?(\w+/\w+)', text, re.MULTILINE)
+    return dict(rows)
+
+
+def check_ros_arguments(words: tuple[str, ...]) -> None:
+    """Remaps are of topics that a node has, parameters are ones it has."""
+    names = {field.name for cls in OPTIONS for field in dataclasses.fields(cls)}
+    topics = {name.lstrip('/') for name in interface('sub|pub')}
+    for before, word in itertools.pairwise(words):
+        name = word.partition(':=')[0]
+        if before in ('-r', '--remap'):
+            assert name.lstrip('/') in topics or name.startswith('__'), words
+        if before in ('-p', '--param'):
+            assert name in names, words
+
+
+def executables() -> set[str]:
+    text = (ROOT / 'setup.cfg').read_text()
+    return set(re.findall(r'^ {4}(\w+) = starcal_ros', text, re.MULTILINE))
+
+
+@pytest.mark.parametrize('line', lines_of('ros2'), ids=lambda line: ' '.join(line.words)[:60])
+def test_what_a_ros2_line_names_is_there(line: Line) -> None:
+    _, verb, *rest = line.words
+    if verb == 'launch' and rest[0] == 'starcal':
+        source = (ROOT / 'launch' / rest[1]).read_text()
+        for argument in rest[2:]:
+            assert f"'{argument.partition(':=')[0]}'" in source
+    elif verb == 'run' and rest[0] == 'starcal':
+        assert rest[1] in executables()
+        if rest[1] == 'starcal':
+            parser().parse_args(rest[2:])
+        check_ros_arguments(tuple(rest))
+    elif verb == 'service':
+        assert rest[0] == 'call'
+        _, node, service = rest[1].split('/')
+        services = interface('srv')
+        kind = services[f'~/{service}']
+        assert node == 'calibrator' and rest[2] == kind.replace('/', '/srv/')
+    elif verb == 'topic':
+        names = {name.lstrip('/') for name in interface('sub|pub')}
+        assert rest[0] in ('echo', 'hz', 'list') and rest[1].lstrip('/') in names
+    elif verb == 'bag':
+        names = {name.lstrip('/') for name in interface('sub|pub')}
+        assert rest[0] in ('record', 'play', 'convert', 'info')
+        if rest[0] == 'record':
+            assert {word.lstrip('/') for word in rest if word.startswith('/')} <= names
+    elif verb in ('param', 'lifecycle'):
+        assert rest[1].lstrip('/') in ('star_observer', 'calibrator')
+        if verb == 'param':
+            assert rest[2] in {f.name for cls in OPTIONS for f in dataclasses.fields(cls)}
+        else:
+            assert rest[2] in ('configure', 'activate', 'deactivate', 'cleanup', 'shutdown')
+    else:
+        assert verb in ('launch', 'run') and rest[0] != 'starcal', line
+
+
+def test_the_documents_show_the_ways_into_the_vehicle() -> None:
+    assert {line.words[1] for line in lines_of('ros2')} >= {'launch', 'run', 'service', 'topic'}
+
+
+def test_versions_to_install_are_the_pinned_ones() -> None:
+    pinned = (ROOT / 'requirements' / 'runtime.txt').read_text().splitlines()
+    lines = [line.words for line in lines_of('pip') if line.words[1] == 'install']
+    assert lines
+    for words in lines:
+        assert words[2:] and set(words[2:]) <= set(pinned)
+
+
+def test_the_version_of_the_figures_is_that_of_the_package() -> None:
+    version = ElementTree.parse(ROOT / 'package.xml').findtext('version')
+    assert f'version {version}' in (ROOT / 'docs' / 'performance.md').read_text()

