@@ -47,6 +47,7 @@ class CameraModel:
     width: int
     height: int
     parameters: Floats
+    model: str = 'plumb_bob'
 
     def __post_init__(self) -> None:
         """Freeze a float copy of the parameters."""
@@ -59,6 +60,11 @@ class CameraModel:
             raise ValueError(f'fx, fy: {parameters[0]}, {parameters[2]} are not positive')
         parameters.setflags(write=False)
         object.__setattr__(self, 'parameters', parameters)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of `parameters`, in order."""
+        return PARAMETER_NAMES
 
     @property
     def intrinsics(self) -> Floats:
