@@ -26,7 +26,6 @@ from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import observe, solve
 from starcal_ros.records import (
-    CALIBRATION_PARAMETER_NAMES,
     CameraGeometry,
     Ensemble,
     StarObservations,
@@ -175,7 +174,8 @@ def trial(case: Case, seed: int) -> Floats:
     except TooFewObservations:
         return np.full(5, np.nan)
     bound = np.zeros((13, 13))
-    columns = [CALIBRATION_PARAMETER_NAMES.index(name) for name in simulated_centroids.BOUND_NAMES]
+    names = simulated_centroids.bound_names(scenario.truth.camera)
+    columns = [found.parameter_names.index(name) for name in names]
     bound[np.ix_(columns, columns)] = simulated_centroids.cramer_rao_covariance(scenario)
     error_px = map_error_px(found.geometry.camera, scenario.truth.camera)
     over_bound2, over_sigma2 = np.concatenate(stars, axis=1).mean(axis=1)

@@ -25,12 +25,12 @@ from starcal_ros.estimation.calibrate import CalibrationOptions, estimate_calibr
 from starcal_ros.estimation.normal_equations import arrange, star_table, StarTable
 from starcal_ros.estimation.problem import minimise, Problem, State
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.simulation.centroids import BOUND_NAMES, true_observations
+from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario
 
 Floats = NDArray[np.float64]
 
-FREE = np.sort(np.array([PARAMETER_NAMES.index(name) for name in BOUND_NAMES]))
+FREE = np.array([k for k, name in enumerate(PARAMETER_NAMES) if name not in ('cx', 'cy')])
 SIGMA_PX = 0.1
 TOLERANCE = 1e-12
 _MAGNITUDE_LIMIT = 6.65  # leaves about 80 stars in an image
@@ -83,6 +83,7 @@ def make_case(ensemble: Ensemble, prior: CameraGeometry) -> Case:
     ).inv()
     problem = Problem(
         method='per_image',
+        model='plumb_bob',
         free=FREE,
         prior_parameters=prior.camera.parameters,
         prior_sigma=np.full(10, np.inf),
@@ -152,7 +153,7 @@ def solve_scipy(case: Case) -> Answer:
     def residuals(x: Floats) -> Floats:
         turn, _ = _turn_jacobian(x[f:].reshape(m, 3))
         directions = np.einsum('nij,nj->ni', turn[table.image], base)
-        predicted = project_parameters(parameters_of(x), directions)
+        predicted = project_parameters('plumb_bob', parameters_of(x), directions)
         return np.asarray((predicted - table.measured_px).ravel() / SIGMA_PX)
 
     def jacobian(x: Floats) -> csr_matrix:
@@ -205,7 +206,7 @@ def solve_ceres(case: Case) -> Answer:
             turn, L = _turn_jacobian(blocks[1])
             directions = self.base @ turn.T
             if jacobians is None:
-                predicted_px = project_parameters(parameters, directions)
+                predicted_px = project_parameters('plumb_bob', parameters, directions)
             else:
                 camera = dataclasses.replace(prior, parameters=parameters)
                 predicted_px, J_parameters, J_rotation = project_jacobians(camera, directions)

@@ -70,11 +70,13 @@ def cost_of(case: Case, answer: Answer, steps: int = 0) -> float:
     measurements = arrange(case.table, keep, case.table.covariance_px2)
     rotations = Rotation.from_matrix(answer.camera_from_icrf)
     for _ in range(steps):
-        _, blocks = normal_blocks(measurements, answer.parameters, rotations.as_matrix())
+        _, blocks = normal_blocks(
+            measurements, 'plumb_bob', answer.parameters, rotations.as_matrix()
+        )
         gradient = blocks[:, ROTATION, RESIDUAL, None]
         step = np.linalg.solve(blocks[:, ROTATION, ROTATION], gradient)[..., 0]
         rotations = Rotation.from_rotvec(-step) * rotations
-    return normal_blocks(measurements, answer.parameters, rotations.as_matrix())[0]
+    return normal_blocks(measurements, 'plumb_bob', answer.parameters, rotations.as_matrix())[0]
 
 
 def parameter_sigma(case: Case, answer: Answer) -> Floats:
@@ -201,7 +203,7 @@ def measure_growth(
         n, keep = len(case.table), np.ones(len(case.table), bool)
         measurements = arrange(case.table, keep, case.table.covariance_px2)
         rotations = case.start.camera_from_icrf.as_matrix()
-        held = (measurements, case.start.parameters, rotations)
+        held = (measurements, 'plumb_bob', case.start.parameters, rotations)
         pass_ns = 1e9 * least_s(3 * repeats, normal_blocks, *held) / n
         search_s = least_s(repeats, solve_starcal, case)
         iteration_ns = 1e9 * search_s / n / solve_starcal(case).iterations

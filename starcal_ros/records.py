@@ -14,12 +14,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.camera import CameraModel, PARAMETER_NAMES
+from starcal_ros.camera import CameraModel
 
 Floats = NDArray[np.float64]
 
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
-CALIBRATION_PARAMETER_NAMES = PARAMETER_NAMES + ALIGNMENT_NAMES
 
 IMAGE_REFUSALS: Mapping[str, str] = {
     'bad_encoding': 'the pixel encoding is not one of mono8, mono16, 8UC1, 16UC1',
@@ -57,6 +56,11 @@ STAR_REFUSALS: Mapping[str, str] = {
     'ambiguous': 'off the place or the brightness that the other stars give it',
 }
 """Why a single predicted star can be left out: stable name -> meaning."""
+
+
+def calibration_parameter_names(camera: CameraModel) -> tuple[str, ...]:
+    """Names of the parameters of a camera, and of the alignment angles."""
+    return camera.parameter_names + ALIGNMENT_NAMES
 
 
 @dataclass(frozen=True)
@@ -452,8 +456,8 @@ class Calibration:
         Stamp of the last image used.
     geometry : CameraGeometry
         The estimated camera and alignment.
-    covariance : (13, 13)
-        Of `CALIBRATION_PARAMETER_NAMES`; the alignment angles (rad) are passive small rotations
+    covariance : (p + 3, p + 3)
+        Of `parameter_names`; the alignment angles (rad) are passive small rotations
         in the camera frame; zero rows where a parameter was held.
     method : str
     estimated : tuple of str
@@ -546,6 +550,11 @@ class Calibration:
     gate: tuple[GateCheck, ...] = ()
 
     @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the p camera parameters and of the alignment angles."""
+        return calibration_parameter_names(self.geometry.camera)
+
+    @property
     def sigma(self) -> Floats:
-        """1-sigma of `CALIBRATION_PARAMETER_NAMES`, (13,)."""
+        """1-sigma of `parameter_names`, (p + 3,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))

@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
-from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
+from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation.calibrate import CalibrationOptions, estimate_calibration
+from starcal_ros.estimation.calibrate import (
+    CalibrationOptions,
+    estimate_calibration,
+    estimated_parameters,
+)
 from starcal_ros.records import CameraGeometry, Ensemble
 
 Floats = NDArray[np.float64]
@@ -115,17 +119,21 @@ def difference(
     """
     Difference of two calibrations; ``estimated`` are the camera parameters that both estimate.
 
-    The covariances (13, 13) are taken as independent.  Of two ensembles that share images, the
-    difference is less than they say.
+    The covariances (p + 3, p + 3) are taken as independent.  Of two ensembles that share images,
+    the difference is less than they say.  Of two lens models only the lines of sight are compared.
     """
     turn_rad, left_px = movement(before, after)
+    if before.camera.model != after.camera.model:
+        return Difference(turn_rad, float(left_px.max()), 0.0, 0, 0.0, 0)
     turned_rad = alignment_difference_rad(after, before)
     moves = np.concatenate([after.camera.parameters - before.camera.parameters, turned_rad])
     covariance = before_covariance + after_covariance
-    camera = [PARAMETER_NAMES.index(name) for name in estimated]
+    names = after.camera.parameter_names
+    camera = [names.index(name) for name in estimated]
+    angles = range(len(names), len(names) + 3)
     of_camera, of_all = (
         _squared_sigmas(moves[rows], covariance[np.ix_(rows, rows)])
-        for rows in (camera, [*camera, 10, 11, 12])
+        for rows in (camera, [*camera, *angles])
     )
     return Difference(turn_rad, float(left_px.max()), *of_camera, *of_all)
 
@@ -165,6 +173,7 @@ def halves(
         )
     except TooFewObservations as error:
         return f'a half alone cannot be solved: {error}'
+    estimated = estimated_parameters(options, prior.camera.model)
     return difference(
-        first.geometry, first.covariance, second.geometry, second.covariance, options.estimate
+        first.geometry, first.covariance, second.geometry, second.covariance, estimated
     )

@@ -11,10 +11,9 @@ from scipy.special import chdtrc
 
 from starcal_ros.assessment.agreement import alignment_difference_rad, lines_of_sight
 from starcal_ros.assessment.observability import line_of_sight_sigma_arcsec, map_sigma_px
-from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
-from starcal_ros.records import Calibration, CALIBRATION_PARAMETER_NAMES, CameraGeometry
+from starcal_ros.records import Calibration, CameraGeometry
 
 Floats = NDArray[np.float64]
 
@@ -43,9 +42,10 @@ class Comparison:
 
     Attributes
     ----------
-    difference, sigma : (13,)
-        B less A of `CALIBRATION_PARAMETER_NAMES`, and its 1-sigma if their errors are
-        independent.  The alignment angles (rad) are passive small rotations in the camera frame.
+    difference, sigma : (p + 3,)
+        B less A of the parameters of B, and its 1-sigma if their errors are independent; NaN
+        where the lens models differ, but for the alignment.  The alignment angles (rad) are
+        passive small rotations in the camera frame.
     turn_rad : float
         The rotation common to all lines of sight.
     before, after : DifferenceMap
@@ -71,7 +71,7 @@ class Comparison:
 
     @property
     def sigmas(self) -> Floats:
-        """The differences in their sigma, (13,); NaN where a parameter was held in both."""
+        """The differences in their sigma, (p + 3,); NaN where a parameter was held in both."""
         return _ratio(self.difference, self.sigma)
 
 
@@ -90,13 +90,16 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
             f'A is of a camera of {camera_a.width} x {camera_a.height}, '
             f'B of one of {camera_b.width} x {camera_b.height}: they cannot be compared'
         )
-    difference = np.concatenate(
-        [
-            camera_b.parameters - camera_a.parameters,
-            alignment_difference_rad(b.geometry, a.geometry),
-        ]
-    )
-    sigma = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
+    turned_rad = alignment_difference_rad(b.geometry, a.geometry)
+    if camera_a.model == camera_b.model:
+        difference = np.concatenate([camera_b.parameters - camera_a.parameters, turned_rad])
+        covariance = a.covariance + b.covariance
+    else:
+        p = len(camera_b.parameters)
+        difference = np.concatenate([np.full(p, np.nan), turned_rad])
+        covariance = np.full((p + 3, p + 3), np.nan)
+        covariance[-3:, -3:] = a.covariance[-3:, -3:] + b.covariance[-3:, -3:]
+    sigma = np.sqrt(np.diag(covariance))
     old, new = (_sound_lines_of_sight(calibration.geometry) for calibration in (a, b))
     turn, _ = Rotation.align_vectors(new, old)
     sight_sigma_rad = _both(
@@ -107,7 +110,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     )
     shape_sigma_px = _both(*(map_sigma_px(c.geometry.camera, c.covariance, GRID) for c in (a, b)))
     shape_sigma_rad = shape_sigma_px / camera_a.parameters[0]
-    degrees, total = _chi2(difference, a.covariance + b.covariance)
+    degrees, total = _chi2(difference, covariance)
     return Comparison(
         a=a,
         b=b,
@@ -180,9 +183,15 @@ def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) ->
             'A and B are from the same stars: their errors are alike, so the true sigma of a '
             'difference is smaller'
         )
+    names = b.geometry.camera.parameter_names
+    if a.geometry.camera.model != b.geometry.camera.model:
+        notes.append(
+            f'the lens models differ, {a.geometry.camera.model} in A, {b.geometry.camera.model} '
+            'in B: only lines of sight and alignment are compared'
+        )
     held = [
         name
-        for name, moved, error in zip(PARAMETER_NAMES, difference[:10], sigma[:10], strict=True)
+        for name, moved, error in zip(names, difference[:-3], sigma[:-3], strict=True)
         if moved and not error
     ]
     if held:
@@ -217,13 +226,13 @@ def content(comparison: Comparison) -> dict[str, object]:
         }
 
     return {
-        'parameter_names': list(CALIBRATION_PARAMETER_NAMES),
+        'parameter_names': list(comparison.b.parameter_names),
         'a': plain(comparison.a.geometry.camera.parameters),
         'b': plain(comparison.b.geometry.camera.parameters),
         'difference': plain(comparison.difference),
         'sigma': plain(comparison.sigma),
         'sigmas': plain(comparison.sigmas),
-        'alignment_arcsec': plain(comparison.difference[10:] / ARCSECOND_RAD),
+        'alignment_arcsec': plain(comparison.difference[-3:] / ARCSECOND_RAD),
         'common_turn_arcsec': comparison.turn_rad / ARCSECOND_RAD,
         'lines_of_sight': of_map(comparison.before),
         'without_common_turn': of_map(comparison.after),

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.assessment.agreement import Difference, movement
+from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import CalibrationOptions
 from starcal_ros.options import option
-from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, CameraGeometry, GateCheck
+from starcal_ros.records import calibration_parameter_names, CameraGeometry, GateCheck
 
 
 @dataclass(frozen=True)
@@ -67,11 +69,11 @@ class GateOptions:
         high=3600.0,
     )
     max_parameter_sigma: tuple[float, ...] = option(
-        (0.0,) * 13,
-        'largest 1-sigma of fx, skew, fy, cx, cy (px), k1, k2, k3, p1, p2, and of the alignment'
-        " about the camera's x, y, z (arcsec); 0: no limit",
+        (0.0,),
+        'largest 1-sigma of fx, skew, fy, cx, cy (px), of the coefficients of the lens model, and'
+        " of the alignment about the camera's x, y, z (arcsec); 0: no limit, a single 0: none at"
+        ' all',
         low=0.0,
-        length=13,
     )
     min_singular_value: float = option(
         1e-4,
@@ -133,7 +135,7 @@ class Candidate:
     Attributes
     ----------
     geometry, prior : CameraGeometry
-    covariance : (13, 13)
+    covariance : (p + 3, p + 3)
     residual_rms_px : float
     images_used, images_misfit : int
         Images of the ensemble, and those of them whose attitude does not fit.
@@ -171,6 +173,23 @@ class Candidate:
     termination: str
     halves: Difference | str
     step: Difference | None = None
+
+
+def check_gate_options(options: GateOptions, camera: CameraModel) -> None:
+    """
+    Raise `OptionError` for limits that do not go with the lens model of a camera.
+
+    Raises
+    ------
+    OptionError
+        Naming the option.
+    """
+    names, count = calibration_parameter_names(camera), len(options.max_parameter_sigma)
+    if count not in (1, len(names)):
+        raise OptionError(
+            f'max_parameter_sigma: {count} numbers, but there are {len(names)} parameters with '
+            f'the lens model {camera.model}: {", ".join(names)}'
+        )
 
 
 def judge(
@@ -333,11 +352,11 @@ def _of_the_knowledge(candidate: Candidate, options: GateOptions) -> Iterator[Ga
         'arcsec',
     )
     sigma = np.sqrt(np.diag(candidate.covariance))
-    sigma[10:] /= ARCSECOND_RAD
-    units = ('px',) * 5 + ('',) * 5 + ('arcsec',) * 3
-    for name, found, limit, unit in zip(
-        CALIBRATION_PARAMETER_NAMES, sigma, options.max_parameter_sigma, units, strict=True
-    ):
+    sigma[-3:] /= ARCSECOND_RAD
+    units = ('px',) * 5 + ('',) * (len(sigma) - 8) + ('arcsec',) * 3
+    names = calibration_parameter_names(candidate.geometry.camera)
+    limits = np.broadcast_to(options.max_parameter_sigma, len(names)).tolist()
+    for name, found, limit, unit in zip(names, sigma, limits, units, strict=True):
         if limit > 0:
             kept = bool(found <= limit)
             name = f'1-sigma of {name}'

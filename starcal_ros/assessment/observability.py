@@ -12,13 +12,19 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.camera import (
     CameraModel,
     line_of_sight,
-    PARAMETER_NAMES,
+    parameter_names,
     pixel_grid,
     project_jacobians,
     project_parameters,
 )
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import CalibrationOptions, FEWEST_STARS, problem_of, start_of
+from starcal_ros.estimation.calibrate import (
+    CalibrationOptions,
+    estimated_parameters,
+    FEWEST_STARS,
+    problem_of,
+    start_of,
+)
 from starcal_ros.estimation.covariance import shared_covariance, shared_names
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.normal_equations import arrange, star_table
@@ -70,14 +76,15 @@ def image_information(
     order, with_rate = _supported_terms(ensemble, options)
     problem, state, blocks, _ = _at_the_prior(ensemble, prior, options, order, with_rate)
     information = information_of_images(problem, state, blocks)
-    shared = np.concatenate([problem.free, np.arange(10, information.shape[1])])
+    shared = np.concatenate([problem.free, np.arange(problem.camera_count, information.shape[1])])
     return information[:, shared][:, :, shared] * blocks.any(axis=(1, 2), keepdims=True)
 
 
-def estimated_names(options: CalibrationOptions) -> tuple[str, ...]:
+def estimated_names(options: CalibrationOptions, model: str) -> tuple[str, ...]:
     """Names of all that is to be estimated: camera, terms of temperature, alignment, its rate."""
-    names = shared_names(options.focal_temperature_order, options.alignment_temperature)
-    return tuple(name for name in names if name not in PARAMETER_NAMES or name in options.estimate)
+    names = shared_names(model, options.focal_temperature_order, options.alignment_temperature)
+    held = set(parameter_names(model)) - set(estimated_parameters(options, model))
+    return tuple(name for name in names if name not in held)
 
 
 def predicted_sigma(
@@ -90,7 +97,7 @@ def predicted_sigma(
     where not observable yet.  Terms of temperature that the images carry are among what is
     estimated, so all sigmas account for them.
     """
-    names = estimated_names(options)
+    names = estimated_names(options, prior.camera.model)
     if not ensemble.images:
         return np.full(len(names), np.inf)
     terms = _supported_terms(ensemble, options)
@@ -145,7 +152,8 @@ def _sigma_with(
         )
     except (NotObservable, np.linalg.LinAlgError):
         return {}
-    return dict(zip(shared_names(order, with_rate), np.sqrt(np.diag(covariance)), strict=True))
+    names = shared_names(problem.model, order, with_rate)
+    return dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
 
 
 def ensemble_status(
@@ -160,7 +168,7 @@ def ensemble_status(
         min_stars=options.min_stars,
         refused=dict(ensemble.refused),
         coverage=coverage(ensemble, prior.camera),
-        parameter_names=estimated_names(options),
+        parameter_names=estimated_names(options, prior.camera.model),
         predicted_sigma=predicted_sigma(ensemble, prior, options),
     )
 
@@ -227,7 +235,7 @@ def line_of_sight_sigma_arcsec(
     """
     1-sigma (rows, columns) of the line of sight of pixels in the star tracker frame, arcsec.
 
-    Root of the summed variance of the two angles, from the (13, 13) covariance of camera and
+    Root of the summed variance of the two angles, from the (p + 3, p + 3) covariance of camera and
     alignment.
     """
     _, J = _line_of_sight_jacobian(camera, columns, rows)
@@ -251,11 +259,12 @@ def shape_sigma_rad(
     removed: it belongs to the alignment.
     """
     directions, J = _line_of_sight_jacobian(camera, columns, rows)
-    J = J[:, :, :10].reshape(-1, 10)
+    p = len(camera.parameters)
+    J = J[:, :, :p].reshape(-1, p)
     turns = np.stack([np.cross(axis, directions) for axis in np.eye(3)], axis=-1)
     Q, _ = np.linalg.qr(turns.reshape(-1, 3))
-    J = (J - Q @ (Q.T @ J)).reshape(-1, 3, 10)
-    variance = np.einsum('nij,jk,nik->n', J, covariance[:10, :10], J)
+    J = (J - Q @ (Q.T @ J)).reshape(-1, 3, p)
+    variance = np.einsum('nij,jk,nik->n', J, covariance[:p, :p], J)
     return np.asarray(np.sqrt(variance).reshape(rows, columns))
 
 
@@ -274,7 +283,7 @@ def map_error_px(found: CameraModel, true: CameraModel) -> float:
 
 
 def detector_maps(camera: CameraModel, covariance: Floats, pixels: Floats) -> DetectorMaps:
-    """Maps of a camera with a covariance (13, 13) that is from stars at pixels (n, 2)."""
+    """Maps of a camera with a covariance (p + 3, p + 3) that is from stars at pixels (n, 2)."""
     return DetectorMaps(
         stars_in_cells(pixels, camera),
         line_of_sight_sigma_arcsec(camera, covariance, MAP_COLS, MAP_ROWS),
@@ -299,13 +308,13 @@ def movement_px(camera: CameraModel, changes: Floats) -> Floats:
     pixels = pixel_grid(camera, 25, 20)
     directions = line_of_sight(camera, pixels)
     moved = camera.parameters - np.diag(changes)
-    found = np.stack([project_parameters(row, directions) for row in moved])
+    found = np.stack([project_parameters(camera.model, row, directions) for row in moved])
     return np.asarray(np.linalg.norm(pixels - found, axis=-1).max(axis=1))
 
 
 def _line_of_sight_jacobian(camera: CameraModel, columns: int, rows: int) -> tuple[Floats, Floats]:
     """
-    Lines of sight (n, 3) of a grid of pixels, and their derivatives (n, 3, 13).
+    Lines of sight (n, 3) of a grid of pixels, and their derivatives (n, 3, p + 3).
 
     By the camera parameters and the alignment angles, in the camera frame.  For a fixed pixel:
     a direction moves so as to undo what the parameter does to its image.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from starcal_ros.assessment.observability import map_error_px
-from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.normal_equations import arrange, Measurements, residuals_px
@@ -30,7 +30,7 @@ from starcal_ros.records import Removal
 
 Floats = NDArray[np.float64]
 
-_HELD_AT_ZERO = ('skew', 'k1', 'k2', 'k3', 'p1', 'p2')
+_HELD_AT_PRIOR = tuple(name for name in INTRINSIC_NAMES if name != 'skew')
 _CHANCE = 0.01  # that terms which are none raise chi^2 by as much
 
 
@@ -77,18 +77,18 @@ def removal_study(estimate: Estimate) -> tuple[Removal, ...]:
 
 
 def _held_at(name: str, problem: Problem) -> float:
-    if name in _HELD_AT_ZERO:
+    if name not in _HELD_AT_PRIOR:
         return 0.0
-    return float(problem.prior_parameters[PARAMETER_NAMES.index(name)])
+    return float(problem.prior_parameters[problem.parameter_names.index(name)])
 
 
 def _sigmas(problem: Problem, state: State, measurements: Measurements) -> dict[str, float]:
     """How far each free parameter is from what it would be held at, in its sigma."""
     _, blocks = image_blocks(problem, state, measurements)
     information = reduced_information(problem, state, blocks)
-    estimated = np.concatenate([problem.free, np.arange(10, len(information))])
+    estimated = np.concatenate([problem.free, np.arange(problem.camera_count, len(information))])
     variance = np.diag(inverse(information[np.ix_(estimated, estimated)]))
-    names = [PARAMETER_NAMES[i] for i in problem.free]
+    names = [problem.parameter_names[i] for i in problem.free]
     return {
         name: float((state.parameters[i] - _held_at(name, problem)) / np.sqrt(v))
         for name, i, v in zip(names, problem.free, variance, strict=False)
@@ -97,7 +97,7 @@ def _sigmas(problem: Problem, state: State, measurements: Measurements) -> dict[
 
 def _without(name: str, problem: Problem, state: State) -> tuple[Problem, State]:
     """The problem without a parameter, and the state with it where it is held."""
-    k = PARAMETER_NAMES.index(name)
+    k = problem.parameter_names.index(name)
     parameters = state.parameters.copy()
     parameters[k] = _held_at(name, problem)
     return (
@@ -109,7 +109,9 @@ def _without(name: str, problem: Problem, state: State) -> tuple[Problem, State]
 def _of_prior(before: Problem, after: Problem) -> float:
     """Chi^2 of the prior of the removed, which are no longer in the cost."""
     removed = np.setdiff1d(before.free, after.free)
-    off = [_held_at(PARAMETER_NAMES[k], before) - before.prior_parameters[k] for k in removed]
+    off = [
+        _held_at(before.parameter_names[k], before) - before.prior_parameters[k] for k in removed
+    ]
     return float(np.sum(np.square(np.array(off) / before.prior_sigma[removed])))
 
 
@@ -124,7 +126,8 @@ def _removal(
     within: bool,
 ) -> Removal:
     rotations = state.camera_from_icrf.as_matrix()
-    residual_px = residuals_px(estimate.table, image_parameters(problem, state), rotations)
+    parameters = image_parameters(problem, state)
+    residual_px = residuals_px(estimate.table, problem.model, parameters, rotations)
     residual_px = residual_px[estimate.kept]
     std_u, std_v = residual_px.std(axis=0)
     camera = estimate.geometry.camera

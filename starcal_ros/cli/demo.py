@@ -19,7 +19,6 @@ import numpy as np
 import yaml
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
-from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
 from starcal_ros.products.calibration_json import read_calibration
@@ -211,8 +210,9 @@ def _own_domain() -> dict[str, str]:
 
 def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeometry) -> Comparison:
     """Every estimated parameter and the alignment, beside prior and truth."""
-    names = [name for name in PARAMETER_NAMES if name in calibration.estimated]
-    columns = [PARAMETER_NAMES.index(name) for name in names]
+    known = calibration.geometry.camera.parameter_names
+    names = [name for name in known if name in calibration.estimated]
+    columns = [known.index(name) for name in names]
     before, estimate, true = (
         geometry.camera.parameters[columns] for geometry in (prior, calibration.geometry, truth)
     )
@@ -228,7 +228,7 @@ def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeomet
     # Angles are counted from the truth.
     prior_arcsec = alignment_difference_rad(prior, truth) / ARCSECOND_RAD
     error_arcsec = alignment_difference_rad(calibration.geometry, truth) / ARCSECOND_RAD
-    sigma_arcsec = sigma[10:] / ARCSECOND_RAD
+    sigma_arcsec = sigma[-3:] / ARCSECOND_RAD
     angles_off = error_arcsec / sigma_arcsec
     lines += [
         f'{"alignment " + axis:<12}{b:>+12.2f}"{e:>+12.2f}"{s:>10.2f}"{0:>12}"{o:>+6.1f} sigma'

@@ -8,7 +8,6 @@ import numpy as np
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.assessment.comparison import Comparison, DifferenceMap
-from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.cli.terminal import print_table, print_verdict
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation import temperature
@@ -21,7 +20,7 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     """Print parameters, statistics and verdict; changes are against the prior."""
     camera, sigma = calibration.geometry.camera, calibration.sigma
     rows = []
-    for k, name in enumerate(PARAMETER_NAMES):
+    for k, name in enumerate(camera.parameter_names):
         value, change = camera.parameters[k], camera.parameters[k] - prior.camera.parameters[k]
         free = name in calibration.estimated
         rows.append(
@@ -34,7 +33,7 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
             )
         )
     angles = alignment_difference_rad(calibration.geometry, prior) / ARCSECOND_RAD
-    for axis, angle, error in zip('xyz', angles, sigma[10:] / ARCSECOND_RAD, strict=True):
+    for axis, angle, error in zip('xyz', angles, sigma[-3:] / ARCSECOND_RAD, strict=True):
         rows.append(
             (f'alignment {axis}', '', f'{error:.2f}"', f'{angle:+.2f}"', _sigmas(angle, error))
         )
@@ -127,20 +126,21 @@ def _print_images(inspection: Inspection) -> None:
 
 def print_comparison(comparison: Comparison) -> None:
     """Print the differences of parameters, alignment and lines of sight."""
-    a, b = (c.geometry.camera.parameters for c in (comparison.a, comparison.b))
+    a, b = (c.geometry.camera for c in (comparison.a, comparison.b))
+    of_a = dict(zip(a.parameter_names, a.parameters, strict=True))
     difference, sigma = comparison.difference, comparison.sigma
     rows = [
         (
             name,
-            f'{a[k]:.8g}',
-            f'{b[k]:.8g}',
+            f'{of_a[name]:.8g}' if name in of_a else '',
+            f'{b.parameters[k]:.8g}',
             f'{difference[k]:+.4g}',
             f'{sigma[k]:.2g}' if sigma[k] else 'held',
             _sigmas(difference[k], sigma[k]),
         )
-        for k, name in enumerate(PARAMETER_NAMES)
+        for k, name in enumerate(b.parameter_names)
     ]
-    arcsec, sigma_arcsec = difference[10:] / ARCSECOND_RAD, sigma[10:] / ARCSECOND_RAD
+    arcsec, sigma_arcsec = difference[-3:] / ARCSECOND_RAD, sigma[-3:] / ARCSECOND_RAD
     rows += [
         (f'alignment {axis}', '', '', f'{d:+.2f}"', f'{s:.2f}"', _sigmas(d, s))
         for axis, d, s in zip('xyz', arcsec, sigma_arcsec, strict=True)

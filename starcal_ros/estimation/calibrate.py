@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.camera import ALL_PARAMETER_NAMES, parameter_names
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.covariance import shared_covariance, shared_names
@@ -46,6 +46,7 @@ from starcal_ros.estimation.variance_components import (
     estimate_star_tracker_sigma,
     estimate_variance,
 )
+from starcal_ros.lens import COEFFICIENTS
 from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Ensemble, Thermal
 
@@ -68,9 +69,10 @@ class CalibrationOptions:
         'hierarchical', 'how the attitudes of the images are treated', choices=METHODS
     )
     estimate: tuple[str, ...] = option(
-        ('fx', 'skew', 'fy', 'k1', 'k2', 'k3', 'p1', 'p2'),
-        'camera parameters that are estimated; the others are held at the prior',
-        choices=PARAMETER_NAMES,
+        ('fx', 'skew', 'fy', 'distortion'),
+        'camera parameters that are estimated; the others are held at the prior; distortion: all'
+        ' coefficients of the lens model',
+        choices=(*ALL_PARAMETER_NAMES, 'distortion'),
     )
     star_tracker_sigma_arcsec: tuple[float, ...] = option(
         (10.0, 10.0, 10.0),
@@ -95,11 +97,11 @@ class CalibrationOptions:
         high=20.0,
     )
     prior_sigma: tuple[float, ...] = option(
-        (0.0,) * 10,
-        '1-sigma of the prior of fx, skew, fy, cx, cy (px), k1, k2, k3, p1, p2; 0: of one that is'
-        ' estimated, nothing is known; of one that is held, it is taken as exact',
+        (0.0,),
+        '1-sigma of the prior of fx, skew, fy, cx, cy (px) and of the coefficients of the lens'
+        ' model, or one number for all; 0: of one that is estimated, nothing is known; of one that'
+        ' is held, it is taken as exact',
         low=0.0,
-        length=10,
     )
     variance_components: bool = option(
         True, 'estimate the sigmas of centroids and star tracker again from the residuals'
@@ -126,13 +128,14 @@ class Estimate:
     Attributes
     ----------
     geometry : CameraGeometry
-    covariance : (13, 13)
+    covariance : (p + 3, p + 3)
+        Of the p camera parameters and the alignment angles.
     information : (k, k)
         On the estimated camera parameters and focal terms, then the alignment where the method
         has one, and its rate; the rotations of the images eliminated.
     information_names : tuple of k str
     shared_covariance : (s, s)
-        Of the ten camera parameters, focal terms, alignment and its rate.
+        Of the camera parameters, focal terms, alignment and its rate.
     shared_names : tuple of s str
     problem : Problem
         The one whose minimum the state is.
@@ -186,9 +189,9 @@ class Estimate:
     thermal: Thermal | None
 
 
-def check_options(options: CalibrationOptions) -> None:
+def check_options(options: CalibrationOptions, model: str) -> None:
     """
-    Raise `OptionError` for options that do not go together.
+    Raise `OptionError` for options that do not go together, or not with a lens model.
 
     Raises
     ------
@@ -199,6 +202,27 @@ def check_options(options: CalibrationOptions) -> None:
         # Its mean of the images' alignments has no place for a slope: `hierarchical` with a loose
         # star tracker is the same estimate with one.
         raise OptionError('alignment_temperature: the method per_image has no common alignment')
+    names = parameter_names(model)
+    for name in estimated_parameters(options, model):
+        if name not in names:
+            raise OptionError(
+                f'estimate: {name} is not a parameter of the lens model {model}, which has '
+                + ', '.join(names)
+            )
+    if len(options.prior_sigma) not in (1, len(names)):
+        raise OptionError(
+            f'prior_sigma: {len(options.prior_sigma)} numbers, but the lens model {model} has '
+            f'{len(names)} parameters: {", ".join(names)}'
+        )
+
+
+def estimated_parameters(options: CalibrationOptions, model: str) -> tuple[str, ...]:
+    """Names of the camera parameters that ``estimate`` asks for, of a lens model."""
+    return tuple(
+        name
+        for asked in options.estimate
+        for name in (COEFFICIENTS[model] if asked == 'distortion' else (asked,))
+    )
 
 
 def check_enough(ensemble: Ensemble, options: CalibrationOptions) -> None:
@@ -244,7 +268,7 @@ def estimate_calibration(
     OptionError
         For options that do not go together.
     """
-    check_options(options)
+    check_options(options, prior.camera.model)
     check_enough(ensemble, options)
     table = star_table(ensemble.images)
     problem = problem_of(ensemble, prior, options)
@@ -263,7 +287,7 @@ def estimate_calibration(
             why = 'within chance'
         except (NotObservable, np.linalg.LinAlgError) as error:
             if not (order or with_rate):
-                names = ', '.join(options.estimate)
+                names = ', '.join(estimated_parameters(options, problem.model))
                 raise TooFewObservations(
                     f'the stars do not determine all of {names} and the alignment: {error}; '
                     'more images, or stars over more of the detector, or fewer parameters are '
@@ -286,10 +310,13 @@ def estimate_calibration(
 
 def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Problem:
     """What a search is given of an ensemble."""
-    prior_sigma = np.array(options.prior_sigma)
+    model, names = prior.camera.model, prior.camera.parameter_names
+    prior_sigma = np.broadcast_to(options.prior_sigma, len(names))
+    free = {names.index(name) for name in estimated_parameters(options, model)}
     return Problem(
         method=options.method,
-        free=np.sort(np.array([PARAMETER_NAMES.index(n) for n in options.estimate], np.int64)),
+        model=model,
+        free=np.array(sorted(free), np.int64),
         prior_parameters=prior.camera.parameters,
         prior_sigma=np.where(prior_sigma > 0, prior_sigma, np.inf),
         star_tracker_from_icrf=Rotation.from_quat(
@@ -413,12 +440,13 @@ def _estimate(
         problem, dataclasses.replace(state, camera_from_star_tracker=alignment), blocks
     )
     information = reduced_information(problem, state, blocks)
-    shared = np.concatenate([problem.free, np.arange(10, len(information))])
-    k = 10 + len(state.focal)
-    at_reference = np.r_[0:10, k : k + 3]
+    p = problem.camera_count
+    shared = np.concatenate([problem.free, np.arange(p, len(information))])
+    k = p + len(state.focal)
+    at_reference = np.r_[0:p, k : k + 3]
     thermal = _thermal(state, full, options)
     weakest = weakest_term(thermal, full[k + 3 :, k + 3 :]) if thermal else ''
-    names = shared_names(len(state.focal), len(state.rate) > 0)
+    names = shared_names(problem.model, len(state.focal), len(state.rate) > 0)
     estimate = Estimate(
         geometry=geometry,
         covariance=full[np.ix_(at_reference, at_reference)],
@@ -451,12 +479,13 @@ def _thermal(state: State, full: Floats, options: CalibrationOptions) -> Thermal
     """Terms of temperature of a state; None where none was asked for."""
     if not (options.focal_temperature_order or options.alignment_temperature):
         return None
-    k = 10 + len(state.focal)
+    p = len(state.parameters)
+    k = p + len(state.focal)
     sigma = np.sqrt(np.diag(full))
     return Thermal(
         reference_degc=options.reference_temperature_degc,
         focal_per_degc=tuple(state.focal.tolist()),
-        focal_sigma=tuple(sigma[10:k].tolist()),
+        focal_sigma=tuple(sigma[p:k].tolist()),
         alignment_rate_rad_per_degc=tuple(state.rate.tolist()),
         alignment_rate_sigma=tuple(sigma[k + 3 :].tolist()),
     )
@@ -563,9 +592,8 @@ def _dropped(table: StarTable, kept: Mask) -> NDArray[np.int64]:
 
 
 def _residuals(problem: Problem, state: State, table: StarTable) -> Floats:
-    return residuals_px(
-        table, image_parameters(problem, state), state.camera_from_icrf.as_matrix()
-    )
+    rotations = state.camera_from_icrf.as_matrix()
+    return residuals_px(table, problem.model, image_parameters(problem, state), rotations)
 
 
 def _freedom(
@@ -616,7 +644,7 @@ def _result(
     if not (focal_px > 0).all():
         raise NotObservable(f'fx, fy of {focal_px.round(1).tolist()} px are of a mirrored image')
     camera = prior.camera.replace(
-        **{PARAMETER_NAMES[i]: float(state.parameters[i]) for i in problem.free}
+        **{problem.parameter_names[i]: float(state.parameters[i]) for i in problem.free}
     )
     quaternion = alignment.inv().as_quat()
     # One of the two quaternions of a rotation, so that equal calibrations are equal numbers.

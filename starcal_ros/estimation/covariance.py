@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.camera import parameter_names
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.problem import by_shared, Problem, reduced_information, State
 from starcal_ros.records import ALIGNMENT_NAMES
@@ -20,10 +20,10 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-def shared_names(focal_terms: int, with_rate: bool) -> tuple[str, ...]:
-    """Names of the ten camera parameters, the focal terms, the alignment angles and their rate."""
+def shared_names(model: str, focal_terms: int, with_rate: bool) -> tuple[str, ...]:
+    """Names of camera parameters, focal terms, alignment angles and their rate."""
     return (
-        *PARAMETER_NAMES,
+        *parameter_names(model),
         *(f'focal_temperature_{i}' for i in range(1, focal_terms + 1)),
         *ALIGNMENT_NAMES,
         *(f'{name}_temperature' for name in ALIGNMENT_NAMES if with_rate),
@@ -38,7 +38,7 @@ def shared_covariance(
 
     Parameters
     ----------
-    blocks : (m, 14, 14)
+    blocks : (m, p + 4, p + 4)
         Of `problem.image_blocks`.
     good : (m,) bool
         Images whose attitudes count in the mean of ``per_image``; the other methods do not ask.
@@ -67,9 +67,9 @@ def considered_covariance(problem: Problem, information: Floats) -> Floats:
     A held parameter with a prior sigma is considered: its uncertainty is its own, and what it does
     to the estimated ones is added to theirs; one without stays at zero.
     """
-    p = len(information)
-    estimated = np.concatenate([problem.free, np.arange(10, p)])
-    held = np.setdiff1d(np.arange(10), problem.free)
+    p, camera = len(information), problem.camera_count
+    estimated = np.concatenate([problem.free, np.arange(camera, p)])
+    held = np.setdiff1d(np.arange(camera), problem.free)
     held_variance = np.where(
         np.isfinite(problem.prior_sigma[held]), problem.prior_sigma[held], 0.0
     )

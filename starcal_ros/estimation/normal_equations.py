@@ -1,10 +1,11 @@
 """
 Residuals of star observations and their normal matrices, image by image (Eqs. 15, 27-37).
 
-For every image the residual and its derivatives by the ten camera parameters and by the small
-rotation of that image are whitened by each star's covariance and multiplied into one (14, 14)
-matrix: ``[J_camera J_rotation r]' [J_camera J_rotation r]``.  Every method of calibration is
-assembled from those matrices, so the dense Jacobian of the ensemble is never formed.
+For every image the residual and its derivatives by the p camera parameters and by the small
+rotation of that image are whitened by each star's covariance and multiplied into one square
+matrix of p + 4 rows: ``[J_camera J_rotation r]' [J_camera J_rotation r]``.  Every method of
+calibration is assembled from those matrices, so the dense Jacobian of the ensemble is never
+formed.
 """
 
 from __future__ import annotations
@@ -15,14 +16,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.camera import project_parameters
+from starcal_ros.camera import ALL_PARAMETER_NAMES, project_parameters
+from starcal_ros.lens import (
+    coefficient_jacobian,
+    distort,
+    distort_jacobian,
+    ideal_by_rotation,
+    ideal_points,
+)
 from starcal_ros.records import StarObservations
 
 Floats = NDArray[np.float64]
 
-CAMERA = slice(0, 10)
-ROTATION = slice(10, 13)
-RESIDUAL = 13
+# Rows and columns of the matrix of an image; the camera's are as many as the model has parameters.
+CAMERA = slice(0, -4)
+ROTATION = slice(-4, -1)
+RESIDUAL = -1
 _CHUNK_STARS = 8192  # measured: calls into numpy cost more below, the cache more above
 
 
@@ -132,21 +141,26 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
         )
         first = last
     largest = max((chunk.measured_px[0].size for chunk in chunks), default=0)
-    return Measurements(tuple(chunks), table.image_count, np.empty(30 * largest))
+    # For the largest lens model; pages that a smaller one does not touch cost nothing.
+    columns = len(ALL_PARAMETER_NAMES) + 5
+    return Measurements(tuple(chunks), table.image_count, np.empty(2 * columns * largest))
 
 
 def normal_blocks(
     measurements: Measurements,
+    model: str,
     parameters: Floats,
     camera_from_icrf: Floats,
     loss_scale: float = np.inf,
 ) -> tuple[float, Floats]:
     """
-    Cost and the (14, 14) normal matrix of every image.
+    Cost and the normal matrix of every image.
 
     Parameters
     ----------
-    parameters : (10,) or (m, 10)
+    model : str
+        Lens model, of `lens.COEFFICIENTS`.
+    parameters : (p,) or (m, p)
         Camera parameters of all images, or of each.
     camera_from_icrf : (m, 3, 3)
         Rotation of each image.
@@ -158,47 +172,88 @@ def normal_blocks(
     -------
     cost : float
         Half the sum of the loss; infinite where a star would lie behind the camera.
-    blocks : (m, 14, 14)
-        Rows and columns: ten camera parameters, three angles, residual (measured - predicted).
-        ``blocks[:, :13, 13]`` is downhill.
+    blocks : (m, p + 4, p + 4)
+        Rows and columns: camera parameters, three angles, residual (measured - predicted).
+        ``blocks[:, :-1, -1]`` is downhill.
     """
-    blocks = np.zeros((measurements.image_count, 14, 14))
+    rows = parameters.shape[-1] + 4
+    whitened_columns = _plumb_bob_columns if model == 'plumb_bob' else _lens_columns
+    blocks = np.zeros((measurements.image_count, rows, rows))
     cost = 0.0
     for chunk in measurements.chunks:
         m, _, n = chunk.direction_icrf.shape
-        J = measurements.derivatives[: 30 * m * n].reshape(2, 15, m * n)
+        size = 2 * (rows + 1) * m * n
+        J = measurements.derivatives[:size].reshape(2, rows + 1, m * n)
         own = parameters
         if parameters.ndim > 1:
             own = np.repeat(parameters[chunk.image], n, axis=0).T
-        if not _whitened_columns(chunk, own, camera_from_icrf[chunk.image], J):
+        if not whitened_columns(chunk, model, own, camera_from_icrf[chunk.image], J):
             return np.inf, blocks
         if np.isfinite(loss_scale):
-            s = J[0, RESIDUAL] ** 2 + J[1, RESIDUAL] ** 2
+            s = J[0, rows - 1] ** 2 + J[1, rows - 1] ** 2
             c2 = loss_scale**2
             cost += 0.5 * c2 * float(np.log1p(s / c2).sum())
-            J[:, :14] *= 1.0 / np.sqrt(1.0 + s / c2)
+            J[:, :rows] *= 1.0 / np.sqrt(1.0 + s / c2)
         # numpy takes A @ A.T to a routine for symmetric products, which for 14 rows is half as
         # fast as the general one: with a row more it does not see that both factors are the same.
-        by_image = J.reshape(2, 15, m, n).transpose(0, 2, 1, 3)
-        product = by_image[:, :, :14] @ by_image.transpose(0, 1, 3, 2)
-        blocks[chunk.image] = (product[0] + product[1])[..., :14]
+        by_image = J.reshape(2, rows + 1, m, n).transpose(0, 2, 1, 3)
+        product = by_image[:, :, :rows] @ by_image.transpose(0, 1, 3, 2)
+        blocks[chunk.image] = (product[0] + product[1])[..., :rows]
     if not np.isfinite(loss_scale):
         cost = 0.5 * float(blocks[:, RESIDUAL, RESIDUAL].sum())
     return cost, blocks
 
 
-def _whitened_columns(
-    chunk: _Chunk, parameters: Floats, camera_from_icrf: Floats, J: Floats
+def _lens_columns(
+    chunk: _Chunk, model: str, parameters: Floats, camera_from_icrf: Floats, J: Floats
 ) -> bool:
     """
-    Write the whitened derivatives and residuals of a chunk into J, (2, 15, m n); the last is zero.
+    Write the whitened derivatives and residuals of a chunk into J, (2, p + 5, m n).
 
-    The first axis is the u and the v rows.  False when a star is behind the camera.
-    ``parameters`` is (10,) or (10, m n).
+    The first axis is the u and the v rows; the last of the second is zero.  False when the camera
+    model has no image of a star.  ``parameters`` is (p,) or (p, m n).
+    """
+    m, _, n = chunk.direction_icrf.shape
+    e = (camera_from_icrf @ chunk.direction_icrf).transpose(0, 2, 1).reshape(m * n, 3)
+    ideal = ideal_points(model, e)
+    fx, skew, fy, cx, cy = parameters[:5]
+    coefficients = parameters[5:]
+    xd, yd = distort(model, ideal, coefficients).T
+    if not np.isfinite(xd).all():
+        return False
+    p = len(parameters)
+    wuu, wuv, wvv = chunk.whitener
+    # Whitened rows by the distorted image plane: u = uu x' + uv y', v = vv y'.
+    uu, uv, vv = wuu * fx, wuu * skew + wuv * fy, wvv * fy
+    J[...] = 0.0
+    J[0, 0], J[0, 1], J[0, 2], J[0, 3], J[0, 4] = wuu * xd, wuu * yd, wuv * yd, wuu, wuv
+    J[1, 2], J[1, 4] = wvv * yd, wvv
+    by_x, by_y = coefficient_jacobian(model, ideal, coefficients)
+    J[0, 5:p] = uu * by_x + uv * by_y
+    J[1, 5:p] = vv * by_y
+    J_ideal = distort_jacobian(model, ideal, coefficients)
+    x_theta, y_theta = ideal_by_rotation(model, ideal)
+    by_x, by_y = ((J_ideal[:, k, :1] * x_theta + J_ideal[:, k, 1:] * y_theta).T for k in (0, 1))
+    J[0, p : p + 3] = uu * by_x + uv * by_y
+    J[1, p : p + 3] = vv * by_y
+    u, v = chunk.measured_px
+    residual_u = u - cx - fx * xd - skew * yd
+    residual_v = v - cy - fy * yd
+    J[0, p + 3] = wuu * residual_u + wuv * residual_v
+    J[1, p + 3] = wvv * residual_v
+    return True
+
+
+def _plumb_bob_columns(
+    chunk: _Chunk, model: str, parameters: Floats, camera_from_icrf: Floats, J: Floats
+) -> bool:
+    """
+    Write the same as `_lens_columns` for ``plumb_bob``, in half the time.
 
     The columns are those of `camera.project_jacobians`, whitened as they are made and in place:
     most of the time of a calibration is spent here, in memory traffic.
     """
+    del model
     m, _, n = chunk.direction_icrf.shape
     e = np.empty((3, m, n))
     np.matmul(camera_from_icrf, chunk.direction_icrf, out=e.transpose(1, 0, 2))
@@ -260,14 +315,16 @@ def _whitened_columns(
     u, v = chunk.measured_px
     residual_u = u - cx - fx * xd - skew * yd
     residual_v = v - cy - fy * yd
-    U[RESIDUAL] = wuu * residual_u + wuv * residual_v
-    multiply(wvv, residual_v, out=V[RESIDUAL])
+    U[13] = wuu * residual_u + wuv * residual_v
+    multiply(wvv, residual_v, out=V[13])
     J[:, 14] = 0.0
     return True
 
 
-def residuals_px(table: StarTable, parameters: Floats, camera_from_icrf: Floats) -> Floats:
-    """Measured minus predicted pixels (n, 2) of every star; parameters (10,) or (m, 10)."""
+def residuals_px(
+    table: StarTable, model: str, parameters: Floats, camera_from_icrf: Floats
+) -> Floats:
+    """Measured minus predicted pixels (n, 2) of every star; parameters (p,) or (m, p)."""
     residual_px = table.measured_px.copy()
     # In parts: a rotation for each of all stars would be most of the memory of a calibration.
     for first in range(0, len(table), _CHUNK_STARS):
@@ -277,7 +334,7 @@ def residuals_px(table: StarTable, parameters: Floats, camera_from_icrf: Floats)
             'nij,nj->ni', camera_from_icrf[image], table.direction_icrf[part]
         )
         own = parameters if parameters.ndim == 1 else parameters[image].T
-        residual_px[part] -= project_parameters(own, direction_camera)
+        residual_px[part] -= project_parameters(model, own, direction_camera)
     return residual_px
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.camera import parameter_names
 from starcal_ros.estimation.levenberg_marquardt import (
     levenberg_marquardt,
     NormalEquations,
@@ -39,7 +40,7 @@ METHODS = ('hierarchical', 'per_image', 'single')
 class State:
     """Where the search stands: camera parameters, alignment and the rotation of every image."""
 
-    parameters: Floats  # (10,)
+    parameters: Floats  # (p,)
     camera_from_star_tracker: Rotation
     camera_from_icrf: Rotation  # (m,)
     focal: Floats = field(default_factory=lambda: np.empty(0))  # (q,) terms of temperature
@@ -54,9 +55,11 @@ class Problem:
     Attributes
     ----------
     method : str
+    model : str
+        Lens model, of `lens.COEFFICIENTS`; it has p camera parameters.
     free : (f,) int
         Camera parameters that are estimated, ascending.
-    prior_parameters, prior_sigma : (10,)
+    prior_parameters, prior_sigma : (p,)
         Gaussian prior of the camera parameters; infinite sigma: none.
     star_tracker_from_icrf : Rotation (m,)
         As measured.
@@ -67,12 +70,23 @@ class Problem:
     """
 
     method: str
+    model: str
     free: NDArray[np.int64]
     prior_parameters: Floats
     prior_sigma: Floats
     star_tracker_from_icrf: Rotation
     star_tracker_sigma_rad: Floats
     above_reference_k: Floats = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the p camera parameters."""
+        return parameter_names(self.model)
+
+    @property
+    def camera_count(self) -> int:
+        """Number p of the camera parameters."""
+        return len(self.prior_parameters)
 
 
 def minimise(
@@ -100,7 +114,7 @@ def minimise(
 
 
 def image_parameters(problem: Problem, state: State) -> Floats:
-    """Camera parameters: (10,) of all images, or (m, 10) where temperature changes them."""
+    """Camera parameters: (p,) of all images, or (m, p) where temperature changes them."""
     if len(state.focal) == 0:
         return state.parameters
     return parameters_at(state.parameters, state.focal, problem.above_reference_k)
@@ -116,9 +130,10 @@ def image_alignment(problem: Problem, state: State) -> Rotation:
 def image_blocks(
     problem: Problem, state: State, measurements: Measurements, loss_scale: float = np.inf
 ) -> tuple[float, Floats]:
-    """Cost and the (m, 14, 14) matrices of `normal_equations.normal_blocks` at a state."""
+    """Cost and the matrices of `normal_equations.normal_blocks` at a state."""
     return normal_blocks(
         measurements,
+        problem.model,
         image_parameters(problem, state),
         state.camera_from_icrf.as_matrix(),
         loss_scale,
@@ -127,31 +142,29 @@ def image_blocks(
 
 def by_shared(problem: Problem, state: State, blocks: Floats) -> Floats:
     """
-    Matrices (m, 14 + q, 14 + q) by the camera parameters and q focal terms, angles and residual.
+    Matrices (m, p + q + 4, p + q + 4) by camera parameters, focal terms, angles and residual.
 
     From those by the parameters of the image; the same where no focal term is estimated.
     """
     q = len(state.focal)
     if q == 0:
         return blocks
-    E = np.zeros((len(blocks), 14, 14 + q))
-    E[:, :10, : 10 + q] = parameters_chain(
-        state.parameters, state.focal, problem.above_reference_k
-    )
-    E[:, 10:, 10 + q :] = np.eye(4)
+    p = problem.camera_count
+    E = np.zeros((len(blocks), p + 4, p + 4 + q))
+    E[:, :p, : p + q] = parameters_chain(state.parameters, state.focal, problem.above_reference_k)
+    E[:, p:, p + q :] = np.eye(4)
     return np.asarray(E.transpose(0, 2, 1) @ blocks @ E)
 
 
 def assemble(problem: Problem, state: State, cost: float, blocks: Floats) -> NormalEquations:
     """
-    Normal equations of a method from the cost and the (m, 14, 14) matrices of the images.
+    Normal equations of a method from the cost and the matrices of the images.
 
     Shared unknowns: the free camera parameters, the focal terms, then the alignment angles where
     the method has one alignment, and their rate; a block is the rotation of an image.
     """
     normal = _with_all_parameters(problem, state, cost, blocks)
-    f = len(normal.a) - 10
-    keep = np.concatenate([problem.free, np.arange(10, 10 + f)])
+    keep = np.concatenate([problem.free, np.arange(problem.camera_count, len(normal.a))])
     return NormalEquations(
         normal.cost,
         normal.A[np.ix_(keep, keep)],
@@ -165,9 +178,9 @@ def assemble(problem: Problem, state: State, cost: float, blocks: Floats) -> Nor
 def _with_all_parameters(
     problem: Problem, state: State, cost: float, blocks: Floats
 ) -> NormalEquations:
-    """Normal equations as if all ten camera parameters were free; priors on those that are."""
+    """Normal equations as if all camera parameters were free; priors on those that are."""
     has_alignment = problem.method != 'per_image'
-    k = 10 + len(state.focal)
+    k = problem.camera_count + len(state.focal)
     p = k + (3 + len(state.rate) if has_alignment else 0)
     A, a = np.zeros((p, p)), np.zeros(p)
     B: Floats = np.zeros((0, 3, p))
@@ -196,15 +209,16 @@ def _with_all_parameters(
         B[:, :, k:] = -to_shared
         C, c = C + information, c - gradient
     C = _pulled(C)
-    off = np.zeros(10)
+    of_camera = np.arange(problem.camera_count)
+    off = np.zeros(len(of_camera))
     off[problem.free] = ((problem.prior_parameters - state.parameters) / problem.prior_sigma)[
         problem.free
     ]
-    weight = np.zeros(10)
+    weight = np.zeros(len(of_camera))
     weight[problem.free] = 1.0 / problem.prior_sigma[problem.free] ** 2
     cost += 0.5 * float(off @ off)
-    A[np.arange(10), np.arange(10)] += weight
-    a[:10] += off / problem.prior_sigma
+    A[of_camera, of_camera] += weight
+    a[of_camera] += off / problem.prior_sigma
     return NormalEquations(cost, A, a, B, C, c)
 
 
@@ -224,7 +238,7 @@ def _by_alignment(problem: Problem, state: State, blocks: Floats) -> Floats:
     """Matrices of `by_shared` with alignment angles and rate in place of the image's rotation."""
     if len(state.rate) == 0:
         return blocks
-    k = 10 + len(state.focal)
+    k = problem.camera_count + len(state.focal)
     E = np.zeros((len(blocks), k + 4, k + 7))
     E[:, :k, :k], E[:, -1, -1] = np.eye(k), 1.0
     E[:, k:-1, k:-1] = _turn_chain(problem, state)
@@ -233,21 +247,22 @@ def _by_alignment(problem: Problem, state: State, blocks: Floats) -> Floats:
 
 def reduced_information(problem: Problem, state: State, blocks: Floats) -> Floats:
     """
-    Information (p, p) on all ten camera parameters, and the other unknowns that are shared.
+    Information (s, s) on all camera parameters, and the other unknowns that are shared.
 
     Those are focal terms, and alignment with its rate where the method has one; the rotations of
     the images are eliminated.
     """
-    of_prior = np.zeros(10)
+    of_camera = np.arange(problem.camera_count)
+    of_prior = np.zeros(len(of_camera))
     of_prior[problem.free] = 1.0 / problem.prior_sigma[problem.free] ** 2
     total = information_of_images(problem, state, blocks).sum(axis=0)
-    total[np.arange(10), np.arange(10)] += of_prior
+    total[of_camera, of_camera] += of_prior
     return np.asarray(total)
 
 
 def information_of_images(problem: Problem, state: State, blocks: Floats) -> Floats:
-    """Information (m, p, p) of each image, without the prior: see `reduced_information`."""
-    k = 10 + len(state.focal)
+    """Information (m, s, s) of each image, without the prior: see `reduced_information`."""
+    k = problem.camera_count + len(state.focal)
     blocks = by_shared(problem, state, blocks)
     if problem.method == 'single':
         p = k + 3 + len(state.rate)

@@ -32,19 +32,19 @@ def focal_factor(focal: Floats, above_reference_k: Floats) -> Floats:
 
 
 def parameters_at(parameters: Floats, focal: Floats, above_reference_k: Floats) -> Floats:
-    """Camera parameters (m, 10) at temperatures (m,) above the reference."""
+    """Camera parameters (m, p) at temperatures (m,) above the reference."""
     result = np.tile(parameters, (len(above_reference_k), 1))
     result[:, _SCALED] *= focal_factor(focal, above_reference_k)[:, None]
     return result
 
 
 def parameters_chain(parameters: Floats, focal: Floats, above_reference_k: Floats) -> Floats:
-    """Derivatives (m, 10, 10 + q) of `parameters_at` by the parameters, then the q focal terms."""
-    q = len(focal)
-    chain = np.tile(np.eye(10, 10 + q), (len(above_reference_k), 1, 1))
+    """Derivatives (m, p, p + q) of `parameters_at` by the parameters, then the q focal terms."""
+    p, q = len(parameters), len(focal)
+    chain = np.tile(np.eye(p, p + q), (len(above_reference_k), 1, 1))
     chain[:, _SCALED, _SCALED] *= focal_factor(focal, above_reference_k)[:, None, None]
     powers = _powers(above_reference_k, q)
-    chain[:, _SCALED, 10:] = parameters[_SCALED][None, :, None] * powers[:, None, :]
+    chain[:, _SCALED, p:] = parameters[_SCALED][None, :, None] * powers[:, None, :]
     return chain
 
 

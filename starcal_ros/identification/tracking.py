@@ -265,15 +265,15 @@ def _corrected_camera(
 ) -> tuple[CameraModel, Rotation]:
     """Camera and turn that fit the stars of one image, held near what the camera was."""
     before = camera.parameters
-    sigma = _CAMERA_SIGMA * np.r_[np.full(5, before[0]), np.ones(5)]
-    held = np.r_[np.ones(10), np.zeros(3)]
+    sigma = _CAMERA_SIGMA * np.r_[np.full(5, before[0]), np.ones(len(before) - 5)]
+    held = np.r_[np.ones(len(before)), np.zeros(3)]
     for _ in range(3):
         pixels, J_parameters, J_rotation = project_jacobians(camera, turn.apply(directions))
         J = np.concatenate([J_parameters * sigma, J_rotation], axis=-1)
         pull = np.r_[(before - camera.parameters) / sigma, np.zeros(3)]
         step = _step(J, measured_px - pixels, weight, held, pull)
-        camera = dataclasses.replace(camera, parameters=camera.parameters + sigma * step[:10])
-        turn = Rotation.from_rotvec(-step[10:]) * turn
+        camera = dataclasses.replace(camera, parameters=camera.parameters + sigma * step[:-3])
+        turn = Rotation.from_rotvec(-step[-3:]) * turn
     return camera, turn
 
 

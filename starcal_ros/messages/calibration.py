@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from starcal_ros.camera import CameraModel, zero_skew_fit
+from starcal_ros.camera import CameraModel, model_of, ros_fit
+from starcal_ros.lens import ros_distortion
 from starcal_ros.messages.fields import (
     counts_of_reasons,
     flat_array,
@@ -26,8 +27,8 @@ from starcal_ros.messages.types import (
     Message,
 )
 from starcal_ros.records import (
+    ALIGNMENT_NAMES,
     Calibration,
-    CALIBRATION_PARAMETER_NAMES,
     CameraGeometry,
     Correlation,
     DetectorMaps,
@@ -66,7 +67,7 @@ def calibration_to_message(calibration: Calibration, make: Make) -> Message:
         distortion=flat_array(camera.distortion, np.float64),
         parent_frame=calibration.parent_frame,
         alignment=quaternion_to_message(calibration.geometry.star_tracker_from_camera_xyzw, make),
-        parameter_names=list(CALIBRATION_PARAMETER_NAMES),
+        parameter_names=list(calibration.parameter_names),
         covariance=flat_array(calibration.covariance, np.float64),
         method=calibration.method,
         estimated=list(calibration.estimated),
@@ -107,11 +108,12 @@ def calibration_from_message(message: Message) -> Calibration:
         When the message does not hold a camera: an empty one, say.
     """
     names = tuple(str(name) for name in message.parameter_names)
-    if names != CALIBRATION_PARAMETER_NAMES:
-        raise ValueError(f'parameter_names: {", ".join(names) or "none"} are not the thirteen')
+    if names[-3:] != ALIGNMENT_NAMES:
+        raise ValueError(f'parameter_names: {", ".join(names) or "none"} do not end in alignment')
+    model = model_of(names[:-3])
     intrinsics = [message.fx, message.skew, message.fy, message.cx, message.cy]
     camera = CameraModel(
-        int(message.width), int(message.height), np.r_[intrinsics, message.distortion]
+        int(message.width), int(message.height), np.r_[intrinsics, message.distortion], model
     )
     alignment = quaternion_from_message(message.alignment)
     if not abs(np.linalg.norm(alignment) - 1.0) < 1e-6:  # what rounding to a text could leave
@@ -341,20 +343,20 @@ def _thermal_from_message(message: Message) -> Thermal | None:
 
 def camera_info_to_message(calibration: Calibration, make: Make) -> Message:
     """
-    Return a sensor_msgs/CameraInfo: the best camera without skew, as ``plumb_bob``.
+    Return a sensor_msgs/CameraInfo: the best camera without skew.
 
     Skew does not fit: readers of camera_info take K[0,1] as 0 without a word.
     """
-    camera, _ = zero_skew_fit(calibration.geometry.camera)
+    camera, _ = ros_fit(calibration.geometry.camera)
     fx, _, fy, cx, cy = camera.intrinsics
-    k1, k2, k3, p1, p2 = camera.distortion
+    distortion_model, D = ros_distortion(camera.model, camera.distortion)
     return make(
         CAMERA_INFO_TYPE,
         header=make_header(calibration.time_ns, calibration.child_frame, make),
         height=camera.height,
         width=camera.width,
-        distortion_model='plumb_bob',
-        d=np.array([k1, k2, p1, p2, k3]),
+        distortion_model=distortion_model,
+        d=D,
         k=np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
         r=np.eye(3).ravel(),
         p=np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),

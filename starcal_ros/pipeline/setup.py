@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
+import math
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -12,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.assessment.gate import GateOptions
+from starcal_ros.assessment.gate import check_gate_options, GateOptions
+from starcal_ros.camera import convert
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import CalibrationOptions, check_options
 from starcal_ros.identification.star_finder import IdentificationOptions
@@ -24,6 +26,7 @@ from starcal_ros.image.hot_pixels import (
     HotPixels,
     NO_HOT_PIXELS,
 )
+from starcal_ros.lens import COEFFICIENTS
 from starcal_ros.options import (
     from_mapping,
     holds_options,
@@ -45,6 +48,12 @@ class SetupOptions:
 
     camera_info_url: str = option(
         '', 'prior camera: a ROS camera YAML, file:// or package:// URL or a path'
+    )
+    lens_model: str = option(
+        'prior',
+        'lens model that is estimated; prior: that of the prior camera, else the prior camera is'
+        ' converted to it',
+        choices=('prior', *COEFFICIENTS),
     )
     prior_alignment: tuple[float, ...] = option(
         (0.0, 0.0, 0.0, 1.0),
@@ -116,7 +125,9 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
     prior = _prior(frames)
     identification = from_mapping(IdentificationOptions, values)
     calibration = from_mapping(CalibrationOptions, values)
-    check_options(calibration)
+    check_options(calibration, prior.camera.model)
+    gate = from_mapping(GateOptions, values)
+    check_gate_options(gate, prior.camera)
     fixed_pattern = from_mapping(FixedPatternOptions, values)
     path = Path(frames.catalog) if frames.catalog else None
     dark = _read_dark(frames.dark_frame, prior.camera.width, prior.camera.height)
@@ -129,7 +140,7 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
         centroid=from_mapping(CentroidOptions, values),
         identification=identification,
         calibration=calibration,
-        gate=from_mapping(GateOptions, values),
+        gate=gate,
         prior=prior,
         catalog=load_catalog(path, identification.magnitude_limit),
         dark=dark,
@@ -142,6 +153,13 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
     if not frames.camera_info_url:
         raise OptionError('camera_info_url: the prior camera must be given')
     camera = read_camera_info(frames.camera_info_url)
+    if frames.lens_model not in ('prior', camera.model):
+        camera, worst_px = convert(camera, frames.lens_model)
+        if not math.isfinite(worst_px):
+            raise OptionError(
+                f'lens_model: {frames.lens_model} cannot see all of the field of the prior camera,'
+                f' {frames.camera_info_url}'
+            )
     quaternion = np.array(frames.prior_alignment)
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1.0) > 1e-3:

@@ -20,9 +20,14 @@ from starcal_ros.assessment.observability import (
 from starcal_ros.assessment.observability import ensemble_status as _ensemble_status
 from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.assessment.term_removal import removal_study
-from starcal_ros.camera import zero_skew_fit
+from starcal_ros.camera import ros_fit
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate, estimate_calibration
+from starcal_ros.estimation.calibrate import (
+    CalibrationOptions,
+    Estimate,
+    estimate_calibration,
+    estimated_parameters,
+)
 from starcal_ros.options import check_value
 from starcal_ros.pipeline.provenance import provenance_of
 from starcal_ros.pipeline.setup import Setup
@@ -139,7 +144,7 @@ def _not_judged(
         geometry=result.geometry,
         covariance=result.covariance,
         method=setup.calibration.method,
-        estimated=setup.calibration.estimate,
+        estimated=estimated_parameters(setup.calibration, camera.model),
         residual_rms_px=float(np.sqrt(np.mean(result.residual_px[kept] ** 2))),
         variance_factor=result.variance_factor,
         images_used=len(stamps_ns),
@@ -156,7 +161,7 @@ def _not_judged(
         misfit_images_ns=tuple(np.array(stamps_ns)[result.misfit_image].tolist()),
         singular_values=tuple(float(value) for value in singular_values),
         weakest_direction=weakest,
-        zero_skew_cost_px=zero_skew_fit(camera)[1],
+        zero_skew_cost_px=ros_fit(camera)[1],
         iterations=result.iterations,
         termination=result.termination,
         accepted=False,

@@ -17,7 +17,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.camera import CameraModel, DISTORTION_NAMES, INTRINSIC_NAMES
+from starcal_ros.camera import CameraModel, INTRINSIC_NAMES, model_of
 from starcal_ros.errors import ProductError
 from starcal_ros.products.fields import (
     anything,
@@ -36,8 +36,8 @@ from starcal_ros.products.fields import (
 )
 from starcal_ros.products.files import read_text, write_atomically
 from starcal_ros.records import (
+    ALIGNMENT_NAMES,
     Calibration,
-    CALIBRATION_PARAMETER_NAMES,
     CameraGeometry,
     Correlation,
     DetectorMaps,
@@ -126,7 +126,7 @@ def prior_of(calibration: Calibration) -> CameraGeometry | None:
         numbers = np.array(json.loads(calibration.provenance['prior']), np.float64)
         camera = calibration.geometry.camera
         return CameraGeometry(
-            CameraModel(camera.width, camera.height, numbers[:10]), numbers[10:14]
+            CameraModel(camera.width, camera.height, numbers[:-4], camera.model), numbers[-4:]
         )
     except (KeyError, ValueError, TypeError):
         return None
@@ -140,15 +140,15 @@ def calibration_content(calibration: Calibration) -> dict[str, object]:
     return {
         'schema': SCHEMA,
         'intrinsics': dict(zip(INTRINSIC_NAMES, intrinsics, strict=True)),
-        'distortion': dict(zip(DISTORTION_NAMES, distortion, strict=True)),
+        'distortion': dict(zip(camera.parameter_names[5:], distortion, strict=True)),
         'alignment': {
             'parent': calibration.parent_frame,
             'child': calibration.child_frame,
             'quaternion_xyzw': _json_row(geometry.star_tracker_from_camera_xyzw),
         },
-        'parameter_names': list(CALIBRATION_PARAMETER_NAMES),
+        'parameter_names': list(calibration.parameter_names),
         'covariance': covariance,
-        'alignment_covariance_rad2': [row[10:] for row in covariance[10:]],
+        'alignment_covariance_rad2': [row[-3:] for row in covariance[-3:]],
         'method': calibration.method,
         'estimated': list(calibration.estimated),
         'residual_rms_px': _json_number(calibration.residual_rms_px),
@@ -251,22 +251,25 @@ def _thermal_content(thermal: Thermal | None) -> dict[str, object] | None:
 def _calibration_from(reader: CheckedValues) -> Calibration:
     """The record of a JSON object; `alignment_covariance_rad2` repeats a block and is not read."""
     names = reader.get('parameter_names', strings)
-    if names != CALIBRATION_PARAMETER_NAMES:
-        expected = ', '.join(CALIBRATION_PARAMETER_NAMES)
-        raise ProductError(f'{reader.path}: parameter_names are not {expected}')
+    if names[-3:] != ALIGNMENT_NAMES:
+        expected = ', '.join(ALIGNMENT_NAMES)
+        raise ProductError(f'{reader.path}: parameter_names do not end in {expected}')
+    model = model_of(names[:-3])
     parameters = [
         *(reader.get(f'intrinsics.{name}', finite_number) for name in INTRINSIC_NAMES),
-        *(reader.get(f'distortion.{name}', finite_number) for name in DISTORTION_NAMES),
+        *(reader.get(f'distortion.{name}', finite_number) for name in names[5:-3]),
     ]
     width, height = (reader.get(f'image.{side}', whole_number) for side in ('width', 'height'))
-    count = len(CALIBRATION_PARAMETER_NAMES)
+    count = len(names)
     covariance = np.array(reader.get('covariance', list_of(row_of_numbers(count, null=True))))
     if covariance.shape != (count, count):
         raise ProductError(f'{reader.path}: covariance is not {count} x {count}')
     quaternion = np.array(reader.get('alignment.quaternion_xyzw', row_of_numbers(4)))
     return Calibration(
         time_ns=reader.get('time_ns', whole_number),
-        geometry=CameraGeometry(CameraModel(width, height, np.array(parameters)), quaternion),
+        geometry=CameraGeometry(
+            CameraModel(width, height, np.array(parameters), model), quaternion
+        ),
         covariance=covariance,
         method=reader.get('method', string),
         estimated=reader.get('estimated', strings),

@@ -11,38 +11,43 @@ from urllib.parse import unquote
 import numpy as np
 import yaml
 
-from starcal_ros.camera import CameraModel, DISTORTION_NAMES, zero_skew_fit
+from starcal_ros.camera import CameraModel, ros_fit
 from starcal_ros.errors import ProductError
-from starcal_ros.products.fields import CheckedValues, row_of_numbers, whole_number
+from starcal_ros.lens import from_ros_distortion, ros_distortion
+from starcal_ros.products.fields import (
+    CheckedValues,
+    finite_number,
+    list_of,
+    row_of_numbers,
+    whole_number,
+)
 from starcal_ros.products.files import read_text, write_atomically
 
 CAMERA_INFO_FILE = 'camera_info.yaml'
-# plumb_bob's order of coefficients, by our names; ROS puts k3 last.
-_PLUMB_BOB = ('k1', 'k2', 'p1', 'p2', 'k3')
 
 
 def write_camera_info(camera: CameraModel, path: Path, camera_name: str = 'camera') -> None:
     """
-    Write a ROS camera YAML as camera_info_manager reads it, with the zero-skew fit of the camera.
+    Write a ROS camera YAML as camera_info_manager reads it: the best camera without skew.
 
     Readers of ``CameraInfo`` ignore K[0,1] without a word, so it is 0 and the other parameters
-    make up for it as well as they can (`zero_skew_fit`).
+    make up for it as well as they can (`ros_fit`).
 
     Raises
     ------
     ProductError
         When the file cannot be written.
     """
-    fitted, _ = zero_skew_fit(camera)
+    fitted, _ = ros_fit(camera)
     fx, _, fy, cx, cy = fitted.intrinsics.tolist()
-    distortion = dict(zip(DISTORTION_NAMES, fitted.distortion.tolist(), strict=True))
+    distortion_model, D = ros_distortion(fitted.model, fitted.distortion)
     content = {
         'image_width': fitted.width,
         'image_height': fitted.height,
         'camera_name': camera_name,
         'camera_matrix': _matrix(3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
-        'distortion_model': 'plumb_bob',
-        'distortion_coefficients': _matrix(1, 5, [distortion[name] for name in _PLUMB_BOB]),
+        'distortion_model': distortion_model,
+        'distortion_coefficients': _matrix(1, len(D), D.tolist()),
         'rectification_matrix': _matrix(3, 3, np.eye(3).ravel().tolist()),
         'projection_matrix': _matrix(
             3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
@@ -79,14 +84,14 @@ def read_camera_info(location: str | Path) -> CameraModel:
     fx, skew, cx, zero, fy, cy = K[:6]
     if zero != 0.0 or K[6:] != [0.0, 0.0, 1.0]:
         raise ProductError(f'{path}: camera_matrix.data: {K} is not [fx s cx 0 fy cy 0 0 1]')
-    model = content.get('distortion_model', 'plumb_bob')
-    if model != 'plumb_bob':
-        raise ProductError(f'{path}: distortion_model: {model!r} is not plumb_bob')
-    D = reader.get('distortion_coefficients.data', row_of_numbers(4, 5))
-    distortion = dict(zip(_PLUMB_BOB, [*D, 0.0][:5], strict=True))
-    parameters = [fx, skew, fy, cx, cy, *(distortion[name] for name in DISTORTION_NAMES)]
+    distortion_model = content.get('distortion_model', 'plumb_bob')
+    D = reader.get('distortion_coefficients.data', list_of(finite_number))
     try:
-        return CameraModel(width, height, np.array(parameters))
+        model, distortion = from_ros_distortion(str(distortion_model), D)
+    except ValueError as error:
+        raise ProductError(f'{path}: distortion_model: {error}') from error
+    try:
+        return CameraModel(width, height, np.r_[fx, skew, fy, cx, cy, distortion], model)
     except ValueError as error:
         raise ProductError(f'{path}: {error}') from error
 

@@ -23,7 +23,7 @@ from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.assessment.observability import movement_px
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.bag import reader
-from starcal_ros.camera import INTRINSIC_NAMES, PARAMETER_NAMES
+from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.temperature import summary as thermal_summary
 from starcal_ros.messages.types import OBSERVATIONS_TYPE
@@ -165,11 +165,13 @@ def _signed(value: float, digits: int = 3) -> str:
 
 
 def _parameter_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
-    camera, sigma = calibration.geometry.camera, calibration.sigma[:10]
-    changes = camera.parameters - prior.camera.parameters if prior else np.zeros(10)
+    camera, sigma = calibration.geometry.camera, calibration.sigma[:-3]
+    if prior and prior.camera.model != camera.model:
+        prior = None  # parameters of another lens model are no start of these
+    changes = camera.parameters - (prior.camera.parameters if prior else camera.parameters)
     moves, sigma_moves = movement_px(camera, changes), movement_px(camera, sigma)
     rows = []
-    for k, name in enumerate(PARAMETER_NAMES):
+    for k, name in enumerate(camera.parameter_names):
         value, known = camera.parameters[k], sigma[k] > 0
         rows.append(
             Row(
@@ -194,7 +196,7 @@ def _parameter_rows(calibration: Calibration, prior: CameraGeometry | None) -> l
 
 
 def _alignment_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
-    sigma = calibration.sigma[10:] / ARCSECOND_RAD
+    sigma = calibration.sigma[-3:] / ARCSECOND_RAD
     changes = (
         alignment_difference_rad(calibration.geometry, prior) / ARCSECOND_RAD
         if prior

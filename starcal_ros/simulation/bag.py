@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 import yaml
 
 from starcal_ros.bag.reader import BagWriter
-from starcal_ros.camera import CameraModel, PARAMETER_NAMES
+from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.products.camera_yaml import write_camera_info
 from starcal_ros.products.files import write_atomically
 from starcal_ros.records import AttitudeSample, CameraGeometry
 from starcal_ros.simulation.centroids import (
-    BOUND_NAMES,
+    bound_names,
     BOUND_SNR,
     centroid_bound,
     cramer_rao_covariance,
@@ -60,6 +60,7 @@ def truth_content(scenario: Scenario, bag_name: str) -> dict[str, object]:
         'width': true.camera.width,
         'height': true.camera.height,
         'k_true': true.camera.intrinsics.tolist(),
+        'lens_model': true.camera.model,
         'd_true': true.camera.distortion.tolist(),
         'k_prior': prior.camera.intrinsics.tolist(),
         'd_prior': prior.camera.distortion.tolist(),
@@ -70,7 +71,9 @@ def truth_content(scenario: Scenario, bag_name: str) -> dict[str, object]:
         'images': scenario.image_count,
         'stars': stars,
         'stars_snr5': stars_above,
-        'crlb_keep': [PARAMETER_NAMES.index(name) for name in BOUND_NAMES],
+        'crlb_keep': [
+            true.camera.parameter_names.index(name) for name in bound_names(true.camera)
+        ],
         'crlb_cov': cramer_rao_covariance(scenario).tolist(),
         't0': scenario.start_ns / NANOSECONDS_PER_SECOND,
         'step': scenario.cadence_s,
@@ -79,9 +82,9 @@ def truth_content(scenario: Scenario, bag_name: str) -> dict[str, object]:
 
 def true_geometry(content: Mapping[str, Any]) -> CameraGeometry:
     """The true camera and alignment of a truth file's JSON object."""
-    camera = CameraModel(
-        content['width'], content['height'], np.array([*content['k_true'], *content['d_true']])
-    )
+    parameters = np.array([*content['k_true'], *content['d_true']])
+    model = content.get('lens_model', 'plumb_bob')
+    camera = CameraModel(content['width'], content['height'], parameters, model)
     star_tracker_from_camera = Rotation.from_matrix(np.array(content['A_true']).T)
     return CameraGeometry(camera, star_tracker_from_camera.as_quat())
 

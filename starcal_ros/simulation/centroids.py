@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.camera import PARAMETER_NAMES, project_jacobians
+from starcal_ros.camera import CameraModel, project_jacobians
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.simulation.images import pixel_stamps
 from starcal_ros.simulation.scenario import (
@@ -25,8 +25,12 @@ from starcal_ros.simulation.scenario import (
 from starcal_ros.sky.catalog import StarCatalog
 
 Floats = NDArray[np.float64]
-BOUND_NAMES = ('fx', 'skew', 'fy', 'k1', 'k2', 'k3', 'p1', 'p2')
 BOUND_SNR = 5.0
+
+
+def bound_names(camera: CameraModel) -> tuple[str, ...]:
+    """Names of all parameters but the principal point, which trades with the attitude."""
+    return tuple(name for name in camera.parameter_names if name not in ('cx', 'cy'))
 
 
 def true_observations(
@@ -147,18 +151,20 @@ def centroid_bound(
 
 def cramer_rao_covariance(
     scenario: Scenario,
-    names: tuple[str, ...] = BOUND_NAMES,
+    names: tuple[str, ...] = (),
     snr_limit: float = BOUND_SNR,
     catalog: StarCatalog | None = None,
 ) -> Floats:
     """
     Least covariance of the named camera parameters that any unbiased estimator can have.
 
+    Without names: of `bound_names`.
+
     Every star above the signal-to-noise limit counts, with its own bound; the attitude of each
     image is free and the parameters not named are held.
     """
     camera = scenario.truth.camera
-    columns = [PARAMETER_NAMES.index(name) for name in names]
+    columns = [camera.parameter_names.index(name) for name in names or bound_names(camera)]
     information = np.zeros((len(columns), len(columns)))
     for shown in scenes(scenario, catalog):
         covariance, snr = centroid_bound(

@@ -28,7 +28,7 @@ from starcal_ros.estimation.calibrate import (
     Estimate,
     estimate_calibration,
 )
-from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, CameraGeometry, Ensemble
+from starcal_ros.records import calibration_parameter_names, CameraGeometry, Ensemble
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.studies.trials import (
     bound,
@@ -335,6 +335,7 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
             for method, estimate in _solutions(design, ensemble, field, tracker):
                 sigma = np.sqrt(np.diag(estimate.covariance))[ESTIMATED]
                 error = errors(estimate.geometry, field.truth)[ESTIMATED]
+                names = calibration_parameter_names(estimate.geometry.camera)
                 yield {
                     **cell,
                     'tracker_arcsec': tracker,
@@ -345,7 +346,7 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
                     'bound_px': least,
                     'rejected': int((~estimate.kept).sum()),
                     **{
-                        f'{CALIBRATION_PARAMETER_NAMES[k]}_sigmas': float(e / s)
+                        f'{names[k]}_sigmas': float(e / s)
                         for k, e, s in zip(ESTIMATED, error, sigma, strict=True)
                     },
                 }

@@ -19,7 +19,7 @@ from starcal_ros.assessment.agreement import alignment_difference_rad, lines_of_
 from starcal_ros.assessment.observability import GRID, line_of_sight_sigma_arcsec, map_sigma_px
 from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate
+from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate, estimated_parameters
 from starcal_ros.estimation.normal_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.simulation.scenario import Scenario, scenario
@@ -33,7 +33,8 @@ FAR_PRINCIPAL_POINT_PX = 100.0
 FAR_ALIGNMENT_RAD = math.radians(0.3)
 LEAST_TRACKER_ARCSEC = 1e-3  # what a calibration takes for a perfect star tracker
 
-_FREE = [PARAMETER_NAMES.index(name) for name in CalibrationOptions().estimate]
+_NAMES = estimated_parameters(CalibrationOptions(), 'plumb_bob')
+_FREE = [PARAMETER_NAMES.index(name) for name in _NAMES]
 ESTIMATED = np.array([*_FREE, 10, 11, 12])
 """Rows of a (13, 13) covariance that a calibration with default options estimates."""
 
@@ -172,6 +173,7 @@ def information_blocks(field: StarField) -> Floats:
     table = star_table(observe(field, 0.0).images)
     _, blocks = normal_blocks(
         arrange(table, np.ones(len(table), bool), table.covariance_px2),
+        field.truth.camera.model,
         field.truth.camera.parameters,
         field.camera_from_icrf.as_matrix(),
     )

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment.agreement import Difference, difference, halves, movement
 from starcal_ros.camera import project
-from starcal_ros.estimation.calibrate import CalibrationOptions
+from starcal_ros.estimation.calibrate import CalibrationOptions, estimated_parameters
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.studies.trials import (
     calibration_options,
@@ -19,7 +19,7 @@ from starcal_ros.studies.trials import (
     StarField,
 )
 
-ESTIMATED = CalibrationOptions().estimate
+ESTIMATED = estimated_parameters(CalibrationOptions(), 'plumb_bob')
 OPTIONS = calibration_options('hierarchical', 20.0)
 
 

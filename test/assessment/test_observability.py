@@ -20,7 +20,11 @@ from starcal_ros.assessment.observability import (
 )
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import CalibrationOptions, estimate_calibration
+from starcal_ros.estimation.calibrate import (
+    CalibrationOptions,
+    estimate_calibration,
+    estimated_parameters,
+)
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry, Ensemble, refused_image
 from starcal_ros.simulation.centroids import cramer_rao_covariance, true_observations
@@ -29,7 +33,8 @@ from starcal_ros.simulation.scenario import scenario
 SCENARIO = scenario('tiny', seed=4)
 PRIOR, TRUTH = SCENARIO.prior, SCENARIO.truth
 OPTIONS = CalibrationOptions(star_tracker_sigma_arcsec=SCENARIO.star_tracker_sigma_arcsec)
-FREE = [k for k, name in enumerate(PARAMETER_NAMES) if name in OPTIONS.estimate]
+NAMES = estimated_parameters(OPTIONS, 'plumb_bob')
+FREE = [k for k, name in enumerate(PARAMETER_NAMES) if name in NAMES]
 
 
 @functools.cache
@@ -76,12 +81,12 @@ def test_predicted_sigma_at_the_truth_is_the_cramer_rao_bound() -> None:
 
 
 def test_the_order_of_names_is_that_of_the_parameters() -> None:
-    turned = dataclasses.replace(OPTIONS, estimate=OPTIONS.estimate[::-1])
+    turned = dataclasses.replace(OPTIONS, estimate=NAMES[::-1])
     np.testing.assert_array_equal(
         predicted_sigma(ensemble(), PRIOR, turned), predicted_sigma(ensemble(), PRIOR, OPTIONS)
     )
     names = ensemble_status(ensemble(), PRIOR, turned).parameter_names
-    assert names[:8] == tuple(name for name in PARAMETER_NAMES if name in OPTIONS.estimate)
+    assert names[:8] == tuple(name for name in PARAMETER_NAMES if name in NAMES)
 
 
 def test_twice_the_images_have_half_the_variance() -> None:

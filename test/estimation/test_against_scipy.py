@@ -18,7 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate, estimate_calibration
+from starcal_ros.estimation.calibrate import (
+    CalibrationOptions,
+    Estimate,
+    estimate_calibration,
+    estimated_parameters,
+)
 from starcal_ros.records import Ensemble
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario
@@ -55,7 +60,11 @@ def numerical(
     Unknowns: free camera parameters, focal terms, alignment and its rate (not per image), rotation
     of each image (not single); the angles are passive rotations (Eq. 11).
     """
-    free = [k for k, name in enumerate(PARAMETER_NAMES) if name in options.estimate]
+    free = [
+        k
+        for k, name in enumerate(PARAMETER_NAMES)
+        if name in estimated_parameters(options, 'plumb_bob')
+    ]
     f, m = len(free), len(ensemble.images)
     table, state = estimate.table, estimate.state
     q, axes = len(state.focal), len(state.rate)

@@ -18,17 +18,19 @@ from starcal_ros.estimation.calibrate import (
     check_enough,
     Estimate,
     estimate_calibration,
+    estimated_parameters,
 )
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.estimation.variance_components import estimate_variance
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
-from starcal_ros.simulation.centroids import BOUND_NAMES, cramer_rao_covariance, true_observations
+from starcal_ros.simulation.centroids import bound_names, cramer_rao_covariance, true_observations
 from starcal_ros.simulation.scenario import scenario
 
 SCENARIO = scenario('tiny', seed=3)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior
 TRACKER_ARCSEC = (10.0, 10.0, 40.0)
-FREE = [PARAMETER_NAMES.index(name) for name in CalibrationOptions().estimate]
+NAMES = estimated_parameters(CalibrationOptions(), 'plumb_bob')
+FREE = [PARAMETER_NAMES.index(name) for name in NAMES]
 TRIALS = 60
 each_method = pytest.mark.parametrize('method', METHODS)
 
@@ -125,7 +127,7 @@ def test_without_noise_the_truth_comes_back(method: str, with_principal_point: b
         fx=1.2 * TRUTH.camera.parameters[0], fy=1.2 * TRUTH.camera.parameters[2],
         skew=0.0, k1=0.0, k2=0.0, k3=0.0, p1=0.0, p2=0.0,
     )  # fmt: skip
-    estimate = CalibrationOptions().estimate
+    estimate = NAMES
     if with_principal_point:
         cx, cy = TRUTH.camera.parameters[3:5]
         prior_camera = prior_camera.replace(cx=cx + 80.0, cy=cy - 60.0)
@@ -161,7 +163,7 @@ def test_what_is_held_does_not_change_by_a_bit(method: str) -> None:
 @each_method
 def test_the_order_of_the_names_does_not_matter(method: str) -> None:
     noisy = with_noise(clean(), 1)
-    names = CalibrationOptions().estimate
+    names = NAMES
     one, other = (
         estimate_calibration(noisy, PRIOR, options(method, estimate=order))
         for order in (names, names[::-1])
@@ -205,7 +207,7 @@ def test_the_variance_of_the_centroids_is_found_again() -> None:
 
 
 def test_the_line_of_sight_reaches_the_cramer_rao_bound() -> None:
-    assert tuple(PARAMETER_NAMES[k] for k in FREE) == BOUND_NAMES
+    assert tuple(PARAMETER_NAMES[k] for k in FREE) == bound_names(TRUTH.camera)
     bound = cramer_rao_covariance(SCENARIO)
     directions = line_of_sight(TRUTH.camera, pixel_grid(TRUTH.camera, 9, 7))
     _, J, J_rotation = project_jacobians(TRUTH.camera, directions)

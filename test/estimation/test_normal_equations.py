@@ -74,7 +74,7 @@ def test_blocks_equal_the_dense_normal_matrices() -> None:
     keep = np.random.default_rng(2).uniform(size=len(table)) < 0.8
     squared, expected = dense_blocks(table, keep, CAMERA_MODEL, rotations)
     cost, blocks = normal_blocks(
-        arrange(table, keep, table.covariance_px2), CAMERA_MODEL.parameters, rotations
+        arrange(table, keep, table.covariance_px2), 'plumb_bob', CAMERA_MODEL.parameters, rotations
     )
     assert cost == pytest.approx(0.5 * squared.sum(), rel=1e-12)
     unit = 1 / np.sqrt(np.einsum('mii->i', expected))
@@ -91,11 +91,12 @@ def test_images_spread_over_many_chunks_come_back_to_their_places() -> None:
     everything = np.ones(len(table), bool)
     measurements = arrange(table, everything, table.covariance_px2)
     assert len(measurements.chunks) > 3
-    together = normal_blocks(measurements, CAMERA_MODEL.parameters, rotations)
+    together = normal_blocks(measurements, 'plumb_bob', CAMERA_MODEL.parameters, rotations)
     cost = 0.0
     for k in range(len(sizes)):
         alone, blocks = normal_blocks(
             arrange(table, table.image == k, table.covariance_px2),
+            'plumb_bob',
             CAMERA_MODEL.parameters,
             rotations,
         )
@@ -107,7 +108,10 @@ def test_images_spread_over_many_chunks_come_back_to_their_places() -> None:
 def test_no_star_at_all() -> None:
     table, rotations = made((0, 0))
     cost, blocks = normal_blocks(
-        arrange(table, np.zeros(0, bool), table.covariance_px2), CAMERA_MODEL.parameters, rotations
+        arrange(table, np.zeros(0, bool), table.covariance_px2),
+        'plumb_bob',
+        CAMERA_MODEL.parameters,
+        rotations,
     )
     assert cost == 0.0 and blocks.shape == (2, 14, 14) and not blocks.any()
 
@@ -119,11 +123,11 @@ def test_the_gradient_is_that_of_the_cost(loss_scale: float) -> None:
 
     def cost(parameters: np.ndarray, turn: np.ndarray) -> float:
         turned = Rotation.from_rotvec(-turn).as_matrix() @ rotations  # passive (Eq. 11)
-        return normal_blocks(measurements, parameters, turned, loss_scale)[0]
+        return normal_blocks(measurements, 'plumb_bob', parameters, turned, loss_scale)[0]
 
     beta = CAMERA_MODEL.parameters
     still = np.zeros((len(SIZES), 3))
-    _, blocks = normal_blocks(measurements, beta, rotations, loss_scale)
+    _, blocks = normal_blocks(measurements, 'plumb_bob', beta, rotations, loss_scale)
     downhill = blocks[:, CAMERA, RESIDUAL].sum(axis=0)
     N = np.einsum('mii->i', blocks)
     for k in range(10):
@@ -146,16 +150,18 @@ def test_the_robust_loss_is_cauchys() -> None:
     everything = np.ones(len(table), bool)
     squared, _ = dense_blocks(table, everything, CAMERA_MODEL, rotations)
     measurements = arrange(table, everything, table.covariance_px2)
-    cost, blocks = normal_blocks(measurements, CAMERA_MODEL.parameters, rotations, 2.0)
+    cost, blocks = normal_blocks(
+        measurements, 'plumb_bob', CAMERA_MODEL.parameters, rotations, 2.0
+    )
     assert cost == pytest.approx(0.5 * (4 * np.log(1 + squared / 4)).sum(), rel=1e-12)
     # Weights of stars: 1 / (1 + s / c^2), the derivative of the loss by s.
     image_of_one = int(np.nonzero(np.bincount(table.image, minlength=len(SIZES)) == 1)[0][0])
     weight = 1 / (1 + squared[table.image == image_of_one][0] / 4)
-    _, plain = normal_blocks(measurements, CAMERA_MODEL.parameters, rotations)
+    _, plain = normal_blocks(measurements, 'plumb_bob', CAMERA_MODEL.parameters, rotations)
     np.testing.assert_allclose(blocks[image_of_one], weight * plain[image_of_one], rtol=1e-12)
     # Far below its scale it is least squares: s / 2 c^2 = 1e-7 is left out at most.
     scale = np.sqrt(0.5e7 * squared.max())
-    soft, _ = normal_blocks(measurements, CAMERA_MODEL.parameters, rotations, scale)
+    soft, _ = normal_blocks(measurements, 'plumb_bob', CAMERA_MODEL.parameters, rotations, scale)
     assert soft == pytest.approx(0.5 * squared.sum(), rel=1e-7)
 
 
@@ -164,6 +170,7 @@ def test_a_star_behind_the_camera_has_no_finite_cost() -> None:
     rotations[4] = np.diag([1.0, -1.0, -1.0]) @ rotations[4]
     cost, _ = normal_blocks(
         arrange(table, np.ones(len(table), bool), table.covariance_px2),
+        'plumb_bob',
         CAMERA_MODEL.parameters,
         rotations,
     )
@@ -172,7 +179,7 @@ def test_a_star_behind_the_camera_has_no_finite_cost() -> None:
 
 def test_residuals_are_measured_minus_predicted() -> None:
     table, rotations = made()
-    found = residuals_px(table, CAMERA_MODEL.parameters, rotations)
+    found = residuals_px(table, 'plumb_bob', CAMERA_MODEL.parameters, rotations)
     for k in (0, 17, 40, len(table) - 1):
         e = rotations[table.image[k]] @ table.direction_icrf[k]
         expected = table.measured_px[k] - project(CAMERA_MODEL, e)

@@ -19,7 +19,12 @@ from starcal_ros.camera import CameraModel, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation import temperature
-from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate, estimate_calibration
+from starcal_ros.estimation.calibrate import (
+    CalibrationOptions,
+    Estimate,
+    estimate_calibration,
+    estimated_parameters,
+)
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
@@ -34,7 +39,9 @@ from starcal_ros.simulation.scenario import scenario
 SCENARIO = scenario('tiny', seed=3)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior
 TRACKER_ARCSEC = (10.0, 10.0, 40.0)
-FREE = [PARAMETER_NAMES.index(name) for name in CalibrationOptions().estimate]
+FREE = [
+    PARAMETER_NAMES.index(name) for name in estimated_parameters(CalibrationOptions(), 'plumb_bob')
+]
 REFERENCE_DEGC = 15.0
 TEMPERATURES_DEGC = np.array([-20.0, 12.0, -5.0, 31.0, 3.0, 40.0, -14.0, 22.0, 9.0, 35.0])
 # A lens of a few 10^-5 per degree (0.4 px at the edge over 60 degrees), and a mount that turns by
@@ -286,8 +293,12 @@ def test_the_prediction_accounts_for_the_terms(method: str) -> None:
     sigma = dict(
         zip(estimate.shared_names, np.sqrt(np.diag(estimate.shared_covariance)), strict=True)
     )
-    names = estimated_names(chosen)
-    assert set(names) == {n for n in sigma if n not in PARAMETER_NAMES or n in chosen.estimate}
+    names = estimated_names(chosen, 'plumb_bob')
+    assert set(names) == {
+        n
+        for n in sigma
+        if n not in PARAMETER_NAMES or n in estimated_parameters(CalibrationOptions(), 'plumb_bob')
+    }
     predicted = dict(zip(names, predicted_sigma(ensemble, TRUTH, chosen), strict=True))
     # The same formula without the terms in the derivatives: they scale the camera by 0.1 %.
     for name in names:
@@ -300,7 +311,7 @@ def test_the_prediction_accounts_for_the_terms(method: str) -> None:
 def test_terms_that_the_images_do_not_carry_are_infinite_and_cost_nothing() -> None:
     chosen, plain = options(), options(order=0, alignment_temperature=False)
     ensemble = observed(FOCAL, RATE_RAD, np.full(10, 15.0))
-    names, sigma = estimated_names(chosen), predicted_sigma(ensemble, TRUTH, chosen)
+    names, sigma = estimated_names(chosen, 'plumb_bob'), predicted_sigma(ensemble, TRUTH, chosen)
     of_temperature = np.array(['temperature' in name for name in names])
     assert of_temperature.sum() == 5 and np.isinf(sigma[of_temperature]).all()
     np.testing.assert_array_equal(sigma[~of_temperature], predicted_sigma(ensemble, TRUTH, plain))

@@ -14,12 +14,11 @@ from starcal_ros.bag import reader
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
-from starcal_ros.estimation.calibrate import CalibrationOptions
+from starcal_ros.estimation.calibrate import CalibrationOptions, estimated_parameters
 from starcal_ros.pipeline import observe, solve
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
-    CALIBRATION_PARAMETER_NAMES,
     Ensemble,
     refused_image,
 )
@@ -64,7 +63,7 @@ def test_a_solution_with_its_statistics(setup: Setup) -> None:
     assert found.accepted and found.reasons == ()
     assert found.termination == 'converged'
     assert found.method == CalibrationOptions().method
-    assert found.estimated == CalibrationOptions().estimate
+    assert found.estimated == estimated_parameters(CalibrationOptions(), 'plumb_bob')
     assert found.images_used == 10 and found.stars_rejected <= 4
     assert found.stars_used + found.stars_rejected == ensemble().star_count
     assert found.time_ns == ensemble().images[-1].time_ns
@@ -98,7 +97,7 @@ def test_a_solution_is_mapped_over_the_detector(setup: Setup) -> None:
     assert (shape < whole).all() and whole.argmin() not in (0, 19, 300, 319)
     assert correlation.names == (*found.estimated, *ALIGNMENT_NAMES)
     np.testing.assert_allclose(np.diag(correlation.matrix), 1.0, rtol=1e-12)
-    rows = [CALIBRATION_PARAMETER_NAMES.index(name) for name in correlation.names]
+    rows = [found.parameter_names.index(name) for name in correlation.names]
     np.testing.assert_allclose(
         correlation.matrix * np.outer(found.sigma[rows], found.sigma[rows]),
         found.covariance[np.ix_(rows, rows)],

@@ -18,7 +18,6 @@ from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ProductError
 from starcal_ros.products.calibration_json import read_calibration, write_calibration
 from starcal_ros.records import (
-    CALIBRATION_PARAMETER_NAMES,
     CameraGeometry,
     GateCheck,
     Removal,
@@ -112,7 +111,7 @@ def test_json_has_the_keys_of_the_interface_document(tmp_path: Path) -> None:
     assert content['alignment']['parent'] == 'st'
     assert content['alignment']['child'] == 'cam'
     assert len(content['alignment']['quaternion_xyzw']) == 4
-    assert tuple(content['parameter_names']) == CALIBRATION_PARAMETER_NAMES
+    assert tuple(content['parameter_names']) == record.parameter_names
     assert content['alignment_covariance_rad2'] == record.covariance[10:, 10:].tolist()
     assert {
         'method', 'estimated', 'residual_rms_px', 'images_used', 'images_refused', 'stars_used',

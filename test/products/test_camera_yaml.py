@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, zero_skew_fit
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, ros_fit
 from starcal_ros.errors import ProductError
 from starcal_ros.products.camera_yaml import read_camera_info, resolve_url, write_camera_info
 
@@ -48,11 +48,11 @@ def test_camera_without_skew_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     assert back.parameters.tobytes() == camera.parameters.tobytes()
 
 
-def test_camera_info_carries_the_zero_skew_fit(tmp_path: Path) -> None:
+def test_camera_info_carries_the_ros_fit(tmp_path: Path) -> None:
     path = tmp_path / 'camera_info.yaml'
     write_camera_info(CAMERA, path, 'opnav')
     back = read_camera_info(path)
-    fitted, worst_px = zero_skew_fit(CAMERA)
+    fitted, worst_px = ros_fit(CAMERA)
     assert back.parameters.tobytes() == fitted.parameters.tobytes()
     assert back.parameters[1] == 0.0
     grid = pixel_grid(CAMERA, 25, 25)
@@ -68,7 +68,7 @@ def test_camera_info_is_what_camera_info_manager_reads(tmp_path: Path) -> None:
         'image_width', 'image_height', 'camera_name', 'camera_matrix', 'distortion_model',
         'distortion_coefficients', 'rectification_matrix', 'projection_matrix',
     ]  # fmt: skip
-    fitted, _ = zero_skew_fit(CAMERA)
+    fitted, _ = ros_fit(CAMERA)
     fx, _, fy, cx, cy, k1, k2, k3, p1, p2 = fitted.parameters.tolist()
     assert content['camera_name'] == 'opnav'
     assert content['camera_matrix'] == {

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import project, project_jacobians
 from starcal_ros.simulation.centroids import (
-    BOUND_NAMES,
+    bound_names,
     centroid_bound,
     cramer_rao_covariance,
     true_observations,
@@ -162,4 +162,4 @@ def test_parameter_bound_is_the_scatter_of_least_squares() -> None:
     whitened = np.linalg.solve(np.linalg.cholesky(bound), np.array(errors).T)
     # 200 runs of 8 parameters: their normalised squares have mean 1, standard error 0.035.
     assert abs((whitened**2).mean() - 1) < 5 * math.sqrt(2 / whitened.size)
-    assert len(BOUND_NAMES) == len(whitened)
+    assert len(bound_names(tiny.truth.camera)) == len(whitened)
