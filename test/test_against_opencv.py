@@ -1,4 +1,4 @@
-"""The camera model against OpenCV, which has no skew, and skew against the paper's formula."""
+"""Every camera model against OpenCV, which has no skew; skew against the paper's formula."""
 
 from __future__ import annotations
 
@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.camera import CameraModel, line_of_sight, project, project_jacobians
+from starcal_ros.camera import (
+    CameraModel,
+    line_of_sight,
+    pixel_grid,
+    project,
+    project_jacobians,
+)
+from starcal_ros.lens import COEFFICIENTS, ros_distortion
 
 # Distortion at the edge of a 20 degree field and of a wide one: (k1, k2, k3, p1, p2) scales.
 NARROW = np.array([0.1, 0.3, 1.0, 1e-3, 1e-3])
@@ -115,3 +122,67 @@ def test_line_of_sight(seed: int) -> None:
     e = line_of_sight(camera, pixels)
     # OpenCV's iteration ends near 1e-13 of the image plane; ours at 1e-14.
     np.testing.assert_allclose(e[:, :2] / e[:, 2:], ideal, rtol=0, atol=1e-12)
+
+
+# k1 k2 k3 p1 p2 k4 k5 k6, s1 to s4 and the two angles of the tilt.
+LARGEST = np.r_[0.2, 0.05, 0.01, 2e-3, 2e-3, 0.2, 0.05, 0.01, np.full(4, 2e-3), 0.1, 0.1]
+
+
+def random_lens(model: str, seed: int) -> CameraModel:
+    rng = np.random.default_rng(seed)
+    count = len(COEFFICIENTS[model])
+    scale = np.array([0.05, 0.02, 5e-3, 1e-3]) if model == 'equidistant' else LARGEST[:count]
+    intrinsics = [1500.0, 0.0, 1500 * (1 + 0.001 * rng.normal()), *rng.normal([1295, 1023], 15)]
+    return CameraModel(2592, 2048, np.r_[intrinsics, scale * rng.uniform(-1, 1, count)], model)
+
+
+def opencv_of(camera: CameraModel, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n, 2) of directions, and OpenCV's derivatives (n, 2, ...)."""
+    still = np.zeros(3)
+    _, D = ros_distortion(camera.model, camera.distortion)
+    if camera.model == 'equidistant':
+        points = (e / e[:, 2:])[:, None]
+        pixels, J = cv2.fisheye.projectPoints(points, still, still, camera.matrix, D)
+    else:
+        pixels, J = cv2.projectPoints(e, still, still, camera.matrix, D)
+    return pixels.reshape(-1, 2), J.reshape(len(e), 2, -1)
+
+
+@pytest.mark.parametrize('model', COEFFICIENTS)
+@pytest.mark.parametrize('seed', range(3))
+def test_pixels_of_every_model(model: str, seed: int) -> None:
+    camera = random_lens(model, seed)
+    e = directions(seed, 0.9)
+    expected, _ = opencv_of(camera, e)
+    # The same functions in another order of operations: roundings of numbers up to 3000 px.
+    np.testing.assert_allclose(project(camera, e), expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize('model', COEFFICIENTS)
+def test_derivatives_of_every_model(model: str) -> None:
+    camera = random_lens(model, 7)
+    e = directions(7, 0.8)
+    _, J = opencv_of(camera, e)
+    _, J_parameters, J_rotation = project_jacobians(camera, e)
+    # Columns of ours without skew; of theirs, by the order of `ros_distortion`.
+    ours = np.delete(J_parameters, 1, axis=-1)
+    count = len(camera.distortion)
+    _, order = ros_distortion(model, np.arange(float(count)))
+    if model == 'equidistant':  # fx fy, cx cy, k1 to k4, rotation 3, translation 3, skew
+        intrinsics, coefficients, rotation = J[..., :4], J[..., 4:8], J[..., 8:11]
+    else:  # rotation 3, translation 3, fx fy cx cy, coefficients
+        intrinsics, coefficients, rotation = J[..., 6:10], J[..., 10:], J[..., :3]
+    theirs = np.concatenate([intrinsics, coefficients[..., np.argsort(order.astype(int))]], axis=-1)
+    size = np.abs(ours).max(axis=(0, 1))
+    # Both are analytic: roundings alone.
+    np.testing.assert_allclose(ours / size, theirs / size, rtol=0, atol=1e-11)
+    # OpenCV turns the star, we turn the frame: the other sign at zero rotation.
+    np.testing.assert_allclose(J_rotation, -rotation, rtol=0, atol=1e-11 * 1500)
+
+
+@pytest.mark.parametrize('model', COEFFICIENTS)
+def test_line_of_sight_of_every_model(model: str) -> None:
+    camera = random_lens(model, 11).replace(fx=3000.0, fy=3001.0)  # no fold within the detector
+    e = line_of_sight(camera, pixel_grid(camera, 25, 20))
+    expected, _ = opencv_of(camera, e)
+    np.testing.assert_allclose(expected, pixel_grid(camera, 25, 20), rtol=0, atol=1e-9)

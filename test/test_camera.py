@@ -1,4 +1,4 @@
-"""The camera model: derivatives, inverse, the fold of the distortion, the fit without skew."""
+"""Every camera model: derivatives, inverse, the fold of the distortion, fits."""
 
 from __future__ import annotations
 
@@ -7,18 +7,32 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import (
+    ALL_PARAMETER_NAMES,
     CameraModel,
+    convert,
     field_radius_rad,
     line_of_sight,
+    model_of,
     PARAMETER_NAMES,
+    parameter_names,
     pixel_grid,
     project,
     project_jacobians,
     project_parameters,
     ros_fit,
 )
-from starcal_ros.lens import distort, distort_jacobian
+from starcal_ros.lens import (
+    coefficient_jacobian,
+    COEFFICIENTS,
+    distort,
+    distort_jacobian,
+    fold_radius2,
+    ideal_points,
+)
 
+#           k1   k2    k3    p1     p2     k4    k5   k6
+RATIONAL = [0.1, 0.05, 0.01, 1e-3, -7e-4, 0.35, 0.1, 0.02]
+PRISM = [2e-3, -1e-3, -1.5e-3, 5e-4]
 #                     fx     skew     fy     cx     cy     k1     k2     k3    p1     p2
 CAMERAS = {
     'paper': CameraModel(
@@ -31,12 +45,37 @@ CAMERAS = {
         1024, 1024, np.array([900, 3.0, 905, 500, 520, 0.25, 0.1, 0.05, -2e-3, 1e-3])
     ),
     'pinhole': CameraModel(1000, 800, np.array([5000, 0, 5000, 499.5, 399.5, 0, 0, 0, 0, 0])),
+    'rational': CameraModel(
+        640, 480, np.array([420, -0.8, 415, 322, 236, *RATIONAL]), 'rational_polynomial'
+    ),
+    # Large terms that nearly cancel, as calibrations of 90 degree lenses with OpenCV have them.
+    'rational wide': CameraModel(
+        1280,
+        720,
+        np.array([640, 0.4, 641, 639, 362, 9.2, 5.1, 0.19, 2e-5, -1e-4, 9.6, 8.1, 1.1]),
+        'rational_polynomial',
+    ),
+    'thin prism': CameraModel(
+        640, 480, np.array([420, 1.2, 418, 318, 243, *RATIONAL, *PRISM]), 'thin_prism'
+    ),
+    'tilted': CameraModel(
+        640, 480, np.array([420, 1.2, 418, 318, 243, *RATIONAL, *PRISM, 0.05, -0.03]), 'tilted'
+    ),
+    'fisheye': CameraModel(
+        1000, 1000, np.array([330, 0.7, 331, 501, 497, -0.02, 0.01, -0.004, 5e-4]), 'equidistant'
+    ),
+    # 291 degrees from corner to corner.
+    'fisheye behind': CameraModel(
+        640, 480, np.array([160, -0.8, 155, 322, 236, -0.02, 0.01, -0.004, 5e-4]), 'equidistant'
+    ),
 }
 each_camera = pytest.mark.parametrize('camera', CAMERAS.values(), ids=CAMERAS.keys())
 
 
 def wide_grid(camera: CameraModel, beyond: float = 0.2) -> np.ndarray:
     """Pixels (n, 2) over the detector and that fraction of it beyond each side."""
+    if camera is CAMERAS['fisheye behind']:
+        beyond = 0.0  # the sphere ends close to its corners
     grid = pixel_grid(camera, 29, 23)
     centre = 0.5 * np.array([camera.width - 1, camera.height - 1])
     return centre + (1 + 2 * beyond) * (grid - centre)
@@ -48,7 +87,7 @@ def test_derivatives_by_the_parameters(camera: CameraModel) -> None:
     pixels, J, _ = project_jacobians(camera, e)
     # The same sum in another order: 1e-12 px is five roundings of 2592 px.
     np.testing.assert_allclose(pixels, project(camera, e), rtol=0, atol=3e-12)
-    for k, name in enumerate(PARAMETER_NAMES):
+    for k, name in enumerate(camera.parameter_names):
         value = camera.parameters[k]
         size = np.abs(J[..., k]).max()
         complex_step = camera.parameters.astype(complex)
@@ -59,8 +98,12 @@ def test_derivatives_by_the_parameters(camera: CameraModel) -> None:
         h = 1e-3 * max(abs(value), 0.1)
         ahead, behind = (camera.replace(**{name: value + d}) for d in (h, -h))
         central = (project(ahead, e) - project(behind, e)) / (2 * h)
-        # Pixels are linear in each parameter alone: only rounding, 1e-12 px over the step.
-        np.testing.assert_allclose(J[..., k], central, rtol=0, atol=3e-12 / h + 1e-9 * size)
+        # Pixels are linear in each parameter alone, but for a denominator and a tilt, of which
+        # h^2 of the third derivative is left out; and rounding, 1e-12 px over the step.
+        linear = camera.model in ('plumb_bob', 'equidistant')
+        bend = 0.0 if linear else 1000 * h**2
+        atol = 3e-12 / h + (1e-9 + bend) * size
+        np.testing.assert_allclose(J[..., k], central, rtol=0, atol=atol, err_msg=name)
 
 
 @each_camera
@@ -84,14 +127,27 @@ def test_derivatives_by_a_passive_rotation(camera: CameraModel) -> None:
 
 @each_camera
 def test_derivative_of_the_distortion(camera: CameraModel) -> None:
-    xy = line_of_sight(camera, pixel_grid(camera, 9, 7))
-    xy = xy[:, :2] / xy[:, 2:]
+    xy = ideal_points(camera.model, line_of_sight(camera, pixel_grid(camera, 9, 7)))
     J = distort_jacobian(camera.model, xy, camera.distortion)
     for axis in range(2):
         step = xy.astype(complex)
         step[:, axis] += 1e-30j
         exact = distort(camera.model, step, camera.distortion).imag / 1e-30
         np.testing.assert_allclose(J[..., axis], exact, rtol=0, atol=1e-12)
+    of_coefficients = coefficient_jacobian(camera.model, xy, camera.distortion)
+    assert of_coefficients.shape == (2, len(camera.distortion), len(xy))
+    for k in range(len(camera.distortion)):
+        coefficients = camera.distortion.astype(complex)
+        coefficients[k] += 1e-30j
+        exact = distort(camera.model, xy, coefficients).imag.T / 1e-30
+        size = np.abs(exact).max()
+        np.testing.assert_allclose(of_coefficients[:, k], exact, rtol=0, atol=1e-12 * size)
+
+
+def fold_angle(camera: CameraModel) -> float:
+    """Angle from the optical axis at which the radial distortion folds over, rad."""
+    radius = np.sqrt(fold_radius2(camera.model, camera.distortion))
+    return float(radius if camera.model == 'equidistant' else np.arctan(radius))
 
 
 @each_camera
@@ -101,17 +157,18 @@ def test_a_pixel_comes_back_from_its_line_of_sight(camera: CameraModel) -> None:
     assert np.isfinite(e).all()
     # The inverse stops at 1e-14 of the image plane: 7e-11 px at the longest focal length here.
     np.testing.assert_allclose(project(camera, e), pixels, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(np.linalg.norm(e, axis=1), 1.0, rtol=0, atol=4e-16)
+    np.testing.assert_allclose(np.linalg.norm(e, axis=1), 1.0, rtol=0, atol=5e-16)
 
 
 @each_camera
 def test_a_direction_comes_back_from_its_pixel(camera: CameraModel) -> None:
     # Directions that no inverse has made: over the cone in which the detector lies.
     rng = np.random.default_rng(1)
-    radius = np.tan(field_radius_rad(camera)) * np.sqrt(rng.uniform(size=300))
+    inside = min(field_radius_rad(camera), 0.99 * fold_angle(camera))
+    theta = inside * np.sqrt(rng.uniform(size=300))
     angle = rng.uniform(0, 2 * np.pi, 300)
-    e = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones(300)], axis=-1)
-    e /= np.linalg.norm(e, axis=1)[:, None]
+    rho = np.sin(theta)
+    e = np.stack([rho * np.cos(angle), rho * np.sin(angle), np.cos(theta)], axis=-1)
     back = line_of_sight(camera, project(camera, e))
     # 1e-14 of the image plane, a few times more where a barrel shrinks it.
     np.testing.assert_allclose(back, e, rtol=0, atol=1e-13)
@@ -136,8 +193,8 @@ def test_one_and_many_alike(camera: CameraModel) -> None:
     assert project(camera, np.empty((0, 3))).shape == (0, 2)
 
 
-def test_the_length_of_a_direction_does_not_matter() -> None:
-    camera = CAMERAS['barrel']
+@each_camera
+def test_the_length_of_a_direction_does_not_matter(camera: CameraModel) -> None:
     e = line_of_sight(camera, pixel_grid(camera, 5, 5))
     # Powers of two scale exactly.
     np.testing.assert_array_equal(project(camera, 4096.0 * e), project(camera, e))
@@ -149,6 +206,33 @@ def test_behind_the_camera_is_nan() -> None:
     pixels = project(CAMERAS['paper'], e)
     assert np.isnan(pixels[:2]).all() and np.isfinite(pixels[2]).all()
     assert np.isnan(project(CAMERAS['paper'], e[0])).all()
+
+
+def test_a_fisheye_sees_behind_itself_but_not_along_its_axis() -> None:
+    camera = CAMERAS['fisheye behind']
+    theta = np.radians([0.0, 1e-7, 1.0, 89.0, 90.0, 91.0, 120.0, 150.0])
+    e = np.stack([np.sin(theta), np.zeros(8), np.cos(theta)], axis=-1)
+    k1, k2, k3, k4 = camera.distortion
+    t2 = theta**2
+    along = theta * (1 + k1 * t2 + k2 * t2**2 + k3 * t2**3 + k4 * t2**4)
+    fx, _, _, cx, cy = camera.intrinsics
+    expected = np.stack([cx + fx * along, np.full(8, cy)], axis=-1)
+    np.testing.assert_allclose(project(camera, e), expected, rtol=0, atol=1e-11)
+    assert np.isnan(project(camera, np.array([0.0, 0.0, -1.0]))).all()
+
+
+def test_the_rotation_of_a_fisheye_is_smooth_through_the_axis() -> None:
+    # From the series to the closed form at 0.2 rad, and on the axis itself.
+    camera = CAMERAS['fisheye']
+    theta = np.r_[0.0, 1e-12, 1e-5, 0.1, 0.2 - 1e-9, 0.2 + 1e-9, 0.3, 1.0]
+    e = np.stack([np.sin(theta) * 0.6, np.sin(theta) * 0.8, np.cos(theta)], axis=-1)
+    _, _, J = project_jacobians(camera, e)
+    for axis in range(3):
+        step = 1e-30j * np.cross(e[1:], np.eye(3)[axis])
+        exact = project_parameters(camera.model, camera.parameters, e[1:] + step).imag / 1e-30
+        np.testing.assert_allclose(J[1:, :, axis], exact, rtol=0, atol=1e-10 * np.abs(J).max())
+    fx, skew, fy, _, _ = camera.intrinsics
+    np.testing.assert_allclose(J[0], [[skew, -fx, 0], [fy, 0, 0]], rtol=0, atol=1e-12)
 
 
 def test_a_nan_pixel_spoils_no_other() -> None:
@@ -187,6 +271,99 @@ def test_a_pixel_past_the_summit_takes_no_outer_branch() -> None:
     e = line_of_sight(camera, np.stack([500 + 500 * radius, np.full(6, 500.0)], axis=-1))
     assert (e[:3, 0] / e[:3, 2] < 0.935).all()
     assert np.isnan(e[3:]).all()
+
+
+def test_beyond_the_fold_of_a_fisheye_there_is_no_line_of_sight() -> None:
+    # theta (1 - theta^2 / 10) rises to 2/3 sqrt(10/3) and falls from there on.
+    camera = CameraModel(
+        1000, 1000, np.array([500, 0, 500, 500, 500, -0.1, 0, 0, 0]), 'equidistant'
+    )
+    summit = 2 / 3 * np.sqrt(10 / 3)
+    radius = summit * np.array([0.2, 0.9, 0.999, 1.001, 1.1, 2.0, 10.0])
+    e = line_of_sight(camera, np.stack([500 + 500 * radius, np.full(7, 500.0)], axis=-1))
+    assert np.isfinite(e[:3]).all() and np.isnan(e[3:]).all()
+    assert (np.arccos(e[:3, 2]) < np.sqrt(10 / 3)).all()
+    # Without a fold the sphere ends it.
+    whole = camera.replace(k1=0.0)
+    e = line_of_sight(whole, np.array([[500 + 500 * 3.14, 500.0], [500 + 500 * 3.15, 500.0]]))
+    assert np.isfinite(e[0]).all() and np.isnan(e[1]).all()
+
+
+def test_up_to_the_pole_of_a_rational_polynomial_the_whole_plane_is_seen() -> None:
+    # r / (1 - r^2 / 2) grows to infinity at r = sqrt(2): any pixel has a line of sight within.
+    camera = CameraModel(
+        1000, 1000, np.array([500, 0, 500, 500, 500, *[0] * 5, -0.5, 0, 0]), 'rational_polynomial'
+    )
+    pixels = np.array([[500.0 + 500.0 * radius, 500.0] for radius in (0.5, 2.0, 10.0, 100.0)])
+    e = line_of_sight(camera, pixels)
+    x = e[:, 0] / e[:, 2]
+    assert (np.diff(x) > 0).all() and x[-1] < np.sqrt(2)
+    np.testing.assert_allclose(project(camera, e), pixels, rtol=1e-10)
+    # r / (1 + r^2) rises to 1/2 at r = 1.
+    folds = camera.replace(k4=1.0)
+    e = line_of_sight(folds, np.array([[500 + 500 * 0.499, 500.0], [500 + 500 * 0.501, 500.0]]))
+    assert np.isfinite(e[0]).all() and e[0, 0] < e[0, 2] and np.isnan(e[1]).all()
+
+
+def test_a_tilted_detector_is_not_seen_from_behind() -> None:
+    camera = CameraModel(
+        1000, 1000, np.array([500, 0, 500, 500, 500, *[0] * 12, 0, 0.5]), 'tilted'
+    )
+    # w = sin(tau) x + cos(tau) ends at x = -1 / tan(tau).
+    x = -1 / np.tan(0.5) + np.array([-0.1, 0.1])
+    pixels = project(camera, np.stack([x, [0.0, 0.0], [1.0, 1.0]], axis=-1))
+    assert np.isnan(pixels[0]).all() and np.isfinite(pixels[1]).all()
+
+
+@each_camera
+def test_a_camera_becomes_one_of_a_larger_model(camera: CameraModel) -> None:
+    e = line_of_sight(camera, pixel_grid(camera, 9, 7))
+    for model, names in COEFFICIENTS.items():
+        larger = set(camera.parameter_names[5:]) <= set(names)
+        if 'equidistant' in (model, camera.model) or not larger:
+            continue
+        converted, worst_px = convert(camera, model)
+        assert converted.model == model and worst_px == 0.0
+        # The same polynomial: roundings of pixels up to 2592.
+        np.testing.assert_allclose(project(converted, e), project(camera, e), rtol=0, atol=3e-12)
+
+
+@pytest.mark.parametrize(
+    ('name', 'model', 'most_px'),
+    [
+        ('paper', 'equidistant', 0.8),  # decentring, which it has not: 4e-4 r^2 at the corner
+        ('rational', 'plumb_bob', 0.5),
+        ('rational wide', 'plumb_bob', 20.0),
+        ('rational wide', 'equidistant', 1.0),
+        ('tilted', 'thin_prism', 10.0),
+        ('fisheye behind', 'equidistant', 0.0),
+    ],
+)
+def test_a_camera_becomes_the_best_of_another_model(name: str, model: str, most_px: float) -> None:
+    camera = CAMERAS[name]
+    converted, worst_px = convert(camera, model)
+    assert converted.model == model and worst_px <= most_px
+    pixels = pixel_grid(camera, 25, 25)
+    error = np.linalg.norm(project(converted, line_of_sight(camera, pixels)) - pixels, axis=1)
+    assert error.max() == pytest.approx(worst_px, abs=1e-9)
+
+
+def test_what_a_pinhole_cannot_see_costs_everything() -> None:
+    assert convert(CAMERAS['fisheye behind'], 'plumb_bob')[1] == np.inf
+    with pytest.raises(ValueError, match="lens model: 'pinhole' is not one of plumb_bob"):
+        convert(CAMERAS['paper'], 'pinhole')
+
+
+def test_models_and_their_names() -> None:
+    for model in COEFFICIENTS:
+        assert model_of(parameter_names(model)) == model
+        assert set(parameter_names(model)) <= set(ALL_PARAMETER_NAMES)
+    with pytest.raises(ValueError, match='fx are not the parameters of a lens model'):
+        model_of(('fx',))
+    with pytest.raises(ValueError, match='9 finite numbers'):
+        CameraModel(10, 10, CAMERAS['paper'].parameters, 'equidistant')
+    with pytest.raises(ValueError, match="lens model: 'brown' is not one of"):
+        CameraModel(10, 10, CAMERAS['paper'].parameters, 'brown')
 
 
 def test_field_radius() -> None:

@@ -89,7 +89,7 @@ def test_empty_calibration_is_refused() -> None:
     """The calibration of an answer without solution is not taken for a camera."""
     message = calibration_to_message(calibration(), plain)
     message.parameter_names = []
-    with pytest.raises(ValueError, match='none are not the thirteen'):
+    with pytest.raises(ValueError, match='none do not end in alignment'):
         calibration_from_message(message)
 
 

@@ -107,9 +107,10 @@ def test_hand_written_ros_yaml(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('old', 'new', 'says'),
     [
-        ('plumb_bob', 'equidistant', "distortion_model: 'equidistant' is not plumb_bob"),
-        ('plumb_bob', 'rational_polynomial', "'rational_polynomial' is not plumb_bob"),
-        ('plumb_bob', '[1]', r'distortion_model: \[1\] is not plumb_bob'),
+        ('plumb_bob', 'equidistant', 'distortion_model: 5 coefficients of equidistant, .* has 4'),
+        ('plumb_bob', 'rational_polynomial', 'rational_polynomial, not 8, 12 or 14'),
+        ('plumb_bob', 'double_sphere', "distortion_model: 'double_sphere' is not plumb_bob, rat"),
+        ('plumb_bob', '[1]', r"distortion_model: '\[1\]' is not plumb_bob"),
         ('image_width: 640', '', "key 'image_width' is missing"),
         ('image_height: 480', 'image_height: tall', "image_height: 'tall' is not a whole number"),
         ('image_height: 480', 'image_height: 0', '640 x 0 is not an image'),
@@ -117,7 +118,11 @@ def test_hand_written_ros_yaml(tmp_path: Path) -> None:
         ('[500.0, 0.5', '[0, 0.5', 'not positive'),
         ('[500.0, 0.5', '[.nan, 0.5', 'camera_matrix.data: .* is not a finite number'),
         ('239.5, 0, 0, 1]', '239.5, 0, 0, 2]', 'camera_matrix.data: .* is not'),
-        ('[-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]', '[]', 'data: .* is not 4 or 5 numbers'),
+        (
+            '[-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]',
+            '[]',
+            '0 coefficients of plumb_bob, .* 4 or 5',
+        ),
         ('-0.1, 1e-2', 'true, 1e-2', 'distortion_coefficients.data: .* is not a number'),
         ('-0.1, 1e-2', 'big, 1e-2', 'distortion_coefficients.data: .* is not a number'),
         ('camera_matrix', 'matrix', "key 'camera_matrix.data' is missing"),
@@ -130,6 +135,65 @@ def test_a_bad_camera_yaml_is_refused_by_file_and_key(tmp_path, old, new, says) 
     with pytest.raises(ProductError, match=says) as caught:
         read_camera_info(path)
     assert str(path) in str(caught.value) and '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('ros_model', 'D', 'model', 'expected'),
+    [
+        ('equidistant', [1, 2, 3, 4], 'equidistant', [1, 2, 3, 4]),
+        ('fisheye', [1, 2, 3, 4], 'equidistant', [1, 2, 3, 4]),
+        (
+            'rational_polynomial', [1, 2, 4, 5, 3, 6, 7, 8],
+            'rational_polynomial', [1, 2, 3, 4, 5, 6, 7, 8],
+        ),
+        (
+            'rational_polynomial', [1, 2, 4, 5, 3, 6, 7, 8, 9, 10, 11, 12],
+            'thin_prism', [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12],
+        ),
+        (
+            'thin_prism_fraunhofer', [1, 2, 4, 5, 3, 6, 7, 8, 9, 10, 11, 12],
+            'thin_prism', [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12],
+        ),
+        (
+            'rational_polynomial', [1, 2, 4, 5, 3, 6, 7, 8, 9, 10, 11, 12, 13, 14],
+            'tilted', [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14],
+        ),
+    ],
+)  # fmt: skip
+def test_every_distortion_model_of_ros(tmp_path, ros_model, D, model, expected) -> None:
+    path = tmp_path / 'camera.yaml'
+    text = ROS_YAML.replace('plumb_bob', ros_model).replace('[500.0, 0.5', '[500.0, 0.0')
+    path.write_text(text.replace('[-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]', str(D)))
+    camera = read_camera_info(path)
+    assert camera.model == model
+    assert camera.parameters.tolist() == [500.0, 0.0, 501.0, 319.5, 239.5, *expected]
+    write_camera_info(camera, path)
+    content = yaml.safe_load(path.read_text())
+    names = {'equidistant': 'equidistant'}
+    assert content['distortion_model'] == names.get(model, 'rational_polynomial')
+    assert content['distortion_coefficients'] == {'rows': 1, 'cols': len(D), 'data': D}
+    again = read_camera_info(path)
+    assert (again.model, again.parameters.tolist()) == (model, camera.parameters.tolist())
+
+
+@pytest.mark.parametrize(
+    ('model', 'coefficients'),
+    [
+        ('equidistant', [-0.02, 0.01, -0.004, 5e-4]),
+        ('tilted', [0.1, 0.05, 0.01, 1e-3, -7e-4, 0.35, 0.1, 0.02, 0, 0, 0, 0, 0.01, -0.02]),
+    ],
+)
+def test_skew_of_every_model_goes_out_as_the_best_fit(tmp_path, model, coefficients) -> None:
+    camera = CameraModel(
+        1296, 1024, np.array([1800.0, 2.0, 1801.0, 650.0, 510.0, *coefficients]), model
+    )
+    write_camera_info(camera, tmp_path / 'camera.yaml')
+    back = read_camera_info(tmp_path / 'camera.yaml')
+    fitted, worst_px = ros_fit(camera)
+    assert back.model == model and back.parameters.tobytes() == fitted.parameters.tobytes()
+    # Dropped, skew leaves at most skew y', half the height over the focal length; the least
+    # squares may be worse in a corner.
+    assert back.intrinsics[1] == 0.0 and 0.0 < worst_px < 1.3 * 2.0 * 512 / 1800
 
 
 def test_package_urls_follow_ament_prefixes(tmp_path, monkeypatch) -> None:
