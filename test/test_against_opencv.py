@@ -172,7 +172,9 @@ def test_derivatives_of_every_model(model: str) -> None:
         intrinsics, coefficients, rotation = J[..., :4], J[..., 4:8], J[..., 8:11]
     else:  # rotation 3, translation 3, fx fy cx cy, coefficients
         intrinsics, coefficients, rotation = J[..., 6:10], J[..., 10:], J[..., :3]
-    theirs = np.concatenate([intrinsics, coefficients[..., np.argsort(order.astype(int))]], axis=-1)
+    theirs = np.concatenate(
+        [intrinsics, coefficients[..., np.argsort(order.astype(int))]], axis=-1
+    )
     size = np.abs(ours).max(axis=(0, 1))
     # Both are analytic: roundings alone.
     np.testing.assert_allclose(ours / size, theirs / size, rtol=0, atol=1e-11)
