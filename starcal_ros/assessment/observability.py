@@ -273,10 +273,12 @@ def map_error_px(found: CameraModel, true: CameraModel) -> float:
     RMS over the detector between the lines of sight of two cameras, px at the focal length.
 
     The turn of all lines of sight that brings the two closest is removed: a calibration puts it
-    into the alignment.
+    into the alignment.  Infinite where a pixel has no line of sight: a distortion folds.
     """
     grid = pixel_grid(true, GRID, GRID)
     of_found, of_true = line_of_sight(found, grid), line_of_sight(true, grid)
+    if not (np.isfinite(of_found).all() and np.isfinite(of_true).all()):
+        return math.inf
     turn, _ = Rotation.align_vectors(of_true, of_found)
     angle = np.linalg.norm(turn.apply(of_found) - of_true, axis=1)
     return float(np.sqrt(np.mean(angle**2)) * true.parameters[0])

@@ -51,7 +51,9 @@ _STEADY_PX = 1.0  # turn that the next image finds anew as well, from wherever i
 _SYSTEMATIC_PX = 0.15  # rms from which the camera of the prediction is corrected
 # How far the camera that predicts may be from the one before, 1-sigma: a part of the focal length
 # for the intrinsics, and the distortion of a lens that is not quite known.
-_CAMERA_SIGMA = np.array([0.01, 1e-3, 0.01, 0.01, 0.01, 0.05, 0.1, 0.1, 1e-3, 1e-3])
+_INTRINSIC_SIGMA = np.array([0.01, 1e-3, 0.01, 0.01, 0.01])
+_COEFFICIENT_SIGMA = {'k1': 0.05, 'k2': 0.1, 'k3': 0.1, 'k4': 0.05, 'k5': 0.1, 'k6': 0.1}
+_SMALL_SIGMA = 1e-3  # of the other coefficients: decentring, thin prism, tilt
 
 
 @dataclass(frozen=True)
@@ -265,7 +267,8 @@ def _corrected_camera(
 ) -> tuple[CameraModel, Rotation]:
     """Camera and turn that fit the stars of one image, held near what the camera was."""
     before = camera.parameters
-    sigma = _CAMERA_SIGMA * np.r_[np.full(5, before[0]), np.ones(len(before) - 5)]
+    coefficients = [_COEFFICIENT_SIGMA.get(k, _SMALL_SIGMA) for k in camera.parameter_names[5:]]
+    sigma = np.r_[before[0] * _INTRINSIC_SIGMA, coefficients]
     held = np.r_[np.ones(len(before)), np.zeros(3)]
     for _ in range(3):
         pixels, J_parameters, J_rotation = project_jacobians(camera, turn.apply(directions))

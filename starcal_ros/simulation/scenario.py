@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import CameraModel, field_radius_rad, project
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.lens import fold_radius2, ideal_points
 from starcal_ros.records import AttitudeSample, CameraGeometry
 from starcal_ros.sky.astrometry import apparent_directions, tt_julian_date
 from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
@@ -318,7 +319,11 @@ def scene(
     margin_px = stamp_half_px(scenario.detector.psf_sigma_px * (1 + scenario.detector.psf_growth))
     stars = catalog.select(cone(catalog, R[2], field_radius_rad(camera, margin_px)))
     directions = apparent_directions(stars, time_ns)
-    pixels = project(camera, directions @ R.T)
+    in_camera = directions @ R.T
+    # Beyond the fold of the distortion the model has a second image, which no lens has.
+    ideal = ideal_points(camera.model, in_camera)
+    folded = (ideal**2).sum(axis=1) >= fold_radius2(camera.model, camera.distortion)
+    pixels = np.where(folded[:, None], np.nan, project(camera, in_camera))
     size = np.array([camera.width, camera.height])
     near = ((pixels > -margin_px) & (pixels < size - 1 + margin_px)).all(axis=1)
     magnitude = stars.magnitude[near]

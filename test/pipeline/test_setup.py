@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from tiny_campaign import SCENARIO, values, write_png  # type: ignore[import-not-found]
 
+from starcal_ros.camera import CameraModel
 from starcal_ros.errors import CatalogError, OptionError, ProductError
 from starcal_ros.options import holds_options
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, Setup
+from starcal_ros.products.camera_yaml import write_camera_info
 
 
 @pytest.fixture(scope='module')
@@ -51,6 +53,28 @@ def test_a_setup_holds_the_options_of_every_stage(setup: Setup) -> None:
     assert tuple(map(type, held)) == OPTION_CLASSES and len(held) == 9
     for group in held:
         assert dataclasses.asdict(group).items() <= setup.options().items()
+
+
+def test_another_lens_model_starts_from_the_prior_camera(
+    camera_yaml: Path, tmp_path: Path
+) -> None:
+    wide = load_setup(values(camera_yaml, lens_model='rational_polynomial'))
+    prior = wide.prior.camera
+    assert prior.model == 'rational_polynomial'
+    np.testing.assert_array_equal(prior.parameters[:10], SCENARIO.prior.camera.parameters)
+    for name, value in (('estimate', ['fx', 's1']), ('prior_sigma', [0.0] * 10)):
+        with pytest.raises(OptionError, match=f'{name}: .* the lens model rational_polynomial'):
+            load_setup(values(camera_yaml, lens_model='rational_polynomial', **{name: value}))
+    with pytest.raises(OptionError, match='max_parameter_sigma: 12 numbers, .* 16 parameters'):
+        load_setup(
+            values(camera_yaml, lens_model='rational_polynomial', max_parameter_sigma=[1.0] * 12)
+        )
+    fisheye = CameraModel(
+        640, 480, np.array([160, 0, 155, 322, 236, -0.02, 0.01, -0.004, 5e-4]), 'equidistant'
+    )
+    write_camera_info(fisheye, tmp_path / 'fisheye.yaml')
+    with pytest.raises(OptionError, match='lens_model: plumb_bob cannot see all of the field'):
+        load_setup(values(tmp_path / 'fisheye.yaml', lens_model='plumb_bob'))
 
 
 def test_a_rounded_alignment_is_made_unit(camera_yaml: Path) -> None:
