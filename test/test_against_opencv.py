@@ -167,7 +167,8 @@ def test_derivatives_of_every_model(model: str) -> None:
     # Columns of ours without skew; of theirs, by the order of `ros_distortion`.
     ours = np.delete(J_parameters, 1, axis=-1)
     count = len(camera.distortion)
-    _, order = ros_distortion(model, np.arange(float(count)))
+    numbers: np.ndarray = np.arange(count, dtype=np.float64)
+    _, order = ros_distortion(model, numbers)
     if model == 'equidistant':  # fx fy, cx cy, k1 to k4, rotation 3, translation 3, skew
         intrinsics, coefficients, rotation = J[..., :4], J[..., 4:8], J[..., 8:11]
     else:  # rotation 3, translation 3, fx fy cx cy, coefficients
