@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from starcal_ros.detector_field import DetectorField
 from starcal_ros.lens import (
     coefficient_jacobian,
     COEFFICIENTS,
@@ -68,6 +69,8 @@ _INVERSE_STEPS = (
     50  # Newton squares the error at each step: 6 do in the field, the rest is for far corners
 )
 _HELD_PX = 1e-2  # what a fit pays for a coefficient of a rational polynomial that moves by one
+# A field changes by under 0.1 px from pixel to pixel: each step takes off nine tenths and more.
+_FIELD_STEPS = 12
 _INVERSE_TOLERANCE = 1e-14  # of the ideal image plane: 4e-11 px at a focal length of 4000 px
 
 
@@ -77,7 +80,7 @@ class CameraModel:
     A camera: image size in pixels, parameters and lens model.
 
     ``parameters`` is (p,) in the order of `parameter_names`; ``model`` a key of
-    `lens.COEFFICIENTS`.
+    `lens.COEFFICIENTS`; ``field`` what the detector shows beyond the lens model.
 
     Raises
     ------
@@ -90,6 +93,7 @@ class CameraModel:
     height: int
     parameters: Floats
     model: str = 'plumb_bob'
+    field: DetectorField | None = None
 
     def __post_init__(self) -> None:
         """Freeze a float copy of the parameters."""
@@ -166,16 +170,28 @@ def project_parameters(model: str, parameters: Floats, directions_camera: Floats
 
 
 def project(camera: CameraModel, directions_camera: Floats) -> Floats:
-    """Pixels (..., 2) of directions (..., 3) in the camera frame; NaN where there is none."""
+    """
+    Pixels (..., 2) of directions (..., 3) in the camera frame; NaN where there is none.
+
+    The field of the camera is a function of the pixel that comes out, so it is iterated.
+    """
     directions = np.asarray(directions_camera, np.float64)
-    return project_parameters(camera.model, camera.parameters, directions)
+    ideal = project_parameters(camera.model, camera.parameters, directions)
+    if camera.field is None:
+        return ideal
+    pixels = ideal
+    for _ in range(_FIELD_STEPS):
+        pixels = ideal + camera.field.displacement_px(pixels)
+    return pixels
 
 
 def project_jacobians(
     camera: CameraModel, directions_camera: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """
-    Pixels and their derivatives by camera parameters and by a small rotation.
+    Pixels of the lens model, without the field, and their derivatives.
+
+    By the camera parameters and by a small rotation.
 
     Parameters
     ----------
@@ -251,6 +267,8 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     model, distortion = camera.model, camera.distortion
     fold2 = fold_radius2(model, distortion)
     pixels = np.asarray(pixels, np.float64)
+    if camera.field is not None:
+        pixels = pixels - camera.field.displacement_px(pixels)
     fx, skew, fy, cx, cy = camera.intrinsics
     yd = (pixels[..., 1] - cy) / fy
     xd = (pixels[..., 0] - cx - skew * yd) / fx
@@ -331,7 +349,7 @@ def field_radius_rad(camera: CameraModel, margin_px: float = 0.0) -> float:
 
 def ros_fit(camera: CameraModel) -> tuple[CameraModel, float]:
     """
-    Best camera without skew, for readers of ``camera_info``, and its cost.
+    Best camera without skew and field, for readers of ``camera_info``, and its cost.
 
     ROS consumers ignore K[0,1], but their OpenCV has every lens model here.  Skew is a shear; half
     of it is a rotation that only the alignment could carry, so some error stays.  Least squares
@@ -344,10 +362,10 @@ def ros_fit(camera: CameraModel) -> tuple[CameraModel, float]:
     worst_px : float
         Largest pixel error over the grid.
     """
-    if camera.intrinsics[1] == 0.0:
+    if camera.intrinsics[1] == 0.0 and camera.field is None:
         return camera, 0.0
     free = [k for k, name in enumerate(camera.parameter_names) if name != 'skew']
-    return _fit(camera.replace(skew=0.0), free, camera)
+    return _fit(dataclasses.replace(camera.replace(skew=0.0), field=None), free, camera)
 
 
 def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
@@ -367,7 +385,7 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
     ValueError
         For an unknown model.
     """
-    if model == camera.model:
+    if model == camera.model and camera.field is None:
         return camera, 0.0
     if model not in COEFFICIENTS:
         raise ValueError(f'lens model: {model!r} is not one of {", ".join(COEFFICIENTS)}')
@@ -378,7 +396,7 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
     if not same_plane:
         start[5:] = 0.0
     started = CameraModel(camera.width, camera.height, start, model)
-    if same_plane and known.keys() <= set(names):
+    if same_plane and known.keys() <= set(names) and camera.field is None:
         return started, 0.0  # a special case of the larger model
     return _fit(started, list(range(len(names))), camera)
 

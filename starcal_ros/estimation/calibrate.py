@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from starcal_ros.camera import ALL_PARAMETER_NAMES, parameter_names
+from starcal_ros.camera import ALL_PARAMETER_NAMES, CameraModel, parameter_names
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.detector_field import in_degree
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.covariance import shared_covariance, shared_names
 from starcal_ros.estimation.levenberg_marquardt import NotObservable, Solution
+from starcal_ros.estimation.linear_terms import LinearTerms, Score
 from starcal_ros.estimation.normal_equations import (
     arrange,
     Measurements,
@@ -32,13 +34,24 @@ from starcal_ros.estimation.normal_equations import (
 from starcal_ros.estimation.problem import (
     attitude_errors,
     attitudes_of_stars_alone,
+    field_terms,
     image_blocks,
+    image_field,
     image_parameters,
     METHODS,
     minimise,
     Problem,
     reduced_information,
+    scalar_terms_at,
+    score_of,
     State,
+)
+from starcal_ros.estimation.residual_field import (
+    best_prior,
+    degree_for,
+    FieldPrior,
+    polynomials,
+    TEST_DEGREE,
 )
 from starcal_ros.estimation.temperature import weakest_term, why_unsupported
 from starcal_ros.estimation.variance_components import (
@@ -55,6 +68,7 @@ Mask = NDArray[np.bool_]
 
 _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
 _START_FLOOR_PX = 0.05  # until the residuals tell: of the order of what is left in good images
+_FIELD_ROUNDS = 6  # its prior and the variances settle in two or three
 _ROUNDS = 10  # the set of rejected stars settles in two or three
 FEWEST_STARS = 3  # of an image: its rotation fits any one star, and two as good as any
 _FEWEST_SIGHTINGS = 3  # of a star, from which it can be told from its images
@@ -69,7 +83,7 @@ class CalibrationOptions:
         'hierarchical', 'how the attitudes of the images are treated', choices=METHODS
     )
     estimate: tuple[str, ...] = option(
-        ('fx', 'skew', 'fy', 'distortion'),
+        ('fx', 'skew', 'fy', 'cx', 'cy', 'distortion'),
         'camera parameters that are estimated; the others are held at the prior; distortion: all'
         ' coefficients of the lens model',
         choices=(*ALL_PARAMETER_NAMES, 'distortion'),
@@ -103,8 +117,25 @@ class CalibrationOptions:
         ' is held, it is taken as exact',
         low=0.0,
     )
+    principal_point_prior: float = option(
+        0.03,
+        '1-sigma of the prior of cx and cy where prior_sigma gives none, as a fraction of the'
+        ' longer side of the image; 0: none',
+        low=0.0,
+        high=1.0,
+    )
     variance_components: bool = option(
         True, 'estimate the sigmas of centroids and star tracker again from the residuals'
+    )
+    residual_field: bool = option(
+        True,
+        'estimate a smooth field over the detector beside the lens model where stars show one',
+    )
+    max_field_p_value: float = option(
+        0.01,
+        'p-value of no field below which one is estimated',
+        low=0.0,
+        high=1.0,
     )
     focal_temperature_order: int = option(
         0, 'degree of the polynomial of focal length in temperature; 0: none', low=0, high=2
@@ -162,10 +193,16 @@ class Estimate:
     iterations, termination
     thermal : Thermal or None
         None where no change with temperature was asked for.
+    joint_covariance : (p + 3 + 2 t, p + 3 + 2 t)
+        Of ``covariance``'s numbers and the coefficients of the field of the camera, those of u,
+        then those of v; t is 0 where there is no field.
+    field_test : FieldPrior or None
+        Of the test whether the lens model needs a field beside it; None where it was not made.
     """
 
     geometry: CameraGeometry
     covariance: Floats
+    joint_covariance: Floats
     information: Floats
     information_names: tuple[str, ...]
     shared_covariance: Floats
@@ -187,6 +224,7 @@ class Estimate:
     iterations: int
     termination: str
     thermal: Thermal | None
+    field_test: FieldPrior | None
 
 
 def check_options(options: CalibrationOptions, model: str) -> None:
@@ -311,8 +349,12 @@ def estimate_calibration(
 def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Problem:
     """What a search is given of an ensemble."""
     model, names = prior.camera.model, prior.camera.parameter_names
-    prior_sigma = np.broadcast_to(options.prior_sigma, len(names))
+    prior_sigma = np.array(np.broadcast_to(options.prior_sigma, len(names)))
+    weak_px = options.principal_point_prior * max(prior.camera.width, prior.camera.height)
     free = {names.index(name) for name in estimated_parameters(options, model)}
+    for k in free & {names.index('cx'), names.index('cy')}:
+        if prior_sigma[k] == 0:
+            prior_sigma[k] = weak_px
     return Problem(
         method=options.method,
         model=model,
@@ -369,7 +411,7 @@ def _search(
     options: CalibrationOptions,
 ) -> tuple[Estimate, str]:
     """
-    Robust search, then least squares with snooping; see the head of the module.
+    Robust search, then least squares with snooping, without a field and, if it must be, with one.
 
     With the term of temperature to leave out, if any.
     """
@@ -383,12 +425,38 @@ def _search(
     )
     measurements = _arranged(table, verdict)
     solution = _robust_search(problem, start, measurements)
-    iterations = solution.iterations
     _, blocks = image_blocks(problem, solution.state, measurements)
     del measurements  # before the next: they are as large as the table
-    after, measurements = _judge(
-        problem, solution.state, blocks, table, verdict, given_rad, options
+    verdict, measurements = _judge(
+        problem, solution.state, blocks, None, table, verdict, given_rad, options
     )
+    found = _settle(
+        _Found(problem, solution, verdict, solution.iterations), measurements, table, options
+    )
+    del measurements
+    if options.residual_field:
+        found = _with_field(found, table, prior, options)
+    return _estimate(found, table, prior, options)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Where a search stands: its problem, its minimum, and the verdict that it was made with."""
+
+    problem: Problem
+    solution: Solution[State]
+    verdict: _Verdict
+    iterations: int
+    field_test: FieldPrior | None = None
+
+
+def _settle(
+    found: _Found, measurements: Measurements, table: StarTable, options: CalibrationOptions
+) -> _Found:
+    """Least squares and judgement of its residuals in turns, until the judgement stands."""
+    problem, solution = found.problem, found.solution
+    given_rad = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
+    iterations, after = found.iterations, found.verdict
     for _ in range(_ROUNDS):
         verdict = after
         problem = dataclasses.replace(
@@ -397,18 +465,63 @@ def _search(
                 verdict.misfit[:, None], np.inf, verdict.tracker_sigma_rad
             ),
         )
-        del blocks
         solution = minimise(problem, solution.state, measurements)
         iterations += solution.iterations
         _, blocks = image_blocks(problem, solution.state, measurements)
+        terms = field_terms(problem, solution.state, measurements)
         del measurements
         after, measurements = _judge(
-            problem, solution.state, blocks, table, verdict, given_rad, options
+            problem, solution.state, blocks, terms, table, verdict, given_rad, options
         )
+        del blocks
         if after.agrees_with(verdict):
             break
-    del measurements
-    return _estimate(problem, solution, blocks, table, verdict, prior, options, iterations)
+    return dataclasses.replace(
+        found, problem=problem, solution=solution, verdict=verdict, iterations=iterations
+    )
+
+
+def _with_field(
+    found: _Found, table: StarTable, prior: CameraGeometry, options: CalibrationOptions
+) -> _Found:
+    """The search with a field beside the lens model, where the stars show one."""
+    best = _field_prior(found, table, prior.camera, TEST_DEGREE)
+    found = dataclasses.replace(found, field_test=best)
+    if best.p_value > options.max_field_p_value:
+        return found
+    for _ in range(_FIELD_ROUNDS):
+        best = _field_prior(found, table, prior.camera, degree_for(best))
+        state = dataclasses.replace(found.solution.state, modes=np.zeros(best.modes.shape[1]))
+        found = dataclasses.replace(
+            found,
+            problem=dataclasses.replace(found.problem, field_prior=best),
+            solution=dataclasses.replace(found.solution, state=state),
+        )
+        before = found.verdict
+        found = _settle(found, _arranged(table, before), table, options)
+        if found.verdict.agrees_with(before):
+            break
+    return found
+
+
+def _field_prior(found: _Found, table: StarTable, camera: CameraModel, degree: int) -> FieldPrior:
+    """The prior of a field that the residuals at a minimum ask for, in polynomials of a degree."""
+    problem, state = found.problem, found.solution.state
+    camera = dataclasses.replace(camera, parameters=state.parameters, field=None)
+    measurements = _arranged(table, found.verdict)
+    _, blocks = image_blocks(problem, state, measurements)
+    terms = scalar_terms_at(
+        problem, state, measurements, polynomials(camera.width, camera.height, degree)
+    )
+    # The field that there is, if any, is part of what the residuals are asked for.
+    without = dataclasses.replace(problem, field_prior=None)
+    shown = score_of(without, state, blocks, None, terms)
+    now = image_field(problem, state)
+    if now is not None:
+        coefficients = in_degree(now, degree)
+        gradient = shown.gradient + shown.information @ coefficients
+        shown = Score(gradient, shown.information)
+    return best_prior(shown, camera, problem.free, degree)
 
 
 def _arranged(table: StarTable, verdict: _Verdict) -> Measurements:
@@ -416,40 +529,42 @@ def _arranged(table: StarTable, verdict: _Verdict) -> Measurements:
 
 
 def _estimate(
-    problem: Problem,
-    solution: Solution[State],
-    blocks: Floats,
-    table: StarTable,
-    verdict: _Verdict,
-    prior: CameraGeometry,
-    options: CalibrationOptions,
-    iterations: int,
+    found: _Found, table: StarTable, prior: CameraGeometry, options: CalibrationOptions
 ) -> tuple[Estimate, str]:
     """What a search has found, and the term of temperature to leave out, if any."""
+    problem, solution, verdict = found.problem, found.solution, found.verdict
     state = solution.state
+    measurements = _arranged(table, verdict)
+    _, blocks = image_blocks(problem, state, measurements)
+    terms = field_terms(problem, state, measurements)
+    del measurements
     residual_px = _residuals(problem, state, table)
     kept = verdict.kept
-    freedom = _freedom(problem, state, blocks, kept, verdict.tracker_sigma_rad)
+    freedom = _freedom(problem, state, blocks, terms, kept, verdict.tracker_sigma_rad)
     chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()
     lost = np.bincount(table.image[kept], minlength=table.image_count) == 0
     geometry, full, scatter_arcsec = _result(
-        problem, state, blocks, prior, verdict.tracker_sigma_rad
+        problem, state, blocks, terms, prior, verdict.tracker_sigma_rad
     )
     alignment = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).inv()
     attitude_error_rad, attitude_covariance_rad2, attitude_seen = attitudes_of_stars_alone(
         problem, dataclasses.replace(state, camera_from_star_tracker=alignment), blocks
     )
-    information = reduced_information(problem, state, blocks)
     p = problem.camera_count
-    shared = np.concatenate([problem.free, np.arange(p, len(information))])
+    information = reduced_information(problem, state, blocks, terms)
+    in_modes = len(state.modes)
+    shared = np.concatenate([problem.free, np.arange(p, len(information) - in_modes)])
     k = p + len(state.focal)
     at_reference = np.r_[0:p, k : k + 3]
+    of_modes = np.arange(len(full) - in_modes, len(full))
+    full, joint = full[: of_modes[0], : of_modes[0]] if in_modes else full, full
     thermal = _thermal(state, full, options)
     weakest = weakest_term(thermal, full[k + 3 :, k + 3 :]) if thermal else ''
     names = shared_names(problem.model, len(state.focal), len(state.rate) > 0)
     estimate = Estimate(
         geometry=geometry,
         covariance=full[np.ix_(at_reference, at_reference)],
+        joint_covariance=_in_coefficients(problem, joint, np.r_[at_reference, of_modes]),
         information=information[np.ix_(shared, shared)],
         information_names=tuple(names[i] for i in shared),
         shared_covariance=full,
@@ -468,9 +583,10 @@ def _estimate(
         attitude_error_rad=attitude_error_rad,
         attitude_covariance_rad2=attitude_covariance_rad2,
         attitude_seen=attitude_seen,
-        iterations=iterations,
+        iterations=found.iterations,
         termination=solution.termination,
         thermal=thermal,
+        field_test=found.field_test,
     )
     return estimate, weakest
 
@@ -530,6 +646,7 @@ def _judge(
     problem: Problem,
     state: State,
     blocks: Floats,
+    terms: LinearTerms | None,
     table: StarTable,
     before: _Verdict,
     given_rad: Floats,
@@ -543,7 +660,7 @@ def _judge(
     residual_px = _residuals(problem, state, table)
     variance, tracker_sigma_rad = CentroidVariance(1.0, 0.0), given_rad
     if options.variance_components:
-        freedom = _freedom(problem, state, blocks, before.kept, before.tracker_sigma_rad)
+        freedom = _freedom(problem, state, blocks, terms, before.kept, before.tracker_sigma_rad)
         variance = estimate_variance(residual_px, table.covariance_px2, before.kept, freedom)
     kept = _fitting(residual_px, table, variance, options)
     del residual_px
@@ -593,19 +710,48 @@ def _dropped(table: StarTable, kept: Mask) -> NDArray[np.int64]:
 
 def _residuals(problem: Problem, state: State, table: StarTable) -> Floats:
     rotations = state.camera_from_icrf.as_matrix()
-    return residuals_px(table, problem.model, image_parameters(problem, state), rotations)
+    return residuals_px(
+        table,
+        problem.model,
+        image_parameters(problem, state),
+        rotations,
+        image_field(problem, state),
+    )
+
+
+def _in_coefficients(problem: Problem, covariance: Floats, rows: NDArray[np.int64]) -> Floats:
+    """Some rows of a covariance, the modes of a field at its end turned into coefficients."""
+    chosen = covariance[np.ix_(rows, rows)]
+    if problem.field_prior is None:
+        return chosen
+    modes = problem.field_prior.modes
+    k = len(rows) - modes.shape[1]
+    to_coefficients = np.zeros((k + len(modes), len(rows)))
+    to_coefficients[:k, :k] = np.eye(k)
+    to_coefficients[k:, k:] = modes
+    return np.asarray(to_coefficients @ chosen @ to_coefficients.T)
 
 
 def _freedom(
-    problem: Problem, state: State, blocks: Floats, kept: Mask, tracker_sigma_rad: Floats
+    problem: Problem,
+    state: State,
+    blocks: Floats,
+    terms: LinearTerms | None,
+    kept: Mask,
+    tracker_sigma_rad: Floats,
 ) -> float:
     """
     Share of the residuals' degrees of freedom that the fit leaves.
 
     An attitude that the star tracker holds costs less than three: with P the covariance from the
-    stars and T the star tracker's, trace(T (T + P)^-1).
+    stars and T the star tracker's, trace(T (T + P)^-1).  So does a mode of the field that its
+    prior holds: one less its posterior variance.
     """
     unknowns = float(len(problem.free) + len(state.focal) + len(state.rate))
+    if terms is not None:
+        without = dataclasses.replace(problem, field_prior=None)
+        shown = score_of(without, state, blocks, None, terms).information
+        unknowns += len(shown) - float(np.trace(np.linalg.inv(shown + np.eye(len(shown)))))
     if problem.method == 'single':
         unknowns += 3
     else:
@@ -625,6 +771,7 @@ def _result(
     problem: Problem,
     state: State,
     blocks: Floats,
+    terms: LinearTerms | None,
     prior: CameraGeometry,
     tracker_sigma_rad: Floats,
 ) -> tuple[CameraGeometry, Floats, float]:
@@ -639,11 +786,11 @@ def _result(
         good = seen & np.isfinite(problem.star_tracker_sigma_rad[:, 0])
         if good.any():
             scatter_arcsec = float(np.sqrt(eta_rad[good].var(axis=0).mean())) / ARCSECOND_RAD
-    alignment, full = shared_covariance(problem, state, blocks, good, tracker_sigma_rad)
+    alignment, full = shared_covariance(problem, state, blocks, good, tracker_sigma_rad, terms)
     focal_px = state.parameters[[0, 2]]
     if not (focal_px > 0).all():
         raise NotObservable(f'fx, fy of {focal_px.round(1).tolist()} px are of a mirrored image')
-    camera = prior.camera.replace(
+    camera = dataclasses.replace(prior.camera, field=image_field(problem, state)).replace(
         **{problem.parameter_names[i]: float(state.parameters[i]) for i in problem.free}
     )
     quaternion = alignment.inv().as_quat()

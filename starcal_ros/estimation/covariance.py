@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import parameter_names
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.estimation.linear_terms import LinearTerms
+from starcal_ros.estimation.normal_equations import ROTATION
 from starcal_ros.estimation.problem import by_shared, Problem, reduced_information, State
 from starcal_ros.records import ALIGNMENT_NAMES
 
@@ -31,10 +33,15 @@ def shared_names(model: str, focal_terms: int, with_rate: bool) -> tuple[str, ..
 
 
 def shared_covariance(
-    problem: Problem, state: State, blocks: Floats, good: Mask, tracker_sigma_rad: Floats
+    problem: Problem,
+    state: State,
+    blocks: Floats,
+    good: Mask,
+    tracker_sigma_rad: Floats,
+    terms: LinearTerms | None = None,
 ) -> tuple[Rotation, Floats]:
     """
-    The alignment, and the covariance (s, s) of `shared_names`.
+    The alignment, and the covariance (s, s) of `shared_names`, then of the modes of the field.
 
     Parameters
     ----------
@@ -44,20 +51,21 @@ def shared_covariance(
         Images whose attitudes count in the mean of ``per_image``; the other methods do not ask.
     tracker_sigma_rad : (3,)
         Of those attitudes.
+    terms : LinearTerms or None
+        Of `problem.field_terms`.
 
     Raises
     ------
     NotObservable
         When the images do not determine all that is estimated.
     """
-    shared = considered_covariance(problem, reduced_information(problem, state, blocks))
+    information = reduced_information(problem, state, blocks, terms)
+    shared = considered_covariance(problem, information)
     if problem.method != 'per_image':
         return state.camera_from_star_tracker, shared
     if not good.any():
         raise NotObservable('no attitude of an image fits the others')
-    full = np.zeros((len(shared) + 3, len(shared) + 3))
-    full[:-3, :-3] = shared
-    return _mean_alignment(problem, state, blocks, good, full, tracker_sigma_rad)
+    return _mean_alignment(problem, state, blocks, good, shared, tracker_sigma_rad, terms)
 
 
 def considered_covariance(problem: Problem, information: Floats) -> Floats:
@@ -89,30 +97,38 @@ def _mean_alignment(
     state: State,
     blocks: Floats,
     good: Mask,
-    full: Floats,
+    shared: Floats,
     tracker_sigma_rad: Floats,
+    terms: LinearTerms | None,
 ) -> tuple[Rotation, Floats]:
     """
-    Quaternion mean of the alignments of the images (Markley et al. 2007), completing ``full``.
+    Quaternion mean of the alignments of the images (Markley et al. 2007), and all covariance.
 
     SciPy's mean is the dominant eigenvector of sum w q q'; weighted by the covariances of the
-    images.  The mean is linear in the rotations, and those in the camera parameters.
+    images.  The mean is linear in the rotations, and those in the camera parameters, the focal
+    terms and the modes of the field, whose covariance is ``shared``.
     """
     alignments = (state.camera_from_icrf * problem.star_tracker_from_icrf.inv())[good]
     tracker = np.diag(tracker_sigma_rad**2)
-    k = len(full) - 3
+    r = len(state.modes)
+    k = len(shared) - r
     rows = by_shared(problem, state, blocks)[good][:, k : k + 3]
     C, B = rows[:, :, k : k + 3], rows[:, :, :k]
-    stars, by_camera = np.linalg.inv(C), np.linalg.solve(C, B)
-    within = stars + by_camera @ full[:k, :k] @ by_camera.transpose(0, 2, 1)
+    if terms is not None:
+        B = np.concatenate([B, terms.cross[good][:, :, ROTATION].transpose(0, 2, 1)], axis=2)
+    stars, by_shared_unknowns = np.linalg.inv(C), np.linalg.solve(C, B)
+    within = stars + by_shared_unknowns @ shared @ by_shared_unknowns.transpose(0, 2, 1)
     weight = 1.0 / np.trace(within + tracker, axis1=1, axis2=2)
     alignment = alignments.mean(weight)
     weight = weight / weight.sum()
     A = alignment.as_matrix()
-    F = np.einsum('m,mij->ij', weight, by_camera)
+    F = np.einsum('m,mij->ij', weight, by_shared_unknowns)
     scattered = np.einsum('m,mij->ij', weight**2, stars + A @ tracker @ A.T)
-    full = full.copy()
-    full[k:, k:] = scattered + F @ full[:k, :k] @ F.T
-    full[k:, :k] = -F @ full[:k, :k]
-    full[:k, k:] = full[k:, :k].T
+    full = np.zeros((k + r + 3, k + r + 3))
+    before = np.r_[0:k, k + 3 : k + 3 + r]
+    angles = np.arange(k, k + 3)
+    full[np.ix_(before, before)] = shared
+    full[np.ix_(angles, angles)] = scattered + F @ shared @ F.T
+    full[np.ix_(angles, before)] = -F @ shared
+    full[np.ix_(before, angles)] = full[np.ix_(angles, before)].T
     return alignment, full

@@ -10,13 +10,15 @@ formed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.camera import ALL_PARAMETER_NAMES, project_parameters
+from starcal_ros.detector_field import DetectorField
 from starcal_ros.lens import (
     coefficient_jacobian,
     distort,
@@ -74,7 +76,7 @@ def star_table(images: Sequence[StarObservations]) -> StarTable:
 
 
 @dataclass(frozen=True)
-class _Chunk:
+class Chunk:
     """Some images of like star count, padded to the largest with stars of no weight."""
 
     image: NDArray[np.int64]  # (m,)
@@ -87,7 +89,7 @@ class _Chunk:
 class Measurements:
     """Star observations laid out for `normal_blocks`."""
 
-    chunks: tuple[_Chunk, ...]
+    chunks: tuple[Chunk, ...]
     image_count: int
     # Of every pass: fresh pages for each would cost as much as the arithmetic on them.
     derivatives: Floats
@@ -132,7 +134,7 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
         whitener = whitening(covariance_px2[row])
         whitener *= real.ravel()
         chunks.append(
-            _Chunk(
+            Chunk(
                 chosen,
                 direction_icrf.reshape(3, *real.shape).transpose(1, 0, 2),
                 np.ascontiguousarray(table.measured_px[row].T),
@@ -152,6 +154,7 @@ def normal_blocks(
     parameters: Floats,
     camera_from_icrf: Floats,
     loss_scale: float = np.inf,
+    field: DetectorField | None = None,
 ) -> tuple[float, Floats]:
     """
     Cost and the normal matrix of every image.
@@ -167,6 +170,8 @@ def normal_blocks(
     loss_scale : float
         Cauchy loss ``c^2 log(1 + s / c^2)`` of the squared whitened residual s of a star;
         infinite: least squares.
+    field : DetectorField, optional
+        Taken off the measured pixels.
 
     Returns
     -------
@@ -177,18 +182,12 @@ def normal_blocks(
         ``blocks[:, :-1, -1]`` is downhill.
     """
     rows = parameters.shape[-1] + 4
-    whitened_columns = _plumb_bob_columns if model == 'plumb_bob' else _lens_columns
     blocks = np.zeros((measurements.image_count, rows, rows))
     cost = 0.0
-    for chunk in measurements.chunks:
-        m, _, n = chunk.direction_icrf.shape
-        size = 2 * (rows + 1) * m * n
-        J = measurements.derivatives[:size].reshape(2, rows + 1, m * n)
-        own = parameters
-        if parameters.ndim > 1:
-            own = np.repeat(parameters[chunk.image], n, axis=0).T
-        if not whitened_columns(chunk, model, own, camera_from_icrf[chunk.image], J):
+    for chunk, J in whitened_chunks(measurements, model, parameters, camera_from_icrf, field):
+        if J is None:
             return np.inf, blocks
+        m, _, n = chunk.direction_icrf.shape
         if np.isfinite(loss_scale):
             s = J[0, rows - 1] ** 2 + J[1, rows - 1] ** 2
             c2 = loss_scale**2
@@ -204,8 +203,37 @@ def normal_blocks(
     return cost, blocks
 
 
+def whitened_chunks(
+    measurements: Measurements,
+    model: str,
+    parameters: Floats,
+    camera_from_icrf: Floats,
+    field: DetectorField | None = None,
+) -> Iterator[tuple[Chunk, Floats | None]]:
+    """
+    Yield each chunk of m images of n stars with its whitened derivatives and residuals.
+
+    They are (2, p + 5, m n): the u and the v rows of the columns of `normal_blocks`, and a column
+    of zeros; None where the camera model has no image of a star.  The next chunk overwrites them.
+    """
+    whitened_columns = _plumb_bob_columns if model == 'plumb_bob' else _lens_columns
+    columns = parameters.shape[-1] + 5
+    for chunk in measurements.chunks:
+        m, _, n = chunk.direction_icrf.shape
+        J = measurements.derivatives[: 2 * columns * m * n].reshape(2, columns, m * n)
+        own = parameters
+        if parameters.ndim > 1:
+            own = np.repeat(parameters[chunk.image], n, axis=0).T
+        ideal = chunk
+        if field is not None:
+            off_px = field.displacement_px(chunk.measured_px.T).T
+            ideal = dataclasses.replace(chunk, measured_px=chunk.measured_px - off_px)
+        seen = whitened_columns(ideal, model, own, camera_from_icrf[chunk.image], J)
+        yield chunk, (J if seen else None)
+
+
 def _lens_columns(
-    chunk: _Chunk, model: str, parameters: Floats, camera_from_icrf: Floats, J: Floats
+    chunk: Chunk, model: str, parameters: Floats, camera_from_icrf: Floats, J: Floats
 ) -> bool:
     """
     Write the whitened derivatives and residuals of a chunk into J, (2, p + 5, m n).
@@ -245,7 +273,7 @@ def _lens_columns(
 
 
 def _plumb_bob_columns(
-    chunk: _Chunk, model: str, parameters: Floats, camera_from_icrf: Floats, J: Floats
+    chunk: Chunk, model: str, parameters: Floats, camera_from_icrf: Floats, J: Floats
 ) -> bool:
     """
     Write the same as `_lens_columns` for ``plumb_bob``, in half the time.
@@ -322,10 +350,16 @@ def _plumb_bob_columns(
 
 
 def residuals_px(
-    table: StarTable, model: str, parameters: Floats, camera_from_icrf: Floats
+    table: StarTable,
+    model: str,
+    parameters: Floats,
+    camera_from_icrf: Floats,
+    field: DetectorField | None = None,
 ) -> Floats:
     """Measured minus predicted pixels (n, 2) of every star; parameters (p,) or (m, p)."""
     residual_px = table.measured_px.copy()
+    if field is not None:
+        residual_px -= field.displacement_px(table.measured_px)
     # In parts: a rotation for each of all stars would be most of the memory of a calibration.
     for first in range(0, len(table), _CHUNK_STARS):
         part = slice(first, first + _CHUNK_STARS)

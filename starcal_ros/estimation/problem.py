@@ -16,6 +16,7 @@ the derivatives by what is shared follow by the chain rule, one small matrix for
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,12 +24,24 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import parameter_names
+from starcal_ros.detector_field import DetectorField
 from starcal_ros.estimation.levenberg_marquardt import (
+    inverse,
     levenberg_marquardt,
     NormalEquations,
     Solution,
 )
+from starcal_ros.estimation.linear_terms import (
+    Border,
+    bordered,
+    LinearTerms,
+    scalar_terms,
+    Scalars,
+    Score,
+    score,
+)
 from starcal_ros.estimation.normal_equations import Measurements, normal_blocks, RESIDUAL, ROTATION
+from starcal_ros.estimation.residual_field import FieldPrior
 from starcal_ros.estimation.temperature import parameters_at, parameters_chain, turns, turns_chain
 
 Floats = NDArray[np.float64]
@@ -45,6 +58,7 @@ class State:
     camera_from_icrf: Rotation  # (m,)
     focal: Floats = field(default_factory=lambda: np.empty(0))  # (q,) terms of temperature
     rate: Floats = field(default_factory=lambda: np.empty(0))  # (3,) of the alignment, or (0,)
+    modes: Floats = field(default_factory=lambda: np.empty(0))  # (r,) amplitudes of the field
 
 
 @dataclass(frozen=True)
@@ -67,6 +81,8 @@ class Problem:
         1-sigma of each attitude about the star tracker's axes; infinite: not to be trusted.
     above_reference_k : (m,)
         Temperature of each image less the reference; (0,) where no term is estimated.
+    field_prior : FieldPrior or None
+        Of the field that is estimated beside the lens model; None: none is.
     """
 
     method: str
@@ -77,6 +93,7 @@ class Problem:
     star_tracker_from_icrf: Rotation
     star_tracker_sigma_rad: Floats
     above_reference_k: Floats = field(default_factory=lambda: np.empty(0))
+    field_prior: FieldPrior | None = None
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -105,7 +122,10 @@ def minimise(
 
     def evaluate(state: State) -> NormalEquations:
         cost, blocks = image_blocks(problem, state, measurements, loss_scale)
-        return assemble(problem, state, cost, blocks)
+        if not np.isfinite(cost):
+            return NormalEquations(cost, *(np.empty(0) for _ in range(5)))
+        terms = field_terms(problem, state, measurements)
+        return assemble(problem, state, cost, blocks, terms)
 
     def move(state: State, shared: Floats, blocks: Floats) -> State:
         return _move(problem, state, shared, blocks)
@@ -137,7 +157,35 @@ def image_blocks(
         image_parameters(problem, state),
         state.camera_from_icrf.as_matrix(),
         loss_scale,
+        image_field(problem, state),
     )
+
+
+def image_field(problem: Problem, state: State) -> DetectorField | None:
+    """Field at a state; None where none is estimated."""
+    return problem.field_prior.field(state.modes) if problem.field_prior else None
+
+
+def scalar_terms_at(
+    problem: Problem, state: State, measurements: Measurements, scalars: Scalars
+) -> LinearTerms:
+    """Sums of the terms of functions of the pixel at a state."""
+    return scalar_terms(
+        measurements,
+        problem.model,
+        image_parameters(problem, state),
+        state.camera_from_icrf.as_matrix(),
+        scalars,
+        image_field(problem, state),
+    )
+
+
+def field_terms(problem: Problem, state: State, measurements: Measurements) -> LinearTerms | None:
+    """Sums of the modes of the field; None where none is estimated."""
+    prior = problem.field_prior
+    if prior is None:
+        return None
+    return scalar_terms_at(problem, state, measurements, prior.polynomials).in_modes(prior.modes)
 
 
 def by_shared(problem: Problem, state: State, blocks: Floats) -> Floats:
@@ -146,26 +194,38 @@ def by_shared(problem: Problem, state: State, blocks: Floats) -> Floats:
 
     From those by the parameters of the image; the same where no focal term is estimated.
     """
-    q = len(state.focal)
-    if q == 0:
+    if len(state.focal) == 0:
         return blocks
-    p = problem.camera_count
-    E = np.zeros((len(blocks), p + 4, p + 4 + q))
-    E[:, :p, : p + q] = parameters_chain(state.parameters, state.focal, problem.above_reference_k)
-    E[:, p:, p + q :] = np.eye(4)
+    E = _focal_chain(problem, state, len(blocks))
     return np.asarray(E.transpose(0, 2, 1) @ blocks @ E)
 
 
-def assemble(problem: Problem, state: State, cost: float, blocks: Floats) -> NormalEquations:
+def _focal_chain(problem: Problem, state: State, m: int) -> Floats:
+    """Derivatives (m, p + 4, p + q + 4) of the columns of an image by those of `by_shared`."""
+    p, q = problem.camera_count, len(state.focal)
+    E = np.zeros((m, p + 4, p + 4 + q))
+    E[:, :p, : p + q] = parameters_chain(state.parameters, state.focal, problem.above_reference_k)
+    E[:, p:, p + q :] = np.eye(4)
+    return E
+
+
+def assemble(
+    problem: Problem,
+    state: State,
+    cost: float,
+    blocks: Floats,
+    terms: LinearTerms | None = None,
+) -> NormalEquations:
     """
     Normal equations of a method from the cost and the matrices of the images.
 
     Shared unknowns: the free camera parameters, the focal terms, then the alignment angles where
-    the method has one alignment, and their rate; a block is the rotation of an image.
+    the method has one alignment, and their rate, and the modes of the field, whose ``terms`` are
+    those of `field_terms`; a block is the rotation of an image.
     """
     normal = _with_all_parameters(problem, state, cost, blocks)
-    keep = np.concatenate([problem.free, np.arange(problem.camera_count, len(normal.a))])
-    return NormalEquations(
+    keep = _estimated(problem, normal)
+    normal = NormalEquations(
         normal.cost,
         normal.A[np.ix_(keep, keep)],
         normal.a[keep],
@@ -173,6 +233,83 @@ def assemble(problem: Problem, state: State, cost: float, blocks: Floats) -> Nor
         normal.C,
         normal.c,
     )
+    if terms is None:
+        return normal
+    return bordered(
+        dataclasses.replace(normal, cost=normal.cost + 0.5 * float(state.modes @ state.modes)),
+        _with_mode_prior(border_of(problem, state, terms), state),
+    )
+
+
+def _estimated(problem: Problem, normal: NormalEquations) -> NDArray[np.int64]:
+    """Which shared unknowns of `_with_all_parameters` are estimated."""
+    return np.concatenate([problem.free, np.arange(problem.camera_count, len(normal.a))])
+
+
+def _with_mode_prior(border: Border, state: State) -> Border:
+    """The border of modes that have a unit normal prior each."""
+    return dataclasses.replace(
+        border,
+        information=border.information + np.eye(len(state.modes)),
+        gradient=border.gradient - state.modes,
+    )
+
+
+def border_of(
+    problem: Problem, state: State, terms: LinearTerms, every_parameter: bool = False
+) -> Border:
+    """
+    Linear terms as a border of the normal equations of `assemble` without a field.
+
+    With ``every_parameter``, of those in which all camera parameters are unknowns.
+    """
+    cross = terms.cross
+    m, q, _ = cross.shape
+    if len(state.focal):
+        cross = cross @ _focal_chain(problem, state, m)
+    k = problem.camera_count + len(state.focal)
+    camera = cross[:, :, :k].sum(axis=0)
+    rotation = cross[:, :, k : k + 3]
+    if problem.method == 'single':
+        aligned = np.einsum('mqi,mij->qj', rotation, _turn_chain(problem, state))
+        blocks: Floats = np.zeros((0, 3, q))
+    else:
+        count = 0 if problem.method == 'per_image' else 3 + len(state.rate)
+        aligned = np.zeros((q, count))
+        blocks = rotation.transpose(0, 2, 1)
+    if not every_parameter:
+        free = np.concatenate([problem.free, np.arange(problem.camera_count, k)])
+        camera = camera[:, free]
+    return Border(
+        terms.information,
+        cross[:, :, -1].sum(axis=0),
+        np.concatenate([camera, aligned], axis=1),
+        blocks,
+    )
+
+
+def score_of(
+    problem: Problem,
+    state: State,
+    blocks: Floats,
+    field: LinearTerms | None,
+    tested: LinearTerms,
+    between: Floats | None = None,
+) -> Score:
+    """
+    Score of linear terms at a state, all that is estimated free to answer.
+
+    ``field`` are the `field_terms`, with ``between`` (q, r) the information that the tested terms
+    share with the modes.
+    """
+    normal = assemble(problem, state, 0.0, blocks, field)
+    border = border_of(problem, state, tested)
+    if field is not None:
+        assert between is not None
+        border = dataclasses.replace(
+            border, shared=np.concatenate([border.shared, between], axis=1)
+        )
+    return score(normal, border)
 
 
 def _with_all_parameters(
@@ -245,19 +382,31 @@ def _by_alignment(problem: Problem, state: State, blocks: Floats) -> Floats:
     return np.asarray(E.transpose(0, 2, 1) @ blocks @ E)
 
 
-def reduced_information(problem: Problem, state: State, blocks: Floats) -> Floats:
+def reduced_information(
+    problem: Problem, state: State, blocks: Floats, terms: LinearTerms | None = None
+) -> Floats:
     """
     Information (s, s) on all camera parameters, and the other unknowns that are shared.
 
-    Those are focal terms, and alignment with its rate where the method has one; the rotations of
-    the images are eliminated.
+    Those are focal terms, alignment with its rate where the method has one, and the modes of the
+    field, whose ``terms`` are those of `field_terms`; the rotations of the images are eliminated.
     """
-    of_camera = np.arange(problem.camera_count)
-    of_prior = np.zeros(len(of_camera))
+    camera = np.arange(problem.camera_count)
+    of_prior = np.zeros(len(camera))
     of_prior[problem.free] = 1.0 / problem.prior_sigma[problem.free] ** 2
     total = information_of_images(problem, state, blocks).sum(axis=0)
-    total[of_camera, of_camera] += of_prior
-    return np.asarray(total)
+    total[camera, camera] += of_prior
+    if terms is None:
+        return np.asarray(total)
+    border = _with_mode_prior(border_of(problem, state, terms, every_parameter=True), state)
+    shared, information = border.shared, border.information
+    if len(border.blocks):
+        normal = _with_all_parameters(problem, state, 0.0, blocks)
+        X = border.blocks.reshape(-1, len(information))
+        C_inverse = inverse(normal.C)
+        shared = shared - X.T @ (C_inverse @ normal.B).reshape(len(X), -1)
+        information = information - X.T @ (C_inverse @ border.blocks).reshape(X.shape)
+    return np.block([[total, shared.T], [shared, information]])
 
 
 def information_of_images(problem: Problem, state: State, blocks: Floats) -> Floats:
@@ -354,14 +503,17 @@ def _move(problem: Problem, state: State, shared: Floats, blocks: Floats) -> Sta
     f, q = len(problem.free), len(state.focal)
     parameters = state.parameters.copy()
     parameters[problem.free] += shared[:f]
-    focal, turned = state.focal + shared[f : f + q], shared[f + q :]
+    r = len(state.modes)
+    last = len(shared) - r
+    focal, turned = state.focal + shared[f : f + q], shared[f + q : last]
+    modes = state.modes + shared[last:]
     alignment, rotations = state.camera_from_star_tracker, state.camera_from_icrf
     if problem.method == 'per_image':
         rotations = Rotation.from_rotvec(-blocks) * rotations
-        return State(parameters, alignment, rotations, focal, state.rate)
+        return State(parameters, alignment, rotations, focal, state.rate, modes)
     turn = Rotation.from_rotvec(-turned[:3])
     rate = state.rate + turned[3:]
-    moved = State(parameters, turn * alignment, rotations, focal, rate)
+    moved = State(parameters, turn * alignment, rotations, focal, rate, modes)
     if problem.method == 'hierarchical':
         rotations = Rotation.from_rotvec(-blocks) * rotations
     elif len(rate):
