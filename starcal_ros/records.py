@@ -394,6 +394,82 @@ class Halves:
 
 
 @dataclass(frozen=True)
+class HeldTerm:
+    """
+    A camera parameter that is held, or bound by its prior, and what the stars ask for.
+
+    ``assumed`` is the value that it is held at or its prior, ``asked`` the one that the stars give
+    it, ``sigma`` the 1-sigma of their difference where the assumption is true.
+    """
+
+    name: str
+    assumed: float
+    asked: float
+    sigma: float
+
+    @property
+    def significance(self) -> float:
+        """The difference in sigmas."""
+        return abs(self.asked - self.assumed) / self.sigma
+
+
+@dataclass(frozen=True)
+class Step:
+    """
+    The most significant step between two parts of the detector, as lost columns make one.
+
+    The stars beyond ``place_px`` along the axis ``across`` (u or v) are moved along the axis
+    ``moved`` by ``size_px``; ``p_value`` accounts for all places that were looked at.
+    """
+
+    across: str
+    place_px: float
+    moved: str
+    size_px: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class ModelChecks:
+    """
+    What the stars show of the model of the world that the calibration assumes.
+
+    Attributes
+    ----------
+    field_p_value : float
+        Probability of the residuals if the lens model describes the lens; NaN where not tested.
+    field_rms_px, field_worst_px : float
+        Field that was estimated beside the lens model, RMS per axis and largest length over the
+        detector; 0 where none was needed.
+    held : tuple of HeldTerm
+    step : Step
+    velocity_error_km_s, velocity_p_value : float
+        Velocity of the observer that the aberration of the stars misses, and the p-value of none.
+    image_variation_px, image_variation_p_value : float
+        1-sigma change of the camera from image to image in a corner, carried in the covariance;
+        and the p-value of none.
+    correlation_time_s, independent_images : float
+        Of the star-tracker errors: 0 where they are independent; and how many independent images
+        determine the alignment as well.
+    pointings : int
+        Number of different pointings.
+    """
+
+    field_p_value: float
+    field_rms_px: float
+    field_worst_px: float
+    held: tuple[HeldTerm, ...]
+    step: Step
+    velocity_error_km_s: float
+    velocity_p_value: float
+    image_variation_px: float
+    image_variation_p_value: float
+    correlation_time_s: float
+    independent_images: float
+    pointings: int
+
+
+@dataclass(frozen=True)
 class GateCheck:
     """
     One thing that the gate looks at.

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.assessment.lookup import line_of_sight_sigma_rad, shape_sigma_rad
 from starcal_ros.camera import (
     CameraModel,
     line_of_sight,
     parameter_names,
     pixel_grid,
-    project_jacobians,
     project_parameters,
 )
 from starcal_ros.constants import ARCSECOND_RAD
@@ -235,37 +235,17 @@ def line_of_sight_sigma_arcsec(
     """
     1-sigma (rows, columns) of the line of sight of pixels in the star tracker frame, arcsec.
 
-    Root of the summed variance of the two angles, from the (p + 3, p + 3) covariance of camera and
-    alignment.
+    Root of the summed variance of the two angles; the covariance is that of the numbers of
+    `lookup.line_of_sight_jacobian`.
     """
-    _, J = _line_of_sight_jacobian(camera, columns, rows)
-    variance = np.einsum('nij,jk,nik->n', J, covariance, J)
-    return np.asarray(np.sqrt(variance).reshape(rows, columns) / ARCSECOND_RAD)
+    sigma_rad = line_of_sight_sigma_rad(camera, covariance, pixel_grid(camera, columns, rows))
+    return sigma_rad.reshape(rows, columns) / ARCSECOND_RAD
 
 
 def map_sigma_px(camera: CameraModel, covariance: Floats, columns: int = 25) -> Floats:
-    """1-sigma (columns * columns,) of `shape_sigma_rad`, in pixels at the centre."""
-    sigma_rad = shape_sigma_rad(camera, covariance, columns, columns)
-    return np.asarray(sigma_rad.ravel() * camera.parameters[0])
-
-
-def shape_sigma_rad(
-    camera: CameraModel, covariance: Floats, columns: int = 25, rows: int = 20
-) -> Floats:
-    """
-    1-sigma (rows, columns) of the shape of the distortion map at a grid of pixels, rad.
-
-    What a turn common to all pixels can take up (pointing, and most of a moved principal point) is
-    removed: it belongs to the alignment.
-    """
-    directions, J = _line_of_sight_jacobian(camera, columns, rows)
-    p = len(camera.parameters)
-    J = J[:, :, :p].reshape(-1, p)
-    turns = np.stack([np.cross(axis, directions) for axis in np.eye(3)], axis=-1)
-    Q, _ = np.linalg.qr(turns.reshape(-1, 3))
-    J = (J - Q @ (Q.T @ J)).reshape(-1, 3, p)
-    variance = np.einsum('nij,jk,nik->n', J, covariance[:p, :p], J)
-    return np.asarray(np.sqrt(variance).reshape(rows, columns))
+    """1-sigma (columns * columns,) of the shape of the map, in pixels at the centre."""
+    sigma_rad = shape_sigma_rad(camera, covariance, pixel_grid(camera, columns, columns))
+    return np.asarray(sigma_rad * camera.parameters[0])
 
 
 def map_error_px(found: CameraModel, true: CameraModel) -> float:
@@ -285,11 +265,12 @@ def map_error_px(found: CameraModel, true: CameraModel) -> float:
 
 
 def detector_maps(camera: CameraModel, covariance: Floats, pixels: Floats) -> DetectorMaps:
-    """Maps of a camera with a covariance (p + 3, p + 3) that is from stars at pixels (n, 2)."""
+    """Maps of a camera with a covariance that is from stars at pixels (n, 2)."""
+    grid = pixel_grid(camera, MAP_COLS, MAP_ROWS)
     return DetectorMaps(
         stars_in_cells(pixels, camera),
         line_of_sight_sigma_arcsec(camera, covariance, MAP_COLS, MAP_ROWS),
-        shape_sigma_rad(camera, covariance, MAP_COLS, MAP_ROWS) / ARCSECOND_RAD,
+        shape_sigma_rad(camera, covariance, grid).reshape(MAP_ROWS, MAP_COLS) / ARCSECOND_RAD,
     )
 
 
@@ -312,19 +293,3 @@ def movement_px(camera: CameraModel, changes: Floats) -> Floats:
     moved = camera.parameters - np.diag(changes)
     found = np.stack([project_parameters(camera.model, row, directions) for row in moved])
     return np.asarray(np.linalg.norm(pixels - found, axis=-1).max(axis=1))
-
-
-def _line_of_sight_jacobian(camera: CameraModel, columns: int, rows: int) -> tuple[Floats, Floats]:
-    """
-    Lines of sight (n, 3) of a grid of pixels, and their derivatives (n, 3, p + 3).
-
-    By the camera parameters and the alignment angles, in the camera frame.  For a fixed pixel:
-    a direction moves so as to undo what the parameter does to its image.
-    """
-    directions = line_of_sight(camera, pixel_grid(camera, columns, rows))
-    _, J_parameters, J_rotation = project_jacobians(camera, directions)
-    # A turn about the line of sight itself moves nothing: the pseudo-inverse leaves it out.
-    angles = np.linalg.pinv(J_rotation) @ J_parameters
-    angles = np.concatenate([angles, np.broadcast_to(np.eye(3), (len(angles), 3, 3))], axis=-1)
-    moved = np.cross(directions[:, None, :], np.swapaxes(angles, 1, 2))
-    return directions, -np.swapaxes(moved, 1, 2)

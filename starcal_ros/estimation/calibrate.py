@@ -20,7 +20,9 @@ from starcal_ros.camera import ALL_PARAMETER_NAMES, CameraModel, parameter_names
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.detector_field import in_degree
 from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.estimation.attitude_correlation import attitude_correlation, AttitudeCorrelation
 from starcal_ros.estimation.covariance import shared_covariance, shared_names
+from starcal_ros.estimation.image_variation import image_variation, ImageVariation
 from starcal_ros.estimation.levenberg_marquardt import NotObservable, Solution
 from starcal_ros.estimation.linear_terms import LinearTerms, Score
 from starcal_ros.estimation.normal_equations import (
@@ -46,6 +48,7 @@ from starcal_ros.estimation.problem import (
     score_of,
     State,
 )
+from starcal_ros.estimation.repeated_pointings import pointing_groups, repetition
 from starcal_ros.estimation.residual_field import (
     best_prior,
     degree_for,
@@ -68,6 +71,7 @@ Mask = NDArray[np.bool_]
 
 _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
 _START_FLOOR_PX = 0.05  # until the residuals tell: of the order of what is left in good images
+_TRACKER_EXCESS = 1.3  # found over assumed sigma from which the scatter is suspect
 _FIELD_ROUNDS = 6  # its prior and the variances settle in two or three
 _ROUNDS = 10  # the set of rejected stars settles in two or three
 FEWEST_STARS = 3  # of an image: its rotation fits any one star, and two as good as any
@@ -198,6 +202,14 @@ class Estimate:
         then those of v; t is 0 where there is no field.
     field_test : FieldPrior or None
         Of the test whether the lens model needs a field beside it; None where it was not made.
+    repetition : (n,)
+        Factor on the centroid covariances of stars that images of one pointing repeat.
+    pointings : int
+        Number of different pointings of the images.
+    variation : ImageVariation
+        Of the camera from image to image; carried in the covariances.
+    correlation : AttitudeCorrelation
+        Of the star-tracker errors in time; carried in the covariances.
     """
 
     geometry: CameraGeometry
@@ -225,6 +237,10 @@ class Estimate:
     termination: str
     thermal: Thermal | None
     field_test: FieldPrior | None
+    repetition: Floats
+    pointings: int
+    variation: ImageVariation
+    correlation: AttitudeCorrelation
 
 
 def check_options(options: CalibrationOptions, model: str) -> None:
@@ -309,6 +325,7 @@ def estimate_calibration(
     check_options(options, prior.camera.model)
     check_enough(ensemble, options)
     table = star_table(ensemble.images)
+    time_ns = np.array([image.time_ns for image in ensemble.images], np.int64)
     problem = problem_of(ensemble, prior, options)
     order, with_rate = options.focal_temperature_order, options.alignment_temperature
     left_out = []
@@ -321,7 +338,7 @@ def estimate_calibration(
     while True:
         start = start_of(problem, prior, order, with_rate)
         try:
-            estimate, weakest = _search(problem, start, table, prior, options)
+            estimate, weakest = _search(problem, start, table, time_ns, prior, options)
             why = 'within chance'
         except (NotObservable, np.linalg.LinAlgError) as error:
             if not (order or with_rate):
@@ -392,6 +409,11 @@ class _Verdict:
     tracker_sigma_rad: Floats  # (3,)
     misfit: Mask  # (m,)
     kept: Mask  # (n,)
+    repetition: Floats  # (n,) factor on the covariances
+
+    def covariance_px2(self, table: StarTable) -> Floats:
+        """Return the centroid covariances (n, 3) that the search weights with."""
+        return self.variance.of(table.covariance_px2) * self.repetition[:, None]
 
     def agrees_with(self, other: _Verdict) -> bool:
         """Whether a search with the one would end where a search with the other does."""
@@ -399,6 +421,7 @@ class _Verdict:
             np.array_equal(self.kept, other.kept)
             and np.array_equal(self.misfit, other.misfit)
             and self.variance.is_close_to(other.variance)
+            and np.allclose(self.repetition, other.repetition, rtol=0.02)
             and np.allclose(self.tracker_sigma_rad, other.tracker_sigma_rad, rtol=0.02)
         )
 
@@ -407,6 +430,7 @@ def _search(
     problem: Problem,
     start: State,
     table: StarTable,
+    time_ns: NDArray[np.int64],
     prior: CameraGeometry,
     options: CalibrationOptions,
 ) -> tuple[Estimate, str]:
@@ -422,6 +446,7 @@ def _search(
         given_rad,
         np.zeros(table.image_count, bool),
         everything,
+        np.ones(len(table)),
     )
     measurements = _arranged(table, verdict)
     solution = _robust_search(problem, start, measurements)
@@ -436,7 +461,7 @@ def _search(
     del measurements
     if options.residual_field:
         found = _with_field(found, table, prior, options)
-    return _estimate(found, table, prior, options)
+    return _estimate(found, table, time_ns, prior, options)
 
 
 @dataclass(frozen=True)
@@ -469,7 +494,6 @@ def _settle(
         iterations += solution.iterations
         _, blocks = image_blocks(problem, solution.state, measurements)
         terms = field_terms(problem, solution.state, measurements)
-        del measurements
         after, measurements = _judge(
             problem, solution.state, blocks, terms, table, verdict, given_rad, options
         )
@@ -525,11 +549,15 @@ def _field_prior(found: _Found, table: StarTable, camera: CameraModel, degree: i
 
 
 def _arranged(table: StarTable, verdict: _Verdict) -> Measurements:
-    return arrange(table, verdict.kept, verdict.variance.of(table.covariance_px2))
+    return arrange(table, verdict.kept, verdict.covariance_px2(table))
 
 
 def _estimate(
-    found: _Found, table: StarTable, prior: CameraGeometry, options: CalibrationOptions
+    found: _Found,
+    table: StarTable,
+    time_ns: NDArray[np.int64],
+    prior: CameraGeometry,
+    options: CalibrationOptions,
 ) -> tuple[Estimate, str]:
     """What a search has found, and the term of temperature to leave out, if any."""
     problem, solution, verdict = found.problem, found.solution, found.verdict
@@ -551,6 +579,13 @@ def _estimate(
         problem, dataclasses.replace(state, camera_from_star_tracker=alignment), blocks
     )
     p = problem.camera_count
+    radius_px = 0.5 * math.hypot(prior.camera.width, prior.camera.height)
+    focal_px = float(state.parameters[0])
+    variation = image_variation(blocks, focal_px, radius_px)
+    correlated = _correlation(
+        found, time_ns, attitude_error_rad, attitude_covariance_rad2, attitude_seen, options
+    )
+    full = _with_alike(full, variation, correlated, alignment, len(state.focal))
     information = reduced_information(problem, state, blocks, terms)
     in_modes = len(state.modes)
     shared = np.concatenate([problem.free, np.arange(p, len(information) - in_modes)])
@@ -587,8 +622,46 @@ def _estimate(
         termination=solution.termination,
         thermal=thermal,
         field_test=found.field_test,
+        repetition=verdict.repetition,
+        pointings=len(np.unique(pointing_groups(state.camera_from_icrf, focal_px))),
+        variation=variation,
+        correlation=correlated,
     )
     return estimate, weakest
+
+
+def _correlation(
+    found: _Found,
+    time_ns: NDArray[np.int64],
+    error_rad: Floats,
+    covariance_rad2: Floats,
+    seen: Mask,
+    options: CalibrationOptions,
+) -> AttitudeCorrelation:
+    """Correlation in time of the star-tracker errors of the images that fit."""
+    good = seen & ~found.verdict.misfit
+    assumed_rad = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
+    excess = bool((found.verdict.tracker_sigma_rad > _TRACKER_EXCESS * assumed_rad).any())
+    return attitude_correlation(
+        time_ns[good], error_rad[good], np.einsum('mii->mi', covariance_rad2[good]), excess
+    )
+
+
+def _with_alike(
+    full: Floats,
+    variation: ImageVariation,
+    correlated: AttitudeCorrelation,
+    camera_from_star_tracker: Rotation,
+    focal_terms: int,
+) -> Floats:
+    """The covariance of all that is shared with what errors that images have alike add to it."""
+    p = len(variation.information)
+    gain = full[:, :p]
+    full = full + gain @ variation.information @ gain.T
+    angles = slice(p + focal_terms, p + focal_terms + 3)
+    A = camera_from_star_tracker.as_matrix()
+    full[angles, angles] += A @ np.diag(correlated.added_variance_rad2) @ A.T
+    return full
 
 
 def _thermal(state: State, full: Floats, options: CalibrationOptions) -> Thermal | None:
@@ -663,9 +736,11 @@ def _judge(
         freedom = _freedom(problem, state, blocks, terms, before.kept, before.tracker_sigma_rad)
         variance = estimate_variance(residual_px, table.covariance_px2, before.kept, freedom)
     kept = _fitting(residual_px, table, variance, options)
+    groups = pointing_groups(state.camera_from_icrf, float(state.parameters[0]))
+    repeated = repetition(table, kept, residual_px, groups)
     del residual_px
     misfit: Mask = np.zeros(table.image_count, bool)
-    measurements = arrange(table, kept, variance.of(table.covariance_px2))
+    measurements = arrange(table, kept, variance.of(table.covariance_px2) * repeated[:, None])
     # One rotation for all has no attitude of an image to judge.
     if problem.method != 'single':
         # By the stars that fit: one that does not turns an image of few by more than the tracker.
@@ -677,7 +752,7 @@ def _judge(
         )
         if options.variance_components:
             tracker_sigma_rad = found_rad
-    return _Verdict(variance, tracker_sigma_rad, misfit, kept), measurements
+    return _Verdict(variance, tracker_sigma_rad, misfit, kept, repeated), measurements
 
 
 def _fitting(

@@ -93,8 +93,14 @@ def scalar_terms(
     camera_from_icrf: Floats,
     scalars: Scalars,
     field: DetectorField | None = None,
+    information: Floats | None = None,
 ) -> LinearTerms:
-    """Return the sums of 2 t terms, those of u, then those of v: a quarter of the work."""
+    """
+    Return the sums of 2 t terms, those of u, then those of v: a quarter of the work.
+
+    ``information`` is that of an earlier call with the same measurements and functions: it does
+    not depend on the state.
+    """
     uu: Floats = np.zeros((0, 0))
     uv, vv, cross = uu, uu, np.zeros((0, 0, 0))
     for chunk, J in whitened_chunks(measurements, model, parameters, camera_from_icrf, field):
@@ -107,16 +113,19 @@ def scalar_terms(
         if not uu.size:
             uu, uv, vv = np.zeros((3, t, t))
             cross = np.zeros((measurements.image_count, 2 * t, J.shape[1] - 1))
-        uu += (phi * wuu**2) @ phi.T
-        uv += (phi * (wuu * wuv)) @ phi.T
-        vv += (phi * (wuv**2 + wvv**2)) @ phi.T
+        if information is None:
+            uu += (phi * wuu**2) @ phi.T
+            uv += (phi * (wuu * wuv)) @ phi.T
+            vv += (phi * (wuv**2 + wvv**2)) @ phi.T
         by_image = phi.reshape(t, m, n).transpose(1, 0, 2)
         for part, columns in (
             (slice(0, t), wuu * J[0, :-1]),
             (slice(t, 2 * t), wuv * J[0, :-1] + wvv * J[1, :-1]),
         ):
             cross[chunk.image, part] = by_image @ columns.reshape(-1, m, n).transpose(1, 2, 0)
-    return LinearTerms(np.block([[uu, uv], [uv, vv]]), cross)
+    if information is None:
+        information = np.block([[uu, uv], [uv, vv]])
+    return LinearTerms(information, cross)
 
 
 @dataclass(frozen=True)

@@ -119,12 +119,15 @@ def minimise(
     NotObservable
         When the stars do not determine all unknowns.
     """
+    information: Floats | None = None  # of the modes of the field: the same at every state
 
     def evaluate(state: State) -> NormalEquations:
+        nonlocal information
         cost, blocks = image_blocks(problem, state, measurements, loss_scale)
         if not np.isfinite(cost):
             return NormalEquations(cost, *(np.empty(0) for _ in range(5)))
-        terms = field_terms(problem, state, measurements)
+        terms = field_terms(problem, state, measurements, information)
+        information = terms.information if terms else None
         return assemble(problem, state, cost, blocks, terms)
 
     def move(state: State, shared: Floats, blocks: Floats) -> State:
@@ -167,7 +170,11 @@ def image_field(problem: Problem, state: State) -> DetectorField | None:
 
 
 def scalar_terms_at(
-    problem: Problem, state: State, measurements: Measurements, scalars: Scalars
+    problem: Problem,
+    state: State,
+    measurements: Measurements,
+    scalars: Scalars,
+    information: Floats | None = None,
 ) -> LinearTerms:
     """Sums of the terms of functions of the pixel at a state."""
     return scalar_terms(
@@ -177,15 +184,30 @@ def scalar_terms_at(
         state.camera_from_icrf.as_matrix(),
         scalars,
         image_field(problem, state),
+        information,
     )
 
 
-def field_terms(problem: Problem, state: State, measurements: Measurements) -> LinearTerms | None:
-    """Sums of the modes of the field; None where none is estimated."""
+def field_terms(
+    problem: Problem,
+    state: State,
+    measurements: Measurements,
+    information: Floats | None = None,
+) -> LinearTerms | None:
+    """
+    Sums of the modes of the field; None where none is estimated.
+
+    ``information`` is that of an earlier call with the same measurements.
+    """
     prior = problem.field_prior
     if prior is None:
         return None
-    return scalar_terms_at(problem, state, measurements, prior.polynomials).in_modes(prior.modes)
+    if information is None:
+        terms = scalar_terms_at(problem, state, measurements, prior.polynomials)
+        return terms.in_modes(prior.modes)
+    unused = np.empty((0, 0))
+    terms = scalar_terms_at(problem, state, measurements, prior.polynomials, unused)
+    return LinearTerms(information, prior.modes.T @ terms.cross)
 
 
 def by_shared(problem: Problem, state: State, blocks: Floats) -> Floats:

@@ -37,7 +37,7 @@ TEST_DEGREE = 10
 _MAX_DEGREE = 16
 # Length of the kernel in half lengths of the longer side.  Polynomials of degree 4.2 / length hold
 # all but 1e-4 of its variance: 16 of the shortest, which is a wave of a third of the detector.
-_LENGTHS = (0.26, 0.36, 0.5, 0.7, 1.0, 1.4)
+_LENGTHS = (0.26, 0.3, 0.36, 0.43, 0.52, 0.7, 1.0, 1.4)
 _DEGREE_TIMES_LENGTH = 4.2
 _AMPLITUDES_PX = np.geomspace(1e-3, 10.0, 41)
 _GRID = 41  # pixels a side at which the lens model's own displacements are taken

@@ -1,0 +1,12 @@
+"""Array types of the whole package; docstrings give shapes, units and frames."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.uint8]  # (h, w) grey or (h, w, 3) BGR, for display
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]  # detector counts, indexed [v, u]

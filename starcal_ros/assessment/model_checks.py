@@ -1,0 +1,181 @@
+"""
+Whether the stars contradict the model of the world that a calibration assumes.
+
+Each check is a score test at the minimum: what would the stars do with one more term, all that is
+estimated free to answer.  Held camera parameters, a wrong velocity of the observer and a step
+between two parts of the detector are tested; the tests that the estimate makes itself (a field
+beside the lens model, variation from image to image, star-tracker errors that are correlated) are
+reported beside them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.special import chdtrc, ndtr
+
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.camera import CameraModel, pixel_grid, rotation_jacobian
+from starcal_ros.estimation.calibrate import Estimate
+from starcal_ros.estimation.linear_terms import linear_terms, LinearTerms
+from starcal_ros.estimation.normal_equations import arrange, Measurements
+from starcal_ros.estimation.problem import (
+    field_terms,
+    image_blocks,
+    image_parameters,
+    scalar_terms_at,
+    score_of,
+)
+from starcal_ros.records import HeldTerm, ModelChecks, Step
+
+_SPEED_OF_LIGHT_KM_S = 299792.458
+_STEPS = 31  # places along each axis at which a step is looked for
+_GRID = 25
+
+
+def model_checks(estimate: Estimate) -> ModelChecks:
+    """Return what the stars of an estimate show of the model that it assumes."""
+    problem, state = estimate.problem, estimate.state
+    covariance = estimate.variance.of(estimate.table.covariance_px2)
+    covariance = covariance * estimate.repetition[:, None]
+    measurements = arrange(estimate.table, estimate.kept, covariance)
+    _, blocks = image_blocks(problem, state, measurements)
+    field = field_terms(problem, state, measurements)
+    camera = estimate.geometry.camera
+    test, variation, correlation = estimate.field_test, estimate.variation, estimate.correlation
+    velocity_km_s, velocity_p_value = _velocity(estimate, measurements, blocks, field)
+    rms_px, worst_px = _field_px(camera)
+    return ModelChecks(
+        field_p_value=test.p_value if test else float('nan'),
+        field_rms_px=rms_px,
+        field_worst_px=worst_px,
+        held=_held_terms(estimate, blocks, field),
+        step=_step(estimate, measurements, blocks, field),
+        velocity_error_km_s=velocity_km_s,
+        velocity_p_value=velocity_p_value,
+        image_variation_px=variation.sigma_px,
+        image_variation_p_value=variation.p_value,
+        correlation_time_s=correlation.correlation_time_s,
+        independent_images=float(correlation.independent_images.min()),
+        pointings=estimate.pointings,
+    )
+
+
+def _field_px(camera: CameraModel) -> tuple[float, float]:
+    """RMS per axis and largest length of the field over the detector, px."""
+    if camera.field is None:
+        return 0.0, 0.0
+    moved = camera.field.displacement_px(pixel_grid(camera, _GRID, _GRID))
+    return float(np.sqrt((moved**2).mean())), float(np.linalg.norm(moved, axis=1).max())
+
+
+def _held_terms(
+    estimate: Estimate, blocks: Floats, field: LinearTerms | None
+) -> tuple[HeldTerm, ...]:
+    """Camera parameters that are held or bound by their prior, with what the stars ask for."""
+    problem, state = estimate.problem, estimate.state
+    p = problem.camera_count
+    names = problem.parameter_names
+    terms = []
+    held = np.setdiff1d(np.arange(p), problem.free)
+    if len(held):
+        # The held columns are terms like any other; their sums stand in the blocks.
+        rows = blocks[:, held, :]
+        tested = LinearTerms(rows[:, :, held].sum(axis=0), rows)
+        between = None
+        if field is not None:
+            between = field.cross[:, :, held].sum(axis=0).T
+        value, sigma = score_of(problem, state, blocks, field, tested, between).single()
+        for k, j in enumerate(held):
+            if np.isfinite(sigma[k]):
+                asked = float(state.parameters[j] + value[k])
+                terms.append(
+                    HeldTerm(names[j], float(state.parameters[j]), asked, float(sigma[k]))
+                )
+    variance = np.diag(estimate.covariance)
+    for j in problem.free:
+        prior_variance = problem.prior_sigma[j] ** 2
+        if np.isfinite(prior_variance) and variance[j] < prior_variance:
+            # How far the estimate is from the prior, in the sigma of that difference.
+            apart = np.sqrt(prior_variance - variance[j])
+            prior = float(problem.prior_parameters[j])
+            terms.append(HeldTerm(names[j], prior, float(state.parameters[j]), float(apart)))
+    return tuple(terms)
+
+
+def _velocity(
+    estimate: Estimate, measurements: Measurements, blocks: Floats, field: LinearTerms | None
+) -> tuple[float, float]:
+    """Length of the velocity that the stars miss, km/s, and the p-value of none."""
+    problem, state = estimate.problem, estimate.state
+    camera, R = estimate.geometry.camera, state.camera_from_icrf.as_matrix()
+    modes = problem.field_prior
+
+    def displacement(pixels: Floats, directions: Floats, image: Indices) -> Floats:
+        e = directions.T
+        J = rotation_jacobian(dataclasses.replace(camera, field=None), e)
+        axes = R[image]  # columns: the axes of the ICRS in the camera frame
+        toward = axes - e[:, :, None] * np.einsum('ni,nij->nj', e, axes)[:, None, :]
+        # A direction that moves by d turns by the passive rotation d x e.
+        rotation = np.cross(toward, e[:, :, None], axisa=1, axisb=1, axisc=1)
+        moved = (J @ rotation / _SPEED_OF_LIGHT_KM_S).transpose(1, 2, 0)
+        if modes is None:
+            return moved
+        phi = modes.polynomials(pixels)
+        of_u, of_v = modes.modes[: len(phi)], modes.modes[len(phi) :]
+        return np.concatenate([moved, np.stack([of_u.T @ phi, of_v.T @ phi])], axis=1)
+
+    terms = linear_terms(
+        measurements,
+        problem.model,
+        image_parameters(problem, state),
+        R,
+        displacement,
+        estimate.geometry.camera.field,
+    )
+    between = terms.information[:3, 3:] if field is not None else None
+    tested = LinearTerms(terms.information[:3, :3], terms.cross[:, :3])
+    score = score_of(problem, state, blocks, field, tested, between)
+    if not (np.diag(score.information) > 0).all():
+        return 0.0, 1.0
+    missed = np.linalg.solve(score.information, score.gradient)
+    return float(np.linalg.norm(missed)), float(chdtrc(3.0, score.gradient @ missed))
+
+
+def _step(
+    estimate: Estimate, measurements: Measurements, blocks: Floats, field: LinearTerms | None
+) -> Step:
+    """The most significant step of the detector between two parts."""
+    problem, state = estimate.problem, estimate.state
+    camera, prior = estimate.geometry.camera, problem.field_prior
+    along = np.linspace(0.0, 1.0, _STEPS + 2)[1:-1]
+    at = (along * camera.width - 0.5, along * camera.height - 0.5)
+
+    def scalars(pixels: Floats) -> Floats:
+        steps = [0.5 * np.sign(pixels[k] - place[:, None]) for k, place in enumerate(at)]
+        if prior is None:
+            return np.concatenate(steps)
+        return np.concatenate([*steps, prior.polynomials(pixels)])
+
+    terms = scalar_terms_at(problem, state, measurements, scalars)
+    t = len(terms.information) // 2
+    count = 2 * _STEPS
+    steps = np.r_[0:count, t : t + count]
+    polynomials = np.setdiff1d(np.arange(2 * t), steps)
+    between = None
+    if prior is not None:
+        between = terms.information[np.ix_(steps, polynomials)] @ prior.modes
+    tested = LinearTerms(terms.information[np.ix_(steps, steps)], terms.cross[:, steps])
+    size_px, sigma_px = score_of(problem, state, blocks, field, tested, between).single()
+    k = int(np.argmax(np.abs(size_px) / sigma_px))
+    significance = abs(float(size_px[k] / sigma_px[k]))
+    p_value = min(1.0, 2.0 * len(steps) * float(ndtr(-significance)))
+    axis, place = divmod(k % count, _STEPS)
+    return Step(
+        across='uv'[axis],
+        place_px=float(at[axis][place]),
+        moved='uv'[k // count],
+        size_px=float(size_px[k]),
+        p_value=p_value,
+    )
