@@ -513,19 +513,30 @@ def _with_field(
     found = dataclasses.replace(found, field_test=best)
     if best.p_value > options.max_field_p_value:
         return found
+    best = _field_prior(found, table, prior.camera, degree_for(best))
     for _ in range(_FIELD_ROUNDS):
-        best = _field_prior(found, table, prior.camera, degree_for(best))
-        state = dataclasses.replace(found.solution.state, modes=np.zeros(best.modes.shape[1]))
-        found = dataclasses.replace(
-            found,
-            problem=dataclasses.replace(found.problem, field_prior=best),
-            solution=dataclasses.replace(found.solution, state=state),
-        )
-        before = found.verdict
-        found = _settle(found, _arranged(table, before), table, options)
-        if found.verdict.agrees_with(before):
+        found = _settle(_started(found, best), _arranged(table, found.verdict), table, options)
+        again = _field_prior(found, table, prior.camera, degree_for(best))
+        if again.is_close_to(best):
             break
+        best = again
     return found
+
+
+def _started(found: _Found, prior: FieldPrior) -> _Found:
+    """The search with another prior of the field, from the field that there is."""
+    before, state = image_field(found.problem, found.solution.state), found.solution.state
+    modes: Floats = np.zeros(prior.modes.shape[1])
+    if before is not None:
+        coefficients = in_degree(before, prior.degree)
+        modes = np.asarray(np.linalg.lstsq(prior.modes, coefficients, rcond=1e-9)[0])
+    return dataclasses.replace(
+        found,
+        problem=dataclasses.replace(found.problem, field_prior=prior),
+        solution=dataclasses.replace(
+            found.solution, state=dataclasses.replace(state, modes=modes)
+        ),
+    )
 
 
 def _field_prior(found: _Found, table: StarTable, camera: CameraModel, degree: int) -> FieldPrior:

@@ -72,6 +72,13 @@ class FieldPrior:
     length: float
     log_likelihood_ratio: float
 
+    def is_close_to(self, other: FieldPrior) -> bool:
+        """Whether the two stand at the same place of the search, or next to it in amplitude."""
+        apart = abs(np.log(self.amplitude_px / other.amplitude_px))
+        step = np.log(_AMPLITUDES_PX[1] / _AMPLITUDES_PX[0])
+        same = (self.degree, self.length) == (other.degree, other.length)
+        return bool(same and apart < 1.5 * step)
+
     def field(self, amplitudes: Floats) -> DetectorField:
         """Return the field of the amplitudes (r,) of the modes."""
         coefficients = (self.modes @ amplitudes).reshape(2, -1)
