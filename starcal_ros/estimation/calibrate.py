@@ -47,7 +47,7 @@ from starcal_ros.estimation.variance_components import (
     estimate_variance,
 )
 from starcal_ros.options import option
-from starcal_ros.records import CameraGeometry, Ensemble, Thermal
+from starcal_ros.records import CameraGeometry, Ensemble, TemperatureTerms
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -157,7 +157,7 @@ class Estimate:
     attitude_error_rad, attitude_covariance_rad2, attitude_seen : (m, 3), (m, 3, 3), (m,) bool
         Star tracker errors by the stars alone, of `attitudes_of_stars_alone`.
     iterations, termination
-    thermal : Thermal or None
+    thermal : TemperatureTerms or None
         None where no change with temperature was asked for.
     """
 
@@ -183,7 +183,7 @@ class Estimate:
     attitude_seen: Mask
     iterations: int
     termination: str
-    thermal: Thermal | None
+    thermal: TemperatureTerms | None
 
 
 def check_options(options: CalibrationOptions) -> None:
@@ -447,18 +447,18 @@ def _estimate(
     return estimate, weakest
 
 
-def _thermal(state: State, full: Floats, options: CalibrationOptions) -> Thermal | None:
+def _thermal(state: State, full: Floats, options: CalibrationOptions) -> TemperatureTerms | None:
     """Terms of temperature of a state; None where none was asked for."""
     if not (options.focal_temperature_order or options.alignment_temperature):
         return None
     k = 10 + len(state.focal)
     sigma = np.sqrt(np.diag(full))
-    return Thermal(
+    return TemperatureTerms(
         reference_degc=options.reference_temperature_degc,
         focal_per_degc=tuple(state.focal.tolist()),
-        focal_sigma=tuple(sigma[10:k].tolist()),
+        focal_per_degc_sigma=tuple(sigma[10:k].tolist()),
         alignment_rate_rad_per_degc=tuple(state.rate.tolist()),
-        alignment_rate_sigma=tuple(sigma[k + 3 :].tolist()),
+        alignment_rate_rad_per_degc_sigma=tuple(sigma[k + 3 :].tolist()),
     )
 
 

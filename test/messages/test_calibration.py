@@ -19,13 +19,13 @@ from starcal_ros.messages.calibration import (
     calibration_to_message,
     camera_info_to_message,
 )
-from starcal_ros.records import GateCheck, Thermal
+from starcal_ros.records import GateCheck, TemperatureTerms
 
 
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
 def test_calibration_round_trip(make: Any) -> None:
     """Every number survives its message, bit for bit, and so does what is not known."""
-    left_out = dataclasses.replace(calibration(), thermal=Thermal(20.0, note='left out'))
+    left_out = dataclasses.replace(calibration(), thermal=TemperatureTerms(20.0, note='left out'))
     for record in (calibration(), plain_calibration(), left_out):
         assert_same(record, calibration_from_message(calibration_to_message(record, make)))
 

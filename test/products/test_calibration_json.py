@@ -22,7 +22,7 @@ from starcal_ros.records import (
     CameraGeometry,
     GateCheck,
     Removal,
-    Thermal,
+    TemperatureTerms,
 )
 
 REMOVALS = (
@@ -41,7 +41,7 @@ def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     cases: tuple[dict[str, Any], ...] = (
         {},
         {'accepted': False, 'reasons': ('too few stars', 'weak: k3')},
-        {'thermal': Thermal(20.0, note='left out: everything')},
+        {'thermal': TemperatureTerms(20.0, note='left out: everything')},
         {'removals': REMOVALS},
     )
     records = (dataclasses.replace(plain_calibration(), **changes) for changes in cases)
