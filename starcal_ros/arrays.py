@@ -92,8 +92,8 @@ class FieldType:
         return any(isinstance(mark, Finite) for mark in self.marks)
 
 
-@functools.lru_cache(maxsize=64)
-def fields_of(record_type: type[Any]) -> dict[str, FieldType]:
+@functools.cache
+def fields_of(record_type: Any) -> dict[str, FieldType]:
     """Types of the fields of a record by name, in order."""
     hints = get_type_hints(record_type, include_extras=True)
     missing = dataclasses.MISSING

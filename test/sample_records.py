@@ -109,7 +109,13 @@ def calibration() -> Calibration:
 def plain_calibration() -> Calibration:
     """A calibration that tells nothing beyond what each must."""
     return dataclasses.replace(
-        calibration(), temperature=None, maps=None, correlation=None, removals=(), halves=None, gate=()
+        calibration(),
+        temperature=None,
+        maps=None,
+        correlation=None,
+        removals=(),
+        halves=None,
+        gate=(),
     )
 
 

@@ -137,7 +137,7 @@ def _both(a: Floats, b: Floats) -> Floats:
 
 
 def _map(moved: Floats, frame: CameraGeometry, sigma_rad: Floats) -> DifferenceMap:
-    """Map of (GRID^2, 3) differences of unit vectors, star tracker frame; pixels as in the gate."""
+    """Map of (GRID^2, 3) differences of unit vectors in the star tracker frame."""
     camera_from_star_tracker = Rotation.from_quat(frame.star_tracker_from_camera_xyzw).inv()
     in_camera = camera_from_star_tracker.apply(moved).reshape(GRID, GRID, 3)
     length_rad = np.linalg.norm(in_camera, axis=-1)

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from starcal_ros.assessment.agreement import difference, Difference, movement
+from starcal_ros.assessment.agreement import Difference, difference, movement
 from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import CalibrationOptions

@@ -9,7 +9,7 @@ from pathlib import Path
 import threading
 
 from starcal_ros.assessment.residuals import Residuals
-from starcal_ros.calibrator.archive import Archive, Activation
+from starcal_ros.calibrator.archive import Activation, Archive
 from starcal_ros.errors import ArchiveError, OptionError, StarcalError
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.node_options import CalibratorOptions

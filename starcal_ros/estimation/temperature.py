@@ -67,7 +67,7 @@ def turns_chain(rate: Floats, above_reference_k: Floats) -> Floats:
 
 def camera_at(calibration: Calibration, temperature_degc: float) -> CameraGeometry:
     """Camera and alignment of a calibration at a temperature; its own where it has no terms."""
-    return geometry_at(calibration.geometry, calibration.thermal, temperature_degc)
+    return geometry_at(calibration.geometry, calibration.temperature, temperature_degc)
 
 
 def geometry_at(

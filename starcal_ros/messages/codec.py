@@ -31,7 +31,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import check_shape, FieldType, fields_of
+from starcal_ros.arrays import check_shape, fields_of, FieldType
 from starcal_ros.messages.fields import (
     flat_array,
     make_header,
@@ -117,7 +117,7 @@ def _named_sizes(value: Any, kind: FieldType) -> dict[str, object]:
     if kind.kind is not np.ndarray:
         return {}
     named = zip(kind.shape, value.shape, strict=True)
-    return {name: size for name, size in named if _is_word(name)}
+    return {str(name): size for name, size in named if _is_word(name)}
 
 
 def _is_word(dimension: int | str) -> bool:
@@ -137,7 +137,7 @@ def record_from_message(record_type: type[T], message: Message) -> T:
 
 
 def record_fields(
-    record_type: type[Any],
+    record_type: Any,
     message: Message,
     names: Mapping[str, str] = _NO_NAMES,
     leave_out: Collection[str] = (),
@@ -198,6 +198,8 @@ def _from_field(found: Any, kind: FieldType, field: str, sizes: dict[str, int]) 
             return {str(entry.reason): int(entry.count) for entry in found}
         return {str(entry.key): str(entry.value) for entry in found}
     if kind.kind is bool and kind.optional:
+        if found not in (0, 1, NOT_KNOWN):
+            raise ValueError(f'{field}: {found} is none of 0, 1, {NOT_KNOWN}')
         return None if found == NOT_KNOWN else bool(found)
     value = kind.kind(found)
     _check_finite(value, kind, field)

@@ -36,7 +36,7 @@ from starcal_ros.records import (
 
 def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:
     """
-    Return the ensemble with one more image; beyond ``max_images`` the least informative is dropped.
+    Return the ensemble with one more image, and without the least informative if too many.
 
     An image whose size differs from the prior camera's is counted as refused: it is from another
     camera.

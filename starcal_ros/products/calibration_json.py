@@ -1,10 +1,10 @@
 """
 The file of a calibration, ``calibration.json``, both ways.
 
-Most keys are the fields of `Calibration` (`json_codec`).  Camera, alignment and covariance have the
-shape that the interface document publishes, which is described here.  Numbers are written with the
-shortest digits that read back to the same double, so a calibration that was written and read is
-equal to the last bit.
+Most keys are the fields of `Calibration` (`json_codec`).  Camera and alignment have the shape that
+the interface document publishes, which is described here.  Numbers are written with the shortest
+digits that read back to the same double, so a calibration that was written and read is equal to
+the last bit.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """
 Records to JSON and back, from the types of their fields and the marks on them (`arrays`).
 
-Writing: a number that is not finite is null, since JSON has no other word for it; arrays and tuples
+Writing: a number that is not finite is null, which is all that JSON has for it; arrays and tuples
 are lists; a nested record is an object with a key for each field.  Reading is strict: a value of
 another type, a missing key, a wrong shape and a number out of range are errors that name the key.
 A key may be missing only where its field has a default; keys without a field are ignored.
@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import AtLeast, check_shape, FieldType, fields_of
+from starcal_ros.arrays import AtLeast, check_shape, fields_of, FieldType
 
 T = TypeVar('T')
 
@@ -49,7 +49,7 @@ def from_json(record_type: type[T], content: object, key: str = '') -> T:
 
 
 def fields_from_json(
-    record_type: type[Any], content: object, key: str = '', leave_out: Collection[str] = ()
+    record_type: Any, content: object, key: str = '', leave_out: Collection[str] = ()
 ) -> dict[str, Any]:
     """
     Values of the fields of a record from a JSON object, by name, some fields left out.

@@ -27,7 +27,7 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.normal_equations import whitening
-from starcal_ros.records import CameraGeometry, DetectorMaps, Removal
+from starcal_ros.records import CameraGeometry, DetectorMaps, TermRemoval
 
 Floats = NDArray[np.float64]
 
@@ -431,13 +431,13 @@ def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Ma
     return _svg(figure, 'alignment')
 
 
-def term_worth(removals: Sequence[Removal]) -> Markup:
+def term_worth(removals: Sequence[TermRemoval]) -> Markup:
     """Residual and map as terms are left out one after the other (paper, Fig. 8)."""
     figure, axes = _figure()
     steps = np.arange(len(removals))
-    chance = [k for k, removal in enumerate(removals) if removal.within_chance]
-    if len(chance) > 1:
-        axes.axvspan(-0.5, max(chance) + 0.5, color=GRID, alpha=0.6, linewidth=0)
+    negligible = [k for k, removal in enumerate(removals) if removal.negligible]
+    if len(negligible) > 1:
+        axes.axvspan(-0.5, max(negligible) + 0.5, color=GRID, alpha=0.6, linewidth=0)
     axes.plot(steps, [removal.residual_rms_px for removal in removals], 'o-', color=SERIES[0],
               markersize=4, linewidth=1.4, label='residual, rms per axis')  # fmt: skip
     axes.plot(steps[1:], [removal.map_change_px for removal in removals[1:]], 's--',

@@ -128,11 +128,11 @@ def _context(found: Found) -> Mapping[str, object]:
     return {
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),
-        'in_force_since': utc_text(calibration.in_force_since_ns),
+        'active_since': utc_text(calibration.active_since_ns),
         'parameters': _parameter_rows(calibration, prior),
         'alignment': _alignment_rows(calibration, prior),
         'tiles': _tiles(calibration),
-        'thermal': thermal_summary(calibration.thermal) if calibration.thermal else '',
+        'thermal': thermal_summary(calibration.temperature) if calibration.temperature else '',
         'charts': charts_of(calibration, residuals),
         'correlation': calibration.correlation,
         'slider': _slider(calibration, residuals),

@@ -322,7 +322,9 @@ def test_per_image_has_no_rate() -> None:
 
 
 def test_the_camera_at_a_temperature() -> None:
-    terms = TemperatureTerms(REFERENCE_DEGC, FOCAL, (1e-6, 1e-8), tuple(RATE_RAD.tolist()), (1e-6,) * 3)
+    terms = TemperatureTerms(
+        REFERENCE_DEGC, FOCAL, (1e-6, 1e-8), tuple(RATE_RAD.tolist()), (1e-6,) * 3
+    )
     for degc in (-20.0, REFERENCE_DEGC, 35.0):
         got = temperature.geometry_at(TRUTH, terms, degc)
         np.testing.assert_allclose(
@@ -330,14 +332,16 @@ def test_the_camera_at_a_temperature() -> None:
         )
         turn = Rotation.from_quat(got.star_tracker_from_camera_xyzw) * alignment_of(degc, RATE_RAD)
         assert turn.magnitude() < 1e-15
-    assert temperature.geometry_at(TRUTH, TemperatureTerms(REFERENCE_DEGC), 50.0) == CameraGeometry(
-        TRUTH.camera, TRUTH.star_tracker_from_camera_xyzw
-    )
+    assert temperature.geometry_at(
+        TRUTH, TemperatureTerms(REFERENCE_DEGC), 50.0
+    ) == CameraGeometry(TRUTH.camera, TRUTH.star_tracker_from_camera_xyzw)
     assert temperature.geometry_at(TRUTH, None, 50.0) is TRUTH
 
 
 def test_the_summary_is_a_line() -> None:
-    terms = TemperatureTerms(20.0, (4e-5,), (1e-6,), (1e-5, 0.0, 0.0), (1e-6,) * 3, 'left out: this')
+    terms = TemperatureTerms(
+        20.0, (4e-5,), (1e-6,), (1e-5, 0.0, 0.0), (1e-6,) * 3, 'left out: this'
+    )
     assert temperature.summary(terms) == (
         'a1 +4e-05 (1e-06) /degC; alignment +2.063 (0.21), +0.000 (0.21), +0.000 (0.21) '
         'arcsec/degC; reference 20 degC; left out: this'

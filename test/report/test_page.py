@@ -121,8 +121,8 @@ def test_a_refused_calibration_says_why(folder: Path, tmp_path: Path) -> None:
 def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: Path) -> None:
     calibration = read_calibration(folder / CALIBRATION_FILE)
     assert len(calibration.gate) > 15
-    not_kept = dataclasses.replace(calibration.gate[2], found=8.125, kept=False)
-    not_checked = next(check for check in calibration.gate if check.kept is None)
+    not_kept = dataclasses.replace(calibration.gate[2], found=8.125, passed=False)
+    not_checked = next(check for check in calibration.gate if check.passed is None)
     shown = dataclasses.replace(calibration, gate=(not_kept, not_checked))
     write_calibration(shown, tmp_path / CALIBRATION_FILE)
     table = re.findall(r'<table class="limits">.*?</table>', page_of(tmp_path), re.DOTALL)[0]
