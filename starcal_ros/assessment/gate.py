@@ -296,7 +296,7 @@ def _halves(halves: HalvesComparison | None, options: GateOptions) -> Iterator[G
 
 def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateCheck]:
     """Coverage of the detector and precision of the result."""
-    maps, camera = calibration.maps, calibration.geometry.camera
+    maps = calibration.maps
     if maps is None:
         raise ValueError('calibration: the gate needs its detector maps')
     yield _check(
@@ -309,7 +309,7 @@ def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateC
         options,
         'max_map_sigma_px',
         'largest 1-sigma of the distortion map',
-        float(map_sigma_px(camera, calibration.covariance).max()),
+        _map_sigma_px(calibration),
         'px',
     )
     yield _check(
@@ -320,7 +320,7 @@ def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateC
         'arcsec',
     )
     limits = dict(zip(CALIBRATION_PARAMETER_NAMES, options.max_parameter_sigma, strict=True))
-    intrinsic, angles = 5, len(camera.parameters)
+    intrinsic, angles = 5, len(calibration.geometry.camera.parameters)
     for k, (name, sigma) in enumerate(
         zip(calibration.parameter_names, calibration.sigma, strict=True)
     ):
@@ -342,6 +342,14 @@ def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateC
         'smallest singular value',
         calibration.singular_values[-1],
     )
+
+
+def _map_sigma_px(calibration: Calibration) -> float:
+    """Largest 1-sigma of the distortion map; NaN where a pixel has no line of sight."""
+    try:
+        return float(map_sigma_px(calibration.geometry.camera, calibration.covariance).max())
+    except np.linalg.LinAlgError:
+        return math.nan
 
 
 def _changes(

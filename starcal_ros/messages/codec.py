@@ -69,7 +69,8 @@ def message_fields(
     message that have another name.
     """
     fields: dict[str, object] = {}
-    for name, kind in fields_of(type(record)).items():
+    record_type: Any = type(record)
+    for name, kind in fields_of(record_type).items():
         if name in leave_out:
             continue
         value = getattr(record, name)
