@@ -84,5 +84,9 @@ def test_each_path_is_a_field_of_a_published_topic(path: str) -> None:
     fields = dict(store.fielddefs[kind][1])
     for part in re.findall(r'\.(\w+)(\[)?', match[2]):
         assert part[0] in fields
-        is_array = int(fields[part[0]][0]) in (3, 4)  # rosbags: array, sequence
+        node, description = fields[part[0]]
+        is_array = int(node) in (3, 4)  # rosbags: array, sequence
         assert is_array == bool(part[1])
+        if is_array:
+            node, description = description[0]
+        fields = dict(store.fielddefs[description][1]) if int(node) == 2 else {}  # 2: a message
