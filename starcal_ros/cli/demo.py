@@ -19,7 +19,6 @@ import numpy as np
 import yaml
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
-from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
 from starcal_ros.products.calibration_json import read_calibration
@@ -51,8 +50,8 @@ class DemoBag:
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """An estimate beside the truth: a table as lines, and the largest difference in sigmas."""
+class TruthTable:
+    """An estimate beside the truth: the lines of a table, and the largest difference in sigmas."""
 
     lines: tuple[str, ...]
     worst_sigmas: float
@@ -209,10 +208,11 @@ def _own_domain() -> dict[str, str]:
     raise NodeError('no free ROS domain on this machine: set ROS_DOMAIN_ID')
 
 
-def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeometry) -> Comparison:
+def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeometry) -> TruthTable:
     """Every estimated parameter and the alignment, beside prior and truth."""
-    names = [name for name in PARAMETER_NAMES if name in calibration.estimated]
-    columns = [PARAMETER_NAMES.index(name) for name in names]
+    all_names = calibration.geometry.camera.parameter_names
+    names = [name for name in all_names if name in calibration.estimated]
+    columns = [all_names.index(name) for name in names]
     before, estimate, true = (
         geometry.camera.parameters[columns] for geometry in (prior, calibration.geometry, truth)
     )
@@ -228,7 +228,7 @@ def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeomet
     # Angles are counted from the truth.
     prior_arcsec = alignment_difference_rad(prior, truth) / ARCSECOND_RAD
     error_arcsec = alignment_difference_rad(calibration.geometry, truth) / ARCSECOND_RAD
-    sigma_arcsec = sigma[10:] / ARCSECOND_RAD
+    sigma_arcsec = sigma[-3:] / ARCSECOND_RAD
     angles_off = error_arcsec / sigma_arcsec
     lines += [
         f'{"alignment " + axis:<12}{b:>+12.2f}"{e:>+12.2f}"{s:>10.2f}"{0:>12}"{o:>+6.1f} sigma'
@@ -236,4 +236,4 @@ def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeomet
             'xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=True
         )
     ]
-    return Comparison(tuple(lines), float(np.abs([*off, *angles_off]).max()))
+    return TruthTable(tuple(lines), float(np.abs([*off, *angles_off]).max()))
