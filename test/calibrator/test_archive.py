@@ -246,7 +246,7 @@ def test_another_version_is_left_where_it_is(tmp_path: Path, key: str) -> None:
     path.write_text(_sealed(content))
     with opened(tmp_path) as archive:
         assert numbers(archive.read_history()) == [(1, 1)]
-        assert archive.damage == [f'{path}: of another version, passed over']
+        assert archive.damage == [f'{path}: of another version, skipped']
     assert path.exists()
 
 

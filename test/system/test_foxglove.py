@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import json
 from pathlib import Path
 import re
+from typing import Any
 
 import pytest
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
@@ -81,7 +82,7 @@ def test_each_path_is_a_field_of_a_published_topic(path: str) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     for file in (ROOT / 'msg').glob('*.msg'):
         store.register(get_types_from_msg(file.read_text(), f'starcal/msg/{file.stem}'))
-    fields = dict(store.fielddefs[kind][1])
+    fields: dict[str, Any] = dict(store.fielddefs[kind][1])
     for part in re.findall(r'\.(\w+)(\[)?', match[2]):
         assert part[0] in fields
         node, description = fields[part[0]]
