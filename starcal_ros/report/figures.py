@@ -201,7 +201,7 @@ def distortion_contours(camera: CameraModel) -> Markup:
 
 
 def change_contours(before: CameraGeometry, after: CameraGeometry) -> Markup:
-    """How far the lines of sight moved once a common turn is removed, in pixels."""
+    """Movement of the lines of sight, common rotation removed, in pixels."""
     figure, axes = _detector_figure(after.camera)
     _, moved_px = movement(before, after, 60, 48)
     _contours(axes, after.camera, moved_px.reshape(48, 60), ' px')

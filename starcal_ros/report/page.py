@@ -243,7 +243,7 @@ def _tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
     if maps is not None:
         for what, sigma, words in (
             ('Line of sight', maps.line_of_sight_sigma_arcsec, 'in the star tracker frame'),
-            ('Camera alone', maps.shape_sigma_arcsec, 'a turn of all pixels removed'),
+            ('Camera alone', maps.shape_sigma_arcsec, 'common rotation removed'),
         ):
             note = f'1-sigma, rms over the detector, {words}; {sigma.max():.3g}″ at its worst'
             tiles.append((what, f'{np.sqrt(np.mean(sigma**2)):.3g}″', note))
