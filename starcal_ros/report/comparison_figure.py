@@ -17,7 +17,7 @@ FORMATS = ('.png', '.svg', '.pdf')
 
 def write(comparison: Comparison, path: Path) -> None:
     """
-    Draw arrows in pixels, with the lengths in sigmas below, before and after the common rotation is removed.
+    Draw arrows in pixels and lengths in sigmas, with and without the common rotation.
 
     Raises
     ------
