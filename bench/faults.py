@@ -45,10 +45,14 @@ _ANSWER_S = 60.0
 _MAY_BE_INFINITE = frozenset(
     [
         'temperature_degc',
-        'reference_temperature_degc',
         'predicted_sigma',
-        'gate_found',
-        'gate_limit',
+        'attitude_gap_s',
+        'found',
+        'limit',
+        'shape_px',
+        'shape_p_value',
+        'rotation_arcsec',
+        'p_value',
     ]
 )
 

@@ -102,11 +102,11 @@ def _judged(
         found = solve.solve(ensemble, setup)
     except TooFewObservations:
         return ['cannot be solved'], np.nan, np.nan
-    names = [check.option or check.note for check in found.gate if check.kept is False]
+    names = [check.option or check.note for check in found.gate if check.passed is False]
     focal_px = float(field.truth.camera.parameters[0])
     pointing_px = pointing_error_arcsec(found.geometry, field.truth) * np.pi / 648000 * focal_px
     error_px = max(pointing_px, map_error_px(found.geometry.camera, field.truth.camera))
-    chance = np.nan if found.halves is None else found.halves.chance
+    chance = np.nan if found.halves is None else found.halves.p_value
     return names, chance, error_px
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 _INTEGERS = re.compile(r'(u?)int(8|16|32|64)')
 _ARRAY = re.compile(r'(.+)\[(\d+)\]')
-_SEQUENCE = re.compile(r'sequence<(.+?)(?:, \d+)?>')
+_SEQUENCE = re.compile(r'sequence<(.+?)(?:, (\d+))?>')
 
 
 def send_mutants(template: Any, count: int, send: Callable[[Any], None], series: int = 0) -> None:
@@ -80,7 +80,8 @@ def _values(kind: str, old: Any) -> st.SearchStrategy[Any]:
         return st.lists(_single(fixed[1]), min_size=size, max_size=size)
     if sequence:
         if '/' in sequence[1]:
-            return st.lists(mutants(old[0]), max_size=4)
+            most = int(sequence[2] or 4)
+            return st.lists(mutants(old[0]), max_size=most) if len(old) else st.just([])
         element = _single(sequence[1])
         kept = list(old[:64])
         return st.one_of(
@@ -134,6 +135,9 @@ def not_finite(message: Any, allowed: frozenset[str]) -> list[str]:
         elif isinstance(value, float):
             found += [] if math.isfinite(value) else [name]
         elif not isinstance(value, (str, bytes)) and hasattr(value, '__len__'):
+            for one in value:
+                if hasattr(one, 'get_fields_and_field_types'):
+                    found += [f'{name}.{inner}' for inner in not_finite(one, allowed)]
             numbers = [one for one in value if isinstance(one, float)]
             found += [] if all(map(math.isfinite, numbers)) else [name]
     return found

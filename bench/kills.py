@@ -145,7 +145,7 @@ class Flight:
             self._solving = None
         self.told = max([self.told, *(message.images_saved for message in self._status)])
         for message in self._latched:
-            content = [message.fx, message.fy, *message.distortion, *message.covariance]
+            content = [*message.camera.parameters, *message.covariance]
             self.wrong['calibrator'] += not message.accepted
             self.wrong['calibrator'] += self._known.setdefault(message.number, content) != content
         self._status.clear()

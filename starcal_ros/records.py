@@ -1,7 +1,9 @@
 """
 The frozen records that pass between the stages: images -> observations -> calibration.
 
-Arrays in records are never changed after construction.
+Arrays in records are never changed after construction.  The types of the fields, with their marks
+(`arrays`), are the one description of a record: ``products/json_codec.py`` and
+``messages/codec.py`` write and read JSON and messages from them.
 """
 
 from __future__ import annotations
@@ -10,13 +12,14 @@ from collections.abc import Mapping
 import dataclasses
 from dataclasses import dataclass
 import math
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.arrays import Count, Finite, Floats, Shape
 from starcal_ros.camera import CameraModel
-
-Floats = NDArray[np.float64]
+from starcal_ros.detector_field import degrees, DetectorField
 
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
 
@@ -87,14 +90,14 @@ class AttitudeSample:
 @dataclass(frozen=True)
 class CameraGeometry:
     """
-    The camera and how it sits on the star tracker: the prior, or a calibration in force.
+    The camera and its alignment to the star tracker: the prior, or a calibration.
 
     ``star_tracker_from_camera_xyzw`` is (4,): the orientation of the camera in the star tracker
-    frame, as the wire has it.
+    frame, as in messages.
     """
 
     camera: CameraModel
-    star_tracker_from_camera_xyzw: Floats
+    star_tracker_from_camera_xyzw: Annotated[Floats, Finite(), Shape((4,))]
 
 
 @dataclass(frozen=True)
@@ -109,11 +112,11 @@ class StarObservations:
     width, height : int
         Image size, px.
     refusal, detail : str
-        Empty, or a name of `IMAGE_REFUSALS` and what was found.
+        Empty, or a name of `IMAGE_REFUSALS` and the finding in words.
     icrf_from_star_tracker_xyzw : (4,)
         Star tracker attitude at ``time_ns``; identity where there is none.
     attitude_gap_s : float
-        Time between the two samples about the image; -1 where there is none.
+        Time between the two samples around the image; NaN without a sample on both sides.
     catalog_id : (n,) int64
     direction_icrf : (n, 3)
         Apparent unit directions, ICRF axes.
@@ -126,9 +129,9 @@ class StarObservations:
     refused_stars : mapping
         Name of `STAR_REFUSALS` -> number of predicted stars left out for it.
     refused_catalog_id : (m,) int64
-        Those stars; empty in recordings of before their places were kept.
+        Those stars; empty in older recordings.
     refused_px : (m, 2) float32
-        (u, v) where each should stand by the match of the others; to be shown, not measured with.
+        Expected (u, v) of each by the match of the others; for display, not for measurement.
     refused_reason : (m,) uint8
         Which key of ``refused_stars``, counted from 0 in its order.
     background_dn, noise_dn : float
@@ -142,32 +145,32 @@ class StarObservations:
     """
 
     time_ns: int
-    width: int
-    height: int
+    width: Count
+    height: Count
     refusal: str
     detail: str
-    icrf_from_star_tracker_xyzw: Floats
+    icrf_from_star_tracker_xyzw: Annotated[Floats, Finite(), Shape((4,))]
     attitude_gap_s: float
-    catalog_id: NDArray[np.int64]
-    direction_icrf: Floats
-    magnitude: NDArray[np.float32]
-    measured_px: Floats
-    covariance_px2: Floats
-    flux_dn: NDArray[np.float32]
-    snr: NDArray[np.float32]
-    refused_stars: Mapping[str, int]
+    catalog_id: Annotated[NDArray[np.int64], Shape(('n',))]
+    direction_icrf: Annotated[Floats, Finite(), Shape(('n', 3))]
+    magnitude: Annotated[NDArray[np.float32], Shape(('n',))]
+    measured_px: Annotated[Floats, Finite(), Shape(('n', 2))]
+    covariance_px2: Annotated[Floats, Finite(), Shape(('n', 3))]
+    flux_dn: Annotated[NDArray[np.float32], Shape(('n',))]
+    snr: Annotated[NDArray[np.float32], Shape(('n',))]
+    refused_stars: Mapping[str, Count]
     background_dn: float
     noise_dn: float
     psf_sigma_px: float
     catalog_digest: str
     temperature_degc: float = math.nan
-    refused_catalog_id: NDArray[np.int64] = dataclasses.field(
+    refused_catalog_id: Annotated[NDArray[np.int64], Shape(('m',))] = dataclasses.field(
         default_factory=lambda: np.empty(0, np.int64)
     )
-    refused_px: NDArray[np.float32] = dataclasses.field(
+    refused_px: Annotated[NDArray[np.float32], Finite(), Shape(('m', 2))] = dataclasses.field(
         default_factory=lambda: np.empty((0, 2), np.float32)
     )
-    refused_reason: NDArray[np.uint8] = dataclasses.field(
+    refused_reason: Annotated[NDArray[np.uint8], Shape(('m',))] = dataclasses.field(
         default_factory=lambda: np.empty(0, np.uint8)
     )
 
@@ -212,7 +215,7 @@ def refused_image(
         refusal=refusal,
         detail=detail,
         icrf_from_star_tracker_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
-        attitude_gap_s=-1.0,
+        attitude_gap_s=math.nan,
         catalog_id=np.empty(0, np.int64),
         direction_icrf=np.empty((0, 3)),
         magnitude=np.empty(0, np.float32),
@@ -231,7 +234,7 @@ def refused_image(
 
 @dataclass(frozen=True)
 class Ensemble:
-    """What a calibration is made from: usable images as they came, and counts of the others."""
+    """The input of a calibration: usable images in order of arrival, and counts of the others."""
 
     images: tuple[StarObservations, ...] = ()
     refused: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -260,137 +263,196 @@ class Ensemble:
 @dataclass(frozen=True)
 class EnsembleStatus:
     """
-    What has been collected and what a calibration from it would be worth.
+    Images and stars collected so far, and the precision of a calibration made from them.
 
     ``coverage`` is (rows, cols) star observations per focal-plane cell;
     ``predicted_sigma`` is 1-sigma per ``parameter_names``, inf where not observable;
-    ``images_saved`` of the images are on disk and outlast a crash or a power loss.
+    ``images_saved`` counts the images on disk, which survive a crash or a power loss.
     """
 
     time_ns: int
-    images: int
-    stars: int
-    min_images: int
-    min_stars: int
-    refused: Mapping[str, int]
-    coverage: NDArray[np.int64]
-    parameter_names: tuple[str, ...]
-    predicted_sigma: Floats
-    images_saved: int = 0
+    images: Count
+    stars: Count
+    min_images: Count
+    min_stars: Count
+    refused: Mapping[str, Count]
+    coverage: Annotated[NDArray[np.int64], Shape(('coverage_rows', 'coverage_cols'))]
+    parameter_names: Annotated[tuple[str, ...], Shape(('k',))]
+    predicted_sigma: Annotated[Floats, Shape(('k',))]
+    images_saved: Count = 0
 
 
 @dataclass(frozen=True)
-class Thermal:
+class TemperatureTerms:
     """
-    How the camera changes with its temperature, as `thermal` states it.
+    Change of camera and alignment with temperature; `estimation.temperature` has the equations.
 
     Attributes
     ----------
     reference_degc : float
-        Camera and alignment of the calibration hold at this temperature.
-    focal_per_degc, focal_sigma : tuple of 0 to 2 float
+        Temperature at which camera and alignment of the calibration hold.
+    focal_per_degc, focal_per_degc_sigma : tuple of 0 to 2 float
         a1 (1/degC) and a2 (1/degC^2), and their 1-sigma.
-    alignment_rate_rad_per_degc, alignment_rate_sigma : tuple of 0 or 3 float
-        Passive small rotation in the camera frame for each degree, and its 1-sigma.
+    alignment_rate_rad_per_degc, alignment_rate_rad_per_degc_sigma : tuple of 0 or 3 float
+        Passive small rotation in the camera frame per degree, and its 1-sigma.
     note : str
-        What was asked for and left out, and why; may be empty.
+        Terms that were asked for and left out, with the reason; may be empty.
+
+    Raises
+    ------
+    ValueError
+        For another number of terms.
     """
 
-    reference_degc: float
-    focal_per_degc: tuple[float, ...] = ()
-    focal_sigma: tuple[float, ...] = ()
-    alignment_rate_rad_per_degc: tuple[float, ...] = ()
-    alignment_rate_sigma: tuple[float, ...] = ()
+    reference_degc: Annotated[float, Finite()]
+    focal_per_degc: Annotated[tuple[float, ...], Finite(), Shape(('q',))] = ()
+    focal_per_degc_sigma: Annotated[tuple[float, ...], Shape(('q',))] = ()
+    alignment_rate_rad_per_degc: Annotated[tuple[float, ...], Finite(), Shape(('r',))] = ()
+    alignment_rate_rad_per_degc_sigma: Annotated[tuple[float, ...], Shape(('r',))] = ()
     note: str = ''
+
+    def __post_init__(self) -> None:
+        """Check the number of terms."""
+        axes, order = len(self.alignment_rate_rad_per_degc), len(self.focal_per_degc)
+        if axes not in (0, 3):
+            raise ValueError(f'alignment_rate_rad_per_degc: {axes} numbers, not 3 or none')
+        if order > 2:
+            raise ValueError(f'focal_per_degc: {order} numbers, at most 2 are allowed')
 
 
 @dataclass(frozen=True)
 class DetectorMaps:
     """
-    What a calibration is worth over the detector; the first row is that of the least v.
+    Precision of a calibration over the detector; the first row is that of the smallest v.
 
     Attributes
     ----------
-    stars : (rows, cols) int64
+    stars : (coverage_rows, coverage_cols) int64
         Star observations used, in equal cells that cover the detector.
-    line_of_sight_sigma_arcsec : (rows, cols)
+    line_of_sight_sigma_arcsec : (map_rows, map_cols)
         1-sigma of the line of sight of a pixel in the star tracker frame, camera and alignment
         together, at a regular grid of pixels from corner to corner.
-    shape_sigma_arcsec : (rows, cols)
-        The same of the camera alone, after the turn that is common to all those pixels.
+    shape_sigma_arcsec : (map_rows, map_cols)
+        1-sigma of the camera alone, after the rotation common to all those pixels is removed.
     """
 
-    stars: NDArray[np.int64]
-    line_of_sight_sigma_arcsec: Floats
-    shape_sigma_arcsec: Floats
+    stars: Annotated[NDArray[np.int64], Shape(('coverage_rows', 'coverage_cols'))]
+    line_of_sight_sigma_arcsec: Annotated[Floats, Shape(('map_rows', 'map_cols'))]
+    shape_sigma_arcsec: Annotated[Floats, Shape(('map_rows', 'map_cols'))]
 
 
 @dataclass(frozen=True)
 class Correlation:
     """
-    Correlations (k, k) of the k named numbers that are not known exactly.
+    Correlations (k, k) of the k named numbers that have an uncertainty.
 
     Camera parameters that were estimated or considered, focal terms, alignment angles and rate.
     """
 
-    names: tuple[str, ...]
-    matrix: Floats
+    names: Annotated[tuple[str, ...], Shape(('k',))]
+    matrix: Annotated[Floats, Shape(('k', 'k'))]
 
 
 @dataclass(frozen=True)
-class Removal:
+class TermRemoval:
     """
-    A calibration after one more term was removed, those before it staying removed.
+    A calibration after one more term was removed; terms removed before stay removed.
 
     Attributes
     ----------
     removed : str
         The term; empty for the calibration with all of them.
     significance : float
-        How far the term is from what it is held at without it, in its sigma, with all terms.
+        Distance of the term, with all terms estimated, from the value it is held at when removed,
+        in its sigma.
     wald : float
-        Rise of chi^2 that the covariance before the removal had promised.
+        Rise of chi^2 that the covariance before the removal predicts.
     chi2_rise : float
-        Against the calibration with all terms, over its stars and with its weights.
-    within_chance : bool
-        Whether this and all removed before it may be dropped: terms that are none would raise
-        chi^2 by as much in more than 1 of 100.
+        Rise of chi^2 against the calibration with all terms, over its stars, with its weights.
+    negligible : bool
+        Whether this term and all removed before it may be dropped: the p-value of the rise is over
+        1 %.
     residual_rms_px : float
         Per axis, over the same stars.
     residual_std_px : (float, float)
-        Of u and of v.
+        Standard deviation along u and along v.
     map_change_px : float
-        RMS over the detector against the calibration with all terms, the common turn removed.
+        RMS change over the detector against the calibration with all terms, common rotation
+        removed.
     """
 
     removed: str
     significance: float
     wald: float
     chi2_rise: float
-    within_chance: bool
+    negligible: bool
     residual_rms_px: float
-    residual_std_px: tuple[float, float]
+    residual_std_px: Annotated[tuple[float, ...], Shape((2,))]
     map_change_px: float
 
 
 @dataclass(frozen=True)
-class Halves:
+class HalvesComparison:
     """
-    How the calibrations of the earlier and the later half of the images differ.
+    Difference of the calibrations of the earlier and the later half of the images.
 
     Attributes
     ----------
-    shape_px, shape_chance : float
-        Largest movement of a line of sight, common turn removed, px at the focal length; and how
-        often chance makes the cameras differ as much.
-    turn_arcsec, chance : float
-        The common turn; and the same of camera and alignment together.
+    shape_px, shape_p_value : float
+        Largest change of a line of sight, common rotation removed, px at the focal length; and the
+        p-value of the difference of the camera parameters.
+    rotation_arcsec, p_value : float
+        The common rotation; and the p-value of the difference of camera and alignment together.
+    note : str
+        Why the halves were not compared; empty where they were.  The numbers are NaN then.
     """
 
-    shape_px: float
-    shape_chance: float
-    turn_arcsec: float
-    chance: float
+    shape_px: float = math.nan
+    shape_p_value: float = math.nan
+    rotation_arcsec: float = math.nan
+    p_value: float = math.nan
+    note: str = ''
+
+
+@dataclass(frozen=True)
+class ResidualField:
+    """
+    Field over the detector that was estimated beside the lens model.
+
+    Attributes
+    ----------
+    degree : int
+        Of its polynomials (`detector_field.degrees`).
+    coefficients : (2, t)
+        px, for u and for v; a star that the lens model places at u is measured at u + f(u).
+    joint_covariance : (p + 2 t, p + 2 t)
+        Of the parameters of the calibration and the coefficients of u, then of v.
+    length : float
+        Length of the field, in half lengths of the longer side of the detector.
+    amplitude_px : float
+        Its prior 1-sigma per axis.
+    """
+
+    degree: Count
+    coefficients: Annotated[Floats, Finite(), Shape((2, 'terms'))]
+    joint_covariance: Annotated[Floats, Finite(), Shape(('joint', 'joint'))]
+    length: float
+    amplitude_px: float
+
+    def on(self, width: int, height: int) -> DetectorField:
+        """
+        Return the field on a detector of a size.
+
+        Raises
+        ------
+        ValueError
+            When the coefficients are not those of the degree.
+        """
+        expected = len(degrees(self.degree))
+        if self.coefficients.shape[1] != expected:
+            found = self.coefficients.shape[1]
+            raise ValueError(f'field.coefficients: {found} for an axis, not {expected}')
+        return DetectorField(width, height, self.degree, self.coefficients)
 
 
 @dataclass(frozen=True)
@@ -414,7 +476,7 @@ class HeldTerm:
 
 
 @dataclass(frozen=True)
-class Step:
+class DetectorStep:
     """
     The most significant step between two parts of the detector, as lost columns make one.
 
@@ -442,7 +504,7 @@ class ModelChecks:
         Field that was estimated beside the lens model, RMS per axis and largest length over the
         detector; 0 where none was needed.
     held : tuple of HeldTerm
-    step : Step
+    step : DetectorStep
     velocity_error_km_s, velocity_p_value : float
         Velocity of the observer that the aberration of the stars misses, and the p-value of none.
     image_variation_px, image_variation_p_value : float
@@ -459,7 +521,7 @@ class ModelChecks:
     field_rms_px: float
     field_worst_px: float
     held: tuple[HeldTerm, ...]
-    step: Step
+    step: DetectorStep
     velocity_error_km_s: float
     velocity_p_value: float
     image_variation_px: float
@@ -472,23 +534,23 @@ class ModelChecks:
 @dataclass(frozen=True)
 class GateCheck:
     """
-    One thing that the gate looks at.
+    One check of the gate.
 
     Attributes
     ----------
     name : str
-        What it is, in words.
+        What is checked, in words.
     option : str
-        The parameter that limits it: from below where it begins with ``min_``, else from above.
-        Empty for what needs no number: it holds or not.
+        The parameter that sets the limit: a lower limit where its name begins with ``min_``, else
+        an upper limit.  Empty for a check without a number.
     found, limit : float
         In ``unit``; ``found`` is NaN where it was not checked, both where there is no number.
     unit : str
         Empty for pure numbers.
-    kept : bool or None
+    passed : bool or None
         None where it was not checked.
     note : str
-        Why it was not checked, or what decided beside the limit; may be empty.
+        Why it was not checked, or what else decided; may be empty.
     """
 
     name: str
@@ -496,18 +558,18 @@ class GateCheck:
     found: float
     limit: float
     unit: str
-    kept: bool | None
+    passed: bool | None
     note: str = ''
 
     @property
     def is_least(self) -> bool:
-        """Whether the limit is the least that is allowed."""
+        """Whether the limit is a lower limit."""
         return self.option.startswith('min_')
 
     @property
     def found_text(self) -> str:
-        """What was found with its unit; empty where there is no number to be found."""
-        return self._text(self.found) if self.option and self.kept is not None else ''
+        """The value found with its unit; empty where there is none."""
+        return self._text(self.found) if self.option and self.passed is not None else ''
 
     @property
     def limit_text(self) -> str:
@@ -532,12 +594,12 @@ class Calibration:
         Stamp of the last image used.
     geometry : CameraGeometry
         The estimated camera and alignment.
-    covariance : (p + 3, p + 3)
-        Of `parameter_names`; the alignment angles (rad) are passive small rotations
-        in the camera frame; zero rows where a parameter was held.
+    covariance : (p, p)
+        Of `parameter_names`; the alignment angles (rad) are passive small rotations in the camera
+        frame; zero rows where a parameter was held.
     method : str
     estimated : tuple of str
-        Which camera parameters were estimated.
+        The camera parameters that were estimated.
     residual_rms_px : float
         Per axis, over the stars used.
     variance_factor : float
@@ -546,60 +608,67 @@ class Calibration:
     images_refused : mapping
         Reason -> count.
     alignment_scatter_arcsec : float
-        RMS per axis of the alignments that the images show, about their mean; 0 for ``single``.
+        RMS per axis of the alignments of the single images around their mean; 0 for ``single``.
     star_tracker_sigma_arcsec : tuple of 3 float
-        About the star tracker's axes, as given or as estimated again.
+        Around the axes of the star tracker, as given or as estimated again.
     centroid_scale, centroid_floor_px : float
         The centroid covariances C were used as ``scale C + floor^2 I``.
     dropped_catalog_ids : tuple of int
-        Stars that misfit across images and were left out of all.
+        Stars that do not fit in several images and were left out of all.
     misfit_images_ns : tuple of int
         Stamps of images whose attitude does not fit, or that lost their stars.
     singular_values : tuple of float
-        Of the information on what was estimated, scaled to a unit diagonal, largest first.
+        Of the information on the estimated parameters, scaled to a unit diagonal, largest first.
     weakest_direction : str
         The direction of the smallest, in words.
     zero_skew_cost_px : float
-        Worst pixel error of the zero-skew fit that ``camera_info`` carries.
+        Largest pixel error of the zero-skew fit that ``camera_info`` carries.
     iterations, termination
-        What the solver reported.
+        As reported by the solver.
     accepted, reasons
         The verdict of the gate.
+    parent_frame, child_frame : str
+        Names of the star tracker frame and of the camera frame.
     provenance : mapping of str to str
-    thermal : Thermal or None
+    temperature : TemperatureTerms or None
         None where no change with temperature was asked for.
     maps : DetectorMaps or None
     correlation : Correlation or None
-        None where whoever has made the calibration does not tell.
-    removals : tuple of Removal
-        First that of no term, then the terms in the order in which they would go; may be empty.
+        None where not recorded.
+    removals : tuple of TermRemoval
+        First that of no term, then the terms in the order of their removal; may be empty.
     first_image_ns : int
         Stamp of the first image used.
     number : int
-        Counts the calibrations that came into force on one calibrator; 0 for a candidate.
-    in_force_since_ns : int
-        When it came into force, or came back by a roll-back; 0 for a candidate.
+        Counts the calibrations activated on one calibrator; 0 for a candidate.
+    active_since_ns : int
+        When it was activated, or activated again by a roll-back; 0 for a candidate.
     forced : bool
-        It came into force by request, against the gate.
-    halves : Halves or None
-        None where the halves of the images were not compared.
+        Activated by request despite the gate.
+    halves : HalvesComparison or None
+        None where not recorded.
     gate : tuple of GateCheck
-        What the gate has looked at; empty where whoever has made the calibration does not tell.
+        The checks of the gate; empty where not recorded.
+
+    Raises
+    ------
+    ValueError
+        When the covariance does not fit the camera.
     """
 
     time_ns: int
     geometry: CameraGeometry
-    covariance: Floats
+    covariance: Annotated[Floats, Shape(('p', 'p'))]
     method: str
     estimated: tuple[str, ...]
     residual_rms_px: float
     variance_factor: float
-    images_used: int
-    images_refused: Mapping[str, int]
-    stars_used: int
-    stars_rejected: int
+    images_used: Count
+    images_refused: Mapping[str, Count]
+    stars_used: Count
+    stars_rejected: Count
     alignment_scatter_arcsec: float
-    star_tracker_sigma_arcsec: tuple[float, ...]
+    star_tracker_sigma_arcsec: Annotated[tuple[float, ...], Shape((3,))]
     centroid_scale: float
     centroid_floor_px: float
     dropped_catalog_ids: tuple[int, ...]
@@ -607,30 +676,55 @@ class Calibration:
     singular_values: tuple[float, ...]
     weakest_direction: str
     zero_skew_cost_px: float
-    iterations: int
+    iterations: Count
     termination: str
     accepted: bool
     reasons: tuple[str, ...]
     parent_frame: str
     child_frame: str
     provenance: Mapping[str, str]
-    thermal: Thermal | None = None
+    temperature: TemperatureTerms | None = None
     maps: DetectorMaps | None = None
     correlation: Correlation | None = None
-    removals: tuple[Removal, ...] = ()
+    removals: tuple[TermRemoval, ...] = ()
     first_image_ns: int = 0
-    number: int = 0
-    in_force_since_ns: int = 0
+    number: Count = 0
+    active_since_ns: int = 0
     forced: bool = False
-    halves: Halves | None = None
+    halves: HalvesComparison | None = None
+    model: ModelChecks | None = None
+    field: ResidualField | None = None
     gate: tuple[GateCheck, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the size of the covariance."""
+        p = len(self.parameter_names)
+        if self.covariance.shape != (p, p):
+            found = ' x '.join(map(str, self.covariance.shape))
+            raise ValueError(f'covariance: {found} numbers, not {p} x {p}')
+        if self.field is not None and self.geometry.camera.field is None:
+            # Files and messages hold the field beside the camera, with its covariance.
+            camera = self.geometry.camera
+            detector_field = self.field.on(camera.width, camera.height)
+            count = p + detector_field.coefficients.size
+            if len(self.field.joint_covariance) != count:
+                rows = len(self.field.joint_covariance)
+                raise ValueError(f'field.joint_covariance: {rows} rows, not {count}')
+            camera = dataclasses.replace(camera, field=detector_field)
+            geometry = dataclasses.replace(self.geometry, camera=camera)
+            object.__setattr__(self, 'geometry', geometry)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the p camera parameters and of the alignment angles."""
-        return calibration_parameter_names(self.geometry.camera)
+        """Names of the rows of the covariance: camera parameters, then alignment angles."""
+        return self.geometry.camera.parameter_names + ALIGNMENT_NAMES
+
+    @property
+    def joint_covariance(self) -> Floats:
+        """Covariance of `parameter_names`, then of the coefficients of a field."""
+        return self.covariance if self.field is None else self.field.joint_covariance
 
     @property
     def sigma(self) -> Floats:
-        """1-sigma of `parameter_names`, (p + 3,)."""
+        """1-sigma (p,) of `parameter_names`."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))

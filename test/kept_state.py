@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sample_records import calibration  # type: ignore[import-not-found]
 
-from starcal_ros.calibrator.archive import Archive, InForce
+from starcal_ros.calibrator.archive import Activation, Archive
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario
@@ -23,11 +23,11 @@ def images() -> tuple[StarObservations, ...]:
     return true_observations(scenario('tiny', seed=7)).images
 
 
-def in_force(event: int, before: int = 0, number: int = 0) -> InForce:
+def activation(event: int, before: int = 0, number: int = 0) -> Activation:
     """A record whose calibration tells its number by its residual."""
     number = number or event
     changed = dataclasses.replace(calibration(), number=number, residual_rms_px=number / 7)
-    return InForce(event, before, changed)
+    return Activation(event, before, changed)
 
 
 @contextlib.contextmanager
@@ -47,6 +47,6 @@ def collect(folder: Path, shown: tuple[StarObservations, ...], told: Connection)
         for k in itertools.count(len(have.images)):
             image = dataclasses.replace(shown[k % len(shown)], time_ns=k)
             have = Ensemble((*have.images, image), {'no_stars': k})
-            history = (*history, in_force(archive.last_event + 1))[-3:]
+            history = (*history, activation(archive.last_event + 1))[-3:]
             archive.keep(have, history)
             told.send((k, history[-1].event))

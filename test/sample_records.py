@@ -16,11 +16,11 @@ from starcal_ros.records import (
     DetectorMaps,
     EnsembleStatus,
     GateCheck,
-    Halves,
+    HalvesComparison,
     refused_image,
-    Removal,
     StarObservations,
-    Thermal,
+    TemperatureTerms,
+    TermRemoval,
 )
 
 TIME_NS = 1_700_000_000_123_456_789
@@ -85,7 +85,7 @@ def calibration() -> Calibration:
         parent_frame='st',
         child_frame='cam',
         provenance={'catalog': 'x', 'note': 'quote " and µ'},
-        thermal=Thermal(
+        temperature=TemperatureTerms(
             21.5, (4e-5, -6e-7), (1e-6, 2e-8), (1e-5, 2e-5, 3e-5), (1e-6, 2e-6, 3e-6), 'a word'
         ),
         maps=DetectorMaps(
@@ -93,11 +93,11 @@ def calibration() -> Calibration:
             np.arange(12.0).reshape(4, 3) / 7,
             np.sqrt(np.arange(12.0)).reshape(4, 3),
         ),
-        halves=Halves(shape_px=0.03, shape_chance=0.4, turn_arcsec=1.7, chance=0.6),
+        halves=HalvesComparison(0.03, 0.4, 1.7, 0.6),
         correlation=Correlation(('fx', 'fy'), np.array([[1.0, 1 / 3], [1 / 3, 1.0]])),
         removals=(
-            Removal('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
-            Removal('k3', -0.3, 0.5, 1 / 7, False, 0.3, (0.25, 0.35), 1e-9),
+            TermRemoval('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
+            TermRemoval('k3', -0.3, 0.5, 1 / 7, False, 0.3, (0.25, 0.35), 1e-9),
         ),
         gate=(
             GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 0.25, 'px', False, 'a word'),
@@ -109,7 +109,13 @@ def calibration() -> Calibration:
 def plain_calibration() -> Calibration:
     """A calibration that tells nothing beyond what each must."""
     return dataclasses.replace(
-        calibration(), thermal=None, maps=None, correlation=None, removals=(), halves=None, gate=()
+        calibration(),
+        temperature=None,
+        maps=None,
+        correlation=None,
+        removals=(),
+        halves=None,
+        gate=(),
     )
 
 

@@ -1,4 +1,4 @@
-"""How far two calibrations differ: over the detector, and in the sigmas that they report."""
+"""Difference of two calibrations: over the detector, and in the sigmas that they report."""
 
 from __future__ import annotations
 
@@ -7,70 +7,91 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import line_of_sight, pixel_grid
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import (
     CalibrationOptions,
     estimate_calibration,
     estimated_parameters,
 )
-from starcal_ros.records import CameraGeometry, Ensemble
+from starcal_ros.records import CameraGeometry, Ensemble, HalvesComparison
 
-Floats = NDArray[np.float64]
+FEWEST_IMAGES = 6  # of an ensemble that can be cut in two: a scatter needs three images
+FEWEST_STARS = 100  # of a half: with fewer, its sigmas are too uncertain for a test
+_SINGULAR = 1e-12  # eigenvalue of a correlation matrix that is zero but for rounding
 
-FEWEST_IMAGES = 6  # of an ensemble that can be cut in two: three tell a scatter
-FEWEST_STARS = 100  # of a half: with fewer, its sigmas are too uncertain to judge by
+
+@dataclass(frozen=True)
+class ChiSquared:
+    """A squared length in the metric of a covariance, and its degrees of freedom; 0 for none."""
+
+    value: float
+    degrees_of_freedom: int
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a value as large from noise alone; 1 without degrees of freedom."""
+        n = self.degrees_of_freedom
+        return float(chdtrc(n, self.value)) if n else 1.0
+
+    @property
+    def rms_sigma(self) -> float:
+        """RMS in sigmas, about 1 from noise alone; 0 without degrees of freedom."""
+        n = self.degrees_of_freedom
+        return math.sqrt(self.value / n) if n else 0.0
+
+
+def chi_squared(difference: Floats, covariance: Floats) -> ChiSquared:
+    """
+    Squared length of a difference (k,) in the metric of its covariance (k, k) (Mahalanobis).
+
+    Rows without a finite, positive variance are left out; directions in which the covariance is
+    singular are no degree of freedom.
+    """
+    known = np.isfinite(covariance).all(axis=1) & (np.diag(covariance) > 0)
+    if not known.any():
+        return ChiSquared(0.0, 0)
+    difference, covariance = difference[known], covariance[np.ix_(known, known)]
+    # Scaled to a unit diagonal first: fx and k3 differ by many powers of ten.
+    sigma = np.sqrt(np.diag(covariance))
+    scaled, correlation = difference / sigma, covariance / np.outer(sigma, sigma)
+    inverse = np.linalg.pinv(correlation, rcond=_SINGULAR, hermitian=True)
+    rank = int(np.linalg.matrix_rank(correlation, tol=_SINGULAR, hermitian=True))
+    return ChiSquared(float(scaled @ inverse @ scaled), rank)
 
 
 @dataclass(frozen=True)
 class Difference:
     """
-    Between two calibrations of the same pixels.
+    Difference of two calibrations of the same pixels.
 
     Attributes
     ----------
-    turn_rad : float
+    rotation_rad : float
         The rotation common to all lines of sight, in the star tracker frame.
     shape_px : float
-        The largest movement of a line of sight that is left, px at the focal length.  Both are
-        infinite where a pixel has no line of sight any more.
-    shape_chi2, shape_freedom : float, int
-        Squared length of the difference of the camera parameters that both have estimated in the
-        metric of both covariances, and how many they are; 0 for none.
-    chi2, freedom : float, int
+        The largest remaining change of a line of sight, px at the focal length.  Both are infinite
+        where a pixel no longer has a line of sight.
+    camera : ChiSquared
+        Of the camera parameters that both have estimated.
+    total : ChiSquared
         The same with the three angles of the alignment.
     """
 
-    turn_rad: float
+    rotation_rad: float
     shape_px: float
-    shape_chi2: float
-    shape_freedom: int
-    chi2: float
-    freedom: int
-
-    @property
-    def rms_sigma(self) -> float:
-        """The difference in sigmas, RMS over what was estimated: about 1 by chance."""
-        return math.sqrt(self.chi2 / self.freedom) if self.freedom else 0.0
-
-    @property
-    def chance(self) -> float:
-        """How often chance alone makes two calibrations of one camera differ as much."""
-        return float(chdtrc(self.freedom, self.chi2)) if self.freedom else 1.0
-
-    @property
-    def shape_chance(self) -> float:
-        """The same of the cameras alone."""
-        return float(chdtrc(self.shape_freedom, self.shape_chi2)) if self.shape_freedom else 1.0
+    camera: ChiSquared
+    total: ChiSquared
 
 
 def lines_of_sight(geometry: CameraGeometry, columns: int, rows: int) -> Floats:
     """
-    Of a grid of pixels in the star tracker frame, (columns * rows, 3), row by row.
+    Unit directions of a grid of pixels in the star tracker frame, (columns * rows, 3), by rows.
 
     NaN where a pixel has no line of sight.
     """
@@ -83,22 +104,22 @@ def movement(
     before: CameraGeometry, after: CameraGeometry, columns: int = 15, rows: int = 12
 ) -> tuple[float, Floats]:
     """
-    How far the lines of sight of the pixels of a camera moved in the star tracker frame.
+    Movement of the lines of sight of the pixels of a camera in the star tracker frame.
 
     Returns
     -------
-    turn_rad : float
+    rotation_rad : float
         The rotation common to all pixels.
     left_px : (columns * rows,)
-        The movement that is left at a grid of pixels, in pixels of the middle.  Both are infinite
-        where a pixel has no line of sight any more.
+        The remaining movement at a grid of pixels, in pixels at the centre.  Both are infinite
+        where a pixel no longer has a line of sight.
     """
     old, new = (lines_of_sight(geometry, columns, rows) for geometry in (before, after))
     if not (np.isfinite(old).all() and np.isfinite(new).all()):
         return np.inf, np.full(len(old), np.inf)
-    turn, _ = Rotation.align_vectors(new, old)
-    left_rad = np.linalg.norm(new - turn.apply(old), axis=1)
-    return float(turn.magnitude()), left_rad * after.camera.parameters[0]
+    rotation, _ = Rotation.align_vectors(new, old)
+    left_rad = np.linalg.norm(new - rotation.apply(old), axis=1)
+    return float(rotation.magnitude()), left_rad * after.camera.parameters[0]
 
 
 def alignment_difference_rad(a: CameraGeometry, b: CameraGeometry) -> Floats:
@@ -119,51 +140,43 @@ def difference(
     """
     Difference of two calibrations; ``estimated`` are the camera parameters that both estimate.
 
-    The covariances (p + 3, p + 3) are taken as independent.  Of two ensembles that share images,
-    the difference is less than they say.  Of two lens models only the lines of sight are compared.
+    The covariances (p, p), of camera parameters and alignment angles, are taken as independent.
+    Ensembles that share images differ by less than their covariances predict.
     """
-    turn_rad, left_px = movement(before, after)
-    if before.camera.model != after.camera.model:
-        return Difference(turn_rad, float(left_px.max()), 0.0, 0, 0.0, 0)
-    turned_rad = alignment_difference_rad(after, before)
-    moves = np.concatenate([after.camera.parameters - before.camera.parameters, turned_rad])
-    covariance = before_covariance + after_covariance
+    rotation_rad, left_px = movement(before, after)
     names = after.camera.parameter_names
+    changes = np.concatenate(
+        [
+            after.camera.parameters - before.camera.parameters,
+            alignment_difference_rad(after, before),
+        ]
+    )
+    covariance = before_covariance + after_covariance
     camera = [names.index(name) for name in estimated]
     angles = range(len(names), len(names) + 3)
-    of_camera, of_all = (
-        _squared_sigmas(moves[rows], covariance[np.ix_(rows, rows)])
+    of_camera, total = (
+        chi_squared(changes[rows], covariance[np.ix_(rows, rows)])
         for rows in (camera, [*camera, *angles])
     )
-    return Difference(turn_rad, float(left_px.max()), *of_camera, *of_all)
+    return Difference(rotation_rad, float(left_px.max()), of_camera, total)
 
 
-def _squared_sigmas(moves: Floats, covariance: Floats) -> tuple[float, int]:
-    """Squared length in the metric of a covariance, and its degrees of freedom."""
-    scale = np.sqrt(np.diag(covariance))
-    if not len(moves) or not (np.isfinite(scale).all() and (scale > 0).all()):
-        return 0.0, 0
-    scaled = moves / scale
-    correlation = covariance / np.outer(scale, scale)
-    return float(scaled @ np.linalg.pinv(correlation, hermitian=True) @ scaled), len(moves)
-
-
-def halves(
+def compare_halves(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
-) -> Difference | str:
+) -> HalvesComparison:
     """
     Difference of the calibrations of the earlier and of the later half of the images.
 
-    What drifts or jumps while an ensemble is collected shows here: halves that are interleaved
-    would share it.  In words, why there is none: with too few images, where a half does not
-    determine what is to be estimated, or where a change with temperature is, since the halves are
-    of other temperatures.
+    A drift or a jump during the collection of an ensemble shows here; interleaved halves would
+    share it.  The halves are not compared, and the note gives the reason, with too few images,
+    where a half does not determine what is to be estimated, and where a change with temperature
+    is: the halves have different temperatures.
     """
     images = sorted(ensemble.images, key=lambda image: image.time_ns)
     if len(images) < FEWEST_IMAGES:
-        return f'{len(images)} images, {FEWEST_IMAGES} make two halves'
+        return HalvesComparison(note=f'{len(images)} images, {FEWEST_IMAGES} make two halves')
     if options.focal_temperature_order or options.alignment_temperature:
-        return 'the halves are of other temperatures'
+        return HalvesComparison(note='the halves have different temperatures')
     options = dataclasses.replace(options, min_images=2, min_stars=FEWEST_STARS)
     middle = len(images) // 2
     try:
@@ -172,8 +185,14 @@ def halves(
             for part in (images[:middle], images[middle:])
         )
     except TooFewObservations as error:
-        return f'a half alone cannot be solved: {error}'
+        return HalvesComparison(note=f'a half alone cannot be solved: {error}')
     estimated = estimated_parameters(options, prior.camera.model)
-    return difference(
+    found = difference(
         first.geometry, first.covariance, second.geometry, second.covariance, estimated
+    )
+    return HalvesComparison(
+        shape_px=found.shape_px,
+        shape_p_value=found.camera.p_value,
+        rotation_arcsec=found.rotation_rad / ARCSECOND_RAD,
+        p_value=found.total.p_value,
     )

@@ -5,17 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtrc
 
-from starcal_ros.assessment.agreement import alignment_difference_rad, lines_of_sight
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.agreement import (
+    alignment_difference_rad,
+    chi_squared,
+    ChiSquared,
+    lines_of_sight,
+)
 from starcal_ros.assessment.observability import line_of_sight_sigma_arcsec, map_sigma_px
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.records import Calibration, CameraGeometry
-
-Floats = NDArray[np.float64]
 
 GRID = 25  # the columns and rows of `map_sigma_px`
 
@@ -23,11 +25,11 @@ GRID = 25  # the columns and rows of `map_sigma_px`
 @dataclass(frozen=True)
 class DifferenceMap:
     """
-    How far the lines of sight of a grid of pixels moved, in the camera frame of A.
+    Movement of the lines of sight of a grid of pixels, in the camera frame of A.
 
-    ``length_px`` (rows, columns) is the angle in units of a pixel at the centre, as the gate has
-    it; ``difference_px`` (rows, columns, 2) is its part along u and v; ``sigmas`` (rows, columns)
-    is the length in 1-sigma of both calibrations, NaN where nothing was estimated.
+    ``length_px`` (rows, columns) is the angle in units of a pixel at the centre, as in the gate;
+    ``difference_px`` (rows, columns, 2) is its part along u and v; ``sigmas`` (rows, columns) is
+    the length in 1-sigma of both calibrations, NaN where nothing was estimated.
     """
 
     difference_px: Floats
@@ -42,47 +44,43 @@ class Comparison:
 
     Attributes
     ----------
-    difference, sigma : (p + 3,)
-        B less A of the parameters of B, and its 1-sigma if their errors are independent; NaN
-        where the lens models differ, but for the alignment.  The alignment angles (rad) are
-        passive small rotations in the camera frame.
-    turn_rad : float
+    difference, sigma : (p,)
+        B less A of `Calibration.parameter_names`, and its 1-sigma if their errors are
+        independent.  The alignment angles (rad) are passive small rotations in the camera frame.
+    rotation_rad : float
         The rotation common to all lines of sight.
     before, after : DifferenceMap
-        Of the lines of sight in the star tracker frame, and with the common turn taken off.
-    chi2, degrees, chance : float, int, float
-        Of all differences together, and the chance of one as large where only noise differs; NaN
-        where nothing was estimated.
+        Of the lines of sight in the star tracker frame, and with the common rotation removed.
+    total : ChiSquared
+        Of all differences together; no degrees of freedom where nothing was estimated.
     notes : tuple of str
-        What to know before believing the sigmas.
+        Limitations of the sigmas.
     """
 
     a: Calibration
     b: Calibration
     difference: Floats
     sigma: Floats
-    turn_rad: float
+    rotation_rad: float
     before: DifferenceMap
     after: DifferenceMap
-    chi2: float
-    degrees: int
-    chance: float
+    total: ChiSquared
     notes: tuple[str, ...]
 
     @property
     def sigmas(self) -> Floats:
-        """The differences in their sigma, (p + 3,); NaN where a parameter was held in both."""
+        """The differences in their sigma, (p,); NaN where a parameter was held in both."""
         return _ratio(self.difference, self.sigma)
 
 
 def compare(a: Calibration, b: Calibration) -> Comparison:
     """
-    How far B is from A.
+    Difference of B from A.
 
     Raises
     ------
     ProductError
-        When they are of cameras of different size, or a pixel has no line of sight.
+        When the cameras differ in size or model, or a pixel has no line of sight.
     """
     camera_a, camera_b = a.geometry.camera, b.geometry.camera
     if (camera_a.width, camera_a.height) != (camera_b.width, camera_b.height):
@@ -90,44 +88,45 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
             f'A is of a camera of {camera_a.width} x {camera_a.height}, '
             f'B of one of {camera_b.width} x {camera_b.height}: they cannot be compared'
         )
-    turned_rad = alignment_difference_rad(b.geometry, a.geometry)
-    if camera_a.model == camera_b.model:
-        difference = np.concatenate([camera_b.parameters - camera_a.parameters, turned_rad])
-        covariance = a.covariance + b.covariance
-    else:
-        p = len(camera_b.parameters)
-        difference = np.concatenate([np.full(p, np.nan), turned_rad])
-        covariance = np.full((p + 3, p + 3), np.nan)
-        covariance[-3:, -3:] = a.covariance[-3:, -3:] + b.covariance[-3:, -3:]
-    sigma = np.sqrt(np.diag(covariance))
+    if camera_a.model != camera_b.model:
+        raise ProductError(
+            f'A has the lens model {camera_a.model}, B {camera_b.model}: they cannot be compared'
+        )
+    difference = np.concatenate(
+        [
+            camera_b.parameters - camera_a.parameters,
+            alignment_difference_rad(b.geometry, a.geometry),
+        ]
+    )
+    sigma = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
     old, new = (_sound_lines_of_sight(calibration.geometry) for calibration in (a, b))
-    turn, _ = Rotation.align_vectors(new, old)
+    rotation, _ = Rotation.align_vectors(new, old)
     sight_sigma_rad = _both(
         *(
-            line_of_sight_sigma_arcsec(c.geometry.camera, c.covariance, GRID, GRID) * ARCSECOND_RAD
+            line_of_sight_sigma_arcsec(c.geometry.camera, c.joint_covariance, GRID, GRID)
+            * ARCSECOND_RAD
             for c in (a, b)
         )
     )
-    shape_sigma_px = _both(*(map_sigma_px(c.geometry.camera, c.covariance, GRID) for c in (a, b)))
+    shape_sigma_px = _both(
+        *(map_sigma_px(c.geometry.camera, c.joint_covariance, GRID) for c in (a, b))
+    )
     shape_sigma_rad = shape_sigma_px / camera_a.parameters[0]
-    degrees, total = _chi2(difference, covariance)
     return Comparison(
         a=a,
         b=b,
         difference=difference,
         sigma=sigma,
-        turn_rad=float(turn.magnitude()),
+        rotation_rad=float(rotation.magnitude()),
         before=_map(new - old, a.geometry, sight_sigma_rad),
-        after=_map(new - turn.apply(old), a.geometry, shape_sigma_rad),
-        chi2=total,
-        degrees=degrees,
-        chance=float(chdtrc(degrees, total)) if degrees else float('nan'),
+        after=_map(new - rotation.apply(old), a.geometry, shape_sigma_rad),
+        total=chi_squared(difference, a.covariance + b.covariance),
         notes=_notes(a, b, difference, sigma),
     )
 
 
 def _sound_lines_of_sight(geometry: CameraGeometry) -> Floats:
-    """Of the grid, (GRID^2, 3), star tracker frame."""
+    """Lines of sight of the grid, (GRID^2, 3), star tracker frame."""
     directions = lines_of_sight(geometry, GRID, GRID)
     if not np.isfinite(directions).all():
         raise ProductError(
@@ -141,7 +140,7 @@ def _both(a: Floats, b: Floats) -> Floats:
 
 
 def _map(moved: Floats, frame: CameraGeometry, sigma_rad: Floats) -> DifferenceMap:
-    """Of (GRID^2, 3) differences of unit vectors, star tracker frame; pixels as the gate's."""
+    """Map of (GRID^2, 3) differences of unit vectors in the star tracker frame."""
     camera_from_star_tracker = Rotation.from_quat(frame.star_tracker_from_camera_xyzw).inv()
     in_camera = camera_from_star_tracker.apply(moved).reshape(GRID, GRID, 3)
     length_rad = np.linalg.norm(in_camera, axis=-1)
@@ -159,19 +158,6 @@ def _ratio(values: Floats, sigma: Floats) -> Floats:
     )
 
 
-def _chi2(difference: Floats, covariance: Floats) -> tuple[int, float]:
-    """Degrees of freedom, and the squared length of a difference in its covariance."""
-    known = np.isfinite(covariance).all(axis=1) & (np.diag(covariance) > 0)
-    if not known.any():
-        return 0, float('nan')
-    sigma = np.sqrt(np.diag(covariance)[known])
-    # Scaled to a unit diagonal first: fx and k3 differ by many powers of ten.
-    values, vectors = np.linalg.eigh(covariance[np.ix_(known, known)] / np.outer(sigma, sigma))
-    whole = values > 1e-12
-    parts = vectors[:, whole].T @ (difference[known] / sigma)
-    return int(whole.sum()), float(np.sum(parts**2 / values[whole]))
-
-
 def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) -> tuple[str, ...]:
     notes = []
     for name, calibration in (('A', a), ('B', b)):
@@ -180,18 +166,14 @@ def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) ->
     same = 'observations_sha256'
     if a.provenance.get(same) and a.provenance.get(same) == b.provenance.get(same):
         notes.append(
-            'A and B are from the same stars: their errors are alike, so the true sigma of a '
+            'A and B are from the same stars: their errors are correlated, so the true sigma of a '
             'difference is smaller'
-        )
-    names = b.geometry.camera.parameter_names
-    if a.geometry.camera.model != b.geometry.camera.model:
-        notes.append(
-            f'the lens models differ, {a.geometry.camera.model} in A, {b.geometry.camera.model} '
-            'in B: only lines of sight and alignment are compared'
         )
     held = [
         name
-        for name, moved, error in zip(names, difference[:-3], sigma[:-3], strict=True)
+        for name, moved, error in zip(
+            a.geometry.camera.parameter_names, difference, sigma, strict=False
+        )
         if moved and not error
     ]
     if held:
@@ -201,7 +183,7 @@ def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) ->
             f'the frames have other names: {a.parent_frame}, {a.child_frame} in A, '
             f'{b.parent_frame}, {b.child_frame} in B'
         )
-    degc = [c.thermal.reference_degc for c in (a, b) if c.thermal is not None]
+    degc = [c.temperature.reference_degc for c in (a, b) if c.temperature is not None]
     if len(degc) == 1 or len(set(degc)) > 1:
         notes.append('they hold at different temperatures (reference_degc)')
     return tuple(notes)
@@ -225,20 +207,21 @@ def content(comparison: Comparison) -> dict[str, object]:
             'sigmas': plain(found.sigmas),
         }
 
+    total = comparison.total
     return {
-        'parameter_names': list(comparison.b.parameter_names),
+        'parameter_names': list(comparison.a.parameter_names),
         'a': plain(comparison.a.geometry.camera.parameters),
         'b': plain(comparison.b.geometry.camera.parameters),
         'difference': plain(comparison.difference),
         'sigma': plain(comparison.sigma),
         'sigmas': plain(comparison.sigmas),
         'alignment_arcsec': plain(comparison.difference[-3:] / ARCSECOND_RAD),
-        'common_turn_arcsec': comparison.turn_rad / ARCSECOND_RAD,
+        'common_rotation_arcsec': comparison.rotation_rad / ARCSECOND_RAD,
         'lines_of_sight': of_map(comparison.before),
-        'without_common_turn': of_map(comparison.after),
-        'chi2': comparison.chi2 if comparison.degrees else None,
-        'degrees_of_freedom': comparison.degrees,
-        'chance': comparison.chance if comparison.degrees else None,
+        'without_common_rotation': of_map(comparison.after),
+        'chi2': total.value if total.degrees_of_freedom else None,
+        'degrees_of_freedom': total.degrees_of_freedom,
+        'p_value': total.p_value if total.degrees_of_freedom else None,
         'accepted': [comparison.a.accepted, comparison.b.accepted],
         'notes': list(comparison.notes),
     }

@@ -27,7 +27,7 @@ from starcal_ros.estimation.problem import (
     scalar_terms_at,
     score_of,
 )
-from starcal_ros.records import HeldTerm, ModelChecks, Step
+from starcal_ros.records import DetectorStep, HeldTerm, ModelChecks
 
 _SPEED_OF_LIGHT_KM_S = 299792.458
 _STEPS = 31  # places along each axis at which a step is looked for
@@ -145,7 +145,7 @@ def _velocity(
 
 def _step(
     estimate: Estimate, measurements: Measurements, blocks: Floats, field: LinearTerms | None
-) -> Step:
+) -> DetectorStep:
     """The most significant step of the detector between two parts."""
     problem, state = estimate.problem, estimate.state
     camera, prior = estimate.geometry.camera, problem.field_prior
@@ -172,7 +172,7 @@ def _step(
     significance = abs(float(size_px[k] / sigma_px[k]))
     p_value = min(1.0, 2.0 * len(steps) * float(ndtr(-significance)))
     axis, place = divmod(k % count, _STEPS)
-    return Step(
+    return DetectorStep(
         across='uv'[axis],
         place_px=float(at[axis][place]),
         moved='uv'[k // count],

@@ -1,8 +1,8 @@
 """
-What each term of the camera is worth: calibrations with fewer and fewer of them (paper, Fig. 8).
+Significance of each term of the camera: calibrations with fewer and fewer terms (paper, Fig. 8).
 
-Solved again after each removal, from where it stood, with the stars and weights of the calibration
-with all terms: chi^2 rises by what the term was worth and by nothing else.
+After each removal the rest is solved again from the last solution, with the stars and weights of
+the calibration with all terms, so that the rise of chi^2 is due to the removal alone.
 """
 
 from __future__ import annotations
@@ -10,11 +10,9 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from starcal_ros.assessment.observability import map_error_px
-from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.normal_equations import arrange, Measurements, residuals_px
@@ -26,40 +24,41 @@ from starcal_ros.estimation.problem import (
     reduced_information,
     State,
 )
-from starcal_ros.records import Removal
+from starcal_ros.records import TermRemoval
 
-Floats = NDArray[np.float64]
-
-_HELD_AT_PRIOR = tuple(name for name in INTRINSIC_NAMES if name != 'skew')
-_CHANCE = 0.01  # that terms which are none raise chi^2 by as much
+_HELD_AT_PRIOR = ('fx', 'fy', 'cx', 'cy')  # skew and distortion terms are held at zero
+_SIGNIFICANT = 0.01  # p-value below which a rise of chi^2 shows that a term is needed
 
 
-def removal_study(estimate: Estimate) -> tuple[Removal, ...]:
+def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
     """
-    One row for the calibration as it is, and one for each term in the order in which they go.
+    One row for the calibration with all terms, and one for each term in the order of removal.
 
-    Removed skew and distortion are zero, a removed focal length or principal point is the prior's.
-    The next to go is the one whose removal raises chi^2 least by the covariance (Wald: squared
-    distance to the value that it is then held at, over its variance); then all is solved again.
-    Ends early where the stars cannot be explained without a term.
+    Removed skew and distortion are held at zero, a removed focal length or principal point at the
+    prior.  The next term is the one whose removal raises chi^2 least by the covariance (Wald test:
+    squared distance to the value that it is then held at, over its variance); then all is solved
+    again.  The study ends early where the solver fails without a term.
     """
+    # A field beside the lens model stands as it was estimated.
+    estimate = _without_field(estimate)
     problem, state = estimate.problem, estimate.state
     covariance_px2 = estimate.variance.of(estimate.table.covariance_px2)
     measurements = arrange(estimate.table, estimate.kept, covariance_px2)
     solution = minimise(problem, state, measurements)
     cost = solution.normal.cost
-    alone = sigmas = _sigmas(problem, solution.state, measurements)
-    removals = [_removal(estimate, problem, solution.state, '', 0.0, 0.0, 0.0, within=True)]
+    names = estimate.geometry.camera.parameter_names
+    alone = sigmas = _sigmas(names, problem, solution.state, measurements)
+    removals = [_removal(estimate, problem, solution.state, '', 0.0, 0.0, 0.0, negligible=True)]
     while sigmas:
         least = min(sigmas, key=lambda name: abs(sigmas[name]))
-        problem, state = _without(least, problem, solution.state)
+        problem, state = _without(names, least, problem, solution.state)
         try:
             solution = minimise(problem, state, measurements)
         except NotObservable:
             break
         if not solution.converged:
             break
-        rise = 2.0 * (solution.normal.cost - cost) + _of_prior(estimate.problem, problem)
+        rise = 2.0 * (solution.normal.cost - cost) + _of_prior(names, estimate.problem, problem)
         removals.append(
             _removal(
                 estimate,
@@ -69,49 +68,66 @@ def removal_study(estimate: Estimate) -> tuple[Removal, ...]:
                 alone[least],
                 sigmas[least] ** 2,
                 rise,
-                within=bool(chdtrc(len(removals), rise) > _CHANCE),
+                negligible=bool(chdtrc(len(removals), rise) > _SIGNIFICANT),
             )
         )
-        sigmas = _sigmas(problem, solution.state, measurements)
+        sigmas = _sigmas(names, problem, solution.state, measurements)
     return tuple(removals)
 
 
-def _held_at(name: str, problem: Problem) -> float:
-    if name not in _HELD_AT_PRIOR:
-        return 0.0
-    return float(problem.prior_parameters[problem.parameter_names.index(name)])
+def _without_field(estimate: Estimate) -> Estimate:
+    """The estimate with the displacements of its field taken off the stars."""
+    field = estimate.geometry.camera.field
+    if field is None:
+        return estimate
+    measured_px = estimate.table.measured_px
+    measured_px = measured_px - field.displacement_px(measured_px)
+    camera = dataclasses.replace(estimate.geometry.camera, field=None)
+    return dataclasses.replace(
+        estimate,
+        geometry=dataclasses.replace(estimate.geometry, camera=camera),
+        table=dataclasses.replace(estimate.table, measured_px=measured_px),
+        problem=dataclasses.replace(estimate.problem, field_prior=None),
+        state=dataclasses.replace(estimate.state, modes=np.empty(0)),
+    )
 
 
-def _sigmas(problem: Problem, state: State, measurements: Measurements) -> dict[str, float]:
-    """How far each free parameter is from what it would be held at, in its sigma."""
+def _held_at(names: tuple[str, ...], k: int, problem: Problem) -> float:
+    """Value of the k-th parameter after its removal."""
+    return float(problem.prior_parameters[k]) if names[k] in _HELD_AT_PRIOR else 0.0
+
+
+def _sigmas(
+    names: tuple[str, ...], problem: Problem, state: State, measurements: Measurements
+) -> dict[str, float]:
+    """Distance of each free parameter from the value it would be held at, in its sigma."""
     _, blocks = image_blocks(problem, state, measurements)
     information = reduced_information(problem, state, blocks)
-    estimated = np.concatenate([problem.free, np.arange(problem.camera_count, len(information))])
+    estimated = np.concatenate([problem.free, np.arange(len(names), len(information))])
     variance = np.diag(inverse(information[np.ix_(estimated, estimated)]))
-    names = [problem.parameter_names[i] for i in problem.free]
     return {
-        name: float((state.parameters[i] - _held_at(name, problem)) / np.sqrt(v))
-        for name, i, v in zip(names, problem.free, variance, strict=False)
+        names[i]: float((state.parameters[i] - _held_at(names, i, problem)) / np.sqrt(v))
+        for i, v in zip(problem.free, variance, strict=False)
     }
 
 
-def _without(name: str, problem: Problem, state: State) -> tuple[Problem, State]:
-    """The problem without a parameter, and the state with it where it is held."""
-    k = problem.parameter_names.index(name)
+def _without(
+    names: tuple[str, ...], name: str, problem: Problem, state: State
+) -> tuple[Problem, State]:
+    """The problem without a parameter, and the state with the parameter at its held value."""
+    k = names.index(name)
     parameters = state.parameters.copy()
-    parameters[k] = _held_at(name, problem)
+    parameters[k] = _held_at(names, k, problem)
     return (
         dataclasses.replace(problem, free=problem.free[problem.free != k]),
         dataclasses.replace(state, parameters=parameters),
     )
 
 
-def _of_prior(before: Problem, after: Problem) -> float:
-    """Chi^2 of the prior of the removed, which are no longer in the cost."""
+def _of_prior(names: tuple[str, ...], before: Problem, after: Problem) -> float:
+    """Chi^2 of the prior of the removed parameters, which is no longer in the cost."""
     removed = np.setdiff1d(before.free, after.free)
-    off = [
-        _held_at(before.parameter_names[k], before) - before.prior_parameters[k] for k in removed
-    ]
+    off = [_held_at(names, k, before) - before.prior_parameters[k] for k in removed]
     return float(np.sum(np.square(np.array(off) / before.prior_sigma[removed])))
 
 
@@ -123,20 +139,20 @@ def _removal(
     significance: float,
     wald: float,
     rise: float,
-    within: bool,
-) -> Removal:
+    negligible: bool,
+) -> TermRemoval:
     rotations = state.camera_from_icrf.as_matrix()
     parameters = image_parameters(problem, state)
     residual_px = residuals_px(estimate.table, problem.model, parameters, rotations)
     residual_px = residual_px[estimate.kept]
     std_u, std_v = residual_px.std(axis=0)
     camera = estimate.geometry.camera
-    return Removal(
+    return TermRemoval(
         removed=removed,
         significance=significance,
         wald=wald,
         chi2_rise=rise,
-        within_chance=within,
+        negligible=negligible,
         residual_rms_px=float(np.sqrt(np.mean(residual_px**2))),
         residual_std_px=(float(std_u), float(std_v)),
         map_change_px=map_error_px(

@@ -435,9 +435,8 @@ def _typestore() -> Typestore:
     """ROS's own types and starcal's."""
     store = get_typestore(Stores.ROS2_JAZZY)
     folder = _definitions_folder()
-    for type_name in (OBSERVATIONS_TYPE, STATUS_TYPE, CALIBRATION_TYPE):
-        text = (folder / f'{type_name.rpartition("/")[2]}.msg').read_text()
-        store.register(get_types_from_msg(text, type_name))
+    for path in sorted(folder.glob('*.msg')):
+        store.register(get_types_from_msg(path.read_text(), f'starcal/msg/{path.stem}'))
     return store
 
 

@@ -1,21 +1,21 @@
 """
-State on disk: the ensemble, and the calibrations that came into force, safe from a crash.
+State on disk: the ensemble, and the activated calibrations, safe from a crash.
 
 ``ensemble/00000012.mcap`` is one image, numbered in order of arrival: a whole bag that any reader
 of MCAP opens.  ``ensemble/refused.json`` counts the refused images.
-``calibrations/00000007_calibration_00000003.json`` says that as the seventh event calibration 3
-came into force (here: came back by a roll-back): a ``calibration.json`` with two keys more.
+``calibrations/00000007_calibration_00000003.json`` records that event 7 activated calibration 3
+(here by a roll-back): a ``calibration.json`` with two more keys.
 
 A file is written beside its place, synced, renamed, and the folder synced; it is never changed
-afterwards.  So at any instant each file is whole or not there.  What a disk spoils nevertheless
-shows by its checksum: such a file is renamed to ``….damaged`` and passed over.
+afterwards.  So at any instant each file is complete or absent.  A checksum detects damage by the
+disk: such a file is renamed to ``….damaged`` and skipped.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import fcntl
 import hashlib
 import json
@@ -23,7 +23,9 @@ import os
 from pathlib import Path
 import re
 import shutil
+from typing import Any
 
+from starcal_ros.arrays import Count
 from starcal_ros.bag.reader import BagWriter, read_observations
 from starcal_ros.errors import ArchiveError, BagError, ProductError
 from starcal_ros.products.calibration_json import (
@@ -32,6 +34,7 @@ from starcal_ros.products.calibration_json import (
     SCHEMA,
 )
 from starcal_ros.products.files import PART, sync_folder, write_atomically
+from starcal_ros.products.json_codec import from_json, to_json
 from starcal_ros.records import Calibration, Ensemble, StarObservations
 
 ARCHIVE_SCHEMA = 1
@@ -44,12 +47,12 @@ _NUMBERED = re.compile(r'\.?(\d{8,})[._]')
 
 
 @dataclass(frozen=True)
-class InForce:
+class Activation:
     """
-    A calibration came into force, or came back by a roll-back.
+    A calibration was activated, for the first time or by a roll-back.
 
-    ``event`` counts them; ``before`` is the event that a roll-back of this one returns to, 0 for
-    none.  It held until the next event.
+    ``event`` counts activations; ``before`` is the event that a roll-back of this one returns to,
+    0 for none.  The calibration is active until the next event.
     """
 
     event: int
@@ -58,34 +61,47 @@ class InForce:
 
 
 @dataclass(frozen=True)
+class _ActivationKeys:
+    """The key ``archive`` of the file of an activation."""
+
+    schema: int
+    event: Count
+    before: Count
+
+
+@dataclass(frozen=True)
+class _RefusedFile:
+    """The file of the counts of refused images, by reason."""
+
+    schema: int
+    refused: Mapping[str, Count] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class _Kept:
-    """An image on disk, and where."""
+    """An image on disk, and its file."""
 
     image: StarObservations
     path: Path
 
 
-class _AnotherVersion(Exception):
-    """A file that is sound, but not of this version of starcal."""
-
-
 class Archive:
     """
-    A state folder, held by this process alone until `close`.
+    A state folder, locked by this process until `close`.
 
-    What is in memory rules: `keep` makes the folder hold it.  Not for several threads at once.
+    The records in memory are authoritative; `keep` writes them.  Not safe for several threads.
 
     Attributes
     ----------
     damage : list of str
-        A sentence for each file that was set aside or passed over.
+        A sentence for each file that was set aside or skipped.
     last_event : int
-        The highest that any file has been given.
+        The highest number given to any file.
 
     Raises
     ------
     ArchiveError
-        When the folder cannot be made or read, or another process holds it.
+        When the folder cannot be made or read, or another process has locked it.
     """
 
     def __init__(self, folder: Path, frame_id: str) -> None:
@@ -104,7 +120,7 @@ class Archive:
                 part.unlink()
 
     def close(self) -> None:
-        """Let go of the folder; safe to call twice."""
+        """Unlock the folder; safe to call twice."""
         if self._lock >= 0:
             os.close(self._lock)
         self._lock = -1
@@ -114,12 +130,12 @@ class Archive:
         return sum(map(self._holds, ensemble.images))
 
     def _holds(self, image: StarObservations) -> bool:
-        # Not by its stamp: after a reset that the disk did not take, another image may have it.
+        # Not by its stamp: after a reset that failed on disk, another image may have it.
         kept = self._images.get(image.time_ns)
         return kept is not None and kept.image is image
 
     def free_bytes(self) -> int:
-        """Room left on the disk; 0 where it does not tell."""
+        """Free space on the disk; 0 where it cannot be read."""
         try:
             return shutil.disk_usage(self.folder).free
         except OSError:
@@ -134,18 +150,17 @@ class Archive:
                 images.append(image)
                 self._images[image.time_ns] = _Kept(image, path)
         for path in self._files(_ENSEMBLE, _REFUSED):
-            content = self._unsealed(path, 'schema', ARCHIVE_SCHEMA)
-            self._refused = _counts(content.get('refused')) if content else {}
+            self._refused = self._read_refused(path)
         return Ensemble(tuple(images), dict(self._refused))
 
-    def read_history(self) -> tuple[InForce, ...]:
+    def read_history(self) -> tuple[Activation, ...]:
         """
-        What came into force and is kept, in order; the last is in force.
+        The activations on disk, in order; the calibration of the last is active.
 
-        Where the last is damaged, another file of the same calibration stands for it, else the
-        event before.
+        Where the last is damaged, another file of the same calibration replaces it, else the event
+        before.
         """
-        history: list[InForce] = []
+        history: list[Activation] = []
         last_number = 0
         for path in self._files(_CALIBRATIONS, '*.json'):
             name = _EVENT_NAME.fullmatch(path.name)
@@ -158,20 +173,20 @@ class Archive:
                 self._events[event] = path
         same = [record for record in history if record.calibration.number == last_number]
         if same and history[-1].calibration.number != last_number:
-            history.append(InForce(self.last_event, same[-1].before, same[-1].calibration))
+            history.append(Activation(self.last_event, same[-1].before, same[-1].calibration))
         return tuple(history)
 
-    def keep(self, ensemble: Ensemble, history: tuple[InForce, ...]) -> None:
+    def keep(self, ensemble: Ensemble, history: tuple[Activation, ...]) -> None:
         """
-        Make the folder hold these; done at once where it holds them already.
+        Make the folder hold these; returns at once where it holds them already.
 
-        A new image costs one file.  An ensemble that has nothing of the one on disk empties that
-        in one step first.
+        A new image costs one file.  Where the ensemble has no image in common with the one on
+        disk, that one is removed first, in one step.
 
         Raises
         ------
         ArchiveError
-            When it could not be done; what is on disk is sound, and the next call goes on.
+            When writing fails; the files on disk stay intact, and the next call continues.
         """
         current = {image.time_ns for image in ensemble.images}
         try:
@@ -183,8 +198,8 @@ class Archive:
                 if not self._holds(image):
                     self._keep_image(image)
             if dict(ensemble.refused) != self._refused:
-                content = {'schema': ARCHIVE_SCHEMA, 'refused': dict(ensemble.refused)}
-                self._write(_ENSEMBLE, _REFUSED, _sealed(content))
+                content = _RefusedFile(ARCHIVE_SCHEMA, dict(ensemble.refused))
+                self._write(_ENSEMBLE, _REFUSED, _sealed(to_json(content)))
                 self._refused = dict(ensemble.refused)
         except ProductError as error:
             raise ArchiveError(f'state_dir: {error}') from error
@@ -192,19 +207,15 @@ class Archive:
             raise ArchiveError(
                 f'state_dir: {error.filename or self.folder}: {error.strerror}'
             ) from error
-        finally:  # on a full disk, what goes makes room for the next call
+        finally:  # on a full disk, removed files make room for the next call
             self._drop(current, {record.event for record in history})
 
-    def _keep_event(self, record: InForce) -> None:
+    def _keep_event(self, record: Activation) -> None:
         if record.event in self._events:
             return
         content = {
             **calibration_content(record.calibration),
-            'archive': {
-                'schema': ARCHIVE_SCHEMA,
-                'event': record.event,
-                'before': record.before,
-            },
+            'archive': to_json(_ActivationKeys(ARCHIVE_SCHEMA, record.event, record.before)),
         }
         name = f'{record.event:08d}_calibration_{record.calibration.number:08d}.json'
         self._events[record.event] = self._write(_CALIBRATIONS, name, _sealed(content))
@@ -247,7 +258,7 @@ class Archive:
         shutil.rmtree(self.folder / _EMPTIED, ignore_errors=True)
 
     def _files(self, folder: str, pattern: str) -> Iterator[Path]:
-        """Files by their numbers; every number that any file has been given is remembered."""
+        """Files in order of their numbers; the highest number of any file is remembered."""
         try:
             names = [path.name for path in (self.folder / folder).iterdir()]
         except FileNotFoundError:
@@ -275,24 +286,33 @@ class Archive:
             return None
         return found[0]
 
-    def _read_event(self, path: Path, event: int) -> InForce | None:
+    def _read_event(self, path: Path, event: int) -> Activation | None:
         content = self._unsealed(path, 'schema', SCHEMA)
         if content is None:
             return None
         archive = content.get('archive')
+        if not isinstance(archive, dict) or archive.get('schema') != ARCHIVE_SCHEMA:
+            self.damage.append(f'{path}: of another version, skipped')
+            return None
         try:
-            if not isinstance(archive, dict) or archive.get('schema') != ARCHIVE_SCHEMA:
-                raise _AnotherVersion
-            calibration = calibration_from_content(path, content)
-            return InForce(event, int(archive['before']), calibration)
-        except _AnotherVersion:
-            self.damage.append(f'{path}: of another version, passed over')
-        except (ProductError, KeyError, TypeError, ValueError) as error:
+            keys = from_json(_ActivationKeys, archive, 'archive')
+            return Activation(event, keys.before, calibration_from_content(path, content))
+        except (ProductError, ValueError) as error:
             self._set_aside(path, str(error))
-        return None
+            return None
 
-    def _unsealed(self, path: Path, key: str, schema: int) -> Mapping[str, object] | None:
-        """The JSON object of a file whose checksum is right and whose schema is ours."""
+    def _read_refused(self, path: Path) -> dict[str, int]:
+        content = self._unsealed(path, 'schema', ARCHIVE_SCHEMA)
+        if content is None:
+            return {}
+        try:
+            return dict(from_json(_RefusedFile, content).refused)
+        except ValueError as error:
+            self._set_aside(path, str(error))
+            return {}
+
+    def _unsealed(self, path: Path, key: str, schema: int) -> Mapping[str, Any] | None:
+        """The JSON object of a file with the right checksum and this schema; else None."""
         try:
             content = json.loads(path.read_bytes())
             digest = content.pop('sha256')
@@ -302,19 +322,19 @@ class Archive:
             self._set_aside(path, f'{type(error).__name__}: {error}')
             return None
         if content.get(key) != schema:
-            self.damage.append(f'{path}: of another version, passed over')
+            self.damage.append(f'{path}: of another version, skipped')
             return None
         return dict(content)
 
     def _set_aside(self, path: Path, why: str) -> None:
         aside = path.with_name(f'{path.name}.damaged')
-        with contextlib.suppress(OSError):  # on a disk that cannot be written it is passed over
+        with contextlib.suppress(OSError):  # on a read-only disk it is skipped where it is
             path.rename(aside)
         self.damage.append(f'{aside}: damaged, set aside: {" ".join(why.split())}')
 
 
 def _locked(folder: Path) -> int:
-    """Descriptor that holds the folder; the system lets go of it when the process ends."""
+    """Descriptor with a lock on the folder, which the system releases when the process ends."""
     number = -1
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -330,18 +350,12 @@ def _locked(folder: Path) -> int:
 
 
 def _sealed(content: dict[str, object]) -> str:
-    """JSON text of an object with its own checksum as the last key."""
+    """JSON text of an object with its checksum as the last key."""
     sealed = {**content, 'sha256': _digest(content)}
     return json.dumps(sealed, indent=1, allow_nan=False) + '\n'
 
 
 def _digest(content: Mapping[str, object]) -> str:
-    # Numbers are written with the digits that read back to the same double: one text for each.
+    # Numbers are written with the digits that read back to the same double, so the text is unique.
     text = json.dumps(content, sort_keys=True, separators=(',', ':'))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _counts(found: object) -> dict[str, int]:
-    if not isinstance(found, dict):
-        return {}
-    return {str(reason): int(count) for reason, count in found.items()}

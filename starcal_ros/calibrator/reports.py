@@ -1,10 +1,10 @@
 """
 The reports of a calibrator: folders as of ``starcal calibrate``, in its state folder.
 
-``report/`` is of the calibration in force, ``candidate_report/`` of the last that the gate has
-refused.  A thread writes what a report is made from; a process of its own makes the page from
-it, so that neither a solve nor a message ever waits for a picture, and nothing that goes wrong
-there reaches the node but as a sentence.
+``report/`` is for the active calibration, ``candidate_report/`` for the last one that the gate
+refused.  A thread writes the products; a separate process renders the page from them, so that
+neither a solve nor a message waits for a picture, and an error there reaches the node only as a
+sentence.
 """
 
 from __future__ import annotations
@@ -20,14 +20,11 @@ import sys
 import threading
 
 from starcal_ros.assessment.residuals import Residuals
-from starcal_ros.bag.reader import BagWriter
-from starcal_ros.products.calibration_json import CALIBRATION_FILE, write_calibration
-from starcal_ros.products.camera_yaml import CAMERA_INFO_FILE, write_camera_info
-from starcal_ros.products.files import OBSERVATIONS_FILE, REPORT_FILE, sync_folder
-from starcal_ros.products.residuals_npz import RESIDUALS_FILE, write_residuals
+from starcal_ros.products.files import REPORT_FILE, sync_folder
+from starcal_ros.products.folder import write_observations, write_products
 from starcal_ros.records import Calibration, StarObservations
 
-IN_FORCE, CANDIDATE = 'report', 'candidate_report'
+ACTIVE, CANDIDATE = 'report', 'candidate_report'
 
 _NICENESS = 10  # the star observer goes first
 _LONGEST_PAGE_S = 600.0  # a page takes seconds; a processor may be slow and a disk hang
@@ -36,7 +33,7 @@ _LONGEST_CLOSE_S = 5.0  # a disk that hangs must not hold the node
 
 @dataclass(frozen=True)
 class Subject:
-    """What a report is about; without residuals and observations its page says so."""
+    """The subject of a report; its page states it where residuals or observations are missing."""
 
     calibration: Calibration
     residuals: Residuals | None = None
@@ -45,44 +42,44 @@ class Subject:
 
 class CalibratorReports:
     """
-    Keeps the reports of a state folder, safe to use from several threads.
+    Maintains the reports of a state folder, safe to use from several threads.
 
-    One page is made at a time.  A newer subject of the same folder ends the process that is at
-    work on the older one.
+    One page is rendered at a time.  A newer subject for the same folder ends the process that
+    renders the older one.
 
     Parameters
     ----------
     tell : callable
-        Called from a thread of its own with the path of a page, and with why it is not there, in
-        one line; empty where it is.
+        Called from a separate thread with the path of a page and the reason why it is missing, in
+        one line; empty where it is there.
 
     Attributes
     ----------
     trouble : str
-        Why there is no page of what was shown last; empty where there is one.
+        Why the last page is missing; empty where it is there.
     """
 
     def __init__(self, tell: Callable[[Path, str], None]) -> None:
         self.trouble = ''
         self._tell = tell
-        # Of all below; never held while a disk or a process is waited for.
+        # For all below; never held while waiting for a disk or a process.
         self._lock = threading.Lock()
         self._state_dir: Path | None = None
         self._frame_id = ''
         self._waiting: dict[Path, Subject] = {}  # by folder
-        self._at: Path | None = None  # the folder that the thread is at
+        self._at: Path | None = None  # the folder that the thread works on
         self._thread: threading.Thread | None = None
         self._process: subprocess.Popen[str] | None = None
 
     def open(self, state_dir: str, frame_id: str) -> None:
-        """Take up a state folder that this process holds; '' stands for none and no reports."""
+        """Use a state folder that this process has locked; '' for no folder and no reports."""
         with self._lock:
             self._state_dir = Path(state_dir) if state_dir else None
             self._frame_id = frame_id
             self.trouble = ''
 
     def show(self, name: str, subject: Subject) -> None:
-        """Have the folder ``name`` show a calibration; returns at once."""
+        """Update the folder ``name`` to a calibration; returns at once."""
         with self._lock:
             if self._state_dir is None:
                 return
@@ -99,7 +96,7 @@ class CalibratorReports:
                     self.trouble = str(error)
 
     def close(self) -> None:
-        """Let go of the state folder: what waits is written yet, but no page is made."""
+        """Release the state folder; waiting products are written, but no page is rendered."""
         with self._lock:
             self._state_dir = None
             self._kill()
@@ -125,7 +122,7 @@ class CalibratorReports:
             try:
                 _replace(folder, subject, self._frame_id)
                 trouble = self._make_page(folder)
-            except Exception as error:  # no report is worth the node
+            except Exception as error:  # an error here must not end the node
                 trouble = ' '.join(str(error).split()) or type(error).__name__
             with self._lock:
                 is_wanted = self._is_wanted()
@@ -135,7 +132,7 @@ class CalibratorReports:
                 self._tell(folder / REPORT_FILE, trouble)
 
     def _make_page(self, folder: Path) -> str:
-        """Make the page; returns why there is none."""
+        """Render the page; returns why it is missing, or an empty text."""
         with self._lock:
             if not self._is_wanted():
                 return ''
@@ -146,7 +143,7 @@ class CalibratorReports:
             stderr=subprocess.PIPE,
             text=True,
             errors='replace',
-            start_new_session=True,  # Ctrl-C is the node's to hear
+            start_new_session=True,  # the node handles Ctrl-C
         )
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
@@ -171,12 +168,14 @@ class CalibratorReports:
 
 
 def _replace(folder: Path, subject: Subject, frame_id: str) -> None:
-    """Put a folder of products, without a page yet, in the place of the one that is there."""
+    """Replace the folder by one with new products, without a page yet."""
     new, old = (folder.with_name(f'.{folder.name}.{which}') for which in ('new', 'old'))
     _tidy(folder, new, old)
     try:
         new.mkdir()
-        _write(new, subject, frame_id)
+        write_products(subject.calibration, new, subject.residuals)
+        if subject.observations:
+            write_observations(subject.observations, new, frame_id)
         if folder.exists():
             folder.rename(old)
         new.rename(folder)
@@ -186,19 +185,8 @@ def _replace(folder: Path, subject: Subject, frame_id: str) -> None:
 
 
 def _tidy(folder: Path, new: Path, old: Path) -> None:
-    """Leave the folder alone, the old one where there is no new one."""
+    """Remove the temporary folders; restore the old one where there is no new one."""
     shutil.rmtree(new, ignore_errors=True)
     if old.exists() and not folder.exists():
         old.rename(folder)
     shutil.rmtree(old, ignore_errors=True)
-
-
-def _write(folder: Path, subject: Subject, frame_id: str) -> None:
-    write_calibration(subject.calibration, folder / CALIBRATION_FILE)
-    write_camera_info(subject.calibration.geometry.camera, folder / CAMERA_INFO_FILE)
-    if subject.observations:
-        with BagWriter(folder / OBSERVATIONS_FILE) as writer:
-            for record in subject.observations:
-                writer.write_observations('/observations', record, frame_id)
-    if subject.residuals is not None:
-        write_residuals(subject.residuals, folder / RESIDUALS_FILE)

@@ -1,4 +1,4 @@
-"""What a calibrator has collected and what is in force, in memory and on disk."""
+"""The ensemble and the active calibration of a calibrator, in memory and on disk."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import threading
 
 from starcal_ros.assessment.residuals import Residuals
-from starcal_ros.calibrator.archive import Archive, InForce
+from starcal_ros.calibrator.archive import Activation, Archive
 from starcal_ros.errors import ArchiveError, OptionError, StarcalError
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.node_options import CalibratorOptions
@@ -20,16 +20,16 @@ from starcal_ros.records import Calibration, Ensemble, EnsembleStatus, StarObser
 @dataclass(frozen=True)
 class Answer:
     """
-    What came of a request: ``calibration`` is the solution, where there is one.
+    Result of a request: ``calibration`` is the solution, where there is one.
 
-    ``observations`` are those that it was solved from, and ``residuals`` what it left of them; a
-    calibration that came back by a roll-back has neither.
+    ``active`` states whether it is now the active one.  ``observations`` are its input, and
+    ``residuals`` belong to them; a calibration activated by a roll-back has neither.
     """
 
     success: bool
     message: str
     calibration: Calibration | None = None
-    in_force: bool = False
+    active: bool = False
     residuals: Residuals | None = None
     observations: tuple[StarObservations, ...] = ()
 
@@ -39,30 +39,30 @@ class CalibratorState:
     Ensemble and calibrations of one calibrator, safe to use from several threads.
 
     Both are frozen records: a solve works on the ensemble it began with while the next grows.
-    With a state folder both are on disk before anybody is told of them; while the disk fails they
-    are in memory, `trouble` says why, and `save` tries again.
+    With a state folder both are on disk before they are published; while the disk fails they are
+    in memory, `trouble` has the cause, and `save` tries again.
     """
 
     def __init__(self) -> None:
-        self.trouble = ''  # why the last attempt to save has failed
-        self.damage: tuple[str, ...] = ()  # what was found damaged when the folder was read
+        self.trouble = ''  # why the last attempt to save failed
+        self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
         self._records = threading.Lock()  # of the records below; never held during a solve
         self._ensemble = Ensemble()
-        self._history: tuple[InForce, ...] = ()
+        self._history: tuple[Activation, ...] = ()
         self._disk = threading.Lock()  # of the archive; taken before the other
         self._archive: Archive | None = None
         self._folder = ''
 
     def open(self, setup: Setup, options: CalibratorOptions) -> None:
         """
-        Take up what the state folder holds; without one, go on with what is in memory.
+        Read the state folder; without one, continue with the records in memory.
 
         Raises
         ------
         ArchiveError
             When the folder cannot be used.
         OptionError
-            When what it holds is of another camera.
+            When its records are of another camera.
         """
         self._setup, self._options = setup, options
         if not options.state_dir:
@@ -76,7 +76,7 @@ class CalibratorState:
             archive.close()
             raise
         with self._disk, self._records:
-            if self._folder == options.state_dir:  # what a failing disk did not take before
+            if self._folder == options.state_dir:  # not written while the disk failed
                 read = {image.time_ns for image in ensemble.images}
                 for image in self._ensemble.images:
                     if image.time_ns not in read:
@@ -88,7 +88,7 @@ class CalibratorState:
         self.save()
 
     def close(self) -> None:
-        """Let go of the state folder; safe to call twice."""
+        """Release the state folder; safe to call twice."""
         with self._disk:
             if self._archive is not None:
                 self._archive.close()
@@ -96,23 +96,23 @@ class CalibratorState:
 
     @property
     def ensemble(self) -> Ensemble:
-        """What is collected."""
+        """The images collected."""
         with self._records:
             return self._ensemble
 
     @property
-    def in_force(self) -> Calibration | None:
-        """The calibration in force."""
+    def active(self) -> Calibration | None:
+        """The active calibration."""
         with self._records:
             return self._history[-1].calibration if self._history else None
 
     def add(self, observations: StarObservations) -> None:
-        """Take one more image, or the reason why it was refused."""
+        """Add one image, or count the reason why it was refused."""
         with self._records:
             ensemble = self._ensemble
         grown = solving.add_to_ensemble(ensemble, observations, self._setup)
         with self._records:
-            if self._ensemble is not ensemble:  # emptied meanwhile: it starts with this image
+            if self._ensemble is not ensemble:  # emptied meanwhile: start with this image
                 grown = solving.add_to_ensemble(Ensemble(), observations, self._setup)
             self._ensemble = grown
         self.save()
@@ -123,10 +123,10 @@ class CalibratorState:
             images = len(self._ensemble.images)
             self._ensemble = Ensemble()
         self.save()
-        return self._answer(f'{images} images dropped; the calibration in force stays')
+        return self._answer(f'{images} images dropped; the active calibration stays')
 
     def status(self) -> EnsembleStatus:
-        """What has been collected and what a calibration from it would be worth."""
+        """Images and stars collected, and the predicted precision of a calibration from them."""
         ensemble = self.ensemble
         with self._disk:
             saved = self._archive.saved(ensemble) if self._archive else 0
@@ -141,11 +141,11 @@ class CalibratorState:
         dry_run: bool = False,
         force: bool = False,
     ) -> Answer:
-        """Solve, and put in force what the gate accepts or ``force`` demands."""
+        """Solve, and activate a calibration that the gate accepts, or any with ``force``."""
         ensemble = self.ensemble
         try:
             calibration, residuals = solving.solve_with_residuals(
-                ensemble, self._setup, method, estimate, in_force=self.in_force
+                ensemble, self._setup, method, estimate, active=self.active
             )
         except StarcalError as error:
             return Answer(False, str(error))
@@ -153,37 +153,37 @@ class CalibratorState:
             refused = f'refused by the gate: {"; ".join(calibration.reasons)}'
             return Answer(False, refused, calibration, False, residuals, ensemble.images)
         if not calibration.accepted:
-            why = (*calibration.reasons, 'put in force by request all the same')
+            why = (*calibration.reasons, 'activated by request despite the gate')
             calibration = dataclasses.replace(calibration, reasons=why, forced=True)
         if dry_run:
-            return Answer(True, f'would be in force: {summary(calibration)}', calibration)
+            return Answer(True, f'would be activated: {summary(calibration)}', calibration)
         with self._disk, self._records:
             before = self._history[-1].event if self._history else 0
             event = self._next_event()
-            calibration = dataclasses.replace(calibration, number=event, in_force_since_ns=now_ns)
-            self._append(InForce(event, before, calibration))
+            calibration = dataclasses.replace(calibration, number=event, active_since_ns=now_ns)
+            self._append(Activation(event, before, calibration))
         self.save()
-        message = self._answer(f'in force: {summary(calibration)}').message
+        message = self._answer(f'activated: {summary(calibration)}').message
         return Answer(True, message, calibration, True, residuals, ensemble.images)
 
     def rollback(self, now_ns: int) -> Answer:
-        """Return to the calibration before the one in force."""
+        """Activate the calibration before the active one again."""
         with self._disk, self._records:
             if not self._history:
-                return Answer(False, 'no calibration is in force')
+                return Answer(False, 'no calibration is active')
             wanted = self._history[-1].before
             found = [record for record in self._history if record.event == wanted]
             if not found:
-                kept = ' any more' if wanted else ''
-                return Answer(False, f'there is no calibration before the one in force{kept}')
-            calibration = dataclasses.replace(found[0].calibration, in_force_since_ns=now_ns)
-            self._append(InForce(self._next_event(), found[0].before, calibration))
+                kept = ' on record' if wanted else ''
+                return Answer(False, f'there is no calibration before the active one{kept}')
+            calibration = dataclasses.replace(found[0].calibration, active_since_ns=now_ns)
+            self._append(Activation(self._next_event(), found[0].before, calibration))
         self.save()
-        answer = self._answer(f'back in force: {summary(calibration)}')
-        return dataclasses.replace(answer, calibration=calibration, in_force=True)
+        answer = self._answer(f'activated again: {summary(calibration)}')
+        return dataclasses.replace(answer, calibration=calibration, active=True)
 
     def save(self) -> None:
-        """Have the disk hold what memory holds; done at once where it does."""
+        """Write the records to disk; returns at once where they are there."""
         with self._disk:
             if self._archive is None:
                 return
@@ -196,7 +196,7 @@ class CalibratorState:
                 self.trouble = str(error)
 
     def disk_free_bytes(self) -> int | None:
-        """Room left for the state folder; None without one."""
+        """Free space for the state folder; None without one."""
         with self._disk:
             return self._archive.free_bytes() if self._archive else None
 
@@ -204,7 +204,7 @@ class CalibratorState:
         last = self._history[-1].event if self._history else 0
         return 1 + max(last, self._archive.last_event if self._archive else 0)
 
-    def _append(self, record: InForce) -> None:
+    def _append(self, record: Activation) -> None:
         self._history = (*self._history, record)[-self._options.calibration_history :]
 
     def _answer(self, message: str) -> Answer:
@@ -213,7 +213,7 @@ class CalibratorState:
 
 
 def summary(calibration: Calibration) -> str:
-    """A calibration in a few words."""
+    """One line on a calibration."""
     return (
         f'{calibration.residual_rms_px:.3f} px rms per axis over {calibration.stars_used} stars'
         f' in {calibration.images_used} images'
@@ -221,7 +221,7 @@ def summary(calibration: Calibration) -> str:
 
 
 def _check_size(
-    folder: str, ensemble: Ensemble, history: tuple[InForce, ...], setup: Setup
+    folder: str, ensemble: Ensemble, history: tuple[Activation, ...], setup: Setup
 ) -> None:
     prior = setup.prior.camera
     sizes = {(image.width, image.height) for image in ensemble.images}

@@ -50,8 +50,8 @@ class DemoBag:
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """An estimate beside the truth: a table as lines, and the largest difference in sigmas."""
+class TruthTable:
+    """An estimate beside the truth: the lines of a table, and the largest difference in sigmas."""
 
     lines: tuple[str, ...]
     worst_sigmas: float
@@ -208,11 +208,11 @@ def _own_domain() -> dict[str, str]:
     raise NodeError('no free ROS domain on this machine: set ROS_DOMAIN_ID')
 
 
-def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeometry) -> Comparison:
+def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeometry) -> TruthTable:
     """Every estimated parameter and the alignment, beside prior and truth."""
-    known = calibration.geometry.camera.parameter_names
-    names = [name for name in known if name in calibration.estimated]
-    columns = [known.index(name) for name in names]
+    all_names = calibration.geometry.camera.parameter_names
+    names = [name for name in all_names if name in calibration.estimated]
+    columns = [all_names.index(name) for name in names]
     before, estimate, true = (
         geometry.camera.parameters[columns] for geometry in (prior, calibration.geometry, truth)
     )
@@ -236,4 +236,4 @@ def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeomet
             'xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=True
         )
     ]
-    return Comparison(tuple(lines), float(np.abs([*off, *angles_off]).max()))
+    return TruthTable(tuple(lines), float(np.abs([*off, *angles_off]).max()))

@@ -84,11 +84,9 @@ def _calibrate_into(
     folder: Path, bags: Sequence[Path], asked: Topics, setup: Setup, inputs: Mapping[str, str]
 ) -> Calibration:
     """Calibrate from bags; all that a report is made from goes into the folder."""
-    from starcal_ros.bag import reader
     from starcal_ros.pipeline import solve
     from starcal_ros.pipeline import topics as bag_topics
-    from starcal_ros.products.files import OBSERVATIONS_FILE
-    from starcal_ros.products.residuals_npz import RESIDUALS_FILE, write_residuals
+    from starcal_ros.products.folder import write_observations, write_products
     from starcal_ros.records import Ensemble
     from starcal_ros.report import thumbnails
 
@@ -101,15 +99,12 @@ def _calibrate_into(
         ensemble = solve.add_to_ensemble(ensemble, record, setup)
     _make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
-    with reader.BagWriter(folder / OBSERVATIONS_FILE) as writer:
-        for record in observations:
-            writer.write_observations('/observations', record, setup.frames.camera_frame)
+    write_observations(observations, folder, setup.frames.camera_frame)
     try:
         calibration, left = solve.solve_with_residuals(ensemble, setup, inputs=inputs)
     except TooFewObservations as error:
         raise TooFewObservations(f'{error}{_refused_words(ensemble)}') from error
-    _write_products(calibration, folder)
-    write_residuals(left, folder / RESIDUALS_FILE)
+    write_products(calibration, folder, left)
     thumbnails.write_thumbnails(album.thumbnails(), folder / thumbnails.THUMBNAILS_FOLDER)
     return calibration
 
@@ -138,15 +133,6 @@ def _asked(args: argparse.Namespace) -> Topics:
         temperature=args.temperature_topic,
         observations=args.observations_topic,
     )
-
-
-def _write_products(calibration: Calibration, folder: Path) -> None:
-    from starcal_ros.products import calibration_json
-    from starcal_ros.products.calibration_json import write_calibration
-    from starcal_ros.products.camera_yaml import CAMERA_INFO_FILE, write_camera_info
-
-    write_calibration(calibration, folder / calibration_json.CALIBRATION_FILE)
-    write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE)
 
 
 def _report(args: argparse.Namespace) -> int:
@@ -252,6 +238,7 @@ def _demo(args: argparse.Namespace) -> int:
     from starcal_ros.cli import demo
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
+    from starcal_ros.products.folder import write_products
     from starcal_ros.report import page
 
     _make_folder(args.output)
@@ -273,7 +260,7 @@ def _demo(args: argparse.Namespace) -> int:
     # Nodes tell no residuals. The tool's are theirs where it finds the same calibration.
     setup = load_setup(bag.parameters)
     again = _calibrate_into(args.output, [bag.bag], Topics(), setup, {})
-    _write_products(calibration, args.output)
+    write_products(calibration, args.output)
     apart_px = float(comparison.compare(calibration, again).before.length_px.max())
     same = apart_px <= _DEMO_SAME_PX
     print_verdict(

@@ -46,8 +46,8 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     print(f'residual        {calibration.residual_rms_px:.4f} px rms per axis')
     print(f'method          {calibration.method}')
     print(f'solver          {calibration.iterations} iterations, {calibration.termination}')
-    if calibration.thermal is not None:
-        print(f'temperature     {temperature.summary(calibration.thermal)}')
+    if calibration.temperature is not None:
+        print(f'temperature     {temperature.summary(calibration.temperature)}')
     if calibration.accepted:
         print_verdict(True, 'verdict         accepted')
     else:
@@ -150,14 +150,15 @@ def print_comparison(comparison: Comparison) -> None:
         ('lines of sight', 'worst', 'rms', 'worst', 'rms'),
         [
             ('as they are', *_map_cells(comparison.before)),
-            ('less their common turn', *_map_cells(comparison.after)),
+            ('common rotation removed', *_map_cells(comparison.after)),
         ],
     )
-    print(f'common turn     {comparison.turn_rad / ARCSECOND_RAD:.2f}"')
-    if comparison.degrees:
+    print(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}"')
+    total = comparison.total
+    if total.degrees_of_freedom:
         print(
-            f'all together    chi2 {comparison.chi2:.1f} of {comparison.degrees} degrees of '
-            f'freedom: chance alone does as much in {_percent(comparison.chance)}'
+            f'all together    chi2 {total.value:.1f} of {total.degrees_of_freedom} degrees of '
+            f'freedom, p-value {total.p_value:.2g}'
         )
     for note in comparison.notes:
         print(f'note: {note}')
@@ -171,10 +172,6 @@ def _map_cells(found: DifferenceMap) -> Sequence[str]:
         return [*cells, '', '']
     worst, rms = known.max(), np.sqrt(np.mean(known**2))
     return [*cells, f'{worst:.2f} sigma', f'{rms:.2f} sigma']
-
-
-def _percent(chance: float) -> str:
-    return f'{100 * chance:.3g} % of cases' if chance >= 1e-4 else 'under 0.01 % of cases'
 
 
 def _sigmas(difference: float, sigma: float) -> str:

@@ -64,7 +64,7 @@ from starcal_ros.estimation.variance_components import (
 )
 from starcal_ros.lens import COEFFICIENTS
 from starcal_ros.options import option
-from starcal_ros.records import CameraGeometry, Ensemble, Thermal
+from starcal_ros.records import CameraGeometry, Ensemble, TemperatureTerms
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -195,7 +195,7 @@ class Estimate:
     attitude_error_rad, attitude_covariance_rad2, attitude_seen : (m, 3), (m, 3, 3), (m,) bool
         Star tracker errors by the stars alone, of `attitudes_of_stars_alone`.
     iterations, termination
-    thermal : Thermal or None
+    thermal : TemperatureTerms or None
         None where no change with temperature was asked for.
     joint_covariance : (p + 3 + 2 t, p + 3 + 2 t)
         Of ``covariance``'s numbers and the coefficients of the field of the camera, those of u,
@@ -235,7 +235,7 @@ class Estimate:
     attitude_seen: Mask
     iterations: int
     termination: str
-    thermal: Thermal | None
+    thermal: TemperatureTerms | None
     field_test: FieldPrior | None
     repetition: Floats
     pointings: int
@@ -459,8 +459,7 @@ def _search(
         _Found(problem, solution, verdict, solution.iterations), measurements, table, options
     )
     del measurements
-    if options.residual_field:
-        found = _with_field(found, table, prior, options)
+    found = _with_field(found, table, prior, options)
     return _estimate(found, table, time_ns, prior, options)
 
 
@@ -511,7 +510,7 @@ def _with_field(
     """The search with a field beside the lens model, where the stars show one."""
     best = _field_prior(found, table, prior.camera, TEST_DEGREE)
     found = dataclasses.replace(found, field_test=best)
-    if best.p_value > options.max_field_p_value:
+    if not options.residual_field or best.p_value > options.max_field_p_value:
         return found
     best = _field_prior(found, table, prior.camera, degree_for(best))
     for _ in range(_FIELD_ROUNDS):
@@ -675,19 +674,19 @@ def _with_alike(
     return full
 
 
-def _thermal(state: State, full: Floats, options: CalibrationOptions) -> Thermal | None:
+def _thermal(state: State, full: Floats, options: CalibrationOptions) -> TemperatureTerms | None:
     """Terms of temperature of a state; None where none was asked for."""
     if not (options.focal_temperature_order or options.alignment_temperature):
         return None
     p = len(state.parameters)
     k = p + len(state.focal)
     sigma = np.sqrt(np.diag(full))
-    return Thermal(
+    return TemperatureTerms(
         reference_degc=options.reference_temperature_degc,
         focal_per_degc=tuple(state.focal.tolist()),
-        focal_sigma=tuple(sigma[p:k].tolist()),
+        focal_per_degc_sigma=tuple(sigma[p:k].tolist()),
         alignment_rate_rad_per_degc=tuple(state.rate.tolist()),
-        alignment_rate_sigma=tuple(sigma[k + 3 :].tolist()),
+        alignment_rate_rad_per_degc_sigma=tuple(sigma[k + 3 :].tolist()),
     )
 
 

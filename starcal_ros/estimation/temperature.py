@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
-from starcal_ros.records import Calibration, CameraGeometry, Thermal
+from starcal_ros.records import Calibration, CameraGeometry, TemperatureTerms
 
 Floats = NDArray[np.float64]
 
@@ -67,11 +67,11 @@ def turns_chain(rate: Floats, above_reference_k: Floats) -> Floats:
 
 def camera_at(calibration: Calibration, temperature_degc: float) -> CameraGeometry:
     """Camera and alignment of a calibration at a temperature; its own where it has no terms."""
-    return geometry_at(calibration.geometry, calibration.thermal, temperature_degc)
+    return geometry_at(calibration.geometry, calibration.temperature, temperature_degc)
 
 
 def geometry_at(
-    geometry: CameraGeometry, thermal: Thermal | None, temperature_degc: float
+    geometry: CameraGeometry, thermal: TemperatureTerms | None, temperature_degc: float
 ) -> CameraGeometry:
     """Camera and alignment at a temperature, from those at the reference."""
     if thermal is None:
@@ -103,7 +103,7 @@ def why_unsupported(temperatures_degc: Floats, order: int) -> str:
     return ''
 
 
-def weakest_term(thermal: Thermal, rate_covariance: Floats) -> str:
+def weakest_term(thermal: TemperatureTerms, rate_covariance: Floats) -> str:
     """
     The one to leave out of the highest focal term and the rate: 'focal', 'rate' or neither.
 
@@ -111,7 +111,7 @@ def weakest_term(thermal: Thermal, rate_covariance: Floats) -> str:
     """
     chances = {}
     if thermal.focal_per_degc:
-        sigmas = thermal.focal_per_degc[-1] / thermal.focal_sigma[-1]
+        sigmas = thermal.focal_per_degc[-1] / thermal.focal_per_degc_sigma[-1]
         chances['focal'] = float(chdtrc(1, sigmas**2))
     if thermal.alignment_rate_rad_per_degc:
         rate = np.array(thermal.alignment_rate_rad_per_degc)
@@ -120,17 +120,17 @@ def weakest_term(thermal: Thermal, rate_covariance: Floats) -> str:
     return weakest if chances.get(weakest, 0.0) > _CHANCE else ''
 
 
-def summary(thermal: Thermal) -> str:
+def summary(thermal: TemperatureTerms) -> str:
     """Return a line for a person."""
     parts = [
         f'a{k} {value:+.4g} ({sigma:.2g}) /degC' + (f'^{k}' if k > 1 else '')
         for k, (value, sigma) in enumerate(
-            zip(thermal.focal_per_degc, thermal.focal_sigma, strict=True), start=1
+            zip(thermal.focal_per_degc, thermal.focal_per_degc_sigma, strict=True), start=1
         )
     ]
     if thermal.alignment_rate_rad_per_degc:
         rates = np.degrees(thermal.alignment_rate_rad_per_degc) * 3600.0
-        sigmas = np.degrees(thermal.alignment_rate_sigma) * 3600.0
+        sigmas = np.degrees(thermal.alignment_rate_rad_per_degc_sigma) * 3600.0
         axes = (f'{rate:+.3f} ({sigma:.2g})' for rate, sigma in zip(rates, sigmas, strict=True))
         parts.append('alignment ' + ', '.join(axes) + ' arcsec/degC')
     text = f'{"; ".join(parts) or "no terms"}; reference {thermal.reference_degc:g} degC'

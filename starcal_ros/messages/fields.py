@@ -1,5 +1,5 @@
 """
-What messages of several types are made of: stamps, headers, quaternions and arrays.
+Parts that messages of several types share: stamps, headers, quaternions and arrays.
 
 The functions that read take any object with the fields of the message: those that rclpy takes from
 the graph and those that rosbags decodes from a file alike.  The functions that build are given
@@ -60,29 +60,14 @@ def vector_to_message(xyz: Floats, make: Make) -> Message:
 
 
 def flat_array(values: object, dtype: type[np.generic]) -> NDArray[Any]:
-    """Numbers of any shape as a field of numbers takes them."""
+    """Numbers of any shape as a flat, contiguous array of the type of the field."""
     # Flat and contiguous: rclpy serialises a nested array as garbage without an error.
     return np.ascontiguousarray(values, dtype).reshape(-1)
 
 
-def shaped_array(name: str, values: object, shape: tuple[int, ...]) -> Floats:
-    """
-    A copy of a field's numbers in the shape that they have in the record.
-
-    Raises
-    ------
-    ValueError
-        With the name of the field, when it holds more numbers or fewer.
-    """
-    flat = np.array(values, np.float64)
-    if flat.size != np.prod(shape):
-        raise ValueError(f'{name}: {flat.size} numbers, not {" x ".join(map(str, shape))}')
-    return flat.reshape(shape)
-
-
 def counts_of_reasons(reasons: Sequence[str], counts: Sequence[int]) -> Mapping[str, int]:
     """
-    Reason -> count of a field of reasons and one of their counts.
+    Mapping of reason to count, from a field of reasons and a field of counts.
 
     Raises
     ------

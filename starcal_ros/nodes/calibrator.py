@@ -18,7 +18,7 @@ from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import EnsembleStatus as StatusMessage
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal.srv import Calibrate
-from starcal_ros.calibrator.reports import CalibratorReports, CANDIDATE, IN_FORCE, Subject
+from starcal_ros.calibrator.reports import ACTIVE, CalibratorReports, CANDIDATE, Subject
 from starcal_ros.calibrator.state import Answer, CalibratorState
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.messages.calibration import (
@@ -48,7 +48,7 @@ class Calibrator(StarcalNode):
     """
     Collects observations and solves on request, in a thread of its own.
 
-    What is collected and in force is `CalibratorState`'s; the node tells the graph of it.
+    `CalibratorState` holds the ensemble and the active calibration; the node publishes them.
     """
 
     def __init__(self) -> None:
@@ -121,9 +121,9 @@ class Calibrator(StarcalNode):
         self._status_due.set()
         self._status_thread = threading.Thread(target=self._tell_status, name='status')
         self._status_thread.start()
-        in_force = self._state.in_force
-        if in_force is not None:
-            self._publish_calibration(in_force)
+        active = self._state.active
+        if active is not None:
+            self._publish_calibration(active)
 
     def deactivate(self) -> None:
         """Stop collecting and answering."""
@@ -148,13 +148,13 @@ class Calibrator(StarcalNode):
         self._state.close()
 
     def health(self) -> Health:
-        """What is collected, what is in force, and what came of the last request."""
+        """Images collected, active calibration, and result of the last request."""
         state, last = self._state, self._last_answer
-        ensemble, in_force = state.ensemble, state.in_force
+        ensemble, active = state.ensemble, state.active
         free = state.disk_free_bytes()
         age_s: object = 'none'
-        if in_force is not None:
-            age_ns = self._now_ns() - in_force.in_force_since_ns
+        if active is not None:
+            age_ns = self._now_ns() - active.active_since_ns
             age_s = round(age_ns / NANOSECONDS_PER_SECOND, 1)
         driver = self._driver
         numbers: dict[str, object] = {
@@ -164,7 +164,7 @@ class Calibrator(StarcalNode):
                 f'refused_{reason}': count
                 for reason, count in {**_NONE_REFUSED, **ensemble.refused}.items()
             },
-            'in_force': 'none' if in_force is None else in_force.number,
+            'in_force': 'none' if active is None else active.number,
             'calibration_age_s': age_s,
             'last_gate': self._last_gate,
             'last_answer': last.message,
@@ -175,8 +175,8 @@ class Calibrator(StarcalNode):
         }
         if state.trouble:
             return ERROR, f'kept in memory alone: {state.trouble}', numbers
-        if in_force is not None and in_force.forced:
-            return WARN, f'in force against the gate: {"; ".join(in_force.reasons)}', numbers
+        if active is not None and active.forced:
+            return WARN, f'active against the gate: {"; ".join(active.reasons)}', numbers
         if self.count_publishers(self._calibration.topic_name) > 1:
             return WARN, f'another publisher of {self._calibration.topic_name}', numbers
         if state.damage:
@@ -187,7 +187,7 @@ class Calibrator(StarcalNode):
             return WARN, last.message, numbers
         if self._reports.trouble:
             return WARN, f'no report: {self._reports.trouble}', numbers
-        return OK, 'collecting' if in_force is None else 'calibration in force', numbers
+        return OK, 'collecting' if active is None else 'calibration active', numbers
 
     def _on_observations(self, message: Any) -> None:
         self._state.add(observations_from_message(message))
@@ -257,9 +257,9 @@ class Calibrator(StarcalNode):
 
     def _told(self, answer: Answer, response: Any) -> Any:
         """Publish what came into force, or what the gate has refused; the filled response."""
-        if answer.calibration is not None and answer.in_force:
+        if answer.calibration is not None and answer.active:
             self._publish_calibration(answer.calibration)
-            self._show(IN_FORCE, answer)
+            self._show(ACTIVE, answer)
         elif answer.calibration is not None and not answer.success:
             self._candidate.publish(calibration_to_message(answer.calibration, make_message))
             self._show(CANDIDATE, answer)

@@ -60,7 +60,11 @@ class DemoClient(Node):
     def images_seen(self) -> int:
         """Images that the calibrator has taken or counted as refused."""
         status = self.status
-        return 0 if status is None else int(status.images) + sum(status.refused_counts)
+        return (
+            0
+            if status is None
+            else int(status.images) + sum(entry.count for entry in status.refused)
+        )
 
     def has_seen(self, count: int) -> bool:
         """Whether that many images have come."""

@@ -1,4 +1,4 @@
-"""From an ensemble to a calibration: collected, solved, and held against the gate."""
+"""From an ensemble to a calibration: collect, solve, and judge by the gate."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import math
 
 import numpy as np
 
-from starcal_ros.assessment.agreement import Difference, difference, halves
-from starcal_ros.assessment.gate import Candidate, judge, reasons_of
+from starcal_ros.assessment.agreement import compare_halves
+from starcal_ros.assessment.gate import judge, reasons_of
+from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.assessment.observability import (
     correlation,
     detector_maps,
     keep_most_informative,
-    map_sigma_px,
     weakest_direction,
 )
 from starcal_ros.assessment.observability import ensemble_status as _ensemble_status
@@ -22,6 +22,7 @@ from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import ros_fit
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.detector_field import DetectorField
 from starcal_ros.estimation.calibrate import (
     CalibrationOptions,
     Estimate,
@@ -35,17 +36,18 @@ from starcal_ros.records import (
     Calibration,
     Ensemble,
     EnsembleStatus,
-    Halves,
+    HalvesComparison,
+    ResidualField,
     StarObservations,
 )
 
 
 def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:
     """
-    Return the ensemble with one more image; at ``max_images`` the least informative goes.
+    Return the ensemble with one more image, and without the least informative if too many.
 
-    An image of another size than the prior camera's is counted as refused: its stars are of
-    another camera.
+    An image whose size differs from the prior camera's is counted as refused: it is from another
+    camera.
     """
     size, camera = (observations.width, observations.height), setup.prior.camera
     if not observations.refusal and size != (camera.width, camera.height):
@@ -59,7 +61,7 @@ def within_limit(ensemble: Ensemble, setup: Setup) -> Ensemble:
 
 
 def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
-    """What has been collected and what a calibration from it would be worth."""
+    """Images and stars collected, and the predicted precision of a calibration from them."""
     return _ensemble_status(ensemble, setup.prior, setup.calibration)
 
 
@@ -69,22 +71,23 @@ def solve(
     method: str = '',
     estimate: Sequence[str] = (),
     inputs: Mapping[str, str] | None = None,
-    in_force: Calibration | None = None,
+    active: Calibration | None = None,
 ) -> Calibration:
     """
     A calibration of the ensemble with the verdict of the gate and its provenance.
 
-    ``method`` and ``estimate`` override the options where not empty; ``inputs`` names what the
-    observations came from, for the provenance; the gate holds the change against ``in_force``.
+    ``method`` and ``estimate`` override the options where not empty; ``inputs`` names the sources
+    of the observations, for the provenance; the gate limits the change from ``active``, the
+    calibration that this one would replace.
 
     Raises
     ------
     TooFewObservations
-        When the ensemble cannot carry it; the text says what is missing.
+        When the ensemble is too small; the text names the shortage.
     OptionError
-        For a method or parameter name that is none.
+        For an unknown method or parameter name.
     """
-    return solve_with_residuals(ensemble, setup, method, estimate, inputs, in_force)[0]
+    return solve_with_residuals(ensemble, setup, method, estimate, inputs, active)[0]
 
 
 def solve_with_residuals(
@@ -93,18 +96,20 @@ def solve_with_residuals(
     method: str = '',
     estimate: Sequence[str] = (),
     inputs: Mapping[str, str] | None = None,
-    in_force: Calibration | None = None,
+    active: Calibration | None = None,
 ) -> tuple[Calibration, Residuals]:
-    """The calibration of `solve`, and what it left over of every star and image."""
+    """The calibration of `solve`, and its residuals by star and image."""
     setup = _as_asked_for(setup, method, estimate)
     result = estimate_calibration(ensemble, setup.prior, setup.calibration)
-    agreed: Difference | str = 'min_halves_chance is 0'
-    if setup.gate.min_halves_chance > 0:
-        agreed = halves(ensemble, setup.prior, setup.calibration)
+    halves = HalvesComparison(note='min_halves_p_value is 0')
+    if setup.gate.min_halves_p_value > 0:
+        # A field is common to both halves: each would show less of it, at twice the time.
+        options = dataclasses.replace(setup.calibration, residual_field=False)
+        bare = _without_field(ensemble, result.geometry.camera.field)
+        halves = compare_halves(bare, setup.prior, options)
     provenance = provenance_of(setup, ensemble, inputs or {})
-    calibration = _not_judged(result, ensemble, setup, _halves_record(agreed), provenance)
-    candidate = _candidate(calibration, setup, agreed, _step(in_force, calibration))
-    checks = judge(candidate, setup.gate, setup.calibration)
+    calibration = _not_judged(result, ensemble, setup, halves, provenance)
+    checks = judge(calibration, setup.prior, active, setup.gate, setup.calibration)
     reasons = reasons_of(checks)
     calibration = dataclasses.replace(
         calibration, gate=checks, reasons=reasons, accepted=not reasons
@@ -113,8 +118,35 @@ def solve_with_residuals(
     return calibration, residuals_of(result, ensemble, colour_bp_rp)
 
 
+def _without_field(ensemble: Ensemble, field: DetectorField | None) -> Ensemble:
+    """The ensemble with the displacements of a field taken off its stars."""
+    if field is None:
+        return ensemble
+    images = tuple(
+        dataclasses.replace(
+            image, measured_px=image.measured_px - field.displacement_px(image.measured_px)
+        )
+        for image in ensemble.images
+    )
+    return dataclasses.replace(ensemble, images=images)
+
+
+def _field_record(result: Estimate) -> ResidualField | None:
+    """The field of an estimate with its covariance; None where there is none."""
+    field, prior = result.geometry.camera.field, result.problem.field_prior
+    if field is None or prior is None:
+        return None
+    return ResidualField(
+        field.degree,
+        field.coefficients,
+        result.joint_covariance,
+        prior.length,
+        prior.amplitude_px,
+    )
+
+
 def _as_asked_for(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:
-    """The setup with another method and other parameters to estimate, where they are given."""
+    """The setup with the requested method and parameters to estimate, where given."""
     override: dict[str, object] = {}
     if method:
         override['method'] = method
@@ -131,10 +163,10 @@ def _not_judged(
     result: Estimate,
     ensemble: Ensemble,
     setup: Setup,
-    agreed: Halves | None,
+    halves: HalvesComparison,
     provenance: Mapping[str, str],
 ) -> Calibration:
-    """An estimate with its statistics, as the gate takes it: not accepted yet."""
+    """An estimate with its statistics, before the gate."""
     kept, camera = result.kept, result.geometry.camera
     singular_values, weakest = weakest_direction(result.information, result.information_names)
     stamps_ns = [image.time_ns for image in ensemble.images]
@@ -169,67 +201,11 @@ def _not_judged(
         parent_frame=setup.frames.star_tracker_frame,
         child_frame=setup.frames.camera_frame,
         provenance=provenance,
-        thermal=result.thermal,
-        maps=detector_maps(camera, result.covariance, result.table.measured_px[kept]),
+        temperature=result.thermal,
+        maps=detector_maps(camera, result.joint_covariance, result.table.measured_px[kept]),
         correlation=correlation(result.shared_covariance, result.shared_names),
         removals=removal_study(result),
-        halves=agreed,
-    )
-
-
-def _halves_record(agreed: Difference | str) -> Halves | None:
-    if isinstance(agreed, str):
-        return None
-    return Halves(
-        shape_px=agreed.shape_px,
-        shape_chance=agreed.shape_chance,
-        turn_arcsec=agreed.turn_rad / ARCSECOND_RAD,
-        chance=agreed.chance,
-    )
-
-
-def _step(in_force: Calibration | None, calibration: Calibration) -> Difference | None:
-    """From the calibration in force, over what both estimate."""
-    if in_force is None:
-        return None
-    return difference(
-        in_force.geometry,
-        in_force.covariance,
-        calibration.geometry,
-        calibration.covariance,
-        tuple(name for name in calibration.estimated if name in in_force.estimated),
-    )
-
-
-def _candidate(
-    calibration: Calibration,
-    setup: Setup,
-    agreed: Difference | str,
-    step: Difference | None,
-) -> Candidate:
-    """What the gate looks at of a calibration."""
-    maps = calibration.maps
-    assert maps is not None  # this module has made them
-    given_arcsec = np.array(setup.calibration.star_tracker_sigma_arcsec)
-    found_arcsec = np.array(calibration.star_tracker_sigma_arcsec)
-    return Candidate(
-        geometry=calibration.geometry,
-        prior=setup.prior,
-        covariance=calibration.covariance,
-        residual_rms_px=calibration.residual_rms_px,
-        images_used=calibration.images_used,
-        images_misfit=len(calibration.misfit_images_ns),
-        stars_used=calibration.stars_used,
-        stars_rejected=calibration.stars_rejected,
-        coverage=maps.stars,
-        map_sigma_px=float(
-            map_sigma_px(calibration.geometry.camera, calibration.covariance).max()
-        ),
-        line_of_sight_sigma_arcsec=float(maps.line_of_sight_sigma_arcsec.max()),
-        singular_value=calibration.singular_values[-1],
-        zero_skew_cost_px=calibration.zero_skew_cost_px,
-        star_tracker_excess=float((found_arcsec / given_arcsec).max()),
-        termination=calibration.termination,
-        halves=agreed,
-        step=step,
+        halves=halves,
+        model=model_checks(result),
+        field=_field_record(result),
     )

@@ -1,7 +1,7 @@
 """
-Values of JSON and YAML files, each checked for its kind; an error names file and key.
+Values of YAML files, each checked for its kind; an error names file and key.
 
-A kind is a function that returns the value, or raises ValueError with what it should have been.
+A kind is a function that returns the value, or raises ValueError with the expected kind.
 """
 
 from __future__ import annotations
@@ -51,11 +51,6 @@ def finite_number(value: object) -> float:
     return finite
 
 
-def finite_or_null(value: object) -> float:
-    """A finite number, or NaN where null stands for one that is not."""
-    return math.nan if value is None else finite_number(value)
-
-
 def whole_number(value: object) -> int:
     """A whole number, and no text of one."""
     if isinstance(value, bool) or not isinstance(value, int):
@@ -63,27 +58,10 @@ def whole_number(value: object) -> int:
     return value
 
 
-def anything(value: object) -> object:
-    """The value, whatever it is."""
-    return value
-
-
-def is_null(value: object) -> bool:
-    """Whether the value is null."""
-    return value is None
-
-
 def string(value: object) -> str:
     """A text."""
     if not isinstance(value, str):
         raise ValueError('a text')
-    return value
-
-
-def true_or_false(value: object) -> bool:
-    """True or false, and nothing that could be taken for one."""
-    if not isinstance(value, bool):
-        raise ValueError('true or false')
     return value
 
 
@@ -98,41 +76,13 @@ def list_of(kind: Callable[[object], T]) -> Callable[[object], list[T]]:
     return items
 
 
-def grid_of(kind: Callable[[object], T]) -> Callable[[object], list[list[T]]]:
-    """The kind of a list of rows of one length, neither empty."""
-
-    def grid(value: object) -> list[list[T]]:
-        rows = list_of(list_of(kind))(value)
-        if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
-            raise ValueError('a grid of rows alike')
-        return rows
-
-    return grid
-
-
-def strings(value: object) -> tuple[str, ...]:
-    """A list of texts."""
-    return tuple(list_of(string)(value))
-
-
-def row_of_numbers(*counts: int, null: bool = False) -> Callable[[object], list[float]]:
-    """The kind of a list of so many numbers; with `null`, null reads as NaN."""
+def row_of_numbers(*counts: int) -> Callable[[object], list[float]]:
+    """The kind of a list of so many numbers."""
 
     def row(value: object) -> list[float]:
-        items = list_of(finite_or_null if null else finite_number)(value)
+        items = list_of(finite_number)(value)
         if len(items) not in counts:
             raise ValueError(' or '.join(map(str, counts)) + ' numbers')
         return items
 
     return row
-
-
-def mapping_of(kind: Callable[[object], T]) -> Callable[[object], dict[str, T]]:
-    """The kind of a mapping of texts to items of a kind."""
-
-    def mapping(value: object) -> dict[str, T]:
-        if not isinstance(value, dict):
-            raise ValueError('a mapping')
-        return {string(key): kind(item) for key, item in value.items()}
-
-    return mapping

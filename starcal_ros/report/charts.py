@@ -70,7 +70,7 @@ def charts_of(calibration: Calibration, residuals: Residuals | None) -> Mapping[
                 'detector.',
             )
     if len(calibration.removals) > 1:
-        dropped = [r.removed for r in calibration.removals[1:] if r.within_chance]
+        dropped = [r.removed for r in calibration.removals[1:] if r.negligible]
         charts['terms'] = Chart(
             'What each term is worth',
             figures.term_worth(calibration.removals),

@@ -17,7 +17,7 @@ FORMATS = ('.png', '.svg', '.pdf')
 
 def write(comparison: Comparison, path: Path) -> None:
     """
-    Draw arrows in pixels, with the lengths in sigmas below, before and after the common turn.
+    Draw arrows in pixels and lengths in sigmas, with and without the common rotation.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def write(comparison: Comparison, path: Path) -> None:
     for axes, found, title in zip(
         figure.subplots(1, 2),
         (comparison.before, comparison.after),
-        ('lines of sight, B less A', 'less their common turn'),
+        ('lines of sight, B less A', 'common rotation removed'),
         strict=True,
     ):
         worst_px = float(found.length_px.max())

@@ -27,7 +27,8 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.normal_equations import whitening
-from starcal_ros.records import CameraGeometry, DetectorMaps, Removal
+from starcal_ros.records import CameraGeometry, DetectorMaps, TermRemoval
+from starcal_ros.report.term_removal_figure import curves_of, plot_curves
 
 Floats = NDArray[np.float64]
 
@@ -200,7 +201,7 @@ def distortion_contours(camera: CameraModel) -> Markup:
 
 
 def change_contours(before: CameraGeometry, after: CameraGeometry) -> Markup:
-    """How far the lines of sight moved once a common turn is removed, in pixels."""
+    """Movement of the lines of sight, common rotation removed, in pixels."""
     figure, axes = _detector_figure(after.camera)
     _, moved_px = movement(before, after, 60, 48)
     _contours(axes, after.camera, moved_px.reshape(48, 60), ' px')
@@ -431,22 +432,17 @@ def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Ma
     return _svg(figure, 'alignment')
 
 
-def term_worth(removals: Sequence[Removal]) -> Markup:
-    """Residual and map as terms are left out one after the other (paper, Fig. 8)."""
+def term_worth(removals: Sequence[TermRemoval]) -> Markup:
+    """Residuals and map as terms are removed one after the other (paper, Fig. 8)."""
     figure, axes = _figure()
     steps = np.arange(len(removals))
-    chance = [k for k, removal in enumerate(removals) if removal.within_chance]
-    if len(chance) > 1:
-        axes.axvspan(-0.5, max(chance) + 0.5, color=GRID, alpha=0.6, linewidth=0)
-    axes.plot(steps, [removal.residual_rms_px for removal in removals], 'o-', color=SERIES[0],
-              markersize=4, linewidth=1.4, label='residual, rms per axis')  # fmt: skip
-    axes.plot(steps[1:], [removal.map_change_px for removal in removals[1:]], 's--',
-              color=SERIES[1], markersize=4, linewidth=1.4, label='change of the map')  # fmt: skip
-    axes.set_yscale('log')
+    negligible = [k for k, removal in enumerate(removals) if removal.negligible]
+    if len(negligible) > 1:
+        axes.axvspan(-0.5, max(negligible) + 0.5, color=GRID, alpha=0.6, linewidth=0)
+    plot_curves(axes, *curves_of(removals))
     axes.set_xlim(-0.5, len(removals) - 0.5)
     axes.set_xticks(
         steps, ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])]
     )
-    axes.set(xlabel='left out, one after the other', ylabel='px')
-    axes.legend(loc='lower right')
+    axes.set_xlabel('removed, one after the other')
     return _svg(figure, 'terms')

@@ -128,11 +128,11 @@ def _context(found: Found) -> Mapping[str, object]:
     return {
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),
-        'in_force_since': utc_text(calibration.in_force_since_ns),
+        'active_since': utc_text(calibration.active_since_ns),
         'parameters': _parameter_rows(calibration, prior),
         'alignment': _alignment_rows(calibration, prior),
         'tiles': _tiles(calibration),
-        'thermal': thermal_summary(calibration.thermal) if calibration.thermal else '',
+        'thermal': thermal_summary(calibration.temperature) if calibration.temperature else '',
         'charts': charts_of(calibration, residuals),
         'correlation': calibration.correlation,
         'slider': _slider(calibration, residuals),
@@ -245,7 +245,7 @@ def _tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
     if maps is not None:
         for what, sigma, words in (
             ('Line of sight', maps.line_of_sight_sigma_arcsec, 'in the star tracker frame'),
-            ('Camera alone', maps.shape_sigma_arcsec, 'a turn of all pixels removed'),
+            ('Camera alone', maps.shape_sigma_arcsec, 'common rotation removed'),
         ):
             note = f'1-sigma, rms over the detector, {words}; {sigma.max():.3g}″ at its worst'
             tiles.append((what, f'{np.sqrt(np.mean(sigma**2)):.3g}″', note))

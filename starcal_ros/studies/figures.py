@@ -13,6 +13,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.report.term_removal_figure import plot_curves, plot_removed
 from starcal_ros.studies.monte_carlo import (
     Campaign,
     column,
@@ -179,35 +180,10 @@ def _terms(campaign: Campaign) -> Figure:
             ]
         )
         order = np.argsort(-gone.sum(axis=0), kind='stable')
-        left.imshow(gone[:, order], cmap='Reds', vmin=0, vmax=1.25, aspect='auto')
-        for (row, at), share in np.ndenumerate(gone[:, order]):
-            if 0.005 < share < 0.995:
-                left.text(
-                    at, row, f'{100 * share:.0f}', ha='center', va='center', fontsize=7,
-                    color='w' if share > 0.5 else 'k',
-                )  # fmt: skip
-        left.set_xticks(range(10), [PARAMETER_NAMES[k] for k in order], fontsize=8)
-        left.set_yticks(steps)
-        left.grid(False)
-        left.set_xticks(np.arange(11) - 0.5, minor=True)
-        left.set_yticks(np.arange(len(steps) + 1) - 0.5, minor=True)
-        left.grid(True, which='minor', color='w', linewidth=1.5)
-        left.tick_params(which='minor', length=0)
-        left.set_ylabel('terms removed')
+        plot_removed(left, gone[:, order], [PARAMETER_NAMES[k] for k in order])
         left.set_title(f'removed terms red (% of nights); {method}, {images} images', fontsize=9)
-        for name, look, words in (
-            ('residual_std_u_px', 'o-', 'residual, std of u'),
-            ('residual_std_v_px', 's--', 'residual, std of v'),
-            ('map_change_px', '^:', 'map change, rms'),
-        ):
-            right.plot(steps[1:] if name == 'map_change_px' else steps,
-                       column(cell, name)[1:] if name == 'map_change_px' else column(cell, name),
-                       look, markersize=5, linewidth=1.2, label=words)  # fmt: skip
-        _log_axis(right, 'y')
-        right.set_xticks(steps)
-        right.set_xlabel('terms removed')
-        right.set_ylabel('px')
-        right.legend(frameon=False, fontsize=8)
+        std_px = [column(cell, f'residual_std_{axis}_px') for axis in 'uv']
+        plot_curves(right, np.stack(std_px, axis=-1), column(cell, 'map_change_px'))
     return figure
 
 

@@ -31,7 +31,7 @@ from starcal_ros.image.frame_checks import ScreeningOptions
 from starcal_ros.image.hot_pixels import FixedPatternOptions
 from starcal_ros.pipeline.observe import observe
 from starcal_ros.pipeline.setup import Setup, SetupOptions
-from starcal_ros.records import Ensemble, Removal, StarObservations
+from starcal_ros.records import Ensemble, StarObservations, TermRemoval
 from starcal_ros.simulation.images import fixed_pattern, render
 from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenario, scene
 from starcal_ros.sky.astrometry import SiteOptions
@@ -96,7 +96,7 @@ class PaperStudy:
     methods, counts : tuple of mapping
         A row for each method, and for each number of images: residuals of the other images, error
         of the map of the lines of sight.
-    removals : tuple of Removal
+    removals : tuple of TermRemoval
         Fig. 8 of the same images.
     table1 : Campaign
     """
@@ -112,7 +112,7 @@ class PaperStudy:
     noise_rms_px: float
     methods: tuple[Row, ...]
     counts: tuple[Row, ...]
-    removals: tuple[Removal, ...]
+    removals: tuple[TermRemoval, ...]
     table1: Campaign
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.stats import norm
 
 from starcal_ros.camera import CameraModel, distortion_px, PARAMETER_NAMES, pixel_grid
+from starcal_ros.report.term_removal_figure import curves_of, plot_curves, plot_removed
 from starcal_ros.studies.paper import CALIBRATED_WITH, PaperStudy
 
 _BLUE, _RED = '#0b62a8', '#c4501b'
@@ -115,25 +116,9 @@ def _terms(found: PaperStudy) -> Figure:
     left, right = figure.subplots(1, 2)
     gone = [removal.removed for removal in found.removals[1:]]
     order = [*gone, *(name for name in PARAMETER_NAMES if name not in gone)]
-    steps = np.arange(len(found.removals))
-    left.imshow(
-        [[name in gone[:step] for name in order] for step in steps], cmap='Reds', vmax=1.4,
-        aspect='auto',
-    )  # fmt: skip
-    left.set_xticks(range(len(order)), order)
-    left.set_yticks(steps)
-    left.set_xticks(np.arange(len(order) + 1) - 0.5, minor=True)
-    left.set_yticks(np.arange(len(steps) + 1) - 0.5, minor=True)
-    left.grid(True, which='minor', color='0.8', linewidth=0.8)
-    left.tick_params(which='minor', length=0)
-    left.set(title='red: excluded from the calibration', ylabel='terms removed')
-    for k, (colour, name) in enumerate(((_BLUE, 'u'), (_RED, 'v'))):
-        right.plot(steps, [removal.residual_std_px[k] for removal in found.removals], 'o-',
-                   color=colour, label=f'residual, std of {name}')  # fmt: skip
-    right.plot(steps[1:], [removal.map_change_px for removal in found.removals[1:]], '^:',
-               color='0.4', label='change of the map, rms')  # fmt: skip
-    right.set(yscale='log', xlabel='terms removed', ylabel='px')
-    right.set_xticks(steps)
-    right.legend(frameon=False)
+    share = [[float(name in gone[:step]) for name in order] for step in range(len(gone) + 1)]
+    plot_removed(left, np.array(share), order)
+    left.set_title('red: removed from the calibration')
+    plot_curves(right, *curves_of(found.removals))
     right.grid(color='0.92')
     return figure

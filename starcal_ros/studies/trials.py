@@ -15,7 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.assessment.agreement import alignment_difference_rad, lines_of_sight
+from starcal_ros.assessment.agreement import (
+    alignment_difference_rad,
+    chi_squared,
+    lines_of_sight,
+)
 from starcal_ros.assessment.observability import GRID, line_of_sight_sigma_arcsec, map_sigma_px
 from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
@@ -240,9 +244,7 @@ def errors(found: CameraGeometry, true: CameraGeometry) -> Floats:
 def normalised_error_squared(estimate: Estimate, true: CameraGeometry) -> float:
     """Squared length of `errors` in the metric of the covariance reported: chi^2 with 11."""
     covariance = estimate.covariance[np.ix_(ESTIMATED, ESTIMATED)]
-    sigma = np.sqrt(np.diag(covariance))
-    error = errors(estimate.geometry, true)[ESTIMATED] / sigma
-    return float(error @ np.linalg.solve(covariance / np.outer(sigma, sigma), error))
+    return chi_squared(errors(estimate.geometry, true)[ESTIMATED], covariance).value
 
 
 def unused_residual_px(camera: CameraModel, field: StarField) -> float:

@@ -1,4 +1,4 @@
-"""Differences of calibrations: chance is chance, and what changes midway shows."""
+"""Differences of calibrations: p-values of pure noise, and changes midway."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.assessment.agreement import Difference, difference, halves, movement
+from starcal_ros.assessment.agreement import chi_squared, compare_halves, difference, movement
 from starcal_ros.camera import project
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import CalibrationOptions, estimated_parameters
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.studies.trials import (
@@ -46,21 +47,34 @@ def test_differences_of_random_calibrations_are_chi2() -> None:
         return CameraGeometry(camera, turn.as_quat())
 
     found = [difference(draw(), covariance, draw(), covariance, ESTIMATED) for _ in range(400)]
-    assert {(one.shape_freedom, one.freedom) for one in found} == {(8, 11)}
+    assert {(one.camera.degrees_of_freedom, one.total.degrees_of_freedom) for one in found} == {
+        (8, 11)
+    }
     # 400 draws know the mean of chi^2 with f degrees to sqrt(2 f / 400): four of these.
     for values, freedom in (
-        ([one.shape_chi2 for one in found], 8),
-        ([one.chi2 for one in found], 11),
+        ([one.camera.value for one in found], 8),
+        ([one.total.value for one in found], 11),
     ):
         assert abs(np.mean(values) - freedom) < 4 * np.sqrt(2 * freedom / 400)
-    assert np.median([one.chance for one in found]) == pytest.approx(0.5, abs=0.1)
-    assert np.mean([one.rms_sigma**2 for one in found]) == pytest.approx(1.0, abs=0.1)
+    assert np.median([one.total.p_value for one in found]) == pytest.approx(0.5, abs=0.1)
+    assert np.mean([one.total.rms_sigma**2 for one in found]) == pytest.approx(1.0, abs=0.1)
 
 
 def test_what_is_not_estimated_is_not_compared() -> None:
     geometry = drawn(0).truth
     held = difference(geometry, np.zeros((13, 13)), geometry, np.zeros((13, 13)), ())
-    assert (held.freedom, held.chance, held.shape_chance, held.rms_sigma) == (0, 1.0, 1.0, 0.0)
+    for found in (held.camera, held.total):
+        assert (found.degrees_of_freedom, found.p_value, found.rms_sigma) == (0, 1.0, 0.0)
+
+
+def test_chi_squared_leaves_out_what_has_no_variance_or_is_singular() -> None:
+    """Rows without a variance do not count; of two copies of one number, one does."""
+    copies = np.array([[1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0] * 4, [0.0] * 3 + [4e10]])
+    found = chi_squared(np.array([2.0, 2.0, 7.0, 6e5]), copies)
+    assert found.degrees_of_freedom == 2
+    assert found.value == pytest.approx(2.0**2 + 3.0**2, rel=1e-12)
+    copies[3, 3] = np.nan
+    assert chi_squared(np.array([2.0, 2.0, 7.0, 6e5]), copies).degrees_of_freedom == 1
 
 
 def seen_from_the_middle(field: StarField, truth: CameraGeometry) -> StarField:
@@ -79,44 +93,49 @@ def seen_from_the_middle(field: StarField, truth: CameraGeometry) -> StarField:
     return dataclasses.replace(field, pixel_px=pixels)
 
 
-def test_halves_of_one_camera_differ_by_chance() -> None:
-    chances = []
+def test_halves_of_one_camera_differ_by_noise() -> None:
+    p_values = []
     for trial in range(30):
-        found = halves(observe(drawn(trial), 20.0), drawn(trial).prior, OPTIONS)
-        assert isinstance(found, Difference)
-        chances += [found.chance, found.shape_chance]
-    # Of sixty chances the least is under 1e-4 once in 170 such tests; the seed is fixed.
-    assert min(chances) > 1e-4
-    assert 0.3 < np.median(chances) < 0.7
+        found = compare_halves(observe(drawn(trial), 20.0), drawn(trial).prior, OPTIONS)
+        assert not found.note
+        p_values += [found.p_value, found.shape_p_value]
+    # Of sixty p-values the least is under 1e-4 once in 170 such tests; the seed is fixed.
+    assert min(p_values) > 1e-4
+    assert 0.3 < np.median(p_values) < 0.7
 
 
 def test_a_change_midway_shows() -> None:
-    """A focal length in the shape, a mounting in the turn alone, each as large as it is."""
+    """A focal length in the shape, a mounting in the rotation alone, each as large as it is."""
     field = drawn(1)
     camera = field.truth.camera
     fx, skew, fy = camera.intrinsics[:3] * 1.002
     zoomed = dataclasses.replace(field.truth, camera=camera.replace(fx=fx, skew=skew, fy=fy))
-    found = halves(observe(seen_from_the_middle(field, zoomed), 20.0), field.prior, OPTIONS)
-    assert isinstance(found, Difference) and found.shape_chance < 1e-9
+    found = compare_halves(
+        observe(seen_from_the_middle(field, zoomed), 20.0), field.prior, OPTIONS
+    )
+    assert found.shape_p_value < 1e-9
     # 0.2 % at the corner, 1650 px from the centre; halves know it to 0.1 px.
     assert found.shape_px == pytest.approx(movement(field.truth, zoomed)[1].max(), abs=0.4)
 
     turn = Rotation.from_rotvec([1e-3, 0.0, 0.0])
     mounting = Rotation.from_quat(field.truth.star_tracker_from_camera_xyzw) * turn
     turned = dataclasses.replace(field.truth, star_tracker_from_camera_xyzw=mounting.as_quat())
-    found = halves(observe(seen_from_the_middle(field, turned), 20.0), field.prior, OPTIONS)
-    assert isinstance(found, Difference) and found.chance < 1e-9 < 1e-4 < found.shape_chance
+    found = compare_halves(
+        observe(seen_from_the_middle(field, turned), 20.0), field.prior, OPTIONS
+    )
+    assert found.p_value < 1e-9 < 1e-4 < found.shape_p_value
     # 20 arcsec, 1e-4 rad, for each image: four of these in each half know it to 7e-5.
-    assert found.turn_rad == pytest.approx(1e-3, abs=3e-4)
+    assert found.rotation_arcsec * ARCSECOND_RAD == pytest.approx(1e-3, abs=3e-4)
 
 
-def test_what_cannot_be_halved_is_not_compared() -> None:
+def test_halves_that_cannot_be_compared_give_the_reason() -> None:
     field = drawn(2)
     ensemble = observe(field, 20.0)
-    assert halves(Ensemble(ensemble.images[:5]), field.prior, OPTIONS) == (
-        '5 images, 6 make two halves'
-    )
-    thermal = dataclasses.replace(OPTIONS, focal_temperature_order=1)
-    assert halves(ensemble, field.prior, thermal) == 'the halves are of other temperatures'
+    five = compare_halves(Ensemble(ensemble.images[:5]), field.prior, OPTIONS)
+    assert five.note == '5 images, 6 make two halves' and np.isnan(five.p_value)
+    warm = dataclasses.replace(OPTIONS, focal_temperature_order=1)
+    found = compare_halves(ensemble, field.prior, warm)
+    assert found.note == 'the halves have different temperatures'
     few = Ensemble(tuple(image.select(np.arange(60) < 20) for image in ensemble.images))
-    assert str(halves(few, field.prior, OPTIONS)).startswith('a half alone cannot be solved: ')
+    note = compare_halves(few, field.prior, OPTIONS).note
+    assert note.startswith('a half alone cannot be solved: ')

@@ -51,7 +51,7 @@ def moved(
 def test_nothing_differs_from_itself(tiny: Calibration) -> None:
     found = compare(tiny, tiny)
     assert not found.difference.any()
-    assert found.chi2 == 0 and found.chance == 1
+    assert found.total.value == 0 and found.total.p_value == 1
     # Rounding of unit vectors, 1e-16, times a focal length of 1800 px.
     assert found.before.length_px.max() < 1e-11
     assert found.after.length_px.max() < 1e-11
@@ -92,7 +92,7 @@ def test_the_map_is_what_opencv_says(tiny: Calibration) -> None:
 
 def test_a_turn_is_taken_off(tiny: Calibration) -> None:
     found = compare(tiny, moved(tiny, (100 * ARCSECOND_RAD, 0.0, 0.0)))
-    assert found.turn_rad == pytest.approx(100 * ARCSECOND_RAD)
+    assert found.rotation_rad == pytest.approx(100 * ARCSECOND_RAD)
     middle = GRID // 2
     # A pixel at the axis moves by 100 arcsec of 1/fx: a lens of 1801 px.
     expected_px = 100 * ARCSECOND_RAD * tiny.geometry.camera.parameters[0]
@@ -114,10 +114,10 @@ def test_sigmas_are_those_of_chance(tiny: Calibration) -> None:
         for draw in draws
     ]
     degrees = 11  # eight camera parameters and three angles
-    assert all(one.degrees == degrees for one in found)
+    assert all(one.total.degrees_of_freedom == degrees for one in found)
     # The mean of 100 draws of chi2: sigma sqrt(2 * 11 / 100) = 0.47; four of them.
-    assert np.mean([one.chi2 for one in found]) == pytest.approx(degrees, abs=1.9)
-    assert np.mean([one.chance < 0.5 for one in found]) == pytest.approx(0.5, abs=0.2)
+    assert np.mean([one.total.value for one in found]) == pytest.approx(degrees, abs=1.9)
+    assert np.mean([one.total.p_value < 0.5 for one in found]) == pytest.approx(0.5, abs=0.2)
     for squares in (
         [one.before.sigmas**2 for one in found],
         [one.after.sigmas**2 for one in found],
@@ -134,7 +134,7 @@ def test_what_was_held_has_no_sigma(tiny: Calibration) -> None:
     assert any('held in both' in note and 'cx' in note for note in found.notes)
     exact = dataclasses.replace(tiny, covariance=np.zeros((13, 13)))
     nothing = compare(exact, exact)
-    assert nothing.degrees == 0 and np.isnan(nothing.chi2)
+    assert nothing.total.degrees_of_freedom == 0
     assert np.isnan(nothing.before.sigmas).all()
     made = json.dumps(comparison.content(nothing), allow_nan=False)
     assert json.loads(made)['chi2'] is None

@@ -29,7 +29,7 @@ def test_wald_foretells_the_rise_of_chi_squared(method: str) -> None:
     options = trials.calibration_options(method, told_arcsec, variance_components=False)
     estimate = estimate_calibration(ensemble, field.prior, options)
     first, *removals = removal_study(estimate)
-    assert (first.removed, first.chi2_rise, first.within_chance) == ('', 0.0, True)
+    assert (first.removed, first.chi2_rise, first.negligible) == ('', 0.0, True)
     assert {removal.removed for removal in removals} == set(
         estimated_parameters(options, 'plumb_bob')
     )
@@ -89,7 +89,7 @@ def test_a_removal_is_a_calibration_that_never_had_the_terms() -> None:
     assert removals[3].map_change_px == pytest.approx(change_px, rel=1e-5)
 
 
-def test_terms_that_are_none_are_within_chance_and_others_are_not() -> None:
+def test_terms_that_are_none_are_negligible_and_others_are_not() -> None:
     said = []
     for seed in range(30):
         field = trials.draw_star_field(np.random.default_rng(seed), 6, 40)
@@ -111,9 +111,9 @@ def test_terms_that_are_none_are_within_chance_and_others_are_not() -> None:
         removals = removal_study(estimate_calibration(ensemble, prior, options))
         said.append({removal.removed: removal for removal in removals})
     # One in a hundred is not; two of thirty are seen in one of 30 suites, three in 300.
-    assert sum(not terms['k3'].within_chance for terms in said) <= 2
+    assert sum(not terms['k3'].negligible for terms in said) <= 2
     # k1 is never none: the least of the 30 is 3.7 sigma.
-    assert not any(terms['k1'].within_chance for terms in said)
+    assert not any(terms['k1'].negligible for terms in said)
     # Its significance is a normal deviate: the mean square within the 99.8 % of 30 of them.
     square = np.mean([terms['k3'].significance ** 2 for terms in said])
     low, high = chi2.ppf([0.001, 0.999], len(said)) / len(said)

@@ -12,18 +12,20 @@ import resource
 import shutil
 import time
 
-from kept_state import collect, images, in_force, opened  # type: ignore[import-not-found]
+from kept_state import activation, collect, images, opened  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from sample_records import assert_same  # type: ignore[import-not-found]
+from sample_records import assert_same, calibration, observations  # type: ignore[import-not-found]
 
 from starcal_ros.bag import reader as bag_reader
-from starcal_ros.calibrator.archive import _sealed, Archive, InForce, TOPIC
+from starcal_ros.calibrator.archive import _sealed, Activation, Archive, TOPIC
 from starcal_ros.errors import ArchiveError
 from starcal_ros.records import Ensemble
 
+WRITTEN_BY_0_1 = Path(__file__).resolve().parents[1] / 'data' / 'written_by_0_1'
 
-def numbers(history: tuple[InForce, ...]) -> list[tuple[int, int]]:
+
+def numbers(history: tuple[Activation, ...]) -> list[tuple[int, int]]:
     """Event and calibration of each record."""
     return [(record.event, record.calibration.number) for record in history]
 
@@ -31,7 +33,7 @@ def numbers(history: tuple[InForce, ...]) -> list[tuple[int, int]]:
 def test_what_is_kept_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     """In order of arrival, which is not that of the stamps."""
     kept = Ensemble((images()[2], images()[0], images()[1]), {'no_stars': 3})
-    history = (in_force(1), in_force(2, before=1))
+    history = (activation(1), activation(2, before=1))
     with opened(tmp_path / 'new' / 'state') as archive:
         assert archive.read_ensemble() == Ensemble() and archive.read_history() == ()
         archive.keep(Ensemble(kept.images[:2]), history[:1])
@@ -94,7 +96,7 @@ def test_an_image_that_comes_again_after_a_reset_is_kept(tmp_path: Path) -> None
 
 
 def test_history_is_bounded_by_what_is_handed_over(tmp_path: Path) -> None:
-    history = tuple(in_force(event) for event in range(1, 6))
+    history = tuple(activation(event) for event in range(1, 6))
     with opened(tmp_path) as archive:
         for k in range(1, 6):
             archive.keep(Ensemble(), history[max(0, k - 3) : k])
@@ -141,7 +143,7 @@ def test_a_damaged_file_is_never_believed(tmp_path: Path, pattern: str, kind: st
     """It is read as it was written (a flip where nothing is said), or set aside and named."""
     sound = tmp_path / 'sound'
     with opened(sound) as archive:
-        archive.keep(Ensemble(images()[:1]), (in_force(1), in_force(2, before=1)))
+        archive.keep(Ensemble(images()[:1]), (activation(1), activation(2, before=1)))
     random = np.random.default_rng(3)
     set_aside = 0
     for k in range(60):
@@ -174,9 +176,27 @@ def test_a_damaged_file_is_never_believed(tmp_path: Path, pattern: str, kind: st
     assert set_aside >= (30 if kind == 'flip' else 55)
 
 
+def test_a_folder_of_version_0_1_is_read(tmp_path: Path) -> None:
+    """Written by that version; its unknown attitude gap was -1."""
+    shutil.copytree(WRITTEN_BY_0_1 / 'state', tmp_path / 'state')
+    with opened(tmp_path / 'state') as archive:
+        ensemble, history = archive.read_ensemble(), archive.read_history()
+        assert archive.damage == []
+    first, second = ensemble.images
+    assert_same(first, observations())
+    assert np.isnan(second.attitude_gap_s) and len(second) == 0
+    assert ensemble.refused == {'no_match': 2}
+    (record,) = history
+    found = record.calibration
+    assert (record.event, found.number, found.active_since_ns) == (7, 3, 123)
+    expected = dataclasses.replace(calibration(), number=3, active_since_ns=123, gate=found.gate)
+    assert_same(found, expected)
+    assert [check.passed for check in found.gate] == [False, True, None]
+
+
 def test_a_calibration_of_before_the_gate_told_is_read(tmp_path: Path) -> None:
     with opened(tmp_path) as archive:
-        archive.keep(Ensemble(), (in_force(1),))
+        archive.keep(Ensemble(), (activation(1),))
     (path,) = tmp_path.glob('calibrations/*.json')
     content = json.loads(path.read_text())
     del content['sha256'], content['gate']
@@ -190,10 +210,10 @@ def test_a_calibration_of_before_the_gate_told_is_read(tmp_path: Path) -> None:
 def test_a_damaged_rollback_still_goes_back(tmp_path: Path) -> None:
     """Its name says to which calibration, and that one has a file of its own."""
     with opened(tmp_path) as archive:
-        history: tuple[InForce, ...] = (
-            in_force(1),
-            in_force(2, before=1),
-            in_force(3, number=1),
+        history: tuple[Activation, ...] = (
+            activation(1),
+            activation(2, before=1),
+            activation(3, number=1),
         )
         archive.keep(Ensemble(), history)
     next(tmp_path.glob('calibrations/00000003_*')).write_bytes(b'{"half')
@@ -208,7 +228,7 @@ def test_a_damaged_rollback_still_goes_back(tmp_path: Path) -> None:
 
 def test_an_event_is_never_given_twice(tmp_path: Path) -> None:
     with opened(tmp_path) as archive:
-        archive.keep(Ensemble(), (in_force(1), in_force(2, before=1)))
+        archive.keep(Ensemble(), (activation(1), activation(2, before=1)))
     next(tmp_path.glob('calibrations/00000002_*')).write_bytes(b'')
     with opened(tmp_path) as archive:
         assert numbers(archive.read_history()) == [(1, 1)]
@@ -218,7 +238,7 @@ def test_an_event_is_never_given_twice(tmp_path: Path) -> None:
 @pytest.mark.parametrize('key', ['schema', 'archive'])
 def test_another_version_is_left_where_it_is(tmp_path: Path, key: str) -> None:
     with opened(tmp_path) as archive:
-        archive.keep(Ensemble(), (in_force(1), in_force(2, before=1)))
+        archive.keep(Ensemble(), (activation(1), activation(2, before=1)))
     path = next(tmp_path.glob('calibrations/00000002_*'))
     content = json.loads(path.read_text())
     del content['sha256']
@@ -226,7 +246,7 @@ def test_another_version_is_left_where_it_is(tmp_path: Path, key: str) -> None:
     path.write_text(_sealed(content))
     with opened(tmp_path) as archive:
         assert numbers(archive.read_history()) == [(1, 1)]
-        assert archive.damage == [f'{path}: of another version, passed over']
+        assert archive.damage == [f'{path}: of another version, skipped']
     assert path.exists()
 
 
@@ -260,14 +280,14 @@ def full_disk() -> Iterator[None]:
 def test_a_full_disk_is_told_and_tried_again(tmp_path: Path) -> None:
     whole = Ensemble(images()[:3], {'no_stars': 1})
     with opened(tmp_path) as archive:
-        archive.keep(Ensemble(images()[:2]), (in_force(1),))
+        archive.keep(Ensemble(images()[:2]), (activation(1),))
         with full_disk():
-            for history in ((in_force(1),), (in_force(1), in_force(2))):
+            for history in ((activation(1),), (activation(1), activation(2))):
                 with pytest.raises(ArchiveError, match=r'^state_dir: .*cannot be written'):
                     archive.keep(whole, history)
             assert archive.saved(whole) == 2
         assert not list(tmp_path.glob('*/.*'))
-        archive.keep(whole, (in_force(1), in_force(2)))
+        archive.keep(whole, (activation(1), activation(2)))
         assert archive.saved(whole) == 3
     with opened(tmp_path) as archive:
         assert len(archive.read_ensemble().images) == 3

@@ -15,7 +15,7 @@ from typing import Any
 import psutil  # type: ignore[import-untyped]
 import pytest
 
-from starcal_ros.calibrator.reports import CalibratorReports, CANDIDATE, IN_FORCE, Subject
+from starcal_ros.calibrator.reports import ACTIVE, CalibratorReports, CANDIDATE, Subject
 from starcal_ros.calibrator.state import CalibratorState
 from starcal_ros.cli import main
 from starcal_ros.pipeline.node_options import CalibratorOptions
@@ -98,7 +98,7 @@ def test_the_folder_is_as_the_tool_writes_it(
     subject: Subject, reports: CalibratorReports, told: Told, tmp_path: Path
 ) -> None:
     before = children()
-    reports.show(IN_FORCE, subject)
+    reports.show(ACTIVE, subject)
     page, trouble = told.get(timeout=PAGE_S)
     assert (page, trouble) == (tmp_path / 'report' / 'report.html', '')
     assert {path.name for path in page.parent.iterdir()} == {
@@ -106,12 +106,12 @@ def test_the_folder_is_as_the_tool_writes_it(
         'report.html', 'residuals.npz',
     }  # fmt: skip
     text = page.read_text()
-    assert 'calibration 1, in force since 2027-01-15 08:00:00.000 UTC' in text
+    assert 'calibration 1, active since 2027-01-15 08:00:00.000 UTC' in text
     assert 'figure-images' in text and 'did not have the images' in text
     page.unlink()
     assert main.main(['report', str(page.parent)]) == 0
     assert page.read_text() == text
-    reports.show(IN_FORCE, Subject(subject.calibration))  # it came back by a roll-back
+    reports.show(ACTIVE, Subject(subject.calibration))  # it came back by a roll-back
     assert told.get(timeout=PAGE_S)[1] == ''
     left = {path.name for path in page.parent.iterdir()}
     assert left == {'calibration.json', 'camera_info.yaml', 'report.html'}
@@ -125,13 +125,13 @@ def test_the_newest_wins(
     stand_in(
         'test -e "$4/../go" || { touch "$4/../busy"; exec sleep 600; }; touch "$4/report.html"'
     )
-    reports.show(IN_FORCE, subject)
+    reports.show(ACTIVE, subject)
     until((tmp_path / 'busy').exists)
     reports.show(CANDIDATE, numbered(subject, 0))
     (tmp_path / 'go').touch()
     for number in range(2, 6):
-        reports.show(IN_FORCE, numbered(subject, number))
-    pages = [tmp_path / name / 'report.html' for name in (CANDIDATE, IN_FORCE)]
+        reports.show(ACTIVE, numbered(subject, number))
+    pages = [tmp_path / name / 'report.html' for name in (CANDIDATE, ACTIVE)]
     assert [told.get(timeout=PAGE_S) for _ in pages] == [(page, '') for page in pages]
     numbers = [read_calibration(page.with_name('calibration.json')) for page in pages]
     assert [calibration.number for calibration in numbers] == [0, 5]
@@ -143,20 +143,20 @@ def test_closing_ends_the_process_and_keeps_the_products(
 ) -> None:
     stand_in('touch "$4/../busy"; exec sleep 600')
     before = children()
-    reports.show(IN_FORCE, subject)
+    reports.show(ACTIVE, subject)
     until((tmp_path / 'busy').exists)
     assert children() > before
     reports.show(CANDIDATE, subject)
     reports.close()
     assert children() == before
-    for name in (IN_FORCE, CANDIDATE):
+    for name in (ACTIVE, CANDIDATE):
         assert read_calibration(tmp_path / name / 'calibration.json').number == 1
     assert told.empty()
-    reports.show(IN_FORCE, subject)
+    reports.show(ACTIVE, subject)
     assert children() == before
     stand_in('touch "$4/report.html"')
     reports.open(str(tmp_path), 'camera')
-    reports.show(IN_FORCE, subject)
+    reports.show(ACTIVE, subject)
     assert told.get(timeout=PAGE_S) == (tmp_path / 'report' / 'report.html', '')
 
 
@@ -164,12 +164,12 @@ def test_a_full_disk_leaves_the_report_before(
     subject: Subject, reports: CalibratorReports, told: Told, tmp_path: Path, stand_in: StandIn
 ) -> None:
     stand_in('touch "$4/report.html"')
-    reports.show(IN_FORCE, subject)
+    reports.show(ACTIVE, subject)
     page = told.get(timeout=PAGE_S)[0]
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, limit[1]))
     try:
-        reports.show(IN_FORCE, numbered(subject, 2))
+        reports.show(ACTIVE, numbered(subject, 2))
         trouble = told.get(timeout=PAGE_S)[1]
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
@@ -177,7 +177,7 @@ def test_a_full_disk_leaves_the_report_before(
     assert page.exists()
     assert read_calibration(page.parent / 'calibration.json').number == 1
     assert not list(tmp_path.glob('.*'))
-    reports.show(IN_FORCE, numbered(subject, 2))
+    reports.show(ACTIVE, numbered(subject, 2))
     assert told.get(timeout=PAGE_S)[1] == '' and reports.trouble == ''
 
 
@@ -185,7 +185,7 @@ def test_a_folder_that_went_away_is_said(
     subject: Subject, reports: CalibratorReports, told: Told, tmp_path: Path
 ) -> None:
     shutil.rmtree(tmp_path)
-    reports.show(IN_FORCE, subject)
+    reports.show(ACTIVE, subject)
     assert 'No such file or directory' in told.get(timeout=PAGE_S)[1]
 
 
@@ -208,6 +208,6 @@ def test_why_there_is_no_page(
 ) -> None:
     """The products are there all the same."""
     stand_in(script)
-    reports.show(IN_FORCE, Subject(subject.calibration))
+    reports.show(ACTIVE, Subject(subject.calibration))
     assert told.get(timeout=PAGE_S)[1] == said == reports.trouble
     assert (tmp_path / 'report' / 'calibration.json').is_file()

@@ -61,23 +61,23 @@ def filled(
 def test_a_restart_goes_on_where_it_stood(
     setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
-    """The same solution to the last bit, and the same calibration in force."""
+    """The same solution to the last bit, and the same active calibration."""
     first = filled(setup, shown, tmp_path)
     first.add(refused_image(5, 8, 8, 'no_stars', ''))
     answer = first.solve(1_000)
-    assert answer.success and answer.in_force and answer.calibration is not None
-    assert (answer.calibration.number, answer.calibration.in_force_since_ns) == (1, 1_000)
+    assert answer.success and answer.active and answer.calibration is not None
+    assert (answer.calibration.number, answer.calibration.active_since_ns) == (1, 1_000)
     status = first.status()
     assert status.images == status.images_saved == len(shown)
     first.close()
     second = started(setup, tmp_path)
     assert dict(second.status().refused) == {'no_stars': 1}
-    in_force, again = second.in_force, second.solve(2_000).calibration
-    assert in_force is not None and again is not None
-    for found in (in_force, again):
+    active, again = second.active, second.solve(2_000).calibration
+    assert active is not None and again is not None
+    for found in (active, again):
         assert found.covariance.tobytes() == answer.calibration.covariance.tobytes()
         assert found.provenance == answer.calibration.provenance
-    assert (in_force.number, again.number) == (1, 2)
+    assert (active.number, again.number) == (1, 2)
     second.close()
 
 
@@ -90,12 +90,12 @@ def test_rollback_outlasts_a_restart(
     assert state.rollback(4).success
     state.close()
     state = started(setup, tmp_path)
-    in_force = state.in_force
-    assert in_force is not None and in_force.estimated == ('fx', 'fy', 'k1')
-    assert (in_force.number, in_force.in_force_since_ns) == (2, 4)
+    active = state.active
+    assert active is not None and active.estimated == ('fx', 'fy', 'k1')
+    assert (active.number, active.active_since_ns) == (2, 4)
     back = state.rollback(5)
     assert back.calibration is not None and back.calibration.number == 1
-    assert state.rollback(6) == Answer(False, 'there is no calibration before the one in force')
+    assert state.rollback(6) == Answer(False, 'there is no calibration before the active one')
     # A new one goes back to what was in force when it came.
     assert state.solve(7, estimate=('fx', 'fy'), force=True).success
     back = state.rollback(8)
@@ -114,7 +114,7 @@ def test_history_is_bounded(
     assert len(list((tmp_path / 'calibrations').iterdir())) == 2
     assert state.rollback(9).success
     gone = state.rollback(10)
-    assert gone.message == 'there is no calibration before the one in force any more'
+    assert gone.message == 'there is no calibration before the active one on record'
     state.close()
 
 
@@ -126,14 +126,14 @@ def test_what_is_forced_says_so(
     refused = state.solve(1)
     assert not refused.success and refused.calibration is not None
     assert (refused.calibration.number, refused.calibration.forced) == (0, False)
-    assert state.in_force is None
-    assert state.solve(1, dry_run=True, force=True).success and state.in_force is None
+    assert state.active is None
+    assert state.solve(1, dry_run=True, force=True).success and state.active is None
     assert state.solve(2, force=True).success
     state.close()
     state = started(setup, tmp_path)
-    in_force = state.in_force
-    assert in_force is not None and in_force.forced and not in_force.accepted
-    assert in_force.reasons[-1] == 'put in force by request all the same'
+    active = state.active
+    assert active is not None and active.forced and not active.accepted
+    assert active.reasons[-1] == 'activated by request despite the gate'
     state.close()
 
 
@@ -211,7 +211,7 @@ def test_a_full_disk_costs_nothing_that_memory_holds(
     assert state.trouble == '' and state.status().images_saved == len(shown)
     state.close()
     state = started(setup, tmp_path)
-    assert len(state.ensemble.images) == len(shown) and state.in_force is not None
+    assert len(state.ensemble.images) == len(shown) and state.active is not None
     state.close()
 
 
@@ -248,7 +248,7 @@ def test_damage_is_named(
 
 def test_memory_alone(setup: Setup, shown: tuple[StarObservations, ...]) -> None:
     state = started(setup)
-    assert state.rollback(1) == Answer(False, 'no calibration is in force')
+    assert state.rollback(1) == Answer(False, 'no calibration is active')
     assert 'too few observations' in state.solve(1).message
     assert state.ensemble == Ensemble() and state.disk_free_bytes() is None
     for image in shown:
@@ -256,5 +256,5 @@ def test_memory_alone(setup: Setup, shown: tuple[StarObservations, ...]) -> None
     assert state.solve(1).success
     state.close()
     state.open(setup, CalibratorOptions())
-    in_force = state.in_force
-    assert in_force is not None and np.isfinite(in_force.covariance).all()
+    active = state.active
+    assert active is not None and np.isfinite(active.covariance).all()

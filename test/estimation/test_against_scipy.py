@@ -257,7 +257,7 @@ def test_terms_of_temperature_have_the_same_minimum_and_covariance(
     assert terms is not None and terms.note == ''
     residuals, free = numerical(Ensemble(tuple(warm)), estimate, options)
     f, sigma = len(free), np.sqrt(np.diag(estimate.covariance))
-    thermal_sigma = np.r_[terms.focal_sigma, terms.alignment_rate_sigma]
+    thermal_sigma = np.r_[terms.focal_per_degc_sigma, terms.alignment_rate_rad_per_degc_sigma]
     images = np.full(0 if method == 'single' else 3 * len(warm), sigma[10:].min())
     unit = np.r_[sigma[free], thermal_sigma[:2], sigma[10:], thermal_sigma[2:], images]
     J = jacobian(residuals, unit) * unit

@@ -31,7 +31,7 @@ from starcal_ros.records import (
     CameraGeometry,
     Ensemble,
     StarObservations,
-    Thermal,
+    TemperatureTerms,
 )
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario
@@ -115,7 +115,7 @@ def options(method: str = 'hierarchical', order: int = 2, **other: object) -> Ca
     return CalibrationOptions(method=method, **values)  # type: ignore[arg-type]
 
 
-def found(ensemble: Ensemble, chosen: CalibrationOptions) -> tuple[Estimate, Thermal]:
+def found(ensemble: Ensemble, chosen: CalibrationOptions) -> tuple[Estimate, TemperatureTerms]:
     estimate = estimate_calibration(ensemble, PRIOR, chosen)
     assert estimate.termination == 'converged'
     assert estimate.thermal is not None
@@ -185,9 +185,9 @@ def test_without_noise_the_truth_comes_back(method: str, order: int) -> None:
         zip(estimate.shared_names, np.sqrt(np.diag(estimate.shared_covariance)), strict=True)
     )
     degrees = range(1, order + 1)
-    assert terms.focal_sigma == tuple(sigma[f'focal_temperature_{k}'] for k in degrees)
+    assert terms.focal_per_degc_sigma == tuple(sigma[f'focal_temperature_{k}'] for k in degrees)
     rate_names = [f'{name}_temperature' for name in ALIGNMENT_NAMES if method != 'per_image']
-    assert terms.alignment_rate_sigma == tuple(sigma[name] for name in rate_names)
+    assert terms.alignment_rate_rad_per_degc_sigma == tuple(sigma[name] for name in rate_names)
 
 
 @pytest.mark.parametrize('method', METHODS)
@@ -204,10 +204,10 @@ def test_the_reported_sigmas_are_true(method: str) -> None:
         C = estimate.covariance[np.ix_(rows, rows)] / np.outer(scale, scale)
         error = error_of(estimate)[rows] / scale
         camera.append(error @ np.linalg.solve(C, error))
-        focal.append((np.array(terms.focal_per_degc) - FOCAL) / terms.focal_sigma)
+        focal.append((np.array(terms.focal_per_degc) - FOCAL) / terms.focal_per_degc_sigma)
         if method != 'per_image':
             got = np.array(terms.alignment_rate_rad_per_degc)
-            rate.append((got - RATE_RAD) / terms.alignment_rate_sigma)
+            rate.append((got - RATE_RAD) / terms.alignment_rate_rad_per_degc_sigma)
     low, high = chi2.ppf([0.005, 0.995], len(rows) * TRIALS) / TRIALS
     assert low < np.mean(camera) < high
     low, high = chi2.ppf([0.005, 0.995], TRIALS) / TRIALS
@@ -333,7 +333,9 @@ def test_per_image_has_no_rate() -> None:
 
 
 def test_the_camera_at_a_temperature() -> None:
-    terms = Thermal(REFERENCE_DEGC, FOCAL, (1e-6, 1e-8), tuple(RATE_RAD.tolist()), (1e-6,) * 3)
+    terms = TemperatureTerms(
+        REFERENCE_DEGC, FOCAL, (1e-6, 1e-8), tuple(RATE_RAD.tolist()), (1e-6,) * 3
+    )
     for degc in (-20.0, REFERENCE_DEGC, 35.0):
         got = temperature.geometry_at(TRUTH, terms, degc)
         np.testing.assert_allclose(
@@ -341,16 +343,18 @@ def test_the_camera_at_a_temperature() -> None:
         )
         turn = Rotation.from_quat(got.star_tracker_from_camera_xyzw) * alignment_of(degc, RATE_RAD)
         assert turn.magnitude() < 1e-15
-    assert temperature.geometry_at(TRUTH, Thermal(REFERENCE_DEGC), 50.0) == CameraGeometry(
-        TRUTH.camera, TRUTH.star_tracker_from_camera_xyzw
-    )
+    assert temperature.geometry_at(
+        TRUTH, TemperatureTerms(REFERENCE_DEGC), 50.0
+    ) == CameraGeometry(TRUTH.camera, TRUTH.star_tracker_from_camera_xyzw)
     assert temperature.geometry_at(TRUTH, None, 50.0) is TRUTH
 
 
 def test_the_summary_is_a_line() -> None:
-    terms = Thermal(20.0, (4e-5,), (1e-6,), (1e-5, 0.0, 0.0), (1e-6,) * 3, 'left out: this')
+    terms = TemperatureTerms(
+        20.0, (4e-5,), (1e-6,), (1e-5, 0.0, 0.0), (1e-6,) * 3, 'left out: this'
+    )
     assert temperature.summary(terms) == (
         'a1 +4e-05 (1e-06) /degC; alignment +2.063 (0.21), +0.000 (0.21), +0.000 (0.21) '
         'arcsec/degC; reference 20 degC; left out: this'
     )
-    assert temperature.summary(Thermal(20.0)) == 'no terms; reference 20 degC'
+    assert temperature.summary(TemperatureTerms(20.0)) == 'no terms; reference 20 degC'

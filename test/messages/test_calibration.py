@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -11,85 +12,148 @@ import numpy as np
 import pytest
 from sample_records import assert_same, calibration, plain, plain_calibration  # type: ignore[import-not-found]
 
-from starcal_ros.bag.reader import make_message
+from starcal_ros.bag.reader import _typestore, make_message
 from starcal_ros.camera import line_of_sight, project
+from starcal_ros.estimation import levenberg_marquardt
+from starcal_ros.estimation.calibrate import CalibrationOptions
 from starcal_ros.messages.calibration import (
     alignment_to_message,
     calibration_from_message,
     calibration_to_message,
     camera_info_to_message,
 )
-from starcal_ros.records import GateCheck, Thermal
+from starcal_ros.messages.codec import NOT_KNOWN
+from starcal_ros.messages.types import CALIBRATION_TYPE
+from starcal_ros.records import GateCheck, TemperatureTerms
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
 def test_calibration_round_trip(make: Any) -> None:
     """Every number survives its message, bit for bit, and so does what is not known."""
-    left_out = dataclasses.replace(calibration(), thermal=Thermal(20.0, note='left out'))
+    left_out = dataclasses.replace(
+        calibration(), temperature=TemperatureTerms(20.0, note='left out')
+    )
     for record in (calibration(), plain_calibration(), left_out):
         assert_same(record, calibration_from_message(calibration_to_message(record, make)))
 
 
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
-def test_what_the_gate_did_not_check_is_told(make: Any) -> None:
+def test_a_check_that_was_not_made_is_neither_passed_nor_failed(make: Any) -> None:
     gate = (
         *calibration().gate,
-        GateCheck('turn', 'max_step_turn_deg', math.nan, 0.5, 'deg', None, 'nothing in force'),
+        GateCheck('turn', 'max_step_rotation_deg', math.nan, 0.5, 'deg', None, 'none active'),
     )
     message = calibration_to_message(dataclasses.replace(calibration(), gate=gate), make)
-    assert list(message.gate_kept) == [0, 1, -1]
+    assert [check.passed for check in message.gate] == [0, 1, 2]
     # NaN is not equal to itself.
     assert repr(calibration_from_message(message).gate) == repr(gate)
+    message.gate[0].passed = 3
+    with pytest.raises(ValueError, match='passed: 3 is none of 0, 1, 2'):
+        calibration_from_message(message)
 
 
-def test_older_calibrations_are_read() -> None:
-    """Fields that were added since are as if nothing was known."""
+def test_constants_of_the_definitions_are_those_of_the_code() -> None:
+    """Methods and terminations by the names of the options and of the solver."""
+    store = _typestore()
+    fields = {name: value for name, _, value in store.fielddefs[CALIBRATION_TYPE][0]}
+    (method,) = (f for f in dataclasses.fields(CalibrationOptions) if f.name == 'method')
+    assert {fields[name] for name in ('PER_IMAGE', 'SINGLE', 'HIERARCHICAL')} == set(
+        method.metadata['choices']
+    )
+    source = Path(levenberg_marquardt.__file__).read_text()
+    for name in ('CONVERGED', 'NO_DESCENT', 'ITERATION_LIMIT'):
+        assert f"'{fields[name]}'" in source
+    checks = {name: value for name, _, value in store.fielddefs['starcal/msg/GateCheck'][0]}
+    assert checks == {'FAILED': 0, 'PASSED': 1, 'NOT_CHECKED': NOT_KNOWN}
+    cameras = {name: value for name, _, value in store.fielddefs['starcal/msg/CameraModel'][0]}
+    assert cameras['PLUMB_BOB'] == calibration().geometry.camera.model
+
+
+def test_every_field_of_a_record_has_its_field_in_the_message() -> None:
+    """A message is built from all fields of its definition: rosbags refuses one too few."""
+    definitions = {path.stem for path in (ROOT / 'msg').glob('*.msg')}
+    made = calibration_to_message(calibration(), make_message)
+    used = {made.__msgtype__.rpartition('/')[2]}
+
+    def collect(message: Any) -> None:
+        used.add(message.__msgtype__.rpartition('/')[2])
+        for value in vars(message).values():
+            for one in value if isinstance(value, list) else [value]:
+                if getattr(one, '__msgtype__', '').startswith('starcal/'):
+                    collect(one)
+
+    collect(made)
+    assert used == definitions - {'EnsembleStatus', 'StarObservations'}
+
+
+def test_fields_that_an_older_definition_lacks_have_their_defaults() -> None:
     message = calibration_to_message(calibration(), plain)
-    del message.reference_temperature_degc, message.coverage_rows, message.correlation_names
-    del message.removal_removed, message.gate_name
-    found = calibration_from_message(message)
-    assert found.thermal is None and found.maps is None and found.correlation is None
-    assert found.removals == () and found.gate == ()
+    for name in ('temperature', 'maps', 'correlation', 'removals', 'halves', 'gate'):
+        delattr(message, name)
+    assert_same(calibration_from_message(message), plain_calibration())
 
 
 @pytest.mark.parametrize(
-    ('field', 'text'),
+    ('record', 'field', 'text'),
     [
-        ('coverage', 'coverage: 1 numbers, not 2 x 3'),
-        ('line_of_sight_sigma_arcsec', 'line_of_sight_sigma_arcsec: 1 numbers, not 4 x 3'),
-        ('shape_sigma_arcsec', 'shape_sigma_arcsec: 1 numbers, not 4 x 3'),
-        ('correlation', 'correlation: 1 numbers, not 2 x 2'),
-        ('removal_wald', 'removal_wald: 1 numbers, not 2'),
-        ('removal_within_chance', 'removal_within_chance: 1 numbers, not 2'),
+        ('maps', 'stars', 'stars: 1 numbers, not 2 x 3'),
+        ('maps', 'line_of_sight_sigma_arcsec', 'sigma_arcsec: 1 numbers, not 4 x 3'),
+        ('maps', 'shape_sigma_arcsec', 'shape_sigma_arcsec: 1 numbers, not 4 x 3'),
+        ('correlation', 'matrix', 'matrix: 1 numbers, not 2 x 2'),
+        ('removals', 'residual_std_px', 'residual_std_px: 1 numbers, not 2'),
+        ('temperature', 'focal_per_degc_sigma', 'focal_per_degc_sigma: 1 numbers, not 2'),
+        (
+            'temperature',
+            'alignment_rate_rad_per_degc_sigma',
+            'alignment_rate_rad_per_degc_sigma: 1 numbers, not 3',
+        ),
     ],
 )
-def test_grids_of_another_size_are_refused(field: str, text: str) -> None:
+def test_numbers_of_another_count_are_refused(record: str, field: str, text: str) -> None:
     message = calibration_to_message(calibration(), plain)
-    setattr(message, field, np.zeros(1))
+    setattr(getattr(message, record)[0], field, np.zeros(1))
     with pytest.raises(ValueError, match=text):
         calibration_from_message(message)
 
 
-@pytest.mark.parametrize(
-    ('field', 'text'),
-    [
-        ('focal_per_degc_sigma', 'focal_per_degc_sigma: 1 numbers, not 2'),
-        ('alignment_rate_rad_per_degc', 'alignment_rate_rad_per_degc: 1 numbers, not 3 or none'),
-        ('alignment_rate_rad_per_degc_sigma', '1 numbers, not 3'),
-    ],
-)
-def test_bad_terms_of_temperature_are_refused(field: str, text: str) -> None:
+def test_a_rate_has_three_numbers_or_none() -> None:
     message = calibration_to_message(calibration(), plain)
-    setattr(message, field, np.zeros(1))
-    with pytest.raises(ValueError, match=text):
+    message.temperature[0].alignment_rate_rad_per_degc = np.zeros(1)
+    message.temperature[0].alignment_rate_rad_per_degc_sigma = np.zeros(1)
+    with pytest.raises(ValueError, match='alignment_rate_rad_per_degc: 1 numbers, not 3 or none'):
         calibration_from_message(message)
 
 
-def test_empty_calibration_is_refused() -> None:
-    """The calibration of an answer without solution is not taken for a camera."""
+def test_a_covariance_that_does_not_fit_the_camera_is_refused() -> None:
     message = calibration_to_message(calibration(), plain)
-    message.parameter_names = []
-    with pytest.raises(ValueError, match='none do not end in alignment'):
+    message.covariance = np.zeros(144)
+    with pytest.raises(ValueError, match='covariance: 12 x 12 numbers, not 13 x 13'):
+        calibration_from_message(message)
+    message.covariance = np.zeros(150)
+    with pytest.raises(ValueError, match='covariance: 150 numbers, not 12 x 12'):
+        calibration_from_message(message)
+
+
+@pytest.mark.parametrize(
+    ('change', 'text'),
+    [
+        (lambda m: setattr(m, 'parameter_names', []), 'parameter_names: none, not fx, skew'),
+        (
+            lambda m: setattr(m.camera, 'parameter_names', ['fx']),
+            'camera.parameter_names: fx',
+        ),
+        (lambda m: setattr(m.camera, 'parameters', np.zeros(0)), 'parameters: '),
+        (lambda m: setattr(m.camera, 'width', 0), 'image size: 0 x 1024'),
+        (lambda m: setattr(m.alignment.rotation, 'w', 3.0), 'is not a unit quaternion'),
+    ],
+)
+def test_a_message_without_a_camera_is_refused(change: Any, text: str) -> None:
+    """The empty calibration of an answer without solution is one of these."""
+    message = calibration_to_message(calibration(), plain)
+    change(message)
+    with pytest.raises(ValueError, match=text):
         calibration_from_message(message)
 
 

@@ -30,7 +30,7 @@ def test_observations_round_trip(make: Any) -> None:
         ('covariance_px2', np.zeros(15), 'not positive definite'),
         ('refused_star_counts', np.zeros(1, np.uint32), '2 reasons but 1 counts'),
         ('refused_star_px', np.zeros(7), 'refused_star_px: 7 numbers, not 4 x 2'),
-        ('refused_star_px', np.full(8, np.inf), 'refused_px: not finite'),
+        ('refused_star_px', np.full(8, np.inf), 'refused_star_px: not finite'),
         ('refused_star_reason', np.full(4, 2), 'refused_star_reason: 2 is none of 2 reasons'),
     ],
 )
@@ -51,11 +51,12 @@ def test_refused_stars_are_found_by_reason() -> None:
 
 
 def test_older_observations_are_read() -> None:
-    """Fields that were added since are as if nothing was known."""
+    """Fields that were added since have their defaults; an unknown attitude gap was -1."""
     message = observations_to_message(observations(), 'cam', plain)
     del message.temperature_degc
+    message.attitude_gap_s = -1.0
     del message.refused_star_id, message.refused_star_px, message.refused_star_reason
     record = observations_from_message(message)
-    assert np.isnan(record.temperature_degc)
+    assert np.isnan(record.temperature_degc) and np.isnan(record.attitude_gap_s)
     assert record.refused_stars == {'blend': 3, 'saturated': 1}
     assert record.refused_px.shape == (0, 2)

@@ -1,4 +1,4 @@
-"""Messages of the status of an ensemble: what they tell."""
+"""Messages of the status of an ensemble."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from starcal_ros.messages.status import status_to_message
 
 
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
-def test_every_number_of_a_status_is_told(make: Any) -> None:
+def test_a_status_has_every_number(make: Any) -> None:
     record = status()
     message = status_to_message(record, 'cam', make)
     assert (message.header.frame_id, stamp_ns(message.header.stamp)) == ('cam', TIME_NS)
     for name in ('images', 'images_saved', 'stars', 'min_images', 'min_stars'):
         assert getattr(message, name) == getattr(record, name)
-    assert (message.refused_reasons, message.refused_counts.tolist()) == (['no_match'], [1])
+    assert [(entry.reason, entry.count) for entry in message.refused] == [('no_match', 1)]
     assert (message.coverage_rows, message.coverage_cols) == record.coverage.shape
     assert message.coverage.tolist() == record.coverage.ravel().tolist()
     assert tuple(message.parameter_names) == record.parameter_names

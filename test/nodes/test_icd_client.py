@@ -98,7 +98,7 @@ def test_calibrates_through_the_icd(client: Client, start_node: StartNode, tiny_
     trial = client.call(Calibrate, '/calibrator/solve', dry_run=True)
     assert trial.success, trial.message
     assert trial.calibration.stars_used > 0
-    assert not early, 'before a calibration is in force nothing is published as one'
+    assert not early, 'nothing is published as a calibration before one is active'
 
     answer = client.call(Trigger, '/calibrator/calibrate')
     assert answer.success, answer.message
@@ -124,8 +124,8 @@ def check_products(info: Any, alignment: Any, calibration: Any, folder: Path) ->
     truth = json.loads((folder / 'truth.json').read_text())
     assert calibration.accepted and not calibration.reasons
     sigma = np.sqrt(np.diag(np.reshape(calibration.covariance, (13, 13))))
-    camera = [calibration.fx, calibration.skew, calibration.fy, calibration.cx, calibration.cy]
-    off = np.r_[camera, calibration.distortion] - np.r_[truth['k_true'], truth['d_true']]
+    assert list(calibration.camera.parameter_names) == list(calibration.parameter_names)[:10]
+    off = np.array(calibration.camera.parameters) - np.r_[truth['k_true'], truth['d_true']]
     free = sigma[:10] > 0
     assert free.sum() >= 5
     assert np.abs(off[free] / sigma[:10][free]).max() < 5
@@ -133,15 +133,18 @@ def check_products(info: Any, alignment: Any, calibration: Any, folder: Path) ->
     assert info.distortion_model == 'plumb_bob'
     assert (info.width, info.height) == (truth['width'], truth['height'])
     assert info.k[1] == 0.0
-    assert abs(info.k[0] - calibration.fx) < 1.0
-    assert abs(info.d[0] - calibration.distortion[0]) < 0.01
-    assert abs(info.d[2] - calibration.distortion[3]) < 0.001
+    found = dict(
+        zip(calibration.camera.parameter_names, calibration.camera.parameters, strict=True)
+    )
+    assert abs(info.k[0] - found['fx']) < 1.0
+    assert abs(info.d[0] - found['k1']) < 0.01
+    assert abs(info.d[2] - found['p1']) < 0.001
     assert (alignment.header.frame_id, alignment.child_frame_id) == (
-        calibration.parent_frame,
+        calibration.alignment.parent_frame,
         calibration.header.frame_id,
     )
     q = alignment.transform.rotation
-    assert q == calibration.alignment
+    assert q == calibration.alignment.rotation
     camera_from_st = np.array(truth['A_true'])
     error = rotation(q).T @ camera_from_st.T
     angle = np.arccos(np.clip((np.trace(error) - 1) / 2, -1, 1))

@@ -125,12 +125,12 @@ def test_nodes_and_tool_give_the_same_calibration(
     again = client.call(Trigger, '/calibrator/calibrate')
     assert again.success
     back = client.call(Trigger, '/calibrator/rollback')
-    assert back.success and 'back in force' in back.message
+    assert back.success and 'activated again' in back.message
     none = client.call(Trigger, '/calibrator/rollback')
     assert not none.success and 'no calibration before' in none.message
     before = len(found)
     trial = client.call(Calibrate, '/calibrator/solve', dry_run=True, estimate=['fx', 'fy'])
-    assert trial.success and 'would be in force' in trial.message
+    assert trial.success and 'would be activated' in trial.message
     assert list(trial.calibration.estimated) == ['fx', 'fy']
     bad = client.call(Calibrate, '/calibrator/solve', estimate=['fz'])
     assert not bad.success and 'fz' in bad.message
@@ -172,14 +172,14 @@ def test_gate_refusal_and_force(
     forced = client.call(Calibrate, '/calibrator/solve', force=True)
     assert forced.success and not forced.calibration.accepted
     client.until(lambda: found)
-    assert found[0].reasons[-1] == 'put in force by request all the same'
+    assert found[0].reasons[-1] == 'activated by request despite the gate'
     assert found[0].forced and found[0].number == 1
     client.until(
-        lambda: any('in force against the gate' in m.status[0].message for m in diagnostics)
+        lambda: any('active against the gate' in m.status[0].message for m in diagnostics)
     )
     page = state / 'report' / 'report.html'
     client.until(page.exists, 120.0)
-    assert ', and in force all the same: calibration 1' in page.read_text()
+    assert ', activated by request: calibration 1' in page.read_text()
     assert calibrator.process.poll() is None
 
 
@@ -348,9 +348,9 @@ def test_camera_info_per_image(
     """The calibration in force with the header of each image; the prior and candidates never."""
     values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())['/**']['ros__parameters']
     setup = load_setup({**values, 'camera_info_url': str(tiny_bag / 'camera.yaml')})
-    in_force = solving.solve(tiny_observations, setup)
-    assert in_force.accepted
-    candidate = dataclasses.replace(in_force, accepted=False, reasons=('bad',))
+    active = solving.solve(tiny_observations, setup)
+    assert active.accepted
+    candidate = dataclasses.replace(active, accepted=False, reasons=('bad',))
     observer = start_node(
         'star_observer',
         ros=parameters(tiny_bag, 'camera_info_per_image:=true', 'attitude_timeout_s:=0.0'),
@@ -378,13 +378,13 @@ def test_camera_info_per_image(
     publish(candidate, 'calibration: one that the gate has refused')
     show(2)
     client.until(lambda: len(answers) == 2)
-    publish(in_force, 'stars are predicted with the calibration in force')
+    publish(active, 'stars are predicted with the calibration in force')
     headers = [show(3), show(4, width=8, height=8), show(7), show(5, 'other')]
     client.until(lambda: len(answers) == 6 and len(infos) == 3)
     # Nothing of the first two comes later: what is of one publisher comes in order.
     assert [info.header for info in infos] == [headers[0], *headers[2:]]
     assert lossy[0].header in headers
-    expected = camera_info_to_message(in_force, make_message)
+    expected = camera_info_to_message(active, make_message)
     for info in infos:
         expected.header = info.header
         assert info == expected
@@ -413,8 +413,8 @@ def test_calibrator_collects_while_it_solves(
         observations.publish(observations_to_message(refused, '', make_message))
     client.until(lambda: all(future.done() for future in futures), 120.0)
     assert all(future.result().success for future in futures)
-    client.until(lambda: 'no_stars' in status[-1].refused_reasons)
-    client.until(lambda: sum(status[-1].refused_counts) == 300)
+    client.until(lambda: 'no_stars' in {entry.reason for entry in status[-1].refused})
+    client.until(lambda: sum(e.count for e in status[-1].refused) == 300)
 
 
 def test_state_outlasts_a_kill(
@@ -442,11 +442,11 @@ def test_state_outlasts_a_kill(
     start_node('calibrator', ros=(*parameters(tiny_bag, state), '-r', '__node:=heir'))
     found = client.latched(Calibration, 'calibration')
     client.until(lambda: found)
-    in_force = calibration_from_message(found[0])
-    assert in_force.number == 1 and in_force.in_force_since_ns > 0
+    active = calibration_from_message(found[0])
+    assert active.number == 1 and active.active_since_ns > 0
     again = client.call(Calibrate, '/heir/solve', dry_run=True)
     answer = calibration_from_message(again.calibration)
-    for one in (in_force, answer):
+    for one in (active, answer):
         np.testing.assert_array_equal(one.covariance, tool.covariance)
     ensemble_by_tool = [sys.executable, '-m', 'starcal_ros.cli.main', 'calibrate']
     ensemble_by_tool += [str(tmp_path / 'state' / 'ensemble'), '-o', str(tmp_path / 'again')]
@@ -464,7 +464,7 @@ def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_ba
     refused = refused_image(5, 8, 8, 'no_stars', '')
     observations.publish(observations_to_message(refused, '', make_message))
     status = client.latched(EnsembleStatus, 'ensemble_status')
-    client.until(lambda: status and list(status[-1].refused_reasons) == ['no_stars'])
+    client.until(lambda: status and [e.reason for e in status[-1].refused] == ['no_stars'])
     assert 'direction_icrf: 0 numbers, not 2 x 3' in calibrator.said()
     assert 'Traceback' not in calibrator.said()
 
@@ -483,7 +483,7 @@ def test_too_few_images(client: Client, start_node: StartNode, tiny_bag: Path) -
     assert str(status_of(client, status).min_images) in answer.message
     assert '\n' not in answer.message
     rollback = client.call(Trigger, '/calibrator/rollback')
-    assert not rollback.success and rollback.message == 'no calibration is in force'
+    assert not rollback.success and rollback.message == 'no calibration is active'
     assert latched == [[], [], []]
 
 

@@ -143,7 +143,7 @@ def test_a_bad_solution_is_refused_and_says_why(camera_yaml: Path) -> None:
     found = solve.solve(ensemble(), strict)
     assert not found.accepted
     assert len(found.reasons) == 1 and 'max_map_sigma_px' in found.reasons[0]
-    refused = [check for check in found.gate if check.kept is False]
+    refused = [check for check in found.gate if check.passed is False]
     assert [check.option for check in refused] == ['max_map_sigma_px']
     assert refused[0].limit == 1e-6 and found.reasons[0].startswith(refused[0].name)
 
@@ -201,8 +201,8 @@ def test_a_bag_with_temperatures_to_a_calibration_with_terms(
     plain = list(observe.observe_bag(paths, '/image', '/attitude', warm))
     assert all(np.isnan(one.temperature_degc) for one in plain)
     # The simulated camera does not change with temperature, and that is what is found.
-    terms = solve.solve(Ensemble(tuple(found)), warm).thermal
+    terms = solve.solve(Ensemble(tuple(found)), warm).temperature
     assert terms is not None and terms.reference_degc == 20.0
     assert 'within chance' in terms.note
-    terms = solve.solve(Ensemble(tuple(plain)), warm).thermal
+    terms = solve.solve(Ensemble(tuple(plain)), warm).temperature
     assert terms is not None and terms.note == 'left out: 4 of 4 images have no temperature'

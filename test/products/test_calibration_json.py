@@ -20,19 +20,22 @@ from starcal_ros.products.calibration_json import read_calibration, write_calibr
 from starcal_ros.records import (
     CameraGeometry,
     GateCheck,
-    Removal,
-    Thermal,
+    TemperatureTerms,
+    TermRemoval,
 )
 
+WRITTEN_BY_0_1 = Path(__file__).resolve().parents[1] / 'data' / 'written_by_0_1'
 REMOVALS = (
-    Removal('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
-    Removal('k3', -1 / 3, 0.5, 1 / 7, True, 0.1 + 0.2, (0.1, 1 / 3), 1e-17),
-    Removal('fx', 4e5, 1.6e11, 1.7e11, False, 700.5, (500.0, 600.0), 12.0),
+    TermRemoval('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
+    TermRemoval('k3', -1 / 3, 0.5, 1 / 7, True, 0.1 + 0.2, (0.1, 1 / 3), 1e-17),
+    TermRemoval('fx', 4e5, 1.6e11, 1.7e11, False, 700.5, (500.0, 600.0), 12.0),
 )
 GATE = (
     GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 1.0, 'px', True),
     GateCheck('solver converged', '', math.nan, math.nan, '', False, 'no_descent'),
-    GateCheck('turn', 'max_step_turn_deg', math.nan, 0.5, 'deg', None, 'nothing was in force'),
+    GateCheck(
+        'turn', 'max_step_rotation_deg', math.nan, 0.5, 'deg', None, 'no calibration was active'
+    ),
 )
 
 
@@ -40,7 +43,7 @@ def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     cases: tuple[dict[str, Any], ...] = (
         {},
         {'accepted': False, 'reasons': ('too few stars', 'weak: k3')},
-        {'thermal': Thermal(20.0, note='left out: everything')},
+        {'temperature': TemperatureTerms(20.0, note='left out: everything')},
         {'removals': REMOVALS},
     )
     records = (dataclasses.replace(plain_calibration(), **changes) for changes in cases)
@@ -49,10 +52,14 @@ def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
         assert_same(record, read_calibration(tmp_path / 'calibration.json'))
 
 
-def test_what_the_gate_has_looked_at_comes_back(tmp_path: Path) -> None:
+def test_the_checks_of_the_gate_come_back(tmp_path: Path) -> None:
     path = tmp_path / 'c.json'
     write_calibration(dataclasses.replace(calibration(), gate=GATE), path)
-    assert [check['kept'] for check in json.loads(path.read_text())['gate']] == [True, False, None]
+    assert [check['passed'] for check in json.loads(path.read_text())['gate']] == [
+        True,
+        False,
+        None,
+    ]
     assert repr(read_calibration(path).gate) == repr(GATE)  # NaN is not equal to itself
 
 
@@ -136,6 +143,16 @@ def test_a_row_of_a_grid_is_a_line(tmp_path: Path) -> None:
     assert_same(written, read_calibration(path))
 
 
+def test_a_file_of_version_0_1_is_read() -> None:
+    """Written by that version from the sample record; keys have other names since."""
+    found = read_calibration(WRITTEN_BY_0_1 / 'calibration.json')
+    last = GateCheck(
+        'turn', 'max_step_turn_deg', math.nan, 0.5, 'deg', None, 'no calibration was in force'
+    )
+    assert repr(found.gate[-1]) == repr(last)
+    assert_same(calibration(), dataclasses.replace(found, gate=found.gate[:-1]))
+
+
 def test_an_older_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / 'c.json'
     write_calibration(calibration(), path)
@@ -155,32 +172,39 @@ def test_an_older_file_is_read(tmp_path: Path) -> None:
         (lambda c: c['intrinsics'].update(fx=-1.0), 'not positive'),
         (lambda c: c['distortion'].update(k1='a'), "distortion.k1: 'a' is not a number"),
         (lambda c: c['distortion'].update(k1=None), 'distortion.k1: None is not a number'),
-        (lambda c: c['covariance'].pop(), 'covariance is not 13 x 13'),
-        (lambda c: c['covariance'][0].pop(), 'covariance: .* is not 13 numbers'),
-        (lambda c: c.update(parameter_names=['fx']), 'parameter_names do not end in alignment'),
+        (lambda c: c['covariance'].pop(), 'covariance: 12 x 13 numbers, not 12 x 12'),
+        (lambda c: c['covariance'][0].pop(), 'covariance: rows of different length'),
         (
-            lambda c: c['parameter_names'].pop(0),
-            'skew, .* are not the parameters of a lens model',
+            lambda c: c['covariance'][0].__setitem__(2, 'a'),
+            r"ance\[0\]\[2\]: 'a' is not a num",
         ),
+        (lambda c: c.update(covariance=[[1.0]]), 'covariance: 1 x 1 numbers, not 13 x 13'),
+        (lambda c: c['parameter_names'].pop(), 'parameters: .* is not ten'),
+        (lambda c: c['parameter_names'].__setitem__(9, 'p3'), "key 'distortion.p3' is missing"),
+        (lambda c: c['image'].update(width=-1), 'image.width: -1 is not in the range 0 to'),
+        (lambda c: c.update(images_used=2**70), 'images_used: .* is not in the range'),
+        (lambda c: c['images_refused'].update(blank='x'), "images_refused.blank: 'x' is not a wh"),
+        (lambda c: c.update(residual_rms_px=True), 'residual_rms_px: True is not a number'),
+        (lambda c: c.update(star_tracker_sigma_arcsec=[1.0]), 'sigma_arcsec: 1 numbers, not 3'),
         (lambda c: c.update(stars_used=1.5), 'stars_used: 1.5 is not a whole number'),
         (lambda c: c.update(accepted=1), 'accepted: 1 is not true or false'),
         (lambda c: c.update(reasons='none'), "reasons: 'none' is not a list"),
-        (lambda c: c.update(provenance=[]), r'provenance: \[\] is not a mapping'),
+        (lambda c: c.update(provenance=[]), r'provenance: \[\] is not an object'),
         (lambda c: c['alignment'].update(parent=3), 'alignment.parent: 3 is not a text'),
-        (lambda c: c.update(intrinsics=3), "key 'intrinsics.fx' is missing"),
-        (lambda c: c.update(temperature={}), "key 'temperature.focal_per_degc' is missing"),
+        (lambda c: c.update(intrinsics=3), 'intrinsics: 3 is not an object'),
+        (lambda c: c.update(temperature={}), "key 'temperature.reference_degc' is missing"),
         (
             lambda c: c['temperature'].update(alignment_rate_rad_per_degc=[1.0]),
-            'temperature.alignment_rate_rad_per_degc: .* is not 0 or 3 numbers',
+            'temperature.alignment_rate_rad_per_degc_sigma: 3 numbers, not 1',
         ),
         (lambda c: c['maps'].pop('stars'), "key 'maps.stars' is missing"),
-        (lambda c: c['maps']['stars'][0].pop(), 'maps.stars: .* is not a grid of rows alike'),
-        (lambda c: c.update(removals=[1]), r'removals: \[1\] is not a mapping'),
-        (lambda c: c['removals'][1].pop('wald'), "key 'removals.wald' is missing"),
-        (lambda c: c['removals'][1].update(within_chance=1), 'within_chance: 1 is not true or'),
-        (lambda c: c['gate'][0].pop('note'), "key 'gate.note' is missing"),
-        (lambda c: c['gate'][0].update(kept=1), 'gate.kept: 1 is not true or false'),
-        (lambda c: c['correlation']['matrix'].pop(), 'correlation.matrix is not of the size'),
+        (lambda c: c['maps']['stars'][0].pop(), 'maps.stars: rows of different length'),
+        (lambda c: c.update(removals=[1]), r'removals\[0\]: 1 is not an object'),
+        (lambda c: c['removals'][1].pop('wald'), r"key 'removals\[1\].wald' is missing"),
+        (lambda c: c['removals'][1].update(negligible=1), 'negligible: 1 is not true or'),
+        (lambda c: c['gate'][0].pop('unit'), r"key 'gate\[0\].unit' is missing"),
+        (lambda c: c['gate'][0].update(passed=1), r'gate\[0\].passed: 1 is not true or false'),
+        (lambda c: c['correlation']['matrix'].pop(), 'correlation.matrix: 1 x 2 numbers, not'),
     ],
 )
 def test_a_damaged_calibration_is_refused_by_file_and_key(tmp_path, change, says) -> None:

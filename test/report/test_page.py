@@ -121,16 +121,16 @@ def test_a_refused_calibration_says_why(folder: Path, tmp_path: Path) -> None:
 def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: Path) -> None:
     calibration = read_calibration(folder / CALIBRATION_FILE)
     assert len(calibration.gate) > 15
-    not_kept = dataclasses.replace(calibration.gate[2], found=8.125, kept=False)
-    not_checked = next(check for check in calibration.gate if check.kept is None)
-    shown = dataclasses.replace(calibration, gate=(not_kept, not_checked))
+    failed = dataclasses.replace(calibration.gate[2], found=8.125, passed=False)
+    not_checked = next(check for check in calibration.gate if check.passed is None)
+    shown = dataclasses.replace(calibration, gate=(failed, not_checked))
     write_calibration(shown, tmp_path / CALIBRATION_FILE)
     table = re.findall(r'<table class="limits">.*?</table>', page_of(tmp_path), re.DOTALL)[0]
     rows = [re.findall(r'<t[hd][^>]*>(.*?)</t[hd]>', row) for row in table.split('<tr>')[2:]]
     limit = f'at most {not_checked.limit_text}'
     names = [f'{check.name} <code>{check.option}</code>' for check in shown.gate]
     assert rows == [
-        [names[0], 'not kept', '8.125 px', 'at most 1 px', ''],
+        [names[0], 'failed', '8.125 px', 'at most 1 px', ''],
         [names[1], 'not checked', '', limit, not_checked.note],
     ]
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import json
 from pathlib import Path
 import re
+from typing import Any
 
 import pytest
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
@@ -81,8 +82,12 @@ def test_each_path_is_a_field_of_a_published_topic(path: str) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     for file in (ROOT / 'msg').glob('*.msg'):
         store.register(get_types_from_msg(file.read_text(), f'starcal/msg/{file.stem}'))
-    fields = dict(store.fielddefs[kind][1])
+    fields: dict[str, Any] = dict(store.fielddefs[kind][1])
     for part in re.findall(r'\.(\w+)(\[)?', match[2]):
         assert part[0] in fields
-        is_array = int(fields[part[0]][0]) in (3, 4)  # rosbags: array, sequence
+        node, description = fields[part[0]]
+        is_array = int(node) in (3, 4)  # rosbags: array, sequence
         assert is_array == bool(part[1])
+        if is_array:
+            node, description = description[0]
+        fields = dict(store.fielddefs[description][1]) if int(node) == 2 else {}  # 2: a message
