@@ -692,7 +692,7 @@ class Calibration:
     active_since_ns: int = 0
     forced: bool = False
     halves: HalvesComparison | None = None
-    model: ModelChecks | None = None
+    model_checks: ModelChecks | None = None
     field: ResidualField | None = None
     gate: tuple[GateCheck, ...] = ()
 

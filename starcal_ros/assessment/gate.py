@@ -233,7 +233,7 @@ def judge(
         *checks,
         *_fit(calibration, options, estimation),
         *_halves(calibration.halves, options),
-        *_model(calibration.model, options, estimation),
+        *_model(calibration.model_checks, options, estimation),
         *_precision(calibration, options),
         *_changes(calibration, prior, active, options),
     )

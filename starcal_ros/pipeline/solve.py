@@ -206,6 +206,6 @@ def _not_judged(
         correlation=correlation(result.shared_covariance, result.shared_names),
         removals=removal_study(result),
         halves=halves,
-        model=model_checks(result),
+        model_checks=model_checks(result),
         field=_field_record(result),
     )

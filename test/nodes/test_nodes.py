@@ -501,8 +501,8 @@ class Interrupt:
         if name == 'starcal_ros.pipeline.setup':
             signal.raise_signal(signal.SIGINT)
 sys.meta_path.insert(0, Interrupt())
-from starcal_ros.nodes import start
-start.{}()
+from starcal_ros.nodes import entry_points
+entry_points.{}()
 """
 
 
