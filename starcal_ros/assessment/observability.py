@@ -1,4 +1,4 @@
-"""What an ensemble can tell: information, predicted sigmas, coverage, line-of-sight map."""
+"""Observability of an ensemble: information, predicted sigmas, coverage, line-of-sight maps."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ from starcal_ros.records import (
 Floats = NDArray[np.float64]
 
 COVERAGE_ROWS, COVERAGE_COLS = 8, 10  # cells of 2 degrees on the paper's camera
-GRID = 25  # pixels along each side of the detector at which maps are compared
-MAP_ROWS, MAP_COLS = 16, 20  # of a smooth surface of degree seven
+GRID = 25  # points along each side of the detector at which maps are compared
+MAP_ROWS, MAP_COLS = 16, 20  # enough for a polynomial surface of degree seven
 
 
 def coverage(ensemble: Ensemble, camera: CameraModel) -> NDArray[np.int64]:
-    """Star observations in each focal-plane cell, (8, 10)."""
+    """Count of star observations in each focal-plane cell, (8, 10)."""
     return stars_in_cells(star_table(ensemble.images).measured_px, camera)
 
 
 def stars_in_cells(pixels: Floats, camera: CameraModel) -> NDArray[np.int64]:
-    """Pixels (n, 2) in each focal-plane cell, (8, 10)."""
+    """Count of pixels (n, 2) in each focal-plane cell, (8, 10)."""
     counts, _, _ = np.histogram2d(
         pixels[:, 1],
         pixels[:, 0],
@@ -62,9 +62,9 @@ def image_information(
     """
     Information (m, k, k) of each image on the k unknowns that all images share, at the prior.
 
-    Those are the estimated camera parameters, then the terms of temperature where these images
-    carry them, and the alignment where the method has one; the rotation of the image is
-    eliminated.  An image with fewer than three stars before the camera tells nothing.
+    These are the estimated camera parameters, the temperature terms if these images support them,
+    and the alignment if the method has one; the rotation of the image is eliminated.  An image
+    with fewer than three stars in front of the camera has zero information.
     """
     ensemble = Ensemble(images)
     order, with_rate = _supported_terms(ensemble, options)
@@ -75,7 +75,7 @@ def image_information(
 
 
 def estimated_names(options: CalibrationOptions) -> tuple[str, ...]:
-    """Names of all that is to be estimated: camera, terms of temperature, alignment, its rate."""
+    """Names of the estimated parameters: camera, temperature terms, alignment and its rate."""
     names = shared_names(options.focal_temperature_order, options.alignment_temperature)
     return tuple(name for name in names if name not in PARAMETER_NAMES or name in options.estimate)
 
@@ -84,11 +84,11 @@ def predicted_sigma(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> Floats:
     """
-    1-sigma (k,) of `estimated_names`, as a calibration would report it, before it is made.
+    1-sigma (k,) of `estimated_names` that a calibration would report, predicted at the prior.
 
-    From the covariances of centroids and star tracker as given, at the prior geometry; infinite
-    where not observable yet.  Terms of temperature that the images carry are among what is
-    estimated, so all sigmas account for them.
+    Uses the covariances of centroids and star tracker as given; infinite for parameters that are
+    not observable yet.  Temperature terms that the images support are estimated jointly, so all
+    sigmas account for them.
     """
     names = estimated_names(options)
     if not ensemble.images:
@@ -96,13 +96,13 @@ def predicted_sigma(
     terms = _supported_terms(ensemble, options)
     found = _sigma_with(ensemble, prior, options, *terms)
     if not found and terms != (0, False):
-        # So would the calibration: without them, where they are not observable.
+        # As the calibration does: without temperature terms if they are not observable.
         found = _sigma_with(ensemble, prior, options, 0, False)
     return np.array([found.get(name, np.inf) for name in names])
 
 
 def _supported_terms(ensemble: Ensemble, options: CalibrationOptions) -> tuple[int, bool]:
-    """Order of the focal terms and whether a rate, as asked for and carried by the images."""
+    """Order of the focal terms and whether a rate, if requested and supported by the images."""
     order, with_rate = options.focal_temperature_order, options.alignment_temperature
     temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
     if (order or with_rate) and why_unsupported(temperatures_degc, order):
@@ -117,7 +117,7 @@ def _at_the_prior(
     order: int,
     with_rate: bool,
 ) -> tuple[Problem, State, Floats, bool]:
-    """What the estimate starts from, its normal matrices, and whether all stars are in front."""
+    """Problem, initial state, normal matrices, and whether all stars are in front."""
     problem = problem_of(ensemble, prior, options)
     state = start_of(problem, prior, order, with_rate)
     table = star_table(ensemble.images)
@@ -134,7 +134,7 @@ def _sigma_with(
     order: int,
     with_rate: bool,
 ) -> dict[str, float]:
-    """1-sigma by name; none where not observable."""
+    """1-sigma by name; empty if not observable."""
     problem, state, blocks, in_front = _at_the_prior(ensemble, prior, options, order, with_rate)
     seen = np.einsum('mii->m', blocks) > 0
     try:
@@ -151,7 +151,7 @@ def _sigma_with(
 def ensemble_status(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> EnsembleStatus:
-    """What has been collected and what a calibration from it would be worth."""
+    """Counts, coverage and predicted sigmas of an ensemble."""
     return EnsembleStatus(
         time_ns=ensemble.images[-1].time_ns if ensemble.images else 0,
         images=len(ensemble.images),
@@ -167,20 +167,20 @@ def ensemble_status(
 
 def weakest_direction(information: Floats, names: tuple[str, ...]) -> tuple[Floats, str]:
     """
-    Singular values of scaled information, and what it tells least of, in words.
+    Singular values of the scaled information, and its weakest direction as text.
 
     Parameters
     ----------
     information : (k, k)
-        On the named parameters.
+        Information on the named parameters.
 
     Returns
     -------
     singular_values : (k,)
-        Of the information scaled to a unit diagonal, largest first: square roots of its
-        eigenvalues.
+        Square roots of the eigenvalues of the information scaled to a unit diagonal, largest
+        first.
     text : str
-        Which parameters can hardly be told apart.
+        Parameters that are nearly indistinguishable.
     """
     scale = 1.0 / np.sqrt(np.diag(information))
     values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
@@ -189,11 +189,11 @@ def weakest_direction(information: Floats, names: tuple[str, ...]) -> tuple[Floa
     largest = [i for i in np.argsort(-np.abs(direction)) if abs(direction[i]) > 0.3]
     terms = ', '.join(f'{names[i]} ({direction[i]:+.2f})' for i in largest)
     if len(largest) < 2:
-        return singular, f'{terms} is known least, and by itself'
+        return singular, f'{terms}, uncorrelated with the others'
     worse = 1.0 / max(float(singular[-1]), 1e-300)
     return singular, (
-        f'{terms} can hardly be told apart: together they are known {worse:.0f} times worse than '
-        'each would be alone'
+        f'{terms} are nearly indistinguishable: their combination has {worse:.0f} times the sigma '
+        'that it would have without correlation'
     )
 
 
@@ -201,10 +201,9 @@ def keep_most_informative(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> Ensemble:
     """
-    The ensemble without its least informative images, down to ``max_images``.
+    Ensemble without its least informative images, at most ``max_images``.
 
-    One by one the image goes whose information weighs least against that of all:
-    ``trace(total^-1 information_k)``.
+    Removes, one at a time, the image k with the least ``trace(total^-1 information_k)``.
     """
     if len(ensemble.images) <= options.max_images:
         return ensemble
@@ -227,8 +226,8 @@ def line_of_sight_sigma_arcsec(
     """
     1-sigma (rows, columns) of the line of sight of pixels in the star tracker frame, arcsec.
 
-    Root of the summed variance of the two angles, from the (13, 13) covariance of camera and
-    alignment.
+    Square root of the sum of the variances of the two angles, from the (13, 13) covariance of
+    camera and alignment.
     """
     _, J = _line_of_sight_jacobian(camera, columns, rows)
     variance = np.einsum('nij,jk,nik->n', J, covariance, J)
@@ -236,7 +235,7 @@ def line_of_sight_sigma_arcsec(
 
 
 def map_sigma_px(camera: CameraModel, covariance: Floats, columns: int = 25) -> Floats:
-    """1-sigma (columns * columns,) of `shape_sigma_rad`, in pixels at the centre."""
+    """`shape_sigma_rad` on a square grid, flattened (columns * columns,), px at the centre."""
     sigma_rad = shape_sigma_rad(camera, covariance, columns, columns)
     return np.asarray(sigma_rad.ravel() * camera.parameters[0])
 
@@ -247,13 +246,13 @@ def shape_sigma_rad(
     """
     1-sigma (rows, columns) of the shape of the distortion map at a grid of pixels, rad.
 
-    What a turn common to all pixels can take up (pointing, and most of a moved principal point) is
+    A rotation common to all pixels (pointing, and most of a shift of the principal point) is
     removed: it belongs to the alignment.
     """
     directions, J = _line_of_sight_jacobian(camera, columns, rows)
     J = J[:, :, :10].reshape(-1, 10)
-    turns = np.stack([np.cross(axis, directions) for axis in np.eye(3)], axis=-1)
-    Q, _ = np.linalg.qr(turns.reshape(-1, 3))
+    rotations = np.stack([np.cross(axis, directions) for axis in np.eye(3)], axis=-1)
+    Q, _ = np.linalg.qr(rotations.reshape(-1, 3))
     J = (J - Q @ (Q.T @ J)).reshape(-1, 3, 10)
     variance = np.einsum('nij,jk,nik->n', J, covariance[:10, :10], J)
     return np.asarray(np.sqrt(variance).reshape(rows, columns))
@@ -261,20 +260,19 @@ def shape_sigma_rad(
 
 def map_error_px(found: CameraModel, true: CameraModel) -> float:
     """
-    RMS over the detector between the lines of sight of two cameras, px at the focal length.
+    RMS difference over the detector of the lines of sight of two cameras, px at the focal length.
 
-    The turn of all lines of sight that brings the two closest is removed: a calibration puts it
-    into the alignment.
+    The best-fit common rotation is removed: a calibration assigns it to the alignment.
     """
     grid = pixel_grid(true, GRID, GRID)
     of_found, of_true = line_of_sight(found, grid), line_of_sight(true, grid)
-    turn, _ = Rotation.align_vectors(of_true, of_found)
-    angle = np.linalg.norm(turn.apply(of_found) - of_true, axis=1)
+    rotation, _ = Rotation.align_vectors(of_true, of_found)
+    angle = np.linalg.norm(rotation.apply(of_found) - of_true, axis=1)
     return float(np.sqrt(np.mean(angle**2)) * true.parameters[0])
 
 
 def detector_maps(camera: CameraModel, covariance: Floats, pixels: Floats) -> DetectorMaps:
-    """Maps of a camera with a covariance (13, 13) that is from stars at pixels (n, 2)."""
+    """Maps of a camera and its covariance (13, 13), estimated from stars at pixels (n, 2)."""
     return DetectorMaps(
         stars_in_cells(pixels, camera),
         line_of_sight_sigma_arcsec(camera, covariance, MAP_COLS, MAP_ROWS),
@@ -283,7 +281,7 @@ def detector_maps(camera: CameraModel, covariance: Floats, pixels: Floats) -> De
 
 
 def correlation(covariance: Floats, names: tuple[str, ...]) -> Correlation:
-    """Correlations of the named numbers of a covariance (k, k), those left out that have none."""
+    """Correlations of a covariance (k, k), without the rows of zero variance."""
     sigma = np.sqrt(np.diag(covariance))
     known = np.nonzero(sigma > 0)[0]
     matrix = covariance[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])
@@ -292,9 +290,9 @@ def correlation(covariance: Floats, names: tuple[str, ...]) -> Correlation:
 
 def movement_px(camera: CameraModel, changes: Floats) -> Floats:
     """
-    Worst movement (k,) over the detector of the image of a direction, px.
+    Largest shift (k,) over the detector of the image of a direction, px.
 
-    When the k-th of the camera parameters alone is less by ``changes`` (k,).
+    For each k, only the k-th camera parameter is reduced, by ``changes[k]``.
     """
     pixels = pixel_grid(camera, 25, 20)
     directions = line_of_sight(camera, pixels)
@@ -307,12 +305,12 @@ def _line_of_sight_jacobian(camera: CameraModel, columns: int, rows: int) -> tup
     """
     Lines of sight (n, 3) of a grid of pixels, and their derivatives (n, 3, 13).
 
-    By the camera parameters and the alignment angles, in the camera frame.  For a fixed pixel:
-    a direction moves so as to undo what the parameter does to its image.
+    With respect to the camera parameters and the alignment angles, in the camera frame, at a fixed
+    pixel: the direction moves so that it cancels the shift of its image by the parameter.
     """
     directions = line_of_sight(camera, pixel_grid(camera, columns, rows))
     _, J_parameters, J_rotation = project_jacobians(camera, directions)
-    # A turn about the line of sight itself moves nothing: the pseudo-inverse leaves it out.
+    # A rotation about the line of sight itself has no effect: the pseudo-inverse omits it.
     angles = np.linalg.pinv(J_rotation) @ J_parameters
     angles = np.concatenate([angles, np.broadcast_to(np.eye(3), (len(angles), 3, 3))], axis=-1)
     moved = np.cross(directions[:, None, :], np.swapaxes(angles, 1, 2))
