@@ -1,4 +1,4 @@
-"""What the tool prints of a calibration, a bag and a comparison."""
+"""Tables and lines that the tool prints for a calibration, a bag and a comparison."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from starcal_ros.utc import utc_text
 
 
 def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
-    """Print parameters, statistics and verdict; changes are against the prior."""
+    """Print parameters, statistics and verdict; changes are relative to the prior."""
     camera, sigma = calibration.geometry.camera, calibration.sigma
     rows = []
     for k, name in enumerate(PARAMETER_NAMES):
@@ -56,7 +56,7 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
 
 
 def print_inspection(inspection: Inspection) -> None:
-    """Print topics, images, attitudes and what would be refused."""
+    """Print topics, images, attitudes and refused images."""
     print_table(
         ('topic', 'type', 'messages', 'rate', 'longest gap'),
         [
@@ -79,7 +79,7 @@ def print_inspection(inspection: Inspection) -> None:
         _print_images(inspection)
     if inspection.status is not None:
         print_table(
-            ('a calibration now', '1-sigma'),
+            ('predicted', '1-sigma'),
             [
                 (name, _predicted(name, value))
                 for name, value in zip(
@@ -94,7 +94,7 @@ def print_inspection(inspection: Inspection) -> None:
     elif inspection.measured:
         print_verdict(True, 'can be calibrated')
     else:
-        print_verdict(True, 'nothing speaks against it so far; --params measures the stars too')
+        print_verdict(True, 'no problems found so far; use --params to measure the stars too')
 
 
 def _print_images(inspection: Inspection) -> None:
@@ -107,10 +107,10 @@ def _print_images(inspection: Inspection) -> None:
         + (f', with the attitudes of {chosen.attitude}' if chosen.attitude else '')
     )
     if inspection.longest_attitude_gap_s >= 0:
-        print(f'longest gap of attitudes about one: {inspection.longest_attitude_gap_s:.3g} s')
+        print(f'longest attitude gap around an image: {inspection.longest_attitude_gap_s:.3g} s')
     if inspection.refused:
         print_table(
-            ('refused', 'images', 'meaning', 'the first'),
+            ('refused', 'images', 'meaning', 'first'),
             [
                 (r.reason, str(r.count), r.meaning, f'{_clock(r.first_ns)}: {r.detail}')
                 for r in inspection.refused
@@ -120,8 +120,8 @@ def _print_images(inspection: Inspection) -> None:
     if inspection.stars_per_image:
         stars = inspection.stars_per_image
         print(
-            f'stars per image: {min(stars)} to {max(stars)}, {sum(stars)} in all; '
-            f'left out: {_counted(inspection.refused_stars)}'
+            f'stars per image: {min(stars)} to {max(stars)}, {sum(stars)} in total; '
+            f'refused: {_counted(inspection.refused_stars)}'
         )
 
 
@@ -149,15 +149,15 @@ def print_comparison(comparison: Comparison) -> None:
     print_table(
         ('lines of sight', 'worst', 'rms', 'worst', 'rms'),
         [
-            ('as they are', *_map_cells(comparison.before)),
-            ('less their common turn', *_map_cells(comparison.after)),
+            ('as calibrated', *_map_cells(comparison.before)),
+            ('common rotation removed', *_map_cells(comparison.after)),
         ],
     )
-    print(f'common turn     {comparison.turn_rad / ARCSECOND_RAD:.2f}"')
+    print(f'common rotation {comparison.turn_rad / ARCSECOND_RAD:.2f}"')
     if comparison.degrees:
         print(
-            f'all together    chi2 {comparison.chi2:.1f} of {comparison.degrees} degrees of '
-            f'freedom: chance alone does as much in {_percent(comparison.chance)}'
+            f'all parameters  chi2 {comparison.chi2:.1f}, {comparison.degrees} degrees of '
+            f'freedom, p-value {comparison.chance:.3g}'
         )
     for note in comparison.notes:
         print(f'note: {note}')
@@ -171,10 +171,6 @@ def _map_cells(found: DifferenceMap) -> Sequence[str]:
         return [*cells, '', '']
     worst, rms = known.max(), np.sqrt(np.mean(known**2))
     return [*cells, f'{worst:.2f} sigma', f'{rms:.2f} sigma']
-
-
-def _percent(chance: float) -> str:
-    return f'{100 * chance:.3g} % of cases' if chance >= 1e-4 else 'under 0.01 % of cases'
 
 
 def _sigmas(difference: float, sigma: float) -> str:
@@ -194,9 +190,9 @@ def _predicted(name: str, sigma: float) -> str:
 def _topic_notes(topic: TopicContent) -> list[str]:
     notes = [f'{utc_text(topic.first_ns)} to {_clock(topic.last_ns)}']
     if topic.kinds:
-        notes.append(', '.join(f'{count} of {kind}' for kind, count in topic.kinds.items()))
+        notes.append(', '.join(f'{count} x {kind}' for kind, count in topic.kinds.items()))
     if topic.bad:
-        notes.append(f'{topic.bad} of {topic.count} messages are not valid')
+        notes.append(f'{topic.bad} of {topic.count} messages are invalid')
     if topic.backward:
         notes.append(f'stamps go back {topic.backward} times')
     return notes
