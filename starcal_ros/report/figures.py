@@ -211,6 +211,7 @@ def _arrows(camera: CameraModel, places: Floats, arrows: Floats | None, name: st
         width=0.0035, headwidth=4,
     )  # fmt: skip
     axes.plot(*places.T, '.', color=MUTED, markersize=1.2)
+    axes.set_title(' ')  # reserves room: an arrow above the canvas would not be drawn
     # The key's text would otherwise take the colour of the arrows.
     axes.quiverkey(
         quiver, 0.9, 1.05, key, f'{key:g} px', labelpos='W', color=SERIES[1], labelcolor=INK,
