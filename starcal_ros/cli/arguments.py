@@ -186,7 +186,8 @@ class _TopFormatter(argparse.RawDescriptionHelpFormatter):
     """Aligns the summaries of the commands."""
 
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=14)
+        super().__init__(prog, max_help_position=15)
+        self._action_max_length = 13  # argparse neglects the indent of the longest, calibrate
 
 
 def parser() -> argparse.ArgumentParser:

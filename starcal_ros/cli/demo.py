@@ -20,6 +20,7 @@ import yaml
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.camera import PARAMETER_NAMES
+from starcal_ros.cli.terminal import table_lines
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
 from starcal_ros.products.calibration_json import read_calibration
@@ -220,10 +221,8 @@ def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeomet
     sigma = calibration.sigma
     off = (estimate - true) / sigma[columns]
     rows = zip(names, before, estimate, sigma[columns], true, off, strict=True)
-    header = ('parameter', 'prior', 'estimate', '1-sigma', 'truth', 'error')
-    lines = ['{:<12}{:>13}{:>13}{:>11}{:>13}{:>12}'.format(*header)]
-    lines += [
-        f'{name:<12}{b:>13.6g}{e:>13.6g}{s:>11.2g}{t:>13.6g}{o:>+6.1f} sigma'
+    table = [
+        (name, f'{b:.6g}', f'{e:.6g}', f'{s:.2g}', f'{t:.6g}', f'{o:+.1f} sigma')
         for name, b, e, s, t, o in rows
     ]
     # Alignment angles are relative to the truth.
@@ -231,10 +230,10 @@ def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeomet
     error_arcsec = alignment_difference_rad(calibration.geometry, truth) / ARCSECOND_RAD
     sigma_arcsec = sigma[10:] / ARCSECOND_RAD
     angles_off = error_arcsec / sigma_arcsec
-    lines += [
-        f'{"alignment " + axis:<12}{b:>+12.2f}"{e:>+12.2f}"{s:>10.2f}"{0:>12}"{o:>+6.1f} sigma'
-        for axis, b, e, s, o in zip(
-            'xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=True
-        )
+    angles = zip('xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=True)
+    table += [
+        (f'alignment {axis}', f'{b:+.2f}"', f'{e:+.2f}"', f'{s:.2f}"', '0"', f'{o:+.1f} sigma')
+        for axis, b, e, s, o in angles
     ]
-    return Comparison(tuple(lines), float(np.abs([*off, *angles_off]).max()))
+    header = ('parameter', 'prior', 'estimate', '1-sigma', 'truth', 'error')
+    return Comparison(tuple(table_lines(header, table)), float(np.abs([*off, *angles_off]).max()))

@@ -83,11 +83,16 @@ _OPTION_GROUPS: dict[str, type[Any]] = {
 OPTION_CLASSES = tuple(_OPTION_GROUPS.values())
 
 
-def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Setup:
+def load_setup(
+    values: Mapping[str, object],
+    others: Sequence[type] = (),
+    prior: CameraGeometry | None = None,
+) -> Setup:
     """
     Setup from a mapping of option names to values, all checked.
 
-    ``others`` are option classes of the caller whose names the mapping may also hold.
+    ``others`` are option classes of the caller whose names the mapping may also hold; ``prior``
+    replaces the camera file and alignment of the options.
 
     Raises
     ------
@@ -102,7 +107,7 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
             raise OptionError(f'{name}: no such parameter{nearest(name, known)}')
     groups = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS.items()}
     frames: SetupOptions = groups['frames']
-    prior = _prior(frames)
+    prior = prior or _prior(frames)
     check_options(groups['calibration'])
     path = Path(frames.catalog) if frames.catalog else None
     dark = _read_dark(frames.dark_frame, prior.camera.width, prior.camera.height)

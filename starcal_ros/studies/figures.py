@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 import io
 import itertools
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -50,6 +51,15 @@ def _values(rows: Sequence[Row], name: str) -> list[int | float | str]:
     return list(dict.fromkeys(row[name] for row in rows))
 
 
+def _look(method: object) -> dict[str, Any]:
+    """Plot settings of a method."""
+    colour, marker, width = _LOOKS[str(method)]
+    return {
+        'color': colour, 'marker': marker, 'markersize': width + 3, 'linewidth': width,
+        'label': method,
+    }  # fmt: skip
+
+
 def _log_axis(axes: Axes, which: str) -> None:
     """Logarithmic with plain numbers at 1, 2, 5."""
     axis = axes.xaxis if which == 'x' else axes.yaxis
@@ -80,18 +90,14 @@ def _table1(result: StudyResult) -> Figure:
         every = _where(result.rows, images=images, stars=stars)
         above, below = axes[0][k], axes[1][k]
         for method in _values(cell, 'method'):
-            colour, marker, width = _LOOKS[str(method)]
+            look = _look(method)
             rows = _where(cell, method=method)
             x = column(rows, 'tracker_arcsec')
             above.errorbar(
                 x, _MILLI * column(rows, 'map_px'), 2 * _MILLI * column(rows, 'map_px_sigma'),
-                color=colour, marker=marker, markersize=width + 3, linewidth=width, elinewidth=1,
-                capsize=2, label=method,
+                elinewidth=1, capsize=2, **look,
             )  # fmt: skip
-            below.plot(
-                x, column(rows, 'pointing_arcsec'),
-                color=colour, marker=marker, markersize=width + 3, linewidth=width, label=method,
-            )  # fmt: skip
+            below.plot(x, column(rows, 'pointing_arcsec'), **look)
         x = np.array(_values(cell, 'tracker_arcsec'), np.float64)
         for axis, name, scale in (
             (above, 'bound_px', _MILLI),
@@ -118,18 +124,13 @@ def _images(result: StudyResult) -> Figure:
         cell = _where(result.summary, stars=stars, tracker_arcsec=tracker)
         every = _where(result.rows, stars=stars, tracker_arcsec=tracker)
         for method in _values(cell, 'method'):
-            colour, marker, width = _LOOKS[str(method)]
             rows = _where(cell, method=method)
             x = column(rows, 'images')
             for axis, y in (
                 (left, _MILLI * column(rows, 'map_px')),
                 (right, 100 * (column(rows, 'unused_to_true') - 1)),
             ):
-                axis.plot(
-                    x, y,
-                    color=colour, marker=marker, markersize=width + 3, linewidth=width,
-                    label=method,
-                )  # fmt: skip
+                axis.plot(x, y, **_look(method))
         x = np.array(_values(cell, 'images'), np.float64)
         bound = [np.sqrt(np.mean(column(_where(every, images=m), 'bound_px') ** 2)) for m in x]
         left.plot(x, _MILLI * np.array(bound), 'k--', linewidth=1, label='Cramér-Rao bound')

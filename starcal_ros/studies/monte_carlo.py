@@ -22,7 +22,7 @@ from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, CameraGeometry, Ensemble
+from starcal_ros.records import CALIBRATION_PARAMETER_NAMES, Ensemble
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.studies.trials import (
     bound,
@@ -167,26 +167,27 @@ def _cells(design: Design, field: StarField) -> Iterable[tuple[Row, StarField]]:
 
 
 def _solutions(
-    design: Design, ensemble: Ensemble, field: StarField, tracker_arcsec: float
-) -> Iterable[tuple[str, Estimate]]:
-    """Each method with its estimate; methods with too few observations are left out."""
+    design: Design, cell: Row, ensemble: Ensemble, field: StarField, tracker_arcsec: float
+) -> Iterable[tuple[Row, Estimate]]:
+    """Key and errors, and estimate, of each method; without those with too few observations."""
     for method in design.methods:
         options = calibration_options(method, design.assumed(tracker_arcsec))
         try:
             estimate = estimate_calibration(ensemble, field.prior, options)
         except TooFewObservations:
             continue
-        yield method, estimate
-
-
-def _score(estimate: Estimate, truth: CameraGeometry) -> Row:
-    """Errors of an estimate, absolute and relative to its reported covariance."""
-    return {
-        'map_px': map_error_px(estimate.geometry.camera, truth.camera),
-        'pointing_arcsec': pointing_error_arcsec(estimate.geometry, truth),
-        'normalised': normalised_error_squared(estimate, truth),
-        'converged': int(estimate.termination == 'converged'),
-    }
+        yield (
+            {
+                **cell,
+                'tracker_arcsec': tracker_arcsec,
+                'method': method,
+                'map_px': map_error_px(estimate.geometry.camera, field.truth.camera),
+                'pointing_arcsec': pointing_error_arcsec(estimate.geometry, field.truth),
+                'normalised': normalised_error_squared(estimate, field.truth),
+                'converged': int(estimate.termination == 'converged'),
+            },
+            estimate,
+        )
 
 
 def _table1_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
@@ -201,13 +202,10 @@ def _table1_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
             own['hierarchical'] = map_bound_px(camera, best)
             pointing = pointing_bound_arcsec(camera, best)
             ensemble = observe(part, tracker)
-            for method, estimate in _solutions(design, ensemble, field, tracker):
+            for row, _ in _solutions(design, cell, ensemble, field, tracker):
                 yield {
-                    **cell,
-                    'tracker_arcsec': tracker,
-                    'method': method,
-                    **_score(estimate, field.truth),
-                    'own_bound_px': own[method],
+                    **row,
+                    'own_bound_px': own[str(row['method'])],
                     'per_image_bound_px': own['per_image'],
                     'bound_px': own['hierarchical'],
                     'pointing_bound_arcsec': pointing,
@@ -226,12 +224,9 @@ def _images_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
         for tracker in design.tracker_arcsec:
             least = map_bound_px(camera, bound('hierarchical', blocks, tracker))
             ensemble = observe(part, tracker)
-            for method, estimate in _solutions(design, ensemble, field, tracker):
+            for row, estimate in _solutions(design, cell, ensemble, field, tracker):
                 yield {
-                    **cell,
-                    'tracker_arcsec': tracker,
-                    'method': method,
-                    **_score(estimate, field.truth),
+                    **row,
                     'bound_px': least,
                     'unused_px': unused_residual_px(estimate.geometry.camera, unused),
                     'unused_true_px': floor,
@@ -277,15 +272,12 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
         for tracker, share in itertools.product(design.tracker_arcsec, (0.0, OUTLIER_SHARE)):
             least = map_bound_px(camera, bound('hierarchical', blocks, tracker))
             ensemble = observe(part, tracker, share)
-            for method, estimate in _solutions(design, ensemble, field, tracker):
+            key: Row = {**cell, 'outlier_share': share}
+            for row, estimate in _solutions(design, key, ensemble, field, tracker):
                 sigma = np.sqrt(np.diag(estimate.covariance))[ESTIMATED]
                 error = errors(estimate.geometry, field.truth)[ESTIMATED]
                 yield {
-                    **cell,
-                    'tracker_arcsec': tracker,
-                    'outlier_share': share,
-                    'method': method,
-                    **_score(estimate, field.truth),
+                    **row,
                     'reported_px': map_bound_px(estimate.geometry.camera, estimate.covariance),
                     'bound_px': least,
                     'rejected': int((~estimate.kept).sum()),

@@ -17,26 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate, estimate_calibration
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.normal_equations import squared_sigmas, star_table
 from starcal_ros.estimation.problem import METHODS
-from starcal_ros.identification.star_finder import IdentificationOptions
-from starcal_ros.image.centroiding import CentroidOptions
-from starcal_ros.image.frame_checks import ScreeningOptions
-from starcal_ros.image.hot_pixels import FixedPatternOptions
 from starcal_ros.pipeline.observe import observe
-from starcal_ros.pipeline.setup import Setup, SetupOptions
+from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Ensemble, Removal, StarObservations
 from starcal_ros.simulation.images import fixed_pattern, render
 from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenario, scene
-from starcal_ros.sky.astrometry import SiteOptions
-from starcal_ros.sky.attitude import AttitudeHistory, AttitudeOptions
-from starcal_ros.sky.catalog import load_catalog
+from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.studies.monte_carlo import Design, Row
 from starcal_ros.studies.summary import StudyResult
 
@@ -121,23 +114,8 @@ class PaperStudy:
 def setup_of(seed: int) -> Setup:
     """Default options with the prior of the scenario."""
     night = scenario(NIGHT, seed)
-    identification = IdentificationOptions()
-    return Setup(
-        frames=SetupOptions(),
-        attitude=AttitudeOptions(),
-        site=SiteOptions(),
-        screening=ScreeningOptions(),
-        fixed_pattern=FixedPatternOptions(),
-        centroid=CentroidOptions(),
-        identification=identification,
-        calibration=CalibrationOptions(
-            star_tracker_sigma_arcsec=night.star_tracker_sigma_arcsec,
-        ),
-        gate=GateOptions(),
-        prior=night.prior,
-        catalog=load_catalog(None, identification.magnitude_limit),
-        dark=None,
-    )
+    values = {'star_tracker_sigma_arcsec': night.star_tracker_sigma_arcsec}
+    return load_setup(values, prior=night.prior)
 
 
 @functools.lru_cache(maxsize=1)
