@@ -1,9 +1,9 @@
 """
 Whether the sigma holds where the world differs from the model.
 
-Each row is a world: a lens, a detector or a star tracker with a fault of a stated size.  Every seed
-renders a campaign of star images in that world, measures it as the observer does, and solves it
-with the default options.  The error of the lines of sight over the detector, the best common
+Each row is a world: a lens, a detector or a star tracker with a fault of a stated size.  Every
+seed renders a campaign of star images in that world, measures it as the observer does, and solves
+it with the default options.  The error of the lines of sight over the detector, the best common
 rotation removed, is divided by the 1-sigma that the calibration reports.  A row is honest where
 the RMS of that ratio over the accepted calibrations is 0.7 to 1.5 and none exceeds 2, or where the
 gate refuses and names the cause.
@@ -175,7 +175,7 @@ def trial(world: World, seed: int) -> Outcome:
     camera = scenario.truth.camera
     pixels = pixel_grid(camera, _GRID, _GRID)
     true = true_directions(world, scenario, pixels)
-    table = line_of_sight_table(found, pixels)
+    table = line_of_sight_table(found.geometry.camera, found.joint_covariance, pixels)
     rotation, _ = Rotation.align_vectors(true, table.direction_camera)
     shape_rad = np.linalg.norm(rotation.apply(table.direction_camera) - true, axis=1)
     to_tracker = (
@@ -238,13 +238,11 @@ def _wide(geometry: CameraGeometry) -> CameraGeometry:
     return dataclasses.replace(geometry, camera=camera)
 
 
-def frames(
-    world: World, scenario: Scenario
-) -> list[tuple[Image, list[AttitudeSample]]]:
+def frames(world: World, scenario: Scenario) -> list[tuple[Image, list[AttitudeSample]]]:
     """All frames of a campaign in a world, with the star tracker's samples about each."""
     pattern = simulated_images.fixed_pattern(scenario)
     rng = np.random.default_rng([scenario.seed, 78])
-    wander_rad = np.zeros(3)
+    wander_rad: Floats = np.zeros(3)
     step = math.exp(-1.0 / _WANDER_IMAGES)
     made = []
     first: Image | None = None
@@ -254,7 +252,7 @@ def frames(
         if world.name == 'one image' and first is not None:
             noise = rng.integers(-1, 2, first.pixels.shape)
             pixels = np.clip(first.pixels.astype(np.int64) + noise, 0, scenario.detector.full_dn)
-            image = Image(shown.time_ns, pixels.astype(first.pixels.dtype))
+            image = Image(shown.time_ns, pixels.astype(np.uint16))
         else:
             image = simulated_images.render(scenario, moved, index, pattern)
         first = first or image
@@ -365,4 +363,3 @@ def true_directions(world: World, scenario: Scenario, pixels: Floats) -> Floats:
     for _ in range(60):  # the displacement is a contraction: 0.1 px of 10 px at most
         at = pixels - field(at)
     return line_of_sight(scenario.truth.camera, at)
-

@@ -1,7 +1,7 @@
 """
 Draw the pictures of docs/gallery.md: ``python -m docs.make_gallery [DIR]``.
 
-Every picture is what `starcal` says of a simulated frame that was spoilt on purpose.
+Every picture is a simulated frame with an artificial fault, annotated by `starcal`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Picture = NDArray[np.uint8]
 
 SCENARIO = scenario.scenario('tiny')
 PLAIN = setup_of(SCENARIO)
-# Fainter stars would cover the pictures with their marks.
+# The marks of fainter stars would cover the pictures.
 SETUP = dataclasses.replace(
     PLAIN, identification=dataclasses.replace(PLAIN.identification, magnitude_limit=7.5)
 )
@@ -37,7 +37,7 @@ SHAPE = (SCENARIO.truth.camera.height, SCENARIO.truth.camera.width)
 FULL_DN = SCENARIO.detector.full_dn
 FIELD = 7  # of some hundred stars, bright and faint
 DRAWN_PX = (400, 320)
-ABOUT_PX = 12  # half width of what is shown about a star
+ABOUT_PX = 12  # half width of the picture of a star
 ENLARGED = 7
 
 
@@ -54,13 +54,13 @@ def electrons(smear_px: float = 0.0, field: int = FIELD) -> Floats:
 
 
 def expose(mean: Floats) -> NDArray[np.uint16]:
-    """A frame of a mean signal, always with the same noise."""
+    """Frame with a mean signal and always the same noise."""
     pixels = simulated_images.expose(mean, SCENARIO.detector, np.random.default_rng(8))
     return pixels.astype(np.uint16)
 
 
 def attitudes(field: int = FIELD, reported: int | None = None) -> AttitudeHistory:
-    """What the star tracker says about a frame: the truth, or the attitude of another field."""
+    """Star tracker samples of a frame: the true attitude, or that of another field."""
     held = AttitudeHistory()
     told = scenario.attitude_samples(SCENARIO, field if reported is None else reported)
     for sample, at in zip(told, scenario.attitude_samples(SCENARIO, field), strict=True):
@@ -69,7 +69,7 @@ def attitudes(field: int = FIELD, reported: int | None = None) -> AttitudeHistor
 
 
 def whole_frames() -> Mapping[str, tuple[Image, StarObservations]]:
-    """Name of a picture -> a frame and what became of it."""
+    """Name of a picture -> frame and observations."""
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     time_ns, sound = SCENARIO.time_ns(FIELD), electrons()
     pixels, before = expose(sound), expose(electrons(field=FIELD - 1))
@@ -123,7 +123,7 @@ def drawn(image: Image, observations: StarObservations) -> Picture:
 
 
 def spoilt_stars() -> tuple[Image, StarObservations]:
-    """A frame in which single stars have met with an accident each, and what became of them."""
+    """Frame with faults at single stars, and its observations."""
     plain = observe.observe(
         Image(SCENARIO.time_ns(FIELD), expose(electrons())), attitudes(), SETUP, SETUP.prior
     )
@@ -147,7 +147,7 @@ def spoilt_stars() -> tuple[Image, StarObservations]:
 
 
 def star_sheet(image: Image, observations: StarObservations) -> Picture:
-    """The brightest star of each reason, enlarged, and one that was used."""
+    """The brightest star of each reason and a used one, enlarged."""
     magnitude = dict(zip(SETUP.catalog.id.tolist(), SETUP.catalog.magnitude, strict=True))
     brightness = np.array([magnitude[star] for star in observations.refused_catalog_id.tolist()])
     usable = observations.measured_px[np.argsort(-observations.snr)]
@@ -166,7 +166,7 @@ def star_sheet(image: Image, observations: StarObservations) -> Picture:
 def _close_up(
     image: Image, observations: StarObservations, reason: str, centre: NDArray[np.int_]
 ) -> Picture:
-    """The pixels about a star, with its mark, under its reason."""
+    """Pixels around a star with its mark, below the name of its reason."""
     side = 2 * ABOUT_PX + 1
     rim = (ABOUT_PX,) * 2
     background = round(observations.background_dn)
@@ -196,7 +196,7 @@ def main() -> None:
     pictures = {f'gallery_{name}': drawn(*frame) for name, frame in whole_frames().items()}
     pictures['gallery_stars'] = star_sheet(*spoilt_stars())
     for name, picture in pictures.items():
-        # Few steps of brightness: noise compresses badly, and nobody sees the difference.
+        # Few brightness levels look the same and compress better.
         small = picture // 16 * 17 if name == 'gallery_glare' else picture // 48 * 51
         cv2.imwrite(str(folder / f'{name}.png'), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 

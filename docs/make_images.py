@@ -1,8 +1,8 @@
 """
-Draw the pictures of the README and the documents: ``python docs/make_images.py [DIR]``.
+Draw the pictures of the README and the documents: ``python -m docs.make_images [DIR]``.
 
-The package computes everything shown from the simulated campaign `small`, seed 1, and the bag in
-the repository, so the pictures can be made again after a change and the numbers are the run's.
+All pictures are computed from the simulated campaign `small`, seed 1, and the bag in the
+repository, so they can be redrawn after a change.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ CLOSE_UP_FIRST, CLOSE_UP_SIZE = (826, 520), (270, 212)  # a part with bright and
 
 
 def setup_of(scenario: Scenario) -> Setup:
-    """What `starcal calibrate` would start on a simulated campaign with."""
+    """Setup of `starcal calibrate` for a simulated campaign."""
     with tempfile.TemporaryDirectory() as folder:
         camera, params = Path(folder, 'camera.yaml'), Path(folder, 'params.yaml')
         write_camera_info(scenario.prior.camera, camera)
@@ -56,7 +56,7 @@ def setup_of(scenario: Scenario) -> Setup:
 
 
 def observe(scenario: Scenario, setup: Setup, image: Image, index: int) -> StarObservations:
-    """The stars of one simulated image."""
+    """Observations of one simulated image."""
     attitudes = AttitudeHistory()
     for sample in synthetic.attitude_samples(scenario, index):
         attitudes.add(sample.time_ns, sample)
@@ -112,7 +112,7 @@ def part_of(
 def star_field(
     image: Image, observations: StarObservations, prior: CameraGeometry, file: Path
 ) -> None:
-    """A whole image with its matches, and beside it an enlarged part."""
+    """An image with its identified stars, and an enlarged part of it."""
     size = (prior.camera.width, prior.camera.height)
     whole = part_of(image, observations, prior, (0, 0), size, 810)
     close = part_of(image, observations, prior, CLOSE_UP_FIRST, CLOSE_UP_SIZE, 810)
@@ -125,12 +125,12 @@ def star_field(
     height = min(len(whole), len(close))
     gap = np.full((height, 10, 3), 255, np.uint8)
     picture = np.hstack([whole[:height], gap, close[:height]])
-    # Sixteen steps of brightness: noise compresses badly, and nobody sees the difference.
+    # Sixteen brightness levels look the same and compress better.
     cv2.imwrite(str(file), picture // 16 * 17, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 def focal_plane(ensemble: Ensemble, setup: Setup, file: Path) -> None:
-    """The distortion found, and where the stars stood that it was found from."""
+    """The estimated distortion and the star positions it was estimated from."""
     calibration = solve.solve(ensemble, setup)
     camera = calibration.geometry.camera
     figure = Figure(figsize=(11, 4.6), layout='constrained')
@@ -144,14 +144,14 @@ def focal_plane(ensemble: Ensemble, setup: Setup, file: Path) -> None:
     coarse = pixel_grid(camera, 14, 11)
     arrows = distortion_px(camera, coarse)
     left.quiver(*coarse.T, *arrows.T, angles='xy', color='0.4', width=0.003)
-    left.set_title('distortion found')
+    left.set_title('estimated distortion')
 
     counts = coverage(ensemble, camera)
     extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
     cells = right.imshow(counts, extent=extent, cmap='Blues', vmin=0)
     stars = np.concatenate([observed.measured_px for observed in ensemble.images])
     right.plot(*stars.T, '.', color='0.2', markersize=0.8)
-    figure.colorbar(cells, ax=right, shrink=0.85, label='star observations in a cell')
+    figure.colorbar(cells, ax=right, shrink=0.85, label='star observations per cell')
     right.set_title(f'{calibration.stars_used} stars in {calibration.images_used} images')
     for axes in (left, right):
         axes.set(xlim=extent[:2], ylim=extent[2:], aspect='equal', xlabel='u, px', ylabel='v, px')
@@ -159,10 +159,10 @@ def focal_plane(ensemble: Ensemble, setup: Setup, file: Path) -> None:
 
 
 def report_page(file: Path) -> None:
-    """The first screen of the small bag's report, as a browser shows it."""
+    """Top of the small bag's report in a browser."""
     browser = next(filter(None, map(shutil.which, ('chromium', 'google-chrome'))), None)
     if browser is None:
-        print(f'{file.name}: not drawn, there is no chromium here')
+        print(f'{file.name}: not drawn, chromium is not installed')
         return
     with tempfile.TemporaryDirectory() as folder:
         arguments = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', folder]
@@ -170,6 +170,8 @@ def report_page(file: Path) -> None:
         look = [
             '--headless',
             '--no-sandbox',
+            '--disable-gpu',
+            '--disable-background-networking',
             '--hide-scrollbars',
             f'--window-size={",".join(map(str, REPORT_SIZE))}',
             f'--screenshot={file.resolve()}',

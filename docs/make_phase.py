@@ -1,8 +1,8 @@
 """
-Draw how centroids depend on the phase in the pixel: ``python -m docs.make_phase [FILE]``.
+Draw the centroid error against the pixel phase: ``python -m docs.make_phase [FILE]``.
 
-Stars of one brightness, each anywhere in its pixel, are rendered and measured by either method:
-the mean error for every tenth of a pixel, and the amplitude of its first wave.
+Stars of one brightness at random pixel phases are rendered and measured by both methods; shown are
+the mean error for every tenth of a pixel, and the amplitude of its first harmonic.
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ def main() -> None:
             sigma = np.sqrt(np.bincount(part, error**2, minlength=BINS)) / count
             middle = 0.5 * (edges[1:] + edges[:-1])
             axes.errorbar(middle, mean, sigma, marker='.', label=f'S/N {snr:.0f}')
-            wave = 2 * abs(np.mean(error * np.exp(2j * np.pi * phase)))
-            chance = 2 * np.sqrt(np.mean(error**2) / len(error))
-            print(f'{method:<7} S/N {snr:6.1f}  wave {wave:.4f} px, by chance {chance:.4f} px')
+            harmonic = 2 * abs(np.mean(error * np.exp(2j * np.pi * phase)))
+            noise = 2 * np.sqrt(np.mean(error**2) / len(error))
+            print(f'{method:<7} S/N {snr:6.1f}  harmonic {harmonic:.4f} px, noise {noise:.4f} px')
         axes.axhspan(-0.01, 0.01, color='0.9', zorder=0)
         axes.set(title=method, xlabel='place of the star in its pixel, px')
     panels[0].set_ylabel('mean error, px')

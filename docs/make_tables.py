@@ -1,8 +1,8 @@
 """
 Write the tables of docs/icd.md from the code: ``python -m docs.make_tables [--check]``.
 
-Parameters come from the options dataclasses, reasons of refusal from the records.  With --check
-nothing is written; the exit status is 1 where a table is not as the code has it.
+Parameters come from the options dataclasses, refusal reasons from the records.  With --check
+nothing is written; the exit status is 1 if a table is out of date.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ FILE = Path(__file__).parent / 'icd.md'
 
 
 def parameter_table(*option_classes: type[Any]) -> str:
-    """Every parameter of some dataclasses, a row each."""
-    rows = ['| parameter | default | allowed | what it is |', '|---|---|---|---|']
+    """Table of the parameters of option dataclasses."""
+    rows = ['| parameter | default | allowed | description |', '|---|---|---|---|']
     for options in option_classes:
         for field in dataclasses.fields(options):
             cells = (
@@ -44,7 +44,7 @@ def parameter_table(*option_classes: type[Any]) -> str:
 
 
 def reason_table(reasons: Mapping[str, str]) -> str:
-    """Names of reasons and what they mean."""
+    """Table of refusal reasons and their meanings."""
     rows = [f'| `{name}` | {meaning} |' for name, meaning in reasons.items()]
     return '\n'.join(['| reason | meaning |', '|---|---|', *rows])
 
@@ -60,7 +60,7 @@ TABLES = {
 
 
 def with_tables(text: str) -> str:
-    """Return a document with what stands between the marks of each table written anew."""
+    """Return a document with the text between the marks of each table replaced."""
     for name, table in TABLES.items():
         marks = re.compile(f'(<!-- {name} -->\n).*?(<!-- end -->)', re.DOTALL)
         if len(marks.findall(text)) != 1:
@@ -70,14 +70,14 @@ def with_tables(text: str) -> str:
 
 
 def main() -> int:
-    """Write the tables, or say whether they are up to date."""
+    """Write the tables, or check that they are up to date."""
     parser = argparse.ArgumentParser(description='Write the tables of docs/icd.md.')
-    parser.add_argument('--check', action='store_true', help='only look')
+    parser.add_argument('--check', action='store_true', help='check only, write nothing')
     check = parser.parse_args().check
     before = FILE.read_text()
     after = with_tables(before)
     if check and after != before:
-        print(f'{FILE.name} is not as the code has it: run python -m docs.make_tables')
+        print(f'{FILE.name} is out of date: run python -m docs.make_tables')
         return 1
     FILE.write_text(after)
     return 0

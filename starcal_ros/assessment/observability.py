@@ -1,4 +1,4 @@
-"""What an ensemble can tell: information, predicted sigmas, coverage, line-of-sight map."""
+"""Observability of an ensemble: information, predicted sigmas, coverage, line-of-sight maps."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ from starcal_ros.records import (
 Floats = NDArray[np.float64]
 
 COVERAGE_ROWS, COVERAGE_COLS = 8, 10  # cells of 2 degrees on the paper's camera
-GRID = 25  # pixels along each side of the detector at which maps are compared
-MAP_ROWS, MAP_COLS = 16, 20  # of a smooth surface of degree seven
+GRID = 25  # points along each side of the detector at which maps are compared
+MAP_ROWS, MAP_COLS = 16, 20  # enough for a polynomial surface of degree seven
 
 
 def coverage(ensemble: Ensemble, camera: CameraModel) -> NDArray[np.int64]:
-    """Star observations in each focal-plane cell, (8, 10)."""
+    """Count of star observations in each focal-plane cell, (8, 10)."""
     return stars_in_cells(star_table(ensemble.images).measured_px, camera)
 
 
 def stars_in_cells(pixels: Floats, camera: CameraModel) -> NDArray[np.int64]:
-    """Pixels (n, 2) in each focal-plane cell, (8, 10)."""
+    """Count of pixels (n, 2) in each focal-plane cell, (8, 10)."""
     counts, _, _ = np.histogram2d(
         pixels[:, 1],
         pixels[:, 0],
@@ -68,9 +68,9 @@ def image_information(
     """
     Information (m, k, k) of each image on the k unknowns that all images share, at the prior.
 
-    Those are the estimated camera parameters, then the terms of temperature where these images
-    carry them, and the alignment where the method has one; the rotation of the image is
-    eliminated.  An image with fewer than three stars before the camera tells nothing.
+    These are the estimated camera parameters, the temperature terms if these images support them,
+    and the alignment if the method has one; the rotation of the image is eliminated.  An image
+    with fewer than three stars in front of the camera has zero information.
     """
     ensemble = Ensemble(images)
     order, with_rate = _supported_terms(ensemble, options)
@@ -91,11 +91,11 @@ def predicted_sigma(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> Floats:
     """
-    1-sigma (k,) of `estimated_names`, as a calibration would report it, before it is made.
+    1-sigma (k,) of `estimated_names` that a calibration would report, predicted at the prior.
 
-    From the covariances of centroids and star tracker as given, at the prior geometry; infinite
-    where not observable yet.  Terms of temperature that the images carry are among what is
-    estimated, so all sigmas account for them.
+    Uses the covariances of centroids and star tracker as given; infinite for parameters that are
+    not observable yet.  Temperature terms that the images support are estimated jointly, so all
+    sigmas account for them.
     """
     names = estimated_names(options, prior.camera.model)
     if not ensemble.images:
@@ -103,13 +103,13 @@ def predicted_sigma(
     terms = _supported_terms(ensemble, options)
     found = _sigma_with(ensemble, prior, options, *terms)
     if not found and terms != (0, False):
-        # So would the calibration: without them, where they are not observable.
+        # As the calibration does: without temperature terms if they are not observable.
         found = _sigma_with(ensemble, prior, options, 0, False)
     return np.array([found.get(name, np.inf) for name in names])
 
 
 def _supported_terms(ensemble: Ensemble, options: CalibrationOptions) -> tuple[int, bool]:
-    """Order of the focal terms and whether a rate, as asked for and carried by the images."""
+    """Order of the focal terms and whether a rate, if requested and supported by the images."""
     order, with_rate = options.focal_temperature_order, options.alignment_temperature
     temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
     if (order or with_rate) and why_unsupported(temperatures_degc, order):
@@ -124,7 +124,7 @@ def _at_the_prior(
     order: int,
     with_rate: bool,
 ) -> tuple[Problem, State, Floats, bool]:
-    """What the estimate starts from, its normal matrices, and whether all stars are in front."""
+    """Problem, initial state, normal matrices, and whether all stars are in front."""
     problem = problem_of(ensemble, prior, options)
     state = start_of(problem, prior, order, with_rate)
     table = star_table(ensemble.images)
@@ -141,7 +141,7 @@ def _sigma_with(
     order: int,
     with_rate: bool,
 ) -> dict[str, float]:
-    """1-sigma by name; none where not observable."""
+    """1-sigma by name; empty if not observable."""
     problem, state, blocks, in_front = _at_the_prior(ensemble, prior, options, order, with_rate)
     seen = np.einsum('mii->m', blocks) > 0
     try:
@@ -159,7 +159,7 @@ def _sigma_with(
 def ensemble_status(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> EnsembleStatus:
-    """What has been collected and what a calibration from it would be worth."""
+    """Counts, coverage and predicted sigmas of an ensemble."""
     return EnsembleStatus(
         time_ns=ensemble.images[-1].time_ns if ensemble.images else 0,
         images=len(ensemble.images),
@@ -175,20 +175,20 @@ def ensemble_status(
 
 def weakest_direction(information: Floats, names: tuple[str, ...]) -> tuple[Floats, str]:
     """
-    Singular values of scaled information, and what it tells least of, in words.
+    Singular values of the scaled information, and its weakest direction as text.
 
     Parameters
     ----------
     information : (k, k)
-        On the named parameters.
+        Information on the named parameters.
 
     Returns
     -------
     singular_values : (k,)
-        Of the information scaled to a unit diagonal, largest first: square roots of its
-        eigenvalues.
+        Square roots of the eigenvalues of the information scaled to a unit diagonal, largest
+        first.
     text : str
-        Which parameters can hardly be told apart.
+        Parameters that are nearly indistinguishable.
     """
     scale = 1.0 / np.sqrt(np.diag(information))
     values, vectors = np.linalg.eigh(information * scale[:, None] * scale[None, :])
@@ -197,11 +197,11 @@ def weakest_direction(information: Floats, names: tuple[str, ...]) -> tuple[Floa
     largest = [i for i in np.argsort(-np.abs(direction)) if abs(direction[i]) > 0.3]
     terms = ', '.join(f'{names[i]} ({direction[i]:+.2f})' for i in largest)
     if len(largest) < 2:
-        return singular, f'{terms} is known least, and by itself'
+        return singular, f'{terms}, uncorrelated with the others'
     worse = 1.0 / max(float(singular[-1]), 1e-300)
     return singular, (
-        f'{terms} can hardly be told apart: together they are known {worse:.0f} times worse than '
-        'each would be alone'
+        f'{terms} are nearly indistinguishable: their combination has {worse:.0f} times the sigma '
+        'that it would have without correlation'
     )
 
 
@@ -209,10 +209,9 @@ def keep_most_informative(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> Ensemble:
     """
-    The ensemble without its least informative images, down to ``max_images``.
+    Ensemble without its least informative images, at most ``max_images``.
 
-    One by one the image goes whose information weighs least against that of all:
-    ``trace(total^-1 information_k)``.
+    Removes, one at a time, the image k with the least ``trace(total^-1 information_k)``.
     """
     if len(ensemble.images) <= options.max_images:
         return ensemble
@@ -250,7 +249,7 @@ def map_sigma_px(camera: CameraModel, covariance: Floats, columns: int = 25) -> 
 
 def map_error_px(found: CameraModel, true: CameraModel) -> float:
     """
-    RMS over the detector between the lines of sight of two cameras, px at the focal length.
+    RMS difference over the detector of the lines of sight of two cameras, px at the focal length.
 
     The turn of all lines of sight that brings the two closest is removed: a calibration puts it
     into the alignment.  Infinite where a pixel has no line of sight: a distortion folds.
@@ -275,7 +274,7 @@ def detector_maps(camera: CameraModel, covariance: Floats, pixels: Floats) -> De
 
 
 def correlation(covariance: Floats, names: tuple[str, ...]) -> Correlation:
-    """Correlations of the named numbers of a covariance (k, k), those left out that have none."""
+    """Correlations of a covariance (k, k), without the rows of zero variance."""
     sigma = np.sqrt(np.diag(covariance))
     known = np.nonzero(sigma > 0)[0]
     matrix = covariance[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])
@@ -284,9 +283,9 @@ def correlation(covariance: Floats, names: tuple[str, ...]) -> Correlation:
 
 def movement_px(camera: CameraModel, changes: Floats) -> Floats:
     """
-    Worst movement (k,) over the detector of the image of a direction, px.
+    Largest shift (k,) over the detector of the image of a direction, px.
 
-    When the k-th of the camera parameters alone is less by ``changes`` (k,).
+    For each k, only the k-th camera parameter is reduced, by ``changes[k]``.
     """
     pixels = pixel_grid(camera, 25, 20)
     directions = line_of_sight(camera, pixels)

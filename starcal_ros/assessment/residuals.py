@@ -1,4 +1,4 @@
-"""Residuals of a calibration, star by star and image by image."""
+"""Residuals of a calibration, per star and per image."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ class Residuals:
     image_misfit : (m,) bool
         Images whose attitude does not fit, or that lost their stars.
     attitude_error_arcsec : (m, 3)
-        Of the star tracker, by the stars of the image alone and the common alignment: the passive
-        small rotation about its own axes that takes the truth to what it reports.  NaN where the
-        image has too few stars to tell.
+        Error of the star tracker, from the stars of the image and the common alignment: the small
+        passive rotation about its own axes from the true to the reported attitude.  NaN if the
+        image has too few stars.
     attitude_sigma_arcsec : (m, 3)
-        1-sigma of it from the centroids, the camera taken as known.
+        Its 1-sigma from the centroids, for a known camera.
     image : (n,) int64
-        Which image the star is in.
+        Index of the image of the star.
     catalog_id : (n,) int64
     magnitude, colour_bp_rp : (n,) float64
-        V, and Gaia BP - RP; NaN where the catalog has none.
+        V and Gaia BP - RP; NaN if not in the catalog.
     measured_px : (n, 2)
     residual_px : (n, 2)
-        Measured less predicted.
+        Measured minus predicted.
     covariance_px2 : (n, 3)
-        uu, uv, vv of the centroids, as the last search has weighted them.
+        uu, uv, vv of the centroids, as weighted in the final estimation.
     used : (n,) bool
         False for outliers and stars of images that were left out.
     """
@@ -58,7 +58,7 @@ class Residuals:
     used: NDArray[np.bool_]
 
     def image_rms_px(self) -> Floats:
-        """RMS per axis (m,) over the stars used of each image; NaN where none was."""
+        """RMS per axis (m,) over the used stars of each image; NaN if none is used."""
         m = len(self.image_time_ns)
         image = self.image[self.used]
         squares = np.bincount(image, (self.residual_px[self.used] ** 2).mean(axis=1), m)
@@ -74,13 +74,13 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
     Parameters
     ----------
     ensemble : Ensemble
-        That the estimate was made from.
+        Ensemble of the estimate.
     colour_bp_rp : (n,)
-        Of the stars of the estimate's table.
+        Colours of the stars in the table of the estimate.
     """
     table = estimate.table
     seen = estimate.attitude_seen[:, None]
-    # The estimation counts from what was reported to the truth.
+    # The estimate has the opposite sign: from the reported to the true attitude.
     error_arcsec = -estimate.attitude_error_rad / ARCSECOND_RAD
     sigma_rad = np.sqrt(np.einsum('mii->mi', estimate.attitude_covariance_rad2))
     return Residuals(

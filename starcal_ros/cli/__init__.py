@@ -1,1 +1,1 @@
-"""The command line tool."""
+"""The command-line tool."""

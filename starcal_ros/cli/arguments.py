@@ -1,9 +1,9 @@
-"""What the `starcal` tool can be told: its commands, their options, and examples of each."""
+"""Command-line arguments of the `starcal` tool: commands, their options, and examples of each."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 import difflib
 from pathlib import Path
 import re
@@ -13,77 +13,77 @@ from typing import Any, NoReturn
 EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_INTERRUPTED = 0, 2, 3, 130
 
 _EXIT_STATUS = """\
-exit status: 0 done, and a calibration passed the gate; 3 solved, but the gate refused it; 2 bad
-input, said in one line; 130 interrupted."""
+exit status: 0 the command succeeded, and a calibration passed the gate; 3 the gate refused the
+calibration; 2 bad input, named in one line; 130 interrupted."""
 
-# Command -> what it is for, what it does, and examples: a comment, then the line to type.
+# Command -> summary, description, and examples: a comment, then the line to type.
 _HELP: dict[str, tuple[str, str, str]] = {
     'demo': (
-        'calibrate the small bag with the real ROS nodes',
+        'calibrate a small bag with the real ROS nodes',
         (
-            'Starts the nodes, plays them ten simulated images, asks for a calibration through '
-            'the service and prints it beside the truth.'
+            'Starts the nodes, plays ten simulated images to them, requests a calibration through '
+            'the service and prints the result beside the truth.'
         ),
         """\
-  # into the folder starcal_demo
+  # write to the folder starcal_demo
   starcal demo
-  # elsewhere
+  # write to another folder
   starcal demo -o /tmp/first_look""",
     ),
     'inspect': (
-        'say what a bag holds, and which of its images would be refused',
+        'list the contents of a bag and the images a calibration would refuse',
         (
-            'Lists topics, rates, stamps, encodings and gaps. Each image is held against the '
-            'attitudes as a calibration would hold it; with --params its stars are measured too.'
+            'Lists topics, rates, stamps, encodings and gaps, and checks each image against the '
+            'attitudes as a calibration does. With --params the stars are measured as well.'
         ),
         """\
-  # a quick look
+  # check stamps and attitudes
   starcal inspect bags/tiny
-  # measure the stars as well, as "starcal calibrate" would
+  # also measure the stars, as "starcal calibrate" does
   starcal inspect bags/tiny --params bags/tiny/params.yaml
-  # for a program
+  # machine-readable output
   starcal inspect bags/tiny --json
 
-exit status: 0 a calibration could use the bag; 3 it could not, and why is said; 2 bad input.""",
+exit status: 0 the bag can be calibrated; 3 it cannot, and the reasons are listed; 2 bad input.""",
     ),
     'calibrate': (
         'calibrate from bags, without a ROS graph',
         (
-            'Measures the stars of all images, solves for camera and alignment, holds the result '
+            'Measures the stars of all images, estimates camera and alignment, checks the result '
             'against the limits of the gate and writes report.html, calibration.json, '
-            'camera_info.yaml and observations.mcap into DIR.'
+            'camera_info.yaml and observations.mcap to DIR.'
         ),
         """\
   # the bag in the repository
   starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out
-  # two bags together, where there are several cameras
+  # two bags together, with several cameras in them
   starcal calibrate night1 night2.mcap --params camera1.yaml -o out --image-topic /camera1/image
-  # again, from the stars measured before: other options, no images
+  # repeat from the recorded observations, with other options and without images
   starcal calibrate out/observations.mcap --params bags/tiny/params.yaml -o again""",
     ),
     'compare': (
-        'say how far two calibrations are apart, in pixels and sigmas',
+        'compare two calibrations in pixels and sigmas',
         (
-            'Each of A and B is a calibration.json or a folder with one. The lines of sight are '
-            'compared in the star tracker frame, before and after the turn common to all pixels '
-            'is taken off. Differences are B less A; their sigmas take A and B as independent.'
+            'A and B are each a calibration.json or a folder that holds one. Lines of sight are '
+            'compared in the star tracker frame, before and after removing their common rotation. '
+            'Differences are B minus A; their sigmas assume that A and B are independent.'
         ),
         """\
   # two runs
   starcal compare out again
   # with a map of the difference over the detector
   starcal compare out again -o difference.png
-  # for a program
+  # machine-readable output
   starcal compare out/calibration.json again/calibration.json --json""",
     ),
     'report': (
-        'write report.html of a calibration anew',
+        'rewrite report.html of a calibration',
         (
-            'Makes one page from the files of a folder: verdict, parameters, residuals, how well '
-            'the camera is known, what was refused. It opens without a network.'
+            'Makes one page from the files of a folder: gate verdict, parameters, residuals, '
+            'uncertainties, refused images and stars. The page needs no network.'
         ),
         """\
-  # of an earlier calibration, with this version of starcal
+  # from the files of an earlier calibration
   starcal report out""",
     ),
     'play': (
@@ -94,32 +94,32 @@ exit status: 0 a calibration could use the bag; 3 it could not, and why is said;
   starcal play bags/tiny
   # as fast as the stars are observed
   starcal play bags/tiny --rate 0
-  # on other topics
+  # on another topic
   starcal play bags/tiny --remap /opnav/image_raw:=/camera/image_raw""",
     ),
     'simulate': (
         'render a bag with known truth',
         (
-            'Renders images of real stars as a camera would see them, with the truth, a prior '
-            'camera and a parameter file beside them.'
+            'Renders images of real stars with a simulated camera and writes the truth, a prior '
+            'camera and a parameter file beside the bag.'
         ),
         """\
-  # 24 images of 1296 x 1024: some seconds
+  # 24 images of 1296 x 1024, in a few seconds
   starcal simulate -o sim --scenario small
-  # and calibrate them
+  # calibrate them
   starcal calibrate sim --params sim/params.yaml -o out
-  # another camera of the kind, with other noise
+  # another draw of the camera and the noise
   starcal simulate -o sim2 --scenario small --seed 2""",
     ),
     'campaign': (
-        'Monte Carlo studies of calibrations',
-        'Calibrates many simulated campaigns and says how far from the truth they end.',
+        'run a Monte Carlo study of the calibration',
+        'Calibrates many simulated campaigns and compares the estimates with the truth.',
         """\
-  # star tracker noise against method, as in Table 1 of the paper
+  # method against star tracker noise, as in Table 1 of the paper
   starcal campaign table1 -o studies
-  # smaller: two noises, twenty trials
+  # a shorter run: two noise levels, twenty trials
   starcal campaign table1 -o studies --trials 20 --tracker 0 20
-  # the whole night of the paper from pixels, with its figures: some minutes
+  # the whole night of the paper from pixels, with its figures, in some minutes
   starcal campaign paper -o paper""",
     ),
 }
@@ -127,43 +127,43 @@ exit status: 0 a calibration could use the bag; 3 it could not, and why is said;
 _INTRODUCTION = 'In-flight star calibration of spacecraft cameras.'
 _FIRST_STEPS = f"""\
 first steps:
-  # does it work here?
+  # check the installation
   starcal demo
-  # what is in the bag?
+  # list the contents of a bag
   starcal inspect bags/tiny
   # calibrate
   starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out
 
-starcal COMMAND --help shows examples of each.
+starcal COMMAND --help shows examples of each command.
 {_EXIT_STATUS}"""
 
 
 def complain(text: str) -> int:
-    """Say on stderr, in one line, what is wrong with the input; returns the exit status for it."""
+    """Print an input error on stderr in one line and return the exit status for it."""
     print(f'starcal: {" ".join(text.split())}', file=sys.stderr)
     return EXIT_BAD_INPUT
 
 
 def _path(text: str) -> Path:
     if not text:
-        raise argparse.ArgumentTypeError('an empty name')  # Path would take it for this folder
+        raise argparse.ArgumentTypeError('empty path')  # Path('') means the current folder
     return Path(text)
 
 
 class _Parser(argparse.ArgumentParser):
-    """Complains in one line, like everything else here, and says what may have been meant."""
+    """Reports errors in one line and suggests the nearest known word."""
 
     def error(self, message: str) -> NoReturn:
         """Exit with status 2."""
-        said = re.search(r"(?:invalid choice: '?|unrecognized arguments: )([^' ]+)", message)
-        if said:
-            near = difflib.get_close_matches(said[1].partition('=')[0], _words(self), 1)
+        bad = re.search(r"(?:invalid choice: '?|unrecognized arguments: )([^' ]+)", message)
+        if bad:
+            near = difflib.get_close_matches(bad[1].partition('=')[0], _words(self), 1)
             message += f' (did you mean {near[0]}?)' if near else ''
         self.exit(complain(f'{message} (see {self.prog} --help)'))
 
 
 def _words(parser: argparse.ArgumentParser) -> list[str]:
-    """Every command and option that a parser and its commands know."""
+    """Every command and option of a parser and its commands."""
     words: list[str] = []
     for action in parser._actions:
         words += action.option_strings
@@ -171,40 +171,6 @@ def _words(parser: argparse.ArgumentParser) -> list[str]:
             for name, command in action.choices.items():
                 words += [name, *_words(command)]
     return words
-
-
-def parser() -> argparse.ArgumentParser:
-    """The parser of the tool; it leaves the command's name in ``command``."""
-    top = _Parser(
-        prog='starcal',
-        description=_INTRODUCTION,
-        epilog=_FIRST_STEPS,
-        formatter_class=_TopFormatter,
-    )
-    commands = top.add_subparsers(
-        required=True, metavar='COMMAND', dest='command', title='commands'
-    )
-    for name, add in (
-        ('demo', _demo),
-        ('inspect', _inspect),
-        ('calibrate', _calibrate),
-        ('report', _report),
-        ('compare', _compare),
-        ('play', _play),
-        ('simulate', _simulate),
-        ('campaign', _campaign),
-    ):
-        short, long, examples = _HELP[name]
-        add(
-            commands.add_parser(
-                name,
-                help=short,
-                description=long,
-                epilog=f'examples:\n{examples}',
-                formatter_class=_Formatter,
-            )
-        )
-    return top
 
 
 class _Formatter(argparse.HelpFormatter):
@@ -217,29 +183,51 @@ class _Formatter(argparse.HelpFormatter):
 
 
 class _TopFormatter(argparse.RawDescriptionHelpFormatter):
-    """Leaves room for the names of the commands beside what they are for."""
+    """Aligns the summaries of the commands."""
 
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=14)
+        super().__init__(prog, max_help_position=15)
+        self._action_max_length = 13  # argparse neglects the indent of the longest, calibrate
 
 
-def _completed(action: argparse.Action, completer: Any) -> None:
-    action.completer = completer  # type: ignore[attr-defined]  # where argcomplete looks for it
+def parser() -> argparse.ArgumentParser:
+    """
+    Parser of the tool.
 
-
-def _bags(command: argparse.ArgumentParser, **how: Any) -> None:
-    action = command.add_argument(
-        'bags' if how else 'bag',
-        type=_path,
-        metavar='BAG',
-        help='an .mcap file or the folder of a bag',
-        **how,
+    It stores the name of the command in ``command``, None without one, and a request for the
+    version in ``version``.
+    """
+    top = _Parser(
+        prog='starcal',
+        description=_INTRODUCTION,
+        epilog=_FIRST_STEPS,
+        formatter_class=_TopFormatter,
     )
-    _completed(action, _files_of('.mcap'))
+    top.add_argument('--version', action='store_true', help='show the version and exit')
+    commands = top.add_subparsers(metavar='COMMAND', dest='command', title='commands')
+    for name, (summary, description, examples) in _HELP.items():
+        command = commands.add_parser(
+            name,
+            help=summary,
+            description=description,
+            epilog=f'examples:\n{examples}',
+            formatter_class=_Formatter,
+        )
+        _ARGUMENTS[name](command)
+    return top
+
+
+def _add(
+    command: argparse.ArgumentParser, *names: str, completer: Any = None, **settings: Any
+) -> None:
+    """Add an argument; argcomplete looks for the completer of its value on the action."""
+    action = command.add_argument(*names, **settings)
+    if completer is not None:
+        action.completer = completer  # type: ignore[attr-defined]
 
 
 def _files_of(*endings: str) -> Any:
-    """Complete the names of folders and of such files."""
+    """Completer of folders and of files with these endings."""
 
     def complete(prefix: str, **_: object) -> Iterable[str]:
         from argcomplete.completers import FilesCompleter
@@ -261,135 +249,116 @@ def _studies(**_: object) -> Iterable[str]:
     return (*STUDIES, 'paper')
 
 
-def _topics(command: argparse.ArgumentParser) -> None:
-    for what in ('image', 'attitude', 'velocity', 'temperature', 'observations'):
-        command.add_argument(
-            f'--{what}-topic',
-            default='',
-            metavar='T',
-            help=f'topic of {what}; left out: the only one of its type in the bag',
-        )
+def _output(command: argparse.ArgumentParser, metavar: str, what: str, **settings: Any) -> None:
+    _add(command, '-o', '--output', type=_path, metavar=metavar, help=what, **settings)
+
+
+def _bags(command: argparse.ArgumentParser, name: str, **settings: Any) -> None:
+    what = 'an .mcap file or a bag folder'
+    completer = _files_of('.mcap')
+    _add(command, name, type=_path, metavar='BAG', help=what, completer=completer, **settings)
 
 
 def _params(command: argparse.ArgumentParser, what: str, required: bool) -> None:
-    action = command.add_argument(
-        '--params', type=_path, required=required, metavar='FILE', help=what
-    )
-    _completed(action, _files_of('.yaml', '.yml'))
+    completer = _files_of('.yaml', '.yml')
+    _add(command, '--params', type=_path, metavar='FILE', help=what, required=required,
+         completer=completer)  # fmt: skip
+
+
+def _json(command: argparse.ArgumentParser) -> None:
+    _add(command, '--json', action='store_true', help='print one JSON object instead of tables')
+
+
+def _topics(command: argparse.ArgumentParser) -> None:
+    for kind in ('image', 'attitude', 'velocity', 'temperature', 'observations'):
+        what = f'{kind} topic (default: the only one of its type in the bag)'
+        _add(command, f'--{kind}-topic', default='', metavar='T', help=what)
 
 
 def _demo(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        '-o',
-        '--output',
-        type=_path,
-        default=Path('starcal_demo'),
-        metavar='DIR',
-        help='folder of products and log files; made if it is not there (starcal_demo)',
-    )
+    what = 'folder for products and log files, created if absent (default: starcal_demo)'
+    _output(command, 'DIR', what, default=Path('starcal_demo'))
 
 
 def _inspect(command: argparse.ArgumentParser) -> None:
-    _bags(command, nargs='+')
-    _params(command, 'ROS parameter file: measure the stars with it as well', required=False)
+    _bags(command, 'bags', nargs='+')
+    _params(command, 'ROS parameter file; with it the stars are measured too', required=False)
     _topics(command)
-    command.add_argument('--json', action='store_true', help='print one JSON object instead')
+    _json(command)
 
 
 def _calibrate(command: argparse.ArgumentParser) -> None:
-    _bags(command, nargs='+')
+    _bags(command, 'bags', nargs='+')
     _params(command, 'ROS parameter file: prior camera, mounting and options', required=True)
-    command.add_argument(
-        '-o',
-        '--output',
-        type=_path,
-        required=True,
-        metavar='DIR',
-        help='folder of the products; made if it is not there, replaced file by file if it is',
-    )
+    what = 'folder for the products, created if absent; existing products are replaced'
+    _output(command, 'DIR', what, required=True)
     _topics(command)
 
 
+def _report(command: argparse.ArgumentParser) -> None:
+    what = 'folder with the products of starcal calibrate'
+    _add(command, 'folder', type=_path, metavar='DIR', help=what)
+
+
 def _compare(command: argparse.ArgumentParser) -> None:
-    for name, what in (('a', 'the one before'), ('b', 'the one after')):
-        action = command.add_argument(
-            name, type=_path, metavar=name.upper(), help=f'{what}: calibration.json or its folder'
-        )
-        _completed(action, _files_of('.json'))
-    command.add_argument(
-        '-o',
-        '--output',
-        type=_path,
-        metavar='FILE',
-        help='draw the difference over the detector: .png, .svg or .pdf',
-    )
-    command.add_argument('--json', action='store_true', help='print one JSON object instead')
+    for name, which in (('a', 'reference calibration'), ('b', 'calibration to compare')):
+        what = f'{which}: calibration.json or its folder'
+        completer = _files_of('.json')
+        _add(command, name, type=_path, metavar=name.upper(), help=what, completer=completer)
+    _output(command, 'FILE', 'plot of the difference over the detector: .png, .svg or .pdf')
+    _json(command)
 
 
 def _play(command: argparse.ArgumentParser) -> None:
-    _bags(command)
-    command.add_argument(
-        '--rate',
-        type=float,
-        default=1.0,
-        metavar='R',
-        help='times real time; 0: as fast as stars are observed (1)',
-    )
-    command.add_argument(
-        '--remap',
-        action='append',
-        default=[],
-        metavar='A:=B',
-        help='publish on B what the bag has on A; may be given again',
-    )
+    _bags(command, 'bag')
+    what = 'playback speed; 1 is real time, 0 is as fast as stars are observed (default: 1)'
+    _add(command, '--rate', type=float, default=1.0, metavar='R', help=what)
+    what = 'publish topic A of the bag as B; may be repeated'
+    _add(command, '--remap', action='append', default=[], metavar='A:=B', help=what)
 
 
-def _report(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        'folder', type=_path, metavar='DIR', help='folder that starcal calibrate has written'
-    )
+def _seed(command: argparse.ArgumentParser, what: str) -> None:
+    _add(command, '--seed', type=int, default=1, metavar='N', help=f'{what} (default: 1)')
 
 
 def _simulate(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        '-o',
-        '--output',
-        type=_path,
-        required=True,
-        metavar='BAG',
-        help='folder of the bag, or an .mcap file; one of that name is replaced',
-    )
-    scenario = command.add_argument(
-        '--scenario', required=True, metavar='NAME', help='tiny, small or paper'
-    )
-    _completed(scenario, _scenarios)
-    command.add_argument(
-        '--seed', type=int, default=1, metavar='N', help='draws the truth and the noise (1)'
-    )
+    what = 'bag folder or .mcap file to write; an existing one is replaced'
+    _output(command, 'BAG', what, required=True)
+    what = 'scenario: tiny, small or paper'
+    _add(command, '--scenario', required=True, metavar='NAME', help=what, completer=_scenarios)
+    _seed(command, 'seed of the truth and the noise')
 
 
 def _campaign(command: argparse.ArgumentParser) -> None:
-    study = command.add_argument(
-        'study', metavar='STUDY', help='table1, images, terms, coverage or paper'
-    )
-    _completed(study, _studies)
-    command.add_argument(
-        '-o', '--output', type=_path, required=True, metavar='DIR', help='for STUDY.json and .png'
-    )
-    command.add_argument('--trials', type=int, metavar='N', help="campaigns; the study's own")
-    command.add_argument('--seed', type=int, default=1, metavar='N', help='of the first (1)')
+    what = 'study: table1, images, terms, coverage, start or paper'
+    _add(command, 'study', metavar='STUDY', help=what, completer=_studies)
+    _output(command, 'DIR', 'folder for STUDY.json and STUDY.png', required=True)
+    what = 'number of trials (default: depends on the study)'
+    _add(command, '--trials', type=int, metavar='N', help=what)
+    _seed(command, 'seed of all trials')
     for name, kind, metavar, what in (
-        ('images', int, 'M', 'images of a calibration'),
-        ('stars', int, 'N', 'stars of an image'),
-        ('tracker', float, 'ARCSEC', 'star tracker noise about each axis'),
-        ('methods', str, 'METHOD', 'per_image, single, hierarchical'),
+        ('images', int, 'M', 'numbers of images in a calibration'),
+        ('stars', int, 'N', 'numbers of stars in an image'),
+        ('tracker', float, 'ARCSEC', 'true star tracker 1-sigma values about each axis, arcsec'),
+        ('methods', str, 'METHOD', 'methods to compare: per_image, single, hierarchical'),
     ):
-        command.add_argument(f'--{name}', type=kind, nargs='+', metavar=metavar, help=what)
-    command.add_argument(
-        '--tracker-told', type=float, metavar='ARCSEC', help='what the calibration takes it for'
-    )
+        _add(command, f'--{name}', type=kind, nargs='+', metavar=metavar, help=what)
+    what = 'star tracker 1-sigma assumed by the calibration, arcsec (default: the true one)'
+    _add(command, '--tracker-assumed', type=float, metavar='ARCSEC', help=what)
     where = command.add_mutually_exclusive_group()
-    where.add_argument(
-        '--workers', type=int, metavar='N', help='processes; 0: none but this; all processors'
-    )
-    where.add_argument('--scheduler', default='', metavar='ADDRESS', help='of a Dask cluster')
+    what = 'worker processes; 0 runs in-process (default: one per CPU)'
+    where.add_argument('--workers', type=int, metavar='N', help=what)
+    what = 'address of a Dask scheduler, e.g. tcp://host:8786'
+    where.add_argument('--scheduler', default='', metavar='ADDRESS', help=what)
+
+
+_ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
+    'demo': _demo,
+    'inspect': _inspect,
+    'calibrate': _calibrate,
+    'report': _report,
+    'compare': _compare,
+    'play': _play,
+    'simulate': _simulate,
+    'campaign': _campaign,
+}

@@ -1,4 +1,4 @@
-"""The demonstration: the real nodes as processes, a small bag played to them, the truth beside."""
+"""Demonstration: calibrates a small bag with the real nodes and compares with the truth."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ import numpy as np
 import yaml
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
+from starcal_ros.cli.terminal import table_lines
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
 from starcal_ros.products.calibration_json import read_calibration
@@ -35,12 +36,12 @@ _NODES = ('star_observer', 'calibrator')
 
 
 class NodeError(StarcalError):
-    """A node did not come up, or did not last."""
+    """A node did not start, or ended early."""
 
 
 @dataclass(frozen=True)
 class DemoBag:
-    """A bag folder with its parameter file, what was believed and what is true."""
+    """A bag folder with its parameters, the prior geometry and the true geometry."""
 
     bag: Path
     parameters: dict[str, object]
@@ -51,7 +52,7 @@ class DemoBag:
 
 @dataclass(frozen=True)
 class TruthTable:
-    """An estimate beside the truth: the lines of a table, and the largest difference in sigmas."""
+    """Estimate and truth: lines of a table, and the largest error in sigmas."""
 
     lines: tuple[str, ...]
     worst_sigmas: float
@@ -67,7 +68,7 @@ def tiny_bag(spare: Path) -> DemoBag:
         folder = simulated_bag.write_bag(scenario.scenario('tiny'), spare / 'tiny').bag
     truth = json.loads((folder / 'truth.json').read_text())
     parameters = yaml.safe_load((folder / 'params.yaml').read_text())['/**']['ros__parameters']
-    # The nodes run anywhere: they need the whole URL.
+    # The nodes may run in another folder: they need the absolute URL.
     parameters['camera_info_url'] = f'file://{(folder / "camera.yaml").resolve()}'
     prior = CameraGeometry(
         read_camera_info(folder / 'camera.yaml'), np.array(parameters['prior_alignment'])
@@ -79,14 +80,15 @@ def run(
     bag: DemoBag, folder: Path, on_image: Callable[[], None] = lambda: None
 ) -> tuple[Calibration | None, str]:
     """
-    Start the nodes, play the bag, ask for the calibration; what came of it, and what was said.
+    Calibration of the nodes, None if refused, and the answer of their service.
 
-    Log files go to the folder.  All processes have ended when this returns.
+    Starts the nodes, plays the bag and calls the service.  Log files go to the folder.  All
+    processes have ended when this returns.
 
     Raises
     ------
     NodeError
-        When a node does not come up, or ends before the calibration.
+        When a node does not start, or ends before the calibration.
     """
     params = folder / 'params.yaml'
     content = {'/**': {'ros__parameters': bag.parameters}}
@@ -106,7 +108,7 @@ def run(
                 stdout=log if output is None else output,
                 stderr=log,
                 env=environment,
-                bufsize=0,  # so that select() and readline() see the same bytes
+                bufsize=0,  # select() does not see bytes that readline() has buffered
             )
             stack.callback(_stop, process)
             return process
@@ -131,7 +133,7 @@ def run(
 
 
 def player_command(path: Path, rate: float, remaps: Sequence[str]) -> list[str]:
-    """The command that plays a bag on the graph."""
+    """Command line that plays a bag on the graph."""
     parameters = ['-p', f'bag:={path.resolve()}', '-p', f'rate:={rate!r}']
     renamed = [part for remap in remaps for part in ('-r', remap)]
     return [*_module_command('bag_player'), '--ros-args', *parameters, *renamed]
@@ -159,7 +161,7 @@ def _module_command(name: str) -> list[str]:
 
 
 def _lines(client: Process, nodes: dict[str, Process]) -> Iterator[str]:
-    """What the client says, as long as it and the nodes live."""
+    """Lines that the client prints, until it or a node ends."""
     assert client.stdout is not None  # it was started with a pipe
     while True:
         if select.select([client.stdout], [], [], 0.2)[0]:
@@ -168,12 +170,12 @@ def _lines(client: Process, nodes: dict[str, Process]) -> Iterator[str]:
                 return
             yield line.decode(errors='replace').strip()
         elif any(node.poll() for node in nodes.values()):
-            return  # status 0 is the player's end, which is no accident
+            return  # the player ends by itself, with status 0
 
 
 @contextlib.contextmanager
 def _ended_like_interrupted() -> Iterator[None]:
-    """Let a polite kill take the way of Ctrl-C, so that it stops the nodes too."""
+    """Handle SIGTERM like Ctrl-C, so that it stops the nodes too."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
@@ -182,10 +184,10 @@ def _ended_like_interrupted() -> Iterator[None]:
 
 
 def _stop(process: Process) -> None:
-    """Ask to end, then insist."""
-    for ask in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+    """End a process, by SIGKILL if it ignores the milder signals."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         if process.poll() is None:
-            process.send_signal(ask)
+            process.send_signal(number)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(5.0)
     if process.stdout is not None:
@@ -193,7 +195,7 @@ def _stop(process: Process) -> None:
 
 
 def _own_domain() -> dict[str, str]:
-    """A ROS domain that nobody on this machine uses, unless the caller has chosen one."""
+    """Environment of a ROS domain unused on this machine; empty if ROS_DOMAIN_ID is set."""
     if 'ROS_DOMAIN_ID' in os.environ:
         return {}
     first = os.getpid() % 100
@@ -209,7 +211,7 @@ def _own_domain() -> dict[str, str]:
 
 
 def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeometry) -> TruthTable:
-    """Every estimated parameter and the alignment, beside prior and truth."""
+    """Table of the estimated parameters and the alignment with prior and truth."""
     all_names = calibration.geometry.camera.parameter_names
     names = [name for name in all_names if name in calibration.estimated]
     columns = [all_names.index(name) for name in names]
@@ -219,21 +221,19 @@ def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeomet
     sigma = calibration.sigma
     off = (estimate - true) / sigma[columns]
     rows = zip(names, before, estimate, sigma[columns], true, off, strict=True)
-    header = ('parameter', 'prior', 'estimate', '1-sigma', 'truth', 'off by')
-    lines = ['{:<12}{:>13}{:>13}{:>11}{:>13}{:>12}'.format(*header)]
-    lines += [
-        f'{name:<12}{b:>13.6g}{e:>13.6g}{s:>11.2g}{t:>13.6g}{o:>+6.1f} sigma'
+    table = [
+        (name, f'{b:.6g}', f'{e:.6g}', f'{s:.2g}', f'{t:.6g}', f'{o:+.1f} sigma')
         for name, b, e, s, t, o in rows
     ]
-    # Angles are counted from the truth.
+    # Alignment angles are relative to the truth.
     prior_arcsec = alignment_difference_rad(prior, truth) / ARCSECOND_RAD
     error_arcsec = alignment_difference_rad(calibration.geometry, truth) / ARCSECOND_RAD
     sigma_arcsec = sigma[-3:] / ARCSECOND_RAD
     angles_off = error_arcsec / sigma_arcsec
-    lines += [
-        f'{"alignment " + axis:<12}{b:>+12.2f}"{e:>+12.2f}"{s:>10.2f}"{0:>12}"{o:>+6.1f} sigma'
-        for axis, b, e, s, o in zip(
-            'xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=True
-        )
+    angles = zip('xyz', prior_arcsec, error_arcsec, sigma_arcsec, angles_off, strict=True)
+    table += [
+        (f'alignment {axis}', f'{b:+.2f}"', f'{e:+.2f}"', f'{s:.2f}"', '0"', f'{o:+.1f} sigma')
+        for axis, b, e, s, o in angles
     ]
-    return TruthTable(tuple(lines), float(np.abs([*off, *angles_off]).max()))
+    header = ('parameter', 'prior', 'estimate', '1-sigma', 'truth', 'error')
+    return TruthTable(tuple(table_lines(header, table)), float(np.abs([*off, *angles_off]).max()))

@@ -1,12 +1,12 @@
 """
-The `starcal` tool: the package's functions from a shell.
+The `starcal` tool.
 
-Exit status: 0 a calibration passed the gate (or the command did its work); 3 solved but refused by
-the gate, products written, or a bag that cannot be calibrated; 2 bad input, one line on stderr;
-130 interrupted.
+Exit status: 0 the command succeeded, and a calibration passed the gate; 3 the gate refused the
+calibration, whose products are written, or a bag cannot be calibrated; 2 bad input, one line on
+stderr; 130 interrupted.
 """
 
-# PYTHON_ARGCOMPLETE_OK: what completes the tool's arguments in a shell looks for this word.
+# PYTHON_ARGCOMPLETE_OK: the shell's global completion looks for this word.
 from __future__ import annotations
 
 import argparse
@@ -28,32 +28,38 @@ from starcal_ros.cli.arguments import (
 from starcal_ros.cli.terminal import print_verdict, progress_bar, with_progress
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 
-# numpy, scipy, OpenCV and the like cost a second to import: each command takes what it needs, so
-# that --help answers at once.
+# NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
+# --help answers at once.
 if TYPE_CHECKING:
     from starcal_ros.pipeline.setup import Setup
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.records import Calibration, Ensemble
 
 NODES = ('star_observer', 'calibrator')
-_DEMO_SAME_PX = 1e-6  # what other threads of BLAS may do to the last digits
-_DEMO_SIGMAS = 5.0  # one in 10^5 demos would miss by chance; the seed is fixed, so none does
+_DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
+_DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns the exit status."""
     try:
-        made = parser()
-        if '_ARGCOMPLETE' in os.environ:  # a shell asks what may come next
+        tool = parser()
+        if '_ARGCOMPLETE' in os.environ:  # set by a shell that completes a command line
             import argcomplete
 
-            argcomplete.autocomplete(made)
-        args = made.parse_args(argv)
-        return _COMMANDS[args.command](args)
+            argcomplete.autocomplete(tool)
+        args = tool.parse_args(argv)
+        if args.version:
+            print(_software())
+        elif args.command is None:
+            tool.print_help()
+        else:
+            return _COMMANDS[args.command](args)
+        return EXIT_ACCEPTED
     except StarcalError as error:
         return complain(str(error))
     except BrokenPipeError:
-        # The reader of our output has gone (starcal ... | head): nothing more to say to it.
+        # The reader of our output has ended (starcal ... | head).
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_BAD_INPUT
     except OSError as error:
@@ -64,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    """Bags to products: what the two nodes do, in one process."""
+    """Calibrate from bags in one process, as the two nodes do on the graph."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
     from starcal_ros.report import page
@@ -74,16 +80,16 @@ def _calibrate(args: argparse.Namespace) -> int:
         raise OptionError(f'{args.output}: not a folder')
     inputs = {str(path): _digest(path) for path in (*reader.mcap_files(args.bags), args.params)}
     calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
-    shown = page.write_report(args.output)
+    report = page.write_report(args.output)
     output.print_calibration(calibration, setup.prior)
-    print(f'written to {args.output}; look at {shown}')
+    print(f'products written to {args.output}; open {report}')
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
 
 
 def _calibrate_into(
     folder: Path, bags: Sequence[Path], asked: Topics, setup: Setup, inputs: Mapping[str, str]
 ) -> Calibration:
-    """Calibrate from bags; all that a report is made from goes into the folder."""
+    """Calibrate from bags and write the files that a report is made from."""
     from starcal_ros.pipeline import solve
     from starcal_ros.pipeline import topics as bag_topics
     from starcal_ros.products.folder import write_observations, write_products
@@ -110,7 +116,7 @@ def _calibrate_into(
 
 
 def _setup(params: Path) -> Setup:
-    """Every option of a parameter file, and what they name, loaded."""
+    """Options of a parameter file, with prior camera, catalog and dark frame loaded."""
     from starcal_ros.options import read_parameter_file
     from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
     from starcal_ros.pipeline.setup import load_setup
@@ -136,10 +142,10 @@ def _asked(args: argparse.Namespace) -> Topics:
 
 
 def _report(args: argparse.Namespace) -> int:
-    """Write the report of a folder anew."""
+    """Write the report of a folder."""
     from starcal_ros.report import page
 
-    print(f'written to {page.write_report(args.folder)}')
+    print(f'report written to {page.write_report(args.folder)}')
     return EXIT_ACCEPTED
 
 
@@ -149,7 +155,7 @@ def _refused_words(ensemble: Ensemble) -> str:
 
 
 def _inspect(args: argparse.Namespace) -> int:
-    """Say what a bag holds."""
+    """List the contents of a bag and the images that a calibration would refuse."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
     from starcal_ros.messages.types import COMPRESSED_TYPE, IMAGE_TYPE, OBSERVATIONS_TYPE
@@ -168,37 +174,37 @@ def _inspect(args: argparse.Namespace) -> int:
 
 
 def _compare(args: argparse.Namespace) -> int:
-    """Say how far two calibrations are apart."""
+    """Compare two calibrations."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import output
     from starcal_ros.products.calibration_json import read_calibration
-    from starcal_ros.report import comparison_figure
+    from starcal_ros.report import figures
 
     found = comparison.compare(*(read_calibration(_file(p)) for p in (args.a, args.b)))
     if args.output:
-        comparison_figure.write(found, args.output)
+        figures.write_comparison(found, args.output)
     if args.json:
         print(json.dumps(comparison.content(found), indent=1, allow_nan=False))
     else:
         output.print_comparison(found)
         if args.output:
-            print(f'written to {args.output}')
+            print(f'figure written to {args.output}')
     return EXIT_ACCEPTED
 
 
 def _file(path: Path) -> Path:
-    """The calibration of a folder, or the file itself."""
+    """Path of the calibration in a folder, or of the file itself."""
     from starcal_ros.products.calibration_json import CALIBRATION_FILE
 
     if not path.is_dir():
         return path
     if not (path / CALIBRATION_FILE).exists():
-        raise OptionError(f'{path}: no {CALIBRATION_FILE} in the folder')
+        raise OptionError(f'{path}: the folder holds no {CALIBRATION_FILE}')
     return path / CALIBRATION_FILE
 
 
 def _play(args: argparse.Namespace) -> int:
-    """Become the bag player."""
+    """Replace this process by the bag player."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import demo
 
@@ -207,7 +213,7 @@ def _play(args: argparse.Namespace) -> int:
         raise OptionError(f'--rate: {args.rate} is not within 0 to 1e6')
     for remap in args.remap:
         if not all(remap.partition(':=')[::2]):
-            raise OptionError(f'--remap: {remap!r} is not A:=B')
+            raise OptionError(f'--remap: {remap!r} is not of the form A:=B')
     sys.stdout.flush()
     os.execv(sys.executable, demo.player_command(args.bag, args.rate, args.remap))
 
@@ -222,18 +228,18 @@ def _simulate(args: argparse.Namespace) -> int:
         known = ', '.join(synthetic.SCENARIOS) + nearest(args.scenario, synthetic.SCENARIOS)
         raise OptionError(f'--scenario: {args.scenario!r} is not one of {known}')
     if args.seed < 0:
-        raise OptionError(f'--seed: {args.seed} is not 0 or more')
+        raise OptionError(f'--seed: {args.seed} is negative')
     scenario = synthetic.scenario(args.scenario, args.seed)
     with progress_bar(scenario.image_count, 'images') as advance:
         made = simulated_bag.write_bag(scenario, args.output, on_image=lambda _: advance())
     print(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
     print(f'truth {made.truth}')
-    print(f'calibrate it with: starcal calibrate {made.bag} --params {made.params} -o DIR')
+    print(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
     return EXIT_ACCEPTED
 
 
 def _demo(args: argparse.Namespace) -> int:
-    """Calibrate the small bag with the real nodes and hold the result against the truth."""
+    """Calibrate the small bag with the real nodes and compare the result with the truth."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import demo
     from starcal_ros.pipeline.setup import load_setup
@@ -243,7 +249,7 @@ def _demo(args: argparse.Namespace) -> int:
 
     _make_folder(args.output)
     bag = demo.tiny_bag(args.output)
-    print(f'bag {bag.bag}; log files and products go to {args.output}')
+    print(f'bag {bag.bag}; log files and products in {args.output}')
     with progress_bar(bag.image_count, 'images') as advance:
         calibration, verdict = demo.run(bag, args.output, on_image=advance)
     print(verdict)
@@ -254,10 +260,10 @@ def _demo(args: argparse.Namespace) -> int:
     good = beside_truth.worst_sigmas <= _DEMO_SIGMAS
     print_verdict(
         good,
-        f'the farthest from the truth is {beside_truth.worst_sigmas:.1f} sigma off, '
-        + ('as chance has it' if good else f'over {_DEMO_SIGMAS:g}: something is wrong'),
+        f'largest error {beside_truth.worst_sigmas:.1f} sigma, '
+        f'{"within" if good else "over"} the limit of {_DEMO_SIGMAS:g} sigma',
     )
-    # Nodes tell no residuals. The tool's are theirs where it finds the same calibration.
+    # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
     setup = load_setup(bag.parameters)
     again = _calibrate_into(args.output, [bag.bag], Topics(), setup, {})
     write_products(calibration, args.output)
@@ -265,28 +271,26 @@ def _demo(args: argparse.Namespace) -> int:
     same = apart_px <= _DEMO_SAME_PX
     print_verdict(
         same,
-        'the tool finds the same from the bag without a graph'
+        'starcal calibrate gives the same calibration from the bag'
         if same
-        else f'the tool finds another calibration from the same bag: {apart_px:.2g} px apart',
+        else f'starcal calibrate gives another calibration from the bag: {apart_px:.2g} px apart',
     )
-    print(f'look at {page.write_report(args.output)}')
+    print(f'open {page.write_report(args.output)}')
     good = good and same
     return EXIT_ACCEPTED if good else EXIT_REFUSED
 
 
 def _campaign(args: argparse.Namespace) -> int:
     """Run a Monte Carlo study."""
-    # One thread each: trials go side by side, and numbers must not hang on how many there are.
+    # Trials run in parallel, one thread each; results must not depend on the number of threads.
     os.environ.update(OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1')
     import dataclasses
     import time
 
     from starcal_ros.options import nearest
-    from starcal_ros.pipeline import provenance
     from starcal_ros.products.files import write_atomically
-    from starcal_ros.studies import figures as study_figures
-    from starcal_ros.studies import monte_carlo
-    from starcal_ros.studies import workers as campaign_workers
+    from starcal_ros.studies import figures, monte_carlo, summary
+    from starcal_ros.studies.workers import run_trials
 
     if args.study == 'paper':
         return _paper(args)
@@ -294,31 +298,30 @@ def _campaign(args: argparse.Namespace) -> int:
         studies = (*monte_carlo.STUDIES, 'paper')
         known = ', '.join(studies) + nearest(args.study, studies)
         raise OptionError(f'STUDY: {args.study!r} is not one of {known}')
-    what, usual = monte_carlo.STUDIES[args.study]
+    what, default = monte_carlo.STUDIES[args.study]
     design = dataclasses.replace(
-        usual,
-        trials=usual.trials if args.trials is None else args.trials,
+        default,
+        trials=default.trials if args.trials is None else args.trials,
         seed=args.seed,
-        images=tuple(args.images or usual.images),
-        stars=tuple(args.stars or usual.stars),
-        tracker_arcsec=tuple(args.tracker or usual.tracker_arcsec),
-        methods=tuple(args.methods or usual.methods),
-        told_arcsec=args.tracker_told,
+        images=tuple(args.images or default.images),
+        stars=tuple(args.stars or default.stars),
+        tracker_arcsec=tuple(args.tracker or default.tracker_arcsec),
+        methods=tuple(args.methods or default.methods),
+        assumed_arcsec=args.tracker_assumed,
     )
     monte_carlo.check(design)
     workers = _workers(args)
     _make_folder(args.output)
     start = time.monotonic()
     with progress_bar(design.trials, 'trials') as advance:
-        rows = campaign_workers.run_trials(design, workers, args.scheduler, advance)
+        rows = run_trials(design, workers, args.scheduler, advance)
     seconds = time.monotonic() - start
-    found = monte_carlo.conclude(design, rows)
+    found = summary.conclude(design, rows)
     path = args.output / f'{design.study}.json'
-    software = f'starcal {provenance.software_version()}'
-    write_atomically(path, monte_carlo.content(found, software))
-    path.with_suffix('.png').write_bytes(study_figures.png(found))
+    write_atomically(path, summary.content(found, _software()))
+    path.with_suffix('.png').write_bytes(figures.png(found))
     print(f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s')
-    print('\n'.join(monte_carlo.table(found)))
+    print('\n'.join(summary.table(found)))
     print(f'written to {path} and {path.with_suffix(".png").name}')
     return EXIT_ACCEPTED
 
@@ -333,14 +336,13 @@ def _workers(args: argparse.Namespace) -> int:
 
 
 def _paper(args: argparse.Namespace) -> int:
-    """Show the paper again."""
+    """Reproduce the paper."""
     import dataclasses
     import functools
 
-    from starcal_ros.pipeline import provenance
     from starcal_ros.products.files import write_atomically
     from starcal_ros.simulation.scenario import scenario
-    from starcal_ros.studies import monte_carlo, paper, paper_figures
+    from starcal_ros.studies import monte_carlo, paper, paper_figures, summary
     from starcal_ros.studies.workers import run_each, run_trials
 
     workers = _workers(args)
@@ -355,17 +357,22 @@ def _paper(args: argparse.Namespace) -> int:
         frames = run_each(frame, images, workers, args.scheduler, advance)
     with progress_bar(table1.trials, 'trials') as advance:
         rows = run_trials(table1, workers, args.scheduler, advance)
-    observations = [frames_at for _, frames_at in sorted(frames, key=lambda item: item[0])]
-    found = paper.study(observations, monte_carlo.conclude(table1, rows), args.seed)
-    software = f'starcal {provenance.software_version()}'
+    observations = [observed for _, observed in sorted(frames, key=lambda item: item[0])]
+    found = paper.study(observations, summary.conclude(table1, rows), args.seed)
     for name, png in paper_figures.pngs(found).items():
         write_atomically(args.output / 'images' / f'paper_{name}.png', png)
     path = args.output / 'paper.md'
-    write_atomically(path, paper.page(found, software))
-    content = {'software': software, **paper.numbers(found)}
+    write_atomically(path, paper.page(found, _software()))
+    content = {'software': _software(), **paper.numbers(found)}
     write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
     print(f'written to {path}, with figures in {args.output / "images"}')
     return EXIT_ACCEPTED
+
+
+def _software() -> str:
+    from starcal_ros.pipeline.provenance import software_version
+
+    return f'starcal {software_version()}'
 
 
 def _digest(path: Path) -> str:
@@ -382,7 +389,7 @@ def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OptionError(f'{path}: cannot be made: {error.strerror}') from error
+        raise OptionError(f'{path}: cannot create the folder: {error.strerror}') from error
 
 
 _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {

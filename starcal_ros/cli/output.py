@@ -1,4 +1,4 @@
-"""What the tool prints of a calibration, a bag and a comparison."""
+"""Tables and lines that the tool prints for a calibration, a bag and a comparison."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from starcal_ros.utc import utc_text
 
 
 def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
-    """Print parameters, statistics and verdict; changes are against the prior."""
+    """Print parameters, statistics and verdict; changes are relative to the prior."""
     camera, sigma = calibration.geometry.camera, calibration.sigma
     rows = []
     for k, name in enumerate(camera.parameter_names):
@@ -55,7 +55,7 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
 
 
 def print_inspection(inspection: Inspection) -> None:
-    """Print topics, images, attitudes and what would be refused."""
+    """Print topics, images, attitudes and refused images."""
     print_table(
         ('topic', 'type', 'messages', 'rate', 'longest gap'),
         [
@@ -78,7 +78,7 @@ def print_inspection(inspection: Inspection) -> None:
         _print_images(inspection)
     if inspection.status is not None:
         print_table(
-            ('a calibration now', '1-sigma'),
+            ('predicted', '1-sigma'),
             [
                 (name, _predicted(name, value))
                 for name, value in zip(
@@ -93,7 +93,7 @@ def print_inspection(inspection: Inspection) -> None:
     elif inspection.measured:
         print_verdict(True, 'can be calibrated')
     else:
-        print_verdict(True, 'nothing speaks against it so far; --params measures the stars too')
+        print_verdict(True, 'no problems found so far; use --params to measure the stars too')
 
 
 def _print_images(inspection: Inspection) -> None:
@@ -106,10 +106,10 @@ def _print_images(inspection: Inspection) -> None:
         + (f', with the attitudes of {chosen.attitude}' if chosen.attitude else '')
     )
     if inspection.longest_attitude_gap_s >= 0:
-        print(f'longest gap of attitudes about one: {inspection.longest_attitude_gap_s:.3g} s')
+        print(f'longest attitude gap around an image: {inspection.longest_attitude_gap_s:.3g} s')
     if inspection.refused:
         print_table(
-            ('refused', 'images', 'meaning', 'the first'),
+            ('refused', 'images', 'meaning', 'first'),
             [
                 (r.reason, str(r.count), r.meaning, f'{_clock(r.first_ns)}: {r.detail}')
                 for r in inspection.refused
@@ -119,8 +119,8 @@ def _print_images(inspection: Inspection) -> None:
     if inspection.stars_per_image:
         stars = inspection.stars_per_image
         print(
-            f'stars per image: {min(stars)} to {max(stars)}, {sum(stars)} in all; '
-            f'left out: {_counted(inspection.refused_stars)}'
+            f'stars per image: {min(stars)} to {max(stars)}, {sum(stars)} in total; '
+            f'refused: {_counted(inspection.refused_stars)}'
         )
 
 
@@ -149,7 +149,7 @@ def print_comparison(comparison: Comparison) -> None:
     print_table(
         ('lines of sight', 'worst', 'rms', 'worst', 'rms'),
         [
-            ('as they are', *_map_cells(comparison.before)),
+            ('as calibrated', *_map_cells(comparison.before)),
             ('common rotation removed', *_map_cells(comparison.after)),
         ],
     )
@@ -157,8 +157,8 @@ def print_comparison(comparison: Comparison) -> None:
     total = comparison.total
     if total.degrees_of_freedom:
         print(
-            f'all together    chi2 {total.value:.1f} of {total.degrees_of_freedom} degrees of '
-            f'freedom, p-value {total.p_value:.2g}'
+            f'all parameters  chi2 {total.value:.1f}, {total.degrees_of_freedom} degrees of '
+            f'freedom, p-value {total.p_value:.3g}'
         )
     for note in comparison.notes:
         print(f'note: {note}')
@@ -191,9 +191,9 @@ def _predicted(name: str, sigma: float) -> str:
 def _topic_notes(topic: TopicContent) -> list[str]:
     notes = [f'{utc_text(topic.first_ns)} to {_clock(topic.last_ns)}']
     if topic.kinds:
-        notes.append(', '.join(f'{count} of {kind}' for kind, count in topic.kinds.items()))
+        notes.append(', '.join(f'{count} x {kind}' for kind, count in topic.kinds.items()))
     if topic.bad:
-        notes.append(f'{topic.bad} of {topic.count} messages are not valid')
+        notes.append(f'{topic.bad} of {topic.count} messages are invalid')
     if topic.backward:
         notes.append(f'stamps go back {topic.backward} times')
     return notes

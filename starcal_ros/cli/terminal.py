@@ -1,4 +1,4 @@
-"""What a person sees: bars and tables on a terminal, plain lines in a pipe or a file."""
+"""Progress bars, tables and verdicts: drawn on a terminal, plain lines in a pipe or a file."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ T = TypeVar('T')
 
 
 @contextlib.contextmanager
-def progress_bar(total: int, what: str) -> Iterator[Callable[[], None]]:
-    """A bar on a terminal, nothing elsewhere; the function given advances it by one."""
+def progress_bar(total: int, label: str) -> Iterator[Callable[[], None]]:
+    """Progress bar on a terminal, nothing elsewhere; yields a function that advances it by one."""
     if not sys.stderr.isatty():
         yield lambda: None
         return
@@ -35,13 +35,13 @@ def progress_bar(total: int, what: str) -> Iterator[Callable[[], None]]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(what, total=total)
+        task = progress.add_task(label, total=total)
         yield lambda: progress.advance(task)
 
 
-def with_progress(items: Iterable[T], total: int, what: str) -> Iterator[T]:
-    """The items, with a bar that shows how many of them have been dealt with."""
-    with progress_bar(total, what) as advance:
+def with_progress(items: Iterable[T], total: int, label: str) -> Iterator[T]:
+    """Yield the items and show how many of them have been processed."""
+    with progress_bar(total, label) as advance:
         for item in items:
             yield item
             advance()
@@ -49,9 +49,9 @@ def with_progress(items: Iterable[T], total: int, what: str) -> Iterator[T]:
 
 def print_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> None:
     """
-    Print a table: drawn on a terminal, else in columns of aligned text.
+    Print a table: drawn on a terminal, aligned text elsewhere.
 
-    The first ``left`` columns begin at the left, the others end at the right, as numbers do.
+    The first ``left`` columns are left-aligned, the others right-aligned.
     """
     rows = list(rows)
     if not sys.stdout.isatty():
@@ -67,12 +67,12 @@ def print_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int 
         box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False, header_style='bold'
     )
     for k, name in enumerate(header):
-        # A name may be cut in two where the terminal is narrow; a number never.
+        # On a narrow terminal a name may be folded, a number never.
         table.add_column(
             name, justify='left' if k < left else 'right', no_wrap=k >= left, overflow='fold'
         )
     for row in rows:
-        table.add_row(*map(Text, row))  # Text: a bracket in a name is no markup
+        table.add_row(*map(Text, row))  # Text: brackets in a name are not markup
     Console().print(table)
 
 
@@ -89,7 +89,7 @@ def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]], left: int 
 
 
 def print_verdict(good: bool, text: str) -> None:
-    """Print a line that says how something ended: in colour on a terminal that has any."""
+    """Print a verdict, in colour on a terminal."""
     if not sys.stdout.isatty():
         print(text)
         return

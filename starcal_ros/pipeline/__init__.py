@@ -1,1 +1,1 @@
-"""The steps that the nodes and the tool share."""
+"""Processing steps shared by the nodes and the tool."""

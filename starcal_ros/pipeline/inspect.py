@@ -1,4 +1,4 @@
-"""What a bag holds, and what a calibration would make of it: by the code that would make it."""
+"""Contents of a bag and the images that a calibration would refuse, by the calibration's code."""
 
 from __future__ import annotations
 
@@ -40,24 +40,18 @@ from starcal_ros.records import (
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
 
 _IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
-_STAMPED = (
-    *_IMAGES,
-    ATTITUDE_TYPE,
-    VELOCITY_TYPE,
-    TEMPERATURE_TYPE,
-    OBSERVATIONS_TYPE,
-)
+_STAMPED = (*_IMAGES, ATTITUDE_TYPE, VELOCITY_TYPE, TEMPERATURE_TYPE, OBSERVATIONS_TYPE)
 
 
 @dataclass(frozen=True)
 class TopicContent:
     """
-    The messages of a topic.
+    Statistics of a topic.
 
     ``first_ns``, ``last_ns``, the median rate and the longest gap are of the stamps in the
-    messages, or of the times of recording where the type is none that starcal reads; a rate is 0
-    where there are not two.  ``kinds`` counts the images by encoding and size.  ``bad`` counts
-    messages that cannot be decoded, and attitudes that are no rotations.
+    messages, or of the recording times for types that starcal does not read; with fewer than two
+    messages the rate is 0.  ``kinds`` counts the images by encoding and size.  ``bad`` counts
+    messages that cannot be decoded, and attitudes that are not rotations.
     """
 
     name: str
@@ -74,7 +68,7 @@ class TopicContent:
 
 @dataclass(frozen=True)
 class Refused:
-    """Images refused for one reason: how many, what it means, and the first of them."""
+    """Images refused for one reason: their count, its meaning, and the first of them."""
 
     reason: str
     count: int
@@ -86,31 +80,31 @@ class Refused:
 @dataclass(frozen=True)
 class Inspection:
     """
-    A bag as a calibration sees it.
+    Contents of a bag as a calibration reads it.
 
     Attributes
     ----------
     bags : tuple of str
     topics : tuple of TopicContent
     chosen : Topics or None
-        What a calibration would read; None where it could not tell.
+        Topics that a calibration would read; None if they are ambiguous or missing.
     images : int
-        Of the chosen topic.
+        Images of the chosen topic.
     refused : tuple of Refused
-        Those that cannot be used, most frequent first.
+        Refused images, most frequent reason first.
     longest_attitude_gap_s : float
-        Between the attitude samples about an image that is not refused; -1 where there is none.
+        Between the attitude samples around an accepted image; -1 if no image is accepted.
     measured : bool
         Whether the stars were measured; if not, an image may still be refused for its stars.
     stars_per_image : tuple of int
-        Of the images that are not refused, where measured.
+        Stars of each accepted image, if measured.
     refused_stars : mapping
-        Reason -> count, where measured.
+        Reason -> count, if measured.
     status : EnsembleStatus or None
-        What a calibration from it would be worth, where measured.
+        Predicted uncertainty of a calibration, if measured.
     damage : tuple of str
     problems : tuple of str
-        Why a calibration would have nothing to work with; empty where it would.
+        Why the bag cannot be calibrated; empty if it can.
     """
 
     bags: tuple[str, ...]
@@ -134,17 +128,17 @@ def inspect(
     on_image: Callable[[], None] = lambda: None,
 ) -> Inspection:
     """
-    What bags hold and which of their images would be refused.
+    Contents of bags and the images that a calibration would refuse.
 
-    With a setup, stars are measured as for a calibration; without one, images are held against
-    the attitudes at the default limits.
+    With a setup, stars are measured as for a calibration; without one, images are only checked
+    against the attitudes, at the default limits.
 
     Raises
     ------
     BagError
-        When a bag is missing or none.
+        When a bag is missing or not a bag.
     """
-    damage: dict[str, None] = {}  # in order, each once
+    damage: dict[str, None] = {}  # an ordered set
     topics = _contents(paths, lambda text: damage.setdefault(text))
     options = setup.attitude if setup else AttitudeOptions()
     problems = []
@@ -189,7 +183,7 @@ def inspect(
 
 
 def content(inspection: Inspection) -> dict[str, object]:
-    """An inspection as a JSON object; a number that is not finite is null."""
+    """JSON object of an inspection; a number that is not finite is null."""
     made = dataclasses.asdict(inspection)
     if inspection.status is not None:
         status = made['status']
@@ -201,7 +195,7 @@ def content(inspection: Inspection) -> dict[str, object]:
 
 
 def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, ...]:
-    """Every topic, by name, from one pass over the files."""
+    """Statistics of every topic, sorted by name, from one pass over the files."""
     types: dict[str, str] = {}
     stamps: defaultdict[str, list[int]] = defaultdict(list)
     kinds: defaultdict[str, Counter[str]] = defaultdict(Counter)
@@ -248,7 +242,7 @@ def _topic_content(
 
 
 def _kind(message: Message) -> str:
-    """Encoding and size of an image message, in words."""
+    """Encoding and size of an image message as text."""
     if hasattr(message, 'encoding'):
         return f'{message.encoding} {message.width} x {message.height}'
     try:
@@ -261,7 +255,7 @@ def _kind(message: Message) -> str:
 def _placed(
     paths: Sequence[Path], topics: Topics, options: AttitudeOptions
 ) -> Iterator[StarObservations]:
-    """Images without their stars: refused where decoding, order or attitude refuses them."""
+    """Images without their stars, refused for bad encoding, order or attitude."""
     attitudes = reader.read_attitudes(paths, topics.attitude, options)
     latest_ns = None
     for image in reader.read_images(paths, topics.image, options.stamp_offset_s):
@@ -293,9 +287,9 @@ def _refused(seen: Iterable[StarObservations]) -> tuple[Refused, ...]:
 
 
 def _shortages(used: Sequence[StarObservations], status: EnsembleStatus | None) -> list[str]:
-    """What is missing for a calibration."""
+    """Reasons why a calibration is not possible."""
     if not used:
-        return ['no image can be used']
+        return ['no usable image']
     if status is None:
         return []
     found = []
@@ -304,5 +298,5 @@ def _shortages(used: Sequence[StarObservations], status: EnsembleStatus | None) 
         ('stars', status.stars, status.min_stars),
     ):
         if there < wanted:
-            found.append(f'{there} {what} can be used, {wanted} are needed (min_{what})')
+            found.append(f'only {there} usable {what}, {wanted} needed (min_{what})')
     return found

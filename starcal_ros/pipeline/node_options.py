@@ -1,8 +1,8 @@
 """
-Options of the nodes alone, declared where code without ROS can see them.
+Options that only the nodes use, declared without importing ROS.
 
-One parameter file serves the nodes and the tool: the tool has no use for these, but it must tell
-a node's parameter from a misspelt one.
+One parameter file serves the nodes and the tool: the tool ignores these options, but must
+distinguish a parameter of a node from a misspelt name.
 """
 
 from __future__ import annotations
@@ -14,61 +14,66 @@ from starcal_ros.options import option
 
 @dataclass(frozen=True)
 class NodeOptions:
-    """What the lifecycle nodes share."""
+    """Options shared by the lifecycle nodes."""
 
-    autostart: bool = option(True, 'configure and activate at start, without a manager')
+    autostart: bool = option(True, 'configure and activate at start, without a lifecycle manager')
 
 
 @dataclass(frozen=True)
 class ObserverOptions:
-    """How the star observer takes its inputs."""
+    """Inputs of the star observer."""
 
     image_transport: str = option(
         'raw',
-        'raw: sensor_msgs/Image on image; compressed: PNG as sensor_msgs/CompressedImage on'
+        'raw: sensor_msgs/Image on image; compressed: PNG in sensor_msgs/CompressedImage on'
         ' image/compressed',
         choices=('raw', 'compressed'),
     )
     image_reliability: str = option(
         'reliable',
-        'reliability asked of the image publisher (best_effort loses large images)',
+        'reliability QoS of the image subscription (best_effort loses large images)',
         choices=('reliable', 'best_effort'),
     )
-    image_queue: int = option(20, 'images held while the one before is measured', low=1, high=1000)
+    image_queue: int = option(
+        20, 'capacity of the queue of images that wait to be measured', low=1, high=1000
+    )
     attitude_timeout_s: float = option(
-        10.0, 'longest time an image waits for the attitude after it, s of wall clock', low=0.0
+        10.0, 'timeout of an image that waits for the attitude after it, wall clock, s', low=0.0
     )
     attitude_history_s: float = option(
-        3600.0, 'how long attitude samples are kept for images still to come, s', low=1.0
+        3600.0, 'time span of attitude samples kept for later images, s', low=1.0
     )
     camera_info_per_image: bool = option(
         False,
-        'publish the calibration in force once for each image, with its header, on'
-        ' image_camera_info',
+        'publish the active calibration on image_camera_info once per image, with the header of'
+        ' the image',
     )
 
 
 @dataclass(frozen=True)
 class CalibratorOptions:
-    """What the calibrator keeps, and what it does with a new calibration beside publishing it."""
+    """State of the calibrator and hand-over of new calibrations."""
 
     state_dir: str = option(
         '',
-        'folder that keeps the ensemble and the calibrations from a crash to the next start;'
-        ' empty: they are held in memory alone',
+        'folder in which the ensemble and the calibrations survive a restart; empty: memory only',
     )
     calibration_history: int = option(
-        20, 'most calibrations kept for roll-back, the one in force included', low=2, high=10000
+        20,
+        'maximum number of calibrations kept for roll-back, including the active one',
+        low=2,
+        high=10000,
     )
     state_report: bool = option(
-        True, 'keep in state_dir a report of what is in force and of the last refused candidate'
+        True,
+        'write reports of the active calibration and of the last refused candidate to state_dir',
     )
     set_camera_info_service: str = option(
-        '', 'sensor_msgs/SetCameraInfo service to hand each new calibration to; empty: none'
+        '', 'sensor_msgs/SetCameraInfo service called with each new calibration; empty: none'
     )
     set_camera_info_timeout_s: float = option(
         5.0,
-        'longest wait for that service, and then for its answer, before it counts as a failure, s',
+        'timeout of that service, and again of its response, before the call counts as failed, s',
         low=0.1,
         high=3600.0,
     )
@@ -76,21 +81,24 @@ class CalibratorOptions:
 
 @dataclass(frozen=True)
 class PlayerOptions:
-    """How a bag is played."""
+    """Playback of a bag."""
 
     bag: str = option('', 'an .mcap file or a bag folder')
     rate: float = option(
-        1.0, 'times real time; 0: as fast as the stars are observed', low=0.0, high=1e6
+        1.0,
+        'playback speed; 1: real time, 0: as fast as the stars are observed',
+        low=0.0,
+        high=1e6,
     )
-    loop: bool = option(False, 'start again at the end')
+    loop: bool = option(False, 'restart at the end of the bag')
     wait_for_subscribers_s: float = option(
-        10.0, 'longest wait for somebody to listen to the images and attitudes, s', low=0.0
+        10.0, 'timeout of the wait for subscribers of images and attitudes, s', low=0.0
     )
     images_in_flight: int = option(
-        4, 'images sent ahead of their observations where a star observer listens', low=1
+        4, 'images sent ahead of their observations if a star observer is running', low=1
     )
-    clock: bool = option(False, 'publish the time of the bag on /clock, for use_sim_time')
+    clock: bool = option(False, 'publish the bag time on /clock, for use_sim_time')
 
 
 NODE_OPTION_CLASSES = (NodeOptions, ObserverOptions, CalibratorOptions)
-"""What a parameter file may hold beside the options of the stages."""
+"""Options that a parameter file may hold besides those of the processing stages."""

@@ -1,4 +1,4 @@
-"""A sequence of images, each measured with what those before it have shown."""
+"""Star observations of an image sequence; each image is predicted from those before it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
 import math
+import operator
 from pathlib import Path
 from typing import TypeVar
 
@@ -31,20 +32,19 @@ Floats = NDArray[np.float64]
 T = TypeVar('T')
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
-
-_IMAGES_OF_A_RESTART = 3  # two images may have changed places on their way; three do not
+_IMAGES_OF_A_RESTART = 3  # two images may be swapped in transit, three are not
 
 
 @dataclass(frozen=True)
 class Track:
     """
-    Where a sequence of images stands.
+    State of an image sequence.
 
-    ``geometry`` is what an image is searched with; ``latest_ns`` stamps the last one used.
-    ``followed`` is what the images so far have shown, with which the next is measured without a
+    ``geometry`` predicts the stars of a full search; ``latest_ns`` is the stamp of the last image
+    used.  ``followed`` is the state of tracking, with which the next image is measured without a
     search; None before the first.  ``behind`` images in a row, the last of them at ``behind_ns``,
-    were stamped before the last one used.  ``seen`` is the last frame of all, used or not,
-    which a stuck camera shows again; ``hot`` the hot pixels found so far.
+    were stamped before the last one used.  ``seen`` is the fingerprint of the last frame, used or
+    not, to detect a frozen camera; ``hot`` the hot pixels found so far.
     """
 
     geometry: CameraGeometry
@@ -65,13 +65,13 @@ def observe_next(
     temperature_degc: float = math.nan,
 ) -> tuple[StarObservations, Track]:
     """
-    The stars of the next image of a sequence, and where the sequence stands then.
+    Observations of the next image of a sequence, and the state of the sequence after it.
 
-    A sequence starts with the prior, or with the calibration in force.  An image stamped at or
-    before one that was used is refused; a refused image moves nothing, so that one wrong stamp
-    costs one image.  The third such image in a row, in order among themselves, is believed: a
-    clock was set back, or a recording plays again.  The sequence starts anew with it.  The pixels
-    of the image before are refused, used or not, when they come again under another stamp.
+    A sequence starts with the prior or the active calibration.  An image stamped at or before the
+    last one used is refused and does not change the state, so that one wrong stamp costs one
+    image.  After the third such image in a row, in order among themselves, the sequence restarts
+    with that image: a clock was set back, or a recording is played again.  An image with the
+    pixels of the image before, used or not, and another stamp is refused.
     """
     track = _after_order(track, image.time_ns)
     known: dict[str, object] = {'temperature_degc': temperature_degc}
@@ -117,34 +117,34 @@ def observe(
     velocity_m_s: Floats | None = None,
 ) -> StarObservations:
     """
-    The stars of one image, or the record of why it is refused; never raises for a bad image.
+    Observations of one image, or the record of its refusal; never raises for a bad image.
 
-    ``geometry`` is what the stars are predicted with: the prior or a calibration in force.
-    ``velocity_m_s`` (3,) is the observer's barycentric velocity, ICRF axes; None: the Earth's.
+    ``geometry`` predicts the stars: the prior or the active calibration.  ``velocity_m_s`` (3,) is
+    the observer's barycentric velocity, ICRF axes; None: the Earth's.
     """
     return observe_next(image, attitudes, setup, Track(geometry), velocity_m_s)[0]
 
 
 def _without_dark(image: Image, setup: Setup) -> Image:
-    """The image less the dark frame, kept positive by the dark frame's own median."""
+    """Image minus dark frame, kept positive by adding the median of the dark frame."""
     pixels, dark = image.pixels, setup.dark
     if dark is None:
         return image
     if dark.dtype != pixels.dtype:
         raise ImageRefused('bad_encoding', f'{pixels.dtype} image, the dark frame is {dark.dtype}')
-    # Noise below the dark level must not be cut off at zero: it would bias the background.
+    # Clipping noise below the dark level at zero would bias the background.
     below = np.minimum(dark, dark.dtype.type(setup.dark_pedestal_dn))
     raised = cv2.add(pixels, dark.dtype.type(setup.dark_pedestal_dn) - below)
-    # The types of OpenCV know of no image of whole numbers.
+    # OpenCV's type stubs lack integer images.
     level: Pixels = cv2.subtract(raised, dark - below)  # type: ignore[assignment]
-    # What is saturated stays at the end of the range, where it is known as such.
+    # Saturated pixels stay at the end of the range, so that they are still found.
     peak = int(pixels.max())
     level[(level > peak) | (pixels >= (saturation_level(pixels, setup.centroid) or np.inf))] = peak
     return Image(image.time_ns, level)
 
 
 def _after_order(track: Track, time_ns: int) -> Track:
-    """Where a sequence stands when an image has come; the third from the past starts it anew."""
+    """State when an image arrives; the third image from the past restarts the sequence."""
     if track.latest_ns is None or time_ns > track.latest_ns:
         return dataclasses.replace(track, behind=0)
     behind = track.behind + 1 if track.behind and time_ns > track.behind_ns else 1
@@ -154,14 +154,14 @@ def _after_order(track: Track, time_ns: int) -> Track:
 
 
 def _stars(shot: Shot, setup: Setup, track: Track) -> tuple[StarObservations, Track]:
-    """The stars where the images before say, or else where a search of the image finds them."""
+    """Observations by tracking from the images before, or else by a full search."""
     time_ns = shot.image.time_ns
     if track.followed is not None:
         try:
             observations, followed = follow(
                 shot, track.followed, setup.catalog, setup.centroid, setup.identification
             )
-            # Good to a few pixels for the camera of the search, which searches over many.
+            # Accurate to a few pixels with the camera of the search, whose window is wider.
             geometry = dataclasses.replace(
                 track.geometry,
                 star_tracker_from_camera_xyzw=followed.geometry.star_tracker_from_camera_xyzw,
@@ -171,7 +171,7 @@ def _stars(shot: Shot, setup: Setup, track: Track) -> tuple[StarObservations, Tr
             )
             return observations, _with_hot_pixels(after, shot, observations, setup)
         except ImageRefused:
-            pass  # the search says what is wrong with the image
+            pass  # the full search finds the reason of refusal
     observations, instrument = observe_stars(
         shot, track.geometry, setup.catalog, setup.centroid, setup.identification
     )
@@ -190,7 +190,7 @@ def _stars(shot: Shot, setup: Setup, track: Track) -> tuple[StarObservations, Tr
 def _with_hot_pixels(
     track: Track, shot: Shot, observations: StarObservations, setup: Setup
 ) -> Track:
-    """The track with the hot pixels that an image shows, which is aligned as the track says."""
+    """State with the hot pixels of an image added."""
     icrf_from_star_tracker = Rotation.from_quat(shot.icrf_from_star_tracker_xyzw)
     hot = learn_hot_pixels(
         track.hot or setup.hot,
@@ -206,7 +206,7 @@ def _with_hot_pixels(
 
 def check_order(image: Image, latest_ns: int | None) -> None:
     """
-    Hold the stamp of an image against that of the last one used, None where there is none.
+    Check that an image is stamped after the last one used (None: no image used yet).
 
     Raises
     ------
@@ -222,16 +222,17 @@ def _check_size(image: Image, camera: CameraModel) -> None:
     height, width = image.pixels.shape
     if (width, height) != (camera.width, camera.height):
         raise ImageRefused(
-            'wrong_size', f'{width} x {height}, the camera has {camera.width} x {camera.height}'
+            'wrong_size',
+            f'image of {width} x {height}, prior camera of {camera.width} x {camera.height}',
         )
 
 
 def latest_at(samples: Sequence[tuple[int, T]], time_ns: int, without: T) -> T:
     """
-    The last sample at or before a time, else the first after it; ``without`` where there is none.
+    Last sample at or before a time, else the first after it; ``without`` if there are none.
 
-    A spacecraft's velocity changes by under 10 m/s (0.007 arcsec) between the samples of a minute,
-    and a camera's temperature by less than its sensor tells.
+    Within a minute, the velocity of a spacecraft changes by under 10 m/s (0.007 arcsec), and the
+    temperature of a camera by less than the resolution of its sensor.
     """
     before = [sample for stamp_ns, sample in samples if stamp_ns <= time_ns]
     if before:
@@ -249,10 +250,10 @@ def observe_bag(
     on_image: OnImage | None = None,
 ) -> Iterator[StarObservations]:
     """
-    Observations of every image of a bag, in the order of the bag; one image in memory at a time.
+    Observations of every image of a bag, in bag order, with one image in memory at a time.
 
-    ``on_image`` is shown each image that could be decoded, with its observations and what the
-    stars were predicted with.
+    ``on_image`` is called with each decoded image, its observations and the geometry that
+    predicted its stars.
 
     Raises
     ------
@@ -260,16 +261,13 @@ def observe_bag(
         When the bag cannot be read or a topic is not in it.
     """
     attitudes = reader.read_attitudes(paths, attitude_topic, setup.attitude)
-    velocities = (
-        sorted(reader.read_velocities(paths, velocity_topic), key=lambda sample: sample[0])
-        if velocity_topic
-        else []
-    )
-    temperatures = (
-        sorted(reader.read_temperatures(paths, temperature_topic), key=lambda sample: sample[0])
-        if temperature_topic
-        else []
-    )
+    by_time = operator.itemgetter(0)
+    velocities: list[tuple[int, Floats]] = []
+    temperatures: list[tuple[int, float]] = []
+    if velocity_topic:
+        velocities = sorted(reader.read_velocities(paths, velocity_topic), key=by_time)
+    if temperature_topic:
+        temperatures = sorted(reader.read_temperatures(paths, temperature_topic), key=by_time)
     track = Track(setup.prior)
     for image in reader.read_images(paths, image_topic, setup.attitude.stamp_offset_s):
         if isinstance(image, StarObservations):

@@ -1,4 +1,4 @@
-"""Where a calibration comes from: software, options, catalog, prior and observations."""
+"""Provenance of a calibration: software, options, catalog, prior and observations."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from starcal_ros.records import Ensemble
 
 def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -> dict[str, str]:
     """
-    Where a calibration comes from, enough to repeat it.
+    Provenance of a calibration, sufficient to repeat it.
 
-    ``inputs`` names what the observations came from.
+    ``inputs`` maps the name of each input file to its digest.
     """
     prior = np.r_[setup.prior.camera.parameters, setup.prior.star_tracker_from_camera_xyzw]
     return {
@@ -33,11 +33,11 @@ def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -
 
 def _digest(ensemble: Ensemble) -> str:
     """
-    SHA-256 of all that an estimate reads of its images, in their order.
+    SHA-256 of everything that an estimate reads from its images, in their order.
 
-    Of each image, little-endian: stamp (int64, ns), number of stars (int64), attitude, then by
-    columns catalog numbers (int64), directions, pixels and covariances, last the temperature where
-    it is known.  Whoever has the recorded observations can make it again.
+    For each image, little-endian: stamp (int64, ns), number of stars (int64), attitude, then by
+    column catalog numbers (int64), directions, pixels and covariances, last the temperature if
+    known.  It can be recomputed from recorded observations.
     """
     digest = hashlib.sha256()
     for image in ensemble.images:
@@ -52,7 +52,7 @@ def _digest(ensemble: Ensemble) -> str:
 
 
 def software_version() -> str:
-    """Version of the installed package; 'unknown' where it runs from a bare source tree."""
+    """Version of the installed package; 'unknown' in a source tree that is not installed."""
     try:
         return importlib.metadata.version('starcal_ros')
     except importlib.metadata.PackageNotFoundError:

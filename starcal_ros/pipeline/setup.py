@@ -1,4 +1,4 @@
-"""What a camera is calibrated with: the options of every stage, and what they name, loaded."""
+"""Setup of a calibration: options of every stage, with the files they name loaded."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 @dataclass(frozen=True)
 class SetupOptions:
-    """Prior camera and alignment, frames, and the files that go with the camera."""
+    """Prior camera and alignment, frames, catalog and dark frame."""
 
     camera_info_url: str = option(
-        '', 'prior camera: a ROS camera YAML, file:// or package:// URL or a path'
+        '', 'ROS camera YAML of the prior camera: file:// or package:// URL, or a path'
     )
     lens_model: str = option(
         'prior',
@@ -57,22 +57,22 @@ class SetupOptions:
     )
     prior_alignment: tuple[float, ...] = option(
         (0.0, 0.0, 0.0, 1.0),
-        'prior orientation of the camera in the star tracker frame, quaternion x, y, z, w',
+        'prior orientation of the camera in the star tracker frame, quaternion (x, y, z, w)',
         low=-1.0,
         high=1.0,
         length=4,
     )
     star_tracker_frame: str = option('star_tracker', 'name of the star tracker frame')
     camera_frame: str = option('camera', 'name of the camera optical frame')
-    catalog: str = option('', 'star catalog file; empty: the bundled one')
+    catalog: str = option('', 'star catalog file; empty: the bundled catalog')
     dark_frame: str = option(
-        '', "dark frame, a PNG or TIFF of the camera's size and depth, subtracted; empty: none"
+        '', 'dark frame to subtract, a PNG or TIFF of image size and depth; empty: none'
     )
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Options of every stage, and what they name, loaded."""
+    """Options of every stage, with prior camera, catalog and dark frame loaded."""
 
     frames: SetupOptions
     attitude: AttitudeOptions
@@ -104,16 +104,21 @@ _OPTION_GROUPS: dict[str, type[Any]] = {
 OPTION_CLASSES = tuple(_OPTION_GROUPS.values())
 
 
-def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Setup:
+def load_setup(
+    values: Mapping[str, object],
+    others: Sequence[type] = (),
+    prior: CameraGeometry | None = None,
+) -> Setup:
     """
-    Checked options with prior camera, catalog and dark frame loaded.
+    Setup from a mapping of option names to values, all checked.
 
-    ``others`` are option classes of the caller whose names the mapping may hold as well.
+    ``others`` are option classes of the caller whose names the mapping may also hold; ``prior``
+    replaces the camera file and alignment of the options.
 
     Raises
     ------
     OptionError
-        For a name nobody knows or a bad value.
+        For an unknown name or a bad value.
     ProductError, CatalogError
         When the prior camera or the catalog cannot be read.
     """
@@ -121,37 +126,26 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
     for name in values:
         if name not in known and name != 'use_sim_time':
             raise OptionError(f'{name}: no such parameter{nearest(name, known)}')
-    frames = from_mapping(SetupOptions, values)
-    prior = _prior(frames)
-    identification = from_mapping(IdentificationOptions, values)
-    calibration = from_mapping(CalibrationOptions, values)
-    check_options(calibration, prior.camera.model)
-    gate = from_mapping(GateOptions, values)
-    check_gate_options(gate, prior.camera)
-    fixed_pattern = from_mapping(FixedPatternOptions, values)
+    groups = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS.items()}
+    frames: SetupOptions = groups['frames']
+    prior = prior or _prior(frames)
+    check_options(groups['calibration'], prior.camera.model)
+    check_gate_options(groups['gate'], prior.camera)
     path = Path(frames.catalog) if frames.catalog else None
     dark = _read_dark(frames.dark_frame, prior.camera.width, prior.camera.height)
     return Setup(
-        frames=frames,
-        attitude=from_mapping(AttitudeOptions, values),
-        site=from_mapping(SiteOptions, values),
-        screening=from_mapping(ScreeningOptions, values),
-        fixed_pattern=fixed_pattern,
-        centroid=from_mapping(CentroidOptions, values),
-        identification=identification,
-        calibration=calibration,
-        gate=gate,
+        **groups,
         prior=prior,
-        catalog=load_catalog(path, identification.magnitude_limit),
+        catalog=load_catalog(path, groups['identification'].magnitude_limit),
         dark=dark,
         dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
-        hot=hot_in_dark(dark, fixed_pattern),
+        hot=hot_in_dark(dark, groups['fixed_pattern']),
     )
 
 
 def _prior(frames: SetupOptions) -> CameraGeometry:
     if not frames.camera_info_url:
-        raise OptionError('camera_info_url: the prior camera must be given')
+        raise OptionError('camera_info_url: not set; give the camera YAML of the prior camera')
     camera = read_camera_info(frames.camera_info_url)
     if frames.lens_model not in ('prior', camera.model):
         camera, worst_px = convert(camera, frames.lens_model)
@@ -176,10 +170,10 @@ def _read_dark(
         return None
     dark = cv2.imread(path.removeprefix('file://'), cv2.IMREAD_UNCHANGED)
     if dark is None:
-        raise OptionError(f'dark_frame: {path} is not an image file')
+        raise OptionError(f'dark_frame: {path} is missing or not an image file')
     if dark.shape != (height, width) or dark.dtype not in (np.uint8, np.uint16):
         raise OptionError(
             f'dark_frame: {path} is {dark.dtype} of shape {dark.shape}, '
-            f'not one channel of {width} x {height}'
+            f'expected 8 or 16 bit, one channel of {width} x {height}'
         )
     return dark.astype(np.uint8) if dark.dtype == np.uint8 else dark.astype(np.uint16)

@@ -1,4 +1,4 @@
-"""Which topics of a bag a calibration is made from."""
+"""Topics of a bag that a calibration reads."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from starcal_ros.records import StarObservations
 
 @dataclass(frozen=True)
 class Topics:
-    """A topic for each kind of message: asked for, or found; empty: not said, or none."""
+    """Topic of each kind of message; empty: not requested, or not in the bag."""
 
     image: str = ''
     attitude: str = ''
@@ -35,15 +35,15 @@ class Topics:
 
 def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = None) -> Topics:
     """
-    The topics that a calibration of bags reads: images and what goes with them, or observations.
+    Topics that a calibration of bags reads: images and telemetry, or recorded observations.
 
-    A topic that was not asked for is the only one of its type.  Recorded observations are taken
-    where they were asked for, or where there are no images.
+    A topic that was not requested must be the only one of its type.  Recorded observations are
+    read if they are requested or the bags hold no images.
 
     Raises
     ------
     BagError
-        When a topic is not there, or there are several of its type.
+        When a topic is missing, or several have its type.
     """
     there = reader.topics(paths)
     types = {topic.type_name for topic in there}
@@ -64,7 +64,7 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
     options = setup.calibration if setup else None
     used = options and (options.focal_temperature_order or options.alignment_temperature)
     thermometers = sum(topic.type_name == TEMPERATURE_TYPE for topic in there)
-    # A spacecraft has many: which one is the camera's matters only where it is made use of.
+    # A spacecraft has many: the topic must be unique only if the calibration uses it.
     if temperature or thermometers == 1 or (thermometers and used):
         temperature = _choose(paths, TEMPERATURE_TYPE, temperature, 'temperature')
     return Topics(image, attitude, velocity, temperature)
@@ -74,13 +74,13 @@ def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str
     try:
         return reader.choose_topic(paths, type_name, asked)
     except BagError as error:
-        raise BagError(f'{error}; --{what}-topic names it') from error
+        raise BagError(f'{error}; choose one with --{what}-topic') from error
 
 
 def read(
     paths: Sequence[Path], topics: Topics, setup: Setup, on_image: OnImage | None = None
 ) -> Iterator[StarObservations]:
-    """Observations of bags, measured in images that ``on_image`` is shown, or as recorded."""
+    """Observations of bags, as recorded or measured in the images (see `observe_bag`)."""
     if topics.observations:
         return reader.read_observations(paths, topics.observations)
     return observe.observe_bag(
@@ -89,6 +89,6 @@ def read(
 
 
 def count(paths: Sequence[Path], topics: Topics) -> int:
-    """How many observations `read` gives."""
+    """Count the observations that `read` yields."""
     wanted = topics.observations or topics.image
     return sum(topic.count for topic in reader.topics(paths) if topic.name == wanted)

@@ -1,1 +1,1 @@
-"""The HTML report, its figures and pictures."""
+"""HTML report with its figures and pictures."""

@@ -1,4 +1,4 @@
-"""A picture of an image with what was seen in it: for people, never for numbers."""
+"""Annotated pictures of images with their predicted, measured and refused stars."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ _SHIFT = 4  # OpenCV draws in sixteenths of a pixel
 
 @dataclass(frozen=True)
 class Mark:
-    """How the stars of one reason are drawn: an OpenCV marker type, its colour and its size."""
+    """Marker of the stars refused for one reason: OpenCV marker type, colour and size."""
 
     shape: int
     color: Color
     size: float = 12.0  # per mille of the longer side of the picture
 
 
-# Shape and colour both differ, for those who do not see one of them.  What the sky or the limits
-# explain is pale; what says something of camera or catalog stands out.
+# Shape and colour both differ, for colour-blind readers.  Reasons explained by the sky or by
+# limits are pale; reasons that indicate a problem of camera or catalog stand out.
 STAR_MARKS: Mapping[str, Mark] = {
     'not_detected': Mark(cv2.MARKER_TRIANGLE_DOWN, (190, 190, 190)),
     'border': Mark(cv2.MARKER_SQUARE, (190, 190, 190)),
@@ -44,27 +44,27 @@ STAR_MARKS: Mapping[str, Mark] = {
     'too_few_pixels': Mark(cv2.MARKER_TRIANGLE_UP, (190, 190, 190)),
     'elongated': Mark(cv2.MARKER_TILTED_CROSS, (0, 150, 255)),
     'hot_pixel': Mark(cv2.MARKER_CROSS, (80, 80, 255)),
-    'faint': Mark(cv2.MARKER_DIAMOND, (150, 150, 150), 6.0),  # the most by far
+    'faint': Mark(cv2.MARKER_DIAMOND, (150, 150, 150), 6.0),  # by far the most frequent
     'ambiguous': Mark(cv2.MARKER_STAR, (80, 80, 255)),
 }
 """Name of `STAR_REFUSALS` -> its mark."""
 
-_UNKNOWN = Mark(cv2.MARKER_STAR, _TEXT)  # a reason of another version
+_UNKNOWN = Mark(cv2.MARKER_STAR, _TEXT)  # a reason from another version
 
 
 def annotate(
     image: Image, observations: StarObservations, geometry: CameraGeometry, legend: bool = True
 ) -> Picture:
     """
-    Picture (height, width, 3) BGR of what became of the stars of an image.
+    Picture (height, width, 3) BGR of an image with its stars marked.
 
-    Crosses stand at the predicted and circles at the measured places of the stars used; those left
-    out carry the mark of their reason, which the legend names with its count.  An image refused as
-    a whole says so in a banner.  ``geometry`` is what the stars are predicted with.  Without
-    ``legend`` there are marks only: a picture that will be shrunk has no room for words.
+    Crosses mark the predicted and circles the measured positions of the used stars; refused stars
+    carry the mark of their reason, which the legend lists with its count.  A banner names the
+    reason of a refused image.  ``geometry`` predicts the stars.  Without ``legend`` only marks are
+    drawn, for pictures that will be reduced.
     """
     picture = np.asarray(cv2.cvtColor(stretch(image.pixels), cv2.COLOR_GRAY2BGR), np.uint8)
-    size = max(max(image.pixels.shape) / 1000.0, 0.6)  # smaller letters cannot be read
+    size = max(max(image.pixels.shape) / 1000.0, 0.6)  # smaller text is illegible
     width = max(1, round(size))
     for reason, places in observations.refused_places().items():
         for uv in places:
@@ -82,7 +82,7 @@ def annotate(
 
 
 def predicted_px(observations: StarObservations, geometry: CameraGeometry) -> Floats:
-    """Pixels (n, 2) where the geometry and the star tracker's attitude put the stars."""
+    """Pixels (n, 2) of the stars predicted by the geometry and the star tracker attitude."""
     icrf_from_camera = Rotation.from_quat(
         observations.icrf_from_star_tracker_xyzw
     ) * Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
@@ -92,7 +92,7 @@ def predicted_px(observations: StarObservations, geometry: CameraGeometry) -> Fl
 
 def stretch(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
     """8-bit picture of an image: sky dark, faint stars visible, bright ones white."""
-    # A sample of the pixels: the picture needs no exact quantiles of thirteen million.
+    # Quantiles of a sample of the pixels suffice for a picture.
     sample = pixels[:: max(1, pixels.shape[0] // 256), :: max(1, pixels.shape[1] // 256)]
     dark, sky, bright = np.percentile(sample, [1.0, 50.0, 99.9])
     noise = max(float(sky - dark) / 2.3, 0.5)
@@ -109,7 +109,7 @@ def _draw_mark(picture: Picture, mark: Mark, place: tuple[int, int], size: float
 
 
 def _draw_banner(picture: Picture, observations: StarObservations, size: float) -> int:
-    """Draw the refusal of the image over its whole width; the first free row below."""
+    """Draw the refusal across the top of the picture and return the first row below it."""
     if not observations.refusal:
         return 0
     scale, line = 0.8 * size, round(32 * size)
@@ -123,7 +123,7 @@ def _draw_banner(picture: Picture, observations: StarObservations, size: float) 
 
 
 def _wrapped(words: list[str], scale: float, room_px: int) -> Iterator[str]:
-    """Words in lines of a width."""
+    """Wrap words to lines of a given width."""
     row = ''
     for word in words:
         longer = f'{row} {word}'.strip()
@@ -137,7 +137,7 @@ def _wrapped(words: list[str], scale: float, room_px: int) -> Iterator[str]:
 def _draw_legend(
     picture: Picture, observations: StarObservations, size: float, top_px: int
 ) -> None:
-    """Draw each mark of the picture with its meaning and count, on a dark panel."""
+    """Draw the marks with their meaning and count on a dark panel."""
     lines = [
         (STAR_MARKS.get(reason, _UNKNOWN), f'{count} {reason.replace("_", " ")}')
         for reason, count in sorted(observations.refused_stars.items())
@@ -179,7 +179,7 @@ def _write(
 
 
 def _pixel(uv: NDArray[np.floating]) -> tuple[int, int]:
-    # Predictions far outside would overflow OpenCV's integers.
+    # Predictions far outside the image would overflow OpenCV's integers.
     u, v = np.clip(np.nan_to_num(uv, nan=-1e4), -1e4, 1e5)
     return round(float(u)), round(float(v))
 

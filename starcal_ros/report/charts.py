@@ -1,4 +1,4 @@
-"""Which figures the report shows, and the words that go with each."""
+"""Figures of the report and their captions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from starcal_ros.report import figures
 
 @dataclass(frozen=True)
 class Chart:
-    """A figure with its caption; ``text`` says in words what the drawing shows."""
+    """A figure with title and caption; the caption also describes it to screen readers."""
 
     title: str
     svg: Markup
@@ -24,58 +24,59 @@ class Chart:
 
 
 def charts_of(calibration: Calibration, residuals: Residuals | None) -> Mapping[str, Chart]:
-    """Charts by the name that the template places them by; those without data are left out."""
+    """Charts by their name in the template; charts without data are left out."""
     camera = calibration.geometry.camera
     charts = {
         'vectors': Chart(
-            'Distortion, as arrows',
+            'Distortion vectors',
             figures.distortion_vectors(camera),
-            'Where the lens puts a star, seen from where an ideal lens would (dot); arrows are '
-            'enlarged, the key gives their scale.',
+            'Displacement of a star from its position with an ideal lens (dot). Arrows are '
+            'enlarged; the key gives their scale.',
         ),
         'contours': Chart(
-            'Distortion, in pixels',
+            'Distortion magnitude',
             figures.distortion_contours(camera),
-            'Lines of equal length of those arrows.',
+            'Contours of the length of the distortion vectors, in pixels.',
         ),
     }
     prior = prior_of(calibration)
     if prior is not None:
         charts['change'] = Chart(
-            'Change against the prior',
+            'Change relative to the prior',
             figures.change_contours(prior, calibration.geometry),
-            'How far the line of sight of a pixel has moved from where the prior had it, a turn '
-            'common to all pixels removed.',
+            'Change of the line of sight of each pixel relative to the prior, in pixels, with the '
+            'common rotation removed.',
         )
     if calibration.maps is not None:
         maps = calibration.maps
         charts['cells'] = Chart(
-            'Stars in each cell',
+            'Stars per cell',
             figures.cell_counts(maps, camera),
-            f'Star observations used in {maps.stars.size} equal cells: '
-            f'{int(maps.stars.min())} to {int(maps.stars.max())}, '
-            f'{int((maps.stars == 0).sum())} of the cells empty.',
+            f'Used star observations in {maps.stars.size} equal cells: '
+            f'{int(maps.stars.min())} to {int(maps.stars.max())} per cell, '
+            f'{int((maps.stars == 0).sum())} cells empty.',
         )
         for name, title, sigma, text in (
             ('line_of_sight', 'Line of sight, camera and alignment',
              maps.line_of_sight_sigma_arcsec, 'in the star tracker frame'),
             ('shape', 'Line of sight, camera alone', maps.shape_sigma_arcsec,
-             'after the turn that is common to all pixels'),
+             'with the rotation common to all pixels removed'),
         ):  # fmt: skip
             charts[name] = Chart(
                 title,
                 figures.line_of_sight_sigma(sigma, camera, name),
-                f'1-sigma of the direction that a pixel looks in, {text}: '
-                f'{sigma.min():.3g}″ to {sigma.max():.3g}″. Each colour is an eighth of the '
+                f'1-sigma of the line of sight of each pixel, {text}: '
+                f'{sigma.min():.3g}″ to {sigma.max():.3g}″. Each colour covers one eighth of the '
                 'detector.',
             )
     if len(calibration.removals) > 1:
-        dropped = [r.removed for r in calibration.removals[1:] if r.negligible]
+        insignificant = [r.removed for r in calibration.removals[1:] if r.negligible]
         charts['terms'] = Chart(
-            'What each term is worth',
+            'Significance of each term',
             figures.term_worth(calibration.removals),
-            'Terms left out one after the other, the least missed first; all others are solved '
-            'again. Within chance (shaded): ' + (', '.join(dropped) or 'none') + '.',
+            'Terms removed one after another, the least significant first, with all others '
+            'estimated again. Not significant (shaded): '
+            f'{", ".join(insignificant) or "none"}.',
         )
     if residuals is not None and residuals.used.any():
         charts.update(_residual_charts(calibration, residuals))
@@ -87,53 +88,52 @@ def _residual_charts(calibration: Calibration, residuals: Residuals) -> dict[str
     rms = residuals.image_rms_px()
     charts = {
         'coverage': Chart(
-            'Where the stars stood',
+            'Star positions',
             figures.star_coverage(residuals, camera),
-            f'All {int(residuals.used.sum()):,} star observations used, of all images.',
+            f'All {int(residuals.used.sum()):,} used star observations of all images.',
         ),
         'images': Chart(
-            'Image by image',
+            'Residuals per image',
             figures.residuals_of_images(residuals),
-            f'RMS per axis of each image: {np.nanmin(rms):.3f} to {np.nanmax(rms):.3f} px. One '
-            'that stands out was smeared, or its stars are wrong.',
+            f'RMS per axis of each image: {np.nanmin(rms):.3f} to {np.nanmax(rms):.3f} px. A high '
+            'value indicates smear or misidentified stars.',
         ),
         'field': Chart(
-            'Over the detector',
+            'Mean residuals over the detector',
             figures.residual_field(residuals, camera),
-            'Mean residual of the stars in a cell, enlarged. Arrows that go together show what '
-            'the model of the lens does not follow; noise has no order.',
+            'Mean residual of the stars in each cell, enlarged. A regular pattern indicates '
+            'distortion that the lens model does not describe; noise has no pattern.',
         ),
         'histogram': Chart(
-            'Against the normal distribution',
+            'Normalised residuals',
             figures.histogram(residuals),
-            'Each residual over its own sigma. A standard deviation near 1 says that the sigmas '
-            'are true; the ends are cut where outliers are left out.',
+            'Each residual divided by its sigma. A standard deviation near 1 confirms the sigmas; '
+            'outliers are left out, which truncates the tails.',
         ),
         'magnitude': Chart(
-            'Against magnitude',
+            'Residuals against magnitude',
             figures.residuals_against_magnitude(residuals),
-            'Dots: single stars. The measured line lies on the expected one where the noise is '
-            'understood.',
+            'Dots: single stars. Measured and expected noise agree where the two lines coincide.',
         ),
     }
     colour = figures.residuals_against_colour(residuals)
     if colour:
         charts['colour'] = Chart(
-            'Against the colour of the star',
+            'Residuals against star colour',
             colour,
-            'A trend is lateral colour of the lens: red and blue stars stand elsewhere.',
+            'A trend indicates lateral colour of the lens, which displaces red from blue stars.',
         )
     charts['phase'] = Chart(
-        'Against the place in the pixel',
+        'Residuals against pixel phase',
         figures.residuals_against_pixel_phase(residuals),
-        'A wave is an error of the centroids: a model of the star that does not fit.',
+        'A wave indicates a centroid error: the star model does not fit.',
     )
     if np.isfinite(residuals.attitude_error_arcsec).any():
         charts['alignment'] = Chart(
-            'Star tracker against the stars, image by image',
+            'Star tracker errors per image',
             figures.alignment_in_time(residuals, calibration.star_tracker_sigma_arcsec),
-            'About the axes of the star tracker, from the common alignment; the band is its '
-            '1-sigma as used. A drift is a mounting that moves; a cross is an image whose '
-            'attitude does not fit and that was not let pull.',
+            'Difference between reported attitude and stars about the star tracker axes, at the '
+            'common alignment; the band is the assumed 1-sigma. A drift indicates a moving mount; '
+            'a cross is an image whose attitude does not fit and was not used.',
         )
     return charts

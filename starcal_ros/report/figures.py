@@ -1,9 +1,8 @@
 """
-Figures of the report as inline SVG.
+Figures of the report as inline SVG, and the figure of a comparison as a file.
 
-They show what the products hold.  Colours that must change with the theme of the page are drawn
-as marks of this module and become CSS variables, so one drawing serves light, dark and paper;
-text stays text and takes the font of the page.
+Colours that depend on the theme of the page are drawn with placeholder colours that become CSS
+variables, so one drawing serves light, dark and print; text stays text in the font of the page.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import html
 import io
+from pathlib import Path
 import re
 
 from markupsafe import Markup
@@ -22,29 +22,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binned_statistic, norm
 
+from starcal_ros.assessment import comparison
 from starcal_ros.assessment.agreement import movement
+from starcal_ros.assessment.comparison import Comparison, DifferenceMap
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.estimation.normal_equations import whitening
 from starcal_ros.records import CameraGeometry, DetectorMaps, TermRemoval
 from starcal_ros.report.term_removal_figure import curves_of, plot_curves
 
 Floats = NDArray[np.float64]
 
-# Colours nothing else draws with -> CSS variables of report.css.
+COMPARISON_FORMATS = ('.png', '.svg', '.pdf')
+
+# Placeholder colours, used by nothing else -> CSS variables of report.css.
 INK, MUTED, GRID, PAPER = '#010203', '#010204', '#010205', '#010206'
 SERIES = ('#010207', '#010208', '#010209')
-_VARIABLES = {
-    INK: '--ink',
-    MUTED: '--muted',
-    GRID: '--grid',
-    PAPER: '--paper',
-    SERIES[0]: '--series-1',
-    SERIES[1]: '--series-2',
-    SERIES[2]: '--series-3',
+_VARIABLES = {INK: '--ink', MUTED: '--muted', GRID: '--grid', PAPER: '--paper'} | {
+    colour: f'--series-{k + 1}' for k, colour in enumerate(SERIES)
 }
-# In pictures of thousands of points, which are pixels: readable on white and on black.
+# For rasterised clouds of points: readable on white and on black.
 _POINTS = '#3d8bd4'
 STYLE = {
     'svg.fonttype': 'none',
@@ -73,7 +72,7 @@ STYLE = {
     'patch.linewidth': 0.0,
 }
 _SIZE = (4.7, 3.5)
-_TITLED = 'titled'  # group id of the points that `_svg` gives titles, which a browser shows
+_TITLED = 'titled'  # group id of the points that get titles, which a browser shows on hover
 
 
 def _figure(width: float = _SIZE[0], height: float = _SIZE[1]) -> tuple[Figure, Axes]:
@@ -83,15 +82,15 @@ def _figure(width: float = _SIZE[0], height: float = _SIZE[1]) -> tuple[Figure, 
 
 def _svg(figure: Figure, name: str, titles: Sequence[str] = ()) -> Markup:
     """
-    SVG element of a figure, its identifiers made unique by a name.
+    SVG element of a figure; the name makes its identifiers unique.
 
-    ``titles`` are those of the points drawn under the group id `_TITLED`, in order.
+    ``titles`` belong to the points drawn under the group id `_TITLED`, in order.
     """
     memory = io.StringIO()
     figure.savefig(memory, format='svg', dpi=144, metadata={'Date': None, 'Creator': None})
     text = memory.getvalue()
     text = text[text.index('<svg') :]
-    # Sizes come from the page, the proportion from viewBox.
+    # The page sets the size, viewBox the aspect ratio.
     text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r'\1', text, count=1)
     text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r'\1', text, count=1)
     text = text.replace('<svg', '<svg aria-hidden="true"', 1)
@@ -107,7 +106,7 @@ def _svg(figure: Figure, name: str, titles: Sequence[str] = ()) -> Markup:
 
 
 def _with_titles(text: str, titles: Sequence[str]) -> str:
-    """Points of the group with titles as children, which a browser shows under the pointer."""
+    """Add titles to the points of the group, which a browser shows on hover."""
     first = text.index(f'id="{_TITLED}"')
     last = first + text[first:].index('</g>\n   </g>') if '</g>\n   </g>' in text[first:] else None
     group = text[first:last]
@@ -122,13 +121,16 @@ def _with_titles(text: str, titles: Sequence[str]) -> str:
 
 
 def _rms_in_bins(x: Floats, values: Floats, edges: Floats) -> tuple[Floats, Floats]:
-    """Centres of the bins that hold ten values or more, and the RMS of their values."""
+    """Centres of the bins with at least ten values, and the RMS of their values."""
     square, _, which = binned_statistic(x, values**2, 'mean', edges)
     enough = np.bincount(which, minlength=len(edges) + 1)[1:-1] >= 10
     return (0.5 * (edges[1:] + edges[:-1]))[enough], np.sqrt(square[enough])
 
 
-def _on_detector(axes: Axes, camera: CameraModel) -> None:
+def _detector_figure(camera: CameraModel, beside: float = 0.0) -> tuple[Figure, Axes]:
+    """Figure with the aspect ratio of the detector; ``beside`` is reserved at the right, inch."""
+    height = 0.75 + (3.9 - beside) * camera.height / camera.width
+    figure, axes = _figure(_SIZE[0], min(height, 5.5))
     axes.set(
         xlim=(-0.5, camera.width - 0.5),
         ylim=(camera.height - 0.5, -0.5),
@@ -137,20 +139,12 @@ def _on_detector(axes: Axes, camera: CameraModel) -> None:
         ylabel='row v (px)',
     )
     axes.grid(False)
-    for side in ('top', 'right'):
-        axes.spines[side].set_visible(True)
-
-
-def _detector_figure(camera: CameraModel, beside: float = 0.0) -> tuple[Figure, Axes]:
-    """A figure with the proportion of the detector; ``beside`` is what its right side takes."""
-    height = 0.75 + (3.9 - beside) * camera.height / camera.width
-    figure, axes = _figure(_SIZE[0], min(height, 5.5))
-    _on_detector(axes, camera)
+    axes.spines[['top', 'right']].set_visible(True)
     return figure, axes
 
 
 def star_coverage(residuals: Residuals, camera: CameraModel) -> Markup:
-    """Every star that was used, where it stood on the detector (paper, Fig. 5)."""
+    """Positions of all used stars on the detector (paper, Fig. 5)."""
     figure, axes = _detector_figure(camera)
     u, v = residuals.measured_px[residuals.used].T
     size = np.clip(4000.0 / max(len(u), 1), 0.6, 5.0)
@@ -159,7 +153,7 @@ def star_coverage(residuals: Residuals, camera: CameraModel) -> Markup:
 
 
 def cell_counts(maps: DetectorMaps, camera: CameraModel) -> Markup:
-    """Stars in equal cells of the detector."""
+    """Star counts in equal cells of the detector."""
     figure, axes = _detector_figure(camera)
     counts = maps.stars
     rows, columns = counts.shape
@@ -170,10 +164,8 @@ def cell_counts(maps: DetectorMaps, camera: CameraModel) -> Markup:
     axes.imshow(share, extent=extent, cmap='Blues', vmin=-0.15, vmax=1.1, aspect='equal')
     size = min(9.0, 90.0 / columns)
     for (row, column), count in np.ndenumerate(counts):
-        dark = share[row, column] > 0.55
-        colour = '#ffffff' if dark else '#12324f'
-        if count == 0:
-            colour = '#b3261e'
+        dark, empty = share[row, column] > 0.55, count == 0
+        colour = '#b3261e' if empty else '#ffffff' if dark else '#12324f'
         axes.text(u[column], v[row], str(count), ha='center', va='center', color=colour,
                   fontsize=size)  # fmt: skip
     return _svg(figure, 'cells')
@@ -182,18 +174,18 @@ def cell_counts(maps: DetectorMaps, camera: CameraModel) -> Markup:
 def _contours(axes: Axes, camera: CameraModel, length: Floats, unit: str) -> None:
     """Labelled contours of a grid (48, 60) of values over the detector."""
     u, v = (a.reshape(48, 60) for a in pixel_grid(camera, 60, 48).T)
-    # No more lines than can be labelled, at round numbers.
+    # Few enough levels for a label on each.
     lines = axes.contour(u, v, length, levels=7, cmap='viridis', linewidths=1.4)
     axes.clabel(lines, fmt=lambda level: f'{level:g}{unit}', fontsize=9, colors=[INK])
 
 
 def distortion_vectors(camera: CameraModel) -> Markup:
-    """How the lens moves what an ideal one would show, as arrows (paper, Fig. 6 left)."""
+    """Distortion as arrows (paper, Fig. 6 left)."""
     return _arrows(camera, pixel_grid(camera, 17, 13), None, 'vectors')
 
 
 def distortion_contours(camera: CameraModel) -> Markup:
-    """The length of those arrows in pixels (paper, Fig. 6 right)."""
+    """Length of the distortion in pixels (paper, Fig. 6 right)."""
     figure, axes = _detector_figure(camera)
     shift = distortion_px(camera, pixel_grid(camera, 60, 48))
     _contours(axes, camera, np.hypot(*shift.T).reshape(48, 60), ' px')
@@ -201,7 +193,7 @@ def distortion_contours(camera: CameraModel) -> Markup:
 
 
 def change_contours(before: CameraGeometry, after: CameraGeometry) -> Markup:
-    """Movement of the lines of sight, common rotation removed, in pixels."""
+    """Change of the lines of sight in pixels, common rotation removed."""
     figure, axes = _detector_figure(after.camera)
     _, moved_px = movement(before, after, 60, 48)
     _contours(axes, after.camera, moved_px.reshape(48, 60), ' px')
@@ -213,14 +205,15 @@ def _arrows(camera: CameraModel, places: Floats, arrows: Floats | None, name: st
     figure, axes = _detector_figure(camera)
     longest = float(np.nanmax(np.hypot(*shift.T), initial=0.0))
     key = _round_length(longest)
-    # The longest is as long as a step of the grid of seventeen.
+    # The longest arrow spans one step of a grid of seventeen columns.
     scale = (longest or 1.0) / (0.9 * camera.width / 16)
     quiver = axes.quiver(
         *places.T, *shift.T, angles='xy', scale_units='xy', scale=scale, color=SERIES[0],
         width=0.0035, headwidth=4,
     )  # fmt: skip
     axes.plot(*places.T, '.', color=MUTED, markersize=1.2)
-    # Set by hand: a key of matplotlib would take its text's colour from the arrows.
+    axes.set_title(' ')  # reserves room: an arrow above the canvas would not be drawn
+    # The key's text would otherwise take the colour of the arrows.
     axes.quiverkey(
         quiver, 0.9, 1.05, key, f'{key:g} px', labelpos='W', color=SERIES[1], labelcolor=INK,
         coordinates='axes',
@@ -229,7 +222,7 @@ def _arrows(camera: CameraModel, places: Floats, arrows: Floats | None, name: st
 
 
 def _round_length(longest: float) -> float:
-    """1, 2 or 5 times a power of ten, not over a length."""
+    """Largest 1, 2 or 5 times a power of ten that does not exceed a length."""
     if not longest > 0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(longest))
@@ -237,7 +230,7 @@ def _round_length(longest: float) -> float:
 
 
 def residual_field(residuals: Residuals, camera: CameraModel) -> Markup:
-    """Mean residual of the stars in cells of the detector: what the model does not follow."""
+    """Mean residual in cells of the detector, which shows unmodelled distortion."""
     u, v = residuals.measured_px[residuals.used].T
     edges_u = np.linspace(-0.5, camera.width - 0.5, 13)
     edges_v = np.linspace(-0.5, camera.height - 0.5, 11)
@@ -254,7 +247,7 @@ def residual_field(residuals: Residuals, camera: CameraModel) -> Markup:
 
 
 def residuals_of_images(residuals: Residuals) -> Markup:
-    """RMS of the stars used of each image, in order of time."""
+    """RMS residual of the used stars of each image, in time order."""
     figure, axes = _figure()
     rms = residuals.image_rms_px()
     number = np.arange(1, len(rms) + 1)
@@ -279,7 +272,7 @@ def _whole_numbers(axes: Axes, count: int) -> None:
 
 
 def histogram(residuals: Residuals) -> Markup:
-    """Residuals in their own sigmas against the normal distribution (paper, Fig. 7)."""
+    """Normalised residuals and the normal distribution (paper, Fig. 7)."""
     figure, axes = _figure()
     edges = np.linspace(-5, 5, 51)
     whitened = whitened_residuals(residuals)
@@ -290,13 +283,13 @@ def histogram(residuals: Residuals) -> Markup:
         )  # fmt: skip
     x = np.linspace(-5, 5, 201)
     axes.plot(x, norm.pdf(x), color=INK, linewidth=1.0, linestyle='--', label='normal')
-    axes.set(xlabel='residual (its own sigma)', ylabel='density', xlim=(-5, 5))
+    axes.set(xlabel='normalised residual (sigma)', ylabel='density', xlim=(-5, 5))
     axes.legend(loc='upper right', handlelength=1.4)
     return _svg(figure, 'histogram')
 
 
 def whitened_residuals(residuals: Residuals) -> tuple[Floats, Floats]:
-    """Residuals of the stars used, independent and of unit variance if all is as assumed."""
+    """Whitened residuals of the used stars: unit variance if the covariances are correct."""
     used = residuals.used
     uu, uv, vv = whitening(residuals.covariance_px2[used])
     r_u, r_v = residuals.residual_px[used].T
@@ -304,21 +297,21 @@ def whitened_residuals(residuals: Residuals) -> tuple[Floats, Floats]:
 
 
 def residuals_against_magnitude(residuals: Residuals) -> Markup:
-    """Lengths of the residuals against V, with the RMS of bins and what the sigmas promise."""
+    """Residuals against V magnitude, with the RMS in bins and the expected sigma."""
     used = residuals.used & np.isfinite(residuals.magnitude)
     V, r = residuals.magnitude[used], residuals.residual_px[used]
     figure, axes = _figure()
     sigma = np.sqrt(residuals.covariance_px2[used][:, [0, 2]].mean(axis=1))
-    # An axis of each star: 1-sigma and RMS mean the same for the points, the dots and the line.
+    # All per axis, so that points, measured RMS and expected sigma are comparable.
     axes.scatter(V, np.sqrt((r**2).mean(axis=1)), s=3, color=_POINTS, alpha=0.35, linewidths=0,
                  rasterized=True)  # fmt: skip
     if len(V):
         edges = np.arange(np.floor(2 * V.min()) / 2, V.max() + 0.5, 0.5)
         if len(edges) > 1:
             axes.plot(*_rms_in_bins(np.r_[V, V], r.T.ravel(), edges), 'o-', color=SERIES[1],
-                      markersize=4, linewidth=1.3, label='rms of half a magnitude')  # fmt: skip
+                      markersize=4, linewidth=1.3, label='measured rms')  # fmt: skip
             axes.plot(*_rms_in_bins(V, sigma, edges), '--', color=INK, linewidth=1.2,
-                      label='1-sigma expected')  # fmt: skip
+                      label='expected 1-sigma')  # fmt: skip
         axes.set_ylim(0, 1.15 * float(np.percentile(np.sqrt((r**2).mean(axis=1)), 99.5)) + 1e-6)
         axes.legend(loc='upper left', handlelength=1.6)
     axes.set(xlabel='magnitude V', ylabel='residual, rms of u and v (px)')
@@ -326,7 +319,7 @@ def residuals_against_magnitude(residuals: Residuals) -> Markup:
 
 
 def _means(axes: Axes, x: Floats, y: Floats, edges: Floats, side: int, label: str) -> None:
-    """Means with their standard errors in bins of ten values or more."""
+    """Plot means and their standard errors in bins with at least ten values."""
     mean, _, which = binned_statistic(x, y, 'mean', edges)
     std, _, _ = binned_statistic(x, y, 'std', edges)
     count = np.bincount(which, minlength=len(edges) + 1)[1:-1]
@@ -347,7 +340,7 @@ def _about_zero(axes: Axes) -> None:
 
 
 def residuals_against_colour(residuals: Residuals) -> Markup:
-    """Mean residual against BP - RP: lateral colour of the lens would show in it; '' if none."""
+    """Mean residual against BP - RP, which shows lateral colour; '' if too few colours."""
     used = residuals.used & np.isfinite(residuals.colour_bp_rp)
     if np.count_nonzero(used) < 30:
         return Markup()
@@ -365,39 +358,39 @@ def residuals_against_colour(residuals: Residuals) -> Markup:
 
 
 def residuals_against_pixel_phase(residuals: Residuals) -> Markup:
-    """Mean residual in u, and in v, against where in its pixel the star's centre stood."""
+    """Mean residual in u and v against the position of the centroid within its pixel."""
     figure, axes = _figure()
     for side, letter in enumerate('uv'):
         place = residuals.measured_px[residuals.used, side]
         residual = residuals.residual_px[residuals.used, side]
         edges = np.linspace(-0.5, 0.5, 11, dtype=np.float64)
         _means(axes, place - np.rint(place), residual, edges, side, f'{letter} against {letter}')
-    axes.set_xlabel('place of the centre in its pixel (px)')
+    axes.set_xlabel('centroid position within its pixel (px)')
     _about_zero(axes)
     return _svg(figure, 'phase')
 
 
 def line_of_sight_sigma(sigma_arcsec: Floats, camera: CameraModel, name: str) -> Markup:
-    """1-sigma of lines of sight at a regular grid of pixels, corner to corner, arcsec."""
+    """1-sigma of the lines of sight on a grid of pixels from corner to corner, arcsec."""
     figure, axes = _detector_figure(camera, beside=0.8)
     rows, columns = sigma_arcsec.shape
     u = np.linspace(0, camera.width - 1, columns)
     v = np.linspace(0, camera.height - 1, rows)
-    # Each band is an eighth of the grid: corners would take up equal steps.
+    # Bands of equal area: with equal steps the corners would use up the colours.
     levels = np.unique(np.quantile(sigma_arcsec, np.linspace(0, 1, 9)))
     if len(levels) > 1:
         filled = axes.contourf(
             u, v, sigma_arcsec, levels, cmap='viridis', norm=BoundaryNorm(levels, 256)
         )
         bar = figure.colorbar(filled, cax=axes.inset_axes((1.03, 0, 0.045, 1)), spacing='uniform')
-        bar.set_ticks(levels.tolist(), labels=_told_apart(levels))
+        bar.set_ticks(levels.tolist(), labels=_distinct_labels(levels))
         bar.ax.tick_params(size=0)
         bar.set_label('1-sigma (arcsec)')
     return _svg(figure, name)
 
 
-def _told_apart(levels: Floats) -> list[str]:
-    """Numbers with three digits, or as many as it takes to tell them apart."""
+def _distinct_labels(levels: Floats) -> list[str]:
+    """Numbers with three significant digits, or more until all labels differ."""
     for digits in range(3, 7):
         labels = [f'{level:.{digits}g}' for level in levels]
         if len(set(labels)) == len(labels):
@@ -406,7 +399,7 @@ def _told_apart(levels: Floats) -> list[str]:
 
 
 def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Markup:
-    """What the star tracker was off in each image by its stars, about its three axes."""
+    """Star tracker error of each image from its stars, about the three tracker axes."""
     figure = Figure(figsize=(_SIZE[0], 4.6), layout='constrained')
     panels = figure.subplots(3, 1, sharex=True)
     minutes = (residuals.image_time_ns - residuals.image_time_ns.min()) / (
@@ -428,7 +421,7 @@ def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Ma
         good = residuals.attitude_error_arcsec[~residuals.image_misfit, k]
         top = max(np.nanmax(np.abs(good), initial=0.0), sigma_arcsec[k]) * 1.25
         axes.set_ylim(-top, top)
-    panels[-1].set_xlabel('time from the first image (min)')
+    panels[-1].set_xlabel('time since the first image (min)')
     return _svg(figure, 'alignment')
 
 
@@ -446,3 +439,52 @@ def term_worth(removals: Sequence[TermRemoval]) -> Markup:
     )
     axes.set_xlabel('removed, one after the other')
     return _svg(figure, 'terms')
+
+
+def write_comparison(found: Comparison, path: Path) -> None:
+    """
+    Draw the difference of two calibrations over the detector, with and without common rotation.
+
+    Arrows are in pixels, colours in sigmas (in pixels if nothing was estimated).
+
+    Raises
+    ------
+    OptionError
+        For an ending that is none of `COMPARISON_FORMATS`.
+    ProductError
+        When the file cannot be written.
+    """
+    if path.suffix not in COMPARISON_FORMATS:
+        raise OptionError(f'{path}: the name must end in {", ".join(COMPARISON_FORMATS)}')
+    figure = Figure(figsize=(11.0, 4.6), layout='constrained')
+    left, right = figure.subplots(1, 2)
+    camera = found.a.geometry.camera
+    _difference(left, camera, found.before, 'lines of sight, B minus A')
+    _difference(right, camera, found.after, 'common rotation removed')
+    memory = io.BytesIO()
+    figure.savefig(memory, format=path.suffix[1:], dpi=130)
+    try:
+        path.write_bytes(memory.getvalue())
+    except OSError as error:
+        raise ProductError(f'{path}: cannot be written: {error.strerror}') from error
+
+
+def _difference(axes: Axes, camera: CameraModel, found: DifferenceMap, title: str) -> None:
+    n = comparison.GRID
+    grid_px = pixel_grid(camera, n, n).reshape(n, n, 2)
+    in_sigmas = not np.isnan(found.sigmas).all()
+    levels = np.nan_to_num(found.sigmas) if in_sigmas else found.length_px
+    filled = axes.contourf(*np.moveaxis(grid_px, -1, 0), levels, 12, cmap='viridis')
+    axes.figure.colorbar(
+        filled, ax=axes, shrink=0.8, label=f'length ({"sigma" if in_sigmas else "px"})'
+    )
+    worst_px, every_other = float(found.length_px.max()), slice(None, None, 2)
+    if worst_px > 0:  # arrows of zero length have no scale
+        axes.quiver(
+            *np.moveaxis(grid_px[every_other, every_other], -1, 0),
+            *np.moveaxis(found.difference_px[every_other, every_other], -1, 0),
+            angles='xy', color='white', edgecolor='black', linewidth=0.4, width=0.004,
+        )  # fmt: skip
+    axes.set_title(f'{title}: at most {worst_px:.3g} px', fontsize=10)
+    axes.set(xlabel='u (px)', ylabel='v (px)', aspect='equal')
+    axes.set(xlim=(0, camera.width - 1), ylim=(camera.height - 1, 0))

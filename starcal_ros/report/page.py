@@ -1,8 +1,8 @@
 """
-The products of a calibration as one self-contained HTML file, ``report.html``.
+Report of a calibration as one self-contained HTML file, ``report.html``.
 
-It arranges what the files of a folder hold and what functions of this package say of it; a section
-whose file is not there says so.  The page needs no network: styles, script and pictures are in it.
+The report is made from the product files of a folder; a section whose file is missing states so.
+The page needs no network: styles, script and pictures are embedded.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _LISTED_REFUSED = 200
 
 @dataclass(frozen=True)
 class Found:
-    """What a folder holds; ``residuals`` and ``observations`` are None where it has none."""
+    """Contents of a folder; ``residuals`` and ``observations`` are None without a file."""
 
     calibration: Calibration
     residuals: Residuals | None
@@ -58,27 +58,27 @@ class Found:
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table of parameters; numbers as text, empty where there is none."""
+    """Row of the parameter table; numbers as text, empty if absent."""
 
     name: str
     unit: str
-    value: str
     sigma: str
-    prior: str
     change: str
     change_sigmas: str
-    moves_px: str
-    sigma_px: str
+    value: str = ''
+    prior: str = ''
+    moves_px: str = ''
+    sigma_px: str = ''
 
 
 def write_report(folder: Path) -> Path:
     """
-    Write ``report.html`` of a folder with a calibration, from the files there; returns its path.
+    Write ``report.html`` from the product files of a folder and return its path.
 
     Raises
     ------
     ProductError, BagError
-        When a file cannot be read or the report not be written.
+        When a file cannot be read or the report cannot be written.
     """
     path = folder / REPORT_FILE
     write_atomically(path, render(read_folder(folder)))
@@ -87,12 +87,12 @@ def write_report(folder: Path) -> Path:
 
 def read_folder(folder: Path) -> Found:
     """
-    What the files of a folder hold.
+    Contents of the product files of a folder.
 
     Raises
     ------
     ProductError, BagError
-        When there is no calibration, or another file is damaged.
+        When there is no calibration, or a file is damaged.
     """
     calibration = read_calibration(folder / CALIBRATION_FILE)
     residuals = folder / RESIDUALS_FILE
@@ -110,7 +110,7 @@ def read_folder(folder: Path) -> Found:
 
 
 def render(found: Found) -> str:
-    """The page."""
+    """HTML text of the report."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader('starcal_ros.report'),
         autoescape=True,
@@ -152,16 +152,16 @@ def _options_of(calibration: Calibration) -> Mapping[str, object]:
     return options if isinstance(options, dict) else {}
 
 
+def _number(value: float, form: str) -> str:
+    return format(value, form).replace('-', '\N{MINUS SIGN}')
+
+
 def _significant(value: float, sigma: float) -> str:
-    """A value with the digits that its sigma gives a meaning, and one more."""
+    """Format a value with two significant digits of its sigma."""
     if not (math.isfinite(sigma) and sigma > 0 and math.isfinite(value)):
         return f'{value:.8g}'
     decimals = max(0, 1 - math.floor(math.log10(sigma)))
-    return f'{value:.{min(decimals, 12)}f}'.replace('-', '\N{MINUS SIGN}')
-
-
-def _signed(value: float, digits: int = 3) -> str:
-    return f'{value:+.{digits}g}'.replace('-', '\N{MINUS SIGN}')
+    return _number(value, f'.{min(decimals, 12)}f')
 
 
 def _parameter_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
@@ -172,24 +172,19 @@ def _parameter_rows(calibration: Calibration, prior: CameraGeometry | None) -> l
     moves, sigma_moves = movement_px(camera, changes), movement_px(camera, sigma)
     rows = []
     for k, name in enumerate(camera.parameter_names):
-        value, known = camera.parameters[k], sigma[k] > 0
+        known, changed = sigma[k] > 0, prior and changes[k]
+        held = '' if name in calibration.estimated else 'held, ' if known else 'held'
         rows.append(
             Row(
-                name,
-                'px' if name in INTRINSIC_NAMES else '',
-                _significant(value, sigma[k]),
-                (f'{sigma[k]:.2g}' if known else '')
-                if name in calibration.estimated
-                else ('held' if not known else f'held, {sigma[k]:.2g}'),
-                f'{prior.camera.parameters[k]:.8g}'.replace('-', '\N{MINUS SIGN}')
-                if prior
-                else '',
-                _signed(changes[k]) if prior and changes[k] else '',
-                f'{changes[k] / sigma[k]:+.1f}'.replace('-', '\N{MINUS SIGN}')
-                if prior and known and changes[k]
-                else '',
-                f'{moves[k]:.3f}' if prior and changes[k] else '',
-                f'{sigma_moves[k]:.3f}' if known else '',
+                name=name,
+                unit='px' if name in INTRINSIC_NAMES else '',
+                value=_significant(camera.parameters[k], sigma[k]),
+                sigma=held + (f'{sigma[k]:.2g}' if known else ''),
+                prior=_number(prior.camera.parameters[k], '.8g') if prior else '',
+                change=_number(changes[k], '+.3g') if changed else '',
+                change_sigmas=_number(changes[k] / sigma[k], '+.1f') if changed and known else '',
+                moves_px=f'{moves[k]:.3f}' if changed else '',
+                sigma_px=f'{sigma_moves[k]:.3f}' if known else '',
             )
         )
     return rows
@@ -204,17 +199,11 @@ def _alignment_rows(calibration: Calibration, prior: CameraGeometry | None) -> l
     )
     return [
         Row(
-            axis,
-            'arcsec',
-            '',
-            f'{sigma[k]:.2f}',
-            '',
-            f'{changes[k]:+.2f}'.replace('-', '\N{MINUS SIGN}') if prior else '',
-            f'{changes[k] / sigma[k]:+.1f}'.replace('-', '\N{MINUS SIGN}')
-            if prior and sigma[k] > 0
-            else '',
-            '',
-            '',
+            name=axis,
+            unit='arcsec',
+            sigma=f'{sigma[k]:.2f}',
+            change=_number(changes[k], '+.2f') if prior else '',
+            change_sigmas=_number(changes[k] / sigma[k], '+.1f') if prior and sigma[k] > 0 else '',
         )
         for k, axis in enumerate('xyz')
     ]
@@ -225,10 +214,10 @@ def _none(count: int) -> str:
 
 
 def _tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """(what, number, note) of what one looks for first."""
+    """(name, number, note) of the main results."""
     rms_px = calibration.residual_rms_px
     pixel_arcsec = 1.0 / calibration.geometry.camera.parameters[0] / ARCSECOND_RAD
-    in_arcsec = f'{rms_px * pixel_arcsec:.2f}″ at {pixel_arcsec:.1f}″ a pixel'
+    in_arcsec = f'{rms_px * pixel_arcsec:.2f}″ at {pixel_arcsec:.1f}″ per pixel'
     refused = _none(sum(calibration.images_refused.values()))
     misfits = _none(len(calibration.misfit_images_ns))
     outliers = _none(calibration.stars_rejected)
@@ -237,28 +226,28 @@ def _tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
         (
             'Images',
             f'{calibration.images_used:,}',
-            f'used; {refused} refused, {misfits} of those used misfits',
+            f'used; {refused} refused; attitude misfits among those used: {misfits}',
         ),
-        ('Stars', f'{calibration.stars_used:,}', f'used; {outliers} left out as outliers'),
+        ('Stars', f'{calibration.stars_used:,}', f'used; outliers left out: {outliers}'),
     ]
     maps = calibration.maps
     if maps is not None:
-        for what, sigma, words in (
+        for name, sigma, text in (
             ('Line of sight', maps.line_of_sight_sigma_arcsec, 'in the star tracker frame'),
             ('Camera alone', maps.shape_sigma_arcsec, 'common rotation removed'),
         ):
-            note = f'1-sigma, rms over the detector, {words}; {sigma.max():.3g}″ at its worst'
-            tiles.append((what, f'{np.sqrt(np.mean(sigma**2)):.3g}″', note))
+            note = f'1-sigma, rms over the detector, {text}; at most {sigma.max():.3g}″'
+            tiles.append((name, f'{np.sqrt(np.mean(sigma**2)):.3g}″', note))
     return tiles
 
 
 def _spread(count: int, most: int) -> list[int]:
-    """At most so many of a count, evenly."""
+    """Evenly spaced indices below a count, at most ``most``."""
     return [round(place) for place in np.linspace(0, count - 1, min(count, most)).tolist()]
 
 
 def _slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str, object] | None:
-    """What the page draws of single images: places in px, residuals in 0.001 px."""
+    """Data of the single-image view: positions in px, residuals in 0.001 px."""
     if residuals is None or len(residuals.image_time_ns) == 0:
         return None
     camera, typical_px = calibration.geometry.camera, max(calibration.residual_rms_px, 1e-6)
@@ -288,7 +277,7 @@ def _slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[st
         'height': camera.height,
         'count': count,
         'images': images,
-        # A line of typical length is a fiftieth of the picture.
+        # A typical residual is drawn as long as a fiftieth of the width.
         'enlarge': round(float(np.clip(np.log10(0.02 * camera.width / typical_px), 0, 4)), 1),
     }
 
@@ -296,12 +285,12 @@ def _slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[st
 def _picture(thumbnail: Thumbnail) -> Markup:
     """Data URL of a picture."""
     kind = 'image/jpeg' if thumbnail.name.endswith('.jpg') else 'image/png'
-    # Made of base64's letters alone.
+    # Safe as markup: base64 has no special characters.
     return Markup(f'data:{kind};base64,{base64.b64encode(thumbnail.encoded).decode("ascii")}')
 
 
 def _refused_images(found: Found) -> list[Mapping[str, object]]:
-    """Each reason with its count, the images it took and pictures of some."""
+    """For each reason: its count, the refused images and pictures of some."""
     pictures = {t.time_ns: t for t in found.thumbnails if not t.reason}
     groups: list[Mapping[str, object]] = []
     for reason, count in sorted(found.calibration.images_refused.items(), key=lambda i: -i[1]):

@@ -1,4 +1,4 @@
-"""Small pictures of a few images and refused stars, kept beside the products for the report."""
+"""Thumbnails of a few images and refused stars, stored beside the products for the report."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.report.annotation import annotate, stretch
 
 THUMBNAILS_FOLDER = 'thumbnails'
-_USED = 6  # images that were used, spread over all; between this and twice as many are kept
+_USED = 6  # used images, evenly spread; between this and twice as many are kept
 _REFUSED_OF_A_REASON = 2
 _STARS_OF_A_REASON = 6
 _WIDTH_PX = 480
@@ -35,7 +35,7 @@ class Thumbnail:
 
     @property
     def name(self) -> str:
-        """File name, from which `read_thumbnails` knows what it shows."""
+        """File name, which `read_thumbnails` parses."""
         if self.reason:
             return f'star_{self.time_ns}_{self.reason}_{self.number}.png'
         return f'image_{self.time_ns}.jpg'
@@ -44,9 +44,9 @@ class Thumbnail:
 @dataclass
 class Album:
     """
-    Chooses which images to keep a picture of while they go by, however many there will be.
+    Selects thumbnails from a stream of images of unknown length.
 
-    Some that were used, evenly spread; the first of each reason of refusal, of images and stars.
+    Keeps some used images, evenly spread, and the first images and stars of each refusal reason.
     """
 
     used: list[Thumbnail] = field(default_factory=list)
@@ -56,7 +56,7 @@ class Album:
     _seen: int = 0
 
     def show(self, image: Image, observations: StarObservations, geometry: CameraGeometry) -> None:
-        """Look at an image, its observations, and what its stars were predicted with."""
+        """Add an image, its observations and the geometry that predicted its stars."""
         if observations.refusal:
             of_reason = self.refused.setdefault(observations.refusal, [])
             if len(of_reason) < _REFUSED_OF_A_REASON:
@@ -72,21 +72,21 @@ class Album:
     def _show_stars(self, image: Image, observations: StarObservations) -> None:
         for reason, places in observations.refused_places().items():
             of_reason = self.stars.setdefault(reason, [])
-            # One star of an image: another image shows something else.
+            # At most one star per image, for variety.
             if len(of_reason) < _STARS_OF_A_REASON and len(places):
                 number = len(of_reason)
                 encoded = _cut_out(image.pixels, places[number % len(places)])
                 of_reason.append(Thumbnail(image.time_ns, reason, number, encoded))
 
     def thumbnails(self) -> tuple[Thumbnail, ...]:
-        """All that were kept."""
+        """All selected thumbnails."""
         groups = [self.used, *self.refused.values(), *self.stars.values()]
         return tuple(thumbnail for group in groups for thumbnail in group)
 
 
 def write_thumbnails(thumbnails: Iterable[Thumbnail], folder: Path) -> None:
     """
-    Write pictures into a folder, in place of those that another calibration has left there.
+    Write thumbnails to a folder and delete those of an earlier calibration.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def write_thumbnails(thumbnails: Iterable[Thumbnail], folder: Path) -> None:
 
 
 def read_thumbnails(folder: Path) -> tuple[Thumbnail, ...]:
-    """Thumbnails of a folder, in order of time; none where there is no such folder."""
+    """Thumbnails of a folder in time order; none if there is no such folder."""
     found = []
     for path in folder.iterdir() if folder.is_dir() else ():
         name = _NAME.fullmatch(path.stem)
@@ -125,7 +125,7 @@ def _whole(image: Image, observations: StarObservations, geometry: CameraGeometr
 def _cut_out(
     pixels: NDArray[np.uint8] | NDArray[np.uint16], place_px: NDArray[np.float32]
 ) -> bytes:
-    """PNG of the pixels about a place; black where that leaves the image."""
+    """PNG of the pixels around a position; black outside the image."""
     u, v = np.rint(np.nan_to_num(np.clip(place_px, -1e4, 1e5), nan=-1e4)).astype(int)
     size = 2 * _STAR_HALF_PX + 1
     picture = np.zeros((size, size), np.uint8)

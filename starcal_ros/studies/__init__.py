@@ -1,1 +1,1 @@
-"""Monte Carlo studies."""
+"""Monte Carlo studies and the reproduction of the paper."""

@@ -1,10 +1,11 @@
-"""Figures of the Monte Carlo studies; they show what the campaign holds and compute no more."""
+"""Figures of the Monte Carlo studies."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import io
 import itertools
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -14,17 +15,11 @@ from scipy.stats import chi2
 
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.report.term_removal_figure import plot_curves, plot_removed
-from starcal_ros.studies.monte_carlo import (
-    Campaign,
-    column,
-    ENOUGH,
-    Row,
-    SAME_SIGMAS,
-    UNUSED_IMAGES,
-)
+from starcal_ros.studies.monte_carlo import ENOUGH, Row, SAME_SIGMAS, UNUSED_IMAGES
+from starcal_ros.studies.summary import column, StudyResult
 from starcal_ros.studies.trials import ESTIMATED
 
-# Colours of Okabe and Ito, told apart by the colour-blind; marker; width, for lines that coincide.
+# Colour-blind-safe colours (Okabe and Ito), marker, and width that keeps coinciding lines visible.
 _LOOKS: Mapping[str, tuple[str, str, float]] = {
     'per_image': ('#56b4e9', 'o', 4.0),
     'single': ('#d55e00', 's', 1.3),
@@ -33,10 +28,10 @@ _LOOKS: Mapping[str, tuple[str, str, float]] = {
 _MILLI = 1000.0
 
 
-def png(campaign: Campaign) -> bytes:
-    """The figure of a campaign."""
-    figure = _FIGURES[campaign.design.study](campaign)
-    design = campaign.design
+def png(result: StudyResult) -> bytes:
+    """PNG of the figure of a study."""
+    figure = _FIGURES[result.design.study](result)
+    design = result.design
     figure.suptitle(
         f'{design.study}: {design.trials} trials, seed {design.seed}',
         fontsize=10,
@@ -53,8 +48,17 @@ def _where(rows: Sequence[Row], **values: object) -> list[Row]:
 
 
 def _values(rows: Sequence[Row], name: str) -> list[int | float | str]:
-    """What a column takes, in order of appearance."""
+    """Distinct values of a column, in order of appearance."""
     return list(dict.fromkeys(row[name] for row in rows))
+
+
+def _look(method: object) -> dict[str, Any]:
+    """Plot settings of a method."""
+    colour, marker, width = _LOOKS[str(method)]
+    return {
+        'color': colour, 'marker': marker, 'markersize': width + 3, 'linewidth': width,
+        'label': method,
+    }  # fmt: skip
 
 
 def _log_axis(axes: Axes, which: str) -> None:
@@ -67,7 +71,7 @@ def _log_axis(axes: Axes, which: str) -> None:
 
 
 def _panels(
-    campaign: Campaign, rows: int, columns: int, width: float, height: float
+    rows: int, columns: int, width: float, height: float
 ) -> tuple[Figure, list[list[Axes]]]:
     figure = Figure(figsize=(width * columns, height * rows + 0.3), layout='constrained')
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -78,27 +82,23 @@ def _panels(
     return figure, axes.tolist()
 
 
-def _table1(campaign: Campaign) -> Figure:
-    """Map error and pointing error against star tracker noise, a column for each kind of image."""
-    cells = list(itertools.product(campaign.design.images, campaign.design.stars))
-    figure, axes = _panels(campaign, 2, len(cells), 4.6, 3.2)
+def _table1(result: StudyResult) -> Figure:
+    """Map and pointing error against star tracker noise, one column per cell of images."""
+    cells = list(itertools.product(result.design.images, result.design.stars))
+    figure, axes = _panels(2, len(cells), 4.6, 3.2)
     for k, (images, stars) in enumerate(cells):
-        cell = _where(campaign.summary, images=images, stars=stars)
-        every = _where(campaign.rows, images=images, stars=stars)
+        cell = _where(result.summary, images=images, stars=stars)
+        every = _where(result.rows, images=images, stars=stars)
         above, below = axes[0][k], axes[1][k]
         for method in _values(cell, 'method'):
-            colour, marker, width = _LOOKS[str(method)]
+            look = _look(method)
             rows = _where(cell, method=method)
             x = column(rows, 'tracker_arcsec')
             above.errorbar(
                 x, _MILLI * column(rows, 'map_px'), 2 * _MILLI * column(rows, 'map_px_sigma'),
-                color=colour, marker=marker, markersize=width + 3, linewidth=width, elinewidth=1,
-                capsize=2, label=method,
+                elinewidth=1, capsize=2, **look,
             )  # fmt: skip
-            below.plot(
-                x, column(rows, 'pointing_arcsec'),
-                color=colour, marker=marker, markersize=width + 3, linewidth=width, label=method,
-            )  # fmt: skip
+            below.plot(x, column(rows, 'pointing_arcsec'), **look)
         x = np.array(_values(cell, 'tracker_arcsec'), np.float64)
         for axis, name, scale in (
             (above, 'bound_px', _MILLI),
@@ -117,34 +117,31 @@ def _table1(campaign: Campaign) -> Figure:
     return figure
 
 
-def _images(campaign: Campaign) -> Figure:
-    """Map error, and the residual of images that were not used, against the number of images."""
-    cells = list(itertools.product(campaign.design.stars, campaign.design.tracker_arcsec))
-    figure, axes = _panels(campaign, len(cells), 2, 4.8, 3.4)
+def _images(result: StudyResult) -> Figure:
+    """Map error and residual of unused images against the number of images."""
+    cells = list(itertools.product(result.design.stars, result.design.tracker_arcsec))
+    figure, axes = _panels(len(cells), 2, 4.8, 3.4)
     for (stars, tracker), (left, right) in zip(cells, axes, strict=True):
-        cell = _where(campaign.summary, stars=stars, tracker_arcsec=tracker)
-        every = _where(campaign.rows, stars=stars, tracker_arcsec=tracker)
+        cell = _where(result.summary, stars=stars, tracker_arcsec=tracker)
+        every = _where(result.rows, stars=stars, tracker_arcsec=tracker)
         for method in _values(cell, 'method'):
-            colour, marker, width = _LOOKS[str(method)]
             rows = _where(cell, method=method)
             x = column(rows, 'images')
             for axis, y in (
                 (left, _MILLI * column(rows, 'map_px')),
                 (right, 100 * (column(rows, 'unused_to_true') - 1)),
             ):
-                axis.plot(
-                    x, y,
-                    color=colour, marker=marker, markersize=width + 3, linewidth=width,
-                    label=method,
-                )  # fmt: skip
+                axis.plot(x, y, **_look(method))
         x = np.array(_values(cell, 'images'), np.float64)
         bound = [np.sqrt(np.mean(column(_where(every, images=m), 'bound_px') ** 2)) for m in x]
         left.plot(x, _MILLI * np.array(bound), 'k--', linewidth=1, label='Cramér-Rao bound')
         words = f'{100 * (ENOUGH - 1):.0f} %'
         right.axhline(100 * (ENOUGH - 1), color='k', linewidth=1, linestyle=':', label=words)
         left.set_ylabel('map error, rms (0.001 px)')
-        right.set_ylabel(f'residual of {UNUSED_IMAGES} unused images\nabove the true camera (%)')
-        left.set_title(f'{stars} stars an image, star tracker {tracker:g}"', fontsize=10)
+        right.set_ylabel(
+            f'residual of {UNUSED_IMAGES} unused images\nabove that of the true camera (%)'
+        )
+        left.set_title(f'{stars} stars per image, star tracker {tracker:g}"', fontsize=10)
         for axis in (left, right):
             axis.set_xlabel('images used')
             _log_axis(axis, 'x')
@@ -157,17 +154,17 @@ def _images(campaign: Campaign) -> Figure:
     return figure
 
 
-def _terms(campaign: Campaign) -> Figure:
-    """Which terms are still there after each step (as the paper's Fig. 8), and the residual."""
+def _terms(result: StudyResult) -> Figure:
+    """Terms removed after each step (as the paper's Fig. 8), and the residual."""
     cells = list(
         itertools.product(
-            campaign.design.images, campaign.design.tracker_arcsec, campaign.design.methods
+            result.design.images, result.design.tracker_arcsec, result.design.methods
         )
     )
-    figure, axes = _panels(campaign, len(cells), 2, 4.8, 3.8)
+    figure, axes = _panels(len(cells), 2, 4.8, 3.8)
     for (images, tracker, method), (left, right) in zip(cells, axes, strict=True):
         key = {'images': images, 'tracker_arcsec': tracker, 'method': method}
-        cell, every = _where(campaign.summary, **key), _where(campaign.rows, **key)
+        cell, every = _where(result.summary, **key), _where(result.rows, **key)
         steps = [int(row['step']) for row in cell]
         gone = np.array(
             [
@@ -187,17 +184,17 @@ def _terms(campaign: Campaign) -> Figure:
     return figure
 
 
-def _coverage(campaign: Campaign) -> Figure:
-    """Distribution of the normalised error squared, and bias and spread of each parameter."""
+def _coverage(result: StudyResult) -> Figure:
+    """Distribution of the normalised squared error, and bias and spread of each parameter."""
     keys = [
         {k: row[k] for k in ('images', 'stars', 'tracker_arcsec', 'outlier_share')}
-        for row in campaign.summary
+        for row in result.summary
     ]
     cells = [key for k, key in enumerate(keys) if key not in keys[:k]]
-    figure, axes = _panels(campaign, len(cells), 2, 4.8, 3.0)
-    names = [n.removeprefix('bias_') for n in campaign.summary[0] if n.startswith('bias_')]
+    figure, axes = _panels(len(cells), 2, 4.8, 3.0)
+    names = [n.removeprefix('bias_') for n in result.summary[0] if n.startswith('bias_')]
     for key, (left, right) in zip(cells, axes, strict=True):
-        cell, every = _where(campaign.summary, **key), _where(campaign.rows, **key)
+        cell, every = _where(result.summary, **key), _where(result.rows, **key)
         most = float(np.percentile(column(every, 'normalised'), 99.5)) * 1.1 + 5
         x = np.linspace(0, most, 300)
         left.plot(x, chi2.pdf(x, len(ESTIMATED)), 'k--', linewidth=1, label='chi squared, 11')
@@ -218,7 +215,7 @@ def _coverage(campaign: Campaign) -> Figure:
                     at, [float(row[f'{statistic}_{name}']) for name in names],
                     marker, color=colour, markerfacecolor=face, markersize=5,
                 )  # fmt: skip
-        # Three sigma of a mean, and of a standard deviation, of so many.
+        # Three sigma of the mean and of the standard deviation over the trials.
         count = float(cell[0]['trials'])
         for level, error in ((0.0, 3 / np.sqrt(count)), (1.0, 3 / np.sqrt(2 * count))):
             right.axhspan(level - error, level + error, color='0.88', zorder=0)
@@ -231,19 +228,19 @@ def _coverage(campaign: Campaign) -> Figure:
             f'{key["images"]} images of {key["stars"]} stars, star tracker'
             f' {key["tracker_arcsec"]:g}", outliers {share:.0f} %', fontsize=9,
         )  # fmt: skip
-        left.set_xlabel('normalised error squared')
+        left.set_xlabel('normalised squared error')
         left.set_yticks([])
         left.set_ylim(0, left.get_ylim()[1] * 1.45)
         left.legend(frameon=False, fontsize=7, loc='upper right')
     return figure
 
 
-def _start(campaign: Campaign) -> Figure:
-    """How far apart the answers from a near and from a far prior are, sorted."""
-    shares = _values(campaign.rows, 'outlier_share')
-    figure, axes = _panels(campaign, 1, len(shares), 4.8, 3.2)
+def _start(result: StudyResult) -> Figure:
+    """Difference of the estimates from a near and a distant prior, sorted."""
+    shares = _values(result.rows, 'outlier_share')
+    figure, axes = _panels(1, len(shares), 4.8, 3.2)
     for axis, share in zip(axes[0], shares, strict=True):
-        every = _where(campaign.rows, outlier_share=share)
+        every = _where(result.rows, outlier_share=share)
         for method in _values(every, 'method'):
             colour, marker, width = _LOOKS[str(method)]
             apart = np.sort(column(_where(every, method=method), 'apart_sigmas'))
@@ -251,16 +248,16 @@ def _start(campaign: Campaign) -> Figure:
                 np.linspace(0, 100, len(apart)), np.maximum(apart, 1e-12),
                 color=colour, marker=marker, markersize=3, linewidth=width, label=method,
             )  # fmt: skip
-        axis.axhline(SAME_SIGMAS, color='k', linewidth=1, linestyle=':', label='one minimum')
+        axis.axhline(SAME_SIGMAS, color='k', linewidth=1, linestyle=':', label='same minimum')
         axis.set_yscale('log')
         axis.set_title(f'outliers {100 * float(share):.0f} %', fontsize=10)
         axis.set_xlabel('share of the trials (%)')
-        axis.set_ylabel('answers from near and far apart,\nworst parameter (sigmas)')
+        axis.set_ylabel('difference of near and distant prior,\nworst parameter (sigmas)')
         axis.legend(frameon=False, fontsize=8)
     return figure
 
 
-_FIGURES: Mapping[str, Callable[[Campaign], Figure]] = {
+_FIGURES: Mapping[str, Callable[[StudyResult], Figure]] = {
     'table1': _table1,
     'images': _images,
     'terms': _terms,

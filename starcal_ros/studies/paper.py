@@ -1,8 +1,8 @@
 """
-The paper shown again: its night simulated, calibrated from few images, judged on the others.
+Reproduction of the paper: its night is simulated, and calibrated from a few of the images.
 
-The 359 frames of the scenario `paper` are drawn pixel by pixel and measured as any image is.  What
-the paper says of its own night stands beside in the page that `page` makes.
+The 359 frames of the scenario `paper` are rendered and measured like any image.  `page` compares
+the results with those of the paper.
 """
 
 from __future__ import annotations
@@ -17,27 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate, estimate_calibration
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.normal_equations import squared_sigmas, star_table
 from starcal_ros.estimation.problem import METHODS
-from starcal_ros.identification.star_finder import IdentificationOptions
-from starcal_ros.image.centroiding import CentroidOptions
-from starcal_ros.image.frame_checks import ScreeningOptions
-from starcal_ros.image.hot_pixels import FixedPatternOptions
 from starcal_ros.pipeline.observe import observe
-from starcal_ros.pipeline.setup import Setup, SetupOptions
+from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Ensemble, StarObservations, TermRemoval
 from starcal_ros.simulation.images import fixed_pattern, render
 from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenario, scene
-from starcal_ros.sky.astrometry import SiteOptions
-from starcal_ros.sky.attitude import AttitudeHistory, AttitudeOptions
-from starcal_ros.sky.catalog import load_catalog
-from starcal_ros.studies.monte_carlo import Campaign, Design, Row
+from starcal_ros.sky.attitude import AttitudeHistory
+from starcal_ros.studies.monte_carlo import Design, Row
+from starcal_ros.studies.summary import StudyResult
 
 Floats = NDArray[np.float64]
 
@@ -45,17 +39,17 @@ NIGHT = 'paper'
 CALIBRATED_WITH = 15
 TABLE_1 = Design('table1', 20, (15,), (80,), (0.0, 5.0, 20.0, 60.0), METHODS)
 _COUNTS = (2, 3, 4, 5, 7, 10, 15, 20, 30, 60, 120)
-# As Fig. 8 does; the first to go are those that can hardly be told from the pointing.
+# As in Fig. 8; terms nearly indistinguishable from the pointing are removed first.
 _ALL_TERMS = ('fx', 'skew', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'p1', 'p2')
 
 
 @dataclass(frozen=True)
 class Judged:
     """
-    Residuals of images that a calibration may have seen or not, each turned to fit; n stars.
+    Residuals of images with a camera, each at its best-fit rotation; n stars.
 
-    ``image`` (n,) counts from 0; ``residual_px`` (n, 2); ``fits`` (n,) bool is False for a star
-    beyond the outlier limit.
+    ``image`` (n,) counts from 0; ``measured_px``, ``residual_px`` (n, 2); ``fits`` (n,) bool is
+    False for outliers.
     """
 
     image: NDArray[np.int64]
@@ -64,12 +58,12 @@ class Judged:
     fits: NDArray[np.bool_]
 
     def rms_px(self, images: Sequence[int]) -> float:
-        """RMS per axis over the stars that fit of some images."""
+        """RMS per axis over the stars of some images, without outliers."""
         here = self.fits & np.isin(self.image, images)
         return float(np.sqrt(np.mean(self.residual_px[here] ** 2)))
 
     def std_of_images_px(self) -> Floats:
-        """Standard deviation (m, 2) of u and v of each image, over the stars that fit."""
+        """Standard deviation (m, 2) of u and v of each image, without outliers."""
         return np.array(
             [
                 self.residual_px[self.fits & (self.image == k)].std(axis=0)
@@ -81,24 +75,24 @@ class Judged:
 @dataclass(frozen=True)
 class PaperStudy:
     """
-    What came of the night.
+    Results of the simulated night.
 
     Attributes
     ----------
     camera, true_camera : CameraModel
-        Of ``per_image``, the paper's Method 1, with `CALIBRATED_WITH` images; and the truth.
+        Estimated by ``per_image``, the paper's Method 1, from `CALIBRATED_WITH` images; and true.
     used : tuple of int
-        Those images, evenly spread over the night.
+        Indices of those images, evenly spread over the night.
     judged : Judged
-        All images with that camera.
+        Residuals of all images with the estimated camera.
     noise_rms_px : float
-        The same residual of the other images with the true camera.
+        RMS residual of the other images with the true camera.
     methods, counts : tuple of mapping
         A row for each method, and for each number of images: residuals of the other images, error
         of the map of the lines of sight.
     removals : tuple of TermRemoval
-        Fig. 8 of the same images.
-    table1 : Campaign
+        Fig. 8, from the same images.
+    table1 : StudyResult
     """
 
     seed: int
@@ -113,30 +107,15 @@ class PaperStudy:
     methods: tuple[Row, ...]
     counts: tuple[Row, ...]
     removals: tuple[TermRemoval, ...]
-    table1: Campaign
+    table1: StudyResult
 
 
 @functools.lru_cache(maxsize=1)
 def setup_of(seed: int) -> Setup:
-    """What is known before: the options as they are by default, and the prior of the scenario."""
+    """Default options with the prior of the scenario."""
     night = scenario(NIGHT, seed)
-    identification = IdentificationOptions()
-    return Setup(
-        frames=SetupOptions(),
-        attitude=AttitudeOptions(),
-        site=SiteOptions(),
-        screening=ScreeningOptions(),
-        fixed_pattern=FixedPatternOptions(),
-        centroid=CentroidOptions(),
-        identification=identification,
-        calibration=CalibrationOptions(
-            star_tracker_sigma_arcsec=night.star_tracker_sigma_arcsec,
-        ),
-        gate=GateOptions(),
-        prior=night.prior,
-        catalog=load_catalog(None, identification.magnitude_limit),
-        dark=None,
-    )
+    values = {'star_tracker_sigma_arcsec': night.star_tracker_sigma_arcsec}
+    return load_setup(values, prior=night.prior)
 
 
 @functools.lru_cache(maxsize=1)
@@ -146,7 +125,7 @@ def _night_and_pattern(seed: int) -> tuple[Scenario, Floats]:
 
 
 def observe_frame(seed: int, index: int) -> StarObservations:
-    """The stars of a frame of the night, measured in its pixels."""
+    """Observations of a frame of the night, measured in its rendered pixels."""
     night, pattern = _night_and_pattern(seed)
     setup = setup_of(seed)
     attitudes = AttitudeHistory()
@@ -157,7 +136,7 @@ def observe_frame(seed: int, index: int) -> StarObservations:
 
 
 def judge(camera: CameraModel, images: Sequence[StarObservations], outlier_sigma: float) -> Judged:
-    """Residuals of images with a camera, each turned to fit its own stars (as in Fig. 7)."""
+    """Residuals of images with a camera, each at its best-fit rotation (as in Fig. 7)."""
     table = star_table(images)
     residual_px = np.empty_like(table.measured_px)
     weight = 1.0 / (table.covariance_px2[:, 0] + table.covariance_px2[:, 2])
@@ -174,13 +153,13 @@ def judge(camera: CameraModel, images: Sequence[StarObservations], outlier_sigma
 
 
 def spread(count: int, most: int) -> tuple[int, ...]:
-    """At most so many of a count, evenly over all of them."""
+    """``count`` evenly spaced indices below ``most``, or all of them if fewer."""
     return tuple(sorted({round(k) for k in np.linspace(0, most - 1, min(count, most))}))
 
 
-def study(observations: Sequence[StarObservations], table1: Campaign, seed: int) -> PaperStudy:
+def study(observations: Sequence[StarObservations], table1: StudyResult, seed: int) -> PaperStudy:
     """
-    The paper's figures from the observations of a night.
+    Results of the paper's figures from the observations of a night.
 
     Raises
     ------
@@ -238,12 +217,12 @@ def study(observations: Sequence[StarObservations], table1: Campaign, seed: int)
 
 
 def numbers(found: PaperStudy) -> Mapping[str, object]:
-    """What the page says, as numbers."""
+    """Numbers on the page, by name."""
     distortion = np.hypot(*distortion_px(found.camera, pixel_grid(found.camera, 60, 48)).T)
     judged = found.judged
     others = sorted(set(range(found.images - found.refused)) - set(found.used))
     of_others = judged.fits & np.isin(judged.image, others)
-    at_least = found.removals[0].residual_rms_px
+    all_terms_px = found.removals[0].residual_rms_px
     return {
         'seed': found.seed,
         'images': found.images,
@@ -266,7 +245,7 @@ def numbers(found: PaperStudy) -> Mapping[str, object]:
             {
                 'removed': removal.removed or 'none',
                 'std_px': removal.residual_std_px,
-                'rise_percent': 100 * (removal.residual_rms_px / at_least - 1),
+                'rise_percent': 100 * (removal.residual_rms_px / all_terms_px - 1),
                 'map_change_px': removal.map_change_px,
             }
             for removal in found.removals
@@ -278,13 +257,13 @@ def numbers(found: PaperStudy) -> Mapping[str, object]:
 
 
 def page(found: PaperStudy, software: str) -> str:
-    """A page in Markdown: what the paper reports, what came of it here, and how they differ."""
+    """Page in Markdown that compares the results with those of the paper."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader('starcal_ros.report'),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
-        autoescape=False,  # Markdown, and nothing in it comes from outside
+        autoescape=False,  # Markdown, without external input
     )
     return environment.get_template('paper.md').render(software=software, **numbers(found))

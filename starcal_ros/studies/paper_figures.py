@@ -1,4 +1,4 @@
-"""Figures 5 to 8 of the paper from a simulated night; they show what the study holds."""
+"""Figures 5 to 8 of the paper, from a simulated night."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BLUE, _RED = '#0b62a8', '#c4501b'
 
 
 def pngs(found: PaperStudy) -> Mapping[str, bytes]:
-    """Name of each figure -> its PNG."""
+    """PNG of each figure, by name."""
     drawn = {
         'figure_5': _coverage(found),
         'figure_6': _distortion(found),
@@ -56,12 +56,12 @@ def _distortion(found: PaperStudy) -> Figure:
     camera = found.camera
     coarse = pixel_grid(camera, 20, 16)
     left.quiver(*coarse.T, *distortion_px(camera, coarse).T, angles='xy', color=_BLUE, width=0.003)
-    left.set_title('distortion, not to scale')
+    left.set_title('distortion vectors, not to scale')
     grid = pixel_grid(camera, 60, 48)
     u, v, length = (a.reshape(48, 60) for a in (*grid.T, np.hypot(*distortion_px(camera, grid).T)))
     lines = right.contour(u, v, length, levels=8, cmap='viridis')
     right.clabel(lines, fmt='%g')
-    right.set_title('its length (px)')
+    right.set_title('distortion magnitude (px)')
     for axes in (left, right):
         _detector(axes, camera)
     return figure
@@ -81,20 +81,19 @@ def _residuals(found: PaperStudy) -> Figure:
         )  # fmt: skip
     for k, at in enumerate(found.used):
         images.axvline(at + 1, color='0.85', linewidth=1.5, zorder=0,
-                       label=f'the {CALIBRATED_WITH} used' if k == 0 else None)  # fmt: skip
+                       label=f'{CALIBRATED_WITH} images used' if k == 0 else None)  # fmt: skip
     x = np.linspace(-1, 1, 201)
     std = float(judged.residual_px[judged.fits].std())
-    histogram.plot(x, norm.pdf(x, scale=std), 'k--', linewidth=1, label='normal of that width')
+    histogram.plot(x, norm.pdf(x, scale=std), 'k--', linewidth=1, label='normal distribution')
     images.set(xlabel='image', ylabel='standard deviation (px)', ylim=(0, 1.3 * spread.max()))
     histogram.set(xlabel='residual (px)', ylabel='density', xlim=(-1, 1))
-    bright = judged.fits
-    field.hist2d(*judged.residual_px[bright].T, bins=np.linspace(-0.6, 0.6, 81).tolist(),
+    field.hist2d(*judged.residual_px[judged.fits].T, bins=np.linspace(-0.6, 0.6, 81).tolist(),
                  cmap='Blues')  # fmt: skip
     field.set(xlabel='residual of u (px)', ylabel='residual of v (px)', aspect='equal')
     number = [float(row['images']) for row in found.counts]
     for name, colour, words in (
         ('others_px', _BLUE, 'residual of the other images'),
-        ('map_error_px', _RED, 'error of the map'),
+        ('map_error_px', _RED, 'map error'),
     ):
         counts.plot(number, [float(row[name]) for row in found.counts], 'o-', color=colour,
                     markersize=4, label=words)  # fmt: skip

@@ -1,8 +1,8 @@
 """
-One trial of a Monte Carlo study: star fields whose truth is known, and how far off an answer is.
+Trials of a Monte Carlo study: star fields with known truth, and errors of their calibration.
 
-A field is drawn whole; fewer images, fewer stars or another star tracker are parts or multiples of
-the same draws, so that cells of a study differ by what they compare and not by their luck.
+A field is drawn at full size; cells with fewer images, fewer stars or another star tracker use
+parts or multiples of the same draws, so that their difference has little sampling noise.
 """
 
 from __future__ import annotations
@@ -31,35 +31,36 @@ from starcal_ros.simulation.scenario import Scenario, scenario
 Floats = NDArray[np.float64]
 
 CENTROID_SIGMA_PX = 0.1
-OUTLIER_REACH_PX = 20.0  # a misidentified star: anywhere in a square of this half side
+OUTLIER_REACH_PX = 20.0  # half side of the square over which misidentified stars scatter
 FAR_FOCAL = 0.2
 FAR_PRINCIPAL_POINT_PX = 100.0
 FAR_ALIGNMENT_RAD = math.radians(0.3)
-LEAST_TRACKER_ARCSEC = 1e-3  # what a calibration takes for a perfect star tracker
+LEAST_TRACKER_ARCSEC = 1e-3  # assumed sigma of a perfect star tracker
 
 _NAMES = estimated_parameters(CalibrationOptions(), 'plumb_bob')
 _FREE = [PARAMETER_NAMES.index(name) for name in _NAMES]
 ESTIMATED = np.array([*_FREE, 10, 11, 12])
-"""Rows of a (13, 13) covariance that a calibration with default options estimates."""
+"""Rows of the (13, 13) covariance that a calibration with default options estimates."""
 
 
 @dataclass(frozen=True)
 class StarField:
     """
-    Images at random attitudes, each with stars uniformly over the detector; m images, n stars.
+    Images at random attitudes with stars uniform over the detector; m images, n stars each.
 
     Attributes
     ----------
     truth, prior : CameraGeometry
     camera_from_icrf : Rotation (m,)
-        The truth.
+        True attitudes.
     pixel_px, direction_icrf : (m, n, 2), (m, n, 3)
-        The truth.
+        True positions.
     centroid_error_px : (m, n, 2)
     tracker_error : (m, 3)
         In units of the star tracker's sigma, about its axes.
-    luck, outlier_px : (m, n), (m, n, 2)
-        A star whose luck, uniform in 0 to 1, is under the share of outliers is off by this.
+    outlier_draw, outlier_px : (m, n), (m, n, 2)
+        A star is displaced by ``outlier_px`` if its draw, uniform in 0 to 1, is below the outlier
+        share.
     """
 
     truth: CameraGeometry
@@ -69,32 +70,31 @@ class StarField:
     direction_icrf: Floats
     centroid_error_px: Floats
     tracker_error: Floats
-    luck: Floats
+    outlier_draw: Floats
     outlier_px: Floats
 
     def part(self, first: int, count: int, stars: int) -> StarField:
-        """Some images in a row with the first stars of each."""
+        """Consecutive images with the first stars of each."""
         m, n = slice(first, first + count), slice(stars)
-        return StarField(
-            self.truth,
-            self.prior,
-            self.camera_from_icrf[m],
-            self.pixel_px[m, n],
-            self.direction_icrf[m, n],
-            self.centroid_error_px[m, n],
-            self.tracker_error[m],
-            self.luck[m, n],
-            self.outlier_px[m, n],
+        return dataclasses.replace(
+            self,
+            camera_from_icrf=self.camera_from_icrf[m],
+            pixel_px=self.pixel_px[m, n],
+            direction_icrf=self.direction_icrf[m, n],
+            centroid_error_px=self.centroid_error_px[m, n],
+            tracker_error=self.tracker_error[m],
+            outlier_draw=self.outlier_draw[m, n],
+            outlier_px=self.outlier_px[m, n],
         )
 
 
 def draw_scenario(rng: np.random.Generator) -> Scenario:
-    """The paper's campaign with its truth, and the prior that launch has spoilt, at random."""
+    """The paper's campaign with a random truth and a random post-launch prior error."""
     return scenario('paper', int(rng.integers(2**31)))
 
 
 def draw_star_field(rng: np.random.Generator, images: int, stars: int) -> StarField:
-    """A star field of the paper's camera (2592 x 2048, 35 mm), with all its errors drawn."""
+    """Random star field of the paper's camera (2592 x 2048, 35 mm) with all its errors."""
     drawn = draw_scenario(rng)
     camera = drawn.truth.camera
     rotations = Rotation.from_quat(rng.normal(size=(images, 4)))
@@ -107,17 +107,17 @@ def draw_star_field(rng: np.random.Generator, images: int, stars: int) -> StarFi
         direction_icrf=line_of_sight(camera, pixels) @ rotations.as_matrix(),
         centroid_error_px=CENTROID_SIGMA_PX * rng.normal(size=pixels.shape),
         tracker_error=rng.normal(size=(images, 3)),
-        luck=rng.uniform(0.0, 1.0, (images, stars)),
+        outlier_draw=rng.uniform(0.0, 1.0, (images, stars)),
         outlier_px=rng.uniform(-OUTLIER_REACH_PX, OUTLIER_REACH_PX, pixels.shape),
     )
 
 
 def far_prior(truth: CameraGeometry, rng: np.random.Generator) -> CameraGeometry:
     """
-    A prior far off in a random direction.
+    Distant prior, in a random direction from the truth.
 
     The focal lengths are off by `FAR_FOCAL`, the principal point by `FAR_PRINCIPAL_POINT_PX` and
-    the alignment by `FAR_ALIGNMENT_RAD`; of distortion and skew it knows nothing.
+    the alignment by `FAR_ALIGNMENT_RAD`; distortion and skew are zero.
     """
     fx, _, fy, cx, cy = truth.camera.parameters[:5]
     longer = 1.0 + FAR_FOCAL * rng.choice([-1.0, 1.0])
@@ -130,19 +130,19 @@ def far_prior(truth: CameraGeometry, rng: np.random.Generator) -> CameraGeometry
     }
     camera = truth.camera.replace(**{**dict.fromkeys(PARAMETER_NAMES, 0.0), **pinhole})
     axis = rng.normal(size=3)
-    turn = Rotation.from_rotvec(FAR_ALIGNMENT_RAD * axis / np.linalg.norm(axis))
-    star_tracker_from_camera = Rotation.from_quat(truth.star_tracker_from_camera_xyzw) * turn
+    error = Rotation.from_rotvec(FAR_ALIGNMENT_RAD * axis / np.linalg.norm(axis))
+    star_tracker_from_camera = Rotation.from_quat(truth.star_tracker_from_camera_xyzw) * error
     return CameraGeometry(camera, star_tracker_from_camera.as_quat())
 
 
 def observe(field: StarField, tracker_arcsec: float, outlier_share: float = 0.0) -> Ensemble:
-    """What is measured of a star field, with a star tracker of that noise about each axis."""
+    """Observations of a star field with the given star tracker noise about each axis."""
     camera = field.truth.camera
     star_tracker_from_camera = Rotation.from_quat(field.truth.star_tracker_from_camera_xyzw)
     error = Rotation.from_rotvec(tracker_arcsec * ARCSECOND_RAD * field.tracker_error)
     reported = (star_tracker_from_camera * field.camera_from_icrf).inv() * error
     measured = field.pixel_px + field.centroid_error_px
-    measured += (field.luck < outlier_share)[..., None] * field.outlier_px
+    measured += (field.outlier_draw < outlier_share)[..., None] * field.outlier_px
     n = measured.shape[1]
     ones = np.ones(n, np.float32)
     images = [
@@ -173,7 +173,7 @@ def observe(field: StarField, tracker_arcsec: float, outlier_share: float = 0.0)
 
 
 def information_blocks(field: StarField) -> Floats:
-    """Normal matrices (m, 13, 13) of the images on camera and own rotation, at the truth."""
+    """Normal matrices (m, 13, 13) of the images for camera and own rotation, at the truth."""
     table = star_table(observe(field, 0.0).images)
     _, blocks = normal_blocks(
         arrange(table, np.ones(len(table), bool), table.covariance_px2),
@@ -186,12 +186,12 @@ def information_blocks(field: StarField) -> Floats:
 
 def bound(method: str, blocks: Floats, tracker_arcsec: float) -> Floats:
     """
-    Cramer-Rao bound (13, 13) of a method's own model of the images.
+    Cramer-Rao bound (13, 13) under the assumptions of a method.
 
-    ``single`` takes the star tracker as perfect, ``per_image`` learns nothing from it,
-    ``hierarchical`` knows its sigma: that one is the bound of any method.  The alignment of
-    ``per_image`` is no part of its model and left at zero.  The sigma is the same about all axes,
-    so the frame in which it is given does not matter.
+    ``single`` assumes a perfect star tracker, ``per_image`` does not use it, ``hierarchical``
+    assumes its true sigma, which gives the bound of any method.  ``per_image`` does not model the
+    alignment, whose rows are zero.  The sigma is the same about all axes, so its frame is
+    irrelevant.
     """
     N = blocks[:, [*_FREE, 10, 11, 12]][:, :, [*_FREE, 10, 11, 12]]
     f = len(_FREE)
@@ -220,38 +220,39 @@ def _inverse(information: Floats) -> Floats:
 
 
 def map_bound_px(camera: CameraModel, covariance: Floats) -> float:
-    """RMS over the detector of what `map_error_px` is to be expected to be, px."""
+    """Expected `map_error_px` for a covariance (13, 13), RMS over the detector, px."""
     return _rms(map_sigma_px(camera, covariance, GRID))
 
 
 def pointing_bound_arcsec(camera: CameraModel, covariance: Floats) -> float:
-    """RMS over the detector of what `pointing_error_arcsec` is to be expected to be."""
+    """Expected `pointing_error_arcsec` for a covariance (13, 13), RMS over the detector."""
     return _rms(line_of_sight_sigma_arcsec(camera, covariance, GRID, GRID))
 
 
 def pointing_error_arcsec(found: CameraGeometry, true: CameraGeometry) -> float:
-    """RMS over the detector between the lines of sight in the star tracker frame, arcsec."""
+    """RMS difference of the lines of sight in the star tracker frame over the detector, arcsec."""
     of_found, of_true = (lines_of_sight(geometry, GRID, GRID) for geometry in (found, true))
     return _rms(np.linalg.norm(of_found - of_true, axis=1)) / ARCSECOND_RAD
 
 
 def errors(found: CameraGeometry, true: CameraGeometry) -> Floats:
-    """Found less true (13,): camera parameters, then the passive turn of the camera frame, rad."""
-    turn_rad = alignment_difference_rad(found, true)
-    return np.concatenate([found.camera.parameters - true.camera.parameters, turn_rad])
+    """Found minus true (13,): camera parameters, then passive camera frame rotation, rad."""
+    rotation_rad = alignment_difference_rad(found, true)
+    return np.concatenate([found.camera.parameters - true.camera.parameters, rotation_rad])
 
 
 def normalised_error_squared(estimate: Estimate, true: CameraGeometry) -> float:
-    """Squared length of `errors` in the metric of the covariance reported: chi^2 with 11."""
+    """Squared `errors` normalised by the reported covariance: chi^2, 11 degrees of freedom."""
     covariance = estimate.covariance[np.ix_(ESTIMATED, ESTIMATED)]
     return chi_squared(errors(estimate.geometry, true)[ESTIMATED], covariance).value
 
 
 def unused_residual_px(camera: CameraModel, field: StarField) -> float:
     """
-    RMS per axis of the residuals of images that a calibration has not seen, px.
+    RMS residual per axis of images that were not used in a calibration, px.
 
-    Each image is turned to fit (as in the paper's Fig. 7): what the camera gets wrong stays.
+    Each image gets its best-fit rotation (as in the paper's Fig. 7), so that only errors of the
+    camera remain.
     """
     squares = 0.0
     measured = field.pixel_px + field.centroid_error_px
@@ -262,11 +263,11 @@ def unused_residual_px(camera: CameraModel, field: StarField) -> float:
 
 
 def calibration_options(method: str, tracker_arcsec: float, **other: object) -> CalibrationOptions:
-    """Options for few images and stars too, told a star tracker's sigma about each axis."""
-    told = max(tracker_arcsec, LEAST_TRACKER_ARCSEC)
+    """Options that allow few images and stars, with the assumed star tracker sigma per axis."""
+    assumed = max(tracker_arcsec, LEAST_TRACKER_ARCSEC)
     options = CalibrationOptions(
         method=method,
-        star_tracker_sigma_arcsec=(told, told, told),
+        star_tracker_sigma_arcsec=(assumed, assumed, assumed),
         min_images=2,
         min_stars=10,
     )

@@ -1,4 +1,4 @@
-"""Trials on the processes of this machine, or on a Dask cluster that is there already."""
+"""Parallel trials, in processes of this machine or on a running Dask cluster."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ Result = TypeVar('Result')
 
 LOOPBACK = '127.0.0.1'
 _CONNECT_S = 10.0
-_GLANCE_S = 0.2  # how often to look whether to stop
-_AHEAD = 8  # trials handed out for each thread of the workers
+_POLL_S = 0.2  # interval of checks for an interrupt
+_AHEAD = 8  # trials submitted ahead for each worker thread
 _SETTINGS = {
     'logging': {'distributed': 'critical'},
-    'distributed.worker.daemon': True,  # a worker whose parent was killed does not stay
+    'distributed.worker.daemon': True,  # a worker ends with its parent
     'distributed.nanny.pre-spawn-environ': {
         'OMP_NUM_THREADS': 1,
         'OPENBLAS_NUM_THREADS': 1,
@@ -40,7 +40,7 @@ _SETTINGS = {
 
 
 def processors() -> int:
-    """How many processors this process may use."""
+    """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
@@ -64,21 +64,21 @@ def run_each(
     on_each: Callable[[], None] = lambda: None,
 ) -> list[tuple[int, Result]]:
     """
-    What a function makes of each of 0 to count - 1, with that number, in any order.
+    Pairs (number, result) of a function called with 0 to count - 1, in any order.
 
     Parameters
     ----------
     workers : int
-        Processes to start on this machine; 0: none, all is done here.
+        Processes to start on this machine; 0 runs in-process.
     scheduler : str
-        Address of a Dask scheduler, whose workers have this package; then none is started.
+        Address of a Dask scheduler, whose workers have this package; then no process is started.
     on_each : callable
-        Called after each.
+        Called after each result.
 
     Raises
     ------
     OptionError
-        When there is no scheduler at the address.
+        When no scheduler answers at the address.
     """
     if not scheduler and workers == 0:
         results = []
@@ -105,38 +105,38 @@ def _gather(
     on_each: Callable[[], None],
     stop: threading.Event,
 ) -> list[tuple[int, Result]]:
-    """All results, a few numbers ahead of the workers: 100,000 would be slow to give up."""
+    """All results; submits few tasks ahead, since cancelling 100,000 of them is slow."""
     results: list[tuple[int, Result]] = []
     finished: queue.SimpleQueue[Future[Result]] = queue.SimpleQueue()
-    handed_out: dict[Future[Result], int] = {}
+    submitted: dict[Future[Result], int] = {}
     numbers = iter(range(count))
 
-    def hand_out(most: int) -> None:
+    def submit(most: int) -> None:
         for number in itertools.islice(numbers, most):
             future = client.submit(function, number, pure=False, retries=2)
-            handed_out[future] = number
+            submitted[future] = number
             future.add_done_callback(finished.put)  # type: ignore[no-untyped-call]
 
     threads = client.nthreads()  # type: ignore[no-untyped-call]
-    hand_out(_AHEAD * max(1, sum(threads.values())))
-    while handed_out:
+    submit(_AHEAD * max(1, sum(threads.values())))
+    while submitted:
         if stop.is_set():
             raise KeyboardInterrupt
         with contextlib.suppress(queue.Empty):
-            future = finished.get(timeout=_GLANCE_S)
-            results.append((handed_out.pop(future), future.result()))
+            future = finished.get(timeout=_POLL_S)
+            results.append((submitted.pop(future), future.result()))
             on_each()
-            hand_out(1)
+            submit(1)
     return results
 
 
 @contextlib.contextmanager
 def _interrupts_wait() -> Iterator[threading.Event]:
     """
-    Ctrl-C sets an event; a second one is a `KeyboardInterrupt` at once.
+    Ctrl-C sets an event; a second one raises `KeyboardInterrupt` at once.
 
-    Raised just anywhere in the client of Dask, the exception can leave a lock behind that its
-    closing waits for without end.
+    An exception raised inside the Dask client can leave a lock held, on which closing the client
+    would wait forever.
     """
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -167,7 +167,7 @@ def _local_cluster(workers: int) -> Iterator[LocalCluster]:
                 host=LOOPBACK,
                 dashboard_address=None,
                 worker_dashboard_address=None,
-                # Without a dashboard too it would take port 8787, or warn that it is taken.
+                # Otherwise it opens port 8787 even without a dashboard, or warns if it is in use.
                 scheduler_kwargs={'dashboard_address': f'{LOOPBACK}:0'},
                 silence_logs=logging.CRITICAL,
                 local_directory=folder,
@@ -180,11 +180,11 @@ def _local_cluster(workers: int) -> Iterator[LocalCluster]:
 @contextlib.contextmanager
 def _no_interrupts_for_children() -> Iterator[None]:
     """
-    Processes started within do not hear Ctrl-C; this one hears it afterwards.
+    Block Ctrl-C in processes started within; this process receives it afterwards.
 
-    The terminal sends it to all of them, and each would print a traceback.
+    The terminal sends it to all processes, and each would print a traceback.
     """
-    # It would let the signal through again when started later.
+    # Started later, it would unblock the signal.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -204,7 +204,7 @@ def _client(where: LocalCluster | str) -> Client:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Nothing on stderr of a connection that closes while a run ends."""
+    """Suppress messages about connections that close at the end of a run."""
     logger = logging.getLogger('distributed')
     level = logger.level
     logger.setLevel(logging.CRITICAL)

@@ -21,6 +21,7 @@ import yaml
 from starcal_ros.bag.reader import BagWriter
 from starcal_ros.cli import demo, main
 from starcal_ros.cli.arguments import parser
+from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.records import Image
 
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
@@ -71,6 +72,16 @@ def params(tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
+def test_no_command_prints_the_help(run: Run) -> None:
+    status, out, err = run()
+    assert (status, err) == (0, '')
+    assert out == parser().format_help()
+
+
+def test_version(run: Run) -> None:
+    assert run('--version') == (0, f'starcal {software_version()}\n', '')
+
+
 def test_help_is_there_at_once() -> None:
     start = time.monotonic()
     done = subprocess.run(
@@ -87,13 +98,12 @@ def test_help_is_there_at_once() -> None:
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [
-        ([], ['COMMAND']),
         (['fly'], ["'fly'"]),
         (['calibrat'], ['did you mean calibrate?']),
         (['calibrate', 'a.mcap', '--image-topick=/a'], ['--params']),
         (['inspect', 'a.mcap', '--image-topick=/a'], ['did you mean --image-topic?']),
         (['inspect', 'none.mcap'], ['none.mcap', 'no such bag']),
-        (['inspect', ''], ['an empty name']),
+        (['inspect', ''], ['empty path']),
         (['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', ''], ['--output']),
         (['calibrate', str(TINY), '--params', str(TINY / 'camera.yaml'), '-o', 'x'], ['section']),
         (['calibrate', str(TINY), '--params', str(TINY / 'tiny_0.mcap'), '-o', 'x'], ['text']),

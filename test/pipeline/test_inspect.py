@@ -194,7 +194,7 @@ def test_a_bag_that_cannot_be_calibrated_ends_with_3(
         writer.write_attitude(ATTITUDE, 5, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
     assert main.main(['inspect', str(path)]) == 3
     out = capsys.readouterr().out
-    assert 'cannot be calibrated: no image can be used' in out and 'no_attitude' in out
+    assert 'cannot be calibrated: no usable image' in out and 'no_attitude' in out
     few = tmp_path / 'few.mcap'
     with reader.BagWriter(few) as writer:
         for raw in reader.read_raw([TINY], [ATTITUDE]):
@@ -204,4 +204,4 @@ def test_a_bag_that_cannot_be_calibrated_ends_with_3(
             writer.write_image(IMAGE, image, 'camera')
     assert main.main(['inspect', str(few)]) == 0  # as far as can be told without the stars
     assert main.main(['inspect', str(few), '--params', str(PARAMS)]) == 3
-    assert '2 images can be used, 3 are needed (min_images)' in capsys.readouterr().out
+    assert 'only 2 usable images, 3 needed (min_images)' in capsys.readouterr().out

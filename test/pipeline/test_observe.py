@@ -92,7 +92,10 @@ def test_from_the_ground_stars_are_where_the_air_puts_them(camera_yaml: Path) ->
 def test_an_image_of_another_size_is_refused(setup: Setup) -> None:
     small = Image(image().time_ns, image().pixels[:-2].copy())
     found = observe.observe(small, attitudes(), setup, setup.prior)
-    assert (found.refusal, found.detail) == ('wrong_size', '640 x 510, the camera has 640 x 512')
+    assert (found.refusal, found.detail) == (
+        'wrong_size',
+        'image of 640 x 510, prior camera of 640 x 512',
+    )
     assert (found.width, found.height) == (640, 510)
     assert len(found) == 0
 

@@ -103,8 +103,8 @@ def test_a_folder_with_a_calibration_alone_says_what_is_missing(
 ) -> None:
     shutil.copy(folder / CALIBRATION_FILE, tmp_path)
     text = page_of(tmp_path)
-    assert 'not in this folder (residuals.npz)' in text
-    assert 'did not have the images' in text
+    assert 'no residuals of single stars (residuals.npz)' in text
+    assert 'without access to the images' in text
     assert 'id="figure-vectors"' in text and 'id="figure-images"' not in text
 
 
@@ -139,7 +139,7 @@ def test_a_calibration_of_before_the_gate_told_says_so(folder: Path, tmp_path: P
     calibration = read_calibration(folder / CALIBRATION_FILE)
     write_calibration(dataclasses.replace(calibration, gate=()), tmp_path / CALIBRATION_FILE)
     text = page_of(tmp_path)
-    assert 'does not tell what the gate has looked at' in text
+    assert 'does not record the gate checks' in text
     assert '<table class="limits">' not in text
 
 

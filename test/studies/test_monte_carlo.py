@@ -26,10 +26,9 @@ from starcal_ros.cli import main
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.studies import figures as study_figures
-from starcal_ros.studies import monte_carlo
-from starcal_ros.studies import trials as campaign_trials
-from starcal_ros.studies import workers as campaign_workers
-from starcal_ros.studies.monte_carlo import Campaign, Design, Row
+from starcal_ros.studies import monte_carlo, summary, trials, workers
+from starcal_ros.studies.monte_carlo import Design, Row
+from starcal_ros.studies.summary import StudyResult
 
 METHODS = ('per_image', 'single', 'hierarchical')
 ARGUMENTS = ('coverage', '--trials', '4', '--images', '4', '--stars', '20', '--seed', '5')
@@ -48,9 +47,9 @@ def small(study: str) -> Design:
 
 
 @functools.cache
-def here(design: Design) -> Campaign:
+def here(design: Design) -> StudyResult:
     """Run in this process."""
-    return monte_carlo.conclude(design, campaign_workers.run_trials(design))
+    return summary.conclude(design, workers.run_trials(design))
 
 
 def only(rows: tuple[Row, ...], **values: object) -> Row:
@@ -71,9 +70,9 @@ def tool(*arguments: object) -> subprocess.Popen[str]:
 
 def test_json_is_the_same_bytes_from_any_number_of_workers(tmp_path: Path) -> None:
     written = []
-    for workers in (0, 1, 2):
-        folder = tmp_path / str(workers)
-        done = tool(*ARGUMENTS, '-o', folder, '--workers', workers)
+    for count in (0, 1, 2):
+        folder = tmp_path / str(count)
+        done = tool(*ARGUMENTS, '-o', folder, '--workers', count)
         out, err = done.communicate(timeout=100)
         assert done.returncode == 0, err
         assert err == ''  # neither progress nor the words of Dask
@@ -94,8 +93,8 @@ def scheduler() -> Iterator[str]:
 
 def test_a_cluster_that_is_there_gives_the_same_rows(scheduler: str) -> None:
     design = small('coverage')
-    rows = campaign_workers.run_trials(design, scheduler=scheduler)
-    assert monte_carlo.conclude(design, rows) == here(design)
+    rows = workers.run_trials(design, scheduler=scheduler)
+    assert summary.conclude(design, rows) == here(design)
 
 
 def test_workers_listen_on_loopback_only() -> None:
@@ -108,7 +107,7 @@ def test_workers_listen_on_loopback_only() -> None:
                 if connection.status == psutil.CONN_LISTEN:
                     listening.add(connection.laddr.ip)
 
-    campaign_workers.run_trials(small('coverage'), workers=1, on_trial=look)
+    workers.run_trials(small('coverage'), workers=1, on_trial=look)
     assert listening == {'127.0.0.1'}
 
 
@@ -141,17 +140,17 @@ def test_a_trial_hangs_on_nothing_but_seed_study_and_number() -> None:
     ):
         assert monte_carlo.run_trial(design, 3)[0]['map_px'] != other[0]['map_px']
     rows = [row for trial in (3, 0, 2, 1) for row in monte_carlo.run_trial(design, trial)]
-    assert monte_carlo.conclude(design, rows) == here(design)
+    assert summary.conclude(design, rows) == here(design)
 
 
 @each_study
 def test_results_and_figure(study: str) -> None:
     found = here(small(study))
-    content = json.loads(monte_carlo.content(found, 'starcal 0'))
+    content = json.loads(summary.content(found, 'starcal 0'))
     assert content['study'] == study and content['parameters']['trials'] == found.design.trials
     assert {len(column) for column in content['trials'].values()} == {len(found.rows)}
     assert len(content['summary']) == len(found.summary)
-    lines = monte_carlo.table(found)
+    lines = summary.table(found)
     assert len(lines) == 1 + len(found.summary) and len({len(line) for line in lines}) == 1
     picture = cv2.imdecode(np.frombuffer(study_figures.png(found), np.uint8), 0)
     assert picture is not None and picture.shape[0] > 300 and picture.shape[1] > 600
@@ -223,10 +222,10 @@ def test_unused_images_fit_better_the_more_are_used() -> None:
 
 
 def test_bound_is_the_inverse_of_the_whole_normal_matrix() -> None:
-    field = campaign_trials.draw_star_field(np.random.default_rng(1), 3, 20)
-    N = campaign_trials.information_blocks(field)
+    field = trials.draw_star_field(np.random.default_rng(1), 3, 20)
+    N = trials.information_blocks(field)
     tracker_arcsec, f, m = 7.0, 8, 3
-    rows = campaign_trials.ESTIMATED[:f]
+    rows = trials.ESTIMATED[:f]
     G = np.eye(3) / (tracker_arcsec * ARCSECOND_RAD) ** 2
     dense = np.zeros((f + 3 + 3 * m, f + 3 + 3 * m))
     for k in range(m):
@@ -239,8 +238,8 @@ def test_bound_is_the_inverse_of_the_whole_normal_matrix() -> None:
         dense[f : f + 3, f : f + 3] += G
     scale = 1 / np.sqrt(np.diag(dense))
     expected = (np.linalg.inv(dense * np.outer(scale, scale)) * np.outer(scale, scale))[:11, :11]
-    found = campaign_trials.bound('hierarchical', N, tracker_arcsec)
-    estimated = np.ix_(campaign_trials.ESTIMATED, campaign_trials.ESTIMATED)
+    found = trials.bound('hierarchical', N, tracker_arcsec)
+    estimated = np.ix_(trials.ESTIMATED, trials.ESTIMATED)
     sigma = np.sqrt(np.diag(expected))
     # Condition 1e6 of the scaled matrix times a rounding.
     np.testing.assert_allclose(
@@ -250,11 +249,11 @@ def test_bound_is_the_inverse_of_the_whole_normal_matrix() -> None:
 
 def test_per_image_and_single_bound_the_hierarchical() -> None:
     """Nothing known of the attitude, and all: the limits of the star tracker's sigma."""
-    field = campaign_trials.draw_star_field(np.random.default_rng(2), 5, 20)
-    blocks = campaign_trials.information_blocks(field)
+    field = trials.draw_star_field(np.random.default_rng(2), 5, 20)
+    blocks = trials.information_blocks(field)
     for method, tracker_arcsec in (('per_image', 3e5), ('single', 0.0)):
-        limit = campaign_trials.bound('hierarchical', blocks, tracker_arcsec)
-        own = campaign_trials.bound(method, blocks, tracker_arcsec)
+        limit = trials.bound('hierarchical', blocks, tracker_arcsec)
+        own = trials.bound(method, blocks, tracker_arcsec)
         # 0.001 arcsec, which stands for none, against the 1 arcsec that the stars know: squared.
         np.testing.assert_allclose(
             np.diag(limit)[:10], np.diag(own)[:10], rtol=1e-5, err_msg=method
@@ -262,7 +261,7 @@ def test_per_image_and_single_bound_the_hierarchical() -> None:
 
 
 def test_map_error_leaves_out_a_common_turn() -> None:
-    field = campaign_trials.draw_star_field(np.random.default_rng(3), 1, 1)
+    field = trials.draw_star_field(np.random.default_rng(3), 1, 1)
     camera = field.truth.camera
     assert map_error_px(camera, camera) < 1e-9  # rounding of the inverse
     # A moved principal point is a turn but for its second order: 5 px of tilt times the
@@ -284,8 +283,8 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
     found = here(design)
     # Eight stars are under the ten that a calibration takes.
     assert [row['images'] for row in found.rows] == [4]
-    json.loads(monte_carlo.content(found, ''))
-    with pytest.raises(TooFewObservations, match='none of the 1 trials'):
+    json.loads(summary.content(found, ''))
+    with pytest.raises(TooFewObservations, match='no calibration was possible in 1 trials'):
         here(dataclasses.replace(design, images=(2,)))
 
 
@@ -297,12 +296,12 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
         (['table1', '--trials', 'many'], "--trials: invalid int value: 'many'"),
         (['table1', '--seed', '-1'], '--seed: -1'),
         (['table1', '--images', '1'], '--images: 1 is not within 2 to'),
-        (['table1', '--images', '5', '5'], '--images: 5 5 says one thing twice'),
+        (['table1', '--images', '5', '5'], '--images: duplicate values: 5 5'),
         (['table1', '--stars', '2'], '--stars: 2'),
-        (['terms', '--stars', '20'], '--stars: the images of the study terms'),
+        (['terms', '--stars', '20'], '--stars: not applicable to the study terms'),
         (['table1', '--tracker', '-3'], '-3.0 is not within 0 to 3600'),
         (['table1', '--tracker', 'nan'], 'nan is not within 0 to 3600'),
-        (['table1', '--tracker-told', '4000'], '4000.0 is not within'),
+        (['table1', '--tracker-assumed', '4000'], '4000.0 is not within'),
         (['table1', '--methods', 'all'], "--methods: 'all' is not one of per_image, single"),
         (['table1', '--workers', '-1'], '--workers: -1 is not within 0'),
         (['table1', '--workers', '1', '--scheduler', 'x'], 'not allowed with'),
@@ -317,7 +316,7 @@ def test_bad_arguments_are_one_line(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(campaign_workers, '_CONNECT_S', 0.5)
+    monkeypatch.setattr(workers, '_CONNECT_S', 0.5)
     monkeypatch.setattr(os, 'environ', dict(os.environ))
     try:
         status = main.main(['campaign', *arguments, '-o', str(tmp_path / 'out')])

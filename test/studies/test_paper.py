@@ -14,7 +14,7 @@ from starcal_ros.cli import main
 from starcal_ros.records import Ensemble
 from starcal_ros.simulation import centroids as simulated_centroids
 from starcal_ros.simulation import scenario
-from starcal_ros.studies import monte_carlo, paper, paper_figures, workers
+from starcal_ros.studies import monte_carlo, paper, paper_figures, summary, workers
 from starcal_ros.studies.paper import judge, PaperStudy, spread
 
 NIGHT = scenario.scenario(paper.NIGHT, seed=3)
@@ -31,7 +31,7 @@ def ensemble() -> Ensemble:
 @pytest.fixture(scope='module')
 def found(ensemble: Ensemble) -> PaperStudy:
     design = monte_carlo.Design('table1', 2, (15,), (20,), (0.0, 20.0), ('per_image', 'single'))
-    table1 = monte_carlo.conclude(design, workers.run_trials(design))
+    table1 = summary.conclude(design, workers.run_trials(design))
     return paper.study(ensemble.images, table1, seed=3)
 
 

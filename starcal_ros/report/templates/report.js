@@ -1,5 +1,5 @@
 'use strict';
-// Draws one image of the ensemble: where its stars stood, and their residuals, enlarged.
+// Draws the stars of one image and their enlarged residuals.
 (() => {
   const box = document.getElementById('one-image');
   if (!box) return;
@@ -22,26 +22,26 @@
     let used = 0;
     const count = image.stars.length / 5;
     for (let k = 0; k < count; k++) {
-      const [u, v, du, dv, kept] = image.stars.slice(5 * k, 5 * k + 5);
-      used += kept;
+      const [u, v, du, dv, isUsed] = image.stars.slice(5 * k, 5 * k + 5);
+      used += isUsed;
       const group = add('g', {}, svg);
       add('line', {
         x1: u, y1: v, x2: u + scale * du / 1000, y2: v + scale * dv / 1000,
-        stroke: kept ? 'var(--series-1)' : 'var(--series-2)', 'stroke-width': 1.6 * unit,
+        stroke: isUsed ? 'var(--series-1)' : 'var(--series-2)', 'stroke-width': 1.6 * unit,
       }, group);
       add('circle', {
-        cx: u, cy: v, r: 3 * unit, fill: kept ? 'var(--ink)' : 'var(--series-2)',
+        cx: u, cy: v, r: 3 * unit, fill: isUsed ? 'var(--ink)' : 'var(--series-2)',
       }, group);
       add('title', {}, group).textContent =
         `(${u}, ${v}) px, residual ${(du / 1000).toFixed(3)}, ${(dv / 1000).toFixed(3)} px` +
-        (kept ? '' : ', left out');
+        (isUsed ? '' : ', left out');
     }
-    const tracker = image.tracker[0] === null ? 'too few stars to judge the star tracker' :
-      `star tracker off by ${image.tracker.map((a) => a.toFixed(1) + '″').join(', ')} about x, y, z`;
+    const tracker = image.tracker[0] === null ? 'too few stars for the star tracker error' :
+      `star tracker error ${image.tracker.map((a) => a.toFixed(1) + '″').join(', ')} about x, y, z`;
     output.textContent = `Image ${image.number} of ${data.count}, ${image.time}: ` +
       `${used} stars used, ${count - used} left out, ` +
       (image.rms === null ? '' : `${image.rms.toFixed(3)} px rms, `) + tracker +
-      (image.misfit ? '; its attitude does not fit' : '') +
+      (image.misfit ? '; attitude misfit' : '') +
       `. Residuals enlarged ${Math.round(scale)} times.`;
     which.setAttribute('aria-valuetext', `image ${image.number}`);
   };

@@ -1,0 +1,229 @@
+"""Summaries of Monte Carlo studies: errors relative to bounds and to reported covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+import dataclasses
+from dataclasses import dataclass
+import json
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from starcal_ros.errors import TooFewObservations
+from starcal_ros.studies.monte_carlo import Design, Row, SAME_SIGMAS
+from starcal_ros.studies.trials import ESTIMATED
+
+Floats = NDArray[np.float64]
+
+CONFIDENCE = 0.99
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """Result of a study: rows of its trials in order, and their summary."""
+
+    design: Design
+    rows: tuple[Row, ...]
+    summary: tuple[Row, ...]
+
+
+def conclude(design: Design, rows: Iterable[Row]) -> StudyResult:
+    """
+    Result of a study from the rows of all its trials, in any order.
+
+    Raises
+    ------
+    TooFewObservations
+        When no calibration was possible in any cell.
+    """
+    ordered = tuple(sorted(rows, key=lambda row: row['trial']))
+    if not ordered:
+        raise TooFewObservations(
+            f'no calibration was possible in {design.trials} trials of {design.study}: '
+            'increase --images or --stars'
+        )
+    return StudyResult(design, ordered, tuple(_SUMMARIES[design.study](ordered)))
+
+
+def content(result: StudyResult, software: str) -> str:
+    """JSON text of a result: design, summary rows, and all trials as columns."""
+    columns = list(dict.fromkeys(name for row in result.rows for name in row))
+    parameters = dataclasses.asdict(result.design)
+    lines = [
+        f' {json.dumps(name)}: {json.dumps(value, allow_nan=False)}'
+        for name, value in (
+            ('software', software),
+            ('study', parameters.pop('study')),
+            ('seed', parameters.pop('seed')),
+            ('parameters', parameters),
+        )
+    ]
+    summary = [f'  {json.dumps(row, allow_nan=False)}' for row in result.summary]
+    trials = [
+        f'  {json.dumps(name)}: '
+        + json.dumps([row.get(name) for row in result.rows], allow_nan=False)
+        for name in columns
+    ]
+    lines.append(' "summary": [\n' + ',\n'.join(summary) + '\n ]')
+    lines.append(' "trials": {\n' + ',\n'.join(trials) + '\n }')
+    return '{\n' + ',\n'.join(lines) + '\n}\n'
+
+
+def _groups(rows: Sequence[Row], *names: str) -> Iterable[tuple[Row, list[Row]]]:
+    """Group rows by the named columns, in order of first appearance."""
+    groups: dict[tuple[int | float | str, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    for key, members in groups.items():
+        yield dict(zip(names, key, strict=True)), members
+
+
+def column(rows: Sequence[Row], name: str) -> Floats:
+    """Column of numbers of some rows."""
+    return np.array([row[name] for row in rows], np.float64)
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _relative_error_of_rms(values: Floats) -> float:
+    """1-sigma of the RMS of a sample, relative to it."""
+    squares = values**2
+    if len(squares) < 2:
+        return math.inf
+    return float(0.5 * squares.std(ddof=1) / squares.mean() / math.sqrt(len(squares)))
+
+
+def _ratio(rows: Sequence[Row], name: str, to: str) -> float:
+    return _rms(column(rows, name)) / _rms(column(rows, to))
+
+
+def _interval(parameters: int, trials: int) -> tuple[float, float]:
+    """Interval of the mean of ``trials`` chi^2 variables with probability `CONFIDENCE`."""
+    tail = (1 - CONFIDENCE) / 2
+    low, high = chi2.ppf([tail, 1 - tail], parameters * trials) / trials
+    return float(low), float(high)
+
+
+def _common(rows: Sequence[Row]) -> Row:
+    map_px = column(rows, 'map_px')
+    return {
+        'trials': len(rows),
+        'map_px': _rms(map_px),
+        'map_px_sigma': _sigma_or_zero(_rms(map_px) * _relative_error_of_rms(map_px)),
+    }
+
+
+def _sigma_or_zero(sigma: float) -> float:
+    """Replace the infinite sigma of a single trial, which JSON cannot hold, by 0."""
+    return sigma if math.isfinite(sigma) else 0.0
+
+
+def _table1_summary(rows: Sequence[Row]) -> Iterable[Row]:
+    for key, cell in _groups(rows, 'images', 'stars', 'tracker_arcsec', 'method'):
+        yield {
+            **key,
+            **_common(cell),
+            'to_own_bound': _ratio(cell, 'map_px', 'own_bound_px'),
+            'to_per_image_bound': _ratio(cell, 'map_px', 'per_image_bound_px'),
+            'to_bound': _ratio(cell, 'map_px', 'bound_px'),
+            'pointing_arcsec': _rms(column(cell, 'pointing_arcsec')),
+            'pointing_to_bound': _ratio(cell, 'pointing_arcsec', 'pointing_bound_arcsec'),
+            'normalised': float(column(cell, 'normalised').mean()),
+        }
+
+
+def _images_summary(rows: Sequence[Row]) -> Iterable[Row]:
+    for key, cell in _groups(rows, 'images', 'stars', 'tracker_arcsec', 'method'):
+        yield {
+            **key,
+            **_common(cell),
+            'to_bound': _ratio(cell, 'map_px', 'bound_px'),
+            'unused_px': _rms(column(cell, 'unused_px')),
+            'unused_to_true': _ratio(cell, 'unused_px', 'unused_true_px'),
+        }
+
+
+def _terms_summary(rows: Sequence[Row]) -> Iterable[Row]:
+    for key, cell in _groups(rows, 'images', 'tracker_arcsec', 'method', 'step'):
+        removed = [str(row['removed']) for row in cell]
+        usual = max(sorted(set(removed)), key=removed.count)
+        yield {
+            **key,
+            'trials': len(cell),
+            'usual': usual or 'none',
+            'share': removed.count(usual) / len(cell),
+            'residual_std_u_px': _rms(column(cell, 'residual_std_u_px')),
+            'residual_std_v_px': _rms(column(cell, 'residual_std_v_px')),
+            'map_change_px': _rms(column(cell, 'map_change_px')),
+        }
+
+
+def _coverage_summary(rows: Sequence[Row]) -> Iterable[Row]:
+    names = [name for name in rows[0] if name.endswith('_sigmas')]
+    for key, cell in _groups(rows, 'images', 'stars', 'tracker_arcsec', 'outlier_share', 'method'):
+        low, high = _interval(len(ESTIMATED), len(cell))
+        normalised = float(column(cell, 'normalised').mean())
+        bias = {name: float(column(cell, name).mean()) for name in names}
+        spread = {name: _rms(column(cell, name)) for name in names}
+        worst = max(names, key=lambda name: abs(bias[name]))
+        widest = max(names, key=lambda name: spread[name])
+        yield {
+            **key,
+            **_common(cell),
+            'to_bound': _ratio(cell, 'map_px', 'bound_px'),
+            'to_reported': _ratio(cell, 'map_px', 'reported_px'),
+            'normalised': normalised,
+            'low': low,
+            'high': high,
+            'inside': int(low <= normalised <= high),
+            'worst_bias': worst.removesuffix('_sigmas'),
+            'worst_bias_sigmas': bias[worst],
+            'widest': widest.removesuffix('_sigmas'),
+            'widest_rms_sigmas': spread[widest],
+            **{f'bias_{name}': value for name, value in bias.items()},
+            **{f'rms_{name}': value for name, value in spread.items()},
+        }
+
+
+def _start_summary(rows: Sequence[Row]) -> Iterable[Row]:
+    for key, cell in _groups(rows, 'images', 'stars', 'tracker_arcsec', 'outlier_share', 'method'):
+        apart = column(cell, 'apart_sigmas')
+        yield {
+            **key,
+            **_common(cell),
+            'same_minimum': int((apart < SAME_SIGMAS).sum()),
+            'worst_apart_sigmas': float(apart.max()),
+            'outliers': int(column(cell, 'outliers').sum()),
+            'outliers_kept': int(column(cell, 'outliers_kept').sum()),
+            'iterations_near': float(column(cell, 'iterations_near').mean()),
+            'iterations_far': float(column(cell, 'iterations_far').mean()),
+        }
+
+
+_SUMMARIES: Mapping[str, Callable[[Sequence[Row]], Iterable[Row]]] = {
+    'table1': _table1_summary,
+    'images': _images_summary,
+    'terms': _terms_summary,
+    'coverage': _coverage_summary,
+    'start': _start_summary,
+}
+
+
+def table(result: StudyResult) -> list[str]:
+    """Summary as lines of aligned columns, without bias and spread of single parameters."""
+    names = [n for n in result.summary[0] if not n.startswith(('bias_', 'rms_'))]
+    cells = [[_words(row[name]) for name in names] for row in result.summary]
+    widths = [max(map(len, column)) for column in zip(names, *cells, strict=True)]
+    return [
+        '  '.join(f'{text:>{width}}' for text, width in zip(line, widths, strict=True))
+        for line in [names, *cells]
+    ]
+
+
+def _words(value: int | float | str) -> str:
+    return f'{value:.4g}' if isinstance(value, float) else str(value)
