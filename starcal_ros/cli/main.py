@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from starcal_ros.records import Calibration, Ensemble
 
 NODES = ('star_observer', 'calibrator')
+_MODULES_OF_EXTRAS = ('dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')  # setup.cfg
 _DEMO_SAME_PX = 1e-6  # what other threads of BLAS may do to the last digits
 _DEMO_SIGMAS = 5.0  # one in 10^5 demos would miss by chance; the seed is fixed, so none does
 
@@ -58,6 +59,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_BAD_INPUT
     except OSError as error:
         return complain(f'{error.filename or "input/output"}: {error.strerror or error}')
+    except ModuleNotFoundError as error:
+        extra = 'studies' if args.command == 'campaign' else 'report'
+        return complain(_missing_extra(error, extra))
     except KeyboardInterrupt:
         complain('interrupted')
         return EXIT_INTERRUPTED
@@ -67,16 +71,15 @@ def _calibrate(args: argparse.Namespace) -> int:
     """Bags to products: what the two nodes do, in one process."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
-    from starcal_ros.report import page
 
     setup = _setup(args.params)
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
     inputs = {str(path): _digest(path) for path in (*reader.mcap_files(args.bags), args.params)}
     calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
-    shown = page.write_report(args.output)
+    report = _write_report(args.output)
     output.print_calibration(calibration, setup.prior)
-    print(f'written to {args.output}; look at {shown}')
+    print(f'written to {args.output}; {report}')
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
 
 
@@ -157,6 +160,22 @@ def _report(args: argparse.Namespace) -> int:
     return EXIT_ACCEPTED
 
 
+def _write_report(folder: Path) -> str:
+    """Write the report of a folder; returns where it is, or why there is none."""
+    try:
+        from starcal_ros.report import page
+    except ModuleNotFoundError as error:
+        return f'no report: {_missing_extra(error, "report")}'
+    return f'look at {page.write_report(folder)}'
+
+
+def _missing_extra(error: ModuleNotFoundError, extra: str) -> str:
+    """One line that names the extra to install; raises what is missing for another reason."""
+    if error.name not in _MODULES_OF_EXTRAS:
+        raise error
+    return f"{error.name} is not installed: pip install 'starcal_ros[{extra}]'"
+
+
 def _refused_words(ensemble: Ensemble) -> str:
     counted = ', '.join(f'{reason} {count}' for reason, count in ensemble.refused.items())
     return f' ({counted})' if counted else ''
@@ -186,10 +205,11 @@ def _compare(args: argparse.Namespace) -> int:
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import output
     from starcal_ros.products.calibration_json import read_calibration
-    from starcal_ros.report import comparison_figure
 
     found = comparison.compare(*(read_calibration(_file(p)) for p in (args.a, args.b)))
     if args.output:
+        from starcal_ros.report import comparison_figure
+
         comparison_figure.write(found, args.output)
     if args.json:
         print(json.dumps(comparison.content(found), indent=1, allow_nan=False))
