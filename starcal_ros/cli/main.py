@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.records import Calibration, Ensemble
 
-NODES = ('star_observer', 'calibrator')
 _MODULES_OF_EXTRAS = ('dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')  # setup.cfg
 _DEMO_SAME_PX = 1e-6  # what other threads of BLAS may do to the last digits
 _DEMO_SIGMAS = 5.0  # one in 10^5 demos would miss by chance; the seed is fixed, so none does
@@ -71,11 +70,13 @@ def _calibrate(args: argparse.Namespace) -> int:
     """Bags to products: what the two nodes do, in one process."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
+    from starcal_ros.pipeline.provenance import inputs_of
+    from starcal_ros.pipeline.setup import read_setup
 
-    setup = _setup(args.params)
+    setup = read_setup(args.params)
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
-    inputs = {str(path): _digest(path) for path in (*reader.mcap_files(args.bags), args.params)}
+    inputs = inputs_of((*reader.mcap_files(args.bags), args.params))
     calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
     report = _write_report(args.output)
     output.print_calibration(calibration, setup.prior)
@@ -115,20 +116,6 @@ def _calibrate_into(
     write_residuals(left, folder / RESIDUALS_FILE)
     thumbnails.write_thumbnails(album.thumbnails(), folder / thumbnails.THUMBNAILS_FOLDER)
     return calibration
-
-
-def _setup(params: Path) -> Setup:
-    """Every option of a parameter file, and what they name, loaded."""
-    from starcal_ros.options import read_parameter_file
-    from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-    from starcal_ros.pipeline.setup import load_setup
-    from starcal_ros.products.camera_yaml import with_camera_url_from
-
-    values = with_camera_url_from(read_parameter_file(params, NODES), params)
-    try:
-        return load_setup(values, others=NODE_OPTION_CLASSES)
-    except OptionError as error:
-        raise OptionError(f'{params}: {error}') from error
 
 
 def _asked(args: argparse.Namespace) -> Topics:
@@ -187,8 +174,9 @@ def _inspect(args: argparse.Namespace) -> int:
     from starcal_ros.cli import output
     from starcal_ros.messages.types import COMPRESSED_TYPE, IMAGE_TYPE, OBSERVATIONS_TYPE
     from starcal_ros.pipeline import inspect
+    from starcal_ros.pipeline.setup import read_setup
 
-    setup = _setup(args.params) if args.params else None
+    setup = read_setup(args.params) if args.params else None
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:
@@ -399,16 +387,6 @@ def _paper(args: argparse.Namespace) -> int:
     write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
     print(f'written to {path}, with figures in {args.output / "images"}')
     return EXIT_ACCEPTED
-
-
-def _digest(path: Path) -> str:
-    import hashlib
-
-    digest = hashlib.sha256()
-    with path.open('rb') as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return f'sha256:{digest.hexdigest()}'
 
 
 def _make_folder(path: Path) -> None:

@@ -31,12 +31,16 @@ from starcal_ros.options import (
     nearest,
     option,
     OptionValue,
+    read_parameter_file,
 )
-from starcal_ros.products.camera_yaml import read_camera_info
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
+from starcal_ros.products.camera_yaml import read_camera_info, with_camera_url_from
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
+
+NODES = ('star_observer', 'calibrator')
 
 
 @dataclass(frozen=True)
@@ -95,11 +99,34 @@ _OPTION_GROUPS: dict[str, type[Any]] = {
 OPTION_CLASSES = tuple(_OPTION_GROUPS.values())
 
 
-def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Setup:
+def read_setup(params: Path) -> Setup:
+    """
+    The setup of a ROS parameter file, in which the nodes' own parameters may stand as well.
+
+    Raises
+    ------
+    OptionError
+        For an unknown name or a bad value; the text begins with the file.
+    ProductError, CatalogError
+        When the prior camera or the catalog cannot be read.
+    """
+    values = with_camera_url_from(read_parameter_file(params, NODES), params)
+    try:
+        return load_setup(values, others=NODE_OPTION_CLASSES)
+    except OptionError as error:
+        raise OptionError(f'{params}: {error}') from error
+
+
+def load_setup(
+    values: Mapping[str, object],
+    others: Sequence[type] = (),
+    prior: CameraGeometry | None = None,
+) -> Setup:
     """
     Checked options with prior camera, catalog and dark frame loaded.
 
-    ``others`` are option classes of the caller whose names the mapping may hold as well.
+    ``others`` are option classes of the caller whose names the mapping may hold as well; a
+    ``prior`` is used in place of the one that the options name.
 
     Raises
     ------
@@ -113,7 +140,7 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
         if name not in known and name != 'use_sim_time':
             raise OptionError(f'{name}: no such parameter{nearest(name, known)}')
     frames = from_mapping(SetupOptions, values)
-    prior = _prior(frames)
+    prior = prior or _prior(frames)
     identification = from_mapping(IdentificationOptions, values)
     calibration = from_mapping(CalibrationOptions, values)
     check_options(calibration)
