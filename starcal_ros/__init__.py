@@ -15,4 +15,71 @@ Conventions, everywhere in this package:
 - Pixels are (u right, v down); the centre of the first pixel is (0, 0); images index ``[v, u]``.
 - Angles are radians inside and arcseconds for people; times are integer nanoseconds since the
   Unix epoch (UTC, as ROS stamps); directions are unit vectors; xyz is the last axis.
+
+The public functions and records are those of ``__all__``; `api` describes them.  Each is imported
+at its first use, so that ``import starcal_ros`` loads neither NumPy nor OpenCV.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from starcal_ros.api import (
+        calibrate,
+        calibrate_bag,
+        Calibration,
+        CameraGeometry,
+        CameraModel,
+        lines_of_sight,
+        observations_of,
+        OptionError,
+        project,
+        read_calibration,
+        StarcalError,
+        StarObservations,
+        TooFewObservations,
+        write_calibration,
+    )
+
+    __version__: str
+
+__all__ = [
+    'Calibration',
+    'CameraGeometry',
+    'CameraModel',
+    'OptionError',
+    'StarObservations',
+    'StarcalError',
+    'TooFewObservations',
+    '__version__',
+    'calibrate',
+    'calibrate_bag',
+    'lines_of_sight',
+    'observations_of',
+    'project',
+    'read_calibration',
+    'write_calibration',
+]
+
+if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
+
+    def __getattr__(name: str) -> object:
+        """Import a public name at its first use (PEP 562)."""
+        if name not in __all__:
+            raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+        if name == '__version__':
+            from importlib import metadata
+
+            value: object = metadata.version(__name__)
+        else:
+            from starcal_ros import api
+
+            value = getattr(api, name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    """Names of the module, the public ones that are not imported yet included."""
+    return sorted({*globals(), *__all__})

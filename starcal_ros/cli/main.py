@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.records import Calibration, Ensemble
 
-NODES = ('star_observer', 'calibrator')
+_MODULES_OF_EXTRAS = ('dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')  # setup.cfg
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
 
@@ -64,6 +64,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_BAD_INPUT
     except OSError as error:
         return complain(f'{error.filename or "input/output"}: {error.strerror or error}')
+    except ModuleNotFoundError as error:
+        extra = 'studies' if args.command == 'campaign' else 'report'
+        return complain(_missing_extra(error, extra))
     except KeyboardInterrupt:
         complain('interrupted')
         return EXIT_INTERRUPTED
@@ -73,16 +76,17 @@ def _calibrate(args: argparse.Namespace) -> int:
     """Calibrate from bags in one process, as the two nodes do on the graph."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
-    from starcal_ros.report import page
+    from starcal_ros.pipeline.provenance import inputs_of
+    from starcal_ros.pipeline.setup import read_setup
 
-    setup = _setup(args.params)
+    setup = read_setup(args.params)
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
-    inputs = {str(path): _digest(path) for path in (*reader.mcap_files(args.bags), args.params)}
+    inputs = inputs_of((*reader.mcap_files(args.bags), args.params))
     calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
-    report = page.write_report(args.output)
+    report = _write_report(args.output)
     output.print_calibration(calibration, setup.prior)
-    print(f'products written to {args.output}; open {report}')
+    print(f'products written to {args.output}; {report}')
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
 
 
@@ -115,20 +119,6 @@ def _calibrate_into(
     return calibration
 
 
-def _setup(params: Path) -> Setup:
-    """Options of a parameter file, with prior camera, catalog and dark frame loaded."""
-    from starcal_ros.options import read_parameter_file
-    from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-    from starcal_ros.pipeline.setup import load_setup
-    from starcal_ros.products.camera_yaml import with_camera_url_from
-
-    values = with_camera_url_from(read_parameter_file(params, NODES), params)
-    try:
-        return load_setup(values, others=NODE_OPTION_CLASSES)
-    except OptionError as error:
-        raise OptionError(f'{params}: {error}') from error
-
-
 def _asked(args: argparse.Namespace) -> Topics:
     from starcal_ros.pipeline.topics import Topics
 
@@ -149,6 +139,22 @@ def _report(args: argparse.Namespace) -> int:
     return EXIT_ACCEPTED
 
 
+def _write_report(folder: Path) -> str:
+    """Write the report of a folder; returns where it is, or why there is none."""
+    try:
+        from starcal_ros.report import page
+    except ModuleNotFoundError as error:
+        return f'no report: {_missing_extra(error, "report")}'
+    return f'look at {page.write_report(folder)}'
+
+
+def _missing_extra(error: ModuleNotFoundError, extra: str) -> str:
+    """One line that names the extra to install; raises what is missing for another reason."""
+    if error.name not in _MODULES_OF_EXTRAS:
+        raise error
+    return f"{error.name} is not installed: pip install 'starcal_ros[{extra}]'"
+
+
 def _refused_words(ensemble: Ensemble) -> str:
     counted = ', '.join(f'{reason} {count}' for reason, count in ensemble.refused.items())
     return f' ({counted})' if counted else ''
@@ -160,8 +166,9 @@ def _inspect(args: argparse.Namespace) -> int:
     from starcal_ros.cli import output
     from starcal_ros.messages.types import COMPRESSED_TYPE, IMAGE_TYPE, OBSERVATIONS_TYPE
     from starcal_ros.pipeline import inspect
+    from starcal_ros.pipeline.setup import read_setup
 
-    setup = _setup(args.params) if args.params else None
+    setup = read_setup(args.params) if args.params else None
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:
@@ -178,10 +185,11 @@ def _compare(args: argparse.Namespace) -> int:
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import output
     from starcal_ros.products.calibration_json import read_calibration
-    from starcal_ros.report import figures
 
     found = comparison.compare(*(read_calibration(_file(p)) for p in (args.a, args.b)))
     if args.output:
+        from starcal_ros.report import figures
+
         figures.write_comparison(found, args.output)
     if args.json:
         print(json.dumps(comparison.content(found), indent=1, allow_nan=False))
@@ -373,16 +381,6 @@ def _software() -> str:
     from starcal_ros.pipeline.provenance import software_version
 
     return f'starcal {software_version()}'
-
-
-def _digest(path: Path) -> str:
-    import hashlib
-
-    digest = hashlib.sha256()
-    with path.open('rb') as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return f'sha256:{digest.hexdigest()}'
 
 
 def _make_folder(path: Path) -> None:

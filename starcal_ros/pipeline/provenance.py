@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 import hashlib
 import importlib.metadata
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 
@@ -29,6 +30,18 @@ def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -
         'observations_sha256': _digest(ensemble),
         **{f'input {name}': value for name, value in inputs.items()},
     }
+
+
+def inputs_of(files: Iterable[Path]) -> dict[str, str]:
+    """SHA-256 of the files that a calibration is made from, by their paths."""
+    digests = {}
+    for path in files:
+        digest = hashlib.sha256()
+        with path.open('rb') as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+        digests[str(path)] = f'sha256:{digest.hexdigest()}'
+    return digests
 
 
 def _digest(ensemble: Ensemble) -> str:

@@ -34,12 +34,16 @@ from starcal_ros.options import (
     nearest,
     option,
     OptionValue,
+    read_parameter_file,
 )
-from starcal_ros.products.camera_yaml import read_camera_info
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
+from starcal_ros.products.camera_yaml import read_camera_info, with_camera_url_from
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
+
+NODES = ('star_observer', 'calibrator')
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,24 @@ _OPTION_GROUPS: dict[str, type[Any]] = {
     name: kind for name, kind in get_type_hints(Setup).items() if holds_options(kind)
 }
 OPTION_CLASSES = tuple(_OPTION_GROUPS.values())
+
+
+def read_setup(params: Path) -> Setup:
+    """
+    The setup of a ROS parameter file, in which the nodes' own parameters may stand as well.
+
+    Raises
+    ------
+    OptionError
+        For an unknown name or a bad value; the text begins with the file.
+    ProductError, CatalogError
+        When the prior camera or the catalog cannot be read.
+    """
+    values = with_camera_url_from(read_parameter_file(params, NODES), params)
+    try:
+        return load_setup(values, others=NODE_OPTION_CLASSES)
+    except OptionError as error:
+        raise OptionError(f'{params}: {error}') from error
 
 
 def load_setup(

@@ -15,12 +15,9 @@ from starcal_ros.cli import main
 from starcal_ros.messages.fields import make_header
 from starcal_ros.messages.telemetry import attitude_from_message
 from starcal_ros.messages.types import COMPRESSED_TYPE
-from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import inspect, observe
-from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.pipeline.topics import Topics
-from starcal_ros.products.camera_yaml import with_camera_url_from
 from starcal_ros.records import Image
 from starcal_ros.simulation import bag as simulated_bag
 
@@ -32,8 +29,7 @@ IMAGE, ATTITUDE = simulated_bag.IMAGE_TOPIC, simulated_bag.ATTITUDE_TOPIC
 
 @pytest.fixture(scope='module')
 def setup() -> Setup:
-    values = with_camera_url_from(read_parameter_file(PARAMS, main.NODES), PARAMS)
-    return load_setup(values, NODE_OPTION_CLASSES)
+    return read_setup(PARAMS)
 
 
 @pytest.fixture(scope='module')

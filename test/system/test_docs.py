@@ -341,3 +341,4 @@ def test_versions_to_install_are_the_pinned_ones() -> None:
 def test_the_version_of_the_figures_is_that_of_the_package() -> None:
     version = ElementTree.parse(ROOT / 'package.xml').findtext('version')
     assert f'version {version}' in (ROOT / 'docs' / 'performance.md').read_text()
+    assert f'\nversion: {version}\n' in (ROOT / 'CITATION.cff').read_text()

@@ -1,0 +1,113 @@
+"""
+Sphinx: the site of `make docs`, in docs/_build/html.
+
+The documents are written to be read in the repository.  For the site, those outside docs/ and the
+notebook are copied into docs/generated/, and links between documents are led to the copies.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import re
+import shutil
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree
+
+from pygments.lexers.special import TextLexer
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
+GENERATED = DOCS / 'generated'
+COPIED = (
+    'README.md',
+    'CONTRIBUTING.md',
+    'CHANGELOG.rst',
+    'QUALITY_DECLARATION.md',
+    'bench/README.md',
+    'starcal_ros/sky/data/ATTRIBUTION.md',
+)
+NOTEBOOK = ROOT / 'examples/calibrate.ipynb'
+
+project = 'starcal'
+project_copyright = 'starcal maintainers'
+release = ElementTree.parse(ROOT / 'package.xml').findtext('version') or ''
+
+extensions = [
+    'sphinx.ext.autodoc',
+    'sphinx.ext.autosummary',
+    'sphinx.ext.viewcode',
+    'numpydoc',
+    'myst_parser',
+]
+exclude_patterns = ['_build']
+html_theme = 'alabaster'
+html_theme_options = {'page_width': '1100px', 'sidebar_width': '240px'}
+default_role = 'py:obj'
+
+autosummary_generate = True
+templates_path = ['templates']
+autodoc_member_order = 'bysource'
+autodoc_typehints = 'none'  # the signature is enough: numpydoc's sections have shapes and units
+add_module_names = False
+numpydoc_class_members_toctree = False
+numpydoc_show_class_members = False
+myst_heading_anchors = 4
+
+
+def copy_of(document: Path) -> Path:
+    """Where the copy of a document outside docs/ goes."""
+    return GENERATED / '_'.join(document.relative_to(ROOT).parts)
+
+
+def led_to_copies(text: str, original: Path, shown: Path) -> str:
+    """Lead the relative links of a document, written where it was, from where it is shown."""
+
+    def lead(match: re.Match[str]) -> str:
+        name, _, anchor = match[1].partition('#')
+        if '://' in name or not name:
+            return match[0]
+        target = (original.parent / name).resolve()
+        if str(target.relative_to(ROOT)) in COPIED:
+            target = copy_of(target)
+        path = os.path.relpath(target, shown.parent)
+        return f']({path}#{anchor})' if anchor else f']({path})'
+
+    return re.sub(r'\]\(([^)\s]+)\)', lead, text)
+
+
+def notebook_page(path: Path) -> str:
+    """Return the cells of a notebook as one Markdown document."""
+    cells = json.loads(path.read_text())['cells']
+    texts = ((cell['cell_type'], ''.join(cell['source'])) for cell in cells)
+    return '\n\n'.join(
+        f'```python\n{text}\n```' if kind == 'code' else text for kind, text in texts
+    )
+
+
+def write_copies(app: Sphinx) -> None:
+    """Write the documents that are outside docs/; pages of modules that are gone go too."""
+    shutil.rmtree(GENERATED, ignore_errors=True)
+    GENERATED.mkdir()
+    for name in COPIED:
+        document, copy = ROOT / name, copy_of(ROOT / name)
+        copy.write_text(led_to_copies(document.read_text(), document, copy))
+    (GENERATED / 'notebook.md').write_text(notebook_page(NOTEBOOK))
+
+
+def lead_links(app: Sphinx, name: str, content: list[str]) -> None:
+    """Lead links of the documents in docs/ to the copies."""
+    path = Path(app.env.doc2path(name))
+    if path.suffix == '.md' and path.parent == DOCS:
+        content[0] = led_to_copies(content[0], path, path)
+
+
+def setup(app: Sphinx) -> None:
+    """Sphinx calls this."""
+    app.connect('builder-inited', write_copies, priority=100)  # before autosummary looks for files
+    app.connect('source-read', lead_links)
+    app.add_lexer('mermaid', TextLexer)  # a diagram is shown as its text, which is to be read

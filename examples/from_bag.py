@@ -1,0 +1,32 @@
+"""Calibrate a camera from a bag: ``python from_bag.py BAG PARAMS CALIBRATION_JSON``."""
+
+from __future__ import annotations
+
+import sys
+
+import starcal_ros
+
+
+def main() -> int:
+    """Calibrate; the exit status is 2 for bad input and 3 for a refused calibration."""
+    bag, params, output = sys.argv[1:]
+    try:
+        calibration = starcal_ros.calibrate_bag(bag, params)
+    except starcal_ros.StarcalError as error:
+        print(error, file=sys.stderr)
+        return 2
+    starcal_ros.write_calibration(calibration, output)
+
+    camera = starcal_ros.read_calibration(output).geometry.camera
+    for name, value, sigma in zip(
+        camera.parameter_names, camera.parameters, calibration.sigma, strict=False
+    ):
+        print(f'{name:<5} {value:12.6g}  sigma {sigma:.2g}')
+    if not calibration.accepted:
+        print('refused:', ', '.join(calibration.reasons))
+        return 3
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,317 @@
+"""
+The public functions of the package, for use without ROS; imported as attributes of `starcal_ros`.
+
+A calibration from arrays or from a bag is the one that ``starcal calibrate`` and the nodes give
+from the same observations, with the same options.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+import dataclasses
+import hashlib
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.assessment.gate import GateOptions
+from starcal_ros.bag import reader
+from starcal_ros.camera import CameraModel, line_of_sight, project
+from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
+from starcal_ros.estimation.calibrate import CalibrationOptions
+from starcal_ros.options import names_of, nearest
+from starcal_ros.pipeline import solve, topics
+from starcal_ros.pipeline.provenance import inputs_of
+from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
+from starcal_ros.products import calibration_json
+from starcal_ros.records import (
+    Calibration,
+    CameraGeometry,
+    Ensemble,
+    refused_image,
+    StarObservations,
+)
+
+__all__ = [
+    'Calibration',
+    'CameraGeometry',
+    'CameraModel',
+    'OptionError',
+    'StarObservations',
+    'StarcalError',
+    'TooFewObservations',
+    'calibrate',
+    'calibrate_bag',
+    'lines_of_sight',
+    'observations_of',
+    'project',
+    'read_calibration',
+    'write_calibration',
+]
+
+Floats = NDArray[np.float64]
+
+_UNIT_TOLERANCE = 1e-6  # 0.2 arcsec in a difference of directions; single precision meets it
+
+
+def observations_of(
+    camera: CameraModel,
+    time_ns: int,
+    measured_px: ArrayLike,
+    covariance_px2: ArrayLike,
+    direction_icrf: ArrayLike,
+    icrf_from_star_tracker_xyzw: ArrayLike,
+    catalog_id: ArrayLike | None = None,
+    temperature_degc: float = float('nan'),
+) -> StarObservations:
+    """
+    Observations of the n stars of one image, from arrays.
+
+    Parameters
+    ----------
+    camera : CameraModel
+        Gives the size of the image.
+    time_ns : int
+        Middle of the exposure, since the Unix epoch; different for each image.
+    measured_px : (n, 2)
+        Centroids (u, v); the centre of the first pixel is (0, 0).
+    covariance_px2 : (n, 2, 2) or (2, 2)
+        Covariance of each centroid, or one for all.
+    direction_icrf : (n, 3)
+        Unit vectors towards the stars at that time, in ICRF axes, corrected for proper motion and
+        for the aberration of light.
+    icrf_from_star_tracker_xyzw : (4,)
+        Attitude of the star tracker at that time, unit quaternion, scalar last.
+    catalog_id : (n,) int, optional
+        The same number for the same star in every image, so that a star with a wrong direction is
+        found.  Without it, stars of exactly equal directions are taken as the same.
+    temperature_degc : float
+        Temperature of the camera; NaN if not measured.
+
+    Returns
+    -------
+    StarObservations
+        Magnitude, flux and signal-to-noise ratio are NaN: the estimate does not use them.
+
+    Raises
+    ------
+    ValueError
+        For an array of the wrong shape, a number that is not finite, a vector that is not of unit
+        length or a covariance that is not positive definite; the text names the argument.
+    """
+    pixels = _finite('measured_px', measured_px)
+    if pixels.ndim != 2 or pixels.shape[1] != 2:
+        raise ValueError(f'measured_px: shape {pixels.shape} is not (n, 2)')
+    n = len(pixels)
+    covariance = _finite('covariance_px2', covariance_px2)
+    if covariance.shape not in ((n, 2, 2), (2, 2)):
+        raise ValueError(f'covariance_px2: shape {covariance.shape} is not ({n}, 2, 2) or (2, 2)')
+    covariance = np.broadcast_to(covariance, (n, 2, 2))
+    uu, uv, vv = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    if not ((uu > 0) & (uu * vv > uv**2) & np.isclose(uv, covariance[:, 1, 0])).all():
+        raise ValueError('covariance_px2: not symmetric and positive definite')
+    directions = _unit('direction_icrf', direction_icrf, (n, 3))
+    if catalog_id is None:
+        identifiers = _identifiers(directions)
+    else:
+        identifiers = np.asarray(catalog_id, np.int64)
+        if identifiers.shape != (n,):
+            raise ValueError(f'catalog_id: shape {identifiers.shape} is not ({n},)')
+    unknown = np.full(n, np.nan, np.float32)
+    return refused_image(
+        time_ns,
+        camera.width,
+        camera.height,
+        refusal='',
+        detail='',
+        icrf_from_star_tracker_xyzw=_unit(
+            'icrf_from_star_tracker_xyzw', icrf_from_star_tracker_xyzw, (4,)
+        ),
+        catalog_id=identifiers,
+        direction_icrf=directions,
+        magnitude=unknown,
+        measured_px=pixels,
+        covariance_px2=np.stack([uu, uv, vv], axis=-1),
+        flux_dn=unknown,
+        snr=unknown,
+        temperature_degc=temperature_degc,
+    )
+
+
+def calibrate(
+    images: Iterable[StarObservations], prior: CameraGeometry, **options: object
+) -> Calibration:
+    """
+    Calibration of camera and alignment from the observations of several images.
+
+    Parameters
+    ----------
+    images : iterable of StarObservations
+        As of `observations_of`.
+    prior : CameraGeometry
+        Camera and alignment to start from; what is not estimated is held there.
+    **options
+        Fields of `CalibrationOptions` and `GateOptions` by name, such as ``method``, ``estimate``
+        or ``star_tracker_sigma_arcsec``; parameter files have the same names.
+
+    Returns
+    -------
+    Calibration
+        ``geometry`` has the camera and the alignment, ``sigma`` their 1-sigma; ``accepted`` and
+        ``reasons`` are the verdict of the gate.
+
+    Raises
+    ------
+    OptionError
+        For an unknown option or a bad value.
+    TooFewObservations
+        When the images do not determine what is to be estimated.
+    """
+    known = names_of(CalibrationOptions, GateOptions)
+    for name in options:
+        if name not in known:
+            raise OptionError(f'{name}: no such option{nearest(name, known)}')
+    setup = load_setup(options, prior=prior)
+    # The caller has looked the stars up: the bundled catalog has no part in the result.
+    none = dataclasses.replace(setup.catalog.select(slice(0)), digest='')
+    return solve.solve(_ensemble(images, setup), dataclasses.replace(setup, catalog=none))
+
+
+def calibrate_bag(
+    bags: Path | str | Sequence[Path | str],
+    params: Path | str,
+    *,
+    image_topic: str = '',
+    attitude_topic: str = '',
+    velocity_topic: str = '',
+    temperature_topic: str = '',
+    observations_topic: str = '',
+) -> Calibration:
+    """
+    Calibration from MCAP bags, as by ``starcal calibrate``; nothing is written.
+
+    Parameters
+    ----------
+    bags : path or sequence of paths
+        Files or folders of bags.
+    params : path
+        ROS parameter file with the prior camera, the prior alignment and all other options.
+    image_topic, attitude_topic, velocity_topic, temperature_topic, observations_topic : str
+        Needed where a bag has more than one topic of the type.
+
+    Raises
+    ------
+    StarcalError
+        One line that names the cause: a bag, an option, a file or too few observations.
+    """
+    paths = [Path(bag) for bag in ([bags] if isinstance(bags, (str, Path)) else bags)]
+    setup = read_setup(Path(params))
+    asked = topics.Topics(
+        image=image_topic,
+        attitude=attitude_topic,
+        velocity=velocity_topic,
+        temperature=temperature_topic,
+        observations=observations_topic,
+    )
+    images = topics.read(paths, topics.choose_topics(paths, asked, setup), setup)
+    inputs = inputs_of((*reader.mcap_files(paths), Path(params)))
+    return solve.solve(_ensemble(images, setup), setup, inputs=inputs)
+
+
+def read_calibration(path: Path | str) -> Calibration:
+    """
+    The calibration of a ``calibration.json``, or of the folder that holds one.
+
+    Raises
+    ------
+    ProductError
+        Naming the file and the key that is missing or wrong.
+    """
+    return calibration_json.read_calibration(_calibration_file(path))
+
+
+def write_calibration(calibration: Calibration, path: Path | str) -> None:
+    """
+    Write a ``calibration.json``, into a folder if the path is one.
+
+    Raises
+    ------
+    ProductError
+        When the file cannot be written.
+    """
+    calibration_json.write_calibration(calibration, _calibration_file(path))
+
+
+def lines_of_sight(
+    calibration: Calibration | CameraGeometry,
+    pixels_px: ArrayLike,
+    frame: Literal['camera', 'star_tracker'] = 'camera',
+) -> Floats:
+    """
+    Unit vectors (..., 3) towards what pixels (..., 2) see; the inverse of `project`.
+
+    Parameters
+    ----------
+    calibration : Calibration or CameraGeometry
+    pixels_px : (..., 2)
+        (u, v); the centre of the first pixel is (0, 0).
+    frame : {'camera', 'star_tracker'}
+        Axes of the vectors; the star tracker's are those of the alignment.
+
+    Returns
+    -------
+    (..., 3)
+        NaN where the distortion model has no inverse.
+
+    Raises
+    ------
+    ValueError
+        For another frame.
+    """
+    geometry = calibration if isinstance(calibration, CameraGeometry) else calibration.geometry
+    in_camera = line_of_sight(geometry.camera, np.asarray(pixels_px, np.float64))
+    if frame == 'camera':
+        return in_camera
+    if frame != 'star_tracker':
+        raise ValueError(f"frame: {frame!r} is not 'camera' or 'star_tracker'")
+    star_tracker_from_camera = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
+    return np.asarray(in_camera @ star_tracker_from_camera.as_matrix().T)
+
+
+def _ensemble(images: Iterable[StarObservations], setup: Setup) -> Ensemble:
+    ensemble = Ensemble()
+    for image in images:
+        ensemble = solve.add_to_ensemble(ensemble, image, setup)
+    return ensemble
+
+
+def _calibration_file(path: Path | str) -> Path:
+    path = Path(path)
+    return path / calibration_json.CALIBRATION_FILE if path.is_dir() else path
+
+
+def _finite(name: str, values: ArrayLike) -> Floats:
+    array = np.array(values, np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError(f'{name}: not all numbers are finite')
+    return array
+
+
+def _unit(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    """Vectors of unit length to the last bit, from ones that are nearly so."""
+    array = _finite(name, values)
+    if array.shape != shape:
+        raise ValueError(f'{name}: shape {array.shape} is not {shape}')
+    length = np.linalg.norm(array, axis=-1, keepdims=True)
+    if (np.abs(length - 1.0) > _UNIT_TOLERANCE).any():
+        raise ValueError(f'{name}: not of unit length')
+    return np.asarray(array / length)
+
+
+def _identifiers(directions: Floats) -> NDArray[np.int64]:
+    """A number (n,) for each direction, the same for equal ones in any image."""
+    digests = (hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in directions)
+    return np.frombuffer(b''.join(digests), np.int64)

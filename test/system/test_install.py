@@ -1,0 +1,122 @@
+"""`pip install .` without extras, and the packages that the nodes leave out."""
+
+from __future__ import annotations
+
+from importlib import metadata
+import json
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+import sysconfig
+
+from packaging.requirements import Requirement
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE', 'msg')
+OF_EXTRAS = ('dask', 'distributed', 'jinja2', 'matplotlib', 'sphinx')
+
+
+def run(*command: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*map(str, command)], cwd=cwd, capture_output=True, text=True)
+
+
+def required(installed: metadata.Distribution) -> set[str]:
+    """Names of the distributions that one needs without its extras, directly or not."""
+    found: set[str] = set()
+    waiting = [installed]
+    while waiting:
+        for text in waiting.pop().requires or ():
+            requirement = Requirement(text)
+            if requirement.marker and not requirement.marker.evaluate({'extra': ''}):
+                continue
+            name = requirement.name.lower().replace('_', '-')
+            if name not in found:
+                found.add(name)
+                waiting.append(metadata.distribution(name))
+    return found
+
+
+def link_distribution(name: str, packages: Path) -> None:
+    """Make an installed distribution importable from another folder of packages."""
+    distribution = metadata.distribution(name)
+    here = Path(sysconfig.get_path('purelib'))
+    tops = {Path(file).parts[0] for file in distribution.files or () if '..' not in file.parts}
+    for top in tops - {'__pycache__'}:
+        if not (packages / top).exists():
+            (packages / top).symlink_to(here / top)
+
+
+@pytest.fixture(scope='module')
+def flight_install(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """
+    An environment with starcal and the closure of its requirements, no extras and no network.
+
+    starcal is built and installed by pip; what it requires is linked from this environment.
+    """
+    folder = tmp_path_factory.mktemp('flight')
+    sources = folder / 'sources'
+    shutil.copytree(
+        ROOT / 'starcal_ros', sources / 'starcal_ros', ignore=shutil.ignore_patterns('__pycache__')
+    )
+    for name in SOURCES:
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+        copy(ROOT / name, sources / name)
+    venv = folder / 'venv'
+    made = run(sys.executable, '-m', 'venv', '--without-pip', venv, cwd=folder)
+    if made.returncode:
+        pytest.skip(f'no venv can be made here: {made.stderr}')
+    pip, alone = (sys.executable, '-m', 'pip'), ('--no-deps', '--no-index')
+    built = run(*pip, 'wheel', *alone, '--no-build-isolation', sources, cwd=folder)
+    assert built.returncode == 0, built.stdout + built.stderr
+    (wheel,) = folder.glob('starcal_ros-*.whl')
+    to_venv = ('--python', venv / 'bin/python')
+    done = run(*pip, *to_venv, 'install', *alone, wheel, cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (packages,) = venv.glob('lib/python*/site-packages')
+    (information,) = packages.glob('starcal_ros-*.dist-info')
+    for name in required(metadata.Distribution.at(information)):
+        link_distribution(name, packages)
+    return venv
+
+
+@pytest.mark.slow
+def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path) -> None:
+    python = flight_install / 'bin/python'
+    for name in OF_EXTRAS:
+        assert run(python, '-c', f'import {name}', cwd=tmp_path).returncode == 1, name
+    tiny, starcal = ROOT / 'bags/tiny', flight_install / 'bin/starcal'
+    params = tiny / 'params.yaml'
+    done = run(starcal, 'calibrate', tiny, '--params', params, '-o', 'out', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert json.loads((tmp_path / 'out/calibration.json').read_text())['accepted']
+    assert "pip install 'starcal_ros[report]'" in done.stdout.splitlines()[-1]
+    for line, extra in (
+        (('report', 'out'), 'report'),
+        (('campaign', 'images', '-o', 'study'), 'studies'),
+    ):
+        refused = run(starcal, *line, cwd=tmp_path)
+        assert refused.returncode == 2
+        assert f"is not installed: pip install 'starcal_ros[{extra}]'" in refused.stderr
+        assert refused.stderr.count('\n') == 1
+
+
+@pytest.mark.slow
+def test_types_and_definitions_are_installed(flight_install: Path) -> None:
+    (package,) = flight_install.glob('lib/python*/site-packages/starcal_ros')
+    assert (package / 'py.typed').is_file()
+    installed = {path.name for path in (flight_install / 'share/starcal/msg').iterdir()}
+    assert installed == {path.name for path in (ROOT / 'msg').glob('*.msg')}
+
+
+@pytest.mark.nodes
+def test_the_nodes_import_nothing_of_the_extras() -> None:
+    pytest.importorskip('rclpy')
+    nodes = ('star_observer', 'calibrator', 'bag_player')
+    source = '; '.join(f'import starcal_ros.nodes.{node}' for node in nodes)
+    source += '; import sys; print(*sys.modules)'
+    done = run(sys.executable, '-c', source, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert 'rclpy' in done.stdout.split()
+    assert not set(done.stdout.split()) & set(OF_EXTRAS)
