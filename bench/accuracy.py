@@ -18,10 +18,10 @@ import multiprocessing
 import os
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.frames import history, load_set_up, render_frame
 from bench.table import Table
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import observe, solve
@@ -35,8 +35,6 @@ from starcal_ros.simulation import centroids as simulated_centroids
 from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.simulation.scenario import Scenario
 from starcal_ros.studies.trials import map_bound_px
-
-Floats = NDArray[np.float64]
 
 SIZE = (1296, 1024)
 IMAGES = 8

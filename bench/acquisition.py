@@ -16,11 +16,11 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import beta
 
 from bench.table import Table
+from starcal_ros.arrays import Floats
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import (
     IdentificationOptions,
@@ -35,8 +35,6 @@ from starcal_ros.simulation import images as simulated_images
 from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
-
-Floats = NDArray[np.float64]
 
 SEED = 20161
 IMAGES = 45  # rendered for each kind of field

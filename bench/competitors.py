@@ -14,11 +14,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import PARAMETER_NAMES, project_jacobians, project_parameters
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import CalibrationOptions, estimate_calibration
@@ -27,8 +27,6 @@ from starcal_ros.estimation.problem import minimise, Problem, State
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.simulation.centroids import BOUND_NAMES, true_observations
 from starcal_ros.simulation.scenario import scenario
-
-Floats = NDArray[np.float64]
 
 FREE = np.sort(np.array([PARAMETER_NAMES.index(name) for name in BOUND_NAMES]))
 SIGMA_PX = 0.1

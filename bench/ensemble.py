@@ -10,10 +10,10 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.competitors import make_ensemble
 from bench.table import Table
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import (
     image_information,
     keep_most_informative,
@@ -23,8 +23,6 @@ from starcal_ros.estimation.calibrate import CalibrationOptions
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario
-
-Floats = NDArray[np.float64]
 
 TARGET = 1.05
 RANDOM_CHOICES = 200

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.frames import history, load_set_up, paper_scenario, render_frame
 from bench.table import Table
-from starcal_ros.image.detection import Pixels
+from starcal_ros.arrays import Pixels
 from starcal_ros.pipeline import observe
 
 MAGNITUDE_LIMIT = 7.35  # leaves 122 stars

@@ -18,7 +18,6 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bench.competitors import (
@@ -35,12 +34,11 @@ from bench.competitors import (
     solve_starcal,
 )
 from bench.table import Table, verdict
+from starcal_ros.arrays import Floats
 from starcal_ros.estimation.levenberg_marquardt import covariance
 from starcal_ros.estimation.normal_equations import arrange, normal_blocks, RESIDUAL, ROTATION
 from starcal_ros.estimation.problem import minimise, State
 from starcal_ros.records import CameraGeometry, Ensemble
-
-Floats = NDArray[np.float64]
 
 LIMIT_S = 60.0  # longest that a competitor is waited for
 TARGETS_FROM = 100  # images: below, the time is that of Python itself

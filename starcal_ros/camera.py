@@ -19,9 +19,8 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from starcal_ros.arrays import Floats
 
 INTRINSIC_NAMES = ('fx', 'skew', 'fy', 'cx', 'cy')
 DISTORTION_NAMES = ('k1', 'k2', 'k3', 'p1', 'p2')

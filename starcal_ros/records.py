@@ -14,9 +14,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES
-
-Floats = NDArray[np.float64]
 
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
 CALIBRATION_PARAMETER_NAMES = PARAMETER_NAMES + ALIGNMENT_NAMES
@@ -69,7 +68,7 @@ class Image:
     """
 
     time_ns: int
-    pixels: NDArray[np.uint8] | NDArray[np.uint16]
+    pixels: Pixels
 
 
 @dataclass(frozen=True)

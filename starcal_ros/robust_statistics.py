@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from starcal_ros.arrays import Floats
 
 MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution
 RAYLEIGH_TO_SIGMA = 1.0 / 1.1774  # median length of a vector of two normal components

@@ -40,6 +40,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.sky.catalog import (
     CATALOG_FORMAT,
@@ -58,7 +59,6 @@ from starcal_ros.sky.catalog import (
     TURN_UNIT_RAD,
 )
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 MAS_RAD = ARCSECOND_RAD / 1000.0

@@ -7,16 +7,14 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import CalibrationOptions, estimate_calibration
 from starcal_ros.records import CameraGeometry, Ensemble
-
-Floats = NDArray[np.float64]
 
 FEWEST_IMAGES = 6  # of an ensemble that can be cut in two: three tell a scatter
 FEWEST_STARS = 100  # of a half: with fewer, its sigmas are too uncertain to judge by

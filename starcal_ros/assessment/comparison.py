@@ -5,18 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import alignment_difference_rad, lines_of_sight
 from starcal_ros.assessment.observability import line_of_sight_sigma_arcsec, map_sigma_px
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.records import Calibration, CALIBRATION_PARAMETER_NAMES, CameraGeometry
-
-Floats = NDArray[np.float64]
 
 GRID = 25  # the columns and rows of `map_sigma_px`
 

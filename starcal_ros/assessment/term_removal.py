@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from starcal_ros.assessment.observability import map_error_px
@@ -27,8 +26,6 @@ from starcal_ros.estimation.problem import (
     State,
 )
 from starcal_ros.records import Removal
-
-Floats = NDArray[np.float64]
 
 _HELD_AT_ZERO = ('skew', 'k1', 'k2', 'k3', 'p1', 'p2')
 _CHANCE = 0.01  # that terms which are none raise chi^2 by as much

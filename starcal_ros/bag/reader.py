@@ -22,12 +22,11 @@ from types import TracebackType
 from typing import Any, IO, NamedTuple, TYPE_CHECKING
 
 from mcap.writer import CompressionType, Writer
-import numpy as np
-from numpy.typing import NDArray
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 import yaml
 
+from starcal_ros.arrays import Floats
 from starcal_ros.bag.mcap_reader import Damage, MAGIC, RawMessage, read_messages, read_summary
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.messages.calibration import calibration_to_message
@@ -58,7 +57,6 @@ from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, AttitudeO
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-Floats = NDArray[np.float64]
 
 _CHUNK_BYTES = 4 << 20  # an image or two: what a crash can cost, and what a reader holds
 

@@ -8,16 +8,13 @@ not been made yet has one too.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.problem import by_shared, Problem, reduced_information, State
 from starcal_ros.records import ALIGNMENT_NAMES
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def shared_names(focal_terms: int, with_rate: bool) -> tuple[str, ...]:

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from starcal_ros.arrays import Floats
+
 StateT = TypeVar('StateT')
 
 _MAX_ITERATIONS = 100

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import project_parameters
 from starcal_ros.records import StarObservations
-
-Floats = NDArray[np.float64]
 
 CAMERA = slice(0, 10)
 ROTATION = slice(10, 13)

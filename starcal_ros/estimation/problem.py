@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.estimation.levenberg_marquardt import (
     levenberg_marquardt,
     NormalEquations,
@@ -29,8 +30,6 @@ from starcal_ros.estimation.levenberg_marquardt import (
 )
 from starcal_ros.estimation.normal_equations import Measurements, normal_blocks, RESIDUAL, ROTATION
 from starcal_ros.estimation.temperature import parameters_at, parameters_chain, turns, turns_chain
-
-Floats = NDArray[np.float64]
 
 METHODS = ('hierarchical', 'per_image', 'single')
 

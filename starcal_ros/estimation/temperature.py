@@ -13,13 +13,11 @@ for each degree.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
+from starcal_ros.arrays import Floats
 from starcal_ros.records import Calibration, CameraGeometry, Thermal
-
-Floats = NDArray[np.float64]
 
 FEWEST_SPREAD_K = 1.0  # of the temperatures: what a sensor reads off and lags hides a smaller one
 _CHANCE = 0.0027  # of a term that is none being kept: 3 sigma

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import bdtr, pdtrc
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import line_of_sight, project, rotation_jacobian
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.polynomial_warp import fit_warp, warp_powers
@@ -23,8 +24,6 @@ from starcal_ros.identification.prediction import in_image, Prediction
 from starcal_ros.image.detection import Sources
 from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import median, medians
-
-Floats = NDArray[np.float64]
 
 # Brightest predictions and sources that vote: their pairs fill one histogram at once.
 _VOTERS = 100

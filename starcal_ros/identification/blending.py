@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcal_ros.arrays import Floats
 from starcal_ros.identification.prediction import Prediction
 from starcal_ros.image.centroiding import Centroids, ImageModel, SWAMPED_SIGMA
 from starcal_ros.image.psf_fit import neighbour_pull_px, stamp_radius_px
 from starcal_ros.sky.catalog import CLOSE_PAIR_RAD, StarCatalog
-
-Floats = NDArray[np.float64]
 
 _PULL_UNCERTAINTY = 0.25  # of a neighbour's light: stars of unlike colour differ so from their V
 _MODELLED_UNCERTAINTY = 0.05  # of that of a star measured itself: wings that are no Gaussian's

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.polynomial import polyvander2d
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.robust_statistics import median, RAYLEIGH_TO_SIGMA
-
-Floats = NDArray[np.float64]
 
 _STARS_OF_DEGREE = {5: 60, 3: 20}  # least number that carries a smooth part of so many powers
 _EACH_SIDE = 8  # stars that a jump must be seen by

@@ -10,13 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import best_share, missed_parts, part_of, PARTS
 from starcal_ros.image.centroiding import Centroids, ImageModel
 from starcal_ros.image.psf_fit import expected_snr
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
-
-Floats = NDArray[np.float64]
 
 _FEWEST = 4  # stars whose scatter, or the share of which, means anything
 # A camera's band is not V: stars of a real sky scatter by 0.15 to 0.3 mag, none of 2000 was off

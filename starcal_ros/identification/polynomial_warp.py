@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.robust_statistics import median, medians, RAYLEIGH_TO_SIGMA
-
-Floats = NDArray[np.float64]
 
 
 def warp_powers(n: int) -> list[tuple[int, int]]:

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import field_radius_rad, line_of_sight, project
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import apparent_directions, SiteOptions, through_the_air
 from starcal_ros.sky.catalog import cone, StarCatalog
-
-Floats = NDArray[np.float64]
 
 SPACE = SiteOptions()
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import line_of_sight
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import acquire
@@ -42,7 +43,6 @@ from starcal_ros.image.detection import (
     detect,
     detect_near,
     measure_background,
-    Pixels,
     Sources,
 )
 from starcal_ros.image.hot_pixels import NO_HOT_PIXELS, refuse_on_hot_pixels
@@ -52,8 +52,6 @@ from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import StarCatalog
-
-Floats = NDArray[np.float64]
 
 _TRACKED = 200  # brightest predictions that are looked for in windows of their own
 _TRACKED_ROLL_RAD = 0.01  # a star tracker is off by less about any axis once aligned

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import pdtrc
 
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import (
     CameraModel,
     field_radius_rad,
@@ -33,15 +34,12 @@ from starcal_ros.image.detection import (
     Background,
     brightest_near,
     measure_background,
-    Pixels,
     sample_background,
 )
 from starcal_ros.image.psf_field import Instrument
 from starcal_ros.records import CameraGeometry, StarObservations
 from starcal_ros.robust_statistics import median
 from starcal_ros.sky.catalog import cone, StarCatalog
-
-Floats = NDArray[np.float64]
 
 _GUIDES = 24  # brightest predictions that are looked for in windows
 _NEIGHBOUR_PX = 3.0  # a small turn moves the guides alike; a roll of 0.1 degrees, by 3 px

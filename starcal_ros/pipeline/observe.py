@@ -11,23 +11,21 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.bag import reader
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import observe_stars, Shot, tracked
 from starcal_ros.identification.tracking import follow, Followed, following
 from starcal_ros.image.centroiding import saturation_level
-from starcal_ros.image.detection import Pixels
 from starcal_ros.image.frame_checks import Fingerprint, fingerprint, sample_rows, screen
 from starcal_ros.image.hot_pixels import HotPixels, learn_hot_pixels
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
 
-Floats = NDArray[np.float64]
 T = TypeVar('T')
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import re
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, DISTORTION_NAMES, INTRINSIC_NAMES
 from starcal_ros.errors import ProductError
 from starcal_ros.products.fields import (
@@ -47,7 +47,6 @@ from starcal_ros.records import (
     Thermal,
 )
 
-Floats = NDArray[np.float64]
 SCHEMA = 1
 # Keys that came after the first files were written, and what their absence means.
 _LATER_KEYS: Mapping[str, object] = {

@@ -19,17 +19,15 @@ from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import binned_statistic, norm
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import movement
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.normal_equations import whitening
 from starcal_ros.records import CameraGeometry, DetectorMaps, Removal
-
-Floats = NDArray[np.float64]
 
 # Colours nothing else draws with -> CSS variables of report.css.
 INK, MUTED, GRID, PAPER = '#010203', '#010204', '#010205', '#010206'

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 import yaml
 
+from starcal_ros.arrays import Floats
 from starcal_ros.bag.reader import BagWriter
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
@@ -27,8 +27,6 @@ from starcal_ros.simulation.centroids import (
 )
 from starcal_ros.simulation.images import images
 from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenes
-
-Floats = NDArray[np.float64]
 
 IMAGE_TOPIC = '/opnav/image_raw'
 ATTITUDE_TOPIC = '/star_tracker/attitude'

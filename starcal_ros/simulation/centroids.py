@@ -8,8 +8,8 @@ Centroids of a synthetic star field without pixels, and how well any estimator c
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import PARAMETER_NAMES, project_jacobians
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.simulation.images import pixel_stamps
@@ -24,7 +24,6 @@ from starcal_ros.simulation.scenario import (
 )
 from starcal_ros.sky.catalog import StarCatalog
 
-Floats = NDArray[np.float64]
 BOUND_NAMES = ('fx', 'skew', 'fy', 'k1', 'k2', 'k3', 'p1', 'p2')
 BOUND_SNR = 5.0
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.records import Image
 from starcal_ros.simulation.scenario import (
     Detector,
@@ -27,8 +28,6 @@ from starcal_ros.simulation.scenario import (
     stamp_half_px,
 )
 from starcal_ros.sky.catalog import StarCatalog
-
-Floats = NDArray[np.float64]
 
 
 def pixel_stamps(
@@ -104,9 +103,7 @@ def cosmic_ray_electrons(
     return np.asarray(electrons, np.float64)
 
 
-def expose(
-    mean_electrons: Floats, detector: Detector, rng: np.random.Generator
-) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def expose(mean_electrons: Floats, detector: Detector, rng: np.random.Generator) -> Pixels:
     """One exposure of a mean signal: photon and read noise, then the converter."""
     electrons = rng.poisson(mean_electrons) + rng.normal(
         0.0, detector.read_noise_electrons, mean_electrons.shape

@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, field_radius_rad, project
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.records import AttitudeSample, CameraGeometry
 from starcal_ros.sky.astrometry import apparent_directions, tt_julian_date
 from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
 
-Floats = NDArray[np.float64]
 # Streams of random numbers: (seed, purpose, image).  An image is the same whatever came before.
 TRUTH_STREAM, ATTITUDE_STREAM, CENTROID_STREAM, PATTERN_STREAM, PIXEL_STREAM = range(5)
 _STAMP_SIGMAS = 6.0  # half a stamp: 2e-9 of a star's light falls outside

@@ -16,13 +16,11 @@ import math
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.constants import AU_M, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.options import option
 from starcal_ros.sky.catalog import StarCatalog
-
-Floats = NDArray[np.float64]
 
 _UNIX_EPOCH_JD = 2440587.5  # 1970-01-01T00:00 UTC, POSIX
 _DAY_S = 86400

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
 from starcal_ros.records import AttitudeSample
-
-Floats = NDArray[np.float64]
 
 # A tracker that sends single precision keeps the norm to 1e-7; more than 1e-3 is not a rounding.
 _NORM_TOLERANCE = 1e-3

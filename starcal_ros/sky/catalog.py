@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError
-
-Floats = NDArray[np.float64]
 
 CATALOG_PATH = Path(__file__).parent / 'data' / 'star_catalog.npz'
 CATALOG_FORMAT = 1

@@ -17,9 +17,9 @@ import math
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import PARAMETER_NAMES
@@ -48,7 +48,6 @@ from starcal_ros.studies.trials import (
     unused_residual_px,
 )
 
-Floats = NDArray[np.float64]
 Row = dict[str, 'int | float | str']
 
 OUTLIER_SHARE = 0.02

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.assessment.term_removal import removal_study
@@ -38,8 +39,6 @@ from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeHistory, AttitudeOptions
 from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.studies.monte_carlo import Campaign, Design, Row
-
-Floats = NDArray[np.float64]
 
 NIGHT = 'paper'
 CALIBRATED_WITH = 15

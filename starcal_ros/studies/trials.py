@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import alignment_difference_rad, lines_of_sight
 from starcal_ros.assessment.observability import GRID, line_of_sight_sigma_arcsec, map_sigma_px
 from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, project
@@ -23,8 +23,6 @@ from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate
 from starcal_ros.estimation.normal_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.simulation.scenario import Scenario, scenario
-
-Floats = NDArray[np.float64]
 
 CENTROID_SIGMA_PX = 0.1
 OUTLIER_REACH_PX = 20.0  # a misidentified star: anywhere in a square of this half side
