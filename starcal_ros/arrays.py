@@ -1,4 +1,4 @@
-"""Array types shared by the whole package; shapes, units and frames stand in the docstrings."""
+"""Array types of the whole package; docstrings give shapes, units and frames."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]  # grey (h, w) or BGR (h, w, 3), for people
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]  # as delivered, indexed [v, u]
+Picture = NDArray[np.uint8]  # (h, w) grey or (h, w, 3) BGR, for display
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]  # detector counts, indexed [v, u]

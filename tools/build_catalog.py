@@ -43,6 +43,7 @@ from scipy.spatial import cKDTree
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.sky.catalog import (
+    ANGLE_UNIT_RAD,
     CATALOG_FORMAT,
     CATALOG_PATH,
     CLOSE_PAIR_RAD,
@@ -56,7 +57,6 @@ from starcal_ros.sky.catalog import (
     NO_COLOUR,
     PARALLAX_UNIT_RAD,
     StarCatalog,
-    TURN_UNIT_RAD,
 )
 
 Rows = NDArray[np.intp]
@@ -433,8 +433,8 @@ def integer_columns(
     colour = np.rint(merged.colour_bp_rp / MAGNITUDE_UNIT)
     values = {
         'id': merged.id,
-        'ra': np.rint(ra_rad / TURN_UNIT_RAD).astype(np.int64) % 2**32,
-        'dec': np.rint(dec_rad / TURN_UNIT_RAD),
+        'ra': np.rint(ra_rad / ANGLE_UNIT_RAD).astype(np.int64) % 2**32,
+        'dec': np.rint(dec_rad / ANGLE_UNIT_RAD),
         'pm_ra_cosdec': np.rint(np.sum(merged.motion * east, axis=1) / MOTION_UNIT_RAD),
         'pm_dec': np.rint(np.sum(merged.motion * north, axis=1) / MOTION_UNIT_RAD),
         'parallax': np.rint(np.clip(merged.parallax_rad, 0, None) / PARALLAX_UNIT_RAD),

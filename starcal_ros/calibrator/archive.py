@@ -24,7 +24,8 @@ from pathlib import Path
 import re
 import shutil
 
-from starcal_ros.bag.reader import BagWriter, read_observations
+from starcal_ros.bag.reader import read_observations
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.errors import ArchiveError, BagError, ProductError
 from starcal_ros.products.calibration_json import (
     calibration_content,

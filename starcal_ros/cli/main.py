@@ -84,7 +84,7 @@ def _calibrate_into(
     folder: Path, bags: Sequence[Path], asked: Topics, setup: Setup, inputs: Mapping[str, str]
 ) -> Calibration:
     """Calibrate from bags; all that a report is made from goes into the folder."""
-    from starcal_ros.bag import reader
+    from starcal_ros.bag.writer import BagWriter
     from starcal_ros.pipeline import solve
     from starcal_ros.pipeline import topics as bag_topics
     from starcal_ros.products.files import OBSERVATIONS_FILE
@@ -101,7 +101,7 @@ def _calibrate_into(
         ensemble = solve.add_to_ensemble(ensemble, record, setup)
     _make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
-    with reader.BagWriter(folder / OBSERVATIONS_FILE) as writer:
+    with BagWriter(folder / OBSERVATIONS_FILE) as writer:
         for record in observations:
             writer.write_observations('/observations', record, setup.frames.camera_frame)
     try:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import yaml
 
 from starcal_ros.arrays import Floats
-from starcal_ros.bag.reader import BagWriter
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.products.camera_yaml import write_camera_info

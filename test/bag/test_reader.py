@@ -20,6 +20,9 @@ from rosbags.highlevel import AnyReader
 import yaml
 
 from starcal_ros.bag import reader as bag_reader
+from starcal_ros.bag import writer as writer_module
+from starcal_ros.bag.typestore import make_message, typestore
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.messages.fields import stamp_ns
 from starcal_ros.messages.images import color_image_to_message, image_to_message
@@ -35,7 +38,7 @@ SECOND_NS = 10**9
 def write_bag(path: Path, images: int = 6, size: int = 600, **options: Any) -> Path:
     """Write a bag of noise images, one a second, with two attitudes about each."""
     random = np.random.default_rng(1)
-    with bag_reader.BagWriter(path, **options) as writer:
+    with BagWriter(path, **options) as writer:
         for k in range(images):
             time_ns = START_NS + k * SECOND_NS
             pixels = random.integers(0, 4096, (size, size + 2)).astype(np.uint16)
@@ -149,7 +152,7 @@ def test_topics_and_their_choice(folder: Path) -> None:
     assert listed['/attitude'] == (ATTITUDE_TYPE, 12)
     assert bag_reader.choose_topic([folder], IMAGE_TYPE) == '/image'
     assert bag_reader.choose_topic([folder], IMAGE_TYPE, 'image') == '/image'
-    with pytest.raises(BagError, match=r'no topic /nope of type sensor_msgs.*there are: /image\)'):
+    with pytest.raises(BagError, match=r'no topic /nope of type sensor_msgs.*available: /image\)'):
         bag_reader.choose_topic([folder], IMAGE_TYPE, '/nope')
     with pytest.raises(BagError, match='no topic of type starcal/msg/Calibration'):
         bag_reader.choose_topic([folder], CALIBRATION_TYPE)
@@ -157,10 +160,10 @@ def test_topics_and_their_choice(folder: Path) -> None:
 
 def test_several_topics_of_a_type(tmp_path: Path) -> None:
     """Which of two is meant cannot be guessed."""
-    with bag_reader.BagWriter(tmp_path / 'two') as writer:
+    with BagWriter(tmp_path / 'two') as writer:
         for topic in ('/b', '/a'):
             writer.write_image(topic, Image(0, np.zeros((2, 2), np.uint8)), '')
-    with pytest.raises(BagError, match='several topics of type .* name one: /a, /b'):
+    with pytest.raises(BagError, match='several topics of type .* choose one: /a, /b'):
         bag_reader.choose_topic([tmp_path / 'two'], IMAGE_TYPE)
 
 
@@ -193,7 +196,7 @@ def test_split_bag_is_read_in_order(tmp_path: Path) -> None:
     """Files of a split bag come in the order of recording, ten after nine."""
     (tmp_path / 'split').mkdir()
     for k in (0, 9, 10):
-        with bag_reader.BagWriter(tmp_path / 'split' / f'split_{k}.mcap') as writer:
+        with BagWriter(tmp_path / 'split' / f'split_{k}.mcap') as writer:
             writer.write_image('/image', Image(k, np.zeros((2, 2), np.uint8)), '')
     (tmp_path / 'split' / 'metadata.yaml').unlink()
     assert [image.time_ns for image in images_of(tmp_path / 'split')] == [0, 9, 10]
@@ -201,8 +204,8 @@ def test_split_bag_is_read_in_order(tmp_path: Path) -> None:
 
 def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
     """An image in colour comes as a refusal between the others; so do bytes that are no image."""
-    bad = color_image_to_message(7, np.zeros((2, 3, 3), np.uint8), 'cam', bag_reader.make_message)
-    with bag_reader.BagWriter(tmp_path / 'mixed') as writer:
+    bad = color_image_to_message(7, np.zeros((2, 3, 3), np.uint8), 'cam', make_message)
+    with BagWriter(tmp_path / 'mixed') as writer:
         writer.write_image('/image', Image(6, np.zeros((2, 3), np.uint8)), '')
         writer._write('/image', IMAGE_TYPE, 7, bad)
         number = writer._channels['/image'].number
@@ -218,7 +221,7 @@ def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
 
 def test_attitudes_that_are_none(tmp_path: Path) -> None:
     """A sample of no unit length is remembered: the image about it says so."""
-    with bag_reader.BagWriter(tmp_path / 'b') as writer:
+    with BagWriter(tmp_path / 'b') as writer:
         for k, w in enumerate([1.0, np.nan, 1.0]):
             writer.write_attitude('/attitude', k, np.array([0, 0, 0, w]), 'icrf')
     history = bag_reader.read_attitudes([tmp_path / 'b'], '/attitude', AttitudeOptions())
@@ -237,7 +240,7 @@ def test_cut_off_bag(tmp_path: Path, folder: Path) -> None:
         said: list[str] = []
         images = images_of(file, on_damage=said.append)
         assert len(said) == 1, said
-        assert str(file) in said[0] and 'cut off' in said[0]
+        assert str(file) in said[0] and 'truncated' in said[0]
         for image, pixels in zip(images, sound, strict=False):
             assert isinstance(image, Image)
             np.testing.assert_array_equal(image.pixels, pixels)
@@ -278,7 +281,7 @@ def test_bit_flips_are_noticed(tmp_path: Path, folder: Path) -> None:
 def small_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bag of many small chunks."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bag_reader, '_CHUNK_BYTES', 800)
+        patch.setattr(writer_module, '_CHUNK_BYTES', 800)
         folder = write_bag(tmp_path_factory.mktemp('bag') / 'small', images=8, size=8)
     return next(folder.glob('*.mcap'))
 
@@ -355,8 +358,8 @@ def test_random_bytes_never_crash(tmp_path: Path, folder: Path) -> None:
 def test_other_writers(tmp_path: Path, indexed: bool) -> None:
     """A file without chunks or summary is read, a channel that is not ROS 2 is passed over."""
     file = tmp_path / 'plain.mcap'
-    store = bag_reader._typestore()
-    message = image_to_message(Image(5, np.ones((2, 2), np.uint8)), '', bag_reader.make_message)
+    store = typestore()
+    message = image_to_message(Image(5, np.ones((2, 2), np.uint8)), '', make_message)
     with file.open('wb') as stream:
         writer = Writer(
             stream, use_chunking=indexed, use_statistics=indexed, compression=CompressionType.NONE

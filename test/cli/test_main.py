@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import yaml
 
-from starcal_ros.bag.reader import BagWriter
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.cli import demo, main
 from starcal_ros.cli.arguments import parser
 from starcal_ros.records import Image
@@ -284,7 +284,7 @@ def test_images_of_a_wrong_encoding(
         message.encoding = 'bgr8'
         return message
 
-    monkeypatch.setattr('starcal_ros.bag.reader.image_to_message', colour)
+    monkeypatch.setattr('starcal_ros.bag.writer.image_to_message', colour)
     bag = tmp_path / 'colour.mcap'
     write_bag_of(bag, np.zeros((512, 640), np.uint8))
     monkeypatch.undo()

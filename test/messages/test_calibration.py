@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from sample_records import assert_same, calibration, plain, plain_calibration  # type: ignore[import-not-found]
 
-from starcal_ros.bag.reader import make_message
+from starcal_ros.bag.typestore import make_message
 from starcal_ros.camera import line_of_sight, project
 from starcal_ros.messages.calibration import (
     alignment_to_message,

@@ -23,6 +23,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 
 from starcal.msg import EnsembleStatus
 from starcal_ros.bag import reader
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.messages.fields import stamp_ns
 from starcal_ros.records import Image
 
@@ -89,7 +90,7 @@ def test_the_policies_name_what_the_nodes_have(
     client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
 ) -> None:
     """Least privilege: each policy allows the topics and services of its node, and no others."""
-    with reader.BagWriter(tmp_path / 'bag') as writer:
+    with BagWriter(tmp_path / 'bag') as writer:
         writer.write_image('/image', Image(1, np.zeros((2, 2), np.uint8)), 'camera')
         writer.write_attitude('/attitude', 1, np.array([0, 0, 0, 1.0]), 'icrf')
         writer.write_velocity('/velocity', 1, np.zeros(3), 'icrf')

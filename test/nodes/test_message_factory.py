@@ -14,7 +14,7 @@ pytest.importorskip('starcal.msg')
 from rclpy.serialization import deserialize_message, serialize_message
 from sample_records import assert_same, calibration, observations, status  # type: ignore[import-not-found]
 
-from starcal_ros.bag import reader
+from starcal_ros.bag import typestore as bag_types
 from starcal_ros.messages.calibration import (
     alignment_to_message,
     calibration_from_message,
@@ -62,8 +62,8 @@ def test_both_kinds_of_message_are_the_same_on_the_wire() -> None:
         lambda make: calibration_to_message(calibration(), make),
         lambda make: image_to_message(Image(5, np.ones((4, 6), np.uint16)), 'c', make),
     ):
-        live, recorded = build(make_message), build(reader.make_message)
-        data = reader._typestore().serialize_cdr(recorded, recorded.__msgtype__)
+        live, recorded = build(make_message), build(bag_types.make_message)
+        data = bag_types.typestore().serialize_cdr(recorded, recorded.__msgtype__)
         assert len(serialize_message(live)) == len(data)
         assert deserialize_message(bytes(data), type(live)) == live
 

@@ -40,6 +40,7 @@ from std_srvs.srv import Trigger
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal.srv import Calibrate
 from starcal_ros.bag import reader
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.messages import fields as message_fields
 from starcal_ros.messages.calibration import (
     calibration_from_message,
@@ -636,7 +637,7 @@ def test_lifecycle_by_hand(
 def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: Path) -> None:
     """A bag of large images at full speed arrives whole, in order, with its stamps."""
     random = np.random.default_rng(2)
-    with reader.BagWriter(tmp_path / 'large', compression='') as writer:
+    with BagWriter(tmp_path / 'large', compression='') as writer:
         for k in range(24):
             pixels = random.integers(0, 4096, (1024, 1296)).astype(np.uint16)
             for j in range(40):

@@ -235,7 +235,7 @@ def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path: Path) -> None:
     bag.write_bytes(whole[: len(whole) * 7 // 10])
     done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count('\n') == 1 and 'cut off' in done.stderr  # said, once
+    assert done.stderr.count('\n') == 1 and 'truncated' in done.stderr  # said, once
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
     assert 3 <= calibration.images_used < 10
     assert_close_to_truth(calibration, read_truth(TINY / 'truth.json'))
