@@ -3,8 +3,8 @@ Acquisition: how often a field is matched that should not be, and one that shoul
 
 Every trial is a rendered image of 640 x 512, pixels to stars: `star_finder.observe_stars`, from
 the search beside the predictions to the whole one of 1.5 degrees and 5 degrees of roll, and in one
-row `tracking.follow`.  Seeds are fixed; a match is wrong where more than one star in ten stands
-where another was drawn.
+row `tracking.track_stars`.  Seeds are fixed; a match is wrong if more than one star in ten is
+identified as another one.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from bench.table import Table
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import (
+    Exposure,
     IdentificationOptions,
     observe_stars,
-    Shot,
-    tracked,
+    realigned,
 )
-from starcal_ros.identification.tracking import follow, Followed, following
+from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.simulation import images as simulated_images
@@ -81,7 +81,7 @@ def scrambled(images: int, attitudes: int) -> Table:
         scenario = random_fields(rng, images)
         found = []
         for image, scene, tried in draw(scenario, rng, attitudes):
-            known: CameraGeometry | Followed = scenario.prior
+            known: CameraGeometry | TrackedCamera = scenario.prior
             if name in FOLLOWED:
                 known = followed_from(image, scene, scenario.prior, catalog)
             found += [trial(image, scene, attitude, known, catalog) for attitude in tried]
@@ -126,18 +126,18 @@ def trial(
     image: Image,
     drawn: Scene,
     icrf_from_star_tracker_xyzw: Floats,
-    known: CameraGeometry | Followed,
+    known: CameraGeometry | TrackedCamera,
     catalog: StarCatalog,
 ) -> Found:
     """One image searched, or followed from another, its stars held against those drawn."""
-    shot = Shot(image, icrf_from_star_tracker_xyzw, 0.0)
+    exposure = Exposure(image, icrf_from_star_tracker_xyzw, 0.0)
     centroid, options = CentroidOptions(), IdentificationOptions()
     start_s = time.process_time()
     try:
-        if isinstance(known, Followed):
-            stars, _ = follow(shot, known, catalog, centroid, options)
+        if isinstance(known, TrackedCamera):
+            stars, _ = track_stars(exposure, known, catalog, centroid, options)
         else:
-            stars, _ = observe_stars(shot, known, catalog, centroid, options)
+            stars, _ = observe_stars(exposure, known, catalog, centroid, options)
     except ImageRefused:
         return Found(accepted=False, wrong=False, seconds=time.process_time() - start_s)
     seconds = time.process_time() - start_s
@@ -152,13 +152,13 @@ def trial(
 
 def followed_from(
     image: Image, drawn: Scene, prior: CameraGeometry, catalog: StarCatalog
-) -> Followed | CameraGeometry:
+) -> TrackedCamera | CameraGeometry:
     """What an image whose attitude is right shows, with which others are to be followed."""
-    shot = Shot(image, drawn.icrf_from_star_tracker_xyzw, 0.0)
+    exposure = Exposure(image, drawn.icrf_from_star_tracker_xyzw, 0.0)
     stars, instrument = observe_stars(
-        shot, prior, catalog, CentroidOptions(), IdentificationOptions()
+        exposure, prior, catalog, CentroidOptions(), IdentificationOptions()
     )
-    return following(tracked(prior, stars), stars, instrument) or prior
+    return start_tracking(realigned(prior, stars), stars, instrument) or prior
 
 
 def random_fields(rng: np.random.Generator, count: int) -> Scenario:

@@ -26,7 +26,7 @@ _STAGES = (
     ('  prediction', 'prediction', 'predict'),
     ('  match', 'identification', '_find'),
     ('  PSF and pixel noise', 'centroiding', 'model_image'),
-    ('  images after the first', 'tracking', 'follow'),
+    ('  images after the first', 'tracking', 'track_stars'),
     ('  centroids', 'centroiding', 'measure_stars'),
     ('estimate', 'calibration', 'estimate_calibration'),
     ('digest of the bag', 'cli', '_digest'),

@@ -1,8 +1,8 @@
 """
-Covariance of what the images share: camera, focal terms, alignment and its rate.
+Covariance of the shared parameters: camera, focal terms, alignment and its rate.
 
-From the normal matrices of the images at a state; it needs no residuals, so a calibration that has
-not been made yet has one too.
+It follows from the normal matrices of the images at a state without residuals, so it also predicts
+the covariance of a future calibration.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ def shared_covariance(
     blocks : (m, 14, 14)
         Of `problem.image_blocks`.
     good : (m,) bool
-        Images whose attitudes count in the mean of ``per_image``; the other methods do not ask.
+        Images in the mean alignment of ``per_image``; unused by the other methods.
     tracker_sigma_rad : (3,)
-        Of those attitudes.
+        1-sigma of their attitudes.
 
     Raises
     ------
     NotObservable
-        When the images do not determine all that is estimated.
+        If the images do not determine all estimated parameters.
     """
     shared = considered_covariance(problem, reduced_information(problem, state, blocks))
     if problem.method != 'per_image':
@@ -59,10 +59,10 @@ def shared_covariance(
 
 def considered_covariance(problem: Problem, information: Floats) -> Floats:
     """
-    Covariance (p, p) of all camera parameters, and of what else the information has.
+    Covariance (p, p) of all camera parameters and of the other shared parameters.
 
-    A held parameter with a prior sigma is considered: its uncertainty is its own, and what it does
-    to the estimated ones is added to theirs; one without stays at zero.
+    Fixed parameters with a prior sigma are consider parameters: they keep their prior variance, and
+    its effect on the estimated parameters is added.  Without a prior sigma their variance is zero.
     """
     p = len(information)
     estimated = np.concatenate([problem.free, np.arange(10, p)])
@@ -92,8 +92,8 @@ def _mean_alignment(
     """
     Quaternion mean of the alignments of the images (Markley et al. 2007), completing ``full``.
 
-    SciPy's mean is the dominant eigenvector of sum w q q'; weighted by the covariances of the
-    images.  The mean is linear in the rotations, and those in the camera parameters.
+    SciPy's mean is the dominant eigenvector of sum w q q', with weights from the covariances of
+    the images.  The mean is linear in the rotations, and those in the camera parameters.
     """
     alignments = (state.camera_from_icrf * problem.star_tracker_from_icrf.inv())[good]
     tracker = np.diag(tracker_sigma_rad**2)

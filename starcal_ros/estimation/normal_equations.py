@@ -1,10 +1,10 @@
 """
 Residuals of star observations and their normal matrices, image by image (Eqs. 15, 27-37).
 
-For every image the residual and its derivatives by the ten camera parameters and by the small
-rotation of that image are whitened by each star's covariance and multiplied into one (14, 14)
-matrix: ``[J_camera J_rotation r]' [J_camera J_rotation r]``.  Every method of calibration is
-assembled from those matrices, so the dense Jacobian of the ensemble is never formed.
+For every image the residuals and their derivatives by the ten camera parameters and by the small
+rotation of that image are whitened by the covariance of each star and multiplied to one (14, 14)
+matrix: ``[J_camera J_rotation r]' [J_camera J_rotation r]``.  Every method of calibration uses
+those matrices, so the dense Jacobian of the ensemble is never formed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from starcal_ros.records import StarObservations
 CAMERA = slice(0, 10)
 ROTATION = slice(10, 13)
 RESIDUAL = 13
-_CHUNK_STARS = 8192  # measured: calls into numpy cost more below, the cache more above
+_CHUNK_STARS = 8192  # fastest: numpy call overhead dominates below, cache misses above
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class StarTable:
     """
     All stars of an ensemble as columns, in image order.
 
-    ``image`` (n,) index of the image; ``catalog_id`` (n,); ``star`` (n,) index of the catalog star
-    among those that were seen; ``direction_icrf`` (n, 3);
-    ``measured_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``image_count``.
+    ``image`` (n,) index of the image; ``catalog_id`` (n,); ``star`` (n,) index among the observed
+    catalog stars; ``direction_icrf`` (n, 3); ``measured_px`` (n, 2); ``covariance_px2`` (n, 3) uu,
+    uv, vv; ``image_count``.
     """
 
     image: NDArray[np.int64]
@@ -65,7 +65,7 @@ def star_table(images: Sequence[StarObservations]) -> StarTable:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Some images of like star count, padded to the largest with stars of no weight."""
+    """Images with similar star counts, padded with stars of zero weight."""
 
     image: NDArray[np.int64]  # (m,)
     direction_icrf: Floats  # (m, 3, n)
@@ -79,7 +79,7 @@ class Measurements:
 
     chunks: tuple[_Chunk, ...]
     image_count: int
-    # Of every pass: fresh pages for each would cost as much as the arithmetic on them.
+    # Reused in every pass: allocating new pages takes as long as the arithmetic on them.
     derivatives: Floats
 
 
@@ -99,7 +99,7 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
     """
     Lay out the kept stars, (n,) mask, whitened by covariances (n, 3).
 
-    Images of like size share a chunk, so that little is padded.
+    Images with similar star counts share a chunk, which limits the padding.
     """
     order = np.nonzero(keep)[0]
     counts = np.bincount(table.image[order], minlength=table.image_count)
@@ -109,7 +109,7 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
     chunks = []
     first = 0
     while first < len(images):
-        # No image is padded by more than half, and none alone is too large for a chunk.
+        # Padding is at most half of an image; a single image always fits.
         like = counts[images] <= 1.5 * counts[images[first]] + 8
         fits = np.arange(1, len(images) - first + 1) * counts[images[first:]] <= _CHUNK_STARS
         last = first + max(1, int(np.count_nonzero(like[first:] & fits)))
@@ -156,10 +156,10 @@ def normal_blocks(
     Returns
     -------
     cost : float
-        Half the sum of the loss; infinite where a star would lie behind the camera.
+        Half the sum of the loss; infinite if a star is behind the camera.
     blocks : (m, 14, 14)
         Rows and columns: ten camera parameters, three angles, residual (measured - predicted).
-        ``blocks[:, :13, 13]`` is downhill.
+        ``blocks[:, :13, 13]`` is the negative gradient.
     """
     blocks = np.zeros((measurements.image_count, 14, 14))
     cost = 0.0
@@ -176,8 +176,8 @@ def normal_blocks(
             c2 = loss_scale**2
             cost += 0.5 * c2 * float(np.log1p(s / c2).sum())
             J[:, :14] *= 1.0 / np.sqrt(1.0 + s / c2)
-        # numpy takes A @ A.T to a routine for symmetric products, which for 14 rows is half as
-        # fast as the general one: with a row more it does not see that both factors are the same.
+        # numpy computes A @ A.T with a routine for symmetric products, which is half as fast as
+        # the general one for 14 rows; the additional row avoids it.
         by_image = J.reshape(2, 15, m, n).transpose(0, 2, 1, 3)
         product = by_image[:, :, :14] @ by_image.transpose(0, 1, 3, 2)
         blocks[chunk.image] = (product[0] + product[1])[..., :14]
@@ -190,13 +190,13 @@ def _whitened_columns(
     chunk: _Chunk, parameters: Floats, camera_from_icrf: Floats, J: Floats
 ) -> bool:
     """
-    Write the whitened derivatives and residuals of a chunk into J, (2, 15, m n); the last is zero.
+    Write the whitened derivatives and residuals of a chunk to J (2, 15, m n); the last is zero.
 
-    The first axis is the u and the v rows.  False when a star is behind the camera.
+    The first axis holds u and v.  Returns False if a star is behind the camera.
     ``parameters`` is (10,) or (10, m n).
 
-    The columns are those of `camera.project_jacobians`, whitened as they are made and in place:
-    most of the time of a calibration is spent here, in memory traffic.
+    The columns are those of `camera.project_jacobians`, whitened in place: most of the
+    time of a calibration is spent here, in memory traffic.
     """
     m, _, n = chunk.direction_icrf.shape
     e = np.empty((3, m, n))
@@ -268,7 +268,7 @@ def _whitened_columns(
 def residuals_px(table: StarTable, parameters: Floats, camera_from_icrf: Floats) -> Floats:
     """Measured minus predicted pixels (n, 2) of every star; parameters (10,) or (m, 10)."""
     residual_px = table.measured_px.copy()
-    # In parts: a rotation for each of all stars would be most of the memory of a calibration.
+    # In parts: one rotation per star would take most of the memory of a calibration.
     for first in range(0, len(table), _CHUNK_STARS):
         part = slice(first, first + _CHUNK_STARS)
         image = table.image[part]

@@ -215,11 +215,11 @@ def test_a_column_without_data_is_not_observable() -> None:
 def test_two_columns_alike_are_not_observable() -> None:
     J = np.random.default_rng(5).normal(size=(20, 3))
     J[:, 2] = J[:, 1] * 1e6
-    with pytest.raises(NotObservable, match='cannot be told apart'):
+    with pytest.raises(NotObservable, match='cannot be separated'):
         covariance(plain(J, J[:, 0]))
     # Alike to 1e-9: positive definite by luck of rounding at best, and refused all the same.
     J[:, 2] *= 1 + 1e-9 * np.arange(20)
-    with pytest.raises(NotObservable, match='cannot be told apart'):
+    with pytest.raises(NotObservable, match='cannot be separated'):
         covariance(plain(J, J[:, 0]))
 
 

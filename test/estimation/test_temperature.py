@@ -234,7 +234,7 @@ def test_temperatures_that_nobody_asks_for_change_no_bit(method: str) -> None:
     [
         (np.where(np.arange(10) == 4, np.nan, TEMPERATURES_DEGC), '1 of 10 images have no temp'),
         (np.linspace(20.0, 21.0, 10), 'the temperatures spread by 0.32 degC, less than 1'),
-        (np.repeat([0.0, 30.0], 5), '2 temperatures do not carry a polynomial of degree 2'),
+        (np.repeat([0.0, 30.0], 5), '2 temperatures do not determine a polynomial of degree 2'),
     ],
 )
 def test_what_the_images_do_not_carry_is_left_out(temperatures: np.ndarray, note: str) -> None:

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import (
+    Exposure,
     IdentificationOptions,
     observe_stars,
-    Shot,
-    tracked,
+    realigned,
 )
 from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.records import (
@@ -52,8 +52,8 @@ def observed(
     geometry: CameraGeometry = PRIOR,
     options: IdentificationOptions = OPTIONS,
 ) -> StarObservations:
-    shot = Shot(image, icrf_from_star_tracker_xyzw, 0.5)
-    return observe_stars(shot, geometry, catalog(), CENTROIDS, options)[0]
+    exposure = Exposure(image, icrf_from_star_tracker_xyzw, 0.5)
+    return observe_stars(exposure, geometry, catalog(), CENTROIDS, options)[0]
 
 
 def turned(geometry: CameraGeometry, turn: Rotation) -> CameraGeometry:
@@ -213,8 +213,8 @@ def test_one_spoilt_star_is_left_out_by_its_reason(
     options = CentroidOptions(centroid=centroid)
 
     def seen(pixels: np.ndarray) -> StarObservations:
-        shot = Shot(Image(image.time_ns, pixels), one.icrf_from_star_tracker_xyzw, 0.5)
-        return observe_stars(shot, PRIOR, catalog(), options, OPTIONS)[0]
+        exposure = Exposure(Image(image.time_ns, pixels), one.icrf_from_star_tracker_xyzw, 0.5)
+        return observe_stars(exposure, PRIOR, catalog(), options, OPTIONS)[0]
 
     before = seen(image.pixels)
     apart = np.linalg.norm(one.pixel_px[:, None] - one.pixel_px[None], axis=-1)
@@ -265,7 +265,7 @@ def test_too_few_stars_are_refused() -> None:
     greedy = dataclasses.replace(OPTIONS, min_stars_per_image=1000)
     refused = observed(image, one.icrf_from_star_tracker_xyzw, options=greedy)
     assert (refused.refusal, len(refused)) == ('too_few_stars', 0)
-    assert f'{len(used)} stars measured well, 1000 needed' in refused.detail
+    assert f'{len(used)} stars measured, 1000 needed' in refused.detail
     # What became of the others is told all the same.
     assert refused.refused_stars == used.refused_stars
     np.testing.assert_array_equal(refused.refused_px, used.refused_px)
@@ -288,7 +288,7 @@ def test_the_geometry_is_tracked_from_image_to_image() -> None:
     off = turned(PRIOR, turn)
     one, image = shown(5)
     found = observed(image, one.icrf_from_star_tracker_xyzw, off)
-    after = tracked(off, found)
+    after = realigned(off, found)
     left = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw).inv() * Rotation.from_quat(
         after.star_tracker_from_camera_xyzw
     )
@@ -296,17 +296,17 @@ def test_the_geometry_is_tracked_from_image_to_image() -> None:
     assert np.degrees(left.magnitude()) * 3600 < 200
     np.testing.assert_array_equal(after.camera.parameters, off.camera.parameters)
     lost = refused_image(image.time_ns, 640, 512, 'no_match', '')
-    assert tracked(off, lost) is off
+    assert realigned(off, lost) is off
 
 
 def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure() -> None:
     one, image = shown(2)
     marked = dataclasses.replace(catalog(), close_pair=np.ones(len(catalog()), bool))
     before = observed(image, one.icrf_from_star_tracker_xyzw)
-    shot = Shot(image, one.icrf_from_star_tracker_xyzw, 0.5)
-    after, _ = observe_stars(shot, PRIOR, marked, CENTROIDS, OPTIONS)
+    exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
+    after, _ = observe_stars(exposure, PRIOR, marked, CENTROIDS, OPTIONS)
     strict = dataclasses.replace(OPTIONS, max_blend_sigma=0.1)
-    fewer, _ = observe_stars(shot, PRIOR, marked, CENTROIDS, strict)
+    fewer, _ = observe_stars(exposure, PRIOR, marked, CENTROIDS, strict)
     assert fewer.refused_stars['blend'] > after.refused_stars['blend']
     both, i, j = np.intersect1d(before.catalog_id, after.catalog_id, return_indices=True)
     more_px2 = after.covariance_px2[j] - before.covariance_px2[i]

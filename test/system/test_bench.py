@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bench import acquisition
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.star_finder import IdentificationOptions, observe_stars, Shot
+from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
 from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.sky.catalog import load_catalog
 
@@ -75,7 +75,7 @@ def test_a_match_that_is_right_in_a_part_of_the_image_is_refused() -> None:
     image, drawn, attitudes = [next(fields) for _ in range(8)][7]
     right = Rotation.from_quat(drawn.icrf_from_star_tracker_xyzw)
     off_deg = np.degrees((right.inv() * Rotation.from_quat(attitudes)).magnitude())
-    shot = Shot(image, attitudes[int(np.abs(off_deg - 2.34).argmin())], 0.0)
+    shot = Exposure(image, attitudes[int(np.abs(off_deg - 2.34).argmin())], 0.0)
     with pytest.raises(ImageRefused, match='part of the image'):
         observe_stars(
             shot,
