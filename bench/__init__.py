@@ -1,7 +1,7 @@
-"""Measurements of time, memory, accuracy and wrong matches, some against other people's code."""
+"""Benches of time, memory, accuracy and identification, some against other packages."""
 
 NAMES = ('solver', 'ensemble', 'measure', 'calibrate', 'observer', 'gate')
 """The benches, each a module with ``run(quick)`` that prints its tables and returns them."""
 
 LONG = ('accuracy', 'acquisition', 'paper', 'faults', 'soak', 'transport')
-"""Those that take some minutes: run when they are named."""
+"""Benches that take minutes; run only by name."""

@@ -61,8 +61,8 @@ def considered_covariance(problem: Problem, information: Floats) -> Floats:
     """
     Covariance (p, p) of all camera parameters and of the other shared parameters.
 
-    Fixed parameters with a prior sigma are consider parameters: they keep their prior variance, and
-    its effect on the estimated parameters is added.  Without a prior sigma their variance is zero.
+    A fixed parameter with a prior sigma is a consider parameter: it keeps its prior variance,
+    whose effect on the estimated parameters is added.  Without a prior sigma its variance is zero.
     """
     p = len(information)
     estimated = np.concatenate([problem.free, np.arange(10, p)])

@@ -122,14 +122,33 @@ def test_nodes_and_tool_give_the_same_calibration(
     ours = {k: v for k, v in offline.provenance.items() if not k.startswith('input ')}
     assert dict(live.provenance) == ours
 
-    # Held for the next tests of the same run: what can be asked of a node with an ensemble.
-    again = client.call(Trigger, '/calibrator/calibrate')
-    assert again.success
+
+@pytest.fixture
+def calibrated(
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
+) -> list[Any]:
+    """Calibrations published by a calibrator that has collected the tiny bag: one so far."""
+    start_node('calibrator', ros=parameters(tiny_bag))
+    play(start_node, tiny_products / 'observations.mcap')
+    images = json.loads((tiny_bag / 'truth.json').read_text())['images']
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status and status[-1].images == images)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    published: list[Any] = client.latched(Calibration, 'calibration')
+    client.until(lambda: published)
+    return published
+
+
+def test_rollback(client: Client, calibrated: list[Any]) -> None:
+    """Rollback activates the previous calibration, and fails without one."""
+    assert client.call(Trigger, '/calibrator/calibrate').success
     back = client.call(Trigger, '/calibrator/rollback')
     assert back.success and 'back in force' in back.message
     none = client.call(Trigger, '/calibrator/rollback')
     assert not none.success and 'no calibration before' in none.message
-    before = len(found)
+
+
+def test_dry_run_and_bad_requests_activate_nothing(client: Client, calibrated: list[Any]) -> None:
     trial = client.call(Calibrate, '/calibrator/solve', dry_run=True, estimate=['fx', 'fy'])
     assert trial.success and 'would be in force' in trial.message
     assert list(trial.calibration.estimated) == ['fx', 'fy']
@@ -138,12 +157,19 @@ def test_nodes_and_tool_give_the_same_calibration(
     assert bad.calibration.stars_used == 0
     bad = client.call(Calibrate, '/calibrator/solve', method='magic')
     assert not bad.success and 'magic' in bad.message
+    assert len(calibrated) == 1
+
+
+def test_reset_empties_the_ensemble(client: Client, calibrated: list[Any]) -> None:
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status)
+    images = status[-1].images
     reset = client.call(Trigger, '/calibrator/reset')
     assert reset.success and str(images) in reset.message
     client.until(lambda: status[-1].images == 0)
     empty = client.call(Trigger, '/calibrator/calibrate')
     assert not empty.success
-    assert len(found) == before, 'nothing of these came into force'
+    assert len(calibrated) == 1
 
 
 def test_gate_refusal_and_force(
@@ -176,7 +202,7 @@ def test_gate_refusal_and_force(
     assert found[0].reasons[-1] == 'put in force by request all the same'
     assert found[0].forced and found[0].number == 1
     client.until(
-        lambda: any('in force against the gate' in m.status[0].message for m in diagnostics)
+        lambda: any('active despite the gate' in m.status[0].message for m in diagnostics)
     )
     page = state / 'report' / 'report.html'
     client.until(page.exists, 120.0)
@@ -376,10 +402,10 @@ def test_camera_info_per_image(
         client.until(lambda: said in observer.said())
 
     show(1)
-    publish(candidate, 'calibration: one that the gate has refused')
+    publish(candidate, 'calibration: refused by the gate')
     show(2)
     client.until(lambda: len(answers) == 2)
-    publish(in_force, 'stars are predicted with the calibration in force')
+    publish(in_force, 'predicting stars with the active calibration')
     headers = [show(3), show(4, width=8, height=8), show(7), show(5, 'other')]
     client.until(lambda: len(answers) == 6 and len(infos) == 3)
     # Nothing of the first two comes later: what is of one publisher comes in order.
@@ -391,7 +417,7 @@ def test_camera_info_per_image(
         assert info == expected
     forced = dataclasses.replace(candidate, forced=True, child_frame='elsewhere')
     calibrations.publish(calibration_to_message(forced, make_message))
-    client.until(lambda: observer.said().count('stars are predicted') == 2)
+    client.until(lambda: observer.said().count('predicting stars') == 2)
     header = show(8)
     client.until(lambda: len(infos) == 4)
     assert infos[-1].header == header
@@ -662,7 +688,7 @@ def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: P
 @pytest.mark.parametrize(
     ('arguments', 'text'),
     [
-        ((), 'bag: the bag to play must be given'),
+        ((), 'bag: path of the bag to play is missing'),
         (('-p', 'bag:=/no/such/bag'), '/no/such/bag: no such bag'),
         (('-p', 'bag:=x', '-p', 'rate:=-1.0'), 'rate'),
     ],

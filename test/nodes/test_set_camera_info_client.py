@@ -74,7 +74,7 @@ def test_driver_is_told_and_its_failures_are_seen(
     assert (nothing.success, nothing.message) == (False, 'no calibration is in force')
     fill(client, tiny_observations)
     assert client.call(Trigger, '/calibrator/calibrate').success
-    client.until(told(diagnostics, 'not there; sent when it comes', b'\x01'))
+    client.until(told(diagnostics, 'service not available; will be sent when it is', b'\x01'))
 
     # A driver that takes the call and never answers: nobody spins its node.
     silent = other_client.node.create_service(SetCameraInfo, SERVICE, lambda _, answer: answer)
@@ -109,7 +109,12 @@ def test_driver_is_told_and_its_failures_are_seen(
     assert client.call(Trigger, '/calibrator/calibrate').success
     client.until(lambda: len(received) > before)
     said = calibrator.said()
-    for outcome in ('not there', 'no answer within 1 s', 'refused: sensor busy', 'accepted'):
+    for outcome in (
+        'service not available',
+        'no answer within 1 s',
+        'refused: sensor busy',
+        'accepted',
+    ):
         assert f'{SERVICE}: {outcome}' in said
     assert 'Traceback' not in said
 

@@ -272,6 +272,7 @@ def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_products: Path
 
 
 @needs_interfaces
+@pytest.mark.nodes
 def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path: Path) -> None:
     psutil = pytest.importorskip('psutil')
     command = [sys.executable, '-m', 'starcal_ros.cli.main', 'demo', '-o', str(tmp_path)]
