@@ -1,4 +1,4 @@
-"""The camera model against OpenCV, which has no skew, and skew against the paper's formula."""
+"""The camera model against OpenCV, and skew, which OpenCV lacks, against the paper."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The camera model: derivatives, inverse, the fold of the distortion, the fit without skew."""
+"""The camera model: derivatives, inverse, fold of the distortion, fit without skew."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ each_camera = pytest.mark.parametrize('camera', CAMERAS.values(), ids=CAMERAS.ke
 
 
 def wide_grid(camera: CameraModel, beyond: float = 0.2) -> np.ndarray:
-    """Pixels (n, 2) over the detector and that fraction of it beyond each side."""
+    """Pixels (n, 2) over the detector widened by a fraction of it on each side."""
     grid = pixel_grid(camera, 29, 23)
     centre = 0.5 * np.array([camera.width - 1, camera.height - 1])
     return centre + (1 + 2 * beyond) * (grid - centre)

@@ -1,4 +1,4 @@
-"""Options: every type and limit, with texts that name the option and the value; YAML files."""
+"""Options: types, limits, error messages, YAML files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from starcal_ros.pipeline.setup import OPTION_CLASSES
 
 @dataclass(frozen=True)
 class Sample:
-    """One option of each type."""
+    """An option of each type."""
 
     yes: bool = option(False, 'a switch')
     count: int = option(3, 'a number of things', low=1, high=10)

@@ -1,4 +1,4 @@
-"""Cameras that change with their temperature: found again, true to their sigma, or left out."""
+"""Temperature terms: recovery, errors within sigma, omission of insignificant terms."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def camera_of(temperature_degc: float, focal: tuple[float, ...]) -> CameraModel:
 
 
 def alignment_of(temperature_degc: float, rate_rad: np.ndarray) -> Rotation:
-    """The true camera_from_star_tracker at a temperature: a passive turn from the reference."""
+    """True camera_from_star_tracker at a temperature: a passive rotation from the reference."""
     dT = temperature_degc - REFERENCE_DEGC
     turn = Rotation.from_rotvec(-rate_rad * dT)
     return turn * Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw).inv()
@@ -73,7 +73,7 @@ def observed(
     seed: int | None = None,
     tracker_arcsec: tuple[float, ...] = TRACKER_ARCSEC,
 ) -> Ensemble:
-    """The stars as the changing camera sees them, with noise where there is a seed."""
+    """Observations with the temperature-dependent camera; noise if a seed is given."""
     rng = np.random.default_rng(seed)
     images = []
     for image, degc in zip(stars(), temperatures_degc, strict=True):

@@ -1,4 +1,4 @@
-"""Frames whose rows do not belong together are refused, and none because its prior is wrong."""
+"""Frames with lost lines are refused; frames with a wrong prior are not."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def exposure(index: int) -> Exposure:
 
 
 def with_lost_rows(index: int, row: int, lost: int) -> Exposure:
-    """A frame of which some rows are lost: all below them stand so much higher."""
+    """A frame with lost rows: all rows below are shifted up."""
     image = exposure(index).image
     pixels = image.pixels.copy()
     pixels[row:-lost] = image.pixels[row + lost :]

@@ -1,4 +1,4 @@
-"""Places that agree by chance are told by the brightnesses; true ones are left alone."""
+"""Brightnesses expose false matches and do not affect true ones."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MODEL = ImageModel(
 
 
 def sky(count: int, scatter_mag: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray, Centroids]:
-    """Magnitudes, places and centroids of good stars that scatter about what they should be."""
+    """Magnitudes, pixels and centroids of good stars with scattered brightnesses."""
     rng = np.random.default_rng(seed)
     magnitude = rng.uniform(3.0, 8.0, count)
     flux = 10.0 ** (0.4 * (ZERO_POINT - magnitude + rng.normal(0.0, scatter_mag, count)))
@@ -127,9 +127,9 @@ FAR_OFF_XYZW = [
 @pytest.mark.parametrize('attitude_xyzw', FAR_OFF_XYZW)
 def test_no_star_of_a_field_that_is_there_in_part_is_wrong(attitude_xyzw: list[float]) -> None:
     """
-    2.3 degrees off, where 1.5 are searched: found by the bench of acquisition.
+    2.3 degrees off with a search range of 1.5 degrees; found by the acquisition bench.
 
-    By places alone 64 and 54 stars were matched, one and three of five rightly.
+    By position alone 64 and 54 stars were matched, one fifth and three fifths of them rightly.
     """
     base = synthetic.scenario('tiny', seed=367)
     field = synthetic.Inertial((MILKY_WAY_DEG,) * 12)

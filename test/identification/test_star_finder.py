@@ -1,4 +1,4 @@
-"""Identification of simulated images: right stars or none, whatever alignment or attitude say."""
+"""Identification of simulated images: right stars or none, with wrong alignment or attitude."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ def observed(
 
 
 def turned(geometry: CameraGeometry, turn: Rotation) -> CameraGeometry:
-    """A geometry whose camera is turned about its own axes."""
+    """Geometry with the camera rotated about its own axes."""
     rotation = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * turn
     return CameraGeometry(geometry.camera, rotation.as_quat())
 
 
 def assert_right(found: StarObservations, one: Scene, least: int = 100) -> None:
-    """Every star stands where the star of its catalog number was drawn."""
+    """Assert that every star is at the pixel of its catalog number."""
     assert found.refusal == '' and len(found) >= least
     place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
     true_px = np.array([place.get(number, [np.nan, np.nan]) for number in found.catalog_id])
@@ -177,20 +177,20 @@ def test_planets_are_no_stars(index: int, turn_deg: float) -> None:
 
 
 def reasons(found: StarObservations) -> dict[int, str]:
-    """Why each star that was left out was."""
+    """Refusal reasons by catalog number."""
     names = list(found.refused_stars)
     pairs = zip(found.refused_catalog_id.tolist(), found.refused_reason.tolist(), strict=True)
     return {number: names[code] for number, code in pairs}
 
 
 def moved_right(pixels: np.ndarray, u: int, v: int, shift: int) -> None:
-    """The light about a pixel stands some pixels to the right of its place."""
+    """Shift the light around a pixel to the right."""
     window = slice(v - 7, v + 8), slice(u - 7, u + 8)
     pixels[window] = np.roll(pixels[window], shift, axis=1)
 
 
 def sharpened(pixels: np.ndarray, u: int, v: int) -> None:
-    """Of the light about a pixel only the three brightest pixels are left."""
+    """Keep only the three brightest pixels around a pixel."""
     window = pixels[v - 4 : v + 5, u - 4 : u + 5]
     window[window < np.sort(window.ravel())[-3]] = np.median(pixels)
 

@@ -1,4 +1,4 @@
-"""Images measured without a search: the same stars as a search finds, or a track that is lost."""
+"""Tracking: the same stars as a search, or a lost track."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def shown(index: int) -> tuple[Scene, Image]:
 
 
 def exposure(index: int, turn_rad: float = 0.0) -> Exposure:
-    """An image with the attitude that the star tracker has for it, turned about some axis."""
+    """Image with its reported attitude rotated about an axis."""
     one, image = shown(index)
     turn = Rotation.from_rotvec(turn_rad * np.array([0.6, -0.8, 0.0]))
     return Exposure(
@@ -62,7 +62,7 @@ def followed(image: Exposure, before: TrackedCamera) -> tuple[StarObservations, 
 
 
 @pytest.mark.parametrize('index', [1, 2, 5])
-def test_a_followed_image_gives_the_stars_of_a_search(index: int) -> None:
+def test_tracking_gives_the_stars_of_a_search(index: int) -> None:
     _, known = searched(0)
     tracked, _ = followed(exposure(index), known)
     whole, _ = searched(index)
@@ -145,7 +145,7 @@ def test_the_camera_that_predicts_is_corrected(scale: float, k1: float) -> None:
     assert np.abs(off - grid).max() < 1.0
 
 
-def test_noise_of_the_star_tracker_is_followed() -> None:
+def test_noise_of_the_star_tracker_is_tracked() -> None:
     _, known = searched(0)
     quiet, _ = followed(exposure(1), known)
     # 8 px, where the window reaches 12.
@@ -161,7 +161,7 @@ def test_noise_of_the_star_tracker_is_followed() -> None:
     assert (one.inv() * other).magnitude() == pytest.approx(np.radians(0.5), rel=0.001)
 
 
-def test_an_alignment_that_creeps_is_followed() -> None:
+def test_a_drifting_alignment_is_tracked() -> None:
     _, known = searched(0)
     first = Rotation.from_quat(known.geometry.star_tracker_from_camera_xyzw)
     focal_px = PRIOR.camera.intrinsics[0]
@@ -214,7 +214,7 @@ def test_planets_are_no_stars(index: int) -> None:
     assert np.abs(off).max() < 6.0 and np.sqrt((off**2).mean()) < 1.2
 
 
-def test_an_image_that_tells_nothing_is_not_followed() -> None:
+def test_an_image_without_psf_starts_no_track() -> None:
     observations, known = searched(0)
     assert start_tracking(PRIOR, observations, None) is None
     refused = dataclasses.replace(observations, refusal='no_match')

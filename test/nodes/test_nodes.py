@@ -1,4 +1,4 @@
-"""The nodes as processes on the real graph: what they answer, refuse and survive."""
+"""The nodes as processes: services, refusals, faults, parameters, signals."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def parameters(folder: Path, *more: str) -> tuple[str, ...]:
 
 
 def blank(stamp_ns: int, **change: Any) -> Any:
-    """Return an image message of a dark sky, with some of its fields as asked."""
+    """Return an image message of a dark sky with some fields changed."""
     pixels = np.zeros((8, 8), np.uint16)
     message = image_to_message(ImageRecord(stamp_ns, pixels), '', make_message)
     for name, value in change.items():
@@ -85,7 +85,7 @@ def attitude(stamp_ns: int) -> Any:
 
 
 def play(start_node: StartNode, folder: Path, *more: str) -> None:
-    """Play a bag as fast as it is taken, to its end."""
+    """Play a bag at full speed to its end."""
     player = start_node('bag_player', ros=('-p', f'bag:={folder}', '-p', 'rate:=0', *more))
     assert player.wait(120.0) == 0, player.said()
 
@@ -175,7 +175,7 @@ def test_reset_empties_the_ensemble(client: Client, calibrated: list[Any]) -> No
 def test_gate_refusal_and_force(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path, tmp_path: Path
 ) -> None:
-    """A refused candidate is in the answer alone, unless it is forced."""
+    """A refused candidate is only in the response, unless it is forced."""
     state = tmp_path / 'state'
     strict = ('max_residual_rms_px:=0.001', f'state_dir:={state}')
     calibrator = start_node('calibrator', ros=parameters(tiny_bag, *strict))
@@ -213,7 +213,7 @@ def test_gate_refusal_and_force(
 def test_every_image_gets_one_answer(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
-    """Images that cannot be used are refused by name, in order, each once."""
+    """Unusable images are refused with a reason, in order, each once."""
     start_node('star_observer', ros=parameters(tiny_bag, 'attitude_timeout_s:=0.5'))
     answers: list[Any] = client.collect(StarObservations, 'observations')
     images = client.publisher(Image, 'image', 50)
@@ -247,7 +247,7 @@ def test_every_image_gets_one_answer(
 def test_image_waits_for_its_attitude(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
-    """An image that comes before its attitude is measured when that has come, not refused."""
+    """An image that arrives before its attitude waits for it."""
     start_node('star_observer', ros=(*parameters(tiny_bag, 'attitude_timeout_s:=60.0'), *REMAPS))
     answers: list[Any] = client.collect(StarObservations, 'observations')
     images = client.publisher(Image, '/opnav/image_raw', 10)
@@ -292,7 +292,7 @@ def test_observations_carry_the_temperature(
 
 
 def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """A PNG on image/compressed gives the observations that the raw image gives, remaps too."""
+    """A PNG on image/compressed gives the same observations as the raw image, also remapped."""
     # A small message waits behind a large one of its participant, under load longer than 10 s.
     patient = 'attitude_timeout_s:=60.0'
     raw_observer = start_node('star_observer', ros=(*parameters(tiny_bag, patient), *REMAPS))
@@ -329,7 +329,7 @@ def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path
 
 
 def test_overrun_is_answered(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """More images than the queue holds: each is still answered, the surplus by name."""
+    """With more images than the queue holds, each is answered, the surplus with overrun."""
     start_node(
         'star_observer', ros=parameters(tiny_bag, 'image_queue:=5', 'attitude_timeout_s:=60.0')
     )
@@ -349,13 +349,13 @@ def test_overrun_is_answered(client: Client, start_node: StartNode, tiny_bag: Pa
 
 
 def is_waiting(diagnostics: list[Any], images: int) -> bool:
-    """Whether the observer said last that it holds so many images."""
+    """Return True if the latest diagnostics report this number of queued images."""
     values = {v.key: v.value for m in diagnostics[-1:] for v in m.status[0].values}
     return values.get('images_waiting') == str(images)
 
 
 def test_annotated_image(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """A picture for whoever listens, of the image's size and stamp."""
+    """The annotated image has the size and stamp of the image."""
     start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
     pictures = client.collect(Image, 'annotated_image', 5)
     answers: list[Any] = client.collect(StarObservations, 'observations')
@@ -372,7 +372,7 @@ def test_annotated_image(client: Client, start_node: StartNode, tiny_bag: Path) 
 def test_camera_info_per_image(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_observations: Ensemble
 ) -> None:
-    """The calibration in force with the header of each image; the prior and candidates never."""
+    """The active calibration with the header of each image; never the prior or a candidate."""
     values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())['/**']['ros__parameters']
     setup = load_setup({**values, 'camera_info_url': str(tiny_bag / 'camera.yaml')})
     in_force = solving.solve(tiny_observations, setup)
@@ -426,7 +426,7 @@ def test_camera_info_per_image(
 def test_calibrator_collects_while_it_solves(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
 ) -> None:
-    """Observations that come during solves are all counted."""
+    """Observations that arrive during a calibration are all counted."""
     start_node('calibrator', ros=parameters(tiny_bag))
     play(start_node, tiny_products / 'observations.mcap')
     status = client.latched(EnsembleStatus, 'ensemble_status')
@@ -447,7 +447,7 @@ def test_calibrator_collects_while_it_solves(
 def test_state_outlasts_a_kill(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path, tmp_path: Path
 ) -> None:
-    """After kill -9: the ensemble, the calibration in force, the same answer; one owner."""
+    """Ensemble and active calibration survive kill -9; the state folder has one owner."""
     tool = read_calibration(tiny_products / CALIBRATION_FILE)
     state = f'state_dir:={tmp_path / "state"}'
     killed = start_node('calibrator', ros=parameters(tiny_bag, state))
@@ -484,7 +484,7 @@ def test_state_outlasts_a_kill(
 
 
 def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """Observations that do not fit together are logged and counted; the next are taken."""
+    """Inconsistent observations are logged and counted; the next ones are used."""
     calibrator = start_node('calibrator', ros=parameters(tiny_bag))
     observations = client.publisher(StarObservations, 'observations')
     observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
@@ -497,7 +497,7 @@ def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_ba
 
 
 def test_too_few_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """An empty ensemble is refused with what is missing; the prior is no calibration."""
+    """A calibration of an empty ensemble is refused; the prior is no calibration."""
     start_node('calibrator', ros=parameters(tiny_bag))
     latched = [
         client.latched(CameraInfo, 'camera_info'),
@@ -515,7 +515,7 @@ def test_too_few_images(client: Client, start_node: StartNode, tiny_bag: Path) -
 
 
 def status_of(client: Client, status: list[Any]) -> Any:
-    """Newest ensemble status."""
+    """Latest ensemble status."""
     client.until(lambda: status)
     return status[-1]
 
@@ -528,14 +528,14 @@ class Interrupt:
         if name == 'starcal_ros.pipeline.setup':
             signal.raise_signal(signal.SIGINT)
 sys.meta_path.insert(0, Interrupt())
-from starcal_ros.nodes import start
-start.{}()
+from starcal_ros.nodes import entry_points
+entry_points.{}()
 """
 
 
 @pytest.mark.parametrize('name', BOTH)
 def test_a_signal_while_python_imports(name: str) -> None:
-    """Ctrl-C before the node is there ends its console script without a traceback."""
+    """Ctrl-C during imports ends the console script without a traceback."""
     command = [sys.executable, '-c', INTERRUPTED.format(name)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
@@ -551,7 +551,7 @@ def test_signals(client: Client, start_node: StartNode, tiny_bag: Path, number: 
 
 
 def tiny_parameters(change: Callable[[str], str]) -> Callable[[Path, Path], tuple[str, ...]]:
-    """ROS arguments for the bag's parameter file with its text changed."""
+    """ROS arguments for a changed copy of the parameter file of the bag."""
 
     def arguments(folder: Path, scratch: Path) -> tuple[str, ...]:
         text = change((folder / 'params.yaml').read_text())
@@ -595,7 +595,7 @@ def test_bad_parameters(
 
 
 def test_parameters_while_running(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """Parameters are described, and what is in use is not changed behind the node's back."""
+    """Parameters have descriptions, and those in use cannot be changed."""
     node = start_node('star_observer', ros=parameters(tiny_bag, 'max_attitude_gap_s:=3'))
     described = client.call(
         DescribeParameters,
@@ -619,7 +619,7 @@ def test_parameters_while_running(client: Client, start_node: StartNode, tiny_ba
 
 
 def set_gap(client: Client, value: float, kind: int = ParameterType.PARAMETER_DOUBLE) -> str:
-    """Why the node refused the parameter; empty where it did not."""
+    """Set a parameter; return the reason of a refusal, '' if accepted."""
     number = ParameterValue(type=kind, double_value=value)
     parameter = Parameter(name='max_attitude_gap_s', value=number)
     answer = client.call(SetParameters, '/star_observer/set_parameters', parameters=[parameter])
@@ -633,7 +633,7 @@ def state_of(client: Client, name: str = 'star_observer') -> str:
 
 
 def change_state(client: Client, transition: int, name: str = 'star_observer') -> bool:
-    """Whether a node made a transition."""
+    """Request a transition; return True if the node made it."""
     request = Transition(id=transition)
     return bool(client.call(ChangeState, f'/{name}/change_state', transition=request).success)
 
@@ -642,7 +642,7 @@ def change_state(client: Client, transition: int, name: str = 'star_observer') -
 def test_lifecycle_by_hand(
     client: Client, start_node: StartNode, tiny_bag: Path, name: str
 ) -> None:
-    """Without autostart the node waits; a transition it cannot make is answered, not fatal."""
+    """Without autostart the node stays unconfigured; an invalid transition is answered."""
     node = start_node(name, ros=parameters(tiny_bag, 'autostart:=false'))
     assert state_of(client, name) == 'unconfigured'
     assert not change_state(client, Transition.TRANSITION_ACTIVATE, name)
@@ -661,7 +661,7 @@ def test_lifecycle_by_hand(
 
 
 def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: Path) -> None:
-    """A bag of large images at full speed arrives whole, in order, with its stamps."""
+    """A bag of large images at full speed arrives completely, in order, with its stamps."""
     random = np.random.default_rng(2)
     with BagWriter(tmp_path / 'large', compression='') as writer:
         for k in range(24):

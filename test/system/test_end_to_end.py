@@ -1,4 +1,4 @@
-"""The whole flow, bag to products, from outside the process and against the truth."""
+"""Bag to products as a separate process, against the truth."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def starcal(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 def calibrated(made: simulated_bag.SimulatedBag, folder: Path) -> Calibration:
-    """What the tool makes of a bag in this process, where its warnings are errors."""
+    """Calibration of a bag in this process, where warnings are errors."""
     arguments = ['calibrate', str(made.bag), '--params', str(made.params), '-o', str(folder)]
     assert main.main(arguments) == 0
     return read_calibration(folder / 'calibration.json')
@@ -59,7 +59,7 @@ def read_truth(path: Path) -> CameraGeometry:
 
 
 def normalised_error(calibration: Calibration, truth: CameraGeometry) -> tuple[float, int]:
-    """Squared error of all that was estimated in the metric of its covariance, and how many."""
+    """Squared Mahalanobis error of all estimated parameters, and their number."""
     free = [k for k, name in enumerate(PARAMETER_NAMES) if name in calibration.estimated]
     error = np.r_[
         (calibration.geometry.camera.parameters - truth.camera.parameters)[free],
@@ -74,7 +74,7 @@ def normalised_error(calibration: Calibration, truth: CameraGeometry) -> tuple[f
 
 
 def assert_close_to_truth(calibration: Calibration, truth: CameraGeometry) -> None:
-    """Each parameter within 5 of its own sigmas, all of them together within 5 of theirs."""
+    """Assert each parameter within 5 sigma, and the Mahalanobis error within 5 sigma."""
     prior_is_not_asked = calibration.geometry  # the comparison table wants one
     comparison = demo.compare(calibration, truth, prior_is_not_asked)
     assert comparison.worst_sigmas < 5, '\n'.join(comparison.lines)
@@ -170,7 +170,7 @@ def test_the_tiny_bag_is_small_and_says_what_it_is() -> None:
 
 
 def test_bright_stars_of_the_bag_stand_where_truth_and_attitude_say() -> None:
-    """Conventions of bag and truth file by a formula of this test's own, matrix by matrix."""
+    """Conventions of bag and truth file, by an independent formula."""
     truth = json.loads((TINY / 'truth.json').read_text())
     fx, skew, fy, cx, cy = truth['k_true']
     k1, k2, k3, p1, p2 = truth['d_true']
