@@ -30,9 +30,8 @@ from starcal_ros.records import Image
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.timeout(
-    400
-)  # fifteen node starts of 2 s; on a busy machine each takes ten times that
+@pytest.mark.slow
+@pytest.mark.timeout(400)  # fifteen node starts of 2 s, ten times as long on a busy machine
 def test_no_fault_loses_or_kills(tmp_path: Path) -> None:
     """Every fault of the bench in its short form: nothing lost, wrong or dead."""
     found = tmp_path / 'found.json'

@@ -31,6 +31,8 @@ from starcal_ros.studies import trials as campaign_trials
 from starcal_ros.studies import workers as campaign_workers
 from starcal_ros.studies.monte_carlo import Campaign, Design, Row
 
+pytestmark = pytest.mark.slow
+
 METHODS = ('per_image', 'single', 'hierarchical')
 ARGUMENTS = ('coverage', '--trials', '4', '--images', '4', '--stars', '20', '--seed', '5')
 SMALL = {

@@ -17,6 +17,8 @@ from starcal_ros.identification.star_finder import Exposure, IdentificationOptio
 from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.sky.catalog import load_catalog
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 
 

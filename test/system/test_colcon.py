@@ -23,7 +23,10 @@ INSTALLED = ('launch', 'config', 'bags/tiny')
 NODE_ANSWERS_WITHIN_S = 30.0
 NODE_STOPS_WITHIN_S = 15.0
 
-pytestmark = pytest.mark.timeout(240)  # colcon takes 15 s on two free cores
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(240),  # colcon takes 15 s on two free cores
+]
 
 # The messages in use, not only the Python files that wrap them, must be those of the workspace.
 ORIGINS = """

@@ -24,6 +24,8 @@ from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES, PlayerOptions
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').glob('*.md'), *ROOT.glob('bags/*/*.md')])
 OPTIONS = (*OPTION_CLASSES, *NODE_OPTION_CLASSES, PlayerOptions)

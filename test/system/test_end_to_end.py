@@ -27,6 +27,8 @@ from starcal_ros.records import Calibration, CameraGeometry, Image
 from starcal_ros.simulation import bag as simulated_bag
 from starcal_ros.simulation import scenario as synthetic
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 TINY = ROOT / 'bags' / 'tiny'
 INDEPENDENT = ROOT.parent / 'shared' / 'independent'
