@@ -180,10 +180,10 @@ def random_fields(rng: np.random.Generator, count: int) -> Scenario:
     )
 
 
-def turned(geometry: CameraGeometry, turn: Rotation) -> CameraGeometry:
+def turned(geometry: CameraGeometry, rotation: Rotation) -> CameraGeometry:
     """Geometry with the camera rotated about its own axes."""
-    rotation = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * turn
-    return CameraGeometry(geometry.camera, rotation.as_quat())
+    alignment = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * rotation
+    return CameraGeometry(geometry.camera, alignment.as_quat())
 
 
 def error_within_the_search(rng: np.random.Generator) -> Rotation:

@@ -110,7 +110,7 @@ def estimate_starcal(case: Case) -> Answer:
     return Answer(found.state.parameters, rotations, found.iterations)
 
 
-def _turn_jacobian(theta: Floats) -> tuple[Floats, Floats]:
+def _rotation_jacobian(theta: Floats) -> tuple[Floats, Floats]:
     """
     Rotations (..., 3, 3) by passive angles (..., 3), and the small rotation (..., 3, 3) by them.
 
@@ -125,9 +125,9 @@ def _turn_jacobian(theta: Floats) -> tuple[Floats, Floats]:
     K2 = K @ K
     # 1 - cos as a square, to keep precision at small angles.
     versine = 2.0 * np.sin(0.5 * angle) ** 2 / angle2
-    turn = np.eye(3) + np.sin(angle) / angle * K + versine * K2
+    rotation = np.eye(3) + np.sin(angle) / angle * K + versine * K2
     cubic = np.where(angle2 < 1e-8, 1.0 / 6.0, (angle - np.sin(angle)) / (angle * angle2))
-    return turn, np.eye(3) + versine * K + cubic * K2
+    return rotation, np.eye(3) + versine * K + cubic * K2
 
 
 def solve_scipy(case: Case) -> Answer:
@@ -148,14 +148,14 @@ def solve_scipy(case: Case) -> Answer:
         return parameters
 
     def residuals(x: Floats) -> Floats:
-        turn, _ = _turn_jacobian(x[f:].reshape(m, 3))
-        directions = np.einsum('nij,nj->ni', turn[table.image], base)
+        rotation, _ = _rotation_jacobian(x[f:].reshape(m, 3))
+        directions = np.einsum('nij,nj->ni', rotation[table.image], base)
         predicted = project_parameters(parameters_of(x), directions)
         return np.asarray((predicted - table.measured_px).ravel() / SIGMA_PX)
 
     def jacobian(x: Floats) -> csr_matrix:
-        turn, L = _turn_jacobian(x[f:].reshape(m, 3))
-        directions = np.einsum('nij,nj->ni', turn[table.image], base)
+        rotation, L = _rotation_jacobian(x[f:].reshape(m, 3))
+        directions = np.einsum('nij,nj->ni', rotation[table.image], base)
         camera = dataclasses.replace(case.prior.camera, parameters=parameters_of(x))
         _, J_parameters, J_rotation = project_jacobians(camera, directions)
         J = np.concatenate([J_parameters[..., FREE], J_rotation @ L[table.image]], axis=-1)
@@ -176,8 +176,8 @@ def solve_scipy(case: Case) -> Answer:
             'btol': 1e-9,
         },  # otherwise its steps are inexact: 6 iterations instead of 4
     )
-    turn, _ = _turn_jacobian(found.x[f:].reshape(m, 3))
-    rotations = turn @ case.start.camera_from_icrf.as_matrix()
+    rotation, _ = _rotation_jacobian(found.x[f:].reshape(m, 3))
+    rotations = rotation @ case.start.camera_from_icrf.as_matrix()
     return Answer(parameters_of(found.x), rotations, found.njev)
 
 
@@ -203,8 +203,8 @@ def solve_ceres(case: Case) -> Answer:
             """Write residuals in sigma, and derivatives if requested."""
             parameters = held.copy()
             parameters[FREE] = blocks[0]
-            turn, L = _turn_jacobian(blocks[1])
-            directions = self.base @ turn.T
+            rotation, L = _rotation_jacobian(blocks[1])
+            directions = self.base @ rotation.T
             if jacobians is None:
                 predicted_px = project_parameters(parameters, directions)
             else:
@@ -236,9 +236,9 @@ def solve_ceres(case: Case) -> Answer:
     pyceres.solve(options, problem, summary)
     parameters = held.copy()
     parameters[FREE] = shared
-    turn, _ = _turn_jacobian(angles)
+    rotation, _ = _rotation_jacobian(angles)
     iterations = summary.num_successful_steps + summary.num_unsuccessful_steps
-    return Answer(parameters, turn @ rotations, iterations)
+    return Answer(parameters, rotation @ rotations, iterations)
 
 
 def solve_opencv(case: Case) -> Answer:
@@ -275,5 +275,5 @@ def solve_opencv(case: Case) -> Answer:
     )
     k1, k2, p1, p2, k3 = D.ravel()[:5]
     parameters = np.array([K[0, 0], 0.0, K[1, 1], K[0, 2], K[1, 2], k1, k2, k3, p1, p2])
-    turn = Rotation.from_rotvec(np.array(turns).reshape(-1, 3)).as_matrix()
-    return Answer(parameters, turn @ start, 0)
+    rotation = Rotation.from_rotvec(np.array(turns).reshape(-1, 3)).as_matrix()
+    return Answer(parameters, rotation @ start, 0)

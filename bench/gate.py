@@ -43,24 +43,24 @@ def run(quick: bool) -> list[Table]:
     setup = load_set_up(scenario('paper'))
     good = Table(
         'Good campaigns and the gate with its default limits',
-        ('images', 'stars each', 'campaigns', 'refused', 'halves under 1 %', 'least chance'),
+        ('images', 'stars each', 'campaigns', 'refused', 'halves under 1 %', 'least p-value'),
         notes=['halves under 1 %: how many have halves that differ as one in a hundred should.'],
     )
     for images, stars in SIZES:
-        chances, refused = [], 0
+        p_values, refused = [], 0
         for k in range(10 if quick else GOOD):
             rng = np.random.default_rng([images, stars, k])
             tracker = TRACKER_ARCSEC[k % len(TRACKER_ARCSEC)]
             field = draw_star_field(rng, images, stars)
-            reasons, chance, _ = _judged(
+            reasons, p_value, _ = _judged(
                 setup, field, observe(field, tracker, OUTLIER_SHARE), tracker
             )
-            chances.append(chance)
+            p_values.append(p_value)
             if reasons:
                 print(f'refused: {images} x {stars}, {k}: {reasons}')
             refused += bool(reasons)
-        share = float(np.mean(np.array(chances) < 0.01))
-        good.add(images, stars, len(chances), refused, share, float(np.nanmin(chances)))
+        share = float(np.mean(np.array(p_values) < 0.01))
+        good.add(images, stars, len(p_values), refused, share, float(np.nanmin(p_values)))
     spoilt = Table(
         'Spoilt campaigns of 12 images of 80 stars and the gate with its default limits',
         ('what is wrong', 'campaigns', 'refused', 'let through: worst error px', 'by'),
@@ -95,8 +95,8 @@ def _judged(
     setup: Setup, field: StarField, ensemble: Ensemble, tracker_arcsec: float
 ) -> tuple[list[str], float, float]:
     """Names of the failed checks, p-value of the halves, and error of a campaign, px."""
-    told = (tracker_arcsec,) * 3
-    options = dataclasses.replace(setup.calibration, star_tracker_sigma_arcsec=told)
+    assumed_arcsec = (tracker_arcsec,) * 3
+    options = dataclasses.replace(setup.calibration, star_tracker_sigma_arcsec=assumed_arcsec)
     setup = dataclasses.replace(setup, prior=field.prior, calibration=options)
     try:
         found = solve.solve(ensemble, setup)
@@ -106,8 +106,8 @@ def _judged(
     focal_px = float(field.truth.camera.parameters[0])
     pointing_px = pointing_error_arcsec(found.geometry, field.truth) * np.pi / 648000 * focal_px
     error_px = max(pointing_px, map_error_px(found.geometry.camera, field.truth.camera))
-    chance = np.nan if found.halves is None else found.halves.chance
-    return names, chance, error_px
+    p_value = np.nan if found.halves is None else found.halves.chance
+    return names, p_value, error_px
 
 
 def _seen_by(field: StarField, truth: CameraGeometry, rows: slice) -> StarField:
@@ -126,8 +126,8 @@ def _seen_by(field: StarField, truth: CameraGeometry, rows: slice) -> StarField:
 
 def _turned(geometry: CameraGeometry, arcsec: float, rng: np.random.Generator) -> CameraGeometry:
     axis = rng.normal(size=3)
-    turn = Rotation.from_rotvec(arcsec * np.pi / 648000 * axis / np.linalg.norm(axis))
-    alignment = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * turn
+    rotation = Rotation.from_rotvec(arcsec * np.pi / 648000 * axis / np.linalg.norm(axis))
+    alignment = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * rotation
     return dataclasses.replace(geometry, star_tracker_from_camera_xyzw=alignment.as_quat())
 
 

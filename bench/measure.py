@@ -40,9 +40,9 @@ def run(quick: bool) -> list[Table]:
     _, track = observe.observe_next(image, attitudes, setup, observe.Track(setup.prior))
     track = dataclasses.replace(track, latest_ns=None)  # the same image once more
     prior = Rotation.from_quat(setup.prior.star_tracker_from_camera_xyzw)
-    turn = Rotation.from_rotvec(np.radians(ACQUISITION_DEG) * np.array([0.6, -0.8, 0.0]))
+    rotation = Rotation.from_rotvec(np.radians(ACQUISITION_DEG) * np.array([0.6, -0.8, 0.0]))
     shifted = dataclasses.replace(
-        setup.prior, star_tracker_from_camera_xyzw=(prior * turn).as_quat()
+        setup.prior, star_tracker_from_camera_xyzw=(prior * rotation).as_quat()
     )
     ways: dict[str, Callable[[], int]] = {
         'starcal, tracking': lambda: len(observe.observe_next(image, attitudes, setup, track)[0]),

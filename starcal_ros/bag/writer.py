@@ -17,7 +17,6 @@ from starcal_ros.errors import BagError
 from starcal_ros.messages.calibration import calibration_to_message
 from starcal_ros.messages.images import image_to_message
 from starcal_ros.messages.observations import observations_to_message
-from starcal_ros.messages.status import status_to_message
 from starcal_ros.messages.telemetry import (
     attitude_to_message,
     temperature_to_message,
@@ -28,11 +27,10 @@ from starcal_ros.messages.types import (
     CALIBRATION_TYPE,
     IMAGE_TYPE,
     OBSERVATIONS_TYPE,
-    STATUS_TYPE,
     TEMPERATURE_TYPE,
     VELOCITY_TYPE,
 )
-from starcal_ros.records import Calibration, EnsembleStatus, Image, StarObservations
+from starcal_ros.records import Calibration, Image, StarObservations
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -139,11 +137,6 @@ class BagWriter:
         """Write a starcal/StarObservations."""
         message = observations_to_message(record, frame_id, make_message)
         self._write(topic, OBSERVATIONS_TYPE, record.time_ns, message)
-
-    def write_status(self, topic: str, status: EnsembleStatus, frame_id: str) -> None:
-        """Write a starcal/EnsembleStatus."""
-        message = status_to_message(status, frame_id, make_message)
-        self._write(topic, STATUS_TYPE, status.time_ns, message)
 
     def write_calibration(self, topic: str, calibration: Calibration) -> None:
         """Write a starcal/Calibration."""
