@@ -33,6 +33,16 @@ class Prediction:
     xy_px: Floats
     px_per_rad: float
 
+    def select(self, stars: Mask) -> Prediction:
+        """Return the stars of a mask (n,)."""
+        return Prediction(
+            self.catalog_index[stars],
+            self.direction_icrf[stars],
+            self.direction_camera[stars],
+            self.xy_px[stars],
+            self.px_per_rad,
+        )
+
 
 def predict(
     geometry: CameraGeometry,
@@ -69,13 +79,8 @@ def predict(
     near[near] &= np.einsum(
         'ij,ij->i', line_of_sight(camera, xy_px[near]), direction_camera[near]
     ) > np.cos(1e-6)
-    return Prediction(
-        index[near],
-        direction_icrf[near],
-        direction_camera[near],
-        xy_px[near],
-        float(camera.parameters[0]),
-    )
+    px_per_rad = float(camera.parameters[0])
+    return Prediction(index, direction_icrf, direction_camera, xy_px, px_per_rad).select(near)
 
 
 def visible(
@@ -103,11 +108,4 @@ def in_image(xy_px: Floats, width: int, height: int, margin_px: float = 0.0) -> 
 
 def within_image(prediction: Prediction, width: int, height: int) -> Prediction:
     """Predicted stars inside the image."""
-    inside = in_image(prediction.xy_px, width, height)
-    return Prediction(
-        prediction.catalog_index[inside],
-        prediction.direction_icrf[inside],
-        prediction.direction_camera[inside],
-        prediction.xy_px[inside],
-        prediction.px_per_rad,
-    )
+    return prediction.select(in_image(prediction.xy_px, width, height))
