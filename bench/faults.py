@@ -627,7 +627,9 @@ def _many_callers(campaign: Campaign, times: int) -> Iterator[tuple[Any, ...]]:
 
         with campaign.running('calibrator', node='double'):
             warned = client.holds(
-                lambda: any('another publisher' in one.status[0].message for one in health[-4:])
+                lambda: any(
+                    'another node publishes' in one.status[0].message for one in health[-4:]
+                )
             )
         answer = client.call(Trigger, 'calibrator/calibrate')
         died = int(process.poll() is not None)
