@@ -237,7 +237,7 @@ def test_a_shared_column_that_the_blocks_explain_is_not_observable() -> None:
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
 def test_a_start_without_a_cost_is_refused(bad: float) -> None:
     normal = dataclasses.replace(plain(np.eye(2), np.ones(2)), cost=bad)
-    with pytest.raises(NotObservable, match='the cost is not finite'):
+    with pytest.raises(NotObservable, match='the cost at the start is not finite'):
         levenberg_marquardt(np.zeros(2), lambda _: normal, add)
 
 
