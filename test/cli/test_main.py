@@ -225,7 +225,7 @@ def test_bad_parameters(
         ('a: [', ['not YAML']),
         ('/**:\n  camera_info_url: a.yaml\n', ['ros__parameters']),
         ('star_observer:\n  ros__parameters: 3\n', ['star_observer', 'ros__parameters']),
-        ('other_node:\n  ros__parameters: {a: 1}\n', ['no section /**', 'other_node']),
+        ('other_node:\n  ros__parameters: {a: 1}\n', ['no section for /**', 'other_node']),
         ('/**:\n  ros__parameters: {camera_name: a}\n', ['camera_name', 'bad.yaml']),
         ('/**:\n  ros__parameters: {min_images: 3}\n', ['camera_info_url', 'bad.yaml']),
     ],
