@@ -1,4 +1,4 @@
-"""Measurements of time, memory, accuracy and wrong matches, some against other people's code."""
+"""Benches of time, memory, accuracy and identification, some against other packages."""
 
 NAMES = ('solver', 'ensemble', 'measure', 'calibrate', 'observer', 'gate')
 """The benches, each a module with ``run(quick)`` that prints its tables and returns them."""

@@ -1,4 +1,4 @@
-"""``python -m bench [NAME...]``: run the benches, or those named, and print their tables."""
+"""``python -m bench [NAME...]``: run benches and print their tables."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from bench import LONG, NAMES
 
 
 def main() -> None:
-    """Run what was asked for."""
+    """Run the requested benches."""
     parser = argparse.ArgumentParser(prog='python -m bench', description='Measure starcal.')
     parser.add_argument('names', nargs='*', metavar='NAME', help=', '.join(NAMES + LONG))
     parser.add_argument('--quick', action='store_true', help='small sizes, a few seconds each')
-    parser.add_argument('--json', type=Path, metavar='FILE', help='write the tables there too')
+    parser.add_argument(
+        '--json', type=Path, metavar='FILE', help='also write the tables to this file'
+    )
     args = parser.parse_args()
     for name in args.names:
         if name not in NAMES + LONG:
             parser.error(f'{name!r} is not one of {", ".join(NAMES + LONG)}')
     load = os.getloadavg()[0]
     print(
-        f'{platform.machine()}, {os.cpu_count()} cores, load {load:.1f}: a time on a busy machine'
+        f'{platform.machine()}, {os.cpu_count()} cores, load {load:.1f}: times on a busy machine'
     )
-    print('is too long; ratios are of runs that took turns.\n')
+    print('are too long; ratios are of alternating runs.\n')
     found = {}
     for name in args.names or NAMES:
         start_s = time.perf_counter()

@@ -1,10 +1,10 @@
 """
 From pixels to a calibration, against the Cramer-Rao bound: cameras, PSF widths, star trackers.
 
-Every seed renders a campaign of its own, measures it through `observe.observe_next`, solves it,
-and compares the lines of sight over the detector with the truth, the best common turn removed.
-The bound is that of every star above a signal-to-noise ratio of 5, the attitude of each image
-free.  One draw scatters by about 30 %: the figure is the rms over the seeds.
+Every seed renders a campaign, measures it with `observe.observe_next`, solves it, and compares the
+lines of sight over the detector with the truth after removal of the best common rotation.  The
+bound uses every star above a signal-to-noise ratio of 5 with the attitude of each image free.  One
+draw scatters by about 30 %; the figure is the rms over the seeds.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import multiprocessing
 import os
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.frames import history, load_set_up, render_frame
 from bench.table import Table
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import observe, solve
@@ -34,8 +34,6 @@ from starcal_ros.simulation import centroids as simulated_centroids
 from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.simulation.scenario import Scenario
 from starcal_ros.studies.trials import map_bound_px
-
-Floats = NDArray[np.float64]
 
 SIZE = (1296, 1024)
 IMAGES = 8
@@ -76,10 +74,10 @@ def run(quick: bool) -> list[Table]:
             *('its sigma / bound', 'star / bound', 'star / sigma', 'stars', 'not solved'),
         ),
         notes=[
-            'map: rms over the detector after the best common turn; its sigma: the same by the',
-            'covariance of the calibration.  star: rms error per axis over the bound of each star',
-            'and over its own sigma, signal-to-noise above 10.',
-            'not solved: campaigns without a calibration; no other column knows of them.',
+            'map: rms over the detector after the best common rotation; its sigma: the same from',
+            'the covariance of the calibration.  star: rms error per axis over the bound of each',
+            'star and over its own sigma, signal-to-noise above 10.',
+            'not solved: campaigns without a calibration, not included in the other columns.',
         ],
     )
     with ProcessPoolExecutor(_cores(), multiprocessing.get_context('spawn')) as pool:
@@ -120,7 +118,7 @@ def _summary(case: Case, rows: Iterable[Floats]) -> tuple[float | str, ...]:
 
 
 def scenario_of(case: Case, seed: int) -> Scenario:
-    """A campaign of a case: the camera of `scenario.scenario` with another lens."""
+    """Campaign of a case: the camera of `scenario.scenario` with another lens."""
     base = synthetic.scenario('small', seed)
     assert (base.truth.camera.width, base.truth.camera.height) == SIZE
     focal_px = SIZE[0] / 2 / math.tan(math.radians(case.field_deg / 2))
@@ -155,9 +153,9 @@ def scenario_of(case: Case, seed: int) -> Scenario:
 
 def trial(case: Case, seed: int) -> Floats:
     """
-    Map error and its sigma by the bound; squares of star errors by bound and sigma; stars: (5,).
+    Map error and its sigma over the bound, squared star errors over bound and sigma, count: (5,).
 
-    NaN where the campaign gives no calibration.
+    NaN if the campaign gives no calibration.
     """
     scenario = scenario_of(case, seed)
     setup = load_set_up(scenario)
@@ -187,7 +185,7 @@ def trial(case: Case, seed: int) -> Floats:
 
 
 def _star_errors(scenario: Scenario, index: int, observed: StarObservations) -> Floats:
-    """Squared errors (2, n) per axis by bound and by reported sigma, of stars that tell."""
+    """Squared errors (2, n) per axis by bound and by reported sigma, of the brighter stars."""
     shown = synthetic.scene(scenario, index)
     order = np.argsort(shown.catalog_id)
     row = order[np.searchsorted(shown.catalog_id[order], observed.catalog_id)]

@@ -1,10 +1,10 @@
 """
-Acquisition: how often a field is matched that should not be, and one that should is found.
+Acquisition: rates of false matches and of fields found.
 
 Every trial is a rendered image of 640 x 512, pixels to stars: `star_finder.observe_stars`, from
 the search beside the predictions to the whole one of 1.5 degrees and 5 degrees of roll, and in one
-row `tracking.follow`.  Seeds are fixed; a match is wrong where more than one star in ten stands
-where another was drawn.
+row `tracking.track_stars`.  Seeds are fixed; a match is wrong if more than one star in ten is
+identified as another one.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import beta
 
 from bench.table import Table
+from starcal_ros.arrays import Floats
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import (
+    Exposure,
     IdentificationOptions,
     observe_stars,
-    Shot,
-    tracked,
+    realigned,
 )
-from starcal_ros.identification.tracking import follow, Followed, following
+from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.simulation import images as simulated_images
@@ -36,20 +36,18 @@ from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
-Floats = NDArray[np.float64]
-
 SEED = 20161
 IMAGES = 45  # rendered for each kind of field
 ATTITUDES = 100  # tried on each of them
 TRUE_FIELDS = 100  # for each row of what is to be found
 QUICK = 12  # of a hundred
-MATCH_PX = 2.0  # a star farther from where it was drawn is another one
-RIGHT = 0.9  # share of its stars that a match has right
+MATCH_PX = 2.0  # a star farther from its true pixel is another one
+RIGHT = 0.9  # share of right stars in a right match
 
 
 @dataclass(frozen=True)
 class Found:
-    """What became of one trial."""
+    """Result of one trial."""
 
     accepted: bool
     wrong: bool
@@ -57,7 +55,7 @@ class Found:
 
 
 def run(quick: bool) -> list[Table]:
-    """Scrambled fields, then fields to be found; ten minutes, or one."""
+    """Run scrambled fields, then true fields; takes ten minutes, or one."""
     share = QUICK / 100 if quick else 1.0
     images, attitudes = max(3, round(IMAGES * share)), max(4, round(ATTITUDES * share))
     refused = scrambled(images, attitudes)
@@ -68,7 +66,7 @@ def run(quick: bool) -> list[Table]:
 
 
 def scrambled(images: int, attitudes: int) -> Table:
-    """How many fields are accepted that no attitude within the search explains."""
+    """Number of accepted fields among those that no attitude in the search range explains."""
     table = Table(
         'Fields that must be refused',
         ('field', 'tried', 'wrongly accepted', '95 % limit', 'ms each'),
@@ -83,9 +81,9 @@ def scrambled(images: int, attitudes: int) -> Table:
         scenario = random_fields(rng, images)
         found = []
         for image, scene, tried in draw(scenario, rng, attitudes):
-            known: CameraGeometry | Followed = scenario.prior
+            known: CameraGeometry | TrackedCamera = scenario.prior
             if name in FOLLOWED:
-                known = followed_from(image, scene, scenario.prior, catalog)
+                known = tracked_from(image, scene, scenario.prior, catalog)
             found += [trial(image, scene, attitude, known, catalog) for attitude in tried]
         wrong = sum(one.wrong for one in found)
         total += [len(found), wrong]
@@ -96,7 +94,7 @@ def scrambled(images: int, attitudes: int) -> Table:
 
 
 def to_be_found(fields: int) -> Table:
-    """How many fields are found from a random error within the search."""
+    """Number of fields found from a random error within the search range."""
     table = Table(
         'Fields to be found, off by up to 1.5 degrees and 5 degrees of roll',
         ('field', 'tried', 'found', 'refused', 'wrong', 'median ms', 'worst ms'),
@@ -128,18 +126,18 @@ def trial(
     image: Image,
     drawn: Scene,
     icrf_from_star_tracker_xyzw: Floats,
-    known: CameraGeometry | Followed,
+    known: CameraGeometry | TrackedCamera,
     catalog: StarCatalog,
 ) -> Found:
-    """One image searched, or followed from another, its stars held against those drawn."""
-    shot = Shot(image, icrf_from_star_tracker_xyzw, 0.0)
+    """Search or track one image, and compare its stars with the true ones."""
+    exposure = Exposure(image, icrf_from_star_tracker_xyzw, 0.0)
     centroid, options = CentroidOptions(), IdentificationOptions()
     start_s = time.process_time()
     try:
-        if isinstance(known, Followed):
-            stars, _ = follow(shot, known, catalog, centroid, options)
+        if isinstance(known, TrackedCamera):
+            stars, _ = track_stars(exposure, known, catalog, centroid, options)
         else:
-            stars, _ = observe_stars(shot, known, catalog, centroid, options)
+            stars, _ = observe_stars(exposure, known, catalog, centroid, options)
     except ImageRefused:
         return Found(accepted=False, wrong=False, seconds=time.process_time() - start_s)
     seconds = time.process_time() - start_s
@@ -152,19 +150,19 @@ def trial(
     return Found(accepted=True, wrong=bool(right.mean() < RIGHT), seconds=seconds)
 
 
-def followed_from(
+def tracked_from(
     image: Image, drawn: Scene, prior: CameraGeometry, catalog: StarCatalog
-) -> Followed | CameraGeometry:
-    """What an image whose attitude is right shows, with which others are to be followed."""
-    shot = Shot(image, drawn.icrf_from_star_tracker_xyzw, 0.0)
+) -> TrackedCamera | CameraGeometry:
+    """Track from an image with the right attitude, to measure other images with."""
+    exposure = Exposure(image, drawn.icrf_from_star_tracker_xyzw, 0.0)
     stars, instrument = observe_stars(
-        shot, prior, catalog, CentroidOptions(), IdentificationOptions()
+        exposure, prior, catalog, CentroidOptions(), IdentificationOptions()
     )
-    return following(tracked(prior, stars), stars, instrument) or prior
+    return start_tracking(realigned(prior, stars), stars, instrument) or prior
 
 
 def random_fields(rng: np.random.Generator, count: int) -> Scenario:
-    """A camera of 20 x 16 degrees that looks anywhere in the sky."""
+    """Camera of 20 x 16 degrees with random pointings."""
     attitudes = Rotation.random(count, random_state=rng)
     z = attitudes.apply([0.0, 0.0, 1.0])
     fields = np.stack(
@@ -182,14 +180,14 @@ def random_fields(rng: np.random.Generator, count: int) -> Scenario:
     )
 
 
-def turned(geometry: CameraGeometry, turn: Rotation) -> CameraGeometry:
-    """A geometry whose camera is turned about its own axes."""
-    rotation = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * turn
-    return CameraGeometry(geometry.camera, rotation.as_quat())
+def turned(geometry: CameraGeometry, rotation: Rotation) -> CameraGeometry:
+    """Geometry with the camera rotated about its own axes."""
+    alignment = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * rotation
+    return CameraGeometry(geometry.camera, alignment.as_quat())
 
 
 def error_within_the_search(rng: np.random.Generator) -> Rotation:
-    """A turn of the camera by up to 1.5 degrees, evenly over the disc, and a roll of up to 5."""
+    """Rotation of the camera by up to 1.5 degrees, uniform over the disc, and a roll up to 5."""
     tilt_rad, roll_rad = np.radians([1.48 * np.sqrt(rng.uniform()), rng.uniform(-4.9, 4.9)])
     about = rng.uniform(0, 2 * np.pi)
     tilt = Rotation.from_rotvec(tilt_rad * np.array([np.cos(about), np.sin(about), 0.0]))
@@ -197,7 +195,7 @@ def error_within_the_search(rng: np.random.Generator) -> Rotation:
 
 
 def changed(drawn: Scene, rng: np.random.Generator, missing: float, strange: int) -> Scene:
-    """The scene without a share of its stars, and with bright ones that no catalog has."""
+    """Scene without a share of its stars and with bright objects that are not in the catalog."""
     seen = rng.uniform(size=len(drawn.pixel_px)) >= missing
     electrons = 10 ** rng.uniform(4.0, 6.5, strange)
     return dataclasses.replace(
@@ -208,7 +206,7 @@ def changed(drawn: Scene, rng: np.random.Generator, missing: float, strange: int
 
 
 def scattered(rng: np.random.Generator, count: int) -> Floats:
-    """Places (count, 2) anywhere in the image."""
+    """Uniform random pixels (count, 2) in the image."""
     return rng.uniform([0, 0], [639, 511], (count, 2))
 
 
@@ -226,7 +224,7 @@ def _anywhere(rng: np.random.Generator, count: int) -> list[Floats]:
 def random_attitudes(
     scenario: Scenario, rng: np.random.Generator, count: int
 ) -> Iterator[tuple[Image, Scene, list[Floats]]]:
-    """True stars, and an attitude from anywhere."""
+    """True stars and a random attitude."""
     for index in range(scenario.image_count):
         drawn = synthetic.scene(scenario, index)
         yield simulated_images.render(scenario, drawn, index), drawn, _anywhere(rng, count)
@@ -235,7 +233,7 @@ def random_attitudes(
 def beyond_the_search(
     scenario: Scenario, rng: np.random.Generator, count: int
 ) -> Iterator[tuple[Image, Scene, list[Floats]]]:
-    """True stars, and an attitude 2 to 8 degrees off: most of the stars are shared, but moved."""
+    """True stars and an attitude 2 to 8 degrees off: most stars are shared, but displaced."""
     for index in range(scenario.image_count):
         drawn = synthetic.scene(scenario, index)
         right = Rotation.from_quat(drawn.icrf_from_star_tracker_xyzw)
@@ -253,7 +251,7 @@ def beyond_the_search(
 def random_sources(
     scenario: Scenario, rng: np.random.Generator, count: int
 ) -> Iterator[tuple[Image, Scene, list[Floats]]]:
-    """The brightnesses of true stars, each anywhere in the image."""
+    """True brightnesses at random pixels."""
     for index in range(scenario.image_count):
         drawn = synthetic.scene(scenario, index)
         image = simulated_images.render(
@@ -268,7 +266,7 @@ def random_sources(
 def dense_fields(
     scenario: Scenario, rng: np.random.Generator, count: int
 ) -> Iterator[tuple[Image, Scene, list[Floats]]]:
-    """A star in every hundred pixels, hot pixels and cosmic rays besides."""
+    """One star per hundred pixels, with hot pixels and cosmic rays."""
     detector = dataclasses.replace(scenario.detector, hot_fraction=2e-3, cosmic_rays=30.0)
     scenario = dataclasses.replace(scenario, detector=detector)
     for index in range(scenario.image_count):
@@ -285,7 +283,7 @@ def dense_fields(
 def shifted_copies(
     scenario: Scenario, rng: np.random.Generator, count: int
 ) -> Iterator[tuple[Image, Scene, list[Floats]]]:
-    """Each star four times, as a shaken camera or a reflection shows it; attitudes anywhere."""
+    """Each star four times, as with a shaken camera or a reflection; random attitudes."""
     for index in range(scenario.image_count):
         drawn = synthetic.scene(scenario, index)
         shifts = np.concatenate([np.zeros((1, 2)), rng.uniform(-40, 40, (3, 2))])
@@ -297,17 +295,17 @@ def shifted_copies(
         yield simulated_images.render(scenario, doubled, index), drawn, _anywhere(rng, count)
 
 
-FOLLOWED = ('followed, attitude from anywhere', 'followed, attitude 2 to 8 degrees off')
+FOLLOWED = ('tracked, random attitude', 'tracked, attitude 2 to 8 degrees off')
 SCRAMBLES: dict[str, Draw] = {
-    'true stars, attitude from anywhere': random_attitudes,
+    'true stars, random attitude': random_attitudes,
     'true stars, attitude 2 to 8 degrees off': beyond_the_search,
-    'stars at random places': random_sources,
-    'a star in every hundred pixels': dense_fields,
+    'stars at random pixels': random_sources,
+    'one star per hundred pixels': dense_fields,
     'each star four times': shifted_copies,
     FOLLOWED[0]: random_attitudes,
     FOLLOWED[1]: beyond_the_search,
 }
-"""Name of a kind of field -> its images, what is true of them, and the attitudes to try."""
+"""Kinds of fields by name: images, truth, and attitudes to try."""
 
 QUIET: dict[str, Any] = {'hot_fraction': 0.0, 'cosmic_rays': 0.0}
 DIFFICULTIES: dict[str, tuple[dict[str, Any], float, int]] = {
@@ -327,4 +325,4 @@ DIFFICULTIES: dict[str, tuple[dict[str, Any], float, int]] = {
         5,
     ),
 }
-"""Name -> changes of the detector, share of stars missing, bright strangers."""
+"""Changes by name: detector options, share of stars missing, bright objects added."""

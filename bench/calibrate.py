@@ -1,4 +1,4 @@
-"""`starcal calibrate` as a whole process, from bag to products."""
+"""`starcal calibrate` as a process, from bag to products."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from starcal_ros.simulation import bag as simulated_bag
 from starcal_ros.simulation import scenario as synthetic
 
 TARGET_S = 6.0
-# What a call takes with all that it calls; the stages indented below one are parts of it.
+# Cumulative times; indented stages are parts of the one above.
 _STAGES = (
     ('import of Python modules', 'importlib._bootstrap', '_find_and_load'),
     ('load options, camera, catalog', 'camera_setup', 'load_setup'),
@@ -26,7 +26,7 @@ _STAGES = (
     ('  prediction', 'prediction', 'predict'),
     ('  match', 'identification', '_find'),
     ('  PSF and pixel noise', 'centroiding', 'model_image'),
-    ('  images after the first', 'tracking', 'follow'),
+    ('  images after the first', 'tracking', 'track_stars'),
     ('  centroids', 'centroiding', 'measure_stars'),
     ('estimate', 'calibration', 'estimate_calibration'),
     ('digest of the bag', 'cli', '_digest'),
@@ -55,7 +55,7 @@ def run(quick: bool) -> list[Table]:
 def time_command(
     name: str, images: int, command: list[str], repeats: int, target_s: float = TARGET_S
 ) -> Table:
-    """Wall time, processor time and memory of a calibration as a process of its own."""
+    """Wall time, processor time and memory of a calibration as a separate process."""
     runs = [_run(command) for _ in range(repeats)]
     wall_s, user_s, system_s, peak_mb = zip(*runs, strict=True)
     met = 'met' if min(wall_s) < target_s else 'MISSED'
@@ -72,14 +72,14 @@ def time_command(
 
 def _run(arguments: list[str]) -> tuple[float, float, float, float]:
     """Wall, user and system seconds and peak resident MB of Python with some arguments."""
-    # As from a shell: the start-up file of the ROS wheels starts Python anew.
+    # As from a shell: the start-up file of the ROS wheels restarts Python.
     kept = {k: v for k, v in os.environ.items() if k != '_ROS_WHEELS_BOOTSTRAP_COMPLETE'}
     start_s = time.perf_counter()
     process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL, env=kept)
     status = Path(f'/proc/{process.pid}/status')
     peak_kb = 0
     while True:
-        # The ru_maxrss of a child holds what its parent had when it was started: ask the kernel.
+        # The ru_maxrss of a child includes the memory of its parent at the start: ask the kernel.
         for line in status.read_text().splitlines():
             if line.startswith('VmHWM'):
                 peak_kb = max(peak_kb, int(line.split()[1]))
@@ -95,11 +95,11 @@ def _run(arguments: list[str]) -> tuple[float, float, float, float]:
 
 
 def _stages(profile: Path) -> Table:
-    """Share of each stage in a profiled run, which is slower than one without."""
+    """Share of each stage in a profiled run."""
     stats = pstats.Stats(str(profile))
     found = stats.stats  # type: ignore[attr-defined]
     total_s = stats.total_tt  # type: ignore[attr-defined]
-    table = Table('Where its time goes, under cProfile', ('stage', 'calls', 's', 'share %'))
+    table = Table('Share of the time by stage, from cProfile', ('stage', 'calls', 's', 'share %'))
     for stage, module, function in _STAGES:
         for (file, _, name), (_, calls, _, cumulative_s, _) in found.items():
             stem = file.removeprefix('<frozen ').removesuffix('>').removesuffix('.py')

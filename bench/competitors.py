@@ -1,7 +1,7 @@
 """
-One least-squares problem of stars as several solvers take it: ours, Ceres, SciPy, OpenCV.
+One least-squares problem of stars for several solvers: starcal, Ceres, SciPy, OpenCV.
 
-Method 1 (`per_image`): eight camera parameters (the principal point is held) and the rotation of
+Method 1 (`per_image`): eight camera parameters (fixed principal point) and the rotation of
 every image.  The others get the analytic derivatives of `camera.project_jacobians`: SciPy for all
 stars at once, Ceres, which calls Python for every image, image by image.
 """
@@ -14,11 +14,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import PARAMETER_NAMES, project_jacobians, project_parameters
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import CalibrationOptions, estimate_calibration
@@ -28,8 +28,6 @@ from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario
 
-Floats = NDArray[np.float64]
-
 FREE = np.array([k for k, name in enumerate(PARAMETER_NAMES) if name not in ('cx', 'cy')])
 SIGMA_PX = 0.1
 TOLERANCE = 1e-12
@@ -38,7 +36,7 @@ _MAGNITUDE_LIMIT = 6.65  # leaves about 80 stars in an image
 
 @dataclass(frozen=True)
 class Case:
-    """One set of data and where every solver starts; n stars in m images."""
+    """Data and the common start of the solvers; n stars in m images."""
 
     ensemble: Ensemble
     prior: CameraGeometry
@@ -55,7 +53,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Answer:
-    """Where a solver ended: parameters (10,), rotations (m, 3, 3), and its count of iterations."""
+    """Result of a solver: parameters (10,), rotations (m, 3, 3), and number of iterations."""
 
     parameters: Floats
     camera_from_icrf: Floats
@@ -63,7 +61,7 @@ class Answer:
 
 
 def make_ensemble(images: int) -> tuple[Ensemble, CameraGeometry]:
-    """Observations of a campaign over one night's turn of the sky, and the prior to start from."""
+    """Observations of a campaign over one night, and the prior to start from."""
     base = scenario('paper')
     campaign = dataclasses.replace(
         base,
@@ -76,7 +74,7 @@ def make_ensemble(images: int) -> tuple[Ensemble, CameraGeometry]:
 
 
 def make_case(ensemble: Ensemble, prior: CameraGeometry) -> Case:
-    """The ensemble as the solvers take it."""
+    """Data of an ensemble for the solvers."""
     m = len(ensemble.images)
     star_tracker_from_icrf = Rotation.from_quat(
         np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
@@ -106,14 +104,14 @@ def solve_starcal(case: Case) -> Answer:
 
 
 def estimate_starcal(case: Case) -> Answer:
-    """The whole estimate: robust search, snooping, variances, covariance."""
+    """Complete estimate: robust search, outlier tests, variance components, covariance."""
     options = CalibrationOptions(method='per_image', star_tracker_sigma_arcsec=(20.0,) * 3)
     found = estimate_calibration(case.ensemble, case.prior, options)
     rotations = found.state.camera_from_icrf.as_matrix()
     return Answer(found.state.parameters, rotations, found.iterations)
 
 
-def _turn_jacobian(theta: Floats) -> tuple[Floats, Floats]:
+def _rotation_jacobian(theta: Floats) -> tuple[Floats, Floats]:
     """
     Rotations (..., 3, 3) by passive angles (..., 3), and the small rotation (..., 3, 3) by them.
 
@@ -126,11 +124,11 @@ def _turn_jacobian(theta: Floats) -> tuple[Floats, Floats]:
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
     K = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     K2 = K @ K
-    # 1 - cos as a square: no digits are lost at the small angles of these data.
+    # 1 - cos as a square, to keep precision at small angles.
     versine = 2.0 * np.sin(0.5 * angle) ** 2 / angle2
-    turn = np.eye(3) + np.sin(angle) / angle * K + versine * K2
+    rotation = np.eye(3) + np.sin(angle) / angle * K + versine * K2
     cubic = np.where(angle2 < 1e-8, 1.0 / 6.0, (angle - np.sin(angle)) / (angle * angle2))
-    return turn, np.eye(3) + versine * K + cubic * K2
+    return rotation, np.eye(3) + versine * K + cubic * K2
 
 
 def solve_scipy(case: Case) -> Answer:
@@ -151,14 +149,14 @@ def solve_scipy(case: Case) -> Answer:
         return parameters
 
     def residuals(x: Floats) -> Floats:
-        turn, _ = _turn_jacobian(x[f:].reshape(m, 3))
-        directions = np.einsum('nij,nj->ni', turn[table.image], base)
+        rotation, _ = _rotation_jacobian(x[f:].reshape(m, 3))
+        directions = np.einsum('nij,nj->ni', rotation[table.image], base)
         predicted = project_parameters('plumb_bob', parameters_of(x), directions)
         return np.asarray((predicted - table.measured_px).ravel() / SIGMA_PX)
 
     def jacobian(x: Floats) -> csr_matrix:
-        turn, L = _turn_jacobian(x[f:].reshape(m, 3))
-        directions = np.einsum('nij,nj->ni', turn[table.image], base)
+        rotation, L = _rotation_jacobian(x[f:].reshape(m, 3))
+        directions = np.einsum('nij,nj->ni', rotation[table.image], base)
         camera = dataclasses.replace(case.prior.camera, parameters=parameters_of(x))
         _, J_parameters, J_rotation = project_jacobians(camera, directions)
         J = np.concatenate([J_parameters[..., FREE], J_rotation @ L[table.image]], axis=-1)
@@ -174,15 +172,18 @@ def solve_scipy(case: Case) -> Answer:
         ftol=TOLERANCE,
         xtol=TOLERANCE,
         gtol=TOLERANCE,
-        tr_options={'atol': 1e-9, 'btol': 1e-9},  # its steps are inexact else: 6 in place of 4
+        tr_options={
+            'atol': 1e-9,
+            'btol': 1e-9,
+        },  # otherwise its steps are inexact: 6 iterations instead of 4
     )
-    turn, _ = _turn_jacobian(found.x[f:].reshape(m, 3))
-    rotations = turn @ case.start.camera_from_icrf.as_matrix()
+    rotation, _ = _rotation_jacobian(found.x[f:].reshape(m, 3))
+    rotations = rotation @ case.start.camera_from_icrf.as_matrix()
     return Answer(parameters_of(found.x), rotations, found.njev)
 
 
 def solve_ceres(case: Case) -> Answer:
-    """Ceres with one analytic residual block of an image, eliminating the images' rotations."""
+    """Ceres with one analytic residual block per image, eliminating the rotations."""
     import pyceres
 
     table, prior = case.table, case.prior.camera
@@ -190,7 +191,7 @@ def solve_ceres(case: Case) -> Answer:
     rotations = case.start.camera_from_icrf.as_matrix()
 
     class Stars(pyceres.CostFunction):  # type: ignore[misc]
-        """The stars of one image."""
+        """Residual block of the stars of one image."""
 
         def __init__(self, stars: slice, rotation: Floats) -> None:
             super().__init__()
@@ -200,11 +201,11 @@ def solve_ceres(case: Case) -> Answer:
             self.set_parameter_block_sizes([len(FREE), 3])
 
         def Evaluate(self, blocks: Any, residuals: Floats, jacobians: Any) -> bool:
-            """Write residuals in sigma, and derivatives where they are asked for."""
+            """Write residuals in sigma, and derivatives if requested."""
             parameters = held.copy()
             parameters[FREE] = blocks[0]
-            turn, L = _turn_jacobian(blocks[1])
-            directions = self.base @ turn.T
+            rotation, L = _rotation_jacobian(blocks[1])
+            directions = self.base @ rotation.T
             if jacobians is None:
                 predicted_px = project_parameters('plumb_bob', parameters, directions)
             else:
@@ -231,19 +232,19 @@ def solve_ceres(case: Case) -> Answer:
     options.function_tolerance = options.parameter_tolerance = TOLERANCE
     options.gradient_tolerance = TOLERANCE
     options.logging_type = pyceres.LoggingType.SILENT
-    options.num_threads = 1  # the callbacks are Python: more threads wait for each other
+    options.num_threads = 1  # the callbacks are Python: more threads would wait for each other
     summary = pyceres.SolverSummary()
     pyceres.solve(options, problem, summary)
     parameters = held.copy()
     parameters[FREE] = shared
-    turn, _ = _turn_jacobian(angles)
+    rotation, _ = _rotation_jacobian(angles)
     iterations = summary.num_successful_steps + summary.num_unsuccessful_steps
-    return Answer(parameters, turn @ rotations, iterations)
+    return Answer(parameters, rotation @ rotations, iterations)
 
 
 def solve_opencv(case: Case) -> Answer:
     """
-    OpenCV's calibration of a camera from points in space.
+    OpenCV calibration of a camera from points in space.
 
     A star stands at two depths, as its calibration places the camera as well as turns it: at one
     depth a shift would be as good as a rotation.  Its points are of single precision.
@@ -256,7 +257,7 @@ def solve_opencv(case: Case) -> Answer:
         points.append(np.concatenate([near, 2.0 * near]).astype(np.float32))
         pixels.append(np.concatenate([table.measured_px[stars]] * 2).astype(np.float32))
     k1, k2, k3, p1, p2 = prior.distortion
-    # Its normal matrix is dense; singular values of it, the default, would take twice as long.
+    # Its normal matrix is dense; the default, singular values, takes twice as long.
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_USE_LU
     _, K, D, turns, _, _, _, _ = cv2.calibrateCameraExtended(
         points,
@@ -275,5 +276,5 @@ def solve_opencv(case: Case) -> Answer:
     )
     k1, k2, p1, p2, k3 = D.ravel()[:5]
     parameters = np.array([K[0, 0], 0.0, K[1, 1], K[0, 2], K[1, 2], k1, k2, k3, p1, p2])
-    turn = Rotation.from_rotvec(np.array(turns).reshape(-1, 3)).as_matrix()
-    return Answer(parameters, turn @ start, 0)
+    rotation = Rotation.from_rotvec(np.array(turns).reshape(-1, 3)).as_matrix()
+    return Answer(parameters, rotation @ start, 0)

@@ -1,8 +1,8 @@
 """
-What it costs to keep 60 of 359 images: of their information, not of their number.
+Information lost by keeping 60 of 359 images.
 
-Sixty images cannot know what 359 know. The best that any sixty of them could do is bounded from
-below by the convex relaxation of the choice (weights of 0 to 1 that sum to sixty).
+Sixty images have less information than 359.  The convex relaxation of the choice (weights of 0 to
+1 with sum sixty) is a lower bound for the variance from any sixty of them.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.competitors import make_ensemble
 from bench.table import Table
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import (
     image_information,
     keep_most_informative,
@@ -24,15 +24,13 @@ from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario
 
-Floats = NDArray[np.float64]
-
 TARGET = 1.05
 RANDOM_CHOICES = 200
 _STEPS = 400  # of Frank-Wolfe: a gap of some 0.1 %
 
 
 def stream(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Ensemble:
-    """The images that are left when they come one by one, as the calibrator has them."""
+    """Images kept from a stream, as in the calibrator."""
     kept = Ensemble()
     for image in ensemble.images:
         kept = keep_most_informative(kept.add(image), prior, options)
@@ -41,10 +39,10 @@ def stream(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOption
 
 def least_mean_variance(information: Floats, count: int, unit: Floats) -> float:
     """
-    No ``count`` of the images (m, k, k) have a lower mean variance, in squares of ``unit`` (k,).
+    Lower bound of the mean variance from ``count`` of the images (m, k, k), in ``unit`` (k,)^2.
 
-    A-optimal design, relaxed to weights: convex, so its tangent at any weights is a lower bound.
-    Frank-Wolfe: a tangent is least at some ``count`` whole images.
+    A-optimal design, relaxed to weights: convex, so a tangent at any weights is a lower bound.
+    Frank-Wolfe: the minimum of a tangent is a choice of ``count`` whole images.
     """
     scaled = information * unit[:, None] * unit[None, :]
     weight = np.full(len(scaled), count / len(scaled))
@@ -68,7 +66,7 @@ def measure(
     options: CalibrationOptions,
     random_choices: int = RANDOM_CHOICES,
 ) -> Table:
-    """Rms and worst sigma of choices of ``max_images``, by those of all and by the best choice."""
+    """Rms and worst sigma of choices of ``max_images``, relative to all and to the best choice."""
     m, count = len(ensemble.images), options.max_images
     everything = predicted_sigma(ensemble, prior, options)
     information = image_information(ensemble.images, prior, options)
@@ -131,7 +129,7 @@ def measure(
 
 
 def run(quick: bool) -> list[Table]:
-    """Images of the whole sky with like stars, and of the paper's drifting night."""
+    """Run images of the whole sky, and of one hour of the night of the paper."""
     m, count = (30, 8) if quick else (359, 60)
     options = CalibrationOptions(star_tracker_sigma_arcsec=(20.0, 20.0, 20.0), max_images=count)
     whole_sky, prior = make_ensemble(m)

@@ -1,14 +1,13 @@
 """
-Faults on the real graph: hostile messages, kills, full disks, doubles, callers that go, bad bags.
+Faults on real nodes: malformed messages, kills, full disks, duplicate nodes, damaged bags.
 
-Each row says how often a fault was made and what it did: what was lost, what was wrong, which node
+Each row gives the number of faults and their effects: lost messages, wrong results, nodes that
 died.  All three must be 0.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-import functools
 import importlib.util
 from pathlib import Path
 import random
@@ -22,7 +21,7 @@ import cv2
 import numpy as np
 
 from bench import graph
-from bench.frames import history, render_frame, write_set_up
+from bench.campaign import Campaign
 from bench.table import Table
 from starcal_ros.bag import reader
 from starcal_ros.calibrator.archive import Archive
@@ -30,18 +29,13 @@ from starcal_ros.errors import BagError
 from starcal_ros.messages.calibration import calibration_to_message
 from starcal_ros.messages.fields import make_header
 from starcal_ros.messages.images import image_to_message
-from starcal_ros.messages.observations import observations_to_message
 from starcal_ros.messages.telemetry import attitude_to_message
-from starcal_ros.options import read_parameter_file
-from starcal_ros.pipeline import observe, solve
-from starcal_ros.pipeline.setup import load_setup
-from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.records import StarObservations
 from starcal_ros.simulation import bag as simulated_bag
-from starcal_ros.simulation import scenario
 
 COLUMNS = ('fault', 'node', 'times', 'what', 'answered', 'lost', 'wrong', 'died')
 _ANSWER_S = 60.0
-# What the documents allow: not known, not observable, and no number.
+# Fields that may be NaN or infinite by the interface document.
 _MAY_BE_INFINITE = frozenset(
     [
         'temperature_degc',
@@ -58,14 +52,14 @@ _MAY_BE_INFINITE = frozenset(
 
 
 def run(quick: bool) -> list[Table]:
-    """Make every fault a few times, or as often as the requirements ask."""
+    """Inject every fault a few times, or as often as required."""
     if not importlib.util.find_spec('rclpy'):
         print('faults: no rclpy here: left out\n')
         return []
     graph.own_domain()
     table = Table('Faults: lost, wrong and died must be 0', COLUMNS)
     with tempfile.TemporaryDirectory() as folder:
-        bench = _Bench(Path(folder))
+        campaign = Campaign(Path(folder))
         for fault, quick_times, times in (
             (_damaged_bags, 40, 5000),
             (_hostile_to_observer, 20, 10_000),
@@ -74,7 +68,7 @@ def run(quick: bool) -> list[Table]:
             (_no_room, 1, 5),
             (_many_callers, 10, 10),
         ):
-            for row in fault(bench, quick_times if quick else times):
+            for row in fault(campaign, quick_times if quick else times):
                 table.add(*row)
                 print('faults:', *row, flush=True)
     print()
@@ -82,47 +76,15 @@ def run(quick: bool) -> list[Table]:
     return [table]
 
 
-class _Bench:
-    """Ten small frames, their observations and their calibration, and where nodes find them."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.scenario = scenario.scenario('tiny')
-        self.params = write_set_up(self.scenario, folder)
-        self.log = folder / 'log'
-        self.frames = [render_frame(self.scenario, index) for index in range(10)]
-        self.setup = load_setup(read_parameter_file(self.params, ()))
-        self.observations: list[StarObservations] = []
-        track = observe.Track(self.setup.prior)
-        for image, samples in self.frames:
-            found, track = observe.observe_next(image, history(samples), self.setup, track)
-            self.observations.append(found)
-        ensemble = functools.reduce(Ensemble.add, self.observations, Ensemble())
-        self.calibration = solve.solve(ensemble, self.setup)
-
-    def message(self, record: StarObservations, time_ns: int | None = None) -> Any:
-        """Observations as a message, with another stamp where one is given."""
-        from starcal_ros.nodes.message_factory import make_message
-
-        message = observations_to_message(record, 'camera', make_message)
-        if time_ns is not None:
-            message.header = make_header(time_ns, 'camera', make_message)
-        return message
-
-    def running(self, name: str, *values: str, **options: Any) -> Any:
-        """A node process for a ``with`` statement."""
-        return graph.running(name, self.params, self.log, *values, **options)
-
-
-def _damaged_bags(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
-    """Bits flipped and ends cut off: what is read was written, what is missing is said."""
-    folder = bench.folder / 'bag'
-    simulated_bag.write_bag(bench.scenario, folder)
+def _damaged_bags(campaign: Campaign, times: int) -> Iterator[tuple[Any, ...]]:
+    """Flipped bits and truncation: every message read was written, every loss is reported."""
+    folder = campaign.folder / 'bag'
+    simulated_bag.write_bag(campaign.scenario, folder)
     whole = next(folder.glob('*.mcap')).read_bytes()
     sound = list(reader.read_raw([folder]))
     choose = random.Random(1)
     silent = wrong = failed = 0
-    file = bench.folder / 'damaged.mcap'
+    file = campaign.folder / 'damaged.mcap'
     for _ in range(times):
         damaged = bytearray(whole)
         for _ in range(choose.randint(1, 3)):
@@ -143,14 +105,14 @@ def _damaged_bags(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
     yield 'bits flipped, ends cut off', 'bag reader', times, 'bags', times, silent, wrong, failed
 
 
-def _hostile_to_observer(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
+def _hostile_to_observer(campaign: Campaign, times: int) -> Iterator[tuple[Any, ...]]:
     from geometry_msgs.msg import QuaternionStamped, TwistStamped
     from sensor_msgs.msg import CompressedImage, Image, Temperature
 
     from starcal.msg import Calibration
     from starcal_ros.nodes.message_factory import make_message
 
-    image, samples = bench.frames[0]
+    image, samples = campaign.frames[0]
     small = image_to_message(image, 'camera', make_message)
     small.height, small.width, small.step, small.data = 4, 4, 8, bytes(32)
     attitude = attitude_to_message(
@@ -160,13 +122,13 @@ def _hostile_to_observer(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]
         (QuaternionStamped, 'attitude', attitude),
         (TwistStamped, 'velocity', TwistStamped(header=small.header)),
         (Temperature, 'temperature', Temperature(header=small.header)),
-        (Calibration, 'calibration', _calibration(bench)),
+        (Calibration, 'calibration', _calibration(campaign)),
     ]
-    yield from _hostile(bench, [(Image, 'image', small), *others], times)
+    yield from _hostile(campaign, [(Image, 'image', small), *others], times)
     png = CompressedImage(header=small.header, format='mono16; png compressed')
     png.data = _png(image.pixels[:4, :4])
     compressed = [(CompressedImage, 'image/compressed', png)]
-    yield from _hostile(bench, compressed, times, 'image_transport:=compressed')
+    yield from _hostile(campaign, compressed, times, 'image_transport:=compressed')
 
 
 def _png(pixels: Any) -> bytes:
@@ -174,9 +136,9 @@ def _png(pixels: Any) -> bytes:
 
 
 def _hostile(
-    bench: _Bench, inputs: list[tuple[Any, str, Any]], times: int, *more: str
+    campaign: Campaign, inputs: list[tuple[Any, str, Any]], times: int, *more: str
 ) -> Iterator[tuple[Any, ...]]:
-    """Mutants on inputs and services of a star observer; then a sound image must be measured."""
+    """Mutants on inputs and services of a node; then it must still work."""
     from sensor_msgs.msg import CameraInfo
 
     from starcal.msg import StarObservations
@@ -185,7 +147,7 @@ def _hostile(
     bad: list[str] = []
     name = 'star_observer'
     values = ('attitude_timeout_s:=0.0', 'image_queue:=1000', 'camera_info_per_image:=true')
-    with bench.running(name, *values, *more) as process, graph.Client() as client:
+    with campaign.running(name, *values, *more) as process, graph.Client() as client:
         client.collect(StarObservations, 'observations', _finite(answers, bad), latched=False)
         client.collect(CameraInfo, 'image_camera_info', _finite([], bad), latched=False)
         count = _Taken(client, name)
@@ -197,7 +159,7 @@ def _hostile(
                 sent = _send_images(client, publisher, template, times, answers)
                 answered = len(answers) - before
             else:
-                # Of a latched topic the reader holds one: each waits until the node is through.
+                # The reader of a latched topic holds one message: wait for the node after each.
                 held = 1 if topic == 'calibration' else 1500
                 sent, answered = times, _send(client, publisher, template, times, count, held)
             died = int(process.poll() is not None)
@@ -210,7 +172,7 @@ def _hostile(
                 return
         if not more:
             yield from _hostile_requests(client, process, name, times)
-        used = _measures_a_sound_image(bench, client, answers, inputs[0][1])
+        used = _measures_a_sound_image(campaign, client, answers, inputs[0][1])
         yield (
             *('a sound image after these', name, 1, inputs[0][1], int(used)),
             *(int(not used), len(bad), int(process.poll() is not None)),
@@ -218,24 +180,24 @@ def _hostile(
 
 
 def _measures_a_sound_image(
-    bench: _Bench, client: graph.Client, answers: list[Any], topic: str
+    campaign: Campaign, client: graph.Client, answers: list[Any], topic: str
 ) -> bool:
-    """Whether one of five sound images, far ahead of all that was sent, gives its stars."""
+    """Return True if one of five good images, stamped far ahead of all others, gives its stars."""
     from geometry_msgs.msg import QuaternionStamped
     from sensor_msgs.msg import CompressedImage, Image
 
     from starcal.msg import Calibration
     from starcal_ros.nodes.message_factory import make_message
 
-    client.publisher(Calibration, 'calibration', latched=True).publish(_calibration(bench))
+    client.publisher(Calibration, 'calibration', latched=True).publish(_calibration(campaign))
     attitudes = client.publisher(QuaternionStamped, 'attitude')
     images = client.publisher(Image if topic == 'image' else CompressedImage, topic)
-    image, samples = bench.frames[0]
+    image, samples = campaign.frames[0]
     message = image_to_message(image, 'camera', make_message)
     if topic != 'image':
         message = CompressedImage(format='mono16; png compressed', data=_png(image.pixels))
-    stars = set(bench.observations[0].catalog_id.tolist())
-    for k in range(1, 6):  # the first ones may come before their attitude
+    stars = set(campaign.observations[0].catalog_id.tolist())
+    for k in range(1, 6):  # the first ones may arrive before their attitude
         time_ns = image.time_ns + k * 10**12
         for sample_ns in range(time_ns - 10**9, time_ns + 2 * 10**9, 5 * 10**8 + 1):
             xyzw = samples[1].icrf_from_star_tracker_xyzw
@@ -247,14 +209,14 @@ def _measures_a_sound_image(
         client.holds(lambda: len(answers) > before, _ANSWER_S)  # noqa: B023
         if len(answers) == before or answers[-1].refusal:
             continue
-        # Some of them stand at the limit, which is found anew.
+        # Some of them are near the detection limit.
         if len(stars & set(answers[-1].catalog_id)) > 0.9 * len(stars):
             return True
     return False
 
 
 class _Taken:
-    """How many messages a node says that it has taken, and what else its diagnostics say."""
+    """Number of messages that a node has received, from its diagnostics."""
 
     def __init__(self, client: graph.Client, node: str) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
@@ -269,11 +231,11 @@ class _Taken:
         client.until(self._state.service_is_ready, 'get_state')
 
     def __call__(self) -> int:
-        """Messages taken; up to a second old."""
+        """Number of messages received, up to a second old."""
         return int(self._values['messages'])
 
     def pass_through(self) -> None:
-        """Wait until the node has answered one call: it looked at what came before."""
+        """Wait until the node has answered a call, and so processed all earlier messages."""
         future = self._state.call_async(self._ask)
         self._client.until(future.done, 'get_state')
 
@@ -286,7 +248,7 @@ class _Taken:
 def _send_images(
     client: graph.Client, publisher: Any, template: Any, times: int, answers: list[Any]
 ) -> int:
-    """Publish mutants no faster than they are answered; how many of them a reader can decode."""
+    """Publish mutants no faster than they are answered; return the number of decodable ones."""
     from rclpy.serialization import deserialize_message
 
     from bench.hostile import send_mutants
@@ -308,9 +270,9 @@ def _send(
     client: graph.Client, publisher: Any, template: Any, times: int, taken: _Taken, held: int
 ) -> int:
     """
-    Publish mutants until the node has taken so many; how many it has.
+    Publish mutants until the node has received a number of them; return that number.
 
-    A reader that holds ``held`` messages loses none: no more than that are under way.
+    At most ``held`` messages are in flight, so that a reader with that history loses none.
     """
     from rclpy.serialization import deserialize_message
 
@@ -323,16 +285,18 @@ def _send(
         publisher.publish(mutant)
         sent += _can_be_decoded(mutant, type(template), deserialize_message)
         if held == 1:
-            taken.pass_through()  # at once; its acknowledgement comes with a heartbeat only
+            taken.pass_through()  # acknowledgements arrive only with a heartbeat
         else:
             client.holds(lambda: sent - (taken() - before) < held, _ANSWER_S)
 
-    for series in range(20):  # those that cannot be decoded are made up for
+    for series in range(20):  # replace those that cannot be decoded
         missing = times - (taken() - before)
         if missing <= 0:
             break
         send_mutants(template, missing + missing // 10 + 2, send, series)
-        client.holds(lambda: taken() - before >= sent, 3.0)  # the diagnostics come every second
+        client.holds(
+            lambda: taken() - before >= sent, 3.0
+        )  # diagnostics are published every second
     return taken() - before
 
 
@@ -346,14 +310,14 @@ def _can_be_decoded(mutant: Any, kind: Any, deserialize: Callable[[bytes, Any], 
     return True
 
 
-_AT_ONCE = 8  # requests under way
-_SHUTDOWNS = (5, 6, 7)  # which a node is right to obey
+_AT_ONCE = 8  # requests in flight
+_SHUTDOWNS = (5, 6, 7)  # a node rightly executes it
 
 
 def _hostile_requests(
     client: graph.Client, process: Any, name: str, times: int
 ) -> Iterator[tuple[Any, ...]]:
-    """Mutants of the requests that every node answers; it is active again afterwards."""
+    """Mutants of the requests that every node answers; afterwards it is active again."""
     from lifecycle_msgs.srv import ChangeState, GetState
     from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
     from rcl_interfaces.srv import SetParameters, SetParametersAtomically
@@ -379,7 +343,7 @@ def _hostile_requests(
         )
         if died:
             return
-    for transition in (1, 3):  # configure, activate: one of them or both may be refused
+    for transition in (1, 3):  # configure and activate may each be refused
         change = ChangeState.Request()
         change.transition.id = transition
         client.call(ChangeState, f'{name}/change_state', transition=change.transition)
@@ -391,7 +355,7 @@ def _hostile_requests(
 def _ask(
     client: graph.Client, kind: Any, service: str, template: Any, times: int
 ) -> tuple[int, int, list[str]]:
-    """Ask with mutants, a few at once; how often, how many were answered, what was wrong."""
+    """Send mutant requests, a few at once; numbers of requests and answers, wrong answers."""
     from bench.hostile import not_finite, send_mutants
 
     caller = client.node.create_client(kind, service)
@@ -401,7 +365,7 @@ def _ask(
     waiting: list[Any] = []
 
     def settle(most: int) -> bool:
-        """Take answers until no more than so many are waited for; whether that came to be."""
+        """Process answers until few requests are pending; False after the timeout."""
         nonlocal waiting, answered
 
         def few() -> bool:
@@ -419,7 +383,7 @@ def _ask(
 
     def ask(mutant: Any) -> None:
         nonlocal asked, is_heard
-        # A client of rclpy sends no bytes; and where nobody answers no more is asked.
+        # rclpy clients cannot send bytes; without answers, send no more.
         if isinstance(mutant, bytes) or not is_heard:
             return
         if hasattr(mutant, 'transition') and mutant.transition.id in _SHUTDOWNS:
@@ -438,14 +402,14 @@ def _ask(
     return asked, answered, bad
 
 
-def _calibration(bench: _Bench) -> Any:
+def _calibration(campaign: Campaign) -> Any:
     from starcal_ros.nodes.message_factory import make_message
 
-    return calibration_to_message(bench.calibration, make_message)
+    return calibration_to_message(campaign.calibration, make_message)
 
 
 def _finite(answers: list[Any], bad: list[str]) -> Callable[[Any], None]:
-    """Take messages, and note which of their numbers are not finite."""
+    """Collect the names of fields with non-finite numbers."""
     from bench.hostile import not_finite
 
     def take(message: Any) -> None:
@@ -455,7 +419,7 @@ def _finite(answers: list[Any], bad: list[str]) -> Callable[[Any], None]:
     return take
 
 
-def _hostile_to_calibrator(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
+def _hostile_to_calibrator(campaign: Campaign, times: int) -> Iterator[tuple[Any, ...]]:
     from geometry_msgs.msg import TransformStamped
     from sensor_msgs.msg import CameraInfo
     from std_srvs.srv import Trigger
@@ -467,7 +431,7 @@ def _hostile_to_calibrator(bench: _Bench, times: int) -> Iterator[tuple[Any, ...
     bad: list[str] = []
     status: list[Any] = []
     name = 'calibrator'
-    with bench.running(name, 'max_images:=30') as process, graph.Client() as client:
+    with campaign.running(name, 'max_images:=30') as process, graph.Client() as client:
         for kind, topic, taken in (
             (EnsembleStatus, 'ensemble_status', status),
             (Calibration, 'calibration', []),
@@ -478,7 +442,7 @@ def _hostile_to_calibrator(bench: _Bench, times: int) -> Iterator[tuple[Any, ...
             client.collect(kind, topic, _finite(taken, bad), latched=True)
         count = _Taken(client, name)
         publisher = client.publisher(Observations, 'observations')
-        template = bench.message(_brightest(bench.observations[0]))
+        template = campaign.message(_brightest(campaign.observations[0]))
         answered = _send(client, publisher, template, times, count, 700)
         died = int(process.poll() is not None)
         yield (
@@ -488,15 +452,15 @@ def _hostile_to_calibrator(bench: _Bench, times: int) -> Iterator[tuple[Any, ...
         bad.clear()
 
         def collect(records: list[StarObservations]) -> bool:
-            """Whether the ensemble is made of these alone."""
+            """Collect observations; return True if the ensemble holds exactly these."""
             client.call(Trigger, f'{name}/reset')
             client.holds(lambda: status and status[-1].images == 0)
             for record in records:
-                publisher.publish(bench.message(record))
+                publisher.publish(campaign.message(record))
             return client.holds(lambda: status and status[-1].images == len(records))
 
-        # Few stars: what is asked for is solved where the request is sound.
-        wrong = int(not collect([_brightest(record) for record in bench.observations]))
+        # Few stars, so that valid requests are solved fast.
+        wrong = int(not collect([_brightest(record) for record in campaign.observations]))
         request = Calibrate.Request(method='magic', estimate=['fx', 'fz'])
         asked, answered, found = _ask(client, Calibrate, f'{name}/solve', request, times)
         wrong += len(found)
@@ -506,9 +470,9 @@ def _hostile_to_calibrator(bench: _Bench, times: int) -> Iterator[tuple[Any, ...
             *(asked - answered, wrong, died),
         )
         yield from _hostile_requests(client, process, name, times)
-        wrong = int(not collect(bench.observations))
+        wrong = int(not collect(campaign.observations))
         answer = client.call(Trigger, f'{name}/calibrate')
-        client.holds(lambda: False, 0.5)  # what it publishes is checked too
+        client.holds(lambda: False, 0.5)  # its publications are checked too
         yield (
             *('a sound ensemble after these', name, 1, 'calibrate', int(answer.success)),
             *(int(not answer.success), wrong + len(bad), int(process.poll() is not None)),
@@ -516,19 +480,19 @@ def _hostile_to_calibrator(bench: _Bench, times: int) -> Iterator[tuple[Any, ...
 
 
 def _brightest(record: StarObservations) -> StarObservations:
-    """The same image with its 40 brightest stars."""
+    """The observations with the 40 brightest stars only."""
     return record.select(np.argsort(np.argsort(-record.flux_dn)) < 40)
 
 
-def _killed(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
-    """Kill -9 at random while images flow and solves run; what was told as kept must be there."""
+def _killed(campaign: Campaign, times: int) -> Iterator[tuple[Any, ...]]:
+    """Kill -9 at random during images and solves; all images reported as saved must persist."""
     from bench.kills import Flight
 
     choose = random.Random(2)
-    with Flight(bench, bench.folder / 'state') as flight:
+    with Flight(campaign, campaign.folder / 'state') as flight:
         for k in range(times):
             flight.fly(choose.uniform(0.1, 2.5))
-            # Either, or now and then both at once; the short form kills each.
+            # One of them, or sometimes both at once; the short form kills each.
             names = (('calibrator',), ('star_observer',), flight.NODES)[k % 3]
             flight.kill(*names)
             if k % 5 == 3:
@@ -537,12 +501,12 @@ def _killed(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
     for name in flight.NODES:
         yield (
             *('kill -9', name, flight.kills[name], f'kills, {flight.sent} images'),
-            *(flight.told if name == 'calibrator' else flight.answered, flight.lost[name]),
+            *(flight.reported if name == 'calibrator' else flight.answered, flight.lost[name]),
             *(flight.wrong[name], flight.died[name]),
         )
-    damaged = len(list((bench.folder / 'state').rglob('*.damaged')))
-    what = f'state after {flight.numbers} calibrations in force'
-    yield 'kill -9', 'calibrator', 1, what, flight.told, 0, damaged, 0
+    damaged = len(list((campaign.folder / 'state').rglob('*.damaged')))
+    what = f'state after {flight.numbers} active calibrations'
+    yield 'kill -9', 'calibrator', 1, what, flight.reported, 0, damaged, 0
 
 
 _ROOM = {
@@ -551,50 +515,52 @@ _ROOM = {
 }
 
 
-def _no_room(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
-    """A disk that is full or read-only, and later not: collected in memory, said, then saved."""
+def _no_room(campaign: Campaign, times: int) -> Iterator[tuple[Any, ...]]:
+    """A full or read-only disk that recovers: kept in memory, reported, then saved."""
     if subprocess.run([*_OWN_MOUNTS, 'true'], capture_output=True, check=False).returncode:
         print('faults: no mounts allowed here: full and read-only disk left out', flush=True)
         return
     for fault, (bad, good, cause) in _ROOM.items():
         lost = wrong = died = images = 0
         for k in range(times):
-            here = _without_room(bench, f'{fault.split()[0]}{k}', bad, good, cause)
+            here = _without_room(campaign, f'{fault.split()[0]}{k}', bad, good, cause)
             lost, wrong, died = lost + here[0], wrong + here[1], died + here[2]
-            images += len(bench.observations)
+            images += len(campaign.observations)
         yield fault, 'calibrator', times, 'starts', images, lost, wrong, died
 
 
-# A disk of its own for one process: no other sees it, and it goes when the process ends.
+# A private mount of one process, removed when the process ends.
 _OWN_MOUNTS = ('unshare', '--map-root-user', '--mount')
 _MOUNTED = 'mount -t tmpfs -o "$1" tmpfs "$0" && shift && exec "$@"'
 
 
 def _without_room(
-    bench: _Bench, name: str, bad: str, good: str, cause: str
+    campaign: Campaign, name: str, bad: str, good: str, cause: str
 ) -> tuple[int, int, int]:
-    """Images lost, answers wrong, nodes died."""
+    """Return the numbers of images lost, answers wrong and nodes died."""
     from diagnostic_msgs.msg import DiagnosticArray
     from std_srvs.srv import Trigger
 
     from starcal.msg import EnsembleStatus
     from starcal.msg import StarObservations as Observations
 
-    folder = bench.folder / name
+    folder = campaign.folder / name
     folder.mkdir()
     status: list[Any] = []
     health: list[Any] = []
     before = (*_OWN_MOUNTS, 'sh', '-c', _MOUNTED, str(folder), bad)
     with (
-        bench.running('calibrator', f'state_dir:={folder}', node=name, before=before) as process,
+        campaign.running(
+            'calibrator', f'state_dir:={folder}', node=name, before=before
+        ) as process,
         graph.Client() as client,
     ):
         client.collect(EnsembleStatus, 'ensemble_status', status.append, latched=True)
         client.collect(DiagnosticArray, '/diagnostics', health.append, latched=False)
         publisher = client.publisher(Observations, 'observations')
-        for record in bench.observations:
-            publisher.publish(bench.message(record))
-        count = len(bench.observations)
+        for record in campaign.observations:
+            publisher.publish(campaign.message(record))
+        count = len(campaign.observations)
         client.holds(lambda: status and status[-1].images == count)
         wrong = int(status[-1].images != count) + int(status[-1].images_saved == count)
         answer = client.call(Trigger, f'{name}/calibrate')
@@ -611,10 +577,10 @@ def _without_room(
         subprocess.run([*remount, str(folder)], check=True)
         client.holds(lambda: status[-1].images_saved == count)
         health.clear()
-        # A warning may stay: of the report, which the next calibration writes again.
+        # A warning about the report may remain until the next calibration writes it again.
         wrong += not client.holds(lambda: health and health[-1].status[0].level < b'\x02')
-        # As a restart would read it, through the mounts of the process.
-        copy = bench.folder / f'{name}_copy'
+        # Read it as a restart would, through the mounts of the process.
+        copy = campaign.folder / f'{name}_copy'
         shutil.copytree(Path(f'/proc/{process.pid}/root{folder}'), copy)
         archive = Archive(copy, 'camera')
         lost = count - len(archive.read_ensemble().images)
@@ -623,22 +589,22 @@ def _without_room(
         return lost, wrong, int(process.poll() is not None)
 
 
-def _many_callers(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
-    """Callers at once, one that goes before its answer, and a second calibrator on the graph."""
+def _many_callers(campaign: Campaign, times: int) -> Iterator[tuple[Any, ...]]:
+    """Concurrent clients, one that exits before its answer, and a second calibrator."""
     from diagnostic_msgs.msg import DiagnosticArray
     from std_srvs.srv import Trigger
 
     from starcal.msg import EnsembleStatus
     from starcal.msg import StarObservations as Observations
 
-    with bench.running('calibrator') as process, graph.Client() as client:
+    with campaign.running('calibrator') as process, graph.Client() as client:
         status: list[Any] = []
         health: list[Any] = []
         client.collect(EnsembleStatus, 'ensemble_status', status.append, latched=True)
         client.collect(DiagnosticArray, '/diagnostics', health.append, latched=False)
         publisher = client.publisher(Observations, 'observations')
-        for record in bench.observations:
-            publisher.publish(bench.message(record))
+        for record in campaign.observations:
+            publisher.publish(campaign.message(record))
         client.holds(lambda: status and status[-1].images == 10)
         callers = [
             client.node.create_client(Trigger, 'calibrator/calibrate') for _ in range(times)
@@ -663,9 +629,11 @@ def _many_callers(bench: _Bench, times: int) -> Iterator[tuple[Any, ...]]:
         died = int(process.poll() is not None)
         yield 'caller killed', 'calibrator', 1, '~/calibrate', 1, int(not answer.success), 0, died
 
-        with bench.running('calibrator', node='double'):
+        with campaign.running('calibrator', node='double'):
             warned = client.holds(
-                lambda: any('another publisher' in one.status[0].message for one in health[-4:])
+                lambda: any(
+                    'another node publishes' in one.status[0].message for one in health[-4:]
+                )
             )
         answer = client.call(Trigger, 'calibrator/calibrate')
         died = int(process.poll() is not None)

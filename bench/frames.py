@@ -1,4 +1,4 @@
-"""Simulated frames and the set-up that measures them, as `starcal calibrate` would start."""
+"""Simulated frames and the set-up of `starcal calibrate` for them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from starcal_ros.sky.attitude import AttitudeHistory
 
 
 def write_set_up(scenario: Scenario, folder: Path, **values: object) -> Path:
-    """Prior camera and parameter file of a scenario in a folder; returns the latter."""
+    """Write the prior camera and parameter file of a scenario; return the path of the latter."""
     camera, params = folder / 'camera.yaml', folder / 'params.yaml'
     write_camera_info(scenario.prior.camera, camera)
     content = simulated_bag.parameters(scenario, f'file://{camera}')
@@ -37,18 +37,18 @@ def load_set_up(scenario: Scenario, **values: object) -> Setup:
 
 
 def paper_scenario(magnitude_limit: float) -> Scenario:
-    """Frames of 2592 x 2048 that show the stars down to a magnitude."""
+    """Scenario with frames of 2592 x 2048 and stars down to a magnitude."""
     return dataclasses.replace(synthetic.scenario('paper'), magnitude_limit=magnitude_limit)
 
 
 def render_frame(scenario: Scenario, index: int) -> tuple[Image, list[AttitudeSample]]:
-    """A frame and the star tracker's samples about it."""
+    """Frame and the star-tracker samples around it."""
     image = simulated_images.render(scenario, synthetic.scene(scenario, index), index)
     return image, list(synthetic.attitude_samples(scenario, index))
 
 
 def history(samples: list[AttitudeSample]) -> AttitudeHistory:
-    """The samples as a sequence takes them."""
+    """Attitude history of the samples."""
     attitudes = AttitudeHistory()
     for sample in samples:
         attitudes.add(sample.time_ns, sample)

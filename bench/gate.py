@@ -1,5 +1,5 @@
 """
-The gate: how often it refuses a good campaign, and whether it refuses those that are spoilt.
+The gate: rates of refused good campaigns and accepted spoilt campaigns.
 
 Star fields of the paper's camera with all their errors drawn, as in `starcal campaign`; then the
 same with one thing wrong.  The limits are the defaults.
@@ -30,37 +30,37 @@ from starcal_ros.studies.trials import (
     StarField,
 )
 
-SIZES = ((6, 80), (12, 30), (12, 80), (30, 80))  # images and stars of an image
+SIZES = ((6, 80), (12, 30), (12, 80), (30, 80))  # number of images, stars per image
 TRACKER_ARCSEC = (5.0, 20.0, 40.0)
 OUTLIER_SHARE = 0.01
-GOOD, SPOILT = 200, 40  # campaigns of each size, and of each case
+GOOD, SPOILT = 200, 40  # campaigns per size, per case
 
 Spoil = Callable[[StarField, float, np.random.Generator], Ensemble]
 
 
 def run(quick: bool) -> list[Table]:
-    """Judge good campaigns of several sizes, then spoilt ones."""
+    """Test good campaigns of several sizes, then spoilt ones."""
     setup = load_set_up(scenario('paper'))
     good = Table(
         'Good campaigns and the gate with its default limits',
-        ('images', 'stars each', 'campaigns', 'refused', 'halves under 1 %', 'least chance'),
+        ('images', 'stars each', 'campaigns', 'refused', 'halves under 1 %', 'least p-value'),
         notes=['halves under 1 %: how many have halves that differ as one in a hundred should.'],
     )
     for images, stars in SIZES:
-        chances, refused = [], 0
+        p_values, refused = [], 0
         for k in range(10 if quick else GOOD):
             rng = np.random.default_rng([images, stars, k])
             tracker = TRACKER_ARCSEC[k % len(TRACKER_ARCSEC)]
             field = draw_star_field(rng, images, stars)
-            reasons, chance, _ = _judged(
+            reasons, p_value, _ = _judged(
                 setup, field, observe(field, tracker, OUTLIER_SHARE), tracker
             )
-            chances.append(chance)
+            p_values.append(p_value)
             if reasons:
                 print(f'refused: {images} x {stars}, {k}: {reasons}')
             refused += bool(reasons)
-        share = float(np.mean(np.array(chances) < 0.01))
-        good.add(images, stars, len(chances), refused, share, float(np.nanmin(chances)))
+        share = float(np.mean(np.array(p_values) < 0.01))
+        good.add(images, stars, len(p_values), refused, share, float(np.nanmin(p_values)))
     spoilt = Table(
         'Spoilt campaigns of 12 images of 80 stars and the gate with its default limits',
         ('what is wrong', 'campaigns', 'refused', 'let through: worst error px', 'by'),
@@ -94,9 +94,9 @@ def run(quick: bool) -> list[Table]:
 def _judged(
     setup: Setup, field: StarField, ensemble: Ensemble, tracker_arcsec: float
 ) -> tuple[list[str], float, float]:
-    """Names of the limits that a campaign fails, the chance of its halves, its error, px."""
-    told = (tracker_arcsec,) * 3
-    options = dataclasses.replace(setup.calibration, star_tracker_sigma_arcsec=told)
+    """Names of the failed checks, p-value of the halves, and error of a campaign, px."""
+    assumed_arcsec = (tracker_arcsec,) * 3
+    options = dataclasses.replace(setup.calibration, star_tracker_sigma_arcsec=assumed_arcsec)
     setup = dataclasses.replace(setup, prior=field.prior, calibration=options)
     try:
         found = solve.solve(ensemble, setup)
@@ -106,12 +106,12 @@ def _judged(
     focal_px = float(field.truth.camera.parameters[0])
     pointing_px = pointing_error_arcsec(found.geometry, field.truth) * np.pi / 648000 * focal_px
     error_px = max(pointing_px, map_error_px(found.geometry.camera, field.truth.camera))
-    chance = np.nan if found.halves is None else found.halves.p_value
-    return names, chance, error_px
+    p_value = np.nan if found.halves is None else found.halves.p_value
+    return names, p_value, error_px
 
 
 def _seen_by(field: StarField, truth: CameraGeometry, rows: slice) -> StarField:
-    """The field with some of its images taken through another camera, or mounted otherwise."""
+    """Field with some images taken with another camera or mounting."""
     star_tracker_from_icrf = (
         Rotation.from_quat(field.truth.star_tracker_from_camera_xyzw) * field.camera_from_icrf
     )
@@ -126,13 +126,13 @@ def _seen_by(field: StarField, truth: CameraGeometry, rows: slice) -> StarField:
 
 def _turned(geometry: CameraGeometry, arcsec: float, rng: np.random.Generator) -> CameraGeometry:
     axis = rng.normal(size=3)
-    turn = Rotation.from_rotvec(arcsec * np.pi / 648000 * axis / np.linalg.norm(axis))
-    alignment = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * turn
+    rotation = Rotation.from_rotvec(arcsec * np.pi / 648000 * axis / np.linalg.norm(axis))
+    alignment = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * rotation
     return dataclasses.replace(geometry, star_tracker_from_camera_xyzw=alignment.as_quat())
 
 
 def _focus_drifts(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
-    """By 0.3 % in all, from the first image to the last."""
+    """Focal length drifts by 0.3 % from the first image to the last."""
     for k in range(len(field.pixel_px)):
         factor = 1 + 3e-3 * k / (len(field.pixel_px) - 1)
         camera = field.truth.camera
@@ -167,7 +167,7 @@ def _attitude_inverted(field: StarField, tracker: float, rng: np.random.Generato
 
 
 def _equinox_of_date(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
-    """Catalog directions of the equinox of 2026 taken for ICRF: 26 years at 50.3 arcsec."""
+    """Catalog directions of equinox 2026 used as ICRF: 26 years at 50.3 arcsec."""
     precession = Rotation.from_euler('x', 23.44, degrees=True) * Rotation.from_euler(
         'z', 26 * 50.3 / 3600, degrees=True
     )
@@ -178,7 +178,7 @@ def _equinox_of_date(field: StarField, tracker: float, rng: np.random.Generator)
 
 
 def _old_places(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
-    """Proper motion left out since 1950: 76 years of 50 mas each axis, as bright stars have."""
+    """No proper motion since 1950: 76 years of 50 mas per axis, as for bright stars."""
     motion_rad = rng.normal(0.0, 76 * 0.05 * np.pi / 648000, field.direction_icrf.shape)
     moved = field.direction_icrf + motion_rad
     moved /= np.linalg.norm(moved, axis=-1, keepdims=True)
@@ -186,7 +186,7 @@ def _old_places(field: StarField, tracker: float, rng: np.random.Generator) -> E
 
 
 def _focal_scaled(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
-    """Pixels of an image that was scaled by 5 % about the principal point."""
+    """Pixels of an image scaled by 5 % about the principal point."""
     camera = field.truth.camera
     center = camera.intrinsics[3:]
     pixels = center + 1.05 * (field.pixel_px - center)
@@ -194,7 +194,7 @@ def _focal_scaled(field: StarField, tracker: float, rng: np.random.Generator) ->
 
 
 def _mirrored(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
-    """The image is turned over, left for right."""
+    """Image mirrored left to right."""
     pixels = field.pixel_px.copy()
     pixels[..., 0] = field.truth.camera.width - 1 - pixels[..., 0]
     return observe(dataclasses.replace(field, pixel_px=pixels), tracker, OUTLIER_SHARE)
@@ -205,7 +205,7 @@ def _many_wrong_stars(field: StarField, tracker: float, rng: np.random.Generator
 
 
 def _one_corner(field: StarField, tracker: float, rng: np.random.Generator) -> Ensemble:
-    """Stars in a quarter of the detector alone."""
+    """Stars only in one quarter of the detector."""
     images = [
         image.select(np.all(image.measured_px < [image.width / 2, image.height / 2], axis=1))
         for image in observe(field, tracker, OUTLIER_SHARE).images
@@ -216,12 +216,12 @@ def _one_corner(field: StarField, tracker: float, rng: np.random.Generator) -> E
 CASES: dict[str, Spoil] = {
     'focal length drifts by 0.3 %': _focus_drifts,
     'alignment jumps by 180 arcsec halfway': _alignment_jumps,
-    'half of the images, any, turned by 0.5 deg': _two_alignments,
+    'half of the images, random, rotated by 0.5 deg': _two_alignments,
     'attitude of the wrong direction': _attitude_inverted,
     'catalog of the wrong equinox': _equinox_of_date,
-    'proper motion left out for 76 years': _old_places,
+    'no proper motion for 76 years': _old_places,
     'image scaled by 5 %': _focal_scaled,
     'image mirrored': _mirrored,
     '40 % of the stars misidentified': _many_wrong_stars,
-    'stars in one corner alone': _one_corner,
+    'stars in one corner only': _one_corner,
 }

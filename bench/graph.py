@@ -1,4 +1,4 @@
-"""A ROS graph of its own for a bench: nodes as processes, a client, what a process uses."""
+"""A separate ROS graph for a bench: node processes, a client, and their resource usage."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import sys
 import time
 from typing import Any
 
-START_S = 60.0  # a node imports and starts in 2 s; a busy machine makes that much of it
+START_S = 60.0  # a node starts in 2 s; much slower on a busy machine
 
 
 def own_domain() -> None:
-    """Move this process and its children to a ROS domain in which nobody else takes part."""
+    """Move this process and its children to an unused ROS domain."""
     os.environ['ROS_DOMAIN_ID'] = str(_free_domain())
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 
 def _free_domain() -> int:
-    """A ROS domain in which nobody on this machine takes part."""
+    """ROS domain without participants on this machine."""
     for domain in range(1 + os.getpid() % 100, 201):
         with (
             socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
@@ -44,7 +44,7 @@ def start(
     before: Sequence[str] = (),
     **options: Any,
 ) -> subprocess.Popen[bytes]:
-    """A node process with a parameter file and further values; ``before`` runs its command."""
+    """Start a node process with parameters; ``before`` is a command prefix."""
     arguments = ['-m', f'starcal_ros.nodes.{name}', '--ros-args', '--params-file', str(params)]
     arguments += [word for value in values for word in ('-p', value)]
     arguments += ['-r', f'__node:={node or name}', '--log-level', 'warn']
@@ -62,7 +62,7 @@ def start(
 def running(
     name: str, params: Path, log: Path, *values: str, node: str = '', **options: Any
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A node process that is stopped at the end."""
+    """Context manager of a node process; stops it at the end."""
     process = start(name, params, log, *values, node=node, **options)
     try:
         yield process
@@ -71,7 +71,7 @@ def running(
 
 
 def stop(process: subprocess.Popen[bytes]) -> int:
-    """Exit status after SIGINT; kills the process when it does not listen."""
+    """Exit status after SIGINT; kills the process if it does not end."""
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
     try:
@@ -82,7 +82,7 @@ def stop(process: subprocess.Popen[bytes]) -> int:
 
 
 class Client:
-    """A bare node with its own context, spun while something is waited for."""
+    """A node with its own context that is spun while waiting."""
 
     def __init__(self, name: str = 'bench') -> None:
         import rclpy
@@ -104,18 +104,18 @@ class Client:
         self.context.try_shutdown()
 
     def spin(self, seconds: float = 0.0) -> None:
-        """Take what has come, at most one thing, waiting so long for it."""
+        """Process at most one event within a timeout."""
         self._executor.spin_once(timeout_sec=seconds)
 
     def until(
         self, condition: Callable[[], object], what: str, timeout_s: float = START_S
     ) -> None:
-        """Spin until a condition holds; RuntimeError where it does not within the time."""
+        """Spin until a condition holds; RuntimeError after the timeout."""
         if not self.holds(condition, timeout_s):
             raise RuntimeError(f'{what}: not within {timeout_s:g} s')
 
     def holds(self, condition: Callable[[], object], timeout_s: float = START_S) -> bool:
-        """Whether a condition comes to hold within a time."""
+        """Spin until a condition holds; False after the timeout."""
         deadline_s = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > deadline_s:
@@ -143,7 +143,7 @@ class Client:
         return self.node.create_subscription(kind, topic, take, qos)
 
     def publisher(self, kind: Any, topic: str, depth: int = 1000, latched: bool = False) -> Any:
-        """A publisher that somebody listens to already."""
+        """Publisher with at least one matched subscriber."""
         from rclpy.qos import DurabilityPolicy, QoSProfile
 
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE

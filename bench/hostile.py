@@ -1,4 +1,4 @@
-"""Messages that no honest sender makes, by hypothesis: wrong fields, cut and changed bytes."""
+"""Malformed messages from hypothesis: wrong fields, truncated and changed bytes."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _SEQUENCE = re.compile(r'sequence<(.+?)(?:, (\d+))?>')
 
 def send_mutants(template: Any, count: int, send: Callable[[Any], None], series: int = 0) -> None:
     """
-    Hand ``count`` mutants of a message to ``send``: messages, or bytes, one in sixteen.
+    Pass ``count`` mutants of a message to ``send``: messages, or bytes for one in sixteen.
 
-    The same mutants each time, others in each series.
+    Each series has its own, reproducible mutants.
     """
     from rclpy.serialization import serialize_message
 
     whole = serialize_message(template)
     sent = 0
-    for round_number in range(count):  # hypothesis stops early where it finds nothing new
+    for round_number in range(count):  # hypothesis stops early without new examples
         if sent == count:
             return
 
@@ -49,7 +49,7 @@ def send_mutants(template: Any, count: int, send: Callable[[Any], None], series:
 
 @st.composite
 def _spoilt(draw: st.DrawFn, whole: bytes) -> bytes:
-    """Serialised bytes cut off, with some of the first ones changed: the lengths stand there."""
+    """Truncated bytes with changes near the start, where the lengths are."""
     content = bytearray(whole[: draw(st.integers(4, len(whole)))])
     for _ in range(draw(st.integers(0, 4))):
         content[draw(st.integers(4, max(4, min(len(content) - 1, 200)))) % len(content)] = draw(
@@ -60,7 +60,7 @@ def _spoilt(draw: st.DrawFn, whole: bytes) -> bytes:
 
 @st.composite
 def mutants(draw: st.DrawFn, template: Any) -> Any:
-    """A copy of a message with up to four of its fields replaced."""
+    """Copies of a message with up to four fields replaced."""
     mutant = copy.deepcopy(template)
     kinds = mutant.get_fields_and_field_types()
     for name in draw(st.lists(st.sampled_from(sorted(kinds)), max_size=4, unique=True)):
@@ -73,7 +73,7 @@ def mutants(draw: st.DrawFn, template: Any) -> Any:
 
 
 def _values(kind: str, old: Any) -> st.SearchStrategy[Any]:
-    """Values of a field of a ROS type; arrays may keep their length."""
+    """Values for a field of a ROS type; arrays may keep their length."""
     fixed, sequence = _ARRAY.fullmatch(kind), _SEQUENCE.fullmatch(kind)
     if fixed:
         size = int(fixed[2])
@@ -124,7 +124,7 @@ def _single(kind: str) -> st.SearchStrategy[Any]:
 
 
 def not_finite(message: Any, allowed: frozenset[str]) -> list[str]:
-    """Names of the fields of a message that hold a number that is not finite."""
+    """Names of the fields of a message with non-finite numbers."""
     found = []
     for name in message.get_fields_and_field_types():
         value = getattr(message, name)

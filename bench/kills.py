@@ -1,46 +1,44 @@
-"""Images through both nodes while either is killed; what is published is checked."""
+"""Images through both nodes while nodes are killed, with checks of all published messages."""
 
 from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from bench import graph
+from bench.campaign import Campaign
 from starcal_ros.messages.fields import make_header, stamp_ns
 from starcal_ros.messages.images import image_to_message
 from starcal_ros.messages.telemetry import attitude_to_message
-
-if TYPE_CHECKING:
-    from bench.faults import _Bench
 
 _FIRST_NS = 1_778_829_600_000_000_000
 _STEP_NS = 1_000_000_000
 _AROUND_NS = (-200_000_000, -20_000_000, 20_000_000, 200_000_000)
 _IN_FLIGHT = 4
 _ANSWER_S = 60.0
-# Centroids of a frame hang on the prediction by far less than their noise of 0.05 px.
+# Centroids depend on the prediction by much less than their noise of 0.05 px.
 _SAME_PX = 0.5
 
 
 class Flight:
     """
-    Both nodes, the images that flow, the solves that run, and what is remembered of their answers.
+    Both nodes with images and requests in flight, and the record of their answers.
 
-    ``lost`` of the calibrator are images that it told as saved and did not have after a restart,
-    of the star observer images sent to a running one that were never answered.  ``wrong`` of the
-    calibrator is a calibration latched that the gate refused, that is older than one before, or
-    whose number had another content; of the star observer a star measured where it is not, or no
-    calibration in use after a restart though one is latched.
+    ``lost`` counts images that the calibrator reported as saved but did not have after a restart,
+    and images sent to a running star observer without an answer.  ``wrong`` counts latched
+    calibrations that the gate refused, that are older than a previous one, or whose number had
+    another content; and stars measured at a wrong place, or a star observer that does not use a
+    latched calibration after a restart.
     """
 
     NODES = ('star_observer', 'calibrator')
 
-    def __init__(self, bench: _Bench, state: Path) -> None:
-        self._bench = bench
+    def __init__(self, campaign: Campaign, state: Path) -> None:
+        self._campaign = campaign
         kept = (f'state_dir:={state}', 'max_images:=5000')
         self._values = {'star_observer': (), 'calibrator': kept}
         self._running: dict[str, Any] = {}
@@ -53,24 +51,24 @@ class Flight:
         self._in_flight_ns: set[int] = set()
         self._solving: Any = None
         self._solve: Any = None
-        self.sent = self.told = 0
+        self.sent = self.reported = 0
         self.kills: Counter[str] = Counter()
         self.lost: Counter[str] = Counter()
         self.wrong: Counter[str] = Counter()
         self.died: Counter[str] = Counter()
         self._truth = [
             dict(zip(one.catalog_id.tolist(), one.measured_px, strict=True))
-            for one in bench.observations
+            for one in campaign.observations
         ]
 
     @property
     def answered(self) -> int:
-        """How many images have been answered."""
+        """Number of images with an answer."""
         return len(self._answered_ns)
 
     @property
     def numbers(self) -> int:
-        """How many calibrations have been in force."""
+        """Number of calibrations that have been active."""
         return len(self._known)
 
     def __enter__(self) -> Flight:
@@ -81,7 +79,7 @@ class Flight:
         from starcal.msg import StarObservations
 
         self._client = graph.Client()
-        # A small message waits behind a large one of its participant: the tracker has its own.
+        # A small message waits behind a large one of the same participant: use a second one.
         self._tracker = graph.Client('star_tracker')
         self._client.collect(StarObservations, 'observations', self._take, latched=False)
         self._client.collect(DiagnosticArray, '/diagnostics', self._take_health, latched=False)
@@ -96,7 +94,7 @@ class Flight:
         self._client.__exit__()
 
     def fly(self, seconds: float) -> None:
-        """Start what is not running, and send images and ask for solves for so long."""
+        """Start missing nodes, then send images and request calibrations for a time."""
         from std_srvs.srv import Trigger
 
         missing = [name for name in self.NODES if name not in self._running]
@@ -126,24 +124,24 @@ class Flight:
                 self._solving = self._solve.call_async(Trigger.Request())
 
     def kill_at_start(self, name: str, seconds: float) -> None:
-        """Kill a node that is just starting, before or after it has read its state."""
+        """Kill a node during its start, before or after it has read its state."""
         self._start(name)
         self._client.holds(lambda: self._running[name].poll() is not None, seconds)
         self.kill(name)
 
     def kill(self, *names: str) -> None:
-        """Kill nodes at once, and look at what they have published before."""
+        """Kill nodes at once, and check the messages that they have published."""
         for name in names:
             self._running[name].kill()
         for name in names:
             self.died[name] += self._running.pop(name).wait() != -9
             self.kills[name] += 1
-        self._client.holds(lambda: False, 0.1)  # what was still under way
+        self._client.holds(lambda: False, 0.1)  # messages in flight
         if 'star_observer' in names:
             self._in_flight_ns.clear()
         if 'calibrator' in names:
             self._solving = None
-        self.told = max([self.told, *(message.images_saved for message in self._status)])
+        self.reported = max([self.reported, *(message.images_saved for message in self._status)])
         for message in self._latched:
             content = [*message.camera.parameters, *message.covariance]
             self.wrong['calibrator'] += not message.accepted
@@ -152,15 +150,15 @@ class Flight:
         self._latched.clear()
 
     def _start(self, name: str) -> None:
-        # Each heir has a name of its own: the graph takes 20 s to forget the dead.
+        # A new name for each process: a dead node stays in the graph for 20 s.
         self._names[name] = f'{name}{self.kills[name]}'
-        bench, node = self._bench, self._names[name]
+        campaign, node = self._campaign, self._names[name]
         self._running[name] = graph.start(
-            name, bench.params, bench.log, *self._values[name], node=node
+            name, campaign.params, campaign.log, *self._values[name], node=node
         )
 
     def _observer_is_ready(self) -> bool:
-        """Whether it is heard and answers; what was sent before it was matched is no loss."""
+        """Return True once it is matched and answers; earlier images do not count as lost."""
         mine, before = self._names['star_observer'], self.answered
         if not self._client.holds(lambda: int(self._said(mine, 'listeners', '', '0')) >= 1):
             return False
@@ -182,7 +180,7 @@ class Flight:
         self._solve = client.node.create_client(Trigger, f'{self._names["calibrator"]}/calibrate')
         if not client.holds(lambda: self._status and self._solve.service_is_ready()):
             return False
-        self.lost['calibrator'] += max(0, self.told - self._status[0].images)
+        self.lost['calibrator'] += max(0, self.reported - self._status[0].images)
         if self._known:
             client.holds(lambda: self._latched, 10.0)
             newest = self._latched[0].number if self._latched else 0
@@ -190,14 +188,14 @@ class Flight:
         return True
 
     def _said(self, node: str, key: str, none: str, instead: str) -> str:
-        """A value of the newest diagnostics of a node."""
+        """Value of the newest diagnostics of a node."""
         value = self._health.get(node, {}).get(key, instead)
         return instead if value == none else value
 
     def _send(self) -> None:
         from starcal_ros.nodes.message_factory import make_message
 
-        image, samples = self._bench.frames[self.sent % len(self._bench.frames)]
+        image, samples = self._campaign.frames[self.sent % len(self._campaign.frames)]
         time_ns = _FIRST_NS + self.sent * _STEP_NS
         for around_ns in _AROUND_NS:
             xyzw = samples[1].icrf_from_star_tracker_xyzw
@@ -218,7 +216,7 @@ class Flight:
         measured = np.reshape(message.measured_px, (-1, 2))
         for star, place in zip(message.catalog_id, measured, strict=True):
             known = truth.get(star)
-            # A star near the limit may be found in one pass and not in the other.
+            # A star near the limit may be found in only one of the passes.
             if known is not None and np.abs(known - place).max() > _SAME_PX:
                 self.wrong['star_observer'] += 1
 

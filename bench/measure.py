@@ -1,8 +1,8 @@
 """
-The stars of one frame: `observe.observe_next` against the detectors of sep and photutils.
+Stars of one frame: `observe.observe_next` against the detectors of sep and photutils.
 
-Those two only detect and centroid; ours also predicts, identifies, fits the PSF and judges every
-star.  All take the same mono16 frame of 2592 x 2048.
+Those two only detect and centroid; starcal also predicts, identifies, fits the PSF and checks
+every star.  All use the same mono16 frame of 2592 x 2048.
 """
 
 from __future__ import annotations
@@ -20,17 +20,19 @@ from scipy.spatial.transform import Rotation
 
 from bench.frames import history, load_set_up, paper_scenario, render_frame
 from bench.table import Table
-from starcal_ros.image.detection import Pixels
+from starcal_ros.arrays import Pixels
 from starcal_ros.pipeline import observe
 
 MAGNITUDE_LIMIT = 7.35  # leaves 122 stars
-AT_LEAST_S = 0.1  # of calls in a row: one of 6 ms after another way would time its caches
+AT_LEAST_S = (
+    0.1  # of calls in a row: a single call of 6 ms after another method would time the caches
+)
 DETECTION_SIGMA = 5.0
 ACQUISITION_DEG = 1.2
 
 
 def run(quick: bool) -> list[Table]:
-    """Time each way on one frame, in turns."""
+    """Time each method on one frame, alternating."""
     scenario = paper_scenario(MAGNITUDE_LIMIT)
     setup = load_set_up(scenario, magnitude_limit=MAGNITUDE_LIMIT)
     image, samples = render_frame(scenario, 0)
@@ -38,9 +40,9 @@ def run(quick: bool) -> list[Table]:
     _, track = observe.observe_next(image, attitudes, setup, observe.Track(setup.prior))
     track = dataclasses.replace(track, latest_ns=None)  # the same image once more
     prior = Rotation.from_quat(setup.prior.star_tracker_from_camera_xyzw)
-    turn = Rotation.from_rotvec(np.radians(ACQUISITION_DEG) * np.array([0.6, -0.8, 0.0]))
+    rotation = Rotation.from_rotvec(np.radians(ACQUISITION_DEG) * np.array([0.6, -0.8, 0.0]))
     shifted = dataclasses.replace(
-        setup.prior, star_tracker_from_camera_xyzw=(prior * turn).as_quat()
+        setup.prior, star_tracker_from_camera_xyzw=(prior * rotation).as_quat()
     )
     ways: dict[str, Callable[[], int]] = {
         'starcal, tracking': lambda: len(observe.observe_next(image, attitudes, setup, track)[0]),
@@ -66,8 +68,8 @@ def run(quick: bool) -> list[Table]:
         f'Stars of one frame of {width} x {height}, mono16, in one thread of Python',
         ('way', 'stars', 'least ms', 'median ms', 'by tracking'),
         notes=[
-            f'Processor time of a call, of so many in a row that they take {AT_LEAST_S:g} s.',
-            'by tracking: its least time over that of ours, tracking.',
+            f'Processor time per call, over calls in a row that take {AT_LEAST_S:g} s.',
+            'by tracking: least time over that of starcal, tracking.',
         ],
     )
     ours_ms = min(took_ms['starcal, tracking'])
@@ -78,7 +80,7 @@ def run(quick: bool) -> list[Table]:
 
 
 def _sep(pixels: Pixels) -> int:
-    """Sources found the way of the documentation of sep."""
+    """Sources found as in the documentation of sep."""
     import sep
 
     data = pixels.astype(np.float32)
@@ -88,7 +90,7 @@ def _sep(pixels: Pixels) -> int:
 
 
 def _photutils(pixels: Pixels, psf_fwhm_px: float) -> int:
-    """Sources found the way of the documentation of photutils."""
+    """Sources found as in the documentation of photutils."""
     from astropy.stats import sigma_clipped_stats
     from photutils.detection import DAOStarFinder
 

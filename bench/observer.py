@@ -1,9 +1,9 @@
 """
-The star observer as a process on the real graph, fed at a steady rate from another process.
+The star observer as a process, fed at a steady rate from another process.
 
-Frames of 2592 x 2048, mono16, reliable: what is lost, how late the observations come, and whether
-the memory of the node stays flat.  A few frames are rendered and sent in turn, each with the
-attitude of its own sky and a stamp that goes on.
+Frames of 2592 x 2048, mono16, reliable: lost frames, latency of the observations and growth of
+memory.  A few rendered frames are sent in turn, each with its own attitude and an increasing
+stamp.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ MAGNITUDE_LIMIT = 9.0  # the default of the node: 300 to 400 stars in a frame
 FRAMES = 6
 RUNS = (('stock', 5.0), ('stock', 10.0), ('fastdds.xml', 10.0))  # profile, frames a second
 START_S = 30.0
-LATE_S = 10.0  # longest that the last observations are waited for
+LATE_S = 10.0  # longest wait for the last observations
 _FIRST_NS = 1_778_829_600_000_000_000
-_AROUND_NS = 20_000_000  # from an image to the attitude before and the one after it
+_AROUND_NS = 20_000_000  # from an image to the attitudes before and after it
 
 Frame = tuple[Image, list[AttitudeSample]]
 
@@ -46,9 +46,9 @@ def run(quick: bool) -> list[Table]:
             *('latency ms', 'worst ms', 'RSS MB first', 'after 50', 'after all', 'CPU ms/frame'),
         ),
         notes=[
-            'latency: from before the image is handed to the publisher until its observations',
+            'latency: from just before the image is published until its observations',
             'are received; median and worst.  CPU: user and system time of the node, all threads.',
-            'Frames are counted from the first that was answered on: before, nobody may listen.',
+            'Frames count from the first answered one: earlier ones may have no subscriber.',
         ],
     )
     print('observer: rendering frames', flush=True)
@@ -64,7 +64,7 @@ def run(quick: bool) -> list[Table]:
 
 
 def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tuple[Any, ...]:
-    """Send frames and collect observations; the cells of a row after the rate."""
+    """Send frames and collect observations; return the cells of a row after the rate."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
@@ -105,15 +105,15 @@ def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tupl
             executor.spin_once(timeout_sec=0.02)
         if not ours.poll():
             publisher.kill()
-            raise RuntimeError('the publisher did not come to its end')
+            raise RuntimeError('the publisher did not finish')
         sent_s: dict[int, float] = ours.recv()
         deadline_s = time.monotonic() + LATE_S
         while len(arrived) < count and time.monotonic() < deadline_s:
             executor.spin_once(timeout_sec=0.02)
-        publisher.terminate()  # it stays for the repairs of its last images
+        publisher.terminate()  # it stays to resend its last images
         publisher.join()
         if not arrived:
-            raise RuntimeError('the star observer has not answered')
+            raise RuntimeError('no answer from the star observer')
         processor_ms = 1e3 * (graph.processor_s(process_id) - start_cpu_s) / len(arrived)
         executor.shutdown()
         node.destroy_node()
@@ -139,7 +139,7 @@ def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tupl
 
 
 def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None:
-    """In a process of its own: send the frames at a steady rate and tell when each was sent."""
+    """In a separate process: send frames at a steady rate and report their times."""
     from geometry_msgs.msg import QuaternionStamped
     import rclpy
     from rclpy.serialization import serialize_message
@@ -150,7 +150,7 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
     from starcal_ros.nodes.message_factory import make_message
 
     sent_s: dict[int, float] = {}
-    # Serialized once: what the publisher takes of the two cores is not of the node.
+    # Serialised once, to leave the processor to the node.
     ready = [
         (serialize_message(image_to_message(image, 'camera', make_message)), attitudes[1])
         for image, attitudes in frames
@@ -167,7 +167,7 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
 
         def send(k: int, time_ns: int) -> None:
             content, attitude = ready[k % len(ready)]
-            # The stamp comes first in the message, after four bytes that tell the encoding.
+            # The stamp is first in the message, after four bytes of encoding.
             stamp = struct.pack('=iI', *divmod(time_ns, 10**9))
             message = b''.join((content[:4], stamp, memoryview(content)[12:]))
             xyzw = attitude.icrf_from_star_tracker_xyzw
@@ -177,9 +177,9 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
                 attitudes.publish(attitude_to_message(stamp_ns, xyzw, 'icrf', make_message))
             images.publish(message)
 
-        # A reader may see its writer later than it is seen: until an answer has come all the way.
+        # Discovery is not symmetric: wait for an answer.
         for k in range(round(START_S)):
-            send(-1, _FIRST_NS - 10**9 * (100 - k))  # not the frame that comes next
+            send(-1, _FIRST_NS - 10**9 * (100 - k))  # not the next frame
             if pipe.poll(1.0):
                 break
         sent_s.clear()

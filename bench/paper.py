@@ -1,8 +1,8 @@
 """
-`starcal calibrate` on the set of the paper: 359 images of 2592 x 2048, from bag to products.
+`starcal calibrate` on the campaign of the paper: 359 images of 2592 x 2048, bag to products.
 
-The bag is 3.8 GB and takes some minutes to render; it is deleted at the end.  A fourth of the
-images goes first: memory that does not grow with them is the same for both.
+The bag has 3.8 GB and takes minutes to render; it is deleted at the end.  A fourth of the images
+is calibrated first, to check that memory does not grow with their number.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """
 Two hours of flight at speed: 10,000 images through both nodes, on the real graph.
 
-A few frames of 640 x 512 are sent in turn, each with the attitude of its own sky, 0.72 s apart by
-their stamps and as fast as they are observed, four ahead at most.  Every image must be answered,
-and the memory of the nodes must stay where it was when the ensemble was full.
+A few frames of 640 x 512 are sent in turn, each with its own attitude, with stamps 0.72 s apart,
+as fast as they are observed, at most four in flight.  Every image must be answered, and the memory
+of the nodes must not grow once the ensemble is full.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LATE_S = 30.0
 
 
 def run(quick: bool) -> list[Table]:
-    """Send the images; memory at a tenth of the way and at the end."""
+    """Send the images; memory after a tenth of them and at the end."""
     if not importlib.util.find_spec('rclpy'):
         print('soak: no rclpy here: left out\n')
         return []
@@ -75,7 +75,7 @@ def _soak(folder: Path, count: int) -> Table:
         graph.running('star_observer', params, folder / 'log') as observer,
         graph.running('calibrator', params, folder / 'log', limit, state) as calibrator,
         graph.Client() as client,
-        # A small message waits behind a large one of its participant: the tracker has its own.
+        # A small message waits behind a large one of the same participant: use a second one.
         graph.Client('star_tracker') as tracker,
     ):
         client.collect(StarObservations, 'observations', take, latched=False)

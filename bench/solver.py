@@ -1,8 +1,8 @@
 """
-The least-squares search against Ceres, SciPy and OpenCV, on the same stars from the same start.
+The least-squares search against Ceres, SciPy and OpenCV, with the same stars and start.
 
-About 80 stars an image with 0.1 px of noise; the skew of the truth is zero, as OpenCV has none.
-Solvers take turns in one process for the times; each has a process of its own for its memory.
+About 80 stars per image with 0.1 px noise; the true skew is zero, because OpenCV has none.  Times
+are from alternating runs in one process, memory from a separate process per solver.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bench.competitors import (
@@ -35,15 +34,14 @@ from bench.competitors import (
     solve_starcal,
 )
 from bench.table import Table, verdict
+from starcal_ros.arrays import Floats
 from starcal_ros.estimation.levenberg_marquardt import covariance
 from starcal_ros.estimation.normal_equations import arrange, normal_blocks, RESIDUAL, ROTATION
 from starcal_ros.estimation.problem import minimise, State
 from starcal_ros.records import CameraGeometry, Ensemble
 
-Floats = NDArray[np.float64]
-
-LIMIT_S = 60.0  # longest that a competitor is waited for
-TARGETS_FROM = 100  # images: below, the time is that of Python itself
+LIMIT_S = 60.0  # longest wait for a competitor
+TARGETS_FROM = 100  # images; below, Python overhead dominates
 TARGETS = {'pyceres': 20.0, 'scipy': 10.0, 'opencv': 12.0}
 TARGET_PASS_NS = 100.0
 TARGET_MEMORY_MB = 40.0
@@ -65,7 +63,7 @@ LABELS = {
 
 
 def cost_of(case: Case, answer: Answer, steps: int = 0) -> float:
-    """Least-squares cost of an answer, after some Gauss-Newton steps of the rotations alone."""
+    """Least-squares cost of a result, after Gauss-Newton steps of the rotations only."""
     keep = np.ones(len(case.table), bool)
     measurements = arrange(case.table, keep, case.table.covariance_px2)
     rotations = Rotation.from_matrix(answer.camera_from_icrf)
@@ -110,7 +108,7 @@ def _resident_kb(field: str) -> int:
 
 
 def _solve_apart(name: str, case: Case, pipe: Any) -> None:
-    """In a process of its own: seconds, peak resident memory above the data (MB), answer."""
+    """In a separate process: seconds, peak resident memory above the data (MB), result."""
     warm = make_case(Ensemble(case.ensemble.images[:5]), case.prior)
     SOLVERS[name](warm)
     Path('/proc/self/clear_refs').write_text('5')  # the peak counts from now (man 5 proc)
@@ -122,7 +120,7 @@ def _solve_apart(name: str, case: Case, pipe: Any) -> None:
 
 
 def solve_apart(name: str, case: Case) -> tuple[float, float, Answer] | None:
-    """What `_solve_apart` says; None when it does not end in time."""
+    """Result of `_solve_apart`; None after the time limit."""
     context = multiprocessing.get_context('spawn')
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_solve_apart, args=(name, case, sender))
@@ -139,7 +137,7 @@ def solve_apart(name: str, case: Case) -> tuple[float, float, Answer] | None:
 
 @dataclass
 class Result:
-    """What a solver took and where it ended."""
+    """Time, memory and result of a solver."""
 
     best_s: float
     peak_mb: float
@@ -147,7 +145,7 @@ class Result:
 
 
 def solve_all(case: Case, names: list[str], repeats: int) -> dict[str, Result]:
-    """Results of the solvers that end in time."""
+    """Results of the solvers within the time limit."""
     results = {}
     for name in names:
         found = solve_apart(name, case)
@@ -156,14 +154,15 @@ def solve_all(case: Case, names: list[str], repeats: int) -> dict[str, Result]:
     for _ in range(repeats):
         for name, result in results.items():
             if name != 'opencv':  # which takes so long that once, apart, is enough
-                # Ours takes a fraction of the time of others: more of it, for the minimum.
+                # starcal takes a fraction of the time of others: repeat it more often for the
+                # minimum.
                 calls = 3 if name == 'starcal' else 1
                 result.best_s = min(result.best_s, least_s(calls, SOLVERS[name], case))
     return results
 
 
 def add_rows(table: Table, case: Case, names: list[str], results: dict[str, Result]) -> None:
-    """A row for each solver, set against ours."""
+    """Add a row for each solver, relative to starcal."""
     ours, m = results['starcal'], case.table.image_count
     sigma, least = parameter_sigma(case, ours.answer), cost_of(case, ours.answer)
     for name in names:
@@ -182,7 +181,7 @@ def add_rows(table: Table, case: Case, names: list[str], results: dict[str, Resu
             1e3 * result.best_s,
             f'{ratio:.1f}',
             judged,
-            # The whole estimate leaves stars out and weighs them anew: it has a cost of its own.
+            # The complete estimate rejects and reweights stars, so its cost is not comparable.
             None if name == 'estimate' else cost / least - 1.0,
             float(np.abs(off).max()),
             result.peak_mb,
@@ -198,7 +197,7 @@ def measure_growth(
     table = Table(title, (*columns, 'by pass', 'target'))
     for m in sizes:
         ensemble, prior = ensembles.get(m) or ensembles[max(ensembles)]
-        # The largest is the one before, five times: time is asked for, not numbers.
+        # The largest case repeats the previous one five times: only its time matters.
         case = make_case(Ensemble(ensemble.images * (m // len(ensemble.images))), prior)
         n, keep = len(case.table), np.ones(len(case.table), bool)
         measurements = arrange(case.table, keep, case.table.covariance_px2)
@@ -216,10 +215,10 @@ def measure_growth(
 
 def run(quick: bool) -> list[Table]:
     """
-    Compare the solvers at several numbers of images; then how ours grows with them.
+    Compare the solvers at several numbers of images, then the growth of starcal with them.
 
-    All with one thread of linear algebra: on two shared cores more threads wait for each other,
-    which costs SciPy up to five times its time and gains nobody anything.
+    All use one thread of linear algebra: on two shared cores more threads wait for each other,
+    which makes SciPy up to five times slower and no solver faster.
     """
     before = os.environ.get('OPENBLAS_NUM_THREADS')
     os.environ['OPENBLAS_NUM_THREADS'] = '1'  # read when numpy is loaded: by a new process
@@ -237,7 +236,7 @@ def run(quick: bool) -> list[Table]:
 
 
 def measure(quick: bool) -> list[Table]:
-    """What `run` prints."""
+    """Tables of `run`."""
     sizes = (6,) if quick else (15, 359, 2000)
     growth = (6, 30) if quick else (15, 359, 2000, 10000)
     repeats = 1 if quick else 3

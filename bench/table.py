@@ -1,4 +1,4 @@
-"""What a bench found, as an aligned table for people and as plain values for programs."""
+"""Result tables of benches, as aligned text and as plain values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Table:
         self.rows.append(cells)
 
     def text(self) -> str:
-        """Aligned columns: words to the left, numbers to the right."""
+        """Aligned columns: text to the left, numbers to the right."""
         shown = [list(self.columns), *([_shown(cell) for cell in row] for row in self.rows)]
         widths = [max(len(row[k]) for row in shown) for k in range(len(self.columns))]
         words = [
@@ -39,13 +39,13 @@ class Table:
         return '\n'.join([*lines, *(f'  {note}' for note in self.notes), ''])
 
     def content(self) -> dict[str, object]:
-        """The same as a JSON object."""
+        """The table as a JSON object."""
         rows = [dict(zip(self.columns, row, strict=True)) for row in self.rows]
         return {'title': self.title, 'rows': rows, 'notes': self.notes}
 
 
 def verdict(ratio: float, target: float) -> str:
-    """How a measured ratio stands to the least that is wanted."""
+    """Comparison of a measured ratio with its target."""
     return f'>= {target:g}: ' + ('met' if ratio >= target else 'MISSED')
 
 

@@ -1,5 +1,5 @@
 """
-Fast DDS with and without config/fastdds.xml: how late a small message and a large one come.
+Fast DDS with and without config/fastdds.xml: latency of a small and a large message.
 
 One participant sends an attitude and just after it a frame of 10.6 MB, five times a second, to a
 reader in another process.  Stock Fast DDS holds the small one back until its heartbeat.
@@ -28,7 +28,7 @@ _LATE_S = 8.0
 
 
 def run(quick: bool) -> list[Table]:
-    """Both settings, reliable and best effort, in turn."""
+    """Run both settings, reliable and best effort, alternating."""
     if not importlib.util.find_spec('rclpy'):
         print('transport: no rclpy here: left out\n')
         return []
@@ -65,7 +65,7 @@ def run(quick: bool) -> list[Table]:
 
 
 def settings(profile: str) -> dict[str, str]:
-    """Environment of a process that runs Fast DDS as it is, or by the profile of the package."""
+    """Environment of a process with stock Fast DDS, or with the profile of the package."""
     if profile == 'stock':
         return {}
     files = {f'{name}_DEFAULT_PROFILES_FILE': str(PROFILE) for name in ('FASTRTPS', 'FASTDDS')}
@@ -74,7 +74,7 @@ def settings(profile: str) -> dict[str, str]:
 
 @contextlib.contextmanager
 def profile(name: str) -> Iterator[None]:
-    """Let the processes that are started meanwhile run by a profile."""
+    """Context manager: processes started within it use a profile."""
     values = settings(name)
     os.environ.update(values)
     try:
@@ -102,12 +102,12 @@ def _send(reliability: str, count: int) -> None:
             lambda: images.get_subscription_count() and small.get_subscription_count(), ''
         )
         frame = Image(data=array('B', bytes(FRAME_BYTES)))
-        time.sleep(2.0)  # the reader may see the writer later than it is seen
+        time.sleep(2.0)  # discovery is not symmetric
         start_s = time.monotonic()
         for k in range(count):
             time.sleep(max(0.0, start_s + k / RATE_HZ - time.monotonic()))
             for message, publisher in ((Temperature(), small), (frame, images)):
-                seconds = time.time()  # clocks of one machine: both processes read the same
+                seconds = time.time()  # one machine: both processes read the same clock
                 message.header.stamp.sec = int(seconds)
                 message.header.stamp.nanosec = int(seconds % 1 * 1e9)
                 publisher.publish(message)

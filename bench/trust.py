@@ -22,11 +22,11 @@ import os
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bench.frames import history, load_set_up
 from bench.table import Table
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
@@ -38,7 +38,6 @@ from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.sky.astrometry import tt_julian_date
 
-Floats = NDArray[np.float64]
 Field = Callable[[Floats], Floats]  # displacement (n, 2) px of pixels (n, 2)
 
 SEEDS = 10

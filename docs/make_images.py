@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 import yaml
 
+from starcal_ros.arrays import Floats, Picture
 from starcal_ros.assessment.observability import coverage
 from starcal_ros.camera import distortion_px, pixel_grid
 from starcal_ros.cli import main as cli
@@ -35,9 +36,6 @@ from starcal_ros.simulation import images as simulated_images
 from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.simulation.scenario import Scenario
 from starcal_ros.sky.attitude import AttitudeHistory
-
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 FOLDER = Path(__file__).parent / 'images'
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'

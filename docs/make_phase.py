@@ -13,14 +13,12 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.image.centroiding import CentroidOptions, measure_stars, model_image
 from starcal_ros.image.detection import detect, measure_background
 from starcal_ros.simulation.images import expose, star_electrons
 from starcal_ros.simulation.scenario import Detector
-
-Floats = NDArray[np.float64]
 
 FILE = Path(__file__).parent / 'images' / 'pixel_phase.png'
 SHAPE = (1024, 1296)

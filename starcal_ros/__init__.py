@@ -5,10 +5,10 @@ After Christian, Benhacine, Hikes and D'Souza, "Geometric Calibration of the Ori
 Navigation Camera using Star Field Images", J. Astronaut. Sci. 2016,
 DOI 10.1007/s40295-016-0091-3.  Equation numbers in the docstrings are that paper's.
 
-Conventions, everywhere in this package:
+Conventions of the whole package:
 
 - Frames: ``icrf`` (inertial), ``star_tracker``, ``camera`` (+x right, +y down, +z out).
-- ``b_from_a`` takes coordinates in frame a to coordinates in frame b.
+- ``b_from_a`` transforms coordinates in frame a to coordinates in frame b.
 - Quaternions are scalar-last (x, y, z, w).
 - Small angles are passive rotations in the camera frame:
   ``camera_from_icrf <- exp(-[dtheta x]) camera_from_icrf``  (Eq. 11).

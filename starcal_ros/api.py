@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.bag import reader
 from starcal_ros.camera import CameraModel, line_of_sight, project
@@ -51,8 +52,6 @@ __all__ = [
     'read_calibration',
     'write_calibration',
 ]
-
-Floats = NDArray[np.float64]
 
 _UNIT_TOLERANCE = 1e-6  # 0.2 arcsec in a difference of directions; single precision meets it
 

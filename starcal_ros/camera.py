@@ -20,9 +20,9 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from starcal_ros.arrays import Floats
 from starcal_ros.detector_field import DetectorField
 from starcal_ros.lens import (
     coefficient_jacobian,
@@ -34,8 +34,6 @@ from starcal_ros.lens import (
     ideal_by_rotation,
     ideal_points,
 )
-
-Floats = NDArray[np.float64]
 
 INTRINSIC_NAMES = ('fx', 'skew', 'fy', 'cx', 'cy')
 

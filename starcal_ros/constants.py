@@ -1,10 +1,21 @@
-"""Physical and angular constants, each with its authority."""
+"""Physical and angular constants, each with its authority; the text form of a stamp."""
 
 from __future__ import annotations
 
+from datetime import datetime, timezone
 import math
 
 ARCSECOND_RAD = math.pi / 648000.0  # definition
 SPEED_OF_LIGHT_M_S = 299792458.0  # SI, exact
 AU_M = 149597870700.0  # IAU 2012 Resolution B2, exact
 NANOSECONDS_PER_SECOND = 1_000_000_000
+
+
+def utc_text(time_ns: int) -> str:
+    """Date and time to the millisecond, ``2026-05-15 07:20:00.000 UTC``."""
+    seconds, rest_ns = divmod(time_ns, NANOSECONDS_PER_SECOND)
+    try:
+        whole = datetime.fromtimestamp(seconds, timezone.utc)
+    except (ValueError, OverflowError, OSError):
+        return f'{time_ns} ns'  # outside the calendar of datetime
+    return f'{whole:%Y-%m-%d %H:%M:%S}.{rest_ns // 1_000_000:03d} UTC'

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from starcal_ros.arrays import Floats
 
 
 def degrees(total: int) -> NDArray[np.int64]:

@@ -1,10 +1,10 @@
-"""The few exceptions a caller may catch; their text is one line that a person can act on."""
+"""Exceptions that a caller may catch; each text is one line that names cause and remedy."""
 
 from __future__ import annotations
 
 
 class StarcalError(Exception):
-    """Base of all that starcal raises on purpose for bad input."""
+    """Base class of the exceptions that starcal raises for bad input."""
 
 
 class OptionError(StarcalError):
@@ -12,31 +12,31 @@ class OptionError(StarcalError):
 
 
 class CatalogError(StarcalError):
-    """The star catalog file is missing, damaged or not one."""
+    """The star catalog file is missing, damaged or of another format."""
 
 
 class BagError(StarcalError):
-    """A bag is missing, not a bag, or lacks what was asked of it."""
+    """A bag is missing, not an MCAP bag, or lacks the requested topic."""
 
 
 class ProductError(StarcalError):
-    """A calibration file or camera YAML cannot be read back."""
+    """A calibration file or a camera YAML file cannot be read."""
 
 
 class ArchiveError(StarcalError):
-    """The state folder cannot be used, or not be written just now; the text says why."""
+    """The state folder cannot be used or cannot be written at present."""
 
 
 class ImageRefused(StarcalError):
     """
-    One image cannot be used; the run goes on without it.
+    One image cannot be used; processing continues without it.
 
     Attributes
     ----------
     reason : str
-        Short stable name, counted and published (``records.IMAGE_REFUSALS``).
+        Stable name, counted and published (``records.IMAGE_REFUSALS``).
     detail : str
-        What was found, for a person.
+        Explanation for the operator.
     """
 
     def __init__(self, reason: str, detail: str = '') -> None:
@@ -46,4 +46,4 @@ class ImageRefused(StarcalError):
 
 
 class TooFewObservations(StarcalError):
-    """The ensemble cannot carry the calibration asked for; the text says what is missing."""
+    """The ensemble does not suffice for the requested calibration; the text names the shortage."""

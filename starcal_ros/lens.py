@@ -33,9 +33,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from starcal_ros.arrays import Floats
 
 _PLUMB_BOB = ('k1', 'k2', 'k3', 'p1', 'p2')
 _RATIONAL = (*_PLUMB_BOB, 'k4', 'k5', 'k6')

@@ -1,9 +1,8 @@
 """
-Options: declared once as dataclass fields, read from ROS parameter files.
+Options: dataclass fields with a description, a unit and a range; reading of parameter files.
 
-Each stage keeps its own frozen options dataclass beside the function that it tunes.  A field made
-with `option` carries its description, unit and range; ROS parameters, the parameter file and the
-documentation all come from those fields.
+Each stage has a frozen options dataclass beside the function that it tunes.  ROS parameters, the
+parameter file and the documentation are generated from the fields made with `option`.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ def option(
     length: int | None = None,
 ) -> Any:
     """
-    A dataclass field with what a ROS parameter descriptor needs.
+    Dataclass field with the content of a ROS parameter descriptor.
 
-    ``low`` and ``high`` are inclusive and hold for each element of a list; ``choices`` too.
+    ``low`` and ``high`` are inclusive; like ``choices`` they apply to each element of a list.
     """
     return dataclasses.field(
         default=default,
@@ -51,12 +50,12 @@ def option(
 
 def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
     """
-    The value in the field's own type.
+    Value converted to the type of the field.
 
     Raises
     ------
     OptionError
-        Naming the option, the value and what was expected.
+        With the option, the value and the expected type or range.
     """
     default, meta = field.default, field.metadata
 
@@ -75,7 +74,7 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
 
     def text(item: object) -> str:
         if not isinstance(item, str):
-            raise refuse('a text')
+            raise refuse('a string')
         if meta['choices'] and item not in meta['choices']:
             raise refuse('one of ' + ', '.join(meta['choices']) + nearest(item, meta['choices']))
         return item
@@ -87,7 +86,7 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
     if isinstance(default, int):
         whole = number(value)
         if whole != int(whole):
-            raise refuse('a whole number')
+            raise refuse('an integer')
         return int(whole)
     if isinstance(default, float):
         return float(number(value))
@@ -97,7 +96,7 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
         raise refuse('a list')
     items = list(value)
     if meta['length'] is not None and len(items) != meta['length']:
-        raise refuse(f'a list of {meta["length"]}')
+        raise refuse(f'a list of {meta["length"]} values')
     of_text = meta['choices'] or (isinstance(default, tuple) and isinstance(default[0], str))
     if of_text:
         return tuple(text(item) for item in items)
@@ -105,13 +104,13 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """What may have been meant by a word that is not known, as the end of a complaint."""
+    """Suggestion for an unknown word, to append to an error message; '' without a close match."""
     near = difflib.get_close_matches(word, known, 1)
     return f' (did you mean {near[0]}?)' if near else ''
 
 
 def holds_options(kind: object) -> bool:
-    """Whether a type is a dataclass whose fields were made with `option`."""
+    """Return True for a dataclass whose fields were all made with `option`."""
     return (
         isinstance(kind, type)
         and dataclasses.is_dataclass(kind)
@@ -120,18 +119,18 @@ def holds_options(kind: object) -> bool:
 
 
 def names_of(*option_classes: type[Any]) -> set[str]:
-    """Every option name of the given dataclasses."""
+    """Option names of the given dataclasses."""
     return {f.name for cls in option_classes for f in dataclasses.fields(cls)}
 
 
 def from_mapping(cls: type[OptionsT], values: Mapping[str, object]) -> OptionsT:
     """
-    An options dataclass from those entries of a mapping that it has fields for.
+    Options dataclass from the entries of a mapping that match its fields.
 
     Raises
     ------
     OptionError
-        For a value of the wrong type or out of range.
+        If a value has the wrong type or is out of range.
     """
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     return cls(**{f.name: check_value(f, values[f.name]) for f in fields if f.name in values})
@@ -139,14 +138,15 @@ def from_mapping(cls: type[OptionsT], values: Mapping[str, object]) -> OptionsT:
 
 def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]:
     """
-    The parameters of a ROS 2 parameter file that apply to any of the named nodes.
+    Parameters of a ROS 2 parameter file that apply to any of the named nodes.
 
-    Sections apply as in ROS: ``/**`` to all, then a node's own name, later ones winning.
+    Sections apply as in ROS: ``/**`` to all nodes, a node name to that node; later sections
+    override earlier ones.
 
     Raises
     ------
     OptionError
-        When the file cannot be read or is not a ROS parameter file.
+        If the file cannot be read or is not a ROS parameter file.
     """
     try:
         content = yaml.safe_load(path.read_text())
@@ -158,14 +158,13 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
         line = str(error).replace('\n', ' ')
         raise OptionError(f'{path}: not YAML: {line}') from error
     if not isinstance(content, dict):
-        raise OptionError(f'{path}: not a ROS parameter file (no node sections)')
+        raise OptionError(f'{path}: not a ROS parameter file: it has no node sections')
     values: dict[str, object] = {}
     known = {'/**', *nodes, *('/' + n for n in nodes), *('/**/' + n for n in nodes)}
     if not known & content.keys():
         there = ', '.join(map(str, content))
         raise OptionError(
-            f'{path}: not a parameter file for this: no section /**, {" or ".join(nodes)}, '
-            f'only {there[:80]}'
+            f'{path}: no section for /**, {" or ".join(nodes)}; the file has only {there[:80]}'
         )
     for section, body in content.items():
         if section not in known:

@@ -17,7 +17,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import Count, Finite, Floats, Shape
+from starcal_ros.arrays import Count, Finite, Floats, Pixels, Shape
 from starcal_ros.camera import CameraModel
 from starcal_ros.detector_field import degrees, DetectorField
 
@@ -76,7 +76,7 @@ class Image:
     """
 
     time_ns: int
-    pixels: NDArray[np.uint8] | NDArray[np.uint16]
+    pixels: Pixels
 
 
 @dataclass(frozen=True)

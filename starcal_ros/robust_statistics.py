@@ -1,8 +1,8 @@
 """
-Medians, and the standard deviations of normal noise that they stand for.
+Medians and the standard deviations of normal noise that correspond to them.
 
-NumPy's own median takes twenty times as long on the hundred numbers of one image: of an even count
-it forms the mean of two, and it looks for NaN.  These take the upper one of the two.
+`numpy.median` takes twenty times as long for the hundred numbers of one image: it checks for NaN
+and averages the two middle values of an even count.  These functions take the upper one.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from starcal_ros.arrays import Floats
 
 MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal distribution
 RAYLEIGH_TO_SIGMA = 1.0 / 1.1774  # median length of a vector of two normal components
 
 
 def median(values: NDArray[Any]) -> float:
-    """Middle one of all values, the upper of two; there must be one."""
+    """Median of at least one value; the upper middle value of an even count."""
     flat = values.ravel()
     middle = flat.size // 2
     return float(np.partition(flat, middle)[middle])

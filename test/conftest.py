@@ -1,4 +1,4 @@
-"""Shared by the tests on the real graph: a ROS domain of their own, node processes, a client."""
+"""Fixtures for tests with nodes: a separate ROS domain, node processes, a client."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from typing import Any
 
 import pytest
 
-START_S = 60.0  # a node imports and starts in 2 s; two busy cores make that much of it
+START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
 NODES = 'starcal_ros.nodes.'
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 
 
 def free_domain() -> int:
-    """A ROS domain in which nobody on this machine takes part."""
+    """Return a ROS domain without participants on this machine."""
     for k in range(100):
         domain = 1 + (os.getpid() + k) % 100
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -36,12 +36,24 @@ def free_domain() -> int:
     raise RuntimeError('no free ROS domain on this machine')
 
 
-os.environ['ROS_DOMAIN_ID'] = str(free_domain())
-os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+@pytest.fixture(scope='session')
+def ros_domain() -> Iterator[None]:
+    """Set an unused ROS domain in the environment, for this process and its node processes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('ROS_DOMAIN_ID', str(free_domain()))
+        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        yield
+
+
+@pytest.fixture(autouse=True)
+def domain_of_node_tests(request: pytest.FixtureRequest) -> None:
+    """Tests marked ``nodes`` run in `ros_domain`; other tests open no socket."""
+    if request.node.get_closest_marker('nodes'):
+        request.getfixturevalue('ros_domain')
 
 
 class NodeProcess:
-    """A node as a process of its own; what it says is kept in a file."""
+    """A node as a separate process with its output in a file."""
 
     def __init__(self, name: str, log: Path, arguments: list[str]) -> None:
         self.name = name
@@ -55,16 +67,16 @@ class NodeProcess:
             )
 
     def said(self) -> str:
-        """All that it has written so far."""
+        """Return the output so far."""
         return self._log.read_text(errors='replace')
 
     def wait(self, timeout_s: float = START_S) -> int:
-        """Exit status, when it ends by itself."""
+        """Wait for the end of the process; return its exit status."""
         return self.process.wait(timeout_s)
 
     def stop(self, number: int = signal.SIGINT) -> int:
-        """Exit status after a signal; kills it when it does not listen."""
-        self.tell_to_end(number)
+        """Send a signal and return the exit status; kill the process if it does not end."""
+        self.send(number)
         try:
             return self.process.wait(START_S)
         except subprocess.TimeoutExpired:
@@ -72,13 +84,13 @@ class NodeProcess:
             self.process.wait()
             raise
 
-    def tell_to_end(self, number: int = signal.SIGINT) -> None:
-        """Send a signal, if it is still there."""
+    def send(self, number: int = signal.SIGINT) -> None:
+        """Send a signal if the process still runs."""
         if self.process.poll() is None:
             self.process.send_signal(number)
 
     def end(self) -> None:
-        """Wait for it to end; kill it when it does not."""
+        """Wait for the end of the process; kill it if it does not end."""
         try:
             self.process.wait(START_S)
         except subprocess.TimeoutExpired:
@@ -90,8 +102,8 @@ StartNode = Callable[..., NodeProcess]
 
 
 @pytest.fixture
-def start_node(tmp_path: Path) -> Iterator[StartNode]:
-    """Start node processes by module name; they are stopped when the test ends."""
+def start_node(ros_domain: None, tmp_path: Path) -> Iterator[StartNode]:
+    """Start node processes by module name; they are stopped at the end of the test."""
     started: list[NodeProcess] = []
 
     def start(name: str, *arguments: str, ros: tuple[str, ...] = ()) -> NodeProcess:
@@ -101,17 +113,16 @@ def start_node(tmp_path: Path) -> Iterator[StartNode]:
         return started[-1]
 
     yield start
-    # One that does not end must not stay for the tests after it, nor keep the others here; whether
-    # nodes end when they are told is for test_lifecycle to say.
+    # A node that does not end must not disturb later tests; test_lifecycle tests that nodes end.
     for process in started:
-        process.tell_to_end()
+        process.send()
     for process in started:
         process.end()
 
 
 @pytest.fixture(scope='session')
 def tiny_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bag of the repository, its parameters such that a node anywhere finds the camera."""
+    """Copy of the bag in the repository, with an absolute URL of its camera file."""
     folder = tmp_path_factory.mktemp('bags') / 'tiny'
     shutil.copytree(TINY, folder)
     relative = (TINY / 'params.yaml').read_text()
@@ -123,7 +134,7 @@ def tiny_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='session')
 def tiny_products(tiny_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the tool, a process of its own, makes of that bag; who changes it takes a copy."""
+    """Products of `starcal calibrate` for that bag; tests must not change them."""
     folder = tmp_path_factory.mktemp('tiny_products')
     command = [sys.executable, '-m', 'starcal_ros.cli.main', 'calibrate', str(tiny_bag)]
     command += ['--params', str(tiny_bag / 'params.yaml'), '-o', str(folder)]
@@ -134,7 +145,7 @@ def tiny_products(tiny_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 def _seen(condition: Callable[..., object]) -> str:
-    """What a condition looks at, the newest of each list, cut to what can be read."""
+    """Values that a condition refers to, shortened; of lists the last element."""
     function = condition.func if isinstance(condition, functools.partial) else condition
     arguments = condition.args if isinstance(condition, functools.partial) else ()
     looked_at = inspect.signature(function).bind(*arguments).arguments
@@ -148,7 +159,7 @@ def _seen(condition: Callable[..., object]) -> str:
 
 
 class Client:
-    """A bare rclpy node that waits on conditions, never for a time."""
+    """A rclpy node that waits for conditions instead of sleeping."""
 
     def __init__(self) -> None:
         import rclpy
@@ -161,10 +172,10 @@ class Client:
         self._executor.add_node(self.node)
 
     def until(self, condition: Callable[[], object], timeout_s: float = START_S) -> None:
-        """Spin until a condition holds; fail where it does not within the time."""
+        """Spin until a condition holds; fail after the timeout."""
         deadline_s = time.monotonic() + timeout_s
         while not condition():
-            assert time.monotonic() < deadline_s, f'did not come to hold with {_seen(condition)}'
+            assert time.monotonic() < deadline_s, f'timeout with {_seen(condition)}'
             self._executor.spin_once(timeout_sec=0.05)
 
     def call(
@@ -176,9 +187,9 @@ class Client:
         **fields: Any,
     ) -> Any:
         """
-        Answer of a service; asked once more if there is none after some time.
+        Call a service; without an answer after some time, call it once more.
 
-        A node may take a request before it has found the reader of its answer, which is lost then.
+        A node may receive a request before discovery of the client; then its answer is lost.
         """
         client = self.node.create_client(kind, name)
         try:
@@ -190,7 +201,7 @@ class Client:
     def ask(
         self, service: Any, request: Any, timeout_s: float = 60.0, again_s: float = 20.0
     ) -> Any:
-        """Answer of a service that is ready; asked once more if there is none after some time."""
+        """Call a service that is ready; without an answer after some time, call it once more."""
         asked = [service.call_async(request)]
         again_s += time.monotonic()
 
@@ -203,37 +214,36 @@ class Client:
         return next(future.result() for future in asked if future.done())
 
     def collect(self, kind: Any, topic: str, qos: Any = 1000) -> list[Any]:
-        """A list that grows with the messages of a topic."""
+        """Return a list that collects the messages of a topic."""
         found: list[Any] = []
         self.node.create_subscription(kind, topic, found.append, qos)
         return found
 
     def latched(self, kind: Any, topic: str) -> list[Any]:
-        """A list of what a latched topic holds, read by a subscriber that comes late."""
+        """Return a list that collects the messages of a latched topic."""
         from rclpy.qos import DurabilityPolicy, QoSProfile
 
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         return self.collect(kind, topic, qos)
 
     def publisher(self, kind: Any, topic: str, depth: int = 1000) -> Any:
-        """A publisher that somebody listens to already."""
+        """Return a publisher with at least one matched subscriber."""
         publisher = self.node.create_publisher(kind, topic, depth)
         self.until(publisher.get_subscription_count)
         return publisher
 
     def until_listened(self, name: str = 'star_observer', listeners: int = 1) -> None:
         """
-        Wait until an observer itself knows who listens to its observations.
+        Wait until an observer reports that its observations have subscribers.
 
-        That the client has matched the observer says nothing of the other way round, and of a
-        third node nothing at all; what a volatile publisher sends before its match is lost.
+        Discovery is not symmetric, and messages of a volatile publisher before the match are lost.
         """
         from diagnostic_msgs.msg import DiagnosticArray
 
-        told: list[Any] = self.collect(DiagnosticArray, '/diagnostics')
+        reported: list[Any] = self.collect(DiagnosticArray, '/diagnostics')
 
         def is_listened() -> bool:
-            mine = [m.status[0] for m in told if m.status[0].name == f'starcal: {name}']
+            mine = [m.status[0] for m in reported if m.status[0].name == f'starcal: {name}']
             values = {v.key: v.value for status in mine[-1:] for v in status.values}
             return int(values.get('listeners', 0)) >= listeners
 
@@ -247,8 +257,8 @@ class Client:
 
 
 @pytest.fixture
-def client() -> Iterator[Client]:
-    """A client on the graph for one test."""
+def client(ros_domain: None) -> Iterator[Client]:
+    """A client node for one test."""
     pytest.importorskip('rclpy')
     pytest.importorskip('starcal.msg')
     one = Client()
@@ -257,8 +267,8 @@ def client() -> Iterator[Client]:
 
 
 @pytest.fixture
-def other_client() -> Iterator[Client]:
-    """A second client, which answers nothing while nobody waits on it."""
+def other_client(ros_domain: None) -> Iterator[Client]:
+    """A second client node; it answers requests only while it is spun."""
     pytest.importorskip('rclpy')
     one = Client()
     yield one
@@ -267,7 +277,7 @@ def other_client() -> Iterator[Client]:
 
 @pytest.fixture(scope='session')
 def tiny_observations() -> Any:
-    """An ensemble of the tiny bag's sky as if measured, without pixels."""
+    """Simulated observations of scenario tiny, without pixels."""
     synthetic = pytest.importorskip('starcal_ros.simulation.scenario')
     centroids = pytest.importorskip('starcal_ros.simulation.centroids')
     return centroids.true_observations(synthetic.scenario('tiny'))
@@ -275,7 +285,7 @@ def tiny_observations() -> Any:
 
 @pytest.fixture(scope='session')
 def camera_yaml(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The prior camera of `tiny_campaign` as a file."""
+    """Camera file of the prior of `tiny_campaign`."""
     from tiny_campaign import SCENARIO  # type: ignore[import-not-found]
 
     from starcal_ros.products.camera_yaml import write_camera_info

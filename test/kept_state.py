@@ -1,4 +1,4 @@
-"""A state folder that is filled, for tests that kill the process which fills it."""
+"""Writer of a state folder, for tests that kill its process."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def opened(folder: Path) -> Iterator[Archive]:
 
 
 def collect(folder: Path, shown: tuple[StarObservations, ...], told: Connection) -> None:
-    """In a process of its own: keep images and calibrations; tell when each call is done."""
+    """In a separate process: save images and calibrations, and report the end of each call."""
     with opened(folder) as archive:
         have, history = archive.read_ensemble(), archive.read_history()
         assert not archive.damage, archive.damage

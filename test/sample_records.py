@@ -1,4 +1,4 @@
-"""Records with a different number in every place, and how to tell that none was lost."""
+"""Records with a different number in every field, and exact comparison of records."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TIME_NS = 1_700_000_000_123_456_789
 
 
 def observations(n: int = 5) -> StarObservations:
-    """Observations of n stars with a different number in every place."""
+    """Observations of n stars with a different number in every field."""
     random = np.random.default_rng(3)
     directions = random.normal(size=(n, 3))
     return dataclasses.replace(
@@ -54,7 +54,7 @@ def observations(n: int = 5) -> StarObservations:
 
 
 def calibration() -> Calibration:
-    """A calibration with a different number in every place."""
+    """A calibration with a different number in every field."""
     parameters = [3641.5, -0.74, 3642.3, 647.5, 511.5, -0.051, 0.117, 0.01, 5.1e-4, 3.2e-4]
     camera = CameraModel(1296, 1024, np.array(parameters))
     return Calibration(
@@ -107,7 +107,7 @@ def calibration() -> Calibration:
 
 
 def plain_calibration() -> Calibration:
-    """A calibration that tells nothing beyond what each must."""
+    """A calibration without optional fields."""
     return dataclasses.replace(
         calibration(),
         temperature=None,
@@ -120,7 +120,7 @@ def plain_calibration() -> Calibration:
 
 
 def status() -> EnsembleStatus:
-    """A status with a different number in every place."""
+    """A status with a different number in every field."""
     return EnsembleStatus(
         time_ns=TIME_NS,
         images=3,
@@ -136,12 +136,12 @@ def status() -> EnsembleStatus:
 
 
 def plain(_type: str, /, **fields: Any) -> SimpleNamespace:
-    """Return a message that is nothing but its fields."""
+    """Return a plain object with the fields of a message."""
     return SimpleNamespace(**fields)
 
 
 def assert_same(a: Any, b: Any) -> None:
-    """Every field equal to the last bit, arrays with type and shape."""
+    """Assert that all fields are equal bit for bit, arrays with type and shape."""
     for field in dataclasses.fields(a):
         x, y = getattr(a, field.name), getattr(b, field.name)
         if dataclasses.is_dataclass(x):

@@ -1,4 +1,4 @@
-"""A sky of random stars, planets in a field, and a detector without flaws."""
+"""Random star catalogs, planets in a field, and a detector without defects."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
 
 
 def random_catalog(seed: int, count: int = 40_000, faintest: float = 9.0) -> StarCatalog:
-    """Stars all over the sky, as many more of each magnitude as there really are."""
+    """Uniform random stars with a realistic distribution of magnitudes."""
     rng = np.random.default_rng(seed)
     zero = np.zeros(count)
     return StarCatalog(
@@ -38,12 +38,12 @@ def random_catalog(seed: int, count: int = 40_000, faintest: float = 9.0) -> Sta
 
 CATALOG = random_catalog(1)
 
-# Venus, Jupiter, Mars, Saturn and Mercury, and Uranus, which could be any star.
+# Venus, Jupiter, Mars, Saturn, Mercury, and Uranus, which resembles a star.
 PLANET_MAGNITUDES = np.array([-4.2, -2.3, -1.0, 0.4, 1.5, 5.8])
 
 
 def with_planets(scenario: Scenario, shown: Scene, seed: int) -> Scene:
-    """A scene with six planets: four 3 to 25 px from one of its bright stars, two anywhere."""
+    """Scene with six planets: four at 3 to 25 px from a bright star, two at random pixels."""
     rng = np.random.default_rng(seed)
     camera = scenario.truth.camera
     size = np.array([camera.width, camera.height])

@@ -1,4 +1,4 @@
-"""Options: every type and limit, with texts that name the option and the value; YAML files."""
+"""Options: types, limits, error messages, YAML files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from starcal_ros.pipeline.setup import OPTION_CLASSES
 
 @dataclass(frozen=True)
 class Sample:
-    """One option of each type."""
+    """An option of each type."""
 
     yes: bool = option(False, 'a switch')
     count: int = option(3, 'a number of things', low=1, high=10)
@@ -63,7 +63,7 @@ def test_good_values(values: dict[str, object], expected: Sample) -> None:
         ({'yes': 1}, 'yes: 1 is not true or false'),
         ({'yes': 'true'}, "yes: 'true' is not true or false"),
         ({'count': True}, 'count: True is not a number'),
-        ({'count': 2.5}, 'count: 2.5 is not a whole number'),
+        ({'count': 2.5}, 'count: 2.5 is not an integer'),
         ({'count': 0}, 'count: 0 is not within 1 to 10'),
         ({'count': 11}, 'count: 11 is not within 1 to 10'),
         ({'count': '5'}, "count: '5' is not a number"),
@@ -74,9 +74,9 @@ def test_good_values(values: dict[str, object], expected: Sample) -> None:
         ({'size_px': False}, 'size_px: False is not a number'),
         ({'size_px': [1.0]}, 'size_px: [1.0] is not a number'),
         ({'kind': 'c'}, "kind: 'c' is not one of a, b"),
-        ({'kind': 1}, 'kind: 1 is not a text'),
-        ({'name': 3.0}, 'name: 3.0 is not a text'),
-        ({'axes': [1.0, 2.0]}, 'axes: [1.0, 2.0] is not a list of 3'),
+        ({'kind': 1}, 'kind: 1 is not a string'),
+        ({'name': 3.0}, 'name: 3.0 is not a string'),
+        ({'axes': [1.0, 2.0]}, 'axes: [1.0, 2.0] is not a list of 3 values'),
         ({'axes': 1.0}, 'axes: 1.0 is not a list'),
         ({'axes': 'abc'}, "axes: 'abc' is not a list"),
         ({'axes': [1.0, 2.0, -1.0]}, 'axes: [1.0, 2.0, -1.0] is not within 0.0 to None'),
@@ -84,8 +84,8 @@ def test_good_values(values: dict[str, object], expected: Sample) -> None:
         ({'axes': [1.0, 2.0, True]}, 'axes: [1.0, 2.0, True] is not a number'),
         ({'parts': ['u', 'x']}, "parts: ['u', 'x'] is not one of u, v, w"),
         ({'parts': 'u'}, "parts: 'u' is not a list"),
-        ({'parts': [1]}, 'parts: [1] is not a text'),
-        ({'words': [2]}, 'words: [2] is not a text'),
+        ({'parts': [1]}, 'parts: [1] is not a string'),
+        ({'words': [2]}, 'words: [2] is not a string'),
     ],
 )
 def test_bad_values(values: dict[str, object], text: str) -> None:

@@ -1,4 +1,4 @@
-"""The small simulated campaign that several tests measure and solve."""
+"""Small simulated campaign used by several tests."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TRUTH = SCENARIO.truth
 
 
 def values(camera_yaml: Path, **others: object) -> dict[str, object]:
-    """A parameter file's content that is complete."""
+    """Complete content of a parameter file."""
     return {
         'camera_info_url': str(camera_yaml),
         'prior_alignment': SCENARIO.prior.star_tracker_from_camera_xyzw.tolist(),

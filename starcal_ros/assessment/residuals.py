@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.records import Ensemble
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

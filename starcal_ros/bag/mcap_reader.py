@@ -1,10 +1,10 @@
 """
-The messages of an MCAP file, as far as they are sound.
+Intact messages of an MCAP file, damaged or not.
 
-A chunk whose checksum fails is left out.  Where the bytes between chunks are damaged, reading goes
-on at the next chunk that the summary knows; where the first chunk is lost, with it the names of
-the topics, they are the summary's.  What is missing is counted by the summary, or by the indexes
-that follow each chunk.  A file that was cut off has no summary: it is read up to the cut.
+A chunk with a wrong checksum is skipped.  If the bytes between chunks are damaged, reading
+continues at the next chunk listed in the summary; if the first chunk with the topic names is lost,
+the names come from the summary.  Lost messages are counted from the summary or, without one, from
+the indexes after each chunk.  A truncated file has no summary and is read up to its end.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ Damage = Callable[[str], None]
 
 MAGIC = b'\x89MCAP0\r\n'
 _FOOTER = struct.Struct('<BQQQI')  # kind, length, start of summary and of its offsets, checksum
-# Damage shows as whatever the bytes after it are taken for: no common base.
+# Damaged bytes are parsed as an arbitrary record, so the exceptions have no common base class.
 _DAMAGE_ERRORS = (McapError, ValueError, struct.error, KeyError, OverflowError, MemoryError)
 
 
 @dataclass(frozen=True)
 class RawMessage:
-    """One message as the bag holds it: ``data`` is serialised CDR, header included."""
+    """One recorded message; ``data`` is serialised CDR with its header."""
 
     topic: str
     type_name: str
@@ -48,12 +48,12 @@ class RawMessage:
 
 def read_summary(file: Path) -> Summary | None:
     """
-    The summary at the end of a file, empty where the file was written without one.
+    Summary at the end of a file; empty if the file was written without one.
 
-    None where it is damaged, or was never reached: a checksum is held against what is read.
+    None if the summary is damaged (its checksum is verified) or missing.
     """
     with file.open('rb') as stream:
-        # What a damaged summary raises has no common base.
+        # The exceptions of a damaged summary have no common base class.
         try:
             stream.seek(-(_FOOTER.size + len(MAGIC)), os.SEEK_END)
             tail = stream.read()
@@ -74,7 +74,7 @@ def read_summary(file: Path) -> Summary | None:
 def read_messages(
     file: Path, wanted: frozenset[str] | None, on_damage: Damage
 ) -> Iterator[RawMessage]:
-    """Sound messages of the wanted topics (None: all), in the order of the file."""
+    """Intact messages of the wanted topics (None: all), in file order."""
     summary = read_summary(file)
     known = summary or Summary()
     schemas: dict[int, Schema] = dict(known.schemas)
@@ -91,14 +91,14 @@ def read_messages(
             channel = channels.get(record.channel_id)
             schema = schemas.get(channel.schema_id) if channel else None
             if channel is None or schema is None or channel.message_encoding != 'cdr':
-                continue  # its channel went with a damaged chunk, or it is not ROS 2's
+                continue  # its channel was lost with a damaged chunk, or it is not ROS 2
             if wanted is None or channel.topic in wanted:
                 definition = schema.data.decode(errors='replace')
                 yield RawMessage(
                     channel.topic, schema.name, definition, record.log_time, record.data
                 )
     if summary is None and pieces.complete:
-        pieces.tell('cut off or damaged in its summary; what stands before it was read')
+        pieces.report('truncated, or its summary is damaged; all messages before it were read')
     if known.statistics is not None:
         expected = Counter(known.statistics.channel_message_counts)
         lost = expected - found
@@ -106,7 +106,7 @@ def read_messages(
         expected, lost = found + pieces.lost, pieces.lost
     nameless = {number: n for number, n in found.items() if number not in channels}
     if lost or nameless:
-        pieces.tell(_loss(lost, expected, channels, nameless))
+        pieces.report(_loss(lost, expected, channels, nameless))
 
 
 def _loss(
@@ -115,26 +115,26 @@ def _loss(
     channels: dict[int, Channel],
     nameless: dict[int, int],
 ) -> str:
-    """Messages lost by topic, as ``lost 3 of 16 on /image``."""
+    """Lost messages by topic, e.g. ``lost 3 of 16 on /image``."""
     parts = []
     for number, n in sorted(lost.items()):
         name = channels[number].topic if number in channels else f'channel {number}'
         parts.append(f'{n} of {expected[number]} on {name}')
     if nameless:
-        parts.append(f'{sum(nameless.values())} whose topic went with the damage')
+        parts.append(f'{sum(nameless.values())} of unknown topics')
     return 'lost ' + ', '.join(parts)
 
 
 class _Pieces:
     """
-    Schemas, channels and messages of a file, those in chunks too.
+    Schemas, channels and messages of a file, inside and outside chunks.
 
     Attributes
     ----------
     complete : bool
-        Whether the end of the data was reached.
+        True once the end of the data was reached.
     lost : Counter
-        Messages by channel that stood in damaged chunks, by the indexes that follow those.
+        Messages in damaged chunks by channel, from the indexes after those chunks.
     """
 
     def __init__(self, file: Path, summary: Summary, on_damage: Damage) -> None:
@@ -144,11 +144,11 @@ class _Pieces:
         self._on_damage = on_damage
         self._starts = sorted(index.chunk_start_offset for index in summary.chunk_indexes)
         self._has_chunks = bool(self._starts)
-        self._told = False
+        self._reported = False
 
-    def tell(self, text: str) -> None:
-        """Say a damage of this file."""
-        self._told = True
+    def report(self, text: str) -> None:
+        """Report damage of this file."""
+        self._reported = True
         self._on_damage(f'{self._file}: {text}')
 
     def __iter__(self) -> Iterator[McapRecord]:
@@ -159,7 +159,7 @@ class _Pieces:
                 start = yield from self._run(stream, start)
 
     def _run(self, stream: IO[bytes], start: int) -> Any:
-        """Pieces from an offset on; returns where to go on after damage, None at the end."""
+        """Pieces after an offset; returns the offset to continue at after damage, or None."""
         size = os.fstat(stream.fileno()).st_size
         reader = StreamReader(
             stream,
@@ -173,8 +173,8 @@ class _Pieces:
             for record in reader.records:
                 passed = self._start_after(read_to)
                 if passed is not None and passed < stream.tell():
-                    # A length that is too long, or a kind nobody knows, has swallowed a chunk.
-                    self.tell(f'damaged after byte {read_to} of {size}')
+                    # A wrong length or an unknown opcode has skipped the start of a chunk.
+                    self.report(f'damaged after byte {read_to} of {size}')
                     return passed
                 read_to = stream.tell()
                 if isinstance(record, Chunk):
@@ -189,35 +189,35 @@ class _Pieces:
                 elif not self._has_chunks or isinstance(record, (Schema, Channel)):
                     yield record
                 elif isinstance(record, Message):
-                    # Recorders put all messages into chunks or none: it is taken for one only.
-                    self.tell(f'damaged after byte {read_to} of {size}')
+                    # Recorders put all messages into chunks or none: this is no real message.
+                    self.report(f'damaged after byte {read_to} of {size}')
                     return self._start_after(read_to)
-            self.tell(f'damaged before byte {read_to} of {size}: its data have no end')
+            self.report(f'damaged before byte {read_to} of {size}: no end-of-data record')
         except _DAMAGE_ERRORS as error:
             following = self._start_after(read_to)
-            if following is None and not self._told:
+            if following is None and not self._reported:
                 at_end = isinstance(error, (EndOfFile, RecordLengthLimitExceeded))
-                kind = 'cut off' if at_end or stream.tell() >= size else 'damaged'
-                self.tell(
+                kind = 'truncated' if at_end or stream.tell() >= size else 'damaged'
+                self.report(
                     f'{kind} after byte {read_to} of {size} ({type(error).__name__});'
-                    ' what stands before it was read'
+                    ' all messages before it were read'
                 )
             elif following is not None:
-                self.tell(f'damaged after byte {read_to} of {size} ({type(error).__name__})')
+                self.report(f'damaged after byte {read_to} of {size} ({type(error).__name__})')
             return following
         return None
 
     def _start_after(self, offset: int) -> int | None:
-        """Offset of the first chunk of the summary beyond an offset."""
+        """Offset of the first chunk in the summary after an offset."""
         k = bisect.bisect_right(self._starts, offset)
         return self._starts[k] if k < len(self._starts) else None
 
     def _of_chunk(self, chunk: Chunk, end: int) -> Any:
-        """Records of a chunk; returns whether its checksum and its compression were right."""
+        """Records of a chunk; returns False if its checksum or compression is invalid."""
         try:
             stream, length = get_chunk_data_stream(chunk, validate_crc=True)
         except Exception as error:
-            self.tell(f'the chunk that ends at byte {end} is damaged and left out: {error}')
+            self.report(f'skipped the damaged chunk that ends at byte {end}: {error}')
             return False
         yield from _inside(stream, length)
         return True

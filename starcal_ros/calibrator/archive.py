@@ -26,7 +26,8 @@ import shutil
 from typing import Any
 
 from starcal_ros.arrays import Count
-from starcal_ros.bag.reader import BagWriter, read_observations
+from starcal_ros.bag.reader import read_observations
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.errors import ArchiveError, BagError, ProductError
 from starcal_ros.products.calibration_json import (
     calibration_content,

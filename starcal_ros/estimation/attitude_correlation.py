@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from starcal_ros.arrays import Floats
 
 _FEWEST_IMAGES = 8  # fewer show no correlation time
 _SHARES = np.array([0.0, 0.3, 0.6, 0.9, 1.0])  # of the process in the variance of the tracker

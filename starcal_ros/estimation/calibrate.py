@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import ALL_PARAMETER_NAMES, CameraModel, parameter_names
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.detector_field import in_degree
@@ -65,9 +66,6 @@ from starcal_ros.estimation.variance_components import (
 from starcal_ros.lens import COEFFICIENTS
 from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Ensemble, TemperatureTerms
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
 _START_FLOOR_PX = 0.05  # until the residuals tell: of the order of what is left in good images

@@ -1,25 +1,22 @@
 """
-Covariance of what the images share: camera, focal terms, alignment and its rate.
+Covariance of the shared parameters: camera, focal terms, alignment and its rate.
 
-From the normal matrices of the images at a state; it needs no residuals, so a calibration that has
-not been made yet has one too.
+It follows from the normal matrices of the images at a state without residuals, so it also predicts
+the covariance of a future calibration.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import parameter_names
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.linear_terms import LinearTerms
 from starcal_ros.estimation.normal_equations import ROTATION
 from starcal_ros.estimation.problem import by_shared, Problem, reduced_information, State
 from starcal_ros.records import ALIGNMENT_NAMES
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def shared_names(model: str, focal_terms: int, with_rate: bool) -> tuple[str, ...]:
@@ -48,7 +45,7 @@ def shared_covariance(
     blocks : (m, p + 4, p + 4)
         Of `problem.image_blocks`.
     good : (m,) bool
-        Images whose attitudes count in the mean of ``per_image``; the other methods do not ask.
+        Images in the mean alignment of ``per_image``; unused by the other methods.
     tracker_sigma_rad : (3,)
         Of those attitudes.
     terms : LinearTerms or None
@@ -57,7 +54,7 @@ def shared_covariance(
     Raises
     ------
     NotObservable
-        When the images do not determine all that is estimated.
+        If the images do not determine all estimated parameters.
     """
     information = reduced_information(problem, state, blocks, terms)
     shared = considered_covariance(problem, information)
@@ -70,10 +67,10 @@ def shared_covariance(
 
 def considered_covariance(problem: Problem, information: Floats) -> Floats:
     """
-    Covariance (p, p) of all camera parameters, and of what else the information has.
+    Covariance (p, p) of all camera parameters and of the other shared parameters.
 
-    A held parameter with a prior sigma is considered: its uncertainty is its own, and what it does
-    to the estimated ones is added to theirs; one without stays at zero.
+    A fixed parameter with a prior sigma is a consider parameter: it keeps its prior variance,
+    whose effect on the estimated parameters is added.  Without a prior sigma its variance is zero.
     """
     p, camera = len(information), problem.camera_count
     estimated = np.concatenate([problem.free, np.arange(camera, p)])

@@ -1,7 +1,7 @@
 """
 Levenberg-Marquardt on bordered block-diagonal normal equations (Eqs. 20-26).
 
-Knows no cameras and no stars.  The unknowns are p shared ones s and m blocks b_k of q each, and
+Independent of cameras and stars.  The unknowns are p shared ones s and m blocks b_k of q each, and
 the normal matrix is an arrow::
 
     N = [ A    B_1' ... B_m' ]        A (p, p)
@@ -9,9 +9,9 @@ the normal matrix is an arrow::
         [ ...        ...     ]        C (m, q, q)
         [ B_m            C_m ]
 
-so a step costs one pass over the blocks (Schur complement) and memory is linear in m:
+so a step takes one pass over the blocks (Schur complement) and memory is linear in m:
 with C~ and A~ damped, ``S = A~ - sum B_k' C~_k^-1 B_k``.  With m = 0 it is plain
-Levenberg-Marquardt.  The cost that accepts a step is the one whose gradient made it.
+Levenberg-Marquardt.  A step is accepted by the same cost whose gradient gave the step.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from starcal_ros.arrays import Floats
+
 StateT = TypeVar('StateT')
 
 _MAX_ITERATIONS = 100
-_STEP_TOLERANCE = 1e-9  # of a parameter's own 1-sigma scale: nobody can tell such a difference
-_COST_TOLERANCE = 1e-13  # relative; under 100 roundings of a cost summed in double precision
-_SCHUR_TOLERANCE = 1e-12  # a sum of a million products keeps twelve digits
-# The paper starts at 1e-3 (step 4), which holds the weak directions back: 6 passes, here 3.
+_STEP_TOLERANCE = 1e-9  # in 1-sigma of a parameter: negligible
+_COST_TOLERANCE = 1e-13  # relative; under 100 rounding errors of a sum in double precision
+_SCHUR_TOLERANCE = 1e-12  # precision of a sum of a million products
+# The paper starts at 1e-3 (step 4), which slows weak directions: 6 passes instead of 3.
 _LAMBDA_START = 1e-6
 _LAMBDA_MAX = 1e12
 
@@ -38,7 +38,7 @@ _LAMBDA_MAX = 1e12
 @dataclass(frozen=True)
 class NormalEquations:
     """
-    Cost ``F = sum of squares / 2`` (or its robust kind), its normal matrix and downhill vector.
+    Cost ``F = sum of squares / 2`` (or robust), its normal matrix and negative gradient.
 
     ``A`` (p, p), ``a`` (p,); ``B`` (m, q, p); ``C`` (m, q, q), ``c`` (m, q); the gradient of the
     cost is ``-[a; c]``.
@@ -55,10 +55,10 @@ class NormalEquations:
 @dataclass(frozen=True)
 class Solution(Generic[StateT]):
     """
-    Where the search ended and why.
+    Final state of the search and the reason of its termination.
 
-    ``termination`` is ``converged``, ``no_descent`` (damped to the limit without a lower cost)
-    or ``iteration_limit``; only the first is success.
+    ``termination`` is ``converged``, ``no_descent`` (no lower cost up to the largest damping) or
+    ``iteration_limit``; only the first is success.
     """
 
     state: StateT
@@ -68,7 +68,7 @@ class Solution(Generic[StateT]):
 
     @property
     def converged(self) -> bool:
-        """Whether a minimum was reached."""
+        """True if a minimum was reached."""
         return self.termination == 'converged'
 
 
@@ -78,9 +78,9 @@ class NotObservable(ArithmeticError):
 
 def _factor(matrix: Floats) -> tuple[Floats, Floats]:
     """
-    Scale (..., n), and inverse (..., n, n) of the unit-diagonal form of positive matrices.
+    Scale (..., n), and inverse (..., n, n) of positive matrices scaled to a unit diagonal.
 
-    ``inverse(matrix) = scale * that inverse * scale``: so parameters of any unit are alike.
+    ``inverse(matrix) = scale * scaled_inverse * scale``, which is independent of units.
     """
     diagonal = np.einsum('...ii->...i', matrix)
     if not (diagonal > 0).all():
@@ -88,12 +88,12 @@ def _factor(matrix: Floats) -> tuple[Floats, Floats]:
     scale = 1.0 / np.sqrt(diagonal)
     scaled = matrix * scale[..., :, None] * scale[..., None, :]
     try:
-        # The factorisation is the check that the matrix is positive definite.
+        # The factorisation fails if the matrix is not positive definite.
         lower = np.linalg.cholesky(scaled)
     except np.linalg.LinAlgError as error:
-        raise NotObservable('the unknowns cannot be told apart') from error
+        raise NotObservable('the unknowns cannot be separated') from error
     if np.einsum('...ii->...i', lower).min(initial=1.0) < 1e-7:
-        raise NotObservable('the unknowns cannot be told apart')
+        raise NotObservable('the unknowns cannot be separated')
     lower_inverse = np.linalg.inv(lower)
     return scale, np.swapaxes(lower_inverse, -1, -2) @ lower_inverse
 
@@ -106,16 +106,16 @@ def inverse(matrix: Floats) -> Floats:
 
 def _schur_complement(A: Floats, flat_B: Floats, W: Floats) -> Floats:
     """
-    ``A - B' C^-1 B`` (p, p): what the blocks leave of the shared unknowns.
+    ``A - B' C^-1 B`` (p, p): information on the shared unknowns with free blocks.
 
     Raises
     ------
     NotObservable
-        When of an unknown only rounding is left.
+        If the information on an unknown is below rounding.
     """
     S = A - flat_B.T @ W.reshape(flat_B.shape)
     if (np.diag(S) < _SCHUR_TOLERANCE * np.diag(A)).any():
-        raise NotObservable('the blocks explain a shared unknown')
+        raise NotObservable('a shared unknown cannot be separated from the blocks')
     return np.asarray(S)
 
 
@@ -152,7 +152,7 @@ def covariance(normal: NormalEquations) -> tuple[Floats, Floats, Floats]:
     cross : (m, q, p)
         Between each block and the shared unknowns.
     blocks : (m, q, q)
-        Of each block with itself.
+        Covariance of each block.
 
     Raises
     ------
@@ -181,11 +181,11 @@ def levenberg_marquardt(
     Parameters
     ----------
     state
-        Where to start; any type.
+        Start; any type.
     evaluate
-        Cost and normal equations at a state; a cost that is not finite refuses the state.
+        Cost and normal equations at a state; a state with a non-finite cost is rejected.
     move
-        A new state from a state, a shared step (p,) and block steps (m, q).
+        New state from a state, a shared step (p,) and block steps (m, q).
 
     Notes
     -----
@@ -201,7 +201,7 @@ def levenberg_marquardt(
     """
     normal = evaluate(state)
     if not np.isfinite(normal.cost):
-        raise NotObservable('the start does not explain the data: the cost is not finite')
+        raise NotObservable('the cost at the start is not finite')
     damping, growth = _LAMBDA_START, 2.0
     for iteration in range(1, _MAX_ITERATIONS + 1):
         shared, blocks = solve_arrow(normal, damping)
@@ -209,18 +209,18 @@ def levenberg_marquardt(
             np.abs(shared * np.sqrt(np.diag(normal.A))).max(initial=0.0),
             np.abs(blocks * np.sqrt(np.einsum('mii->mi', normal.C))).max(initial=0.0),
         )
-        # Half the reduction the linear model promises: step' (damping D step + [a; c]) / 2.
-        promised = 0.5 * (
+        # Predicted reduction of the cost: step' (damping D step + [a; c]) / 2.
+        predicted = 0.5 * (
             shared @ (damping * np.diag(normal.A) * shared + normal.a)
             + (blocks * (damping * np.einsum('mii->mi', normal.C) * blocks + normal.c)).sum()
         )
-        # Damping shortens a step: what matters is how far it would go without.
+        # The criteria apply to the undamped step.
         reach = 1.0 + damping
-        if scaled * reach < _STEP_TOLERANCE or promised * reach < _COST_TOLERANCE * normal.cost:
+        if scaled * reach < _STEP_TOLERANCE or predicted * reach < _COST_TOLERANCE * normal.cost:
             return Solution(state, normal, iteration, 'converged')
         candidate = move(state, shared, blocks)
         candidate_normal = evaluate(candidate)
-        gain = (normal.cost - candidate_normal.cost) / promised
+        gain = (normal.cost - candidate_normal.cost) / predicted
         if np.isfinite(candidate_normal.cost) and gain > 1e-4:
             state, normal = candidate, candidate_normal
             damping *= max(0.1, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)

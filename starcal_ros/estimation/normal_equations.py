@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import ALL_PARAMETER_NAMES, project_parameters
 from starcal_ros.detector_field import DetectorField
 from starcal_ros.lens import (
@@ -27,8 +28,6 @@ from starcal_ros.lens import (
     ideal_points,
 )
 from starcal_ros.records import StarObservations
-
-Floats = NDArray[np.float64]
 
 # Rows and columns of the matrix of an image; the camera's are as many as the model has parameters.
 CAMERA = slice(0, -4)
@@ -42,9 +41,9 @@ class StarTable:
     """
     All stars of an ensemble as columns, in image order.
 
-    ``image`` (n,) index of the image; ``catalog_id`` (n,); ``star`` (n,) index of the catalog star
-    among those that were seen; ``direction_icrf`` (n, 3);
-    ``measured_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``image_count``.
+    ``image`` (n,) index of the image; ``catalog_id`` (n,); ``star`` (n,) index among the observed
+    catalog stars; ``direction_icrf`` (n, 3); ``measured_px`` (n, 2); ``covariance_px2`` (n, 3) uu,
+    uv, vv; ``image_count``.
     """
 
     image: NDArray[np.int64]
@@ -91,7 +90,7 @@ class Measurements:
 
     chunks: tuple[Chunk, ...]
     image_count: int
-    # Of every pass: fresh pages for each would cost as much as the arithmetic on them.
+    # Reused in every pass: allocating new pages takes as long as the arithmetic on them.
     derivatives: Floats
 
 
@@ -111,7 +110,7 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
     """
     Lay out the kept stars, (n,) mask, whitened by covariances (n, 3).
 
-    Images of like size share a chunk, so that little is padded.
+    Images with similar star counts share a chunk, which limits the padding.
     """
     order = np.nonzero(keep)[0]
     counts = np.bincount(table.image[order], minlength=table.image_count)
@@ -121,7 +120,7 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
     chunks = []
     first = 0
     while first < len(images):
-        # No image is padded by more than half, and none alone is too large for a chunk.
+        # Padding is at most half of an image; a single image always fits.
         like = counts[images] <= 1.5 * counts[images[first]] + 8
         fits = np.arange(1, len(images) - first + 1) * counts[images[first:]] <= _CHUNK_STARS
         last = first + max(1, int(np.count_nonzero(like[first:] & fits)))
@@ -278,8 +277,8 @@ def _plumb_bob_columns(
     """
     Write the same as `_lens_columns` for ``plumb_bob``, in half the time.
 
-    The columns are those of `camera.project_jacobians`, whitened as they are made and in place:
-    most of the time of a calibration is spent here, in memory traffic.
+    The columns are those of `camera.project_jacobians`, whitened in place: most of the
+    time of a calibration is spent here, in memory traffic.
     """
     del model
     m, _, n = chunk.direction_icrf.shape

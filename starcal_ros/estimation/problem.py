@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import parameter_names
 from starcal_ros.detector_field import DetectorField
 from starcal_ros.estimation.levenberg_marquardt import (
@@ -43,8 +44,6 @@ from starcal_ros.estimation.linear_terms import (
 from starcal_ros.estimation.normal_equations import Measurements, normal_blocks, RESIDUAL, ROTATION
 from starcal_ros.estimation.residual_field import FieldPrior
 from starcal_ros.estimation.temperature import parameters_at, parameters_chain, turns, turns_chain
-
-Floats = NDArray[np.float64]
 
 METHODS = ('hierarchical', 'per_image', 'single')
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import (
     CameraModel,
     line_of_sight,
@@ -30,8 +31,6 @@ from starcal_ros.camera import (
 )
 from starcal_ros.detector_field import basis, degrees, DetectorField, legendre
 from starcal_ros.estimation.linear_terms import Scalars, Score
-
-Floats = NDArray[np.float64]
 
 TEST_DEGREE = 10
 _MAX_DEGREE = 16

@@ -1,33 +1,31 @@
 """
-How a camera changes with its temperature (beyond the paper; as NASA's GIANT has it).
+Temperature dependence of focal length and alignment (beyond the paper; as in NASA's GIANT).
 
 With ``dT`` the temperature of an image less the reference::
 
     fx, skew, fy              times g = 1 + a1 dT + a2 dT^2
     camera_from_star_tracker  exp(-[b dT x]) times that at the reference
 
-``a`` are the focal terms, ``b`` the alignment rate: a passive small rotation in the camera frame
-for each degree.
+``a`` are the focal terms, ``b`` the alignment rate: a small passive rotation of the camera frame
+per degree.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
+from starcal_ros.arrays import Floats
 from starcal_ros.records import Calibration, CameraGeometry, TemperatureTerms
 
-Floats = NDArray[np.float64]
-
-FEWEST_SPREAD_K = 1.0  # of the temperatures: what a sensor reads off and lags hides a smaller one
-_CHANCE = 0.0027  # of a term that is none being kept: 3 sigma
+FEWEST_SPREAD_K = 1.0  # of the temperatures; sensor errors and lag hide a smaller one
+_MAX_P_VALUE = 0.0027  # significance of a term: 3 sigma
 _SCALED = slice(0, 3)  # fx, skew, fy
 
 
 def focal_factor(focal: Floats, above_reference_k: Floats) -> Floats:
-    """Factors (m,) of the focal length at temperatures (m,) above the reference."""
+    """Factors (m,) of the focal length at temperature differences (m,) from the reference."""
     return np.asarray(1.0 + _powers(above_reference_k, len(focal)) @ focal)
 
 
@@ -49,15 +47,15 @@ def parameters_chain(parameters: Floats, focal: Floats, above_reference_k: Float
 
 
 def turns(rate: Floats, above_reference_k: Floats) -> Rotation:
-    """Rotations (m) of the camera frame at temperatures (m,) above the reference."""
+    """Rotations (m) of the camera frame at temperature differences (m,) from the reference."""
     return Rotation.from_rotvec(-np.outer(above_reference_k, rate))
 
 
 def turns_chain(rate: Floats, above_reference_k: Floats) -> Floats:
     """
-    How alignment angles and rate turn the camera of each image, (m, 3, 6).
+    Derivative (m, 3, 6) of the rotation of each image by alignment angles and rate.
 
-    Exact to a twelfth of the squared turn: 1e-7 at 0.06 degrees.
+    Relative error: a twelfth of the squared rotation, 1e-7 at 0.06 degrees.
     """
     dT = above_reference_k[:, None, None]
     x, y, z = rate
@@ -73,7 +71,7 @@ def camera_at(calibration: Calibration, temperature_degc: float) -> CameraGeomet
 def geometry_at(
     geometry: CameraGeometry, thermal: TemperatureTerms | None, temperature_degc: float
 ) -> CameraGeometry:
-    """Camera and alignment at a temperature, from those at the reference."""
+    """Camera and alignment at a temperature; unchanged without thermal terms."""
     if thermal is None:
         return geometry
     above_k = np.array([temperature_degc - thermal.reference_degc])
@@ -83,13 +81,13 @@ def geometry_at(
         fx, skew, fy = parameters_at(camera.parameters, focal, above_k)[0, _SCALED]
         camera = camera.replace(fx=float(fx), skew=float(skew), fy=float(fy))
     if thermal.alignment_rate_rad_per_degc:
-        turn = turns(np.array(thermal.alignment_rate_rad_per_degc), above_k)[0]
-        alignment = (Rotation.from_quat(alignment) * turn.inv()).as_quat()
+        rotation = turns(np.array(thermal.alignment_rate_rad_per_degc), above_k)[0]
+        alignment = (Rotation.from_quat(alignment) * rotation.inv()).as_quat()
     return CameraGeometry(camera, alignment)
 
 
 def why_unsupported(temperatures_degc: Floats, order: int) -> str:
-    """Why images of these temperatures (m,) carry no thermal terms; empty where they may."""
+    """Reason why temperatures (m,) do not determine thermal terms; '' if they do."""
     unknown = int(np.count_nonzero(~np.isfinite(temperatures_degc)))
     count = len(temperatures_degc)
     if unknown:
@@ -99,29 +97,29 @@ def why_unsupported(temperatures_degc: Floats, order: int) -> str:
         return f'the temperatures spread by {spread:.2g} degC, less than {FEWEST_SPREAD_K:g}'
     distinct = len(np.unique(temperatures_degc))
     if distinct <= order:
-        return f'{distinct} temperatures do not carry a polynomial of degree {order}'
+        return f'{distinct} temperatures do not determine a polynomial of degree {order}'
     return ''
 
 
 def weakest_term(thermal: TemperatureTerms, rate_covariance: Floats) -> str:
     """
-    The one to leave out of the highest focal term and the rate: 'focal', 'rate' or neither.
+    Term to omit: 'focal' (the highest focal term), 'rate', or '' if both are significant.
 
-    The one that chance explains better, where that is beyond 3 sigma of a single number.
+    The term with the larger p-value, if that exceeds the one of 3 sigma.
     """
-    chances = {}
+    p_values = {}
     if thermal.focal_per_degc:
         sigmas = thermal.focal_per_degc[-1] / thermal.focal_per_degc_sigma[-1]
-        chances['focal'] = float(chdtrc(1, sigmas**2))
+        p_values['focal'] = float(chdtrc(1, sigmas**2))
     if thermal.alignment_rate_rad_per_degc:
         rate = np.array(thermal.alignment_rate_rad_per_degc)
-        chances['rate'] = float(chdtrc(3, rate @ np.linalg.solve(rate_covariance, rate)))
-    weakest = max(chances, key=lambda name: chances[name], default='')
-    return weakest if chances.get(weakest, 0.0) > _CHANCE else ''
+        p_values['rate'] = float(chdtrc(3, rate @ np.linalg.solve(rate_covariance, rate)))
+    weakest = max(p_values, key=lambda name: p_values[name], default='')
+    return weakest if p_values.get(weakest, 0.0) > _MAX_P_VALUE else ''
 
 
 def summary(thermal: TemperatureTerms) -> str:
-    """Return a line for a person."""
+    """One line of text with the terms, their sigmas and the reference."""
     parts = [
         f'a{k} {value:+.4g} ({sigma:.2g}) /degC' + (f'^{k}' if k > 1 else '')
         for k, (value, sigma) in enumerate(
@@ -138,5 +136,5 @@ def summary(thermal: TemperatureTerms) -> str:
 
 
 def _powers(above_reference_k: Floats, order: int) -> Floats:
-    """First to ``order``-th powers (m, order)."""
+    """Powers 1 to ``order`` of the temperature differences, (m, order)."""
     return np.asarray(above_reference_k[:, None] ** np.arange(1, order + 1))

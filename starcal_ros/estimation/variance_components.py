@@ -11,12 +11,10 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.special import chdtr
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from starcal_ros.arrays import Floats, Mask
 
 _STARS_PER_GROUP = 40  # whose median squared residual is known to 25 %
 _FEWEST_IMAGES = 3  # from which their scatter can contradict a sigma, or one of them the others

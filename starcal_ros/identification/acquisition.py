@@ -1,9 +1,9 @@
 """
-Which source is which star, where the prior alignment may be far off.
+Identification of sources with stars under a large error of the prior alignment.
 
-The common shift and roll is found by a vote of bright sources against bright predictions; then
-rotation, scale and a smooth correction are fitted, and the match is checked against chance.
-Sources that no match explains are refused, never matched wrongly.
+Bright sources and bright predictions vote for a common shift and roll; then rotation, scale and a
+smooth correction are fitted, and the match is tested against the hypothesis of chance.  An image
+without a significant match is refused.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import bdtr, pdtrc
 
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import line_of_sight, project, rotation_jacobian
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.polynomial_warp import fit_warp, warp_powers
@@ -24,15 +24,13 @@ from starcal_ros.image.detection import Sources
 from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import median, medians
 
-Floats = NDArray[np.float64]
-
-# Brightest predictions and sources that vote: their pairs fill one histogram at once.
+# Number of the brightest predictions and sources that vote; all pairs fill one histogram.
 _VOTERS = 100
-_SIDE = 3  # parts of the image along each side, in which a match must hold
+_SIDE = 3  # the image is checked in _SIDE x _SIDE parts
 PARTS = _SIDE**2
-_TELLING = 4  # points of a part whose share means anything
-_PART_CHANCE = 1e-3  # greatest probability that a right match misses so many in a part
-_CHANCE = 1e-9  # greatest probability that a match is accepted by chance
+_FEWEST_IN_PART = 4  # points in a part for a significant share
+_PART_MAX_P_VALUE = 1e-3  # of the misses in a part, if the match is right
+_MAX_P_VALUE = 1e-9  # of the matched stars, if the match is wrong
 
 
 def acquire(
@@ -43,17 +41,17 @@ def acquire(
     roll_rad: float,
 ) -> Floats:
     """
-    Predicted pixels (n, 2) brought onto the sources of the image.
+    Predicted pixels (n, 2) corrected to match the sources of the image.
 
-    They may be off by up to ``reach_px``, and rolled by up to ``roll_rad``.
+    The prediction error is at most ``reach_px`` and a roll of ``roll_rad``.
 
     Raises
     ------
     ImageRefused
-        ``no_match`` where no more of them meet a source than chance explains.
+        ``no_match`` if the number of matched predictions is consistent with chance.
     """
-    turn = _vote(prediction, sources, geometry, reach_px, roll_rad)
-    return _match(prediction, sources, geometry, turn)
+    rotation = _vote(prediction, sources, geometry, reach_px, roll_rad)
+    return _match(prediction, sources, geometry, rotation)
 
 
 def _vote(
@@ -64,25 +62,25 @@ def _vote(
     roll_rad: float,
 ) -> Rotation:
     """
-    Small rotation of the camera frame that brings the predictions near their sources.
+    Small rotation of the camera frame that moves the predictions near their sources.
 
     For each roll within the limit, the pixel offsets of all pairs of bright sources and bright
-    predictions are counted in cells; true pairs share one cell, false ones spread.
+    predictions are counted in cells; true pairs share one cell, false ones are spread.
 
     Raises
     ------
     ImageRefused
-        ``no_match`` when the best cell holds no more than chance would put there.
+        ``no_match`` if the count of the best cell is consistent with chance.
     """
     camera = geometry.camera
     half_diagonal_px = 0.5 * np.hypot(camera.width, camera.height)
-    # Wide enough for what the prior focal length and the roll step leave at the edge, but a small
-    # part of what is searched: a cell as large as the search would count everything.
+    # Large enough for the errors of the prior focal length and the roll step at the edge, but
+    # small against the search range: a cell as large as the range would count everything.
     cell_px = min(max(3.0, 0.008 * half_diagonal_px), reach_px / 4)
     half_cells = int(np.ceil(reach_px / cell_px)) + 1
     roll_step = cell_px / half_diagonal_px
     roll_steps = int(np.ceil(roll_rad / roll_step))
-    # Nearest to zero first: of equal votes the smallest turn wins.
+    # Smallest first: among equal votes the smallest rotation wins.
     rolls_rad = [k * roll_step for k in sorted(range(-roll_steps, roll_steps + 1), key=abs)]
 
     centre = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
@@ -93,9 +91,10 @@ def _vote(
     trials = len(rolls_rad) * (2 * half_cells + 1) ** 2
     if votes < 4 or pdtrc(votes - 1, expected) * trials > 1e-2:
         raise ImageRefused(
-            'no_match', f'{votes} of {min(len(stars), len(seen))} bright stars agree, as by chance'
+            'no_match',
+            f'{votes} of {min(len(stars), len(seen))} bright stars agree, consistent with chance',
         )
-    offset = seen[:, None] - _turn(stars, roll)[None]
+    offset = seen[:, None] - _rotated(stars, roll)[None]
     in_block = ((offset >= low) & (offset < low + 2 * cell_px)).all(axis=2)
     shift_px = medians(offset[in_block])
     middle = line_of_sight(camera, np.stack([centre, centre + shift_px]))
@@ -107,15 +106,14 @@ def _fullest_block(
     stars_px: Floats, sources_px: Floats, cell_px: float, half_cells: int, rolls_rad: list[float]
 ) -> tuple[int, float, Floats]:
     """
-    Votes of the two by two cells that most offsets fall into, and their roll and corner.
+    Votes of the fullest block of two by two cells, its roll and its lower corner (2,), px.
 
-    ``stars_px`` (n, 2) and ``sources_px`` (m, 2) count from the point of the roll; the corner (2,)
-    is the one of the least offset, px.
+    ``stars_px`` (n, 2) and ``sources_px`` (m, 2) are relative to the centre of the roll.
     """
     cells = 2 * half_cells + 1
     most, best_roll, best = -1, 0.0, (0, 0)
     for roll in rolls_rad:
-        offset = sources_px[:, None] - _turn(stars_px, roll)[None]
+        offset = sources_px[:, None] - _rotated(stars_px, roll)[None]
         cell = np.floor(offset / cell_px).astype(np.int64).reshape(-1, 2) + half_cells
         inside = ((cell >= 0) & (cell < cells)).all(axis=1)
         flat = cell[inside, 1] * cells + cell[inside, 0]
@@ -128,17 +126,17 @@ def _fullest_block(
     return most, best_roll, (np.array(best) - half_cells) * cell_px
 
 
-def _turn(xy_px: Floats, angle_rad: float) -> Floats:
-    """Points (n, 2) turned about the origin from +u towards +v."""
+def _rotated(xy_px: Floats, angle_rad: float) -> Floats:
+    """Points (n, 2) rotated about the origin from +u towards +v."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.asarray(xy_px @ np.array([[c, s], [-s, c]]))
 
 
-def _pairs(predicted_px: Floats, sources_px: Floats, radius_px: float) -> NDArray[np.int64]:
+def _pairs(predicted_px: Floats, sources_px: Floats, radius_px: float) -> Indices:
     """
-    Pairs (k, 2) of prediction and source that are each other's nearest within a radius.
+    Pairs (k, 2) of prediction and source that are mutual nearest neighbours within a radius.
 
-    Only mutual nearest neighbours count, so no source and no star is used twice.
+    No source and no star is used twice.
     """
     if len(predicted_px) == 0 or len(sources_px) == 0:
         return np.empty((0, 2), np.int64)
@@ -154,17 +152,17 @@ def _refine_rotation(
     sources: Sources,
     geometry: CameraGeometry,
     start: Rotation,
-    stars: NDArray[np.int64],
-) -> tuple[Floats, NDArray[np.int64]]:
+    stars: Indices,
+) -> tuple[Floats, Indices]:
     """
-    Predicted pixels (n, 2) after rotation and focal scale fit the sources, and their pairs (k, 2).
+    Predicted pixels (n, 2) after a fit of rotation and focal scale, and the pairs (k, 2).
 
-    Robust Gauss-Newton on the small rotation and one common scale, the radius of matching closing
-    in; only ``stars`` (rows of the prediction) and the sources take part.
+    Robust Gauss-Newton on the small rotation and one common scale with a decreasing matching
+    radius; only ``stars`` (rows of the prediction) are matched to the sources.
     """
     camera = geometry.camera
     rotation, scale = start, 1.0
-    pairs: NDArray[np.int64] = np.empty((0, 2), np.int64)
+    pairs: Indices = np.empty((0, 2), np.int64)
     centre = camera.parameters[3:5]
     widest = max(8.0, 0.012 * np.hypot(camera.width, camera.height))
     for radius_px in (widest, widest, widest, widest / 2, widest / 2, widest / 3, widest / 3):
@@ -191,22 +189,22 @@ def _refine_rotation(
 
 
 def _match(
-    prediction: Prediction, sources: Sources, geometry: CameraGeometry, turn: Rotation
+    prediction: Prediction, sources: Sources, geometry: CameraGeometry, rotation: Rotation
 ) -> Floats:
     """
-    Predicted pixels (n, 2) refined onto the sources, once the match is beyond chance.
+    Predicted pixels (n, 2) refined to match the sources.
 
     Raises
     ------
     ImageRefused
-        ``no_match`` when the refined predictions meet no more sources than chance explains.
+        ``no_match`` if the number of matched predictions is consistent with chance.
     """
     camera = geometry.camera
-    # As many predictions as sources and the other way round: the fainter surplus matches nothing.
+    # Equal numbers of predictions and sources: the fainter surplus has no counterpart.
     bright = np.arange(min(len(prediction.xy_px), 4 * len(sources.snr), 400))
     first = 4 * len(bright)
     seen = dataclasses.replace(sources, xy_px=sources.xy_px[:first], snr=sources.snr[:first])
-    xy, pairs = _refine_rotation(prediction, seen, geometry, turn, bright)
+    xy, pairs = _refine_rotation(prediction, seen, geometry, rotation, bright)
     half_px = 0.5 * max(camera.width, camera.height)
     for radius_px in (max(4.0, 0.003 * half_px * 2), 3.0, 2.0):
         if len(pairs) < 4:
@@ -221,19 +219,19 @@ def _match(
         pairs = _pairs((xy + correction)[bright], seen.xy_px, radius_px)
     if len(pairs) >= 4:
         xy = xy + correction
-    # Rotation, scale and warp were fitted to the pairs: two parameters can buy one pair.
-    bought = 2 + len(warp_powers(len(pairs)))
-    _check_beyond_chance(xy[bright], seen, bought, camera.width, camera.height)
+    # Rotation, scale and warp were fitted to the pairs: two parameters can make one false pair.
+    fitted_pairs = 2 + len(warp_powers(len(pairs)))
+    _check_beyond_chance(xy[bright], seen, fitted_pairs, camera.width, camera.height)
     return xy
 
 
 def _check_beyond_chance(
-    predicted_px: Floats, sources: Sources, bought: int, width: int, height: int
+    predicted_px: Floats, sources: Sources, fitted_pairs: int, width: int, height: int
 ) -> None:
     """
-    Nothing, where more predictions (n, 2) meet a source than chance explains.
+    Refuse the match if the number of predictions (n, 2) on a source is consistent with chance.
 
-    ``bought`` is how many may meet one because a fit has bent them there.
+    ``fitted_pairs`` is the number of false pairs that the fit itself can make.
 
     Raises
     ------
@@ -247,23 +245,24 @@ def _check_beyond_chance(
     density = len(sources.snr) / sources.searched_px2
     tried = int(np.count_nonzero(inside))
     expected = tried * -np.expm1(-density * np.pi * radius_px**2)
-    few = max(6, 1 + bought)
-    if matched < few or pdtrc(matched - 1 - bought, expected) > _CHANCE:
+    few = max(6, 1 + fitted_pairs)
+    if matched < few or pdtrc(matched - 1 - fitted_pairs, expected) > _MAX_P_VALUE:
         raise ImageRefused(
             'no_match',
-            f'{matched} of {tried} predicted stars meet a source, {expected:.0f} would by chance',
+            f'{matched} of {tried} predicted stars match a source, {expected:.0f} expected by'
+            ' chance',
         )
     if _matched_in_part(sources, met[:, 1], width, height):
-        raise ImageRefused('no_match', 'stars agree in a part of the image only')
+        raise ImageRefused('no_match', 'stars match in one part of the image only')
 
 
-def _matched_in_part(sources: Sources, met: NDArray[np.int64], width: int, height: int) -> bool:
+def _matched_in_part(sources: Sources, met: Indices, width: int, height: int) -> bool:
     """
-    Whether the bright sources of most parts of the image meet far fewer predictions than of one.
+    Return True if bright sources are matched in one part of the image but not in most others.
 
-    ``met`` are the sources that meet one.  In a crowded field a wrong scale or shape can be right
-    in one part and chance in the others, and beyond chance in all.  A part without stars, behind a
-    cloud, shows no sources and says nothing.
+    ``met`` are the matched sources.  In a crowded field a wrong scale or distortion can be right
+    in one part and still pass the test over the whole image.  A part without sources, e.g. behind
+    a cloud, is not counted.
     """
     bright = sources.snr >= median(sources.snr[met])
     meets = np.zeros(len(sources.snr), bool)
@@ -272,26 +271,26 @@ def _matched_in_part(sources: Sources, met: NDArray[np.int64], width: int, heigh
     shown = np.bincount(part[bright], minlength=PARTS)
     found = np.bincount(part[bright & meets], minlength=PARTS)
     missed = missed_parts(shown, found)
-    return bool(2 * np.count_nonzero(missed) > np.count_nonzero(shown >= _TELLING))
+    return bool(2 * np.count_nonzero(missed) > np.count_nonzero(shown >= _FEWEST_IN_PART))
 
 
-def part_of(xy_px: Floats, width: int, height: int) -> NDArray[np.int64]:
-    """Number (n,) of the part of the image, below `PARTS`, that points (n, 2) stand in."""
+def part_of(xy_px: Floats, width: int, height: int) -> Indices:
+    """Index (n,), 0 to `PARTS` - 1, of the part of the image that holds each point (n, 2)."""
     cell = np.clip((xy_px * _SIDE / [width, height]).astype(np.int64), 0, _SIDE - 1)
     return np.asarray(cell[:, 1] * _SIDE + cell[:, 0])
 
 
-def best_share(shown: NDArray[np.int64], found: NDArray[np.int64]) -> float:
-    """Share found of the points shown (PARTS,) in the part where it is largest."""
-    return float((found / (shown + 1.0)).max(where=shown >= _TELLING, initial=0.0))
+def best_share(shown: Indices, found: Indices) -> float:
+    """Largest share over all parts of the points found (PARTS,) among those shown (PARTS,)."""
+    return float((found / (shown + 1.0)).max(where=shown >= _FEWEST_IN_PART, initial=0.0))
 
 
-def missed_parts(shown: NDArray[np.int64], found: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Parts (PARTS,) in which far fewer are found of the points shown than in the best one."""
-    told = shown >= _TELLING
-    if np.count_nonzero(told) < 2:
-        return np.zeros_like(told)
+def missed_parts(shown: Indices, found: Indices) -> Mask:
+    """Mask (PARTS,) of the parts with a much smaller share of points found than the best part."""
+    conclusive = shown >= _FEWEST_IN_PART
+    if np.count_nonzero(conclusive) < 2:
+        return np.zeros_like(conclusive)
     best = best_share(shown, found)
-    # Not by a little: a cosmic ray is several sources in one place.
-    few = (bdtr(found, shown, best) < _PART_CHANCE) & (found < best / 3 * shown)
-    return np.asarray(told & few)
+    # A factor of three: one cosmic ray makes several sources in one place.
+    few = (bdtr(found, shown, best) < _PART_MAX_P_VALUE) & (found < best / 3 * shown)
+    return np.asarray(conclusive & few)

@@ -1,4 +1,4 @@
-"""How far the light of neighbours in the catalog pulls a centroid, and what is left of it."""
+"""Correction of centroids for catalog neighbours, and refusal of blended stars."""
 
 from __future__ import annotations
 
@@ -7,36 +7,35 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.identification.prediction import Prediction
 from starcal_ros.image.centroiding import Centroids, ImageModel, SWAMPED_SIGMA
 from starcal_ros.image.psf_fit import neighbour_pull_px, stamp_radius_px
 from starcal_ros.sky.catalog import CLOSE_PAIR_RAD, StarCatalog
 
-Floats = NDArray[np.float64]
-
-_PULL_UNCERTAINTY = 0.25  # of a neighbour's light: stars of unlike colour differ so from their V
-_MODELLED_UNCERTAINTY = 0.05  # of that of a star measured itself: wings that are no Gaussian's
-_NEAR_SIGMA = 5.0  # a bright neighbour nearer than this swamps, if it is not measured itself
-_ALONE_SIGMA = 0.1  # a star whose neighbours pull it by less tells the PSF
+_PULL_UNCERTAINTY = 0.25  # relative, of a neighbour's flux from its V magnitude: colours differ
+_MODELLED_UNCERTAINTY = 0.05  # relative, of a measured neighbour's flux: the PSF is not Gaussian
+_NEAR_SIGMA = 5.0  # a bright unmeasured neighbour within this swamps the star
+_ALONE_SIGMA = 0.1  # stars pulled by less than this are used to fit the PSF
 
 
 @dataclass(frozen=True)
 class Pulls:
     """
-    What the neighbours of each star do to its centroid.
+    Effect of the neighbours of each star on its centroid.
 
-    ``pull_px`` (n, 2) of those whose light is not taken off; ``uncertain_px`` (n, 2) what the pull
-    of all of them may be wrong by once it is taken off; ``swamped`` (n,) whether one is too near
-    and too bright for that; ``outshone`` (n,) whether a brighter one is near, measured or not.
+    ``pull_px`` (n, 2) pull by neighbours whose light is not subtracted; ``uncertain_px`` (n, 2)
+    uncertainty of the pull by all neighbours after correction; ``swamped`` (n,) True if a
+    neighbour is too near and too bright for a correction; ``outshone`` (n,) True if a brighter
+    neighbour is near, measured or not.
     """
 
     pull_px: Floats
     uncertain_px: Floats
-    swamped: NDArray[np.bool_]
-    outshone: NDArray[np.bool_]
+    swamped: Mask
+    outshone: Mask
 
 
 def neighbour_pulls(
@@ -44,15 +43,14 @@ def neighbour_pulls(
     magnitude: Floats,
     flux_dn: Floats,
     model: ImageModel,
-    modelled: NDArray[np.bool_] | None = None,
+    modelled: Mask | None = None,
 ) -> Pulls:
     """
-    How the neighbours of each star pull its centroid.
+    Pull of the neighbours on the centroid of each star.
 
-    ``flux_dn`` (n,) is measured, with what of a neighbour falls into it; the neighbour's follows
-    from the difference of the magnitudes.  Where the two are too close to be told apart, the pull
-    is from the star to the centre of their light.  The light of stars that are ``modelled`` (n,)
-    is taken off already.
+    ``flux_dn`` (n,) is measured and includes light of neighbours; the flux of a neighbour follows
+    from the difference of the magnitudes.  For an unresolved pair the pull is from the star to the
+    common centre of light.  The light of ``modelled`` (n,) stars is already subtracted.
     """
     sigma_px = model.psf_sigma_px or 1.0
     reach_px = stamp_radius_px(sigma_px) * math.sqrt(2.0) + 2.0 * sigma_px
@@ -63,7 +61,7 @@ def neighbour_pulls(
     offset_px = xy_px[other] - xy_px[star]
     distance_px = np.linalg.norm(offset_px, axis=1)
     known = np.zeros(len(star), bool) if modelled is None else modelled[other]
-    # What two Gaussians have in common: all the light of one that stands behind the other.
+    # Share of the neighbour's light in the measured flux: the overlap of two Gaussians.
     within = np.where(known, 0.0, np.exp(-((0.5 * distance_px / sigma_px) ** 2)))
     own_flux = flux / (1.0 + ratio * within)
     pull_px = neighbour_pull_px(
@@ -78,9 +76,9 @@ def neighbour_pulls(
     np.add.at(total_px, star[~known], pull_px[~known])
     part = np.where(known, _MODELLED_UNCERTAINTY, _PULL_UNCERTAINTY)
     np.add.at(uncertain_px, star, part[:, None] * pull_px)
-    # A neighbour half as bright takes part of the window for itself: no small pull any more.  Nor
-    # is the centre of a double of like stars used: their orbits, which no catalog of places has,
-    # move it by arcseconds (zeta Herculis).
+    # A neighbour half as bright or more dominates part of the window: the pull is not small.  The
+    # centre of a double of similar stars is not used either: its orbital motion, which the catalog
+    # lacks, reaches arcseconds (zeta Herculis).
     near = distance_px < np.where(known, SWAMPED_SIGMA, _NEAR_SIGMA) * sigma_px
     swamped, outshone = np.zeros((2, len(xy_px)), bool)
     swamped[star[near & (ratio > 0.5)]] = True
@@ -90,21 +88,21 @@ def neighbour_pulls(
 
 def unlisted_pull_px(magnitude: Floats, faintest: float, px_per_rad: float) -> Floats:
     """
-    1-sigma per axis (n,) of the pull of a close companion that the catalog has not.
+    1-sigma per axis (n,) of the pull of a close companion that is not in the catalog.
 
-    It is fainter than the faintest star there, and anywhere within `CLOSE_PAIR_RAD`: on average
-    0.58 of that away, with 0.65 of the light that it may have (one magnitude and less), and half
-    of the square along each axis.
+    The companion is fainter than the catalog limit and anywhere within `CLOSE_PAIR_RAD`: on
+    average at 0.58 of that distance, with 0.65 of its largest possible flux, and half of the
+    square along each axis.
     """
     ratio = 10.0 ** (0.4 * np.minimum(magnitude - faintest, 0.0))
     return np.asarray(0.58 * 0.65 * math.sqrt(0.5) * CLOSE_PAIR_RAD * px_per_rad * ratio)
 
 
-def _alone(direction: Floats, asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which (n,) of the directions (n, 3) asked for have no other within `CLOSE_PAIR_RAD`."""
-    alone = asked.copy()
-    near = direction[asked] @ direction.T > math.cos(CLOSE_PAIR_RAD)
-    alone[asked] = np.count_nonzero(near, axis=1) == 1  # itself
+def _alone(direction: Floats, tested: Mask) -> Mask:
+    """Mask (n,) of the tested directions (n, 3) without another one within `CLOSE_PAIR_RAD`."""
+    alone = tested.copy()
+    near = direction[tested] @ direction.T > math.cos(CLOSE_PAIR_RAD)
+    alone[tested] = np.count_nonzero(near, axis=1) == 1  # itself
     return alone
 
 
@@ -114,13 +112,13 @@ def separate(
     centroids: Centroids,
     model: ImageModel,
     max_blend_sigma: float,
-) -> tuple[Centroids, NDArray[np.bool_]]:
+) -> tuple[Centroids, Mask]:
     """
-    Centroids freed from the light of their neighbours in the catalog, or refused as blends.
+    Centroids corrected for catalog neighbours, and a mask (n,) of the isolated stars.
 
-    The pull is taken off, and what it may be wrong by is added to the covariance; where that is
-    more than ``max_blend_sigma`` the star is of no use.  So it is with the pull of companions that
-    the catalog marks but does not hold.  Also says (n,) which stars stand alone.
+    The pull is subtracted and its uncertainty added to the covariance; a star with an uncertainty
+    above ``max_blend_sigma`` is refused as a blend.  The same applies to close companions that the
+    catalog flags but does not list.
     """
     magnitude = catalog.magnitude[prediction.catalog_index]
     pulls = neighbour_pulls(
@@ -136,7 +134,7 @@ def separate(
     beyond = size_px > max_blend_sigma * sigma_px
     refusal = centroids.refusal.copy()
     refusal[(pulls.swamped | beyond) & (refusal == '')] = 'blend'
-    # Its light was taken for that of the brighter one.
+    # Its light was attributed to the brighter star.
     refusal[pulls.outshone & (refusal == 'faint')] = 'blend'
     u, v = pulls.uncertain_px.T
     separated = dataclasses.replace(

@@ -1,9 +1,9 @@
 """
-Whether the rows of a frame belong together, judged by the stars measured in it.
+Detection of lost image lines from the measured stars.
 
-A line lost on the way moves all rows below it by whole pixels.  The stars there still stand in
-their windows and look sound; but they jump against those above, where whatever is not known of
-camera and attitude changes smoothly over the image.
+A line lost in transmission shifts all rows below it by whole pixels.  The stars below still lie in
+their windows, but their residuals jump against those above, whereas errors of camera and attitude
+vary smoothly over the image.
 """
 
 from __future__ import annotations
@@ -12,43 +12,41 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.polynomial import polyvander2d
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.robust_statistics import median, RAYLEIGH_TO_SIGMA
 
-Floats = NDArray[np.float64]
-
-_STARS_OF_DEGREE = {5: 60, 3: 20}  # least number that carries a smooth part of so many powers
-_EACH_SIDE = 8  # stars that a jump must be seen by
-_BRIGHTEST = 150  # stars that tell it; more would take longer and say little more
-_CUTS = 48  # rows that are tried; a star or two on the wrong side of one hides no jump
-_AGREE = 0.7  # of the stars on a side: a few wrong ones of it are no jump of all
-_LEAST_PX = 0.5  # rows and columns are lost in wholes
-# Rise of chi^2 without the jump.  Of 290 sound frames none came to 10 once its wrong stars had
-# lost their weight; normal noise comes to 40 at one of the cuts once in 10^7.
+_STARS_OF_DEGREE = {5: 60, 3: 20}  # polynomial degree: fewest stars
+_EACH_SIDE = 8  # fewest stars on each side of a jump
+_BRIGHTEST = 150  # stars used; more take longer and add little
+_CUTS = 48  # rows tested; one or two stars on the wrong side do not hide a jump
+_AGREE = 0.7  # share of the stars of a side that must follow the jump
+_LEAST_PX = 0.5  # whole rows or columns are lost
+# Rise of chi^2 without the jump.  290 intact frames stayed below 10 after outliers had lost their
+# weight; normal noise reaches 40 at one of the cuts once in 10^7.
 _LEAST_RISE = 40.0
-_FLOOR_PX = 0.05  # what the places of stars may be wrong by besides their noise
+_FLOOR_PX = 0.05  # systematic error of star positions, per axis
 
 
 @dataclass(frozen=True)
-class Tear:
-    """The first row, about, that does not belong to those above; how far (2,) it is off, px."""
+class LineLoss:
+    """Approximate first row after lost lines, and the offset (2,) of the rows below, px."""
 
     row: int
     off_px: Floats
 
 
-def find_tear(
+def find_line_loss(
     predicted_px: Floats, measured_px: Floats, sigma_px: Floats, shape: tuple[int, int]
-) -> Tear | None:
+) -> LineLoss | None:
     """
-    Where the stars of a frame of (height, width) jump against their predictions; None: nowhere.
+    Row at which the residuals of an image (height, width) jump; None without a jump.
 
-    ``predicted_px``, ``measured_px`` (n, 2) of the good stars, ``sigma_px`` (n,) their noise per
-    axis.  The differences are fitted by a polynomial in u and v and a step at each of some rows,
-    robustly.  A prior that is wrong by a smooth function of any size makes no tear.
+    ``predicted_px``, ``measured_px`` (n, 2) of the good stars, ``sigma_px`` (n,) noise per axis.
+    For each tested row, a robust fit of the residuals with a polynomial in u and v and a step.  A
+    smooth error of the prior is no jump, whatever its size.
     """
-    # A jump between two sides takes one of them off by half of it.
+    # The smooth part can take up half of a jump.
     away_px = np.hypot(*(measured_px - predicted_px).T) - 2.0 * sigma_px
     if np.count_nonzero(away_px > 0.5 * _LEAST_PX) < _EACH_SIDE // 2:
         return None
@@ -63,10 +61,10 @@ def find_tear(
     rows = np.linspace(0.0, height, _CUTS + 2)[1:-1]
     below = predicted_px[:, 1, None] > rows
     count = below.sum(axis=0)
-    told = (count >= _EACH_SIDE) & (count <= n - _EACH_SIDE)
-    if not told.any():
+    usable = (count >= _EACH_SIDE) & (count <= n - _EACH_SIDE)
+    if not usable.any():
         return None
-    rows, steps = rows[told], below[:, told].astype(np.float64)
+    rows, steps = rows[usable], below[:, usable].astype(np.float64)
     u, v = ((predicted_px - np.array([width, height]) / 2.0) / (max(width, height) / 2.0)).T
     smooth = polyvander2d(u, v, [degree, degree])
     powers = np.arange(degree + 1)
@@ -89,7 +87,7 @@ def find_tear(
         scatter = max(1.0, median(off_sigma) * RAYLEIGH_TO_SIGMA)
         weight = root / scatter / (1.0 + (off_sigma / (3.0 * scatter)) ** 2) ** power
     agree = off_sigma < 4.0 * scatter
-    side = steps[:, k] == (2.0 * steps[:, k].mean() < 1.0)  # the one of fewer stars
+    side = steps[:, k] == (2.0 * steps[:, k].mean() < 1.0)  # the side with fewer stars
     if np.hypot(*off_px[k]) < _LEAST_PX or agree[side].mean() < _AGREE:
         return None
-    return Tear(round(float(rows[k])), off_px[k])
+    return LineLoss(round(float(rows[k])), off_px[k])

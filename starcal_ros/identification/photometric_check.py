@@ -1,8 +1,8 @@
 """
-Whether the stars of an image are as bright as the catalog says.
+Comparison of measured brightnesses with catalog magnitudes.
 
-Where stars are many, or a part of a field agrees with another field, places can meet by chance.
-Brightnesses then do not: they are a second witness that the search of places has not heard.
+In a crowded field, or where part of a field resembles another one, positions can match by chance.
+Brightnesses do not match then; they are independent of the search by position.
 """
 
 from __future__ import annotations
@@ -10,21 +10,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import best_share, missed_parts, part_of, PARTS
 from starcal_ros.image.centroiding import Centroids, ImageModel
 from starcal_ros.image.psf_fit import expected_snr
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 
-Floats = NDArray[np.float64]
-
-_FEWEST = 4  # stars whose scatter, or the share of which, means anything
-# A camera's band is not V: stars of a real sky scatter by 0.15 to 0.3 mag, none of 2000 was off
-# by 1.5; a lens may dim its corners by 1.  Stars met by chance scatter by 1.0 to 1.7 mag.
-_MOST_OFF = 2.0  # of one star, in the largest scatter of all
+_FEWEST = 4  # stars for a significant scatter or share
+# The band of a camera differs from V: real stars scatter by 0.15 to 0.3 mag, none of 2000 by
+# 1.5; vignetting may reach 1 mag.  False matches scatter by 1.0 to 1.7 mag.
+_MOST_OFF = 2.0  # largest deviation of one star, in units of the largest scatter
 
 
-def refuse_unlike(
+def refuse_by_brightness(
     magnitude: NDArray[np.floating],
     predicted_px: Floats,
     centroids: Centroids,
@@ -34,27 +33,27 @@ def refuse_unlike(
     shape: tuple[int, int],
 ) -> NDArray[np.str_]:
     """
-    Refusals (n,) of stars whose brightness, or lack of it, contradicts the match.
+    Refusal reasons (n,) after a comparison of measured brightness with catalog magnitude.
 
-    A good star that is brighter or fainter than the others make it is ``ambiguous``.  A faint one
-    that should not be is ``not_detected``.  Where a part of the image misses almost all that
-    should be there while another has its stars, the few in parts like it are ``ambiguous`` too.
+    A measured star with an outlying brightness becomes ``ambiguous``; a ``faint`` star that should
+    be bright enough becomes ``not_detected``.  If one part of the image lacks almost all expected
+    stars while another part has them, the few stars found in such parts become ``ambiguous`` too.
 
     Parameters
     ----------
     magnitude, predicted_px : (n,), (n, 2)
-        What the catalog says of the stars.
+        Catalog magnitudes and predicted pixels.
     min_snr : float
-        From which a star is no more faint.
+        Signal-to-noise ratio below which a star is faint.
     max_scatter_mag : float
-        Largest scatter of brightnesses that are those of the catalog.
+        Largest scatter of a true match.
     shape : (int, int)
         Height and width of the image.
 
     Raises
     ------
     ImageRefused
-        ``no_match`` where the brightnesses of most stars contradict it.
+        ``no_match`` if the brightnesses of most stars contradict the match.
     """
     refusal = centroids.refusal.copy()
     good = np.flatnonzero(refusal == '')
@@ -66,12 +65,12 @@ def refuse_unlike(
     if scatter_mag > max_scatter_mag:
         raise ImageRefused(
             'no_match',
-            f'{len(good)} stars stand where catalog stars should,'
+            f'{len(good)} stars match catalog positions,'
             f' but their brightnesses scatter by {scatter_mag:.1f} mag',
         )
     most_mag = max(_MOST_OFF * max_scatter_mag, 5.0 * scatter_mag)
     refusal[good[off_mag > most_mag]] = 'ambiguous'
-    # Even so much fainter they would be seen.
+    # Stars bright enough to be detected even if they are fainter by the largest deviation.
     faintest = median(zero_point) - most_mag
     least_dn = 10.0 ** (0.4 * (faintest - magnitude.astype(np.float64)))
     psf_sigma_px, noise_dn = model.psf_sigma_px or 1.0, model.background.noise_dn
@@ -86,7 +85,7 @@ def refuse_unlike(
     found = np.bincount(part[seen & kept], minlength=PARTS)
     shown = found + np.bincount(part[gone], minlength=PARTS)
     if missed_parts(shown, found).any():
-        # Then a part has to prove itself: by half of what the best one finds.
-        believed = (shown > 0) & (found >= 0.5 * best_share(shown, found) * shown)
-        refusal[kept & ~believed[part]] = 'ambiguous'
+        # Accept only parts with at least half the share of the best one.
+        accepted = (shown > 0) & (found >= 0.5 * best_share(shown, found) * shown)
+        refusal[kept & ~accepted[part]] = 'ambiguous'
     return refusal

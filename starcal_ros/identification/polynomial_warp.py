@@ -1,17 +1,15 @@
-"""The smooth correction that leads from predicted pixels to measured ones."""
+"""Smooth polynomial correction from predicted to measured pixels."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.robust_statistics import median, medians, RAYLEIGH_TO_SIGMA
-
-Floats = NDArray[np.float64]
 
 
 def warp_powers(n: int) -> list[tuple[int, int]]:
-    """Powers of u and v in the correction that n stars can carry."""
+    """Powers of u and v in the correction; n stars determine the degree."""
     degree = 5 if n >= 150 else 3 if n >= 36 else 1 if n >= 12 else 0
     return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
 
@@ -20,10 +18,10 @@ def fit_warp(
     predicted_px: Floats, measured_px: Floats, sigma_px: Floats, at_px: Floats, half_px: float
 ) -> tuple[Floats, float]:
     """
-    Smooth correction (k, 2) at ``at_px`` from predicted to measured, and its robust scatter.
+    Smooth correction (k, 2) at ``at_px`` from predicted to measured pixels, and robust scatter.
 
-    A polynomial in u and v, of a degree that the number of stars carries (at most 5: the prior
-    distortion may be quite unknown), fitted robustly.  Only predictions are corrected by it.
+    Robust fit of a polynomial in u and v; the number of stars determines its degree (at most 5,
+    because the prior distortion may be unknown).  It corrects predictions only.
     """
     n = len(predicted_px)
     powers = warp_powers(n)
@@ -49,8 +47,8 @@ def fit_warp(
         weight = 1.0 / spread2 / (1.0 + size**2 / (9.0 * spread2)) ** 2
         weighted = A * weight
         normal = weighted @ A.T
-        # Powers up to 5 on -1 to 1 leave the normal matrix ten digits; a trace keeps the corner
-        # without stars at rest.
+        # Powers up to 5 on -1 to 1 leave the normal matrix ten digits; the damping bounds the
+        # correction in a corner without stars.
         normal.flat[:: len(normal) + 1] *= 1.0 + 1e-9
         coefficients = np.linalg.solve(normal, weighted @ residual)
         if abs(scatter - before) < 0.03 * scatter:

@@ -1,4 +1,4 @@
-"""Where the stars of the catalog fall: through attitude, alignment and camera to pixels."""
+"""Predicted pixels of catalog stars from attitude, alignment and camera model."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import field_radius_rad, line_of_sight, project
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import apparent_directions, SiteOptions, through_the_air
 from starcal_ros.sky.catalog import cone, StarCatalog
-
-Floats = NDArray[np.float64]
 
 SPACE = SiteOptions()
 
@@ -22,18 +21,27 @@ SPACE = SiteOptions()
 @dataclass(frozen=True)
 class Prediction:
     """
-    Catalog stars in and about the image.
+    Catalog stars in and near the image.
 
-    ``catalog_index`` (n,) rows of the catalog, brightest first; ``direction_icrf`` (n, 3),
-    apparent; ``direction_camera`` (n, 3); ``xy_px`` (n, 2); ``px_per_rad`` the
-    scale of the image, its focal length.
+    ``catalog_index`` (n,) rows of the catalog, brightest first; ``direction_icrf`` (n, 3)
+    apparent; ``direction_camera`` (n, 3); ``xy_px`` (n, 2); ``px_per_rad`` focal length.
     """
 
-    catalog_index: NDArray[np.int64]
+    catalog_index: Indices
     direction_icrf: Floats
     direction_camera: Floats
     xy_px: Floats
     px_per_rad: float
+
+    def select(self, stars: Mask) -> Prediction:
+        """Return the stars of a mask (n,)."""
+        return Prediction(
+            self.catalog_index[stars],
+            self.direction_icrf[stars],
+            self.direction_camera[stars],
+            self.xy_px[stars],
+            self.px_per_rad,
+        )
 
 
 def predict(
@@ -47,10 +55,11 @@ def predict(
     site: SiteOptions = SPACE,
 ) -> Prediction:
     """
-    Apparent catalog stars where attitude, alignment and camera put them.
+    Predicted catalog stars for an attitude, an alignment and a camera.
 
-    Those fainter than a magnitude are left out, and those too near to the horizon of a site;
-    stars outside the image are kept up to ``margin_rad``, as far as acquisition may bring them in.
+    Stars fainter than the magnitude limit or below the elevation limit of a site are omitted;
+    stars up to ``margin_rad`` outside the image are included, because acquisition may move them
+    into it.
     """
     camera = geometry.camera
     icrf_from_camera = Rotation.from_quat(icrf_from_star_tracker_xyzw) * Rotation.from_quat(
@@ -61,32 +70,27 @@ def predict(
     radius_rad = field_radius_rad(camera, margin_px)
     index = cone(catalog, boresight_icrf, radius_rad, magnitude_limit)
     index = index[np.argsort(catalog.magnitude[index], kind='stable')]
-    index, direction_icrf = seen(catalog, index, time_ns, velocity_m_s, site)
+    index, direction_icrf = visible(catalog, index, time_ns, velocity_m_s, site)
     direction_camera = icrf_from_camera.inv().apply(direction_icrf)
     xy_px = project(camera, direction_camera)
     with np.errstate(invalid='ignore'):
-        # A distortion polynomial folds over far outside: only what the inverse leads back is real.
+        # A distortion polynomial folds over far outside: keep stars that the inverse maps back.
         near = in_image(xy_px, camera.width, camera.height, margin_px)
     near[near] &= np.einsum(
         'ij,ij->i', line_of_sight(camera, xy_px[near]), direction_camera[near]
     ) > np.cos(1e-6)
-    return Prediction(
-        index[near],
-        direction_icrf[near],
-        direction_camera[near],
-        xy_px[near],
-        float(camera.parameters[0]),
-    )
+    px_per_rad = float(camera.parameters[0])
+    return Prediction(index, direction_icrf, direction_camera, xy_px, px_per_rad).select(near)
 
 
-def seen(
+def visible(
     catalog: StarCatalog,
     index: NDArray[np.intp],
     time_ns: int,
     velocity_m_s: Floats | None,
     site: SiteOptions,
 ) -> tuple[NDArray[np.intp], Floats]:
-    """Those rows (m,) of the catalog that the observer can see, and where (m, 3), ICRF axes."""
+    """Rows (m,) of the catalog above the horizon, and their apparent ICRF directions (m, 3)."""
     if site.observer != 'ground':
         return index, apparent_directions(catalog.select(index), time_ns, velocity_m_s)
     direction_icrf, elevation_rad = through_the_air(
@@ -96,19 +100,12 @@ def seen(
     return index[high], direction_icrf[high]
 
 
-def in_image(xy_px: Floats, width: int, height: int, margin_px: float = 0.0) -> NDArray[np.bool_]:
-    """Whether (n,) pixels lie in the image widened by a margin."""
+def in_image(xy_px: Floats, width: int, height: int, margin_px: float = 0.0) -> Mask:
+    """Mask (n,) of the pixels (n, 2) inside the image widened by a margin."""
     u, v, m = xy_px[:, 0], xy_px[:, 1], margin_px
     return (u > -m) & (u < width - 1 + m) & (v > -m) & (v < height - 1 + m)
 
 
 def within_image(prediction: Prediction, width: int, height: int) -> Prediction:
-    """Those of the predicted stars that fall into the image."""
-    inside = in_image(prediction.xy_px, width, height)
-    return Prediction(
-        prediction.catalog_index[inside],
-        prediction.direction_icrf[inside],
-        prediction.direction_camera[inside],
-        prediction.xy_px[inside],
-        prediction.px_per_rad,
-    )
+    """Predicted stars inside the image."""
+    return prediction.select(in_image(prediction.xy_px, width, height))

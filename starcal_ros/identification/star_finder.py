@@ -1,9 +1,9 @@
 """
-The stars of one image: predicted, found, and each measured in its own window.
+Stars of one image without a track: prediction, acquisition and measurement.
 
-Sources next to the predictions place the prediction, or those of the whole image where launch has
-turned the camera (`acquisition`); what is measured is freed from the light of its neighbours
-(`blends`), and stars off the place that the others give them are refused.
+Sources near the predictions correct the prediction; if they do not match, the whole image is
+searched (`acquisition`).  Centroids are corrected for neighbours (`blending`), and stars displaced
+from the position that the other stars predict are refused.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.camera import line_of_sight
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import acquire
 from starcal_ros.identification.blending import separate
-from starcal_ros.identification.line_loss import find_tear
-from starcal_ros.identification.photometric_check import refuse_unlike
+from starcal_ros.identification.line_loss import find_line_loss
+from starcal_ros.identification.photometric_check import refuse_by_brightness
 from starcal_ros.identification.polynomial_warp import fit_warp
 from starcal_ros.identification.prediction import (
     in_image,
@@ -42,7 +43,6 @@ from starcal_ros.image.detection import (
     detect,
     detect_near,
     measure_background,
-    Pixels,
     Sources,
 )
 from starcal_ros.image.hot_pixels import NO_HOT_PIXELS, refuse_on_hot_pixels
@@ -53,55 +53,53 @@ from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import StarCatalog
 
-Floats = NDArray[np.float64]
-
-_TRACKED = 200  # brightest predictions that are looked for in windows of their own
-_TRACKED_ROLL_RAD = 0.01  # a star tracker is off by less about any axis once aligned
+_NEAREST = 200  # brightest predictions, searched in windows first
+_NEAREST_ROLL_RAD = 0.01  # an aligned star tracker has smaller errors about any axis
 
 
 @dataclass(frozen=True)
 class IdentificationOptions:
-    """How stars are predicted and matched."""
+    """Options for the prediction and identification of stars."""
 
     magnitude_limit: float = option(
-        9.0, 'faintest catalog star that is looked for, V magnitude', low=0.0, high=20.0
+        9.0, 'faintest catalog star to search for, V magnitude', low=0.0, high=20.0
     )
     acquisition_radius_deg: float = option(
-        1.5, 'largest alignment error that is searched, degrees', low=0.05, high=5.0
+        1.5, 'largest alignment error in the search, degrees', low=0.05, high=5.0
     )
     acquisition_roll_deg: float = option(
-        5.0, 'largest roll error that is searched, degrees', low=0.0, high=20.0
+        5.0, 'largest roll error in the search, degrees', low=0.0, high=20.0
     )
     search_radius_px: int = option(
         12,
-        'half width of the window in which a predicted star is first looked for, px',
+        'half width of the window for the first search of a predicted star, px',
         low=3,
         high=100,
     )
     min_stars_per_image: int = option(
-        8, 'fewest measured stars with which an image is used', low=3, high=1000
+        8, 'fewest measured stars for an image to be used', low=3, high=1000
     )
     max_blend_sigma: float = option(
         3.0,
-        'largest error left of the pull of catalog neighbours on a centroid, in its sigma',
+        'largest uncertainty of the correction for catalog neighbours, in sigma of the centroid',
         low=0.0,
         high=100.0,
     )
     max_brightness_scatter_mag: float = option(
         0.75,
-        'largest scatter of the brightnesses of the stars about those of the catalog, mag, that is'
-        ' no chance match; more for a camera whose band is far from V, 100 not to ask',
+        'largest scatter of measured brightnesses about the catalog, mag; a larger one is a false'
+        ' match; raise it for a camera with a band far from V; 100: no check',
         low=0.3,
         high=100.0,
     )
 
 
 @dataclass(frozen=True)
-class Shot:
+class Exposure:
     """
-    One image with what is known of it: where it was taken, and what to measure it with.
+    One image with its attitude, observer velocity, site and hot pixels.
 
-    ``hot_pixels`` (k,) are the numbers of pixels, row by row from 0, that spoil a star.
+    ``hot_pixels`` (k,) are flat pixel indices, row by row.
     """
 
     image: Image
@@ -109,39 +107,39 @@ class Shot:
     attitude_gap_s: float
     velocity_m_s: Floats | None = None
     site: SiteOptions = SPACE
-    hot_pixels: NDArray[np.int64] = dataclasses.field(default_factory=lambda: NO_HOT_PIXELS.index)
+    hot_pixels: Indices = dataclasses.field(default_factory=lambda: NO_HOT_PIXELS.index)
     temperature_degc: float = math.nan
 
 
 def observe_stars(
-    shot: Shot,
+    exposure: Exposure,
     geometry: CameraGeometry,
     catalog: StarCatalog,
     centroid_options: CentroidOptions,
     options: IdentificationOptions,
 ) -> tuple[StarObservations, Instrument | None]:
     """
-    The stars of one image, searched for, and what they say of the camera's light.
+    Observations of one image without a track, and the PSF and gain measured from them.
 
-    With too few measured well it is a refused image, ``too_few_stars``, that still says what
-    became of each star.
+    With too few measured stars the observations have the refusal ``too_few_stars`` and still list
+    the refusal reason of each star.
 
     Raises
     ------
     ImageRefused
         ``no_stars``, ``no_match`` or ``incomplete``.
     """
-    image = shot.image
+    image = exposure.image
     background = measure_background(image.pixels)
     prediction = predict(
         geometry,
-        shot.icrf_from_star_tracker_xyzw,
+        exposure.icrf_from_star_tracker_xyzw,
         image.time_ns,
         catalog,
         options.magnitude_limit,
         math.radians(options.acquisition_radius_deg),
-        shot.velocity_m_s,
-        shot.site,
+        exposure.velocity_m_s,
+        exposure.site,
     )
     if len(prediction.catalog_index) < 4:
         raise ImageRefused(
@@ -152,15 +150,15 @@ def observe_stars(
     )
     model = model_image(image.pixels, background, sources, centroid_options)
     if model.psf is None:
-        # The brightest stars may all be saturated: fainter ones tell the PSF.
+        # The brightest stars may all be saturated: fit the PSF to fainter ones.
         sources = detect(image.pixels, background, centroid_options.detection_sigma)
         model = model_image(image.pixels, background, sources, centroid_options)
     prediction = dataclasses.replace(prediction, xy_px=predicted_px)
-    return measure_predicted(shot, prediction, model, None, catalog, centroid_options, options)
+    return measure_predicted(exposure, prediction, model, None, catalog, centroid_options, options)
 
 
 def measure_predicted(
-    shot: Shot,
+    exposure: Exposure,
     prediction: Prediction,
     model: ImageModel,
     instrument: Instrument | None,
@@ -169,36 +167,36 @@ def measure_predicted(
     options: IdentificationOptions,
 ) -> tuple[StarObservations, Instrument | None]:
     """
-    The stars of an image once it is known where they stand, and what is known of the light then.
+    Observations from corrected predictions, and the updated PSF and gain.
 
-    ``instrument`` is what was known before, None at the first image.  With too few stars measured
-    well it is a refused image, ``too_few_stars``.
+    ``instrument`` is the PSF and gain of earlier images, None at the first image.  With too few
+    measured stars the observations have the refusal ``too_few_stars``.
 
     Raises
     ------
     ImageRefused
-        ``incomplete`` where the stars show that some rows were lost, ``no_match`` where they are
-        not as bright as those of the catalog.
+        ``incomplete`` if image lines are lost, ``no_match`` if the brightnesses contradict the
+        catalog.
     """
-    height, width = shot.image.pixels.shape
+    height, width = exposure.image.pixels.shape
     shown = within_image(prediction, width, height)
     centroids = measure_stars(
-        shot.image.pixels, shown.xy_px, model, centroid_options, shot.hot_pixels
+        exposure.image.pixels, shown.xy_px, model, centroid_options, exposure.hot_pixels
     )
     centroids, alone = separate(shown, catalog, centroids, model, options.max_blend_sigma)
-    _refuse_torn(shown.xy_px, centroids, (height, width))
+    _refuse_line_loss(shown.xy_px, centroids, (height, width))
     psf_sigma_px = model.psf_sigma_px or 1.0
     refusal = refuse_on_hot_pixels(
         shown.xy_px,
         _refuse_displaced(shown.xy_px, centroids, width),
-        shot.hot_pixels,
+        exposure.hot_pixels,
         width,
         stamp_radius_px(psf_sigma_px),
         psf_sigma_px,
     )
     magnitude = catalog.magnitude[shown.catalog_index]
     centroids = dataclasses.replace(centroids, refusal=refusal)
-    refusal = refuse_unlike(
+    refusal = refuse_by_brightness(
         magnitude,
         shown.xy_px,
         centroids,
@@ -209,7 +207,7 @@ def measure_predicted(
     )
     centroids = dataclasses.replace(centroids, refusal=refusal)
     observations = _observations(
-        shot, shown, catalog, centroids, model, options.min_stars_per_image
+        exposure, shown, catalog, centroids, model, options.min_stars_per_image
     )
     if observations.refusal or centroids.fit is None:
         return observations, instrument
@@ -225,15 +223,15 @@ def measure_predicted(
 
 
 def _observations(
-    shot: Shot,
+    exposure: Exposure,
     prediction: Prediction,
     catalog: StarCatalog,
     centroids: Centroids,
     model: ImageModel,
     fewest: int,
 ) -> StarObservations:
-    """What is said of an image: its stars and those left out; with too few, that it is refused."""
-    height, width = shot.image.pixels.shape
+    """Observations with used and refused stars; refused as a whole with too few stars."""
+    height, width = exposure.image.pixels.shape
     index = prediction.catalog_index
     good = centroids.refusal == ''
     left_out = ~good
@@ -245,13 +243,13 @@ def _observations(
     if few:
         good = np.zeros_like(good)
     return StarObservations(
-        time_ns=shot.image.time_ns,
+        time_ns=exposure.image.time_ns,
         width=width,
         height=height,
         refusal='too_few_stars' if few else '',
-        detail=f'{measured} stars measured well, {fewest} needed' if few else '',
-        icrf_from_star_tracker_xyzw=shot.icrf_from_star_tracker_xyzw,
-        attitude_gap_s=shot.attitude_gap_s,
+        detail=f'{measured} stars measured, {fewest} needed' if few else '',
+        icrf_from_star_tracker_xyzw=exposure.icrf_from_star_tracker_xyzw,
+        attitude_gap_s=exposure.attitude_gap_s,
         catalog_id=catalog.id[index][good],
         direction_icrf=prediction.direction_icrf[good],
         magnitude=catalog.magnitude[index][good].astype(np.float32),
@@ -267,16 +265,16 @@ def _observations(
         noise_dn=model.background.noise_dn,
         psf_sigma_px=model.psf_sigma_px,
         catalog_digest=catalog.digest,
-        temperature_degc=shot.temperature_degc,
+        temperature_degc=exposure.temperature_degc,
     )
 
 
-def tracked(geometry: CameraGeometry, observations: StarObservations) -> CameraGeometry:
+def realigned(geometry: CameraGeometry, observations: StarObservations) -> CameraGeometry:
     """
-    The geometry with which to predict the next image: aligned as this image shows.
+    Geometry with the alignment measured in an image, for the prediction of the next one.
 
-    What launch has turned is found once, by the search of a whole image; from then on stars are
-    looked for where they are.  A refused image leaves it as it was.
+    The search of a whole image then happens once only.  A refused image returns the geometry
+    unchanged.
     """
     if observations.refusal:
         return geometry
@@ -299,10 +297,10 @@ def _find(
     options: IdentificationOptions,
 ) -> tuple[Floats, Sources]:
     """
-    Predicted pixels (n, 2) refined onto the sources of the image, and those sources.
+    Predicted pixels (n, 2) corrected to match the sources of the image, and those sources.
 
-    First the brighter stars are looked for next to their predictions; only when those do not make
-    a match is the whole image searched, and the whole error that launch may have caused.
+    The brighter stars are searched near their predictions first; without a match, the whole image
+    is searched over the full range of alignment errors.
 
     Raises
     ------
@@ -314,13 +312,13 @@ def _find(
     near = detect_near(
         pixels,
         background,
-        prediction.xy_px[inside][:_TRACKED],
+        prediction.xy_px[inside][:_NEAREST],
         options.search_radius_px,
         centroid_options.detection_sigma,
     )
     try:
         reach_px = float(options.search_radius_px)
-        return acquire(prediction, near, geometry, reach_px, _TRACKED_ROLL_RAD), near
+        return acquire(prediction, near, geometry, reach_px, _NEAREST_ROLL_RAD), near
     except ImageRefused:
         pass
     sources = detect(pixels, background, centroid_options.detection_sigma)
@@ -333,9 +331,9 @@ def _find(
 
 def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.str_]:
     """
-    Refusal names (n,): those of the centroids, and of stars off their place.
+    Refusal reasons (n,) of the centroids, with displaced stars as ``ambiguous``.
 
-    The measured stars themselves give the smooth correction against which a place is judged.
+    Displacements are relative to a smooth correction fitted to the measured stars.
     """
     refusal = centroids.refusal.copy()
     sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
@@ -352,9 +350,9 @@ def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) ->
     return refusal
 
 
-def _refuse_torn(predicted_px: Floats, centroids: Centroids, shape: tuple[int, int]) -> None:
+def _refuse_line_loss(predicted_px: Floats, centroids: Centroids, shape: tuple[int, int]) -> None:
     """
-    Refuse a frame whose stars jump at some row against their predictions (n, 2).
+    Refuse an image with lost lines.
 
     Raises
     ------
@@ -363,8 +361,8 @@ def _refuse_torn(predicted_px: Floats, centroids: Centroids, shape: tuple[int, i
     """
     good = np.isin(centroids.refusal, ('', 'not_detected'))
     variance_px2 = 0.5 * (centroids.covariance_px2[good, 0] + centroids.covariance_px2[good, 2])
-    tear = find_tear(predicted_px[good], centroids.xy_px[good], np.sqrt(variance_px2), shape)
-    if tear is not None:
-        u, v = tear.off_px
-        detail = f'below row {tear.row} the stars stand ({u:+.1f}, {v:+.1f}) px from their places'
+    loss = find_line_loss(predicted_px[good], centroids.xy_px[good], np.sqrt(variance_px2), shape)
+    if loss is not None:
+        u, v = loss.off_px
+        detail = f'stars below row {loss.row} are displaced by ({u:+.1f}, {v:+.1f}) px'
         raise ImageRefused('incomplete', detail)

@@ -1,11 +1,11 @@
 """
-The stars of an image whose camera is known: nothing looks at the whole image.
+Stars of an image with a track: measurement in windows without a search of the whole image.
 
-A sequence carries what its images have shown (`Followed`): the camera and alignment with which
-stars are predicted, and how their light falls.  The brightest predictions are looked for in
-windows; their common small turn places all the others to a fraction of a pixel, and each is then
-measured in its own stamp.  Where the windows do not bear the prediction out beyond chance, the
-track is lost and says so: then the whole image is to be searched (`identification`).
+The track (`TrackedCamera`) holds the camera, the alignment and the PSF measured in earlier images.
+The brightest predictions are searched in windows; their common small rotation predicts all other
+stars to a fraction of a pixel, and each is measured in its own window.  If the matches in the
+windows are consistent with chance the track is lost, and the caller searches the whole image
+(`star_finder`).
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import pdtrc
 
+from starcal_ros.arrays import Floats, Mask, Pixels
 from starcal_ros.camera import (
     CameraModel,
     field_radius_rad,
@@ -26,14 +26,17 @@ from starcal_ros.camera import (
     rotation_jacobian,
 )
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.prediction import Prediction, seen
-from starcal_ros.identification.star_finder import IdentificationOptions, measure_predicted, Shot
+from starcal_ros.identification.prediction import Prediction, visible
+from starcal_ros.identification.star_finder import (
+    Exposure,
+    IdentificationOptions,
+    measure_predicted,
+)
 from starcal_ros.image.centroiding import CentroidOptions, known_model
 from starcal_ros.image.detection import (
     Background,
     brightest_near,
     measure_background,
-    Pixels,
     sample_background,
 )
 from starcal_ros.image.psf_field import Instrument
@@ -41,11 +44,9 @@ from starcal_ros.records import CameraGeometry, StarObservations
 from starcal_ros.robust_statistics import median
 from starcal_ros.sky.catalog import cone, StarCatalog
 
-Floats = NDArray[np.float64]
-
-_GUIDES = 24  # brightest predictions that are looked for in windows
-_NEIGHBOUR_PX = 3.0  # a small turn moves the guides alike; a roll of 0.1 degrees, by 3 px
-_CHANCE = 1e-9  # greatest probability that the windows bear out a wrong prediction
+_GUIDES = 24  # brightest predictions, searched in windows
+_NEIGHBOUR_PX = 3.0  # offsets of all guides agree to this under a roll of 0.1 degrees
+_MAX_P_VALUE = 1e-9  # of the matches in the windows, if the prediction is wrong
 _GOOD_SNR = 10.0  # of stars that correct the prediction
 _STEADY_PX = 1.0  # turn that the next image finds anew as well, from wherever it starts
 _SYSTEMATIC_PX = 0.15  # rms from which the camera of the prediction is corrected
@@ -57,12 +58,12 @@ _SMALL_SIGMA = 1e-3  # of the other coefficients: decentring, thin prism, tilt
 
 
 @dataclass(frozen=True)
-class Followed:
+class TrackedCamera:
     """
-    What the images so far have shown.
+    State of a track: geometry, field radius and PSF from the images so far.
 
-    ``geometry`` predicts the next image: its camera may differ from the one that is calibrated
-    from, as it only has to bring the stars into their windows.
+    ``geometry`` predicts the next image; its camera may differ from the prior of the calibration,
+    because it only has to predict the windows.
     """
 
     geometry: CameraGeometry
@@ -70,45 +71,45 @@ class Followed:
     instrument: Instrument
 
 
-def following(
+def start_tracking(
     geometry: CameraGeometry, observations: StarObservations, instrument: Instrument | None
-) -> Followed | None:
+) -> TrackedCamera | None:
     """
-    What to predict the next image with: camera and alignment as this image shows them.
+    Track with the camera and alignment measured in an image.
 
-    None where the image was refused, or does not tell its PSF.
+    None if the image was refused or its PSF was not measured.
     """
     if observations.refusal or instrument is None:
         return None
     corrected = _corrected(geometry, observations)
-    return Followed(corrected, field_radius_rad(corrected.camera), instrument)
+    return TrackedCamera(corrected, field_radius_rad(corrected.camera), instrument)
 
 
-def follow(
-    shot: Shot,
-    before: Followed,
+def track_stars(
+    exposure: Exposure,
+    before: TrackedCamera,
     catalog: StarCatalog,
     centroid_options: CentroidOptions,
     options: IdentificationOptions,
-) -> tuple[StarObservations, Followed]:
+) -> tuple[StarObservations, TrackedCamera]:
     """
-    The stars of the next image, and what is known after it.
+    Observations of the next image, and the updated track.
 
     Raises
     ------
     ImageRefused
-        ``no_match`` when the track is lost, ``too_few_stars``, ``incomplete``.
+        ``no_match`` if the track is lost, ``too_few_stars`` or ``incomplete``.
     """
-    pixels = shot.image.pixels
-    prediction = _predict(shot, before, catalog, options)
-    # Moments stand and fall with the level under each star; a fit finds its own.
+    pixels = exposure.image.pixels
+    prediction = _predict(exposure, before, catalog, options)
+    # Moments depend on the local background; a PSF fit estimates its own.
     fitted = centroid_options.centroid == 'psf'
     background = sample_background(pixels) if fitted else measure_background(pixels)
-    turn_rad = _find_turn(
+    rotation_rad = _find_rotation(
         pixels, background, prediction, before.geometry.camera, centroid_options, options
     )
-    turn = Rotation.from_rotvec(-turn_rad)
-    direction_camera = turn.apply(prediction.direction_camera)
+    rotation = Rotation.from_rotvec(-rotation_rad)
+    direction_camera = rotation.apply(prediction.direction_camera)
     prediction = dataclasses.replace(
         prediction,
         direction_camera=direction_camera,
@@ -116,35 +117,37 @@ def follow(
     )
     model = known_model(pixels, background, before.instrument, prediction.xy_px, centroid_options)
     observations, instrument = measure_predicted(
-        shot, prediction, model, before.instrument, catalog, centroid_options, options
+        exposure, prediction, model, before.instrument, catalog, centroid_options, options
     )
     if observations.refusal:
         raise ImageRefused(observations.refusal, observations.detail)
     instrument = instrument or before.instrument
-    turn_px = turn.magnitude() * prediction.px_per_rad
-    if turn_px < _STEADY_PX and _fits(before.geometry, turn, observations):
+    rotation_px = rotation.magnitude() * prediction.px_per_rad
+    if rotation_px < _STEADY_PX and _fits(before.geometry, rotation, observations):
         return observations, dataclasses.replace(before, instrument=instrument)
     corrected = _corrected(before.geometry, observations)
     radius_rad = before.field_radius_rad
     if corrected.camera is not before.geometry.camera:
         radius_rad = field_radius_rad(corrected.camera)
-    return observations, Followed(corrected, radius_rad, instrument)
+    return observations, TrackedCamera(corrected, radius_rad, instrument)
 
 
 def _predict(
-    shot: Shot, before: Followed, catalog: StarCatalog, options: IdentificationOptions
+    exposure: Exposure, before: TrackedCamera, catalog: StarCatalog, options: IdentificationOptions
 ) -> Prediction:
     """Apparent catalog stars in the field, brightest first."""
     camera = before.geometry.camera
     icrf_from_camera = (
-        Rotation.from_quat(shot.icrf_from_star_tracker_xyzw)
+        Rotation.from_quat(exposure.icrf_from_star_tracker_xyzw)
         * Rotation.from_quat(before.geometry.star_tracker_from_camera_xyzw)
     ).as_matrix()
-    # The catalog is sorted by magnitude, and so are the rows of a cone.
+    # The catalog, and so the rows of a cone, are sorted by magnitude.
     index = cone(catalog, icrf_from_camera[:, 2], before.field_radius_rad, options.magnitude_limit)
-    index, direction_icrf = seen(catalog, index, shot.image.time_ns, shot.velocity_m_s, shot.site)
+    index, direction_icrf = visible(
+        catalog, index, exposure.image.time_ns, exposure.velocity_m_s, exposure.site
+    )
     direction_camera = direction_icrf @ icrf_from_camera
-    # Beyond the edge of the field a distortion polynomial may fold over, back into the image.
+    # Outside the field the distortion polynomial may fold back into the image.
     near = direction_camera[:, 2] > np.cos(before.field_radius_rad + 2e-3)
     index, direction_icrf, direction_camera = (
         index[near],
@@ -155,7 +158,7 @@ def _predict(
     return Prediction(index, direction_icrf, direction_camera, xy_px, float(camera.parameters[0]))
 
 
-def _find_turn(
+def _find_rotation(
     pixels: Pixels,
     background: Background,
     prediction: Prediction,
@@ -164,7 +167,7 @@ def _find_turn(
     options: IdentificationOptions,
 ) -> Floats:
     """
-    Small passive rotation (3,) of the camera, rad, that brings the predictions onto their stars.
+    Small passive rotation (3,) of the camera, rad, from the predictions to the stars.
 
     Raises
     ------
@@ -180,7 +183,7 @@ def _find_turn(
         pixels, background, xy[guides], reach_px, centroid_options.detection_sigma
     )
     guides, place_px = guides[found], place_px[found]
-    lost = ImageRefused('no_match', f'{len(guides)} of the brightest stars meet a source')
+    lost = ImageRefused('no_match', f'{len(guides)} of the brightest stars match a source')
     if len(guides) < 4:
         raise lost
     J = rotation_jacobian(camera, prediction.direction_camera[guides])
@@ -189,60 +192,60 @@ def _find_turn(
     common = int((apart2 < _NEIGHBOUR_PX**2).sum(axis=1).argmax())
     near = apart2[common] < _NEIGHBOUR_PX**2
     limit_px = _NEIGHBOUR_PX
-    turn_rad = np.zeros(3)
+    rotation_rad = np.zeros(3)
     for _ in range(2):
         if np.count_nonzero(near) < 4:
             raise lost
         A, b = J[near].reshape(-1, 3), offset_px[near].ravel()
-        # A trace keeps the roll at rest where all guides stand in one place.
+        # The damping bounds the roll if all guides lie in one place.
         normal = A.T @ A + 1e-9 * float((A * A).sum()) * np.eye(3)
-        turn_rad = np.linalg.solve(normal, A.T @ b)
-        left_px = np.hypot(*(offset_px - J @ turn_rad).T)
+        rotation_rad = np.linalg.solve(normal, A.T @ b)
+        left_px = np.hypot(*(offset_px - J @ rotation_rad).T)
         limit_px = min(max(4.0 * median(left_px[near]), 0.75), _NEIGHBOUR_PX)
         near = left_px < limit_px
     matched = int(np.count_nonzero(near))
     side_px = 2 * reach_px + 1
     expected = len(guides) * np.pi * limit_px**2 / side_px**2
     trials = (side_px / limit_px) ** 2
-    # Three angles were fitted: two parameters can buy one match.
-    if matched < 4 or pdtrc(matched - 3, expected) * trials > _CHANCE:
+    # Three angles were fitted: two parameters can make one false match.
+    if matched < 4 or pdtrc(matched - 3, expected) * trials > _MAX_P_VALUE:
         raise lost
-    return np.asarray(turn_rad)
+    return np.asarray(rotation_rad)
 
 
-def _fits(geometry: CameraGeometry, turn: Rotation, observations: StarObservations) -> bool:
-    """Whether the stars stand where the camera shows them once it is turned."""
+def _fits(geometry: CameraGeometry, rotation: Rotation, observations: StarObservations) -> bool:
+    """Return True if the rotated camera predicts the stars within the systematic limit."""
     bright = _bright(observations)
-    camera_from_icrf = turn * _icrf_from_camera(geometry, observations).inv()
+    camera_from_icrf = rotation * _icrf_from_camera(geometry, observations).inv()
     directions = observations.direction_icrf[bright] @ camera_from_icrf.as_matrix().T
     off_px = observations.measured_px[bright] - project(geometry.camera, directions)
     return _rms_px(off_px) < _SYSTEMATIC_PX
 
 
 def _corrected(geometry: CameraGeometry, observations: StarObservations) -> CameraGeometry:
-    """The geometry turned to where this image shows its stars, its camera corrected if need be."""
+    """Geometry aligned to the stars of an image; its camera is corrected if it does not fit."""
     camera = geometry.camera
     icrf_from_camera = _icrf_from_camera(geometry, observations)
     directions = observations.direction_icrf @ icrf_from_camera.as_matrix()
     variance_px2 = 0.5 * (observations.covariance_px2[:, 0] + observations.covariance_px2[:, 2])
     bright = _bright(observations)
     directions, measured_px = directions[bright], observations.measured_px[bright]
-    # No prediction needs to be better than a twentieth of a pixel.
+    # A prediction need not be better than 0.05 px.
     weight = 1.0 / (variance_px2[bright] + 0.05**2)
     off_px = measured_px - project(camera, directions)
     J = rotation_jacobian(camera, directions)
     step = _step(J, off_px, weight, np.zeros(3), np.zeros(3))
-    turn = Rotation.from_rotvec(-step)
+    rotation = Rotation.from_rotvec(-step)
     left_px = off_px - J @ step
     if _rms_px(left_px) > _SYSTEMATIC_PX:
-        camera, turn = _corrected_camera(camera, turn, directions, measured_px, weight)
+        camera, rotation = _corrected_camera(camera, rotation, directions, measured_px, weight)
     icrf_from_star_tracker = Rotation.from_quat(observations.icrf_from_star_tracker_xyzw)
-    camera_from_star_tracker = turn * icrf_from_camera.inv() * icrf_from_star_tracker
+    camera_from_star_tracker = rotation * icrf_from_camera.inv() * icrf_from_star_tracker
     return CameraGeometry(camera, camera_from_star_tracker.inv().as_quat())
 
 
-def _bright(observations: StarObservations) -> NDArray[np.bool_]:
-    """Which stars (n,) correct a prediction: all, where there are too few bright ones."""
+def _bright(observations: StarObservations) -> Mask:
+    """Mask (n,) of the stars that correct a prediction; all if too few are bright."""
     bright = observations.snr > _GOOD_SNR
     return np.asarray(bright | (np.count_nonzero(bright) < 4))
 
@@ -254,30 +257,30 @@ def _icrf_from_camera(geometry: CameraGeometry, observations: StarObservations) 
 
 
 def _rms_px(off_px: Floats) -> float:
-    """Root mean square per axis of (n, 2), with what is beyond 3 px as 3 px."""
+    """Root mean square per axis of (n, 2), each value limited to 3 px."""
     return float(np.sqrt(np.mean(np.minimum(off_px**2, 9.0))))
 
 
 def _corrected_camera(
     camera: CameraModel,
-    turn: Rotation,
+    rotation: Rotation,
     directions: Floats,
     measured_px: Floats,
     weight: Floats,
 ) -> tuple[CameraModel, Rotation]:
-    """Camera and turn that fit the stars of one image, held near what the camera was."""
+    """Camera and rotation fitted to the stars of one image, with a prior on the camera."""
     before = camera.parameters
     coefficients = [_COEFFICIENT_SIGMA.get(k, _SMALL_SIGMA) for k in camera.parameter_names[5:]]
     sigma = np.r_[before[0] * _INTRINSIC_SIGMA, coefficients]
     held = np.r_[np.ones(len(before)), np.zeros(3)]
     for _ in range(3):
-        pixels, J_parameters, J_rotation = project_jacobians(camera, turn.apply(directions))
+        pixels, J_parameters, J_rotation = project_jacobians(camera, rotation.apply(directions))
         J = np.concatenate([J_parameters * sigma, J_rotation], axis=-1)
         pull = np.r_[(before - camera.parameters) / sigma, np.zeros(3)]
         step = _step(J, measured_px - pixels, weight, held, pull)
         camera = dataclasses.replace(camera, parameters=camera.parameters + sigma * step[:-3])
-        turn = Rotation.from_rotvec(-step[-3:]) * turn
-    return camera, turn
+        rotation = Rotation.from_rotvec(-step[-3:]) * rotation
+    return camera, rotation
 
 
 def _step(J: Floats, residual_px: Floats, weight: Floats, held: Floats, pull: Floats) -> Floats:

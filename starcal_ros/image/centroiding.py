@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.image.detection import (
     Background,
-    Pixels,
     sample_mesh,
     Sources,
     stamps_about,
@@ -43,8 +43,6 @@ from starcal_ros.image.psf_fit import (
 )
 from starcal_ros.options import option
 from starcal_ros.robust_statistics import centre_and_scatter, median
-
-Floats = NDArray[np.float64]
 
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitive than another
 _MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours

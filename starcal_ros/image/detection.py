@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.robust_statistics import median, medians
-
-Floats = NDArray[np.float64]
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 _MESH_PX = 64  # glare and vignetting vary slowly over it
 _MESH_STEP_PX = (4, 4)  # down and across: 256 samples of a cell give its noise to 5 %

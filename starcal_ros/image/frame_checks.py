@@ -18,14 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
 from starcal_ros.records import Image
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
-
-Floats = NDArray[np.float64]
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 _ROWS = 64
 _GOLDEN = 0.618034
@@ -118,7 +116,7 @@ def sample_rows(pixels: Pixels) -> RowSample:
     )
 
 
-def _segments(rows: Pixels) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def _segments(rows: Pixels) -> Pixels:
     """Rows (k, width) cut into segments (k, m, length), without what is left over at the end."""
     k, width = rows.shape
     length = min(_SEGMENT_PX, width)

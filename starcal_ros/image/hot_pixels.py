@@ -14,12 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.options import option
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 _SCANNED_PX = 1 << 19  # of one image, in 0.1 ms; larger images are scanned in turns
 _MOVED_PX = 5.0  # the light of a star that has moved so far has left its pixels

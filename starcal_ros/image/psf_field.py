@@ -14,10 +14,9 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.image.psf_fit import noise_sums, NoiseSums, PixelNoise, PsfFit, select
 from starcal_ros.robust_statistics import centre_and_scatter
-
-Floats = NDArray[np.float64]
 
 _MEMORY = 0.95  # weight of what is known against each new image: about twenty images count
 _BRIGHT_SNR = 15.0  # of stars that tell the shape of the PSF

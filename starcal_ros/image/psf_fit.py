@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf, ndtr
 
+from starcal_ros.arrays import Floats
 from starcal_ros.image.hot_pixels import CORE_PX, SPILT
-
-Floats = NDArray[np.float64]
 
 _FIT_STEPS = 4  # stars settle in two or three; what has not by then is no star
 # A step of s leaves s / SNR of the way for faint stars and s^2 / sigma_px for bright ones.  Below

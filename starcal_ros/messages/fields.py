@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.messages.types import Make, Message
-
-Floats = NDArray[np.float64]
 
 
 def stamp_ns(stamp: Message) -> int:

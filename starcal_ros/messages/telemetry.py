@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.messages.fields import (
     make_header,
     quaternion_from_message,
@@ -21,8 +21,6 @@ from starcal_ros.messages.types import (
     TEMPERATURE_TYPE,
     VELOCITY_TYPE,
 )
-
-Floats = NDArray[np.float64]
 
 
 def attitude_from_message(message: Message) -> tuple[int, Floats]:

@@ -1,1 +1,1 @@
-"""The ROS 2 side: the only place that imports rclpy and generated messages.  Nodes translate."""
+"""ROS 2 nodes: the only room that imports rclpy and generated messages."""

@@ -1,4 +1,4 @@
-"""The bag player: the messages of an MCAP bag on the graph, byte for byte."""
+"""Bag player node: publishes the messages of an MCAP bag unchanged."""
 
 from __future__ import annotations
 
@@ -35,29 +35,29 @@ from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import PlayerOptions
 
 NAME = 'bag_player'
-# A writer that overtakes its readers by more than its history loses messages, reliable or not.
-# Images are acknowledged in 10 ms, small messages with the next heartbeat only: after 3 s.
+# A writer ahead of its readers by more than its history loses messages, reliable or not.  Images
+# are acknowledged within 10 ms, small messages only with the next heartbeat, after up to 3 s.
 _IMAGE_DEPTH, _OTHER_DEPTH = 10, 20_000
 _UNACKED = {True: _IMAGE_DEPTH // 2, False: _OTHER_DEPTH // 2}
-_SMALL_PER_S = 2000.0  # what a Python reader takes beside its other work
+_SMALL_PER_S = 2000.0  # rate that a Python reader sustains beside its other work
 _ACK_S = 30.0
-_CLOCK_S = 0.01  # of wall clock, between two messages on /clock
+_CLOCK_S = 0.01  # wall-clock period of /clock
 _LATCHED_TYPES = (CALIBRATION_TYPE, STATUS_TYPE, CAMERA_INFO_TYPE)
 
 
 class BagPlayer(Node):
-    """Publishes the messages of a bag in its order, with their stamps, at a rate."""
+    """Publishes the messages of a bag in order, with their stamps, at a given rate."""
 
     def __init__(self) -> None:
         super().__init__(NAME)
         self.own = from_mapping(PlayerOptions, OptionParameters(self, [PlayerOptions]).values())
         if not self.own.bag:
-            raise BagError('bag: the bag to play must be given')
+            raise BagError('bag: path of the bag to play is missing')
         self._topics = reader.topics([self.own.bag])
         self._players = {}
         for topic in self._topics:
             if self.own.clock and topic.name == '/clock':
-                continue  # two clocks would go back and forth
+                continue  # the player publishes its own
             try:
                 kind = message_class(topic.type_name)
             except ImportError:
@@ -66,7 +66,7 @@ class BagPlayer(Node):
                 continue
             self._players[topic.name] = self.create_publisher(kind, topic.name, _offer(topic))
         if not self._players:
-            raise BagError(f'{self.own.bag}: no topic in it can be played here')
+            raise BagError(f'{self.own.bag}: no topic has an installed message type')
         self._images = {t.name for t in self._topics if t.type_name == IMAGE_TYPE}
         self._clock_publisher = (
             self.create_publisher(Clock, '/clock', QoSProfile(depth=10))
@@ -77,7 +77,7 @@ class BagPlayer(Node):
         self._unacked = dict.fromkeys(self._players, 0)
         self._observed = threading.Condition()
         self._observed_count = 0
-        # A bag that holds observations would be paced by its own, and take itself for a listener.
+        # Observations in the bag itself must not pace the player or count as subscribers.
         types = {topic.type_name for topic in self._topics}
         self._paced = bool(self._images) and OBSERVATIONS_TYPE not in types
         if self._paced:
@@ -86,7 +86,7 @@ class BagPlayer(Node):
             )
 
     def play(self) -> int:
-        """Play the bag; 0 when every reader has acknowledged every message."""
+        """Play the bag; 0 if all subscribers have acknowledged all messages."""
         self._wait_for_subscribers()
         while True:
             self._play_once()
@@ -126,25 +126,27 @@ class BagPlayer(Node):
                 raise ExternalShutdownException
 
     def _wait_for_subscribers(self) -> None:
-        """Wait until somebody listens to every image and attitude topic, or long enough."""
+        """Wait until all image and attitude topics have subscribers, or until the timeout."""
         inputs = (IMAGE_TYPE, ATTITUDE_TYPE)
         needed = [t.name for t in self._topics if t.type_name in inputs] or list(self._players)
         deadline_s = time.monotonic() + self.own.wait_for_subscribers_s
         while missing := [n for n in needed if not self._players[n].get_subscription_count()]:
             if time.monotonic() > deadline_s:
-                self.get_logger().warning(f'nobody listens to {", ".join(missing)}: played anyway')
+                self.get_logger().warning(f'no subscriber on {", ".join(missing)}: playing anyway')
                 return
-            _sleep_until(time.monotonic() + 0.02)  # rclpy has no wait for a matched reader
+            _sleep_until(time.monotonic() + 0.02)  # rclpy cannot wait for a match
 
     def _wait_for_observations(self, sent: int) -> None:
-        """Wait while a star observer has more images before it than it may."""
+        """Wait while a star observer has too many images in its queue."""
         if not self._paced or not self.count_publishers(self._observations.topic_name):
             return
         with self._observed:
             while sent - self._observed_count >= self.own.images_in_flight:
                 before = self._observed_count
                 if not self._observed.wait(_ACK_S) and self._observed_count == before:
-                    self.get_logger().warning('no observations come: images are no longer paced')
+                    self.get_logger().warning(
+                        'no observations received: images are no longer paced'
+                    )
                     self._paced = False
                     return
 
@@ -190,9 +192,9 @@ def _sleep_until(moment_s: float) -> None:
 
 def main(args: Sequence[str] | None = None) -> int:
     """
-    Play a bag; exit status 0 when all is acknowledged, 1 when not, 2 for a bad bag or parameter.
+    Play a bag; exit status 0 if all is acknowledged, 1 if not, 2 for a bad bag or parameter.
 
-    A signal ends it with 0.
+    A signal ends it with status 0.
     """
     player: BagPlayer | None = None
     listener: threading.Thread | None = None

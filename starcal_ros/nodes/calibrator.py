@@ -1,4 +1,4 @@
-"""The calibrator: star observations in, calibrations out."""
+"""Calibrator node: subscribes to star observations, publishes calibrations."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ from starcal_ros.records import Calibration, IMAGE_REFUSALS
 NAME = 'calibrator'
 _NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# A solve of minutes on a slow processor, at an image a second, loses none.
+# Deep enough to lose no image at one a second during a solve of minutes.
 _OBSERVATIONS = QoSProfile(depth=1000)
-_RETRY_S = 1.0  # while the disk fails
+_RETRY_S = 1.0  # after a failed write
 
 
 class Calibrator(StarcalNode):
     """
-    Collects observations and solves on request, in a thread of its own.
+    Collects observations and calibrates on request, in a worker thread.
 
     `CalibratorState` holds the ensemble and the active calibration; the node publishes them.
     """
@@ -63,7 +63,7 @@ class Calibrator(StarcalNode):
         self._status_thread: threading.Thread | None = None
 
     def configure(self) -> None:
-        """Load prior camera, options and the state folder, make the latched publishers."""
+        """Load the prior camera, options and state folder, create the latched publishers."""
         values = self.options.values()
         self._own = from_mapping(CalibratorOptions, values)
         self._setup = load_setup(values, self.options.classes)
@@ -91,7 +91,7 @@ class Calibrator(StarcalNode):
             self._tf_static = None
 
     def activate(self) -> None:
-        """Start to collect and to answer."""
+        """Start to collect observations and to serve requests."""
         self._listeners: list[tuple[Any, Any]] = []
         collecting, solving = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
         deciding, sending = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
@@ -126,7 +126,7 @@ class Calibrator(StarcalNode):
             self._publish_calibration(active)
 
     def deactivate(self) -> None:
-        """Stop collecting and answering."""
+        """Stop collecting observations and serving requests."""
         if self._driver is not None:
             self._driver.close()
             self._driver = None
@@ -140,7 +140,7 @@ class Calibrator(StarcalNode):
             thread.join()
 
     def cleanup(self) -> None:
-        """Let go of the publishers and the state folder; what is in memory stays."""
+        """Destroy the publishers and close the state folder; the state stays in memory."""
         while self._made:
             destroy, entity = self._made.pop()
             destroy(entity)
@@ -148,7 +148,7 @@ class Calibrator(StarcalNode):
         self._state.close()
 
     def health(self) -> Health:
-        """Images collected, active calibration, and result of the last request."""
+        """Diagnostics: ensemble, active calibration and the result of the last request."""
         state, last = self._state, self._last_answer
         ensemble, active = state.ensemble, state.active
         free = state.disk_free_bytes()
@@ -174,15 +174,15 @@ class Calibrator(StarcalNode):
             'disk_free_mb': 'none' if free is None else free // 1_000_000,
         }
         if state.trouble:
-            return ERROR, f'kept in memory alone: {state.trouble}', numbers
+            return ERROR, f'state not saved, in memory only: {state.trouble}', numbers
         if active is not None and active.forced:
-            return WARN, f'active against the gate: {"; ".join(active.reasons)}', numbers
+            return WARN, f'active despite the gate: {"; ".join(active.reasons)}', numbers
         if self.count_publishers(self._calibration.topic_name) > 1:
-            return WARN, f'another publisher of {self._calibration.topic_name}', numbers
+            return WARN, f'another node publishes {self._calibration.topic_name}', numbers
         if state.damage:
             return WARN, f'set aside as damaged: {"; ".join(state.damage)}', numbers
         if driver is not None and driver.has_failed:
-            return WARN, f'the camera was not told: {driver.outcome}', numbers
+            return WARN, f'camera driver not updated: {driver.outcome}', numbers
         if not last.success:
             return WARN, last.message, numbers
         if self._reports.trouble:
@@ -199,9 +199,8 @@ class Calibrator(StarcalNode):
             self._status_due.set()
 
     def _tell_status(self) -> None:
-        # Once for a burst: the newest status stands for all. Not by a guard condition: one that is
-        # triggered while the executor looks at it is lost before ros2/rmw_fastrtps#895, and with
-        # it the status of the last image.
+        # One status per burst.  A guard condition would not do: before ros2/rmw_fastrtps#895 a
+        # trigger during the executor's wait is lost, and with it the status of the last image.
         tell = self.guarded(self._publish_status)
         while self._status_due.wait() and self._status_thread is not None:
             self._status_due.clear()
@@ -240,7 +239,10 @@ class Calibrator(StarcalNode):
     def _on_send_camera_info(self, _request: Any, response: Any) -> Any:
         driver = self._driver
         if driver is None:
-            response.success, response.message = False, 'set_camera_info_service is not given'
+            response.success, response.message = (
+                False,
+                'parameter set_camera_info_service is empty',
+            )
         else:
             response.success, response.message = driver.hand_over_again()
         return response
@@ -249,14 +251,14 @@ class Calibrator(StarcalNode):
         return int(self.get_clock().now().nanoseconds)
 
     def _judged(self, answer: Answer) -> Answer:
-        """Keep what the gate has said for the diagnostics."""
+        """Store the result of the gate for the diagnostics."""
         if answer.calibration is not None:
             reasons = '; '.join(answer.calibration.reasons)
             self._last_gate = 'accepted' if answer.calibration.accepted else f'refused: {reasons}'
         return answer
 
     def _told(self, answer: Answer, response: Any) -> Any:
-        """Publish what came into force, or what the gate has refused; the filled response."""
+        """Publish the activated or refused calibration; return the filled response."""
         if answer.calibration is not None and answer.active:
             self._publish_calibration(answer.calibration)
             self._show(ACTIVE, answer)
@@ -276,7 +278,7 @@ class Calibrator(StarcalNode):
         if trouble:
             self.get_logger().warning(f'{page}: not made: {trouble}')
         else:
-            self.get_logger().info(f'look at {page}')
+            self.get_logger().info(f'report: {page}')
         self.publish_health_change()
 
     def _publish_calibration(self, calibration: Calibration) -> None:
@@ -291,7 +293,7 @@ class Calibrator(StarcalNode):
             self._driver.hand_over(camera_info)
 
     def _answered(self, answer: Any) -> Any:
-        """Return the service callback with errors answered, logged and counted."""
+        """Return the service callback wrapped so that errors are answered, logged and counted."""
 
         def run_and_tell(request: Any, response: Any) -> Any:
             try:
@@ -309,7 +311,7 @@ class Calibrator(StarcalNode):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the calibrator until it is told to end; exit status 2 for bad parameters."""
+    """Run the calibrator until shutdown; exit status 2 for bad parameters."""
     return run(Calibrator, NAME, args)
 
 

@@ -1,8 +1,8 @@
 """
-The client of ``starcal demo``: waits for the nodes, lets them collect, asks for the calibration.
+Client of ``starcal demo``: waits for the nodes and their images, then requests a calibration.
 
-Speaks to its parent in lines on standard output: ``ready`` when the nodes listen, then
-``collected N`` as images arrive, at last ``result MESSAGE`` or ``failed MESSAGE``.
+It reports to its parent process in lines on standard output: ``ready`` when the nodes are
+connected, ``collected N`` as images arrive, finally ``result MESSAGE`` or ``failed MESSAGE``.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ _LATCHED = QoSProfile(
 
 
 class DemoClient(Node):
-    """Keeps the newest status and calibration, and the one service client."""
+    """Holds the latest status and calibration, and the service client."""
 
     def __init__(self) -> None:
         super().__init__('starcal_demo')
         self.status: EnsembleStatus | None = None
         self.calibration: Calibration | None = None
-        self.is_heard = False  # the observer by the calibrator, as it says itself
+        self.is_heard = False  # the observer reports the calibrator as a subscriber
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
         self.create_subscription(EnsembleStatus, 'ensemble_status', self._on_status, _LATCHED)
         self.create_subscription(Calibration, 'calibration', self._on_calibration, _LATCHED)
@@ -58,7 +58,7 @@ class DemoClient(Node):
         self.calibration = message
 
     def images_seen(self) -> int:
-        """Images that the calibrator has taken or counted as refused."""
+        """Return the number of images that the calibrator has used or counted as refused."""
         status = self.status
         return (
             0
@@ -67,11 +67,11 @@ class DemoClient(Node):
         )
 
     def has_seen(self, count: int) -> bool:
-        """Whether that many images have come."""
+        """Return True once this many images have arrived."""
         return self.images_seen() >= count
 
     def spin_until(self, happened: Callable[[], bool], timeout_s: float) -> bool:
-        """Whether it happened in time."""
+        """Spin until a condition holds; False after the timeout."""
         deadline = time.monotonic() + timeout_s
         while not happened():
             if time.monotonic() > deadline:
@@ -81,16 +81,16 @@ class DemoClient(Node):
 
 
 def run(client: DemoClient, args: argparse.Namespace) -> int:
-    """The whole exchange; returns the exit status: 0 accepted, 3 refused, 2 no result."""
+    """Run the exchange; exit status 0 accepted, 3 refused, 2 no result."""
     listening = (args.image_topic, args.attitude_topic, 'observations')
 
     def missing() -> list[str]:
         found = [topic for topic in listening if not client.count_subscribers(topic)]
         if not client.calibrate.service_is_ready():
             found.append('no service')
-        # What the observer sends before it has found the calibrator is lost.
+        # Messages sent before the observer has discovered the calibrator are lost.
         if not client.is_heard:
-            found.append('nobody hears the observer')
+            found.append('subscriber of the observer')
         return found
 
     if not client.spin_until(lambda: not missing(), args.timeout):
@@ -99,7 +99,9 @@ def run(client: DemoClient, args: argparse.Namespace) -> int:
     print('ready', flush=True)
     for count in range(1, args.images + 1):
         if not client.spin_until(functools.partial(client.has_seen, count), args.timeout):
-            print(f'failed only {client.images_seen()} of {args.images} images came', flush=True)
+            print(
+                f'failed only {client.images_seen()} of {args.images} images arrived', flush=True
+            )
             return 2
         print(f'collected {count}', flush=True)
     future = client.calibrate.call_async(Trigger.Request())
@@ -116,11 +118,11 @@ def run(client: DemoClient, args: argparse.Namespace) -> int:
 def main() -> int:
     """Run the client."""
     parser = argparse.ArgumentParser()
-    parser.add_argument('--images', type=int, required=True, help='how many to wait for')
+    parser.add_argument('--images', type=int, required=True, help='number of images to wait for')
     parser.add_argument('--image-topic', required=True)
     parser.add_argument('--attitude-topic', required=True)
     parser.add_argument('--output', type=Path, required=True, help='calibration.json to write')
-    parser.add_argument('--timeout', type=float, default=30.0, help='of each step, s')
+    parser.add_argument('--timeout', type=float, default=30.0, help='timeout of each step, s')
     args = parser.parse_args()
     rclpy.init()
     client = DemoClient()

@@ -1,8 +1,8 @@
 """
-What the console scripts call: the heavy imports take a second or more, and Ctrl-C may come then.
+Entry points of the console scripts, with the default action for SIGINT during imports.
 
-Python would answer it with a traceback from whatever was being imported; the system's own action
-ends the process without one.
+The imports take over a second; Python would answer Ctrl-C then with a traceback, the default
+action of the system ends the process without one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def bag_player() -> int:
 
 def _run(name: str) -> int:
     before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:  # not where nohup or a shell has it ignored
+    if before is signal.default_int_handler:  # unless nohup or a shell ignores it
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     module = importlib.import_module(f'starcal_ros.nodes.{name}')
     signal.signal(signal.SIGINT, before)

@@ -1,4 +1,4 @@
-"""Images in order of arrival, each held back until its attitude has come."""
+"""Queue of images in order of arrival; each waits for its attitude."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 
-# A stamp so far ahead of the image after it is wrong: no waiting brings its attitude.
+# A stamp this far ahead of the next image is wrong: its attitude will never arrive.
 _WRONG_NS = 10 * NANOSECONDS_PER_SECOND
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """An image message in the queue; ``message`` is None for one that found the queue full."""
+    """An image in the queue; ``message`` is None if the queue was full on its arrival."""
 
     time_ns: int
     width: int
@@ -28,10 +28,10 @@ class Waiting:
 
 class ImageQueue:
     """
-    A queue between the thread that takes images and the one that measures stars.
+    Queue between the subscription thread and the thread that measures stars.
 
-    Every image put comes out, in order: one that finds the queue full comes out without its
-    pixels, so that it too can be answered for.
+    Every image put in comes out, in order; if the queue is full it comes out without pixels, so
+    that its refusal can still be published.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class ImageQueue:
     timeout_s : float
         Longest wait for an image to be ready.
     is_ready : callable
-        Whether an image of a stamp has all it needs; called in the thread that takes.
+        Returns True if the attitude of a stamp is available; called in the thread of `take`.
     """
 
     def __init__(self, size: int, timeout_s: float, is_ready: Callable[[int], bool]) -> None:
@@ -65,18 +65,18 @@ class ImageQueue:
             self._changed.notify()
 
     def wake(self) -> None:
-        """Look again whether the first image is ready."""
+        """Check the first image again."""
         with self._changed:
             self._changed.notify()
 
     def close(self) -> None:
-        """End the waiting: `take` returns None from now on."""
+        """Close the queue: `take` returns None from now on."""
         with self._changed:
             self._closed = True
             self._changed.notify()
 
     def take(self) -> Waiting | None:
-        """The next image once it is ready or has waited long enough; None when closed."""
+        """Return the next image once it is ready or timed out; None after `close`."""
         with self._changed:
             while not self._closed:
                 left_s = None
@@ -91,7 +91,7 @@ class ImageQueue:
             return None
 
     def _is_due(self, first: Waiting) -> bool:
-        """Whether the first image is ready, or its stamp is wrong beside that of the next."""
+        """Return True if the first image is ready or its stamp is wrong."""
         if self._is_ready(first.time_ns):
             return True
         following = self._images[1].time_ns if len(self._images) > 1 else first.time_ns

@@ -1,4 +1,4 @@
-"""A lifecycle node that starts itself, outlives errors of its callbacks and tells its health."""
+"""Lifecycle node base class: starts itself, survives callback errors, publishes diagnostics."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ _THREADS = 8
 
 class StarcalNode(LifecycleNode):
     """
-    What the lifecycle nodes share.
+    Base class of the lifecycle nodes.
 
-    A node of this kind fills in `configure`, `activate`, `deactivate`, `cleanup` and `health`.
+    Subclasses implement `configure`, `activate`, `deactivate`, `cleanup` and `health`.
     """
 
     def __init__(self, name: str) -> None:
@@ -45,7 +45,7 @@ class StarcalNode(LifecycleNode):
         self.options = OptionParameters(self, (*OPTION_CLASSES, *NODE_OPTION_CLASSES))
         for unknown in self.options.unknown():
             self.get_logger().warning(f'{unknown}: not a parameter of starcal')
-        self.failure = ''  # why the last transition failed, one line
+        self.failure = ''  # one-line reason of the last failed transition
         self._errors = 0
         self._taken: Counter[str] = Counter()
         self._level: bytes | None = None
@@ -58,32 +58,32 @@ class StarcalNode(LifecycleNode):
         self._answer_invalid_parameters()
 
     def configure(self) -> None:
-        """Read parameters and files, make the publishers; StarcalError when they are no good."""
+        """Read parameters and files, create the publishers; StarcalError if they are invalid."""
         raise NotImplementedError
 
     def activate(self) -> None:
-        """Start to listen."""
+        """Create the subscriptions and services."""
         raise NotImplementedError
 
     def deactivate(self) -> None:
-        """Stop listening; safe to call twice."""
+        """Destroy the subscriptions and services; may be called twice."""
         raise NotImplementedError
 
     def cleanup(self) -> None:
-        """Let go of what `configure` made; safe to call twice."""
+        """Destroy the objects created by `configure`; may be called twice."""
         raise NotImplementedError
 
     def health(self) -> Health:
-        """Level, a sentence, and numbers by name, of the active node."""
+        """Return level, message and values of the diagnostics of the active node."""
         raise NotImplementedError
 
     @property
     def is_active(self) -> bool:
-        """Whether the node is in the state active."""
+        """True in the lifecycle state active."""
         return bool(self._state_machine.current_state[1] == 'active')
 
     def guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Return the callback with its errors logged and counted: one bad message ends nothing."""
+        """Return the callback wrapped so that its errors are logged and counted."""
 
         @functools.wraps(callback)
         def run(*arguments: Any) -> None:
@@ -95,20 +95,20 @@ class StarcalNode(LifecycleNode):
         return run
 
     def taking(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Return the callback of an input, guarded; what it takes is counted."""
+        """Return the guarded callback of an input with its messages counted."""
         guarded = self.guarded(callback)
 
         def run(message: Any) -> None:
-            # By input: the callbacks of one never run at once, those of two may.
+            # Callbacks of one input never run concurrently, those of different inputs may.
             self._taken[callback.__name__] += 1
             guarded(message)
 
         return run
 
     def count_error(self, error: Exception) -> None:
-        """Log an error that was not foreseen and count it for the diagnostics."""
+        """Log an unexpected error and count it for the diagnostics."""
         if not self.context.ok():
-            return  # at shutdown handles vanish under whatever runs
+            return  # at shutdown, handles are destroyed under running callbacks
         self._errors += 1
         where = error.__traceback__
         while where is not None and where.tb_next is not None:
@@ -136,7 +136,7 @@ class StarcalNode(LifecycleNode):
             self._diagnostics.publish(message)
 
     def publish_health_change(self) -> None:
-        """Publish the diagnostics if their level is not the one published last."""
+        """Publish the diagnostics if their level has changed."""
         if self._health()[0] != self._level:
             self.publish_health()
 
@@ -148,7 +148,7 @@ class StarcalNode(LifecycleNode):
             level, text, numbers = WARN, self.failure or f'not active: {state}', {}
             if self.failure:
                 level = ERROR
-        peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # as Linux counts it
+        peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # kB on Linux
         common = {
             'memory_peak_mb': peak_kb // 1000,
             'messages': sum(list(self._taken.values())),
@@ -157,7 +157,7 @@ class StarcalNode(LifecycleNode):
         return level, text, {**numbers, **common}
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Configure; a bad parameter or file leaves the node unconfigured."""
+        """Configure; with a bad parameter or file the node stays unconfigured."""
         self.options.frozen = True
         outcome = self._transition(self.configure, state, super().on_configure)
         if outcome != TransitionCallbackReturn.SUCCESS:
@@ -178,13 +178,13 @@ class StarcalNode(LifecycleNode):
         return self._transition(self.deactivate, state, super().on_deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Clean up; parameters can be changed again."""
+        """Clean up; parameters may be changed again."""
         outcome = self._transition(self.cleanup, state, super().on_cleanup)
         self.options.frozen = False
         return outcome
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Shut down from whatever state."""
+        """Shut down from any state."""
         self.deactivate()
         return self._transition(self.cleanup, state, super().on_shutdown)
 
@@ -198,7 +198,7 @@ class StarcalNode(LifecycleNode):
     def _transition(
         self, step: Callable[[], None], state: LifecycleState, base: Callable[[Any], Any]
     ) -> TransitionCallbackReturn:
-        # Jazzy swallows what a transition raises without a word: it has to be said here.
+        # Jazzy discards exceptions of a transition silently: log them here.
         try:
             step()
         except StarcalError as error:
@@ -212,7 +212,7 @@ class StarcalNode(LifecycleNode):
         return base(state)
 
     def _answer_invalid_transitions(self) -> None:
-        """Answer a transition that the state does not allow with false; Jazzy's rclpy raises."""
+        """Answer an invalid transition with false; rclpy of Jazzy raises instead."""
         service = self._service_change_state
         change_state = service.callback
 
@@ -229,7 +229,7 @@ class StarcalNode(LifecycleNode):
         service.callback = answer
 
     def _answer_invalid_parameters(self) -> None:
-        """Answer a value of a type that is none with a refusal; rclpy raises, answering nobody."""
+        """Reject a parameter of an invalid type; rclpy raises without an answer."""
 
         def answering(set_parameters: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
             def answer(request: Any, response: Any) -> Any:
@@ -241,7 +241,7 @@ class StarcalNode(LifecycleNode):
                 if isinstance(response, SetParametersAtomically.Response):
                     response.result = refused
                 else:
-                    # Those before the bad one were answered, and may be set.
+                    # Parameters before the bad one are answered and may be set.
                     left = len(request.parameters) - len(response.results)
                     response.results = [*response.results, *[refused] * left]
                 return response
@@ -255,9 +255,9 @@ class StarcalNode(LifecycleNode):
 
 def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | None) -> int:
     """
-    Exit status of a lifecycle node that was run until it was told to end.
+    Run a lifecycle node until shutdown; return its exit status.
 
-    0 after SIGINT or SIGTERM; 2 for bad parameters or files, with one line that names them.
+    0 after SIGINT or SIGTERM; 2 for bad parameters or files, with a one-line message.
     """
     node: StarcalNode | None = None
 
@@ -278,9 +278,10 @@ def until_told_to_end(
     name: str, args: Sequence[str] | None, work: Callable[[], int], end: Callable[[], None]
 ) -> int:
     """
-    Exit status of work between `rclpy.init` and an end that is always come to.
+    Run a function between `rclpy.init` and shutdown; return the exit status.
 
-    Its own, or 0 after SIGINT or SIGTERM, or 2 after an error, with one line that names it.
+    That of the function, or 0 after SIGINT or SIGTERM, or 2 with a one-line message after an
+    error.
     """
     is_up = False
     try:
@@ -290,7 +291,7 @@ def until_told_to_end(
     except (KeyboardInterrupt, ExternalShutdownException, ROSInterruptException):
         return 0
     except Exception as error:
-        # A signal shuts ROS down at once; what was just being made then fails.
+        # A signal shuts ROS down at once; an object under construction then fails.
         if is_up and not rclpy.ok():
             return 0
         print(f'{name}: {one_line(error)}', file=sys.stderr)
@@ -331,5 +332,5 @@ def _spin(node: StarcalNode, executor: MultiThreadedExecutor) -> None:
 
 
 def one_line(error: Exception) -> str:
-    """Text of an error without line breaks."""
+    """Return the text of an error without line breaks."""
     return ' '.join(str(error).split())

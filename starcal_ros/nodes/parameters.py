@@ -1,4 +1,4 @@
-"""ROS parameters declared from the options dataclasses."""
+"""ROS parameters declared from options dataclasses."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from starcal_ros.options import check_value
 
 class OptionParameters:
     """
-    The options of some dataclasses as parameters of a node, checked whenever they are set.
+    Options of dataclasses as parameters of a node, checked whenever they are set.
 
-    ``frozen`` is set while the values are in use: then a change is refused.
+    While ``frozen`` is set, changes are rejected.
 
     Raises
     ------
     OptionError
-        For a value from the command line or the parameter file that is refused, naming it.
+        If a value from the command line or the parameter file is invalid.
     """
 
     def __init__(self, node: Node, option_classes: Sequence[type[Any]]) -> None:
@@ -50,15 +50,15 @@ class OptionParameters:
                 raise OptionError(f'{field.name}: {_reason(error)}') from error
 
     def values(self) -> dict[str, object]:
-        """Every option by name, in the types of the dataclasses."""
+        """Return all options by name, in the types of the dataclasses."""
         return {
             name: check_value(field, self._node.get_parameter(name).value)
             for name, field in self._fields.items()
         }
 
     def unknown(self) -> list[str]:
-        """Names given at start that no option has: ROS itself passes over a misspelt one."""
-        given = getattr(self._node, '_parameter_overrides', {})  # rclpy tells it nowhere else
+        """Return the parameters given at start that match no option; ROS ignores them silently."""
+        given = getattr(self._node, '_parameter_overrides', {})  # no public API
         return sorted(
             name
             for name in given
@@ -89,7 +89,7 @@ def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
     description = meta['description']
     if meta['choices']:
         description += ': ' + ' | '.join(meta['choices'])
-    # Typed by check_value, which takes 2 for 2.0 as the tool does, and lists that may be empty.
+    # Dynamic typing: check_value accepts 2 for 2.0, as the tool does, and lists may be empty.
     descriptor = ParameterDescriptor(description=description, dynamic_typing=True)
     low, high = meta['low'], meta['high']
     if (low is None and high is None) or isinstance(field.default, (bool, tuple)):
@@ -111,6 +111,6 @@ def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
 
 
 def _reason(error: Exception) -> str:
-    # rclpy puts a sentence of its own before the reason that a callback gave.
+    # rclpy prepends a sentence to the reason from the callback.
     text = str(error).replace('\n', ' ')
     return text.rpartition('Reason: ')[2] if 'Reason: ' in text else text

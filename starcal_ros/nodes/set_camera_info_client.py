@@ -1,4 +1,4 @@
-"""The camera's driver, handed each calibration that comes into force."""
+"""Client of the camera driver's set_camera_info service: sends each activated calibration."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ from sensor_msgs.srv import SetCameraInfo
 
 from starcal_ros.nodes.lifecycle import StarcalNode
 
-_LOOK_S = 0.5  # how often to look for the service and at the clock
+_LOOK_S = 0.5  # period of checks for the service and the timeout
 ACCEPTED = 'accepted'
 
 
 class CameraDriver:
     """
-    A client of a driver's set_camera_info that says what became of each call.
+    Client of set_camera_info that reports the outcome of each call.
 
-    A calibration is sent as soon as the service is there.  One that is refused, or not answered in
-    time, is sent again only by `hand_over_again`, or when the service has gone and come back: a
-    driver that says no would say so every second.  Safe to use from several threads.
+    A calibration is sent as soon as the service is available.  After a refusal or a timeout it is
+    sent again only by `hand_over_again` or when the service reappears, because a driver that
+    refuses would refuse every second.  Safe to use from several threads.
 
     Parameters
     ----------
     node : StarcalNode
-        Its log is told of every failure.
+        Failures are logged through it.
     service : str
     timeout_s : float
-        Longest wait for the service, and then for its answer, before it counts as a failure.
+        Longest wait for the service, and for its answer.
     """
 
     def __init__(self, node: StarcalNode, service: str, timeout_s: float) -> None:
         self.failures = 0
         self.outcome = 'no calibration'
-        self.has_failed = False  # at the last attempt
+        self.has_failed = False  # last attempt
         self._node, self._service, self._timeout_s = node, service, timeout_s
         self._camera_info: Any = None
-        self._is_due = False  # to be sent when the service is there
+        self._is_due = False  # to be sent once the service is available
         self._is_there = False
         self._call: Any = None
         self._since_s = 0.0
@@ -49,7 +49,7 @@ class CameraDriver:
         self._timer = node.create_timer(_LOOK_S, node.guarded(self._look), group)
 
     def close(self) -> None:
-        """Let go of the service; whoever waits is told."""
+        """Destroy the client; pending calls return."""
         with self._changed:
             self._closed = True
             self._drop_call()
@@ -58,13 +58,13 @@ class CameraDriver:
         self._node.destroy_client(self._client)
 
     def hand_over(self, camera_info: Any) -> None:
-        """Send a sensor_msgs/CameraInfo, in place of any before it; does not wait."""
+        """Send a sensor_msgs/CameraInfo in place of any earlier one; does not wait."""
         with self._changed:
             self._camera_info = camera_info
             self._begin()
 
     def hand_over_again(self) -> tuple[bool, str]:
-        """Send the last one again and wait for the end of it: whether accepted, and a sentence."""
+        """Send the last one again and wait; return True if accepted, and a message."""
         with self._changed:
             if self._camera_info is None:
                 return False, 'no calibration is in force'
@@ -91,7 +91,7 @@ class CameraDriver:
             ):
                 self._send()
             elif self._is_due and overdue:
-                self._end('not there; sent when it comes', False)
+                self._end('service not available; will be sent when it is', False)
             elif self._call is not None and overdue:
                 self._drop_call()
                 self._end(f'no answer within {self._timeout_s:g} s', False)
@@ -106,7 +106,7 @@ class CameraDriver:
     def _answered(self, call: Any) -> None:
         with self._changed:
             if call is not self._call or self._closed:
-                return  # of a calibration that is not in force any more
+                return  # of a calibration that is no longer active
             self._call = None
             if call.exception() is not None:
                 self._end(f'failed: {call.exception()}', False)

@@ -1,4 +1,4 @@
-"""What the last minute has brought: numbers with their times of arrival."""
+"""Statistics of numbers that arrived in the last minute."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 WINDOW_S = 60.0
-_MOST = 100_000  # a minute at 1.6 kHz: what floods a topic must not fill the memory
+_MOST = 100_000  # a minute at 1.6 kHz; bounds the memory under a flood of messages
 
 
 class Recent:
@@ -31,27 +31,27 @@ class Recent:
         self._lock = threading.Lock()
 
     def add(self, value: float) -> None:
-        """Take a number that has come now."""
+        """Add a number that has just arrived."""
         with self._lock:
             self._forget()
             self._times_s.append(self._clock_s())
             self._values.append(value)
 
     def rate_hz(self) -> float:
-        """How many came in a second; before a whole window has passed, since the start."""
+        """Numbers per second in the window, or since the start if that is shorter."""
         with self._lock:
             now_s = self._forget()
             passed_s = min(now_s - self._start_s, WINDOW_S)
             return len(self._times_s) / passed_s if passed_s > 0 else 0.0
 
     def median(self) -> float | None:
-        """Their median; None where none has come."""
+        """Median; None without numbers."""
         with self._lock:
             self._forget()
             return float(np.median(self._values)) if self._values else None
 
     def largest(self) -> float | None:
-        """The largest; None where none has come."""
+        """Largest number; None without numbers."""
         with self._lock:
             self._forget()
             return max(self._values, default=None)

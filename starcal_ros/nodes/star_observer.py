@@ -1,4 +1,4 @@
-"""The star observer: images and attitudes in, star observations out."""
+"""Star observer node: subscribes to images and attitudes, publishes star observations."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
 
 NAME = 'star_observer'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# Ten seconds of a fast star tracker; a bag played at speed sends them in bursts.
+# Ten seconds of a fast star tracker; a bag played fast sends bursts.
 _SAMPLES = QoSProfile(depth=2000)
 _MAX_VELOCITY_M_S = 1e6
-_JUMP_S = 10.0  # stamps that go back by less are late, not of another clock
+_JUMP_S = 10.0  # smaller steps back are late messages, not a clock change
 
 
 class StarObserver(StarcalNode):
     """
-    Measures the stars of every image, in order of arrival, in one thread of its own.
+    Measures the stars of every image, in order of arrival, in a worker thread.
 
-    Callbacks only take: what the images are predicted with changes in the thread that measures.
+    Callbacks only store their messages; the worker thread alone changes the prediction.
     """
 
     def __init__(self) -> None:
@@ -71,18 +71,16 @@ class StarObserver(StarcalNode):
         self._queue: ImageQueue | None = None
         self._counts: Counter[str] = Counter()
         self._last_refusal = ''
-        self._camera_info: Any = (
-            None  # of the calibration in force; its header is the last image's
-        )
+        self._camera_info: Any = None  # of the active calibration, header of the last image
         self._camera_infos: Any = None
 
     def configure(self) -> None:
-        """Load prior camera and catalog, make the publishers."""
+        """Load the prior camera and the catalog, create the publishers."""
         values = self.options.values()
         self._own = from_mapping(ObserverOptions, values)
         self._setup = load_setup(values, self.options.classes)
         self._geometry = self._setup.prior
-        self._calibration_number = 0  # of the one that stars are predicted with; 0: the prior
+        self._calibration_number = 0  # of the calibration used for prediction; 0: the prior
         self._observations = self.create_lifecycle_publisher(
             ObservationsMessage, 'observations', QoSProfile(depth=100)
         )
@@ -98,7 +96,7 @@ class StarObserver(StarcalNode):
             self._publishers_made.append(self._camera_infos)
 
     def activate(self) -> None:
-        """Start to take images and attitudes, and the thread that measures."""
+        """Subscribe to images and attitudes, start the worker thread."""
         jump_s = max(_JUMP_S, self._setup.attitude.max_attitude_gap_s)
         self._attitudes = AttitudeHistory(self._own.attitude_history_s, jump_s)
         self._track = observe.Track(self._geometry)
@@ -140,28 +138,28 @@ class StarObserver(StarcalNode):
     def _image_input(self) -> tuple[Any, str]:
         if self._own.image_transport == 'raw':
             return ImageMessage, 'image'
-        # As image_transport names it: a remap of `image` carries over.
+        # Name as in image_transport, so that a remap of `image` applies.
         return CompressedImage, self.resolve_topic_name('image') + '/compressed'
 
     def deactivate(self) -> None:
-        """Stop listening; what still waits in the queue is let go."""
+        """Unsubscribe; images still in the queue are dropped."""
         while self._listeners:
             self.destroy_subscription(self._listeners.pop())
         if self._queue is not None and self._worker is not None:
             if len(self._queue):
-                self.get_logger().warning(f'{len(self._queue)} images were waiting at the end')
+                self.get_logger().warning(f'{len(self._queue)} images dropped from the queue')
             self._queue.close()
             self._worker.join()
         self._worker = None
 
     def cleanup(self) -> None:
-        """Let go of the publishers."""
+        """Destroy the publishers."""
         while self._publishers_made:
             self.destroy_lifecycle_publisher(self._publishers_made.pop())
 
     def health(self) -> Health:
-        """Counts of images by what became of them."""
-        counts = dict(self._counts)  # the thread that measures goes on counting
+        """Diagnostics: counts of used and refused images."""
+        counts = dict(self._counts)  # the worker thread continues counting
         numbers: dict[str, object] = {
             'images': sum(counts.values()),
             'images_used': counts.get('', 0),
@@ -193,11 +191,11 @@ class StarObserver(StarcalNode):
             self._queue.put(time_ns, width, height, message)
 
     def _publish_camera_info(self, message: Any) -> None:
-        """Publish the calibration in force with the header of an image message."""
+        """Publish the active calibration with the header of an image message."""
         camera_info = self._camera_info
         if camera_info is None or self._camera_infos is None:
             return
-        # A compressed image does not say its size; one of another size has another camera.
+        # A compressed image has no size; an image of another size is from another camera.
         size = (camera_info.width, camera_info.height)
         if (getattr(message, 'width', size[0]), getattr(message, 'height', size[1])) == size:
             camera_info.header = message.header
@@ -208,7 +206,7 @@ class StarObserver(StarcalNode):
         direction = self._setup.attitude.attitude_direction
         before_ns = self._attitudes.latest_ns
         self._attitudes.add(time_ns, attitude_sample(time_ns, quaternion, direction))
-        # A late sample is no gap, and neither is a step back of the clock.
+        # Late samples and steps back of the clock are not gaps.
         latest_ns = self._attitudes.latest_ns or 0
         step_ns = 0 if before_ns is None else max(0, latest_ns - before_ns)
         self._attitude_step_s.add(step_ns / NANOSECONDS_PER_SECOND)
@@ -217,9 +215,11 @@ class StarObserver(StarcalNode):
 
     def _on_velocity(self, message: Any) -> None:
         time_ns, velocity_m_s = velocity_from_message(message)
-        # The Earth's is 3e4; one like this or not finite would send the stars anywhere.
+        # The Earth moves at 3e4 m/s; a value beyond this limit would displace all stars.
         if not float(abs(velocity_m_s).max()) < _MAX_VELOCITY_M_S:
-            raise ValueError(f'velocity: {velocity_m_s.tolist()} m/s is none of a spacecraft')
+            raise ValueError(
+                f'velocity: {velocity_m_s.tolist()} m/s is not plausible for a spacecraft'
+            )
         self._velocities.append((time_ns, velocity_m_s))
 
     def _on_temperature(self, message: Any) -> None:
@@ -228,18 +228,18 @@ class StarObserver(StarcalNode):
     def _on_calibration(self, message: Any) -> None:
         calibration = calibration_from_message(message)
         if not (calibration.accepted or calibration.forced):
-            raise ValueError('calibration: one that the gate has refused')
+            raise ValueError('calibration: refused by the gate')
         geometry = calibration.geometry
         prior = self._setup.prior.camera
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
-            raise ValueError('calibration: of another image size than the prior camera')
+            raise ValueError('calibration: image size differs from the prior camera')
         self._geometry, self._calibration_number = geometry, calibration.number
         if self._camera_infos is not None:
             self._camera_info = camera_info_to_message(calibration, make_message)
-        self.get_logger().info('stars are predicted with the calibration in force')
+        self.get_logger().info('predicting stars with the active calibration')
 
     def _attitude_has_come(self, time_ns: int) -> bool:
-        """Whether the samples about an image are there, or a later one shows they will not be."""
+        """Return True if the attitude samples of an image have arrived or can no longer arrive."""
         latest_ns = self._attitudes.latest_ns
         if latest_ns is None or latest_ns < time_ns:
             return False
@@ -253,14 +253,14 @@ class StarObserver(StarcalNode):
         return True
 
     def _measure_all(self) -> None:
-        assert self._queue is not None  # made before the thread
+        assert self._queue is not None  # created before the thread
         while (waiting := self._queue.take()) is not None:
             try:
                 self._measure(waiting)
             except Exception as error:
                 self.count_error(error)
                 if not self.context.ok():
-                    return  # told to end: nobody can be answered any more
+                    return  # shutdown: no refusal can be published
                 detail = f'{type(error).__name__}: {error}'
                 self._publish(self._refused(waiting, 'internal_error', detail))
             self._latency_s.add(time.monotonic() - waiting.arrived_s)
@@ -268,7 +268,7 @@ class StarObserver(StarcalNode):
 
     def _measure(self, waiting: Waiting) -> None:
         if waiting.message is None:
-            detail = f'{self._own.image_queue} images were waiting'
+            detail = f'{self._own.image_queue} images were in the queue'
             self._publish(self._refused(waiting, 'overrun', detail))
             return
         try:
@@ -290,7 +290,7 @@ class StarObserver(StarcalNode):
         )
         if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
             self._restarts += 1
-            self.get_logger().warning('the stamps of the images have gone back: started anew')
+            self.get_logger().warning('image stamps went back: restarted the sequence')
         self._publish(observations)
         if self._annotated.get_subscription_count():
             self._publish_annotated(image, observations, before.geometry)
@@ -326,7 +326,7 @@ def _short(number: float | None) -> str:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the star observer until it is told to end; exit status 2 for bad parameters."""
+    """Run the star observer until shutdown; exit status 2 for bad parameters."""
     return run(StarObserver, NAME, args)
 
 

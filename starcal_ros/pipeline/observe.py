@@ -12,23 +12,21 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.bag import reader
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.star_finder import observe_stars, Shot, tracked
-from starcal_ros.identification.tracking import follow, Followed, following
+from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned
+from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.image.centroiding import saturation_level
-from starcal_ros.image.detection import Pixels
 from starcal_ros.image.frame_checks import Fingerprint, fingerprint, sample_rows, screen
 from starcal_ros.image.hot_pixels import HotPixels, learn_hot_pixels
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
 
-Floats = NDArray[np.float64]
 T = TypeVar('T')
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
@@ -40,16 +38,16 @@ class Track:
     """
     State of an image sequence.
 
-    ``geometry`` predicts the stars of a full search; ``latest_ns`` is the stamp of the last image
-    used.  ``followed`` is the state of tracking, with which the next image is measured without a
-    search; None before the first.  ``behind`` images in a row, the last of them at ``behind_ns``,
-    were stamped before the last one used.  ``seen`` is the fingerprint of the last frame, used or
-    not, to detect a frozen camera; ``hot`` the hot pixels found so far.
+    ``geometry`` is what an image is searched with; ``latest_ns`` stamps the last one used.
+    ``tracked_camera`` measures the next image without a search; None before the first image.
+    ``behind`` images in a row, the last of them at ``behind_ns``, were stamped before the last one
+    used.  ``seen`` is the last frame of all, used or not,
+    which a stuck camera shows again; ``hot`` the hot pixels found so far.
     """
 
     geometry: CameraGeometry
     latest_ns: int | None = None
-    followed: Followed | None = None
+    tracked_camera: TrackedCamera | None = None
     behind: int = 0
     behind_ns: int = 0
     seen: Fingerprint | None = None
@@ -91,7 +89,7 @@ def observe_next(
         saturation_dn = setup.centroid.saturation_dn
         screen(sample, seen, track.seen, saturation_dn, setup.dark, setup.screening)
         hot = (track.hot or setup.hot).index
-        shot = Shot(
+        exposure = Exposure(
             _without_dark(image, setup),
             quaternion,
             gap_s,
@@ -100,7 +98,7 @@ def observe_next(
             hot,
             temperature_degc,
         )
-        return _stars(shot, setup, remembered)
+        return _stars(exposure, setup, remembered)
     except ImageRefused as refused:
         height, width = image.pixels.shape
         observations = refused_image(
@@ -153,48 +151,48 @@ def _after_order(track: Track, time_ns: int) -> Track:
     return Track(track.geometry, hot=track.hot)
 
 
-def _stars(shot: Shot, setup: Setup, track: Track) -> tuple[StarObservations, Track]:
-    """Observations by tracking from the images before, or else by a full search."""
-    time_ns = shot.image.time_ns
-    if track.followed is not None:
+def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservations, Track]:
+    """The stars where the images before say, or else where a search of the image finds them."""
+    time_ns = exposure.image.time_ns
+    if track.tracked_camera is not None:
         try:
-            observations, followed = follow(
-                shot, track.followed, setup.catalog, setup.centroid, setup.identification
+            observations, tracked_camera = track_stars(
+                exposure, track.tracked_camera, setup.catalog, setup.centroid, setup.identification
             )
             # Accurate to a few pixels with the camera of the search, whose window is wider.
             geometry = dataclasses.replace(
                 track.geometry,
-                star_tracker_from_camera_xyzw=followed.geometry.star_tracker_from_camera_xyzw,
+                star_tracker_from_camera_xyzw=tracked_camera.geometry.star_tracker_from_camera_xyzw,
             )
             after = dataclasses.replace(
-                track, geometry=geometry, latest_ns=time_ns, followed=followed
+                track, geometry=geometry, latest_ns=time_ns, tracked_camera=tracked_camera
             )
-            return observations, _with_hot_pixels(after, shot, observations, setup)
+            return observations, _with_hot_pixels(after, exposure, observations, setup)
         except ImageRefused:
             pass  # the full search finds the reason of refusal
     observations, instrument = observe_stars(
-        shot, track.geometry, setup.catalog, setup.centroid, setup.identification
+        exposure, track.geometry, setup.catalog, setup.centroid, setup.identification
     )
     if observations.refusal:
         return observations, track
-    geometry = tracked(track.geometry, observations)
+    geometry = realigned(track.geometry, observations)
     after = dataclasses.replace(
         track,
         geometry=geometry,
         latest_ns=time_ns,
-        followed=following(geometry, observations, instrument),
+        tracked_camera=start_tracking(geometry, observations, instrument),
     )
-    return observations, _with_hot_pixels(after, shot, observations, setup)
+    return observations, _with_hot_pixels(after, exposure, observations, setup)
 
 
 def _with_hot_pixels(
-    track: Track, shot: Shot, observations: StarObservations, setup: Setup
+    track: Track, exposure: Exposure, observations: StarObservations, setup: Setup
 ) -> Track:
-    """State with the hot pixels of an image added."""
-    icrf_from_star_tracker = Rotation.from_quat(shot.icrf_from_star_tracker_xyzw)
+    """The track with the hot pixels that an image shows, which is aligned as the track says."""
+    icrf_from_star_tracker = Rotation.from_quat(exposure.icrf_from_star_tracker_xyzw)
     hot = learn_hot_pixels(
         track.hot or setup.hot,
-        shot.image.pixels,
+        exposure.image.pixels,
         observations.background_dn,
         observations.noise_dn,
         icrf_from_star_tracker * Rotation.from_quat(track.geometry.star_tracker_from_camera_xyzw),

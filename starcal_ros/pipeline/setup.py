@@ -11,8 +11,8 @@ from typing import Any, get_type_hints
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Pixels
 from starcal_ros.assessment.gate import check_gate_options, GateOptions
 from starcal_ros.camera import convert
 from starcal_ros.errors import OptionError
@@ -89,7 +89,7 @@ class Setup:
     gate: GateOptions
     prior: CameraGeometry
     catalog: StarCatalog
-    dark: NDArray[np.uint8] | NDArray[np.uint16] | None
+    dark: Pixels | None
     dark_pedestal_dn: int = 0
     hot: HotPixels = NO_HOT_PIXELS
 
@@ -185,9 +185,7 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
     return CameraGeometry(camera, quaternion / norm)
 
 
-def _read_dark(
-    path: str, width: int, height: int
-) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
+def _read_dark(path: str, width: int, height: int) -> Pixels | None:
     if not path:
         return None
     dark = cv2.imread(path.removeprefix('file://'), cv2.IMREAD_UNCHANGED)

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from starcal_ros.assessment.residuals import Residuals
-from starcal_ros.bag.reader import BagWriter
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, write_calibration
 from starcal_ros.products.camera_yaml import CAMERA_INFO_FILE, write_camera_info
 from starcal_ros.products.files import OBSERVATIONS_FILE

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats, Picture, Pixels
 from starcal_ros.camera import project
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 Color = tuple[int, int, int]  # blue, green, red
 
 _PREDICTED = (255, 160, 0)  # blue
@@ -90,7 +89,7 @@ def predicted_px(observations: StarObservations, geometry: CameraGeometry) -> Fl
     return project(geometry.camera, directions.T)
 
 
-def stretch(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
+def stretch(pixels: Pixels) -> NDArray[np.uint8]:
     """8-bit picture of an image: sky dark, faint stars visible, bright ones white."""
     # Quantiles of a sample of the pixels suffice for a picture.
     sample = pixels[:: max(1, pixels.shape[0] // 256), :: max(1, pixels.shape[1] // 256)]

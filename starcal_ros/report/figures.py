@@ -19,9 +19,9 @@ from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import binned_statistic, norm
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment import comparison
 from starcal_ros.assessment.agreement import movement
 from starcal_ros.assessment.comparison import Comparison, DifferenceMap
@@ -32,8 +32,6 @@ from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.estimation.normal_equations import whitening
 from starcal_ros.records import CameraGeometry, DetectorMaps, TermRemoval
 from starcal_ros.report.term_removal_figure import curves_of, plot_curves
-
-Floats = NDArray[np.float64]
 
 COMPARISON_FORMATS = ('.png', '.svg', '.pdf')
 

@@ -24,7 +24,7 @@ from starcal_ros.assessment.observability import movement_px
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.bag import reader
 from starcal_ros.camera import INTRINSIC_NAMES
-from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.estimation.temperature import summary as thermal_summary
 from starcal_ros.messages.types import OBSERVATIONS_TYPE
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, prior_of, read_calibration
@@ -40,7 +40,6 @@ from starcal_ros.records import (
 from starcal_ros.report import figures as report_figures
 from starcal_ros.report.charts import charts_of
 from starcal_ros.report.thumbnails import read_thumbnails, Thumbnail, THUMBNAILS_FOLDER
-from starcal_ros.utc import utc_text
 
 _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200

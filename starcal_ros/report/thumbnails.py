@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.arrays import Pixels
 from starcal_ros.products.files import write_atomically
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.report.annotation import annotate, stretch
@@ -122,10 +123,8 @@ def _whole(image: Image, observations: StarObservations, geometry: CameraGeometr
     return Thumbnail(image.time_ns, '', 0, encoded.tobytes())
 
 
-def _cut_out(
-    pixels: NDArray[np.uint8] | NDArray[np.uint16], place_px: NDArray[np.float32]
-) -> bytes:
-    """PNG of the pixels around a position; black outside the image."""
+def _cut_out(pixels: Pixels, place_px: NDArray[np.float32]) -> bytes:
+    """PNG of the pixels about a place; black where that leaves the image."""
     u, v = np.rint(np.nan_to_num(np.clip(place_px, -1e4, 1e5), nan=-1e4)).astype(int)
     size = 2 * _STAR_HALF_PX + 1
     picture = np.zeros((size, size), np.uint8)

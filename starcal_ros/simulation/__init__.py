@@ -1,1 +1,1 @@
-"""Synthetic skies, images and bags with known truth."""
+"""Simulated star fields, images and bags with known truth."""

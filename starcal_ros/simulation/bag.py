@@ -1,4 +1,4 @@
-"""A synthetic scenario as a bag, with its truth and what a calibration starts from beside it."""
+"""Simulated scenarios as bags, with files of their truth and of the prior of a calibration."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 import yaml
 
-from starcal_ros.bag.reader import BagWriter
+from starcal_ros.arrays import Floats
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.products.camera_yaml import write_camera_info
@@ -28,15 +28,13 @@ from starcal_ros.simulation.centroids import (
 from starcal_ros.simulation.images import images
 from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenes
 
-Floats = NDArray[np.float64]
-
 IMAGE_TOPIC = '/opnav/image_raw'
 ATTITUDE_TOPIC = '/star_tracker/attitude'
 
 
 @dataclass(frozen=True)
 class SimulatedBag:
-    """A bag with known truth, and what `starcal calibrate` needs to start from it."""
+    """Paths of a simulated bag, its truth, and the parameter and camera files to calibrate it."""
 
     bag: Path
     truth: Path
@@ -45,7 +43,7 @@ class SimulatedBag:
 
 
 def truth_content(scenario: Scenario, bag_name: str) -> dict[str, object]:
-    """The truth of a bag as the JSON object that stands beside it."""
+    """Content of the truth file of a bag, a JSON object."""
     true, prior = scenario.truth, scenario.prior
     stars = stars_above = 0
     for shown in scenes(scenario):
@@ -101,17 +99,17 @@ def write_bag(
     on_image: Callable[[int], None] = lambda index: None,
 ) -> SimulatedBag:
     """
-    Render a scenario into a bag, with its truth and the files to calibrate it beside it.
+    Render a scenario to a bag, and write its truth and the files to calibrate it.
 
-    A folder holds ``truth.json``, ``params.yaml`` and ``camera.yaml``; beside a single file
+    A bag folder holds ``truth.json``, ``params.yaml`` and ``camera.yaml``; for a single file
     ``NAME.mcap`` they are ``NAME.json``, ``NAME_params.yaml`` and ``NAME_camera.yaml``.
 
     Parameters
     ----------
     camera_url : str
-        Of the prior camera in the parameter file, instead of a ``file://`` URL.
+        URL of the prior camera in the parameter file; default: a ``file://`` URL.
     on_image : callable
-        Told the number of each image that was written.
+        Called with the index of each image written.
     """
     writer = BagWriter(path)
     with writer:
@@ -142,7 +140,7 @@ def _write_attitude(writer: BagWriter, sample: AttitudeSample) -> None:
 
 
 def parameters(scenario: Scenario, camera_url: str) -> dict[str, object]:
-    """The ROS parameter file of a scenario's prior knowledge."""
+    """Content of the ROS parameter file with the prior of a scenario."""
     values = {
         'camera_info_url': camera_url,
         'prior_alignment': scenario.prior.star_tracker_from_camera_xyzw.tolist(),

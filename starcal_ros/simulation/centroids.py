@@ -1,15 +1,15 @@
 """
-Centroids of a synthetic star field without pixels, and how well any estimator could do.
+Simulated centroids without pixels, and Cramer-Rao bounds.
 
-`true_observations` are noisy centroids, each with its Cramer-Rao bound (`centroid_bound`);
-`cramer_rao_covariance` is the bound of a camera that is estimated from them.
+`true_observations` gives noisy centroids, each with its Cramer-Rao bound (`centroid_bound`);
+`cramer_rao_covariance` is the bound of the camera parameters estimated from them.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, project_jacobians
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.simulation.images import pixel_stamps
@@ -24,7 +24,6 @@ from starcal_ros.simulation.scenario import (
 )
 from starcal_ros.sky.catalog import StarCatalog
 
-Floats = NDArray[np.float64]
 BOUND_SNR = 5.0
 
 
@@ -42,14 +41,14 @@ def true_observations(
     catalog: StarCatalog | None = None,
 ) -> Ensemble:
     """
-    Observations of every star on the detector above a signal-to-noise ratio, without pixels.
+    Observations of all stars on the detector above a signal-to-noise ratio.
 
     Parameters
     ----------
     centroid_sigma_px : float, optional
-        Error per axis of every star; without it each star has its Cramer-Rao bound.
+        1-sigma error per axis of every star; default: its Cramer-Rao bound.
     centroid_noise, attitude_noise : bool
-        Whether the errors are put in; the covariances are reported all the same.
+        False: no errors are added; the covariances stay the same.
     """
     ensemble = Ensemble()
     for index in range(scenario.image_count):
@@ -75,7 +74,7 @@ def _observations(
     )
     if centroid_sigma_px is not None:
         covariance = np.broadcast_to(np.eye(2) * centroid_sigma_px**2, covariance.shape)
-    # Drawn for all stars before any is left out: one star's luck does not hang on another's.
+    # Drawn before the selection, so that the error of a star does not depend on other stars.
     error = rng.normal(size=shown.pixel_px.shape)
     measured = shown.pixel_px.copy()
     if centroid_noise:
@@ -112,16 +111,16 @@ def centroid_bound(
     pixels_px: Floats, flux_electrons: Floats, detector: Detector, shape: tuple[int, int]
 ) -> tuple[Floats, Floats]:
     """
-    Cramer-Rao bound of the centroid of single stars, flux free and background known.
+    Cramer-Rao bound of the centroids of single stars, flux free and background known.
 
-    Pixels outside the detector or saturated tell nothing.
+    Saturated pixels and pixels outside the detector carry no information.
 
     Returns
     -------
     covariance_px2 : (n, 2, 2)
-        A thousand px^2 and more for a star without a usable pixel.
+        Over a thousand px^2 for a star without a usable pixel.
     snr : (n,)
-        Flux over its own bound.
+        Flux divided by its bound.
     """
     height, width = shape
     sigma_px = detector.psf_sigma_at(pixels_px, shape)
@@ -156,7 +155,7 @@ def cramer_rao_covariance(
     catalog: StarCatalog | None = None,
 ) -> Floats:
     """
-    Least covariance of the named camera parameters that any unbiased estimator can have.
+    Cramer-Rao bound of the covariance of the named camera parameters.
 
     Without names: of `bound_names`.
 

@@ -1,9 +1,9 @@
 """
-Pixels of a synthetic star field.
+Simulated images of a star field.
 
-What is modelled: pixel-integrated Gaussian stars, whose PSF widens towards the corners where it is
-asked for, photon, dark and read noise, hot pixels, cosmic rays, saturation and quantisation.  What
-is not: smear, and flat-field errors.
+Modelled: pixel-integrated Gaussian stars with a PSF that may widen towards the corners; photon,
+dark and read noise; hot pixels; cosmic rays; saturation; quantisation.  Not modelled: smear and
+flat-field errors.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.records import Image
 from starcal_ros.simulation.scenario import (
     Detector,
@@ -28,14 +29,12 @@ from starcal_ros.simulation.scenario import (
 )
 from starcal_ros.sky.catalog import StarCatalog
 
-Floats = NDArray[np.float64]
-
 
 def pixel_stamps(
     centers_px: Floats, psf_sigma_px: float | Floats
 ) -> tuple[NDArray[np.int64], Floats, Floats]:
     """
-    Pixel numbers about centers (n,) on one axis, and the light that falls in each, and its slope.
+    Pixel indices around centers (n,) on one axis, with the share of light and its derivative.
 
     Returns
     -------
@@ -43,7 +42,7 @@ def pixel_stamps(
     share : (n, m)
         Integral of the Gaussian over each pixel.
     slope : (n, m)
-        Its derivative by the center, 1/px.
+        Derivative of the share by the center, 1/px.
     """
     sigma_px = np.broadcast_to(np.asarray(psf_sigma_px, np.float64), centers_px.shape)
     half = stamp_half_px(float(sigma_px.max(initial=0.1)))
@@ -75,7 +74,7 @@ def star_electrons(
 
 
 def fixed_pattern(scenario: Scenario) -> Floats:
-    """Mean dark signal and sky (height, width), electrons; the same in every image."""
+    """Mean dark and sky signal (height, width), electrons; equal for all images."""
     detector, camera = scenario.detector, scenario.truth.camera
     rng = random_stream(scenario.seed, PATTERN_STREAM)
     pattern = np.full(camera.height * camera.width, detector.background_electrons)
@@ -87,7 +86,7 @@ def fixed_pattern(scenario: Scenario) -> Floats:
 def cosmic_ray_electrons(
     detector: Detector, shape: tuple[int, int], rng: np.random.Generator
 ) -> Floats:
-    """Signal (height, width) of cosmic rays: tracks of random place, length and charge."""
+    """Signal (height, width) of cosmic rays: tracks of random position, length and charge."""
     height, width = shape
     count = rng.poisson(detector.cosmic_rays)
     start = rng.uniform(0, [width, height], (count, 2))
@@ -104,10 +103,8 @@ def cosmic_ray_electrons(
     return np.asarray(electrons, np.float64)
 
 
-def expose(
-    mean_electrons: Floats, detector: Detector, rng: np.random.Generator
-) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """One exposure of a mean signal: photon and read noise, then the converter."""
+def expose(mean_electrons: Floats, detector: Detector, rng: np.random.Generator) -> Pixels:
+    """One exposure of a mean signal with photon noise, read noise and quantisation."""
     electrons = rng.poisson(mean_electrons) + rng.normal(
         0.0, detector.read_noise_electrons, mean_electrons.shape
     )
@@ -117,7 +114,7 @@ def expose(
 
 
 def render(scenario: Scenario, shown: Scene, index: int, pattern: Floats | None = None) -> Image:
-    """The image of a scene; `fixed_pattern` may be passed in where many images are rendered."""
+    """Image of a scene; pass the `fixed_pattern` to render many images faster."""
     detector, camera = scenario.detector, scenario.truth.camera
     shape = (camera.height, camera.width)
     rng = random_stream(scenario.seed, PIXEL_STREAM, index)
@@ -133,7 +130,7 @@ def render(scenario: Scenario, shown: Scene, index: int, pattern: Floats | None 
 
 
 def images(scenario: Scenario, catalog: StarCatalog | None = None) -> Iterator[Image]:
-    """All images, rendered one after the other."""
+    """All images of a scenario, rendered on demand."""
     pattern = fixed_pattern(scenario)
     for index in range(scenario.image_count):
         yield render(scenario, scene(scenario, index, catalog), index, pattern)

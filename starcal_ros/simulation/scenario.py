@@ -1,12 +1,11 @@
 """
-Star fields with a known truth: campaigns, and what each of their images shows.
+Simulated campaigns with known truth, and the stars in each of their images.
 
-`scenario` names a whole campaign with its truth drawn from a seed; `scene` is what one image of it
-shows, without noise.  `synthetic_images` goes on to pixels, `synthetic_centroids` to noisy
-centroids without them.
+A `Scenario` is a campaign whose truth is drawn from a seed; a `Scene` holds the stars of one of
+its images, without noise.  `images` renders pixels, `centroids` draws noisy centroids without
+pixels.
 
-What is modelled: proper motion and aberration of the catalog, and one error of the star tracker
-per image.
+Modelled: proper motion and aberration of the catalog, and one star-tracker error per image.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, field_radius_rad, project
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.lens import fold_radius2, ideal_points
@@ -28,22 +28,21 @@ from starcal_ros.records import AttitudeSample, CameraGeometry
 from starcal_ros.sky.astrometry import apparent_directions, tt_julian_date
 from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
 
-Floats = NDArray[np.float64]
-# Streams of random numbers: (seed, purpose, image).  An image is the same whatever came before.
+# Random streams (seed, purpose, image): an image does not depend on the previous ones.
 TRUTH_STREAM, ATTITUDE_STREAM, CENTROID_STREAM, PATTERN_STREAM, PIXEL_STREAM = range(5)
-_STAMP_SIGMAS = 6.0  # half a stamp: 2e-9 of a star's light falls outside
+_STAMP_SIGMAS = 6.0  # half width of a stamp: 2e-9 of the light of a star is outside
 _UNIX_EPOCH_JD = 2440587.5  # 1970-01-01T00:00 UTC, POSIX
 ATTITUDE_OFFSETS_S = (-0.75, -0.25, 0.25, 0.75)
-"""When the star tracker reports about an image: 2 Hz, never at the image itself."""
+"""Times of the star-tracker samples relative to an image: 2 Hz, none at the image itself."""
 
 
 @dataclass(frozen=True)
 class Detector:
-    """The detector and the light that falls on it; electrons are per pixel and image."""
+    """Detector and signal levels; electrons are per pixel and image."""
 
     psf_sigma_px: float = 0.95  # at the centre of the detector
-    psf_growth: float = 0.0  # of the width, centre to corner, with the square of the distance
-    zero_point_electrons: float = 3.0e5  # from a star of V = 0: 35 mm f/2 lens, 0.1 s
+    psf_growth: float = 0.0  # relative growth centre to corner, with the square of the distance
+    zero_point_electrons: float = 3.0e5  # flux of a star of V = 0: 35 mm f/2 lens, 0.1 s
     sky_electrons: float = 1.5
     dark_electrons: float = 3.0
     read_noise_electrons: float = 8.0
@@ -51,19 +50,19 @@ class Detector:
     offset_dn: float = 64.0
     bits: int = 12
     hot_fraction: float = 2e-4
-    hot_electrons: float = 600.0  # mean of an exponential law
+    hot_electrons: float = 600.0  # mean of an exponential distribution
     cosmic_rays: float = 2.0  # mean number per image
 
     def psf_sigma_at(self, pixels_px: Floats, shape: tuple[int, int]) -> Floats:
-        """Width (n,) of the stars at pixels (n, 2) of a detector of (height, width)."""
+        """PSF sigma (n,) at pixels (n, 2) of a detector (height, width)."""
         middle = np.array([shape[1] - 1, shape[0] - 1]) / 2.0
         part2 = ((pixels_px - middle) ** 2).sum(axis=1) / (middle**2).sum()
-        # What stands beyond a corner is no wider than what stands in it.
+        # The PSF does not widen further outside the detector.
         return np.asarray(self.psf_sigma_px * (1.0 + self.psf_growth * np.minimum(part2, 1.0)))
 
     @property
     def full_dn(self) -> int:
-        """Where the converter saturates."""
+        """Saturation level of the converter."""
         return (1 << self.bits) - 1
 
     @property
@@ -73,30 +72,30 @@ class Detector:
 
     @property
     def noise_electrons(self) -> float:
-        """1-sigma noise of a pixel without a star: photons, dark current, reading, rounding."""
+        """1-sigma noise of a pixel without a star: photon, dark, read and quantisation noise."""
         rounding = self.electrons_per_dn**2 / 12
         return math.sqrt(self.background_electrons + self.read_noise_electrons**2 + rounding)
 
 
 @dataclass(frozen=True)
 class EarthFixed:
-    """A camera that stands on the Earth and looks at the zenith: the sky drifts through it."""
+    """A camera fixed to the Earth that points at the zenith: stars drift through its field."""
 
     latitude_deg: float
     longitude_deg: float
-    roll_deg: float = 0.0  # of +x from east towards north
+    roll_deg: float = 0.0  # angle of +x from east towards north
 
 
 @dataclass(frozen=True)
 class Inertial:
-    """A camera that is turned from star field to star field: (ra, dec, roll) of each, degrees."""
+    """A camera that points at one star field after another: (ra, dec, roll) of each, degrees."""
 
     attitudes_deg: tuple[tuple[float, float, float], ...]
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One campaign: the truth, what is believed before, and how the images are taken."""
+    """One campaign: truth, prior, detector and exposure times."""
 
     name: str
     seed: int
@@ -118,16 +117,16 @@ class Scenario:
 @dataclass(frozen=True)
 class Scene:
     """
-    What one image shows, without noise.
+    Stars of one image, without noise.
 
     Attributes
     ----------
     camera_from_icrf : (3, 3)
-        The truth.
+        True attitude.
     icrf_from_star_tracker_xyzw : (4,)
-        As the star tracker reports it, with its error of this image.
+        Reported attitude, with the star-tracker error of this image.
     catalog_id, magnitude, direction_icrf, pixel_px, flux_electrons : (n,) or (n, 2 or 3)
-        The stars on the detector, and those whose light reaches over its border.
+        Stars on the detector, and those outside with light on it.
     """
 
     time_ns: int
@@ -141,7 +140,7 @@ class Scene:
     catalog_digest: str
 
 
-# Fields of many bright stars, all over the sky, each seen at another roll.
+# Fields with many bright stars, over the whole sky, each at a different roll.
 _TINY_FIELDS = (
     (250.0, 32.0, 10.0),
     (305.0, 40.0, 95.0),
@@ -157,24 +156,24 @@ _TINY_FIELDS = (
 _HOUSTON = EarthFixed(latitude_deg=29.76, longitude_deg=-95.37, roll_deg=20.0)
 _HERCULES_NS = 1778829600 * NANOSECONDS_PER_SECOND  # 2026-05-15 07:20 UTC: 16.5 h sidereal there
 SCENARIOS: Mapping[str, str] = {
-    'tiny': '10 images of 640 x 512, ten star fields at 4 s: the bag in the repository',
+    'tiny': '10 images of 640 x 512, ten star fields, 4 s apart: the bag in the repository',
     'small': '24 images of 1296 x 1024, zenith over Houston at 60 s',
     'paper': '359 images of 2592 x 2048, zenith over Houston at 10 s (Christian et al. 2016)',
 }
-"""Name -> what it is."""
+"""Descriptions of the scenarios by name."""
 
 
 def scenario(name: str, seed: int = 1) -> Scenario:
     """
-    A named scenario; the seed draws its truth and all its noise.
+    Scenario by name; the seed determines its truth and all its noise.
 
     Raises
     ------
     ValueError
-        When no scenario has that name.
+        If no scenario has that name.
     """
     if name == 'tiny':
-        # Coarse steps of the converter keep the noise near 1 DN, for a bag that compresses well.
+        # A coarse quantisation keeps the noise near 1 DN, so that the bag compresses well.
         return _scenario(
             name,
             seed,
@@ -205,7 +204,7 @@ def _scenario(
     star_tracker_sigma_arcsec: tuple[float, float, float] = (20.0, 20.0, 20.0),
     pointing: EarthFixed | Inertial = _HOUSTON,
 ) -> Scenario:
-    """A 20 x 16 degree camera of any size as the ground knows it, and as launch has left it."""
+    """Scenario with a 20 x 16 degree camera: ground calibration as prior, changed after launch."""
     rng = random_stream(seed, TRUTH_STREAM)
     width, height = size
     focal_px = 35.0 / 0.0048 * width / 2592  # 35 mm lens; 4.8 um pixels at full resolution
@@ -226,7 +225,7 @@ def _scenario(
         p1=4e-4 * rng.normal(),
         p2=4e-4 * rng.normal(),
     )
-    # Any mounting will do as long as no axis of the camera is one of the star tracker.
+    # An arbitrary mounting in which no axis of the camera is parallel to one of the star tracker.
     mounting = Rotation.from_euler('zyx', [-91.0, -28.0, 3.0], degrees=True)
     shift = Rotation.from_rotvec(150.0 * ARCSECOND_RAD * rng.normal(size=3))
     return Scenario(
@@ -244,7 +243,7 @@ def _scenario(
 
 
 def random_stream(seed: int, purpose: int, index: int = 0) -> np.random.Generator:
-    """Random numbers of one of the purposes ``*_STREAM``, for an image."""
+    """Random generator of an image for one of the purposes ``*_STREAM``."""
     return np.random.default_rng([seed, purpose, index])
 
 
@@ -262,7 +261,7 @@ def camera_from_icrf(scenario: Scenario, index: int, offset_s: float = 0.0) -> F
         'ZXZ', [longitude + np.pi / 2, np.pi / 2 - latitude, math.radians(site.roll_deg)]
     )
     time_ns = scenario.time_ns(index) + round(offset_s * NANOSECONDS_PER_SECOND)
-    # UTC stands for UT1: the zenith is 13 arcsec off at most, and nothing here hangs on it.
+    # UTC replaces UT1: the zenith is off by 13 arcsec at most, which does not matter here.
     ut_days = time_ns / (86400 * NANOSECONDS_PER_SECOND)
     earth_from_icrf = erfa.c2t06a(*tt_julian_date(time_ns), _UNIX_EPOCH_JD, ut_days, 0.0, 0.0)
     return np.asarray(earth_from_camera.inv().as_matrix() @ earth_from_icrf)
@@ -271,7 +270,7 @@ def camera_from_icrf(scenario: Scenario, index: int, offset_s: float = 0.0) -> F
 def _icrf_from_star_tracker_xyzw(
     scenario: Scenario, index: int, offset_s: float = 0.0, noise: bool = True
 ) -> Floats:
-    """What the star tracker says: the truth and its error, which is one for the whole image."""
+    """Reported star-tracker attitude (4,): the truth with one error for the whole image."""
     camera_from_star_tracker = Rotation.from_quat(
         scenario.truth.star_tracker_from_camera_xyzw
     ).inv()
@@ -285,7 +284,7 @@ def _icrf_from_star_tracker_xyzw(
 
 
 def attitude_samples(scenario: Scenario, index: int) -> tuple[AttitudeSample, ...]:
-    """The star tracker's reports about an image, at `ATTITUDE_OFFSETS_S`."""
+    """Star-tracker samples around an image, at `ATTITUDE_OFFSETS_S`."""
     return tuple(
         AttitudeSample(
             scenario.time_ns(index) + round(offset_s * NANOSECONDS_PER_SECOND),
@@ -301,7 +300,7 @@ def _bundled_catalog(magnitude_limit: float) -> StarCatalog:
 
 
 def stamp_half_px(psf_sigma_px: float) -> int:
-    """How far from its pixel the light of a star is drawn."""
+    """Half width of the stamp in which the light of a star is drawn, px."""
     return math.ceil(_STAMP_SIGMAS * psf_sigma_px)
 
 
@@ -311,7 +310,7 @@ def scene(
     catalog: StarCatalog | None = None,
     attitude_noise: bool = True,
 ) -> Scene:
-    """What an image shows; without a catalog, the stars of the bundled one down to the limit."""
+    """Stars of an image; default: the bundled catalog down to the magnitude limit."""
     if catalog is None:
         catalog = _bundled_catalog(scenario.magnitude_limit)
     camera, time_ns = scenario.truth.camera, scenario.time_ns(index)
@@ -346,6 +345,6 @@ def scene(
 def scenes(
     scenario: Scenario, catalog: StarCatalog | None = None, attitude_noise: bool = True
 ) -> Iterator[Scene]:
-    """The scenes of all images, one after the other."""
+    """Scenes of all images."""
     for index in range(scenario.image_count):
         yield scene(scenario, index, catalog, attitude_noise)

@@ -1,1 +1,1 @@
-"""Where the stars are: catalog, apparent directions, attitudes."""
+"""Star catalog, apparent directions of stars, and star-tracker attitudes."""

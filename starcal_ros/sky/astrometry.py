@@ -1,12 +1,12 @@
 """
-Where a catalog star appears to an observer: motion, parallax, light bending, aberration, air.
+Apparent directions of catalog stars: motion, parallax, light bending, aberration, refraction.
 
 The chain of the IAU astrometric model in the order of ERFA's ``atciq``: ICRS place at epoch ->
 proper motion and parallax (``pmpx``) -> bending of light by the Sun (``ldsun``) -> aberration
 (``ab``), stopped before precession and nutation so that the axes stay those of the ICRS.
 
-For a camera on the ground the aberration by the Earth's turning and refraction follow (``atioq``);
-what comes out is turned back to the axes of the ICRS.
+For a camera on the ground, diurnal aberration and refraction follow (``atioq``); the result is
+rotated back to the axes of the ICRS.
 """
 
 from __future__ import annotations
@@ -16,13 +16,11 @@ import math
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ros.arrays import Floats
 from starcal_ros.constants import AU_M, NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.options import option
 from starcal_ros.sky.catalog import StarCatalog
-
-Floats = NDArray[np.float64]
 
 _UNIX_EPOCH_JD = 2440587.5  # 1970-01-01T00:00 UTC, POSIX
 _DAY_S = 86400
@@ -34,12 +32,12 @@ _UTC_START_JD = 2436934.5  # 1960-01-01, where UTC and ERFA's dat begin
 
 @dataclass(frozen=True)
 class SiteOptions:
-    """Whether the camera is in space or on the ground, and where the light comes through."""
+    """Site of the camera, in space or on the ground, and the atmosphere above it."""
 
     observer: str = option(
         'space',
-        'where the camera is; on the ground refraction and the turning of the Earth count, and a'
-        ' velocity that is given does not',
+        'site of the camera; on the ground, refraction and the rotation of the Earth are applied'
+        ' and the observer velocity is ignored',
         choices=('space', 'ground'),
     )
     latitude_deg: float = option(
@@ -53,7 +51,7 @@ class SiteOptions:
     )
     air_pressure_hpa: float = option(
         0.0,
-        'air pressure at the site itself, not reduced to sea level, hPa; 0: the usual one at its'
+        'air pressure at the site, not reduced to sea level, hPa; 0: standard pressure at its'
         ' height',
         low=0.0,
         high=1200.0,
@@ -61,14 +59,14 @@ class SiteOptions:
     air_temperature_degc: float = option(
         10.0, 'air temperature at the site, degC', low=-100.0, high=60.0
     )
-    relative_humidity: float = option(0.5, 'of the air at the site, 0 to 1', low=0.0, high=1.0)
+    relative_humidity: float = option(0.5, 'relative humidity at the site', low=0.0, high=1.0)
     wavelength_um: float = option(
-        0.55, 'of the light that the camera sees, micrometres', low=0.1, high=100.0
+        0.55, 'effective wavelength of the camera, micrometres', low=0.1, high=100.0
     )
     min_elevation_deg: float = option(
         10.0,
-        'elevation from which stars are used, degrees; nearer to the horizon refraction is not'
-        ' what the air at the site says',
+        'lowest elevation of stars that are used, degrees; nearer to the horizon the refraction'
+        ' model is not accurate',
         low=3.0,
         high=90.0,
     )
@@ -77,7 +75,7 @@ class SiteOptions:
 @dataclass(frozen=True)
 class Observer:
     """
-    Place and motion of the observer at one instant, along the axes of the ICRS.
+    Position and velocity of the observer at one time, along the axes of the ICRS.
 
     Attributes
     ----------
@@ -101,20 +99,20 @@ class Observer:
 
 def tt_julian_date(time_unix_ns: int) -> tuple[float, float]:
     """
-    Terrestrial time as a two-part Julian date (whole days and a half, rest), good to 0.1 ns.
+    Terrestrial time as a two-part Julian date (day at 0h, fraction), accurate to 0.1 ns.
 
-    After the last leap second that ERFA knows, its TAI - UTC is used; ERFA would do the same, but
-    with a warning for dates more than five years on.
+    After the last leap second in ERFA's table, its TAI - UTC is used; ERFA does the same, but
+    warns for dates more than five years later.
 
     Parameters
     ----------
     time_unix_ns : int
-        UTC as a ROS stamp counts it: nanoseconds since 1970, leap seconds left out.
+        UTC as in a ROS stamp: nanoseconds since 1970 without leap seconds.
 
     Raises
     ------
     ValueError
-        Before 1960, where UTC does not exist.
+        Before 1960, the start of UTC.
     """
     day, in_day_ns = divmod(int(time_unix_ns), _DAY_S * NANOSECONDS_PER_SECOND)
     day_jd = _UNIX_EPOCH_JD + day
@@ -133,10 +131,10 @@ def tt_julian_date(time_unix_ns: int) -> tuple[float, float]:
 
 def observer_at(time_unix_ns: int, velocity_m_s: Floats | None = None) -> Observer:
     """
-    Observer at a time: at the centre of the Earth, moving with it or as told.
+    Observer at the centre of the Earth, with its velocity or a given one.
 
-    The place matters to parallax only: 6 mas for the nearest star at the distance of the Moon.
-    TT stands for TDB, 2 ms apart at most: 60 m along the Earth's way.
+    The position affects parallax only: 6 mas for the nearest star at the distance of the Moon.
+    TT replaces TDB; they differ by at most 2 ms, or 60 m along the Earth's orbit.
 
     Parameters
     ----------
@@ -144,7 +142,7 @@ def observer_at(time_unix_ns: int, velocity_m_s: Floats | None = None) -> Observ
         As for `tt_julian_date`.
     velocity_m_s : (3,), optional
         Velocity of the observer relative to the solar-system barycentre along the axes of the
-        ICRS; the Earth's where not given.
+        ICRS; default: the velocity of the Earth.
     """
     jd = tt_julian_date(time_unix_ns)
     heliocentric, barycentric = erfa.epv00(*jd)
@@ -167,14 +165,14 @@ def observer_at(time_unix_ns: int, velocity_m_s: Floats | None = None) -> Observ
 
 
 def directions_from(observer: Observer, stars: StarCatalog) -> Floats:
-    """Apparent directions of stars, as `apparent_directions`, from an observer already known."""
+    """Apparent directions (n, 3) of stars for an observer; see `apparent_directions`."""
     natural = erfa.pmpx(
         stars.ra_rad,
         stars.dec_rad,
-        # ERFA counts the motion in right ascension along the equator.
+        # ERFA takes the proper motion in right ascension as a coordinate rate.
         stars.pm_ra_cosdec_rad_per_year / np.cos(stars.dec_rad),
         stars.pm_dec_rad_per_year,
-        stars.parallax_rad / erfa.DAS2R,  # ERFA takes parallax alone in arcseconds
+        stars.parallax_rad / erfa.DAS2R,  # only parallax is in arcseconds
         0.0,
         observer.tdb_jyear - stars.epoch_jyear,
         observer.barycentric_au,
@@ -186,9 +184,9 @@ def directions_from(observer: Observer, stars: StarCatalog) -> Floats:
 
 def standard_pressure_hpa(height_m: float, temperature_degc: float) -> float:
     """
-    Usual air pressure at a height.
+    Standard air pressure at a height.
 
-    Allen, Astrophysical Quantities, 3rd ed., section 52, as ERFA's ``apco13`` gives it.
+    Allen, Astrophysical Quantities, 3rd ed., section 52, as in ERFA's ``apco13``.
     """
     at_sea_level_k = 273.15 + temperature_degc + 0.0065 * height_m
     return 1013.25 * math.exp(-height_m / (29.3 * at_sea_level_k))
@@ -198,24 +196,24 @@ def through_the_air(
     direction_icrf: Floats, time_unix_ns: int, site: SiteOptions
 ) -> tuple[Floats, Floats]:
     """
-    Directions (n, 3) as a camera on the ground sees them, and their elevations (n,), rad.
+    Observed directions (n, 3) for a camera on the ground, and their elevations (n,), rad.
 
-    Aberration by the turning of the Earth (0.3 arcsec) and refraction are put on.  The axes stay
-    those of the ICRF, as if the Earth stood between them and the star: an attitude in the ICRF
-    takes the result to the camera.  UT1 is taken as UTC: 0.9 s apart at most, which at 30 degrees
-    of elevation moves a star by 0.02 arcsec.  Polar motion is left out: 0.001 arcsec there.
+    Diurnal aberration (0.3 arcsec) and refraction are applied.  The result is along the axes of
+    the ICRF, so an ICRF attitude rotates it to the camera.  UTC replaces UT1: they differ by at
+    most 0.9 s, which moves a star by 0.02 arcsec at 30 degrees of elevation.  Polar motion is
+    neglected: 0.001 arcsec there.
 
     Parameters
     ----------
     direction_icrf : (n, 3)
-        Apparent directions for an observer who moves with the centre of the Earth.
+        Apparent directions for an observer at the centre of the Earth.
     time_unix_ns : int
         As for `tt_julian_date`.
     site : SiteOptions
 
     Notes
     -----
-    ERFA's ``refco`` and ``atioq``: A tan z + B tan^3 z, within 1 arcsec of a model atmosphere down
+    ERFA ``refco`` and ``atioq``: A tan z + B tan^3 z, within 1 arcsec of a model atmosphere down
     to 15 degrees of elevation.
     """
     tt_jd = tt_julian_date(time_unix_ns)
@@ -247,10 +245,10 @@ def apparent_directions(
     stars: StarCatalog, time_unix_ns: int, observer_velocity_m_s: Floats | None = None
 ) -> Floats:
     """
-    Unit vectors (n, 3), axes of the ICRS, along which an observer sees catalog stars.
+    Apparent directions of catalog stars: unit vectors (n, 3) along the axes of the ICRS.
 
-    Proper motion, parallax, bending of light by the Sun and stellar aberration are applied; the
-    radial velocity is taken as zero.  0.05 ms, and 0.1 ms per thousand stars.
+    Proper motion, parallax, light bending by the Sun and stellar aberration are applied; the
+    radial velocity is assumed zero.  Takes 0.05 ms plus 0.1 ms per thousand stars.
 
     Parameters
     ----------
@@ -259,6 +257,6 @@ def apparent_directions(
     time_unix_ns : int
         UTC as a ROS stamp: integer nanoseconds since 1970, from 1960 on.
     observer_velocity_m_s : (3,), optional
-        Barycentric velocity of the spacecraft, axes of the ICRS; the Earth's where not given.
+        Barycentric velocity of the spacecraft, axes of the ICRS; default: that of the Earth.
     """
     return directions_from(observer_at(time_unix_ns, observer_velocity_m_s), stars)

@@ -1,7 +1,7 @@
 """
-Star catalog: places at one epoch, proper motions, magnitudes; loaded, cut and searched.
+Star catalog: positions at one epoch, proper motions and magnitudes; reading and cone search.
 
-The bundled file holds the whole sky to V = 9, merged from Gaia DR3, Hipparcos-2 and Tycho-2 by
+The bundled file covers the whole sky to V = 9, merged from Gaia DR3, Hipparcos-2 and Tycho-2 by
 ``tools/build_catalog.py``; ``data/ATTRIBUTION.md`` states its sources, licences and accuracy.
 """
 
@@ -20,20 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError
-
-Floats = NDArray[np.float64]
 
 CATALOG_PATH = Path(__file__).parent / 'data' / 'star_catalog.npz'
 CATALOG_FORMAT = 1
 CATALOG_EPOCH_JYEAR = 2016.0  # J2016.0 TCB, Gaia Collaboration 2023, A&A 674, A1
 
-# Columns of the file, in digest order.  Integers, so that the same sky always is the same bytes.
+# Columns of the file, in digest order.  Integers, so that equal catalogs have equal bytes.
 COLUMN_TYPES = {
     'id': '<i8',  # Gaia DR3 source id, or minus the Hipparcos number
-    'ra': '<u4',  # TURN_UNIT_RAD
-    'dec': '<i4',  # TURN_UNIT_RAD
+    'ra': '<u4',  # ANGLE_UNIT_RAD
+    'dec': '<i4',  # ANGLE_UNIT_RAD
     'pm_ra_cosdec': '<i4',  # MOTION_UNIT_RAD per Julian year
     'pm_dec': '<i4',  # MOTION_UNIT_RAD per Julian year
     'parallax': '<u2',  # PARALLAX_UNIT_RAD; 0 unknown
@@ -42,25 +41,25 @@ COLUMN_TYPES = {
     'motion_source': '|u1',  # MotionSource
     'close_pair': '|u1',  # 0 or 1
 }
-TURN_UNIT_RAD = 2 * math.pi / 2**32  # 0.3 mas
+ANGLE_UNIT_RAD = 2 * math.pi / 2**32  # 0.3 mas
 MOTION_UNIT_RAD = 1e-5 * ARCSECOND_RAD  # 0.01 mas
 PARALLAX_UNIT_RAD = 2e-5 * ARCSECOND_RAD  # 0.02 mas
 MAGNITUDE_UNIT = 1e-3
 NO_COLOUR = -32768
 
-# What is marked as a close pair: a neighbour within this.
+# Largest separation of a close pair.
 CLOSE_PAIR_RAD = 20.0 * ARCSECOND_RAD
 
-# What a cone is widened by: the fastest star of the catalog (8.7 arcsec a year) moves this far in
-# 35 years, and aberration brings a star in from 20 arcsec.
+# Margin of a cone: 35 years of motion of the fastest star (8.7 arcsec a year) and 20 arcsec of
+# aberration.
 CONE_MARGIN_RAD = 330 * ARCSECOND_RAD
 
 
 class MotionSource(IntEnum):
-    """Where a star's proper motion comes from, and with that how far its place can be trusted."""
+    """Source of a star's proper motion, which determines the accuracy of its position."""
 
     UNKNOWN = 0  # zero in the catalog
-    DIFFERENCE = 1  # Gaia place at J2016 minus Tycho-2 place at J2000, over 16 years
+    DIFFERENCE = 1  # Gaia position at J2016 minus Tycho-2 position at J2000, over 16 years
     HIPPARCOS = 2  # Hipparcos-2 solution
     GAIA = 3  # Gaia DR3 solution
 
@@ -73,9 +72,9 @@ class StarCatalog:
     Attributes
     ----------
     id : int64
-        Gaia DR3 source id, or minus the Hipparcos number for a star that Gaia lacks.
+        Gaia DR3 source id, or minus the Hipparcos number of a star without one.
     ra_rad, dec_rad : float64
-        ICRS place at ``epoch_jyear``, seen from the solar-system barycentre.
+        Barycentric ICRS position at ``epoch_jyear``.
     pm_ra_cosdec_rad_per_year, pm_dec_rad_per_year : float64
         Proper motion per Julian year; 0 where unknown.
     parallax_rad : float64
@@ -87,15 +86,15 @@ class StarCatalog:
     motion_source : uint8
         `MotionSource`.
     close_pair : bool
-        Another star within 20 arcsec and 5 magnitudes: the place may be that of the pair, and
-        most cameras see one star.  Neighbours are known down to V = 10, below the catalog's own
-        limit; for a coarser pixel see `close_pairs`.
+        Another star within 20 arcsec and 5 magnitudes: the position may be that of the pair, and
+        most cameras do not resolve it.  Neighbours down to V = 10 count, below the limit of the
+        catalog; for coarser pixels see `close_pairs`.
     epoch_jyear : float
     digest : str
-        SHA-256 of the file's columns, kept by selections: names the catalog a row came from.
+        SHA-256 of the columns of the file, also in selections: identifies the source catalog.
     """
 
-    id: NDArray[np.int64]
+    id: Indices
     ra_rad: Floats
     dec_rad: Floats
     pm_ra_cosdec_rad_per_year: Floats
@@ -104,7 +103,7 @@ class StarCatalog:
     magnitude: Floats
     colour_bp_rp: Floats
     motion_source: NDArray[np.uint8]
-    close_pair: NDArray[np.bool_]
+    close_pair: Mask
     epoch_jyear: float
     digest: str
 
@@ -114,7 +113,7 @@ class StarCatalog:
 
     @cached_property
     def direction_icrs(self) -> Floats:
-        """Unit vectors (n, 3) of the places at the epoch."""
+        """Unit vectors (n, 3) of the positions at the catalog epoch."""
         cos_dec = np.cos(self.dec_rad)
         return np.stack(
             [
@@ -125,10 +124,8 @@ class StarCatalog:
             axis=-1,
         )
 
-    def select(
-        self, rows: NDArray[np.bool_] | NDArray[np.int64] | NDArray[np.intp] | slice
-    ) -> StarCatalog:
-        """Return the stars of a mask (n,), of row numbers or of a slice, in that order."""
+    def select(self, rows: Mask | Indices | NDArray[np.intp] | slice) -> StarCatalog:
+        """Return the stars selected by a mask (n,), row numbers or a slice, in that order."""
         columns = {
             field.name: getattr(self, field.name)[rows]
             for field in fields(self)
@@ -136,8 +133,8 @@ class StarCatalog:
         }
         return replace(self, **columns)
 
-    def colours_bp_rp(self, identifiers: NDArray[np.int64]) -> Floats:
-        """BP - RP (n,) of stars by identifier; NaN where no star or colour is known."""
+    def colours_bp_rp(self, identifiers: Indices) -> Floats:
+        """BP - RP (n,) of stars by identifier; NaN for an unknown star or colour."""
         if len(self) == 0:
             return np.full(len(identifiers), np.nan)
         order = np.argsort(self.id)
@@ -147,7 +144,7 @@ class StarCatalog:
 
 
 def column_digest(columns: Mapping[str, NDArray[np.generic]]) -> str:
-    """SHA-256, in hex, of the file's integer columns with their names, types and epoch."""
+    """SHA-256 (hexadecimal) of the integer columns with their names, types and epoch."""
     digest = hashlib.sha256(f'starcal {CATALOG_FORMAT} J{CATALOG_EPOCH_JYEAR}'.encode())
     for name, kind in COLUMN_TYPES.items():
         digest.update(f'{name} {kind} '.encode())
@@ -160,18 +157,18 @@ def _read_columns(path: Path) -> tuple[dict[str, NDArray[np.generic]], str]:
         content = path.read_bytes()
     except OSError as error:
         raise CatalogError(f'{path}: star catalog cannot be read: {error.strerror}') from error
-    # What a damaged archive raises has no common base; some of it is not even an error of zip.
+    # The exceptions of a damaged archive have no common base class.
     try:
         with np.load(io.BytesIO(content)) as file:
             entries = {name: file[name] for name in file.files}
     except Exception as error:
-        raise CatalogError(f'{path}: not a star catalog, or damaged ({error})') from error
+        raise CatalogError(f'{path}: not a star catalog, or a damaged one ({error})') from error
     missing = [name for name in ('format', 'digest', *COLUMN_TYPES) if name not in entries]
     if missing:
-        raise CatalogError(f'{path}: not a star catalog (no {", ".join(missing)})')
+        raise CatalogError(f'{path}: not a star catalog (missing: {", ".join(missing)})')
     if str(entries['format']) != str(CATALOG_FORMAT):
         raise CatalogError(
-            f'{path}: star catalog of format {entries["format"]}, '
+            f'{path}: star catalog has format {entries["format"]}, '
             f'this version reads {CATALOG_FORMAT}'
         )
     columns = {name: entries[name] for name in COLUMN_TYPES}
@@ -183,7 +180,7 @@ def _read_columns(path: Path) -> tuple[dict[str, NDArray[np.generic]], str]:
                 f'{columns[name].shape}, expected {np.dtype(kind)} {columns["id"].shape})'
             )
     if column_digest(columns) != digest:
-        raise CatalogError(f'{path}: star catalog is damaged (its digest does not fit its stars)')
+        raise CatalogError(f'{path}: star catalog is damaged (digest mismatch)')
     return columns, digest
 
 
@@ -196,12 +193,12 @@ def load_catalog(path: Path | None = None, magnitude_limit: float | None = None)
     path : Path, optional
         File written by ``tools/build_catalog.py``.
     magnitude_limit : float, optional
-        Leave out stars fainter than this V.
+        Omit stars fainter than this V.
 
     Raises
     ------
     CatalogError
-        With the path and what is wrong: missing, not a catalog, of another format, or damaged.
+        If the file is missing, not a star catalog, of another format, or damaged.
     """
     columns, digest = _read_columns(CATALOG_PATH if path is None else Path(path))
     rows = slice(None)
@@ -215,8 +212,8 @@ def load_catalog(path: Path | None = None, magnitude_limit: float | None = None)
 
     return StarCatalog(
         id=cut['id'].astype(np.int64),
-        ra_rad=scaled('ra', TURN_UNIT_RAD),
-        dec_rad=scaled('dec', TURN_UNIT_RAD),
+        ra_rad=scaled('ra', ANGLE_UNIT_RAD),
+        dec_rad=scaled('dec', ANGLE_UNIT_RAD),
         pm_ra_cosdec_rad_per_year=scaled('pm_ra_cosdec', MOTION_UNIT_RAD),
         pm_dec_rad_per_year=scaled('pm_dec', MOTION_UNIT_RAD),
         parallax_rad=scaled('parallax', PARALLAX_UNIT_RAD),
@@ -240,18 +237,18 @@ def cone(
     """
     Rows (m,), in ascending order, of all stars that can appear within a radius of a direction.
 
-    Places are compared at the catalog epoch with the radius widened by `CONE_MARGIN_RAD`, so no
-    star is lost to its own motion between 1981 and 2051 or to aberration; some rows lie outside.
+    Catalog positions are compared with the radius plus `CONE_MARGIN_RAD`, so that neither proper
+    motion between 1981 and 2051 nor aberration loses a star; some rows lie outside the radius.
 
     Parameters
     ----------
     catalog : StarCatalog
     direction_icrs : (3,)
-        Axis of the cone, of any length but zero.
+        Axis of the cone, of any non-zero length.
     radius_rad : float
         Half of the opening angle, 0 to pi.
     magnitude_limit : float, optional
-        Leave out stars fainter than this V.
+        Omit stars fainter than this V.
     """
     axis = np.asarray(direction_icrs, np.float64)
     norm = float(np.linalg.norm(axis)) if axis.shape == (3,) else math.nan
@@ -259,7 +256,7 @@ def cone(
         raise ValueError(f'direction_icrs is {direction_icrs!r}, expected three finite numbers')
     if not 0 <= radius_rad <= math.pi:
         raise ValueError(f'radius_rad is {radius_rad!r}, expected 0 to pi')
-    # A cosine loses the angle below 1e-8 rad; the margin is 1.6e-3, so it serves here.
+    # A cosine does not resolve angles below 1e-8 rad; the margin is 1.6e-3.
     cos_radius = math.cos(min(radius_rad + CONE_MARGIN_RAD, math.pi))
     rows = np.flatnonzero(catalog.direction_icrs @ (axis / norm) >= cos_radius)
     if magnitude_limit is not None:
@@ -267,16 +264,14 @@ def cone(
     return rows
 
 
-def close_pairs(
-    catalog: StarCatalog, separation_rad: float, delta_magnitude: float
-) -> NDArray[np.bool_]:
+def close_pairs(catalog: StarCatalog, separation_rad: float, delta_magnitude: float) -> Mask:
     """
-    Mask (n,) of the stars whose centroid a neighbour in the catalog disturbs.
+    Mask (n,) of the stars with a neighbour in the catalog that disturbs their centroid.
 
-    A star is marked when another lies within the separation (at the catalog epoch) and is at most
-    ``delta_magnitude`` fainter.  The separation is the camera's: the diameter of its centroiding
-    mask.  Search the whole catalog and index the mask: a neighbour may be fainter than the stars
-    in use.  Takes 0.1 s for the whole sky and 150 arcsec.
+    A star is marked if another one lies within the separation (at the catalog epoch) and is at
+    most ``delta_magnitude`` fainter.  The separation depends on the camera: the diameter of the
+    centroiding window.  Search the whole catalog, because a neighbour may be fainter than the
+    stars in use.  Takes 0.1 s for the whole sky and 150 arcsec.
 
     Parameters
     ----------
@@ -285,7 +280,7 @@ def close_pairs(
     separation_rad : float
         Smaller than pi.
     delta_magnitude : float
-        2.5 lets a neighbour with a tenth of the star's light pass unmarked.
+        With 2.5, a neighbour with less than a tenth of the star's flux is ignored.
     """
     tree = cKDTree(catalog.direction_icrs)
     pairs = tree.query_pairs(2 * math.sin(separation_rad / 2), output_type='ndarray')

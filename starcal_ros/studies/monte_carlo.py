@@ -15,7 +15,6 @@ import itertools
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.assessment.term_removal import removal_study
@@ -42,7 +41,6 @@ from starcal_ros.studies.trials import (
     unused_residual_px,
 )
 
-Floats = NDArray[np.float64]
 Row = dict[str, 'int | float | str']
 
 OUTLIER_SHARE = 0.02

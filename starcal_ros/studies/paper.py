@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid, project
@@ -32,8 +33,6 @@ from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenario
 from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.studies.monte_carlo import Design, Row
 from starcal_ros.studies.summary import StudyResult
-
-Floats = NDArray[np.float64]
 
 NIGHT = 'paper'
 CALIBRATED_WITH = 15

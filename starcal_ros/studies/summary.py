@@ -9,14 +9,12 @@ import json
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from starcal_ros.arrays import Floats
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.studies.monte_carlo import Design, Row, SAME_SIGMAS
 from starcal_ros.studies.trials import ESTIMATED
-
-Floats = NDArray[np.float64]
 
 CONFIDENCE = 0.99
 

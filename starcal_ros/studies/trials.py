@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import (
     alignment_difference_rad,
     chi_squared,
@@ -27,8 +27,6 @@ from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate, estim
 from starcal_ros.estimation.normal_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.simulation.scenario import Scenario, scenario
-
-Floats = NDArray[np.float64]
 
 CENTROID_SIGMA_PX = 0.1
 OUTLIER_REACH_PX = 20.0  # half side of the square over which misidentified stars scatter

@@ -1,4 +1,4 @@
-"""Bags: round trips, other readers, damage, real bags from elsewhere."""
+"""Bags: round trips, independent readers and writers, damage."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ from rosbags.highlevel import AnyReader
 import yaml
 
 from starcal_ros.bag import reader as bag_reader
+from starcal_ros.bag import writer as writer_module
+from starcal_ros.bag.typestore import make_message, typestore
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.messages.fields import stamp_ns
 from starcal_ros.messages.images import color_image_to_message, image_to_message
@@ -35,7 +38,7 @@ SECOND_NS = 10**9
 def write_bag(path: Path, images: int = 6, size: int = 600, **options: Any) -> Path:
     """Write a bag of noise images, one a second, with two attitudes about each."""
     random = np.random.default_rng(1)
-    with bag_reader.BagWriter(path, **options) as writer:
+    with BagWriter(path, **options) as writer:
         for k in range(images):
             time_ns = START_NS + k * SECOND_NS
             pixels = random.integers(0, 4096, (size, size + 2)).astype(np.uint16)
@@ -52,7 +55,7 @@ def write_bag(path: Path, images: int = 6, size: int = 600, **options: Any) -> P
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sound bag folder."""
+    """An intact bag folder."""
     return write_bag(tmp_path_factory.mktemp('bag') / 'six')
 
 
@@ -64,7 +67,7 @@ def images_of(path: Path, **options: Any) -> list[Image | StarObservations]:
 @pytest.mark.parametrize('compression', ['zstd', 'lz4', ''])
 @pytest.mark.parametrize('name', ['b', 'b.mcap'])
 def test_round_trip(tmp_path: Path, compression: str, name: str) -> None:
-    """A bag gives back what was written to it, as a folder and as a file."""
+    """Records survive writing and reading, as a folder and as a file."""
     path = write_bag(tmp_path / name, compression=compression)
     assert (tmp_path / name).is_file() == name.endswith('.mcap')
     images = images_of(path)
@@ -96,7 +99,7 @@ def test_same_records_same_bytes(tmp_path: Path, folder: Path) -> None:
 
 
 def stamped(reader: AnyReader, data: bytes, type_name: str) -> Any:
-    """Return a message decoded by rosbags, whose fields mypy cannot know."""
+    """Return a message decoded by rosbags, untyped."""
     return reader.deserialize(data, type_name)
 
 
@@ -116,8 +119,8 @@ def test_read_by_rosbags(folder: Path) -> None:
         assert stamped(reader, data, observations.msgtype).detail == '0'
 
 
-def test_what_rosbag2_needs(folder: Path) -> None:
-    """Profile, encodings, offered QoS, type hashes and metadata.yaml are there."""
+def test_metadata_for_rosbag2(folder: Path) -> None:
+    """Profile, encodings, offered QoS, type hashes and metadata.yaml are written."""
     with next(folder.glob('*.mcap')).open('rb') as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == 'ros2'
@@ -143,24 +146,24 @@ def test_what_rosbag2_needs(folder: Path) -> None:
 
 
 def test_topics_and_their_choice(folder: Path) -> None:
-    """The only topic of a type is taken; else the error lists those there are."""
+    """The only topic of a type is chosen; otherwise the error lists the topics."""
     listed = {t.name: (t.type_name, t.count) for t in bag_reader.topics([folder])}
     assert listed['/image'] == (IMAGE_TYPE, 6)
     assert listed['/attitude'] == (ATTITUDE_TYPE, 12)
     assert bag_reader.choose_topic([folder], IMAGE_TYPE) == '/image'
     assert bag_reader.choose_topic([folder], IMAGE_TYPE, 'image') == '/image'
-    with pytest.raises(BagError, match=r'no topic /nope of type sensor_msgs.*there are: /image\)'):
+    with pytest.raises(BagError, match=r'no topic /nope of type sensor_msgs.*available: /image\)'):
         bag_reader.choose_topic([folder], IMAGE_TYPE, '/nope')
     with pytest.raises(BagError, match='no topic of type starcal/msg/Calibration'):
         bag_reader.choose_topic([folder], CALIBRATION_TYPE)
 
 
 def test_several_topics_of_a_type(tmp_path: Path) -> None:
-    """Which of two is meant cannot be guessed."""
-    with bag_reader.BagWriter(tmp_path / 'two') as writer:
+    """Two topics of a type need an explicit choice."""
+    with BagWriter(tmp_path / 'two') as writer:
         for topic in ('/b', '/a'):
             writer.write_image(topic, Image(0, np.zeros((2, 2), np.uint8)), '')
-    with pytest.raises(BagError, match='several topics of type .* name one: /a, /b'):
+    with pytest.raises(BagError, match='several topics of type .* choose one: /a, /b'):
         bag_reader.choose_topic([tmp_path / 'two'], IMAGE_TYPE)
 
 
@@ -175,7 +178,7 @@ def test_several_topics_of_a_type(tmp_path: Path) -> None:
     ],
 )
 def test_not_a_bag(tmp_path: Path, name: str, content: bytes | None, text: str) -> None:
-    """What is no bag is named in one line."""
+    """The error for a file that is not a bag is one line with its path."""
     path = tmp_path / name
     if '/' in name:
         path.parent.mkdir(exist_ok=True)
@@ -190,19 +193,19 @@ def test_not_a_bag(tmp_path: Path, name: str, content: bytes | None, text: str) 
 
 
 def test_split_bag_is_read_in_order(tmp_path: Path) -> None:
-    """Files of a split bag come in the order of recording, ten after nine."""
+    """Files of a split bag are read in recording order: 10 after 9."""
     (tmp_path / 'split').mkdir()
     for k in (0, 9, 10):
-        with bag_reader.BagWriter(tmp_path / 'split' / f'split_{k}.mcap') as writer:
+        with BagWriter(tmp_path / 'split' / f'split_{k}.mcap') as writer:
             writer.write_image('/image', Image(k, np.zeros((2, 2), np.uint8)), '')
     (tmp_path / 'split' / 'metadata.yaml').unlink()
     assert [image.time_ns for image in images_of(tmp_path / 'split')] == [0, 9, 10]
 
 
 def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
-    """An image in colour comes as a refusal between the others; so do bytes that are no image."""
-    bad = color_image_to_message(7, np.zeros((2, 3, 3), np.uint8), 'cam', bag_reader.make_message)
-    with bag_reader.BagWriter(tmp_path / 'mixed') as writer:
+    """A colour image and an undecodable message become refusals between the other images."""
+    bad = color_image_to_message(7, np.zeros((2, 3, 3), np.uint8), 'cam', make_message)
+    with BagWriter(tmp_path / 'mixed') as writer:
         writer.write_image('/image', Image(6, np.zeros((2, 3), np.uint8)), '')
         writer._write('/image', IMAGE_TYPE, 7, bad)
         number = writer._channels['/image'].number
@@ -216,9 +219,9 @@ def test_bad_image_does_not_end_the_run(tmp_path: Path) -> None:
     assert isinstance(last, Image)
 
 
-def test_attitudes_that_are_none(tmp_path: Path) -> None:
-    """A sample of no unit length is remembered: the image about it says so."""
-    with bag_reader.BagWriter(tmp_path / 'b') as writer:
+def test_invalid_attitude_sample(tmp_path: Path) -> None:
+    """An attitude that is not a unit quaternion gives the refusal bad_attitude."""
+    with BagWriter(tmp_path / 'b') as writer:
         for k, w in enumerate([1.0, np.nan, 1.0]):
             writer.write_attitude('/attitude', k, np.array([0, 0, 0, w]), 'icrf')
     history = bag_reader.read_attitudes([tmp_path / 'b'], '/attitude', AttitudeOptions())
@@ -226,8 +229,8 @@ def test_attitudes_that_are_none(tmp_path: Path) -> None:
         history.at(1, max_gap_s=1.0)
 
 
-def test_cut_off_bag(tmp_path: Path, folder: Path) -> None:
-    """Cut anywhere, a bag gives the images before the cut and says where it ends."""
+def test_truncated_bag(tmp_path: Path, folder: Path) -> None:
+    """A bag truncated anywhere gives the images before the end and reports the truncation."""
     whole = next(folder.glob('*.mcap')).read_bytes()
     sound = [image.pixels for image in images_of(folder) if isinstance(image, Image)]
     file = tmp_path / 'cut.mcap'
@@ -237,7 +240,7 @@ def test_cut_off_bag(tmp_path: Path, folder: Path) -> None:
         said: list[str] = []
         images = images_of(file, on_damage=said.append)
         assert len(said) == 1, said
-        assert str(file) in said[0] and 'cut off' in said[0]
+        assert str(file) in said[0] and 'truncated' in said[0]
         for image, pixels in zip(images, sound, strict=False):
             assert isinstance(image, Image)
             np.testing.assert_array_equal(image.pixels, pixels)
@@ -247,8 +250,8 @@ def test_cut_off_bag(tmp_path: Path, folder: Path) -> None:
     assert most == 6
 
 
-def test_bit_flips_are_noticed(tmp_path: Path, folder: Path) -> None:
-    """A flipped bit in what holds the messages is said, and no wrong pixel comes through."""
+def test_bit_flips_are_detected(tmp_path: Path, folder: Path) -> None:
+    """A flipped bit in a chunk is reported, and no wrong pixel is read."""
     whole = next(folder.glob('*.mcap')).read_bytes()
     sound = [image.pixels for image in images_of(folder) if isinstance(image, Image)]
     with next(folder.glob('*.mcap')).open('rb') as stream:
@@ -278,20 +281,20 @@ def test_bit_flips_are_noticed(tmp_path: Path, folder: Path) -> None:
 def small_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bag of many small chunks."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bag_reader, '_CHUNK_BYTES', 800)
+        patch.setattr(writer_module, '_CHUNK_BYTES', 800)
         folder = write_bag(tmp_path_factory.mktemp('bag') / 'small', images=8, size=8)
     return next(folder.glob('*.mcap'))
 
 
-def test_a_flip_costs_its_chunk_alone(tmp_path: Path, small_chunks: Path) -> None:
-    """The first chunk names the topics: without it the others are read all the same, counted."""
+def test_a_flipped_bit_loses_one_chunk_only(tmp_path: Path, small_chunks: Path) -> None:
+    """Without the first chunk, which holds the topic names, the other chunks are read."""
     whole = bytearray(small_chunks.read_bytes())
     with small_chunks.open('rb') as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None and len(summary.chunk_indexes) > 8
     first = summary.chunk_indexes[0]
     file = tmp_path / 'flipped.mcap'
-    # Of its length, which leads astray until the next chunk is found, and of its content.
+    # In its length, which hides all chunks up to the next one in the summary, and in its content.
     for offset in (5, first.chunk_length // 2):
         damaged = bytearray(whole)
         damaged[first.chunk_start_offset + offset] ^= 4
@@ -305,11 +308,11 @@ def test_a_flip_costs_its_chunk_alone(tmp_path: Path, small_chunks: Path) -> Non
 
 @settings(max_examples=250, derandomize=True, deadline=None)
 @given(data=st.data())
-def test_damage_is_never_silent(small_chunks: Path, data: st.DataObject) -> None:
+def test_damage_is_always_reported(small_chunks: Path, data: st.DataObject) -> None:
     """
-    Any bits flipped, any cut: what is read was written, and what is missing is said.
+    With any flipped bits and truncation, messages read were written, and losses are reported.
 
-    With a sound summary it is counted to the message.
+    With an intact summary the count of lost messages is exact.
     """
     whole = small_chunks.read_bytes()
     sound = list(bag_reader.read_raw([small_chunks]))
@@ -337,7 +340,7 @@ def test_damage_is_never_silent(small_chunks: Path, data: st.DataObject) -> None
 
 
 def test_random_bytes_never_crash(tmp_path: Path, folder: Path) -> None:
-    """Whatever stands in a file, reading ends with what is sound or with one line."""
+    """Reading a file with random bytes never raises an unexpected error."""
     whole = np.frombuffer(next(folder.glob('*.mcap')).read_bytes(), np.uint8)
     random = np.random.default_rng(6)
     file = tmp_path / 'rubbish.mcap'
@@ -353,10 +356,10 @@ def test_random_bytes_never_crash(tmp_path: Path, folder: Path) -> None:
 
 @pytest.mark.parametrize('indexed', [False, True])
 def test_other_writers(tmp_path: Path, indexed: bool) -> None:
-    """A file without chunks or summary is read, a channel that is not ROS 2 is passed over."""
+    """A file without chunks or summary is read; a channel that is not ROS 2 is skipped."""
     file = tmp_path / 'plain.mcap'
-    store = bag_reader._typestore()
-    message = image_to_message(Image(5, np.ones((2, 2), np.uint8)), '', bag_reader.make_message)
+    store = typestore()
+    message = image_to_message(Image(5, np.ones((2, 2), np.uint8)), '', make_message)
     with file.open('wb') as stream:
         writer = Writer(
             stream, use_chunking=indexed, use_statistics=indexed, compression=CompressionType.NONE
@@ -387,7 +390,7 @@ print(k, peak() - early)
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='ru_maxrss is in kB on Linux')
 def test_memory_is_flat(tmp_path: Path) -> None:
-    """Forty images more need no more memory than ten."""
+    """Fifty images need no more memory than ten."""
     path = write_bag(tmp_path / 'long', images=50, size=1000)
     done = subprocess.run(
         [sys.executable, '-c', MEMORY, str(path)], capture_output=True, text=True, check=True
@@ -398,7 +401,7 @@ def test_memory_is_flat(tmp_path: Path) -> None:
 
 
 def real(name: str) -> Path:
-    """A bag from elsewhere, or skip."""
+    """Path of an external bag; skips the test if it is missing."""
     path = SHARED / name
     if not path.exists():
         pytest.skip(f'{name} is not on this machine')
@@ -413,7 +416,7 @@ def real(name: str) -> Path:
     ],
 )
 def test_bags_of_others(name: str, images: int, shape: tuple[int, int], dtype: Any) -> None:
-    """Bags by other writers are read whole, without a word about damage."""
+    """Bags by other writers are read completely, without reports of damage."""
     said: list[str] = []
     path = real(name)
     topic = bag_reader.choose_topic([path], IMAGE_TYPE)

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import yaml
 
-from starcal_ros.bag.reader import BagWriter
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.cli import demo, main
 from starcal_ros.cli.arguments import parser
 from starcal_ros.pipeline.provenance import software_version
@@ -235,7 +235,7 @@ def test_bad_parameters(
         ('a: [', ['not YAML']),
         ('/**:\n  camera_info_url: a.yaml\n', ['ros__parameters']),
         ('star_observer:\n  ros__parameters: 3\n', ['star_observer', 'ros__parameters']),
-        ('other_node:\n  ros__parameters: {a: 1}\n', ['no section /**', 'other_node']),
+        ('other_node:\n  ros__parameters: {a: 1}\n', ['no section for /**', 'other_node']),
         ('/**:\n  ros__parameters: {camera_name: a}\n', ['camera_name', 'bad.yaml']),
         ('/**:\n  ros__parameters: {min_images: 3}\n', ['camera_info_url', 'bad.yaml']),
     ],
@@ -294,7 +294,7 @@ def test_images_of_a_wrong_encoding(
         message.encoding = 'bgr8'
         return message
 
-    monkeypatch.setattr('starcal_ros.bag.reader.image_to_message', colour)
+    monkeypatch.setattr('starcal_ros.bag.writer.image_to_message', colour)
     bag = tmp_path / 'colour.mcap'
     write_bag_of(bag, np.zeros((512, 640), np.uint8))
     monkeypatch.undo()

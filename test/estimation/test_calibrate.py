@@ -101,7 +101,7 @@ def normalised_error(estimate: Estimate) -> float:
 
 
 def tracker_of(method: str) -> tuple[float, ...]:
-    """What the method takes the tracker for: perfect, or of the sigma that it is told."""
+    """Star-tracker sigma that the method assumes: zero, or the option."""
     return (0.0, 0.0, 0.0) if method == 'single' else TRACKER_ARCSEC
 
 

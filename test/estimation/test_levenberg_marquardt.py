@@ -47,7 +47,7 @@ def add(x: np.ndarray, shared: np.ndarray, _: np.ndarray) -> np.ndarray:
 def random_arrow(
     seed: int, m: int, p: int = 7, q: int = 3
 ) -> tuple[NormalEquations, np.ndarray, np.ndarray]:
-    """Normal equations with columns of very unlike units, and their dense form (N, n)."""
+    """Normal equations with columns of very different scales, and their dense form (N, n)."""
     rng = np.random.default_rng(seed)
     J_shared = rng.normal(size=(m, 20, p)) * 10.0 ** rng.uniform(-4, 4, p)
     J_blocks = rng.normal(size=(m, 20, q)) * 10.0 ** rng.uniform(-4, 4, q)
@@ -60,7 +60,7 @@ def random_arrow(
 
 
 def scaled_inverse(N: np.ndarray) -> np.ndarray:
-    """Dense inverse, columns scaled so that it keeps its digits."""
+    """Dense inverse with scaled columns to keep precision."""
     scale = 1 / np.sqrt(np.diag(N))
     return np.asarray(scale[:, None] * np.linalg.inv(N * np.outer(scale, scale)) * scale)
 
@@ -118,7 +118,7 @@ def decays(
     unit: np.ndarray,
 ) -> tuple[Callable[[np.ndarray], NormalEquations], Move, Callable[[np.ndarray], np.ndarray]]:
     """
-    Twelve noisy decays ``c exp(-a t) + d exp(-b t)``: a, b shared, c, d of each its own.
+    Twelve noisy decays ``c exp(-a t) + d exp(-b t)``: a, b shared; c, d per decay.
 
     The state is (2 + 24,), each unknown in its own ``unit`` (4,).
     """
@@ -215,11 +215,11 @@ def test_a_column_without_data_is_not_observable() -> None:
 def test_two_columns_alike_are_not_observable() -> None:
     J = np.random.default_rng(5).normal(size=(20, 3))
     J[:, 2] = J[:, 1] * 1e6
-    with pytest.raises(NotObservable, match='cannot be told apart'):
+    with pytest.raises(NotObservable, match='cannot be separated'):
         covariance(plain(J, J[:, 0]))
     # Alike to 1e-9: positive definite by luck of rounding at best, and refused all the same.
     J[:, 2] *= 1 + 1e-9 * np.arange(20)
-    with pytest.raises(NotObservable, match='cannot be told apart'):
+    with pytest.raises(NotObservable, match='cannot be separated'):
         covariance(plain(J, J[:, 0]))
 
 
@@ -237,12 +237,12 @@ def test_a_shared_column_that_the_blocks_explain_is_not_observable() -> None:
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
 def test_a_start_without_a_cost_is_refused(bad: float) -> None:
     normal = dataclasses.replace(plain(np.eye(2), np.ones(2)), cost=bad)
-    with pytest.raises(NotObservable, match='the cost is not finite'):
+    with pytest.raises(NotObservable, match='the cost at the start is not finite'):
         levenberg_marquardt(np.zeros(2), lambda _: normal, add)
 
 
 def falling_line(x: np.ndarray) -> NormalEquations:
-    """A cost 1e4 - x that falls for ever, with an honest gradient and some curvature."""
+    """Cost 1e4 - x without a minimum, with the right gradient and some curvature."""
     return NormalEquations(
         1e4 - float(x[0]), np.eye(1), np.ones(1), np.empty((0, 1, 1)), np.empty((0, 1, 1)),
         np.empty((0, 1)),

@@ -1,4 +1,4 @@
-"""Normal matrices against the dense Jacobian, and one cost that is the one minimised."""
+"""Normal matrices and cost against the dense Jacobian."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SIZES = (30, 0, 7, 1, 120, 0, 8, 30)  # stars of each image
 
 
 def made(sizes: tuple[int, ...] = SIZES, seed: int = 1) -> tuple[StarTable, np.ndarray]:
-    """Stars of some images 1 px off their place, with skew covariances, and rotations."""
+    """Stars of some images with 1 px errors and correlated covariances, and rotations."""
     rng = np.random.default_rng(seed)
     rotations = Rotation.random(len(sizes), random_state=seed)
     images: list[StarObservations] = []

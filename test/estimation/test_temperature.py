@@ -1,4 +1,4 @@
-"""Cameras that change with their temperature: found again, true to their sigma, or left out."""
+"""Temperature terms: recovery, errors within sigma, omission of insignificant terms."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def camera_of(temperature_degc: float, focal: tuple[float, ...]) -> CameraModel:
 
 
 def alignment_of(temperature_degc: float, rate_rad: np.ndarray) -> Rotation:
-    """The true camera_from_star_tracker at a temperature: a passive turn from the reference."""
+    """True camera_from_star_tracker at a temperature: a passive rotation from the reference."""
     dT = temperature_degc - REFERENCE_DEGC
     turn = Rotation.from_rotvec(-rate_rad * dT)
     return turn * Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw).inv()
@@ -80,7 +80,7 @@ def observed(
     seed: int | None = None,
     tracker_arcsec: tuple[float, ...] = TRACKER_ARCSEC,
 ) -> Ensemble:
-    """The stars as the changing camera sees them, with noise where there is a seed."""
+    """Observations with the temperature-dependent camera; noise if a seed is given."""
     rng = np.random.default_rng(seed)
     images = []
     for image, degc in zip(stars(), temperatures_degc, strict=True):
@@ -241,7 +241,7 @@ def test_temperatures_that_nobody_asks_for_change_no_bit(method: str) -> None:
     [
         (np.where(np.arange(10) == 4, np.nan, TEMPERATURES_DEGC), '1 of 10 images have no temp'),
         (np.linspace(20.0, 21.0, 10), 'the temperatures spread by 0.32 degC, less than 1'),
-        (np.repeat([0.0, 30.0], 5), '2 temperatures do not carry a polynomial of degree 2'),
+        (np.repeat([0.0, 30.0], 5), '2 temperatures do not determine a polynomial of degree 2'),
     ],
 )
 def test_what_the_images_do_not_carry_is_left_out(temperatures: np.ndarray, note: str) -> None:

@@ -1,4 +1,4 @@
-"""Predictions brought onto sources, without pixels: right where they belong, else refused."""
+"""Acquisition without pixels: predictions match their sources, or the image is refused."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def prediction() -> Prediction:
 
 
 def sources(xy_px: np.ndarray) -> Sources:
-    """What stands in the image, all alike, found in all of it."""
+    """Sources of equal brightness from a search of the whole image."""
     xy_px = xy_px[in_image(xy_px, WIDTH, HEIGHT)]
     return Sources(xy_px, np.full(len(xy_px), 100.0), float(WIDTH * HEIGHT))
 
 
 @pytest.mark.parametrize('turn_deg', [(0.0, 0.0, 0.0), (1.0, -0.8, 0.0), (-0.5, 0.9, 4.5)])
-def test_a_turned_camera_is_found(turn_deg: tuple[float, ...]) -> None:
-    """A third of the stars is missing, and as many sources are none."""
+def test_a_rotated_camera_is_found(turn_deg: tuple[float, ...]) -> None:
+    """A third of the stars is missing and a third of the sources are false."""
     expected = prediction()
     turn = Rotation.from_rotvec(np.radians(turn_deg))
     turned_px = project(TRUTH.camera, turn.apply(expected.direction_camera))
@@ -64,8 +64,8 @@ def test_a_turn_beyond_the_reach_matches_nothing() -> None:
         acquire(expected, shown, TRUTH, REACH_PX, ROLL_RAD)
 
 
-def test_a_match_in_a_part_alone_is_refused() -> None:
-    """One ninth of the image holds the predicted stars, the rest others."""
+def test_a_match_in_one_part_only_is_refused() -> None:
+    """One ninth of the image holds the predicted stars, the rest other ones."""
     expected = prediction()
     shown_px = np.random.default_rng(6).uniform([0, 0], [WIDTH, HEIGHT], expected.xy_px.shape)
     corner = (expected.xy_px < [WIDTH / 3, HEIGHT / 3]).all(axis=1)

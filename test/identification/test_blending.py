@@ -1,4 +1,4 @@
-"""How neighbours pull a centroid: what the fit itself does, and no more let pass."""
+"""Pull of neighbours on centroids, against fits to mean images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SIGMA_PX = 0.95
 def pull_of_a_neighbour(
     flux_dn: float, ratio: float, distance_px: float, noise_dn: float
 ) -> tuple[float, float, float]:
-    """How far a fit to the mean image of two stars is off, its 1-sigma, px, and its flux, DN."""
+    """Error and 1-sigma (px), and flux (DN) of a fit to the mean image of two stars."""
     pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
     image = star_electrons(pair, flux_dn * np.array([1.0, ratio]), SIGMA_PX, (33, 33))
     r = stamp_radius_px(SIGMA_PX)

@@ -1,4 +1,4 @@
-"""Frames whose rows do not belong together are refused, and none because its prior is wrong."""
+"""Frames with lost lines are refused; frames with a wrong prior are not."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.line_loss import find_tear
-from starcal_ros.identification.star_finder import IdentificationOptions, observe_stars, Shot
-from starcal_ros.identification.tracking import follow, following
+from starcal_ros.identification.line_loss import find_line_loss
+from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
+from starcal_ros.identification.tracking import start_tracking, track_stars
 from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.simulation.images import render
@@ -31,17 +31,17 @@ def catalog() -> StarCatalog:
 
 
 @functools.cache
-def shot(index: int) -> Shot:
+def exposure(index: int) -> Exposure:
     one = scene(SCENARIO, index)
-    return Shot(render(SCENARIO, one, index), one.icrf_from_star_tracker_xyzw, 0.5)
+    return Exposure(render(SCENARIO, one, index), one.icrf_from_star_tracker_xyzw, 0.5)
 
 
-def torn(index: int, row: int, lost: int) -> Shot:
-    """A frame of which some rows are lost: all below them stand so much higher."""
-    image = shot(index).image
+def with_lost_rows(index: int, row: int, lost: int) -> Exposure:
+    """A frame with lost rows: all rows below are shifted up."""
+    image = exposure(index).image
     pixels = image.pixels.copy()
     pixels[row:-lost] = image.pixels[row + lost :]
-    return dataclasses.replace(shot(index), image=Image(image.time_ns, pixels))
+    return dataclasses.replace(exposure(index), image=Image(image.time_ns, pixels))
 
 
 # 1 % of the focal length and 0.08 of k1: 6 px in a corner.
@@ -58,28 +58,28 @@ priors = pytest.mark.parametrize('prior', [PRIOR, WRONG], ids=['prior', 'wrong p
 
 @priors
 @pytest.mark.parametrize('index', range(10))
-def test_a_whole_frame_is_not_torn(prior: CameraGeometry, index: int) -> None:
-    assert not observe_stars(shot(index), prior, catalog(), CENTROIDS, OPTIONS)[0].refusal
+def test_an_intact_frame_is_accepted(prior: CameraGeometry, index: int) -> None:
+    assert not observe_stars(exposure(index), prior, catalog(), CENTROIDS, OPTIONS)[0].refusal
 
 
 @priors
 @pytest.mark.parametrize(('row', 'lost'), [(100, 2), (100, 3), (256, 1), (256, 3), (380, 2)])
 def test_lost_rows_are_found(prior: CameraGeometry, row: int, lost: int) -> None:
-    with pytest.raises(ImageRefused, match='incomplete: below row') as refused:
-        observe_stars(torn(0, row, lost), prior, catalog(), CENTROIDS, OPTIONS)
+    with pytest.raises(ImageRefused, match='incomplete: stars below row') as refused:
+        observe_stars(with_lost_rows(0, row, lost), prior, catalog(), CENTROIDS, OPTIONS)
     row_found, down_px = re.findall(r'row (\d+) .*, ([-+.\d]+)\)', refused.value.detail)[0]
     assert abs(int(row_found) - row) < 40  # a tenth of the rows holds a dozen stars
     assert float(down_px) == pytest.approx(-lost, abs=0.3)  # the smooth part takes some
 
 
 @pytest.mark.parametrize('lost', [1, 2, 3])
-def test_lost_rows_are_found_in_a_frame_that_is_followed(lost: int) -> None:
-    observations, instrument = observe_stars(shot(0), PRIOR, catalog(), CENTROIDS, OPTIONS)
-    known = following(PRIOR, observations, instrument)
+def test_lost_rows_are_found_while_tracking(lost: int) -> None:
+    observations, instrument = observe_stars(exposure(0), PRIOR, catalog(), CENTROIDS, OPTIONS)
+    known = start_tracking(PRIOR, observations, instrument)
     assert known is not None
-    assert not follow(shot(1), known, catalog(), CENTROIDS, OPTIONS)[0].refusal
+    assert not track_stars(exposure(1), known, catalog(), CENTROIDS, OPTIONS)[0].refusal
     with pytest.raises(ImageRefused, match='incomplete'):
-        follow(torn(1, 256, lost), known, catalog(), CENTROIDS, OPTIONS)
+        track_stars(with_lost_rows(1, 256, lost), known, catalog(), CENTROIDS, OPTIONS)
 
 
 def places(n: int, seed: int = 1) -> np.ndarray:
@@ -92,7 +92,9 @@ def test_noise_alone_makes_no_tear(n: int) -> None:
     xy = places(n)
     for _ in range(50):
         sigma = 10 ** rng.uniform(-2, -0.5, n)
-        assert find_tear(xy, xy + sigma[:, None] * rng.normal(size=(n, 2)), sigma, SHAPE) is None
+        assert (
+            find_line_loss(xy, xy + sigma[:, None] * rng.normal(size=(n, 2)), sigma, SHAPE) is None
+        )
 
 
 def test_wrong_stars_on_one_side_make_no_tear() -> None:
@@ -103,14 +105,14 @@ def test_wrong_stars_on_one_side_make_no_tear() -> None:
         below = np.flatnonzero(xy[:, 1] > 400)
         wrong = rng.choice(below, len(below) // 3, replace=False)
         measured[wrong] += rng.uniform(0.5, 3.0, (len(wrong), 2))
-        assert find_tear(xy, measured, sigma, SHAPE) is None
+        assert find_line_loss(xy, measured, sigma, SHAPE) is None
 
 
 def test_columns_that_are_shifted_are_told() -> None:
     rng = np.random.default_rng(4)
     xy, sigma = places(100), np.full(100, 0.1)
     measured = xy + 0.1 * rng.normal(size=(100, 2)) + np.outer(xy[:, 1] > 300, [4.0, 0.0])
-    tear = find_tear(xy, measured, sigma, SHAPE)
+    tear = find_line_loss(xy, measured, sigma, SHAPE)
     assert tear is not None
     assert abs(tear.row - 300) < 12  # the next of the rows that are tried
     np.testing.assert_allclose(tear.off_px, [4.0, 0.0], rtol=0, atol=0.2)

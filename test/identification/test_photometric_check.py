@@ -1,4 +1,4 @@
-"""Places that agree by chance are told by the brightnesses; true ones are left alone."""
+"""Brightnesses expose false matches and do not affect true ones."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.photometric_check import refuse_unlike
-from starcal_ros.identification.star_finder import IdentificationOptions, observe_stars, Shot
+from starcal_ros.identification.photometric_check import refuse_by_brightness
+from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
 from starcal_ros.image.centroiding import CentroidOptions, Centroids, ImageModel
 from starcal_ros.image.detection import Background
 from starcal_ros.image.psf_field import uniform_width
@@ -33,7 +33,7 @@ MODEL = ImageModel(
 
 
 def sky(count: int, scatter_mag: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray, Centroids]:
-    """Magnitudes, places and centroids of good stars that scatter about what they should be."""
+    """Magnitudes, pixels and centroids of good stars with scattered brightnesses."""
     rng = np.random.default_rng(seed)
     magnitude = rng.uniform(3.0, 8.0, count)
     flux = 10.0 ** (0.4 * (ZERO_POINT - magnitude + rng.normal(0.0, scatter_mag, count)))
@@ -54,7 +54,7 @@ def sky(count: int, scatter_mag: float, seed: int = 1) -> tuple[np.ndarray, np.n
 
 def judged(magnitude: np.ndarray, place: np.ndarray, centroids: Centroids) -> np.ndarray:
     most_mag = IdentificationOptions().max_brightness_scatter_mag
-    return refuse_unlike(magnitude, place, centroids, MODEL, MIN_SNR, most_mag, SHAPE)
+    return refuse_by_brightness(magnitude, place, centroids, MODEL, MIN_SNR, most_mag, SHAPE)
 
 
 @pytest.mark.parametrize('scatter_mag', [0.0, 0.15, 0.3])
@@ -75,7 +75,7 @@ def test_brightnesses_drawn_anew_are_no_match() -> None:
 
 
 def test_a_camera_far_from_the_band_of_the_catalog_need_not_be_asked() -> None:
-    assert (refuse_unlike(*sky(60, 1.5), MODEL, MIN_SNR, 100.0, SHAPE) == '').all()
+    assert (refuse_by_brightness(*sky(60, 1.5), MODEL, MIN_SNR, 100.0, SHAPE) == '').all()
 
 
 def test_one_star_unlike_the_others_is_ambiguous() -> None:
@@ -127,9 +127,9 @@ FAR_OFF_XYZW = [
 @pytest.mark.parametrize('attitude_xyzw', FAR_OFF_XYZW)
 def test_no_star_of_a_field_that_is_there_in_part_is_wrong(attitude_xyzw: list[float]) -> None:
     """
-    2.3 degrees off, where 1.5 are searched: found by the bench of acquisition.
+    2.3 degrees off with a search range of 1.5 degrees; found by the acquisition bench.
 
-    By places alone 64 and 54 stars were matched, one and three of five rightly.
+    By position alone 64 and 54 stars were matched, one fifth and three fifths of them rightly.
     """
     base = synthetic.scenario('tiny', seed=367)
     field = synthetic.Inertial((MILKY_WAY_DEG,) * 12)
@@ -137,7 +137,7 @@ def test_no_star_of_a_field_that_is_there_in_part_is_wrong(attitude_xyzw: list[f
     drawn = synthetic.scene(scenario, 11)
     image = simulated_images.render(scenario, drawn, 11)
     options = IdentificationOptions()
-    shot = Shot(image, np.array(attitude_xyzw), 0.0)
+    shot = Exposure(image, np.array(attitude_xyzw), 0.0)
     catalog = load_catalog(None, options.magnitude_limit)
     try:
         found, _ = observe_stars(shot, scenario.prior, catalog, CentroidOptions(), options)

@@ -1,4 +1,4 @@
-"""The smooth correction: a known one is found, of no more terms than the stars carry."""
+"""The polynomial correction: recovery of a known one, and number of terms by star count."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ HALF_PX = 320.0
 
 
 def bent(xy_px: np.ndarray) -> np.ndarray:
-    """A shift and a barrel distortion, up to some 3 px."""
+    """Shift and barrel distortion up to 3 px."""
     uv = (xy_px - HALF_PX) / HALF_PX
     return np.asarray([0.5, -0.25] + uv * (uv**2).sum(axis=1, keepdims=True))
 

@@ -1,4 +1,4 @@
-"""Predicted stars: those of the scene where attitude and camera are the true ones."""
+"""Predicted stars against the simulated scene."""
 
 from __future__ import annotations
 

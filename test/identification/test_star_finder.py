@@ -1,4 +1,4 @@
-"""Identification of simulated images: right stars or none, whatever alignment or attitude say."""
+"""Identification of simulated images: right stars or none, with wrong alignment or attitude."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import (
+    Exposure,
     IdentificationOptions,
     observe_stars,
-    Shot,
-    tracked,
+    realigned,
 )
 from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.records import (
@@ -52,18 +52,18 @@ def observed(
     geometry: CameraGeometry = PRIOR,
     options: IdentificationOptions = OPTIONS,
 ) -> StarObservations:
-    shot = Shot(image, icrf_from_star_tracker_xyzw, 0.5)
-    return observe_stars(shot, geometry, catalog(), CENTROIDS, options)[0]
+    exposure = Exposure(image, icrf_from_star_tracker_xyzw, 0.5)
+    return observe_stars(exposure, geometry, catalog(), CENTROIDS, options)[0]
 
 
 def turned(geometry: CameraGeometry, turn: Rotation) -> CameraGeometry:
-    """A geometry whose camera is turned about its own axes."""
+    """Geometry with the camera rotated about its own axes."""
     rotation = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) * turn
     return CameraGeometry(geometry.camera, rotation.as_quat())
 
 
 def assert_right(found: StarObservations, one: Scene, least: int = 100) -> None:
-    """Every star stands where the star of its catalog number was drawn."""
+    """Assert that every star is at the pixel of its catalog number."""
     assert found.refusal == '' and len(found) >= least
     place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
     true_px = np.array([place.get(number, [np.nan, np.nan]) for number in found.catalog_id])
@@ -177,20 +177,20 @@ def test_planets_are_no_stars(index: int, turn_deg: float) -> None:
 
 
 def reasons(found: StarObservations) -> dict[int, str]:
-    """Why each star that was left out was."""
+    """Refusal reasons by catalog number."""
     names = list(found.refused_stars)
     pairs = zip(found.refused_catalog_id.tolist(), found.refused_reason.tolist(), strict=True)
     return {number: names[code] for number, code in pairs}
 
 
 def moved_right(pixels: np.ndarray, u: int, v: int, shift: int) -> None:
-    """The light about a pixel stands some pixels to the right of its place."""
+    """Shift the light around a pixel to the right."""
     window = slice(v - 7, v + 8), slice(u - 7, u + 8)
     pixels[window] = np.roll(pixels[window], shift, axis=1)
 
 
 def sharpened(pixels: np.ndarray, u: int, v: int) -> None:
-    """Of the light about a pixel only the three brightest pixels are left."""
+    """Keep only the three brightest pixels around a pixel."""
     window = pixels[v - 4 : v + 5, u - 4 : u + 5]
     window[window < np.sort(window.ravel())[-3]] = np.median(pixels)
 
@@ -213,8 +213,8 @@ def test_one_spoilt_star_is_left_out_by_its_reason(
     options = CentroidOptions(centroid=centroid)
 
     def seen(pixels: np.ndarray) -> StarObservations:
-        shot = Shot(Image(image.time_ns, pixels), one.icrf_from_star_tracker_xyzw, 0.5)
-        return observe_stars(shot, PRIOR, catalog(), options, OPTIONS)[0]
+        exposure = Exposure(Image(image.time_ns, pixels), one.icrf_from_star_tracker_xyzw, 0.5)
+        return observe_stars(exposure, PRIOR, catalog(), options, OPTIONS)[0]
 
     before = seen(image.pixels)
     apart = np.linalg.norm(one.pixel_px[:, None] - one.pixel_px[None], axis=-1)
@@ -265,7 +265,7 @@ def test_too_few_stars_are_refused() -> None:
     greedy = dataclasses.replace(OPTIONS, min_stars_per_image=1000)
     refused = observed(image, one.icrf_from_star_tracker_xyzw, options=greedy)
     assert (refused.refusal, len(refused)) == ('too_few_stars', 0)
-    assert f'{len(used)} stars measured well, 1000 needed' in refused.detail
+    assert f'{len(used)} stars measured, 1000 needed' in refused.detail
     # What became of the others is told all the same.
     assert refused.refused_stars == used.refused_stars
     np.testing.assert_array_equal(refused.refused_px, used.refused_px)
@@ -288,7 +288,7 @@ def test_the_geometry_is_tracked_from_image_to_image() -> None:
     off = turned(PRIOR, turn)
     one, image = shown(5)
     found = observed(image, one.icrf_from_star_tracker_xyzw, off)
-    after = tracked(off, found)
+    after = realigned(off, found)
     left = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw).inv() * Rotation.from_quat(
         after.star_tracker_from_camera_xyzw
     )
@@ -296,17 +296,17 @@ def test_the_geometry_is_tracked_from_image_to_image() -> None:
     assert np.degrees(left.magnitude()) * 3600 < 200
     np.testing.assert_array_equal(after.camera.parameters, off.camera.parameters)
     lost = refused_image(image.time_ns, 640, 512, 'no_match', '')
-    assert tracked(off, lost) is off
+    assert realigned(off, lost) is off
 
 
 def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure() -> None:
     one, image = shown(2)
     marked = dataclasses.replace(catalog(), close_pair=np.ones(len(catalog()), bool))
     before = observed(image, one.icrf_from_star_tracker_xyzw)
-    shot = Shot(image, one.icrf_from_star_tracker_xyzw, 0.5)
-    after, _ = observe_stars(shot, PRIOR, marked, CENTROIDS, OPTIONS)
+    exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
+    after, _ = observe_stars(exposure, PRIOR, marked, CENTROIDS, OPTIONS)
     strict = dataclasses.replace(OPTIONS, max_blend_sigma=0.1)
-    fewer, _ = observe_stars(shot, PRIOR, marked, CENTROIDS, strict)
+    fewer, _ = observe_stars(exposure, PRIOR, marked, CENTROIDS, strict)
     assert fewer.refused_stars['blend'] > after.refused_stars['blend']
     both, i, j = np.intersect1d(before.catalog_id, after.catalog_id, return_indices=True)
     more_px2 = after.covariance_px2[j] - before.covariance_px2[i]

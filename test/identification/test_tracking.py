@@ -1,4 +1,4 @@
-"""Images measured without a search: the same stars as a search finds, or a track that is lost."""
+"""Tracking: the same stars as a search, or a lost track."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.star_finder import IdentificationOptions, observe_stars, Shot
-from starcal_ros.identification.tracking import follow, Followed, following
+from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
+from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.simulation.images import render
@@ -37,28 +37,34 @@ def shown(index: int) -> tuple[Scene, Image]:
     return one, render(SCENARIO, one, index)
 
 
-def shot(index: int, turn_rad: float = 0.0) -> Shot:
-    """An image with the attitude that the star tracker has for it, turned about some axis."""
+def exposure(index: int, turn_rad: float = 0.0) -> Exposure:
+    """Image with its reported attitude rotated about an axis."""
     one, image = shown(index)
     turn = Rotation.from_rotvec(turn_rad * np.array([0.6, -0.8, 0.0]))
-    return Shot(image, (Rotation.from_quat(one.icrf_from_star_tracker_xyzw) * turn).as_quat(), 0.5)
+    return Exposure(
+        image, (Rotation.from_quat(one.icrf_from_star_tracker_xyzw) * turn).as_quat(), 0.5
+    )
 
 
-def searched(index: int, geometry: CameraGeometry = PRIOR) -> tuple[StarObservations, Followed]:
-    observations, instrument = observe_stars(shot(index), geometry, catalog(), CENTROIDS, OPTIONS)
-    known = following(geometry, observations, instrument)
+def searched(
+    index: int, geometry: CameraGeometry = PRIOR
+) -> tuple[StarObservations, TrackedCamera]:
+    observations, instrument = observe_stars(
+        exposure(index), geometry, catalog(), CENTROIDS, OPTIONS
+    )
+    known = start_tracking(geometry, observations, instrument)
     assert known is not None
     return observations, known
 
 
-def followed(image: Shot, before: Followed) -> tuple[StarObservations, Followed]:
-    return follow(image, before, catalog(), CENTROIDS, OPTIONS)
+def followed(image: Exposure, before: TrackedCamera) -> tuple[StarObservations, TrackedCamera]:
+    return track_stars(image, before, catalog(), CENTROIDS, OPTIONS)
 
 
 @pytest.mark.parametrize('index', [1, 2, 5])
-def test_a_followed_image_gives_the_stars_of_a_search(index: int) -> None:
+def test_tracking_gives_the_stars_of_a_search(index: int) -> None:
     _, known = searched(0)
-    tracked, _ = followed(shot(index), known)
+    tracked, _ = followed(exposure(index), known)
     whole, _ = searched(index)
     assert tracked.refusal == ''
     both, a, b = np.intersect1d(tracked.catalog_id, whole.catalog_id, return_indices=True)
@@ -78,7 +84,7 @@ def test_a_followed_image_gives_the_stars_of_a_search(index: int) -> None:
 def test_an_ensemble_knows_its_light_better_than_an_image() -> None:
     _, known = searched(0)
     for index in range(1, 10):
-        _, known = followed(shot(index), known)
+        _, known = followed(exposure(index), known)
     noise = known.instrument.noise.pixel_noise()
     detector = SCENARIO.detector
     # Some 500 bright stars tell: the gain to 3 %, the width to 0.2 %.
@@ -92,13 +98,13 @@ def test_an_ensemble_knows_its_light_better_than_an_image() -> None:
 def test_a_width_that_changes_over_the_field_is_learnt() -> None:
     detector = dataclasses.replace(SCENARIO.detector, psf_growth=0.3)
     soft = dataclasses.replace(SCENARIO, detector=detector)
-    known: Followed | None = None
+    known: TrackedCamera | None = None
     for index in range(5):
         one = scene(soft, index)
-        image = Shot(render(soft, one, index), one.icrf_from_star_tracker_xyzw, 0.5)
+        image = Exposure(render(soft, one, index), one.icrf_from_star_tracker_xyzw, 0.5)
         if known is None:
             observations, instrument = observe_stars(image, PRIOR, catalog(), CENTROIDS, OPTIONS)
-            known = following(PRIOR, observations, instrument)
+            known = start_tracking(PRIOR, observations, instrument)
             assert known is not None
         else:
             observations, known = followed(image, known)
@@ -128,7 +134,7 @@ def test_the_camera_that_predicts_is_corrected(scale: float, k1: float) -> None:
         k1=camera.distortion[0] + k1,
     )
     _, known = searched(0, CameraGeometry(wrong, PRIOR.star_tracker_from_camera_xyzw))
-    tracked, known = followed(shot(1), known)
+    tracked, known = followed(exposure(1), known)
     assert len(tracked) > 0.95 * len(searched(1)[0])
     grid = pixel_grid(camera, 9, 7)
     turn, _ = Rotation.align_vectors(
@@ -139,12 +145,12 @@ def test_the_camera_that_predicts_is_corrected(scale: float, k1: float) -> None:
     assert np.abs(off - grid).max() < 1.0
 
 
-def test_noise_of_the_star_tracker_is_followed() -> None:
+def test_noise_of_the_star_tracker_is_tracked() -> None:
     _, known = searched(0)
-    quiet, _ = followed(shot(1), known)
+    quiet, _ = followed(exposure(1), known)
     # 8 px, where the window reaches 12.
-    jumped, after = followed(shot(1, np.radians(0.25)), known)
-    _, before = followed(shot(1, np.radians(-0.25)), known)
+    jumped, after = followed(exposure(1, np.radians(0.25)), known)
+    _, before = followed(exposure(1, np.radians(-0.25)), known)
     np.testing.assert_array_equal(jumped.catalog_id, quiet.catalog_id)
     # Fits that start from elsewhere end within what their last step leaves: 0.1 sigma.
     sigma_px = np.sqrt(quiet.covariance_px2[:, [0, 2]])
@@ -155,14 +161,14 @@ def test_noise_of_the_star_tracker_is_followed() -> None:
     assert (one.inv() * other).magnitude() == pytest.approx(np.radians(0.5), rel=0.001)
 
 
-def test_an_alignment_that_creeps_is_followed() -> None:
+def test_a_drifting_alignment_is_tracked() -> None:
     _, known = searched(0)
     first = Rotation.from_quat(known.geometry.star_tracker_from_camera_xyzw)
     focal_px = PRIOR.camera.intrinsics[0]
     kept = []
     for turned_px in np.arange(0.0, 4.0, 0.4):
         before = known
-        observations, known = followed(shot(1, turned_px / focal_px), known)
+        observations, known = followed(exposure(1, turned_px / focal_px), known)
         assert len(observations) > 0.95 * len(searched(1)[0])
         kept.append(known.geometry is before.geometry)
     # Under a pixel nothing is corrected, as the next image finds its turn anyway; beyond it is.
@@ -176,7 +182,7 @@ def test_an_alignment_that_creeps_is_followed() -> None:
 def test_a_jump_loses_the_track(turn_deg: float) -> None:
     _, known = searched(0)
     with pytest.raises(ImageRefused, match='brightest stars'):
-        followed(shot(1, np.radians(turn_deg)), known)
+        followed(exposure(1, np.radians(turn_deg)), known)
 
 
 def test_no_window_of_another_sky_is_believed() -> None:
@@ -186,7 +192,7 @@ def test_no_window_of_another_sky_is_believed() -> None:
         for other in range(10):
             if index == other:
                 continue
-            one, image = shot(index), shown(other)[1]
+            one, image = exposure(index), shown(other)[1]
             with pytest.raises(ImageRefused):
                 followed(dataclasses.replace(one, image=image), known)
             lost += 1
@@ -198,9 +204,9 @@ def test_planets_are_no_stars(index: int) -> None:
     _, known = searched(0)
     one = shown(index)[0]
     image = render(SCENARIO, with_planets(SCENARIO, one, index), index)
-    found, _ = followed(dataclasses.replace(shot(index), image=image), known)
+    found, _ = followed(dataclasses.replace(exposure(index), image=image), known)
     # The brightest of them raise the noise over some percent of this small field.
-    assert found.refusal == '' and len(found) > 0.8 * len(followed(shot(index), known)[0])
+    assert found.refusal == '' and len(found) > 0.8 * len(followed(exposure(index), known)[0])
     place = dict(zip(one.catalog_id.tolist(), one.pixel_px, strict=True))
     true_px = np.array([place[number] for number in found.catalog_id.tolist()])
     off = (found.measured_px - true_px) / np.sqrt(found.covariance_px2[:, [0, 2]])
@@ -208,21 +214,21 @@ def test_planets_are_no_stars(index: int) -> None:
     assert np.abs(off).max() < 6.0 and np.sqrt((off**2).mean()) < 1.2
 
 
-def test_an_image_that_tells_nothing_is_not_followed() -> None:
+def test_an_image_without_psf_starts_no_track() -> None:
     observations, known = searched(0)
-    assert following(PRIOR, observations, None) is None
+    assert start_tracking(PRIOR, observations, None) is None
     refused = dataclasses.replace(observations, refusal='no_match')
-    assert following(PRIOR, refused, known.instrument) is None
+    assert start_tracking(PRIOR, refused, known.instrument) is None
 
 
 @pytest.mark.parametrize(('plateau', 'refused'), [(1.0, 1), (0.9, 0)])
 def test_the_saturation_that_images_before_have_shown(plateau: float, refused: int) -> None:
     _, known = searched(0)
-    tracked, _ = followed(shot(1), known)
+    tracked, _ = followed(exposure(1), known)
     brightest = np.rint(tracked.measured_px[tracked.flux_dn.argmax()]).astype(int)
     u, v = brightest
     peak = float(shown(1)[1].pixels[v - 1 : v + 2, u - 1 : u + 2].max())
     # One pixel at the level is no plateau of its own; one above it shows that it was none.
     instrument = dataclasses.replace(known.instrument, saturation_dn=0.98 * plateau * peak)
-    again, _ = followed(shot(1), dataclasses.replace(known, instrument=instrument))
+    again, _ = followed(exposure(1), dataclasses.replace(known, instrument=instrument))
     assert again.refused_stars.get('saturated', 0) == refused

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 import pytest
 
+from starcal_ros.arrays import Pixels
 from starcal_ros.errors import ImageRefused
 from starcal_ros.image.frame_checks import (
     background_gradient,
     Fingerprint,
     fingerprint,
-    Pixels,
     sample_rows,
     screen,
     ScreeningOptions,

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Pixels
 from starcal_ros.image.hot_pixels import (
     FixedPatternOptions,
     hot_in_dark,
     HotPixels,
     learn_hot_pixels,
-    Pixels,
     refuse_on_hot_pixels,
 )
 from starcal_ros.simulation import images as simulated_images

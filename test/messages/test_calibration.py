@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from sample_records import assert_same, calibration, plain, plain_calibration  # type: ignore[import-not-found]
 
-from starcal_ros.bag.reader import _typestore, make_message
+from starcal_ros.bag.typestore import make_message, typestore
 from starcal_ros.camera import line_of_sight, project
 from starcal_ros.estimation import levenberg_marquardt
 from starcal_ros.estimation.calibrate import CalibrationOptions
@@ -56,7 +56,7 @@ def test_a_check_that_was_not_made_is_neither_passed_nor_failed(make: Any) -> No
 
 def test_constants_of_the_definitions_are_those_of_the_code() -> None:
     """Methods and terminations by the names of the options and of the solver."""
-    store = _typestore()
+    store = typestore()
     fields = {name: value for name, _, value in store.fielddefs[CALIBRATION_TYPE][0]}
     (method,) = (f for f in dataclasses.fields(CalibrationOptions) if f.name == 'method')
     assert {fields[name] for name in ('PER_IMAGE', 'SINGLE', 'HIERARCHICAL')} == set(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from sample_records import plain, TIME_NS  # type: ignore[import-not-found]
 
-from starcal_ros.bag.reader import make_message
+from starcal_ros.bag.typestore import make_message
 from starcal_ros.errors import ImageRefused
 from starcal_ros.messages.fields import make_header
 from starcal_ros.messages.images import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sample_records import assert_same, observations, plain, TIME_NS  # type: ignore[import-not-found]
 
-from starcal_ros.bag.reader import make_message
+from starcal_ros.bag.typestore import make_message
 from starcal_ros.messages.observations import observations_from_message, observations_to_message
 from starcal_ros.records import refused_image
 

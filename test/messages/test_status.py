@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from sample_records import plain, status, TIME_NS  # type: ignore[import-not-found]
 
-from starcal_ros.bag.reader import make_message
+from starcal_ros.bag.typestore import make_message
 from starcal_ros.messages.fields import stamp_ns
 from starcal_ros.messages.status import status_to_message
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sample_records import plain  # type: ignore[import-not-found]
 
-from starcal_ros.bag.reader import make_message
+from starcal_ros.bag.typestore import make_message
 from starcal_ros.messages.telemetry import (
     attitude_from_message,
     attitude_to_message,

@@ -1,4 +1,4 @@
-"""What the running nodes say of themselves: keys and levels as docs/icd.md has them."""
+"""Diagnostics of the running nodes: keys and levels as in docs/icd.md."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ REMAPS = ('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitu
 
 
 def documented(*tables: str) -> set[str]:
-    """Keys that the document names, those with a reason in them once for each reason."""
+    """Keys in the document; those with a reason in the name once per reason."""
     keys: set[str] = set()
     for table in ('both nodes', *tables):
         marks = f'<!-- diagnostics of {table} -->\n(.*?)<!-- end -->'
@@ -50,7 +50,7 @@ def documented(*tables: str) -> set[str]:
 
 
 def newest(diagnostics: list[Any], name: str) -> tuple[bytes, str, dict[str, str]]:
-    """Level, message and values that a node published last; none before it did."""
+    """Level, message and values of the latest diagnostics of a node; empty before the first."""
     for message in reversed(diagnostics):
         for status in message.status:
             if status.name == f'starcal: {name}':
@@ -93,14 +93,14 @@ def test_observer_says_what_the_document_says(
     assert values['callback_errors'] == '0'
 
 
-def test_calibrator_says_what_the_document_says(
+def test_calibrator_diagnostics_match_the_document(
     client: Client,
     start_node: StartNode,
     tiny_bag: Path,
     tiny_observations: Ensemble,
     tmp_path: Path,
 ) -> None:
-    """Collecting, with a file of its state damaged, then with a calibration in force."""
+    """While collecting, with a damaged state file, and with an active calibration."""
     history = tmp_path / 'state' / 'calibrations'
     history.mkdir(parents=True)
     (history / '00000001_calibration_00000001.json').write_text('{"schema": 1}')

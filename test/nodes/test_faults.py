@@ -1,4 +1,4 @@
-"""Faults on real processes: the short form of the bench, and a bag that plays again by /clock."""
+"""Faults on real processes: the short form of the bench, and replay with /clock."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from diagnostic_msgs.msg import DiagnosticArray
 
 from starcal.msg import EnsembleStatus
 from starcal_ros.bag import reader
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.messages.fields import stamp_ns
 from starcal_ros.records import Image
 
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.timeout(
-    400
-)  # fifteen node starts of 2 s; on a busy machine each takes ten times that
+@pytest.mark.slow
+@pytest.mark.timeout(400)  # fifteen node starts of 2 s, ten times as long on a busy machine
 def test_no_fault_loses_or_kills(tmp_path: Path) -> None:
-    """Hostile messages, kills, no room, doubles, callers that go: nothing lost, wrong or dead."""
+    """Every fault of the bench in its short form: nothing lost, wrong or dead."""
     found = tmp_path / 'found.json'
     command = [sys.executable, '-m', 'bench', 'faults', '--quick', '--json', str(found)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=380)
@@ -55,7 +55,7 @@ def test_no_fault_loses_or_kills(tmp_path: Path) -> None:
 def test_a_bag_plays_again_by_its_clock(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
-    """As replay.launch.py starts them: in a namespace, by /clock; the second pass counts once."""
+    """Nodes as in replay.launch.py, with a namespace and /clock; a second pass adds nothing."""
     given = ('-r', '__ns:=/cam', '--params-file', str(tiny_bag / 'params.yaml'))
     common = (*given, '-p', 'autostart:=true', '-p', 'use_sim_time:=true', '--log-level', 'info')
     remaps = ('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude')
@@ -88,8 +88,8 @@ NODES = ('star_observer', 'calibrator', 'bag_player')
 def test_the_policies_name_what_the_nodes_have(
     client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
 ) -> None:
-    """Least privilege: each policy allows the topics and services of its node, and no others."""
-    with reader.BagWriter(tmp_path / 'bag') as writer:
+    """Each security policy allows exactly the topics and services of its node."""
+    with BagWriter(tmp_path / 'bag') as writer:
         writer.write_image('/image', Image(1, np.zeros((2, 2), np.uint8)), 'camera')
         writer.write_attitude('/attitude', 1, np.array([0, 0, 0, 1.0]), 'icrf')
         writer.write_velocity('/velocity', 1, np.zeros(3), 'icrf')
@@ -118,14 +118,14 @@ WAIT = ('-p', 'wait_for_subscribers_s:=100.0')
 
 
 def full_name(node: str, name: str) -> str:
-    """A name of a policy, resolved for a node in the root."""
+    """Name in a policy, resolved for a node in the root namespace."""
     if name.startswith('~/'):
         return f'/{node}/{name[2:]}'
     return name if name.startswith('/') else f'/{name}'
 
 
 def of_graph(client: Client, name: str) -> set[tuple[str, str]]:
-    """What a node has on the graph, by what a policy calls it."""
+    """Names of the topics and services of a node, by the policy tags."""
     node = client.node
     found = set()
     for kind, ask in (
@@ -141,5 +141,5 @@ def of_graph(client: Client, name: str) -> set[tuple[str, str]]:
 
 
 def shows(client: Client, name: str, allowed: set[tuple[str, str]]) -> bool:
-    """Whether the graph shows by now all that a node may have."""
+    """Return True once the graph shows all names that a node may use."""
     return name in client.node.get_node_names() and of_graph(client, name) >= allowed

@@ -1,5 +1,5 @@
 """
-What an integrator's test would do: generated interfaces and the names of the ICD, nothing else.
+Test of an integrator: only generated interfaces and the names of the ICD.
 
 Nothing here imports starcal_ros; the images come from a bag through rosbags.
 """
@@ -36,7 +36,7 @@ ARCSECOND_RAD = np.pi / 648000
 
 
 def bag_messages(folder: Path) -> Iterator[Any]:
-    """Images and attitudes of a bag as messages of rclpy, in its order."""
+    """Images and attitudes of a bag as rclpy messages, in order."""
     with rosbags.AnyReader([folder]) as reader:
         for connection, _, data in reader.messages():
             found = reader.deserialize(data, connection.msgtype)
@@ -56,7 +56,7 @@ def bag_messages(folder: Path) -> Iterator[Any]:
 
 
 def test_calibrates_through_the_icd(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """Images and attitudes in, the true camera out, for subscribers that come late too."""
+    """Images and attitudes give the true camera, also to late subscribers."""
     parameters = ('--params-file', str(tiny_bag / 'params.yaml'))
     for name in ('star_observer', 'calibrator'):
         start_node(name, ros=parameters)
@@ -115,7 +115,7 @@ def test_calibrates_through_the_icd(client: Client, start_node: StartNode, tiny_
 
 
 def has(messages: list[Any], count: int) -> bool:
-    """Whether so many have come."""
+    """Return True once a number of messages has arrived."""
     return len(messages) >= count
 
 

@@ -1,4 +1,4 @@
-"""The image queue: order, waiting, overrun, end."""
+"""The image queue: order, waiting, overrun, close."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def put(queue: ImageQueue, *stamps: int) -> None:
 
 
 def take(queue: ImageQueue) -> Waiting:
-    """Take an image that must be there."""
+    """Take an image; fail without one."""
     taken = queue.take()
     assert taken is not None
     return taken
@@ -71,7 +71,7 @@ def test_close_ends_the_waiting() -> None:
 
 
 def test_a_stamp_in_the_future_does_not_hold_the_others_back() -> None:
-    """It comes out when the next shows it to be wrong; one a little ahead waits as ever."""
+    """It is released when the next image shows its stamp to be wrong; a small lead waits."""
     queue = ImageQueue(5, 60.0, lambda stamp: stamp < 10 * SECOND_NS)
     put(queue, 100 * SECOND_NS, SECOND_NS)
     assert [take(queue).time_ns for _ in range(2)] == [100 * SECOND_NS, SECOND_NS]

@@ -1,4 +1,4 @@
-"""Every transition in every state of both nodes, and the end by a signal from each."""
+"""Every transition in every state of both nodes, and the end by a signal in each state."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ ALLOWED: dict[str, tuple[tuple[int, str, tuple[int, ...]], ...]] = {
 
 
 class Manager:
-    """Takes one node through its states."""
+    """Client of the lifecycle services of one node."""
 
     def __init__(self, client: Client, name: str) -> None:
         self._client = client
@@ -60,11 +60,11 @@ class Manager:
         return future.result()
 
     def change(self, number: int) -> bool:
-        """Whether the node made a transition."""
+        """Request a transition; return True if the node made it."""
         return bool(self._call(self._change, _to(number)).success)
 
     def state(self) -> str:
-        """Label of the state the node is in."""
+        """Label of the present state of the node."""
         return str(self._call(self._get, GetState.Request()).current_state.label)
 
 
@@ -73,7 +73,7 @@ def _to(number: int) -> Any:
 
 
 def try_everything(manager: Manager, state: str) -> None:
-    """Every transition there is: the state's own are made, the others refused without effect."""
+    """Try every transition: valid ones are made, the others are refused without effect."""
     own = {number for number, _, _ in ALLOWED[state]} | {SHUTDOWN.get(state)}
     for number in (*NUMBERS, NO_TRANSITION):
         if number not in own:
@@ -91,7 +91,7 @@ def try_everything(manager: Manager, state: str) -> None:
 def test_every_transition_in_every_state(
     client: Client, start_node: StartNode, tiny_bag: Path, state: str, shut_down: bool
 ) -> None:
-    """Each node survives all of them, and ends with status 0 where a signal finds it."""
+    """Each node survives all transitions, and a signal ends it with status 0 in every state."""
     ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'autostart:=false')
     nodes = [start_node(name, ros=ros) for name in ('star_observer', 'calibrator')]
     # Each state meets both signals; the two nodes end by the same code.
@@ -131,7 +131,7 @@ sys.exit(until_told_to_end('maker', [], work, lambda: end_quietly(None)))
     ('argument', 'status', 'said'), [('', 2, 'maker: the context is invalid\n'), ('told', 0, '')]
 )
 def test_what_fails_after_a_signal_is_no_error(argument: str, status: int, said: str) -> None:
-    """ROS is gone at once under whatever is just being made; otherwise one line and status 2."""
+    """Errors after a signal give status 0; other errors give one line and status 2."""
     command = [sys.executable, '-c', SIGNALLED, argument]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (status, '', said)

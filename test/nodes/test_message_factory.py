@@ -1,4 +1,4 @@
-"""Conversions: every record through a generated message and its serialised bytes."""
+"""Conversions of every record to a generated message, its serialised bytes, and back."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ pytest.importorskip('starcal.msg')
 from rclpy.serialization import deserialize_message, serialize_message
 from sample_records import assert_same, calibration, observations, status  # type: ignore[import-not-found]
 
-from starcal_ros.bag import reader
+from starcal_ros.bag import typestore as bag_types
 from starcal_ros.messages.calibration import (
     alignment_to_message,
     calibration_from_message,
@@ -56,20 +56,20 @@ def test_camera_info_and_alignment_survive_the_wire() -> None:
 
 
 def test_both_kinds_of_message_are_the_same_on_the_wire() -> None:
-    """What the nodes publish is what the bag writer writes; only padding bytes may differ."""
+    """Nodes and bag writer serialise equal messages, up to padding bytes."""
     for build in (
         lambda make: observations_to_message(observations(), 'cam', make),
         lambda make: calibration_to_message(calibration(), make),
         lambda make: image_to_message(Image(5, np.ones((4, 6), np.uint16)), 'c', make),
     ):
-        live, recorded = build(make_message), build(reader.make_message)
-        data = reader._typestore().serialize_cdr(recorded, recorded.__msgtype__)
+        live, recorded = build(make_message), build(bag_types.make_message)
+        data = bag_types.typestore().serialize_cdr(recorded, recorded.__msgtype__)
         assert len(serialize_message(live)) == len(data)
         assert deserialize_message(bytes(data), type(live)) == live
 
 
 def test_large_images_are_quick() -> None:
-    """Building and reading 26 MB takes as long as copying it, not as long as a Python loop."""
+    """Construction and reading of 26 MB takes about as long as a copy."""
     image = Image(0, np.ones((3600, 3600), np.uint16))
     start_s = time.perf_counter()
     back = image_from_message(image_to_message(image, '', make_message))

@@ -1,4 +1,4 @@
-"""The nodes as processes on the real graph: what they answer, refuse and survive."""
+"""The nodes as processes: services, refusals, faults, parameters, signals."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ from std_srvs.srv import Trigger
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal.srv import Calibrate
 from starcal_ros.bag import reader
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.messages import fields as message_fields
 from starcal_ros.messages.calibration import (
     calibration_from_message,
@@ -70,7 +71,7 @@ def parameters(folder: Path, *more: str) -> tuple[str, ...]:
 
 
 def blank(stamp_ns: int, **change: Any) -> Any:
-    """Return an image message of a dark sky, with some of its fields as asked."""
+    """Return an image message of a dark sky with some fields changed."""
     pixels = np.zeros((8, 8), np.uint16)
     message = image_to_message(ImageRecord(stamp_ns, pixels), '', make_message)
     for name, value in change.items():
@@ -84,7 +85,7 @@ def attitude(stamp_ns: int) -> Any:
 
 
 def play(start_node: StartNode, folder: Path, *more: str) -> None:
-    """Play a bag as fast as it is taken, to its end."""
+    """Play a bag at full speed to its end."""
     player = start_node('bag_player', ros=('-p', f'bag:={folder}', '-p', 'rate:=0', *more))
     assert player.wait(120.0) == 0, player.said()
 
@@ -121,14 +122,33 @@ def test_nodes_and_tool_give_the_same_calibration(
     ours = {k: v for k, v in offline.provenance.items() if not k.startswith('input ')}
     assert dict(live.provenance) == ours
 
-    # Held for the next tests of the same run: what can be asked of a node with an ensemble.
-    again = client.call(Trigger, '/calibrator/calibrate')
-    assert again.success
+
+@pytest.fixture
+def calibrated(
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
+) -> list[Any]:
+    """Calibrations published by a calibrator that has collected the tiny bag: one so far."""
+    start_node('calibrator', ros=parameters(tiny_bag))
+    play(start_node, tiny_products / 'observations.mcap')
+    images = json.loads((tiny_bag / 'truth.json').read_text())['images']
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status and status[-1].images == images)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    published: list[Any] = client.latched(Calibration, 'calibration')
+    client.until(lambda: published)
+    return published
+
+
+def test_rollback(client: Client, calibrated: list[Any]) -> None:
+    """Rollback activates the previous calibration, and fails without one."""
+    assert client.call(Trigger, '/calibrator/calibrate').success
     back = client.call(Trigger, '/calibrator/rollback')
     assert back.success and 'activated again' in back.message
     none = client.call(Trigger, '/calibrator/rollback')
     assert not none.success and 'no calibration before' in none.message
-    before = len(found)
+
+
+def test_dry_run_and_bad_requests_activate_nothing(client: Client, calibrated: list[Any]) -> None:
     trial = client.call(Calibrate, '/calibrator/solve', dry_run=True, estimate=['fx', 'fy'])
     assert trial.success and 'would be activated' in trial.message
     assert list(trial.calibration.estimated) == ['fx', 'fy']
@@ -137,18 +157,25 @@ def test_nodes_and_tool_give_the_same_calibration(
     assert bad.calibration.stars_used == 0
     bad = client.call(Calibrate, '/calibrator/solve', method='magic')
     assert not bad.success and 'magic' in bad.message
+    assert len(calibrated) == 1
+
+
+def test_reset_empties_the_ensemble(client: Client, calibrated: list[Any]) -> None:
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status)
+    images = status[-1].images
     reset = client.call(Trigger, '/calibrator/reset')
     assert reset.success and str(images) in reset.message
     client.until(lambda: status[-1].images == 0)
     empty = client.call(Trigger, '/calibrator/calibrate')
     assert not empty.success
-    assert len(found) == before, 'nothing of these came into force'
+    assert len(calibrated) == 1
 
 
 def test_gate_refusal_and_force(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path, tmp_path: Path
 ) -> None:
-    """A refused candidate is in the answer alone, unless it is forced."""
+    """A refused candidate is only in the response, unless it is forced."""
     state = tmp_path / 'state'
     strict = ('max_residual_rms_px:=0.001', f'state_dir:={state}')
     calibrator = start_node('calibrator', ros=parameters(tiny_bag, *strict))
@@ -175,7 +202,7 @@ def test_gate_refusal_and_force(
     assert found[0].reasons[-1] == 'activated by request despite the gate'
     assert found[0].forced and found[0].number == 1
     client.until(
-        lambda: any('active against the gate' in m.status[0].message for m in diagnostics)
+        lambda: any('active despite the gate' in m.status[0].message for m in diagnostics)
     )
     page = state / 'report' / 'report.html'
     client.until(page.exists, 120.0)
@@ -186,7 +213,7 @@ def test_gate_refusal_and_force(
 def test_every_image_gets_one_answer(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
-    """Images that cannot be used are refused by name, in order, each once."""
+    """Unusable images are refused with a reason, in order, each once."""
     start_node('star_observer', ros=parameters(tiny_bag, 'attitude_timeout_s:=0.5'))
     answers: list[Any] = client.collect(StarObservations, 'observations')
     images = client.publisher(Image, 'image', 50)
@@ -220,7 +247,7 @@ def test_every_image_gets_one_answer(
 def test_image_waits_for_its_attitude(
     client: Client, start_node: StartNode, tiny_bag: Path
 ) -> None:
-    """An image that comes before its attitude is measured when that has come, not refused."""
+    """An image that arrives before its attitude waits for it."""
     start_node('star_observer', ros=(*parameters(tiny_bag, 'attitude_timeout_s:=60.0'), *REMAPS))
     answers: list[Any] = client.collect(StarObservations, 'observations')
     images = client.publisher(Image, '/opnav/image_raw', 10)
@@ -265,7 +292,7 @@ def test_observations_carry_the_temperature(
 
 
 def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """A PNG on image/compressed gives the observations that the raw image gives, remaps too."""
+    """A PNG on image/compressed gives the same observations as the raw image, also remapped."""
     # A small message waits behind a large one of its participant, under load longer than 10 s.
     patient = 'attitude_timeout_s:=60.0'
     raw_observer = start_node('star_observer', ros=(*parameters(tiny_bag, patient), *REMAPS))
@@ -302,7 +329,7 @@ def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path
 
 
 def test_overrun_is_answered(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """More images than the queue holds: each is still answered, the surplus by name."""
+    """With more images than the queue holds, each is answered, the surplus with overrun."""
     start_node(
         'star_observer', ros=parameters(tiny_bag, 'image_queue:=5', 'attitude_timeout_s:=60.0')
     )
@@ -322,13 +349,13 @@ def test_overrun_is_answered(client: Client, start_node: StartNode, tiny_bag: Pa
 
 
 def is_waiting(diagnostics: list[Any], images: int) -> bool:
-    """Whether the observer said last that it holds so many images."""
+    """Return True if the latest diagnostics report this number of queued images."""
     values = {v.key: v.value for m in diagnostics[-1:] for v in m.status[0].values}
     return values.get('images_waiting') == str(images)
 
 
 def test_annotated_image(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """A picture for whoever listens, of the image's size and stamp."""
+    """The annotated image has the size and stamp of the image."""
     start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
     pictures = client.collect(Image, 'annotated_image', 5)
     answers: list[Any] = client.collect(StarObservations, 'observations')
@@ -345,7 +372,7 @@ def test_annotated_image(client: Client, start_node: StartNode, tiny_bag: Path) 
 def test_camera_info_per_image(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_observations: Ensemble
 ) -> None:
-    """The calibration in force with the header of each image; the prior and candidates never."""
+    """The active calibration with the header of each image; never the prior or a candidate."""
     values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())['/**']['ros__parameters']
     setup = load_setup({**values, 'camera_info_url': str(tiny_bag / 'camera.yaml')})
     active = solving.solve(tiny_observations, setup)
@@ -375,10 +402,10 @@ def test_camera_info_per_image(
         client.until(lambda: said in observer.said())
 
     show(1)
-    publish(candidate, 'calibration: one that the gate has refused')
+    publish(candidate, 'calibration: refused by the gate')
     show(2)
     client.until(lambda: len(answers) == 2)
-    publish(active, 'stars are predicted with the calibration in force')
+    publish(active, 'predicting stars with the active calibration')
     headers = [show(3), show(4, width=8, height=8), show(7), show(5, 'other')]
     client.until(lambda: len(answers) == 6 and len(infos) == 3)
     # Nothing of the first two comes later: what is of one publisher comes in order.
@@ -390,7 +417,7 @@ def test_camera_info_per_image(
         assert info == expected
     forced = dataclasses.replace(candidate, forced=True, child_frame='elsewhere')
     calibrations.publish(calibration_to_message(forced, make_message))
-    client.until(lambda: observer.said().count('stars are predicted') == 2)
+    client.until(lambda: observer.said().count('predicting stars') == 2)
     header = show(8)
     client.until(lambda: len(infos) == 4)
     assert infos[-1].header == header
@@ -399,7 +426,7 @@ def test_camera_info_per_image(
 def test_calibrator_collects_while_it_solves(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
 ) -> None:
-    """Observations that come during solves are all counted."""
+    """Observations that arrive during a calibration are all counted."""
     start_node('calibrator', ros=parameters(tiny_bag))
     play(start_node, tiny_products / 'observations.mcap')
     status = client.latched(EnsembleStatus, 'ensemble_status')
@@ -420,7 +447,7 @@ def test_calibrator_collects_while_it_solves(
 def test_state_outlasts_a_kill(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path, tmp_path: Path
 ) -> None:
-    """After kill -9: the ensemble, the calibration in force, the same answer; one owner."""
+    """Ensemble and active calibration survive kill -9; the state folder has one owner."""
     tool = read_calibration(tiny_products / CALIBRATION_FILE)
     state = f'state_dir:={tmp_path / "state"}'
     killed = start_node('calibrator', ros=parameters(tiny_bag, state))
@@ -457,7 +484,7 @@ def test_state_outlasts_a_kill(
 
 
 def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """Observations that do not fit together are logged and counted; the next are taken."""
+    """Inconsistent observations are logged and counted; the next ones are used."""
     calibrator = start_node('calibrator', ros=parameters(tiny_bag))
     observations = client.publisher(StarObservations, 'observations')
     observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
@@ -470,7 +497,7 @@ def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_ba
 
 
 def test_too_few_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """An empty ensemble is refused with what is missing; the prior is no calibration."""
+    """A calibration of an empty ensemble is refused; the prior is no calibration."""
     start_node('calibrator', ros=parameters(tiny_bag))
     latched = [
         client.latched(CameraInfo, 'camera_info'),
@@ -488,7 +515,7 @@ def test_too_few_images(client: Client, start_node: StartNode, tiny_bag: Path) -
 
 
 def status_of(client: Client, status: list[Any]) -> Any:
-    """Newest ensemble status."""
+    """Latest ensemble status."""
     client.until(lambda: status)
     return status[-1]
 
@@ -508,7 +535,7 @@ entry_points.{}()
 
 @pytest.mark.parametrize('name', BOTH)
 def test_a_signal_while_python_imports(name: str) -> None:
-    """Ctrl-C before the node is there ends its console script without a traceback."""
+    """Ctrl-C during imports ends the console script without a traceback."""
     command = [sys.executable, '-c', INTERRUPTED.format(name)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
@@ -524,7 +551,7 @@ def test_signals(client: Client, start_node: StartNode, tiny_bag: Path, number: 
 
 
 def tiny_parameters(change: Callable[[str], str]) -> Callable[[Path, Path], tuple[str, ...]]:
-    """ROS arguments for the bag's parameter file with its text changed."""
+    """ROS arguments for a changed copy of the parameter file of the bag."""
 
     def arguments(folder: Path, scratch: Path) -> tuple[str, ...]:
         text = change((folder / 'params.yaml').read_text())
@@ -568,7 +595,7 @@ def test_bad_parameters(
 
 
 def test_parameters_while_running(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """Parameters are described, and what is in use is not changed behind the node's back."""
+    """Parameters have descriptions, and those in use cannot be changed."""
     node = start_node('star_observer', ros=parameters(tiny_bag, 'max_attitude_gap_s:=3'))
     described = client.call(
         DescribeParameters,
@@ -592,7 +619,7 @@ def test_parameters_while_running(client: Client, start_node: StartNode, tiny_ba
 
 
 def set_gap(client: Client, value: float, kind: int = ParameterType.PARAMETER_DOUBLE) -> str:
-    """Why the node refused the parameter; empty where it did not."""
+    """Set a parameter; return the reason of a refusal, '' if accepted."""
     number = ParameterValue(type=kind, double_value=value)
     parameter = Parameter(name='max_attitude_gap_s', value=number)
     answer = client.call(SetParameters, '/star_observer/set_parameters', parameters=[parameter])
@@ -606,7 +633,7 @@ def state_of(client: Client, name: str = 'star_observer') -> str:
 
 
 def change_state(client: Client, transition: int, name: str = 'star_observer') -> bool:
-    """Whether a node made a transition."""
+    """Request a transition; return True if the node made it."""
     request = Transition(id=transition)
     return bool(client.call(ChangeState, f'/{name}/change_state', transition=request).success)
 
@@ -615,7 +642,7 @@ def change_state(client: Client, transition: int, name: str = 'star_observer') -
 def test_lifecycle_by_hand(
     client: Client, start_node: StartNode, tiny_bag: Path, name: str
 ) -> None:
-    """Without autostart the node waits; a transition it cannot make is answered, not fatal."""
+    """Without autostart the node stays unconfigured; an invalid transition is answered."""
     node = start_node(name, ros=parameters(tiny_bag, 'autostart:=false'))
     assert state_of(client, name) == 'unconfigured'
     assert not change_state(client, Transition.TRANSITION_ACTIVATE, name)
@@ -634,9 +661,9 @@ def test_lifecycle_by_hand(
 
 
 def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: Path) -> None:
-    """A bag of large images at full speed arrives whole, in order, with its stamps."""
+    """A bag of large images at full speed arrives completely, in order, with its stamps."""
     random = np.random.default_rng(2)
-    with reader.BagWriter(tmp_path / 'large', compression='') as writer:
+    with BagWriter(tmp_path / 'large', compression='') as writer:
         for k in range(24):
             pixels = random.integers(0, 4096, (1024, 1296)).astype(np.uint16)
             for j in range(40):
@@ -661,7 +688,7 @@ def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: P
 @pytest.mark.parametrize(
     ('arguments', 'text'),
     [
-        ((), 'bag: the bag to play must be given'),
+        ((), 'bag: path of the bag to play is missing'),
         (('-p', 'bag:=/no/such/bag'), '/no/such/bag: no such bag'),
         (('-p', 'bag:=x', '-p', 'rate:=-1.0'), 'rate'),
     ],

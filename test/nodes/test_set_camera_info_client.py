@@ -1,4 +1,4 @@
-"""A calibration in force is handed to the camera's driver: a real service, and its failures."""
+"""set_camera_info client: each active calibration is sent; failures of a real service."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SERVICE = '/opnav/set_camera_info'
 
 
 def fill(client: Client, ensemble: Ensemble) -> None:
-    """Hand a calibrator the observations of an ensemble."""
+    """Publish the observations of an ensemble to a calibrator."""
     status = client.latched(EnsembleStatus, 'ensemble_status')
     observations = client.publisher(StarObservations, 'observations')
     for image in ensemble.images:
@@ -40,7 +40,7 @@ def fill(client: Client, ensemble: Ensemble) -> None:
 
 
 def told(diagnostics: list[Any], outcome: str, level: bytes) -> Callable[[], bool]:
-    """Whether the newest diagnostics say so of the driver."""
+    """Condition on the level and driver outcome in the latest diagnostics."""
 
     def is_so() -> bool:
         newest = [status for message in diagnostics[-1:] for status in message.status]
@@ -60,7 +60,7 @@ def test_driver_is_told_and_its_failures_are_seen(
     tiny_bag: Path,
     tiny_observations: Ensemble,
 ) -> None:
-    """Absent, silent, refusing, accepting: each is named, counted, and sent again as promised."""
+    """A missing, silent, refusing and accepting driver: outcome, count and retry of each."""
     calibrator = start_node(
         'calibrator',
         ros=(
@@ -74,7 +74,7 @@ def test_driver_is_told_and_its_failures_are_seen(
     assert (nothing.success, nothing.message) == (False, 'no calibration is in force')
     fill(client, tiny_observations)
     assert client.call(Trigger, '/calibrator/calibrate').success
-    client.until(told(diagnostics, 'not there; sent when it comes', b'\x01'))
+    client.until(told(diagnostics, 'service not available; will be sent when it is', b'\x01'))
 
     # A driver that takes the call and never answers: nobody spins its node.
     silent = other_client.node.create_service(SetCameraInfo, SERVICE, lambda _, answer: answer)
@@ -109,7 +109,12 @@ def test_driver_is_told_and_its_failures_are_seen(
     assert client.call(Trigger, '/calibrator/calibrate').success
     client.until(lambda: len(received) > before)
     said = calibrator.said()
-    for outcome in ('not there', 'no answer within 1 s', 'refused: sensor busy', 'accepted'):
+    for outcome in (
+        'service not available',
+        'no answer within 1 s',
+        'refused: sensor busy',
+        'accepted',
+    ):
         assert f'{SERVICE}: {outcome}' in said
     assert 'Traceback' not in said
 

@@ -1,4 +1,4 @@
-"""Numbers of the last minute: what counts, and for how long."""
+"""Statistics of the last minute."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from starcal_ros.nodes.sliding_window import Recent, WINDOW_S
 
 
 class Clock:
-    """Seconds as the test has them."""
+    """Clock set by the test."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -23,7 +23,7 @@ def test_nothing_has_come() -> None:
 
 
 def test_rate_is_right_from_the_start() -> None:
-    """Before a window is full the rate is over the time since the start, not over a window."""
+    """Before the window is full the rate is over the time since the start."""
     clock = Clock()
     recent = Recent(clock)
     for k in range(40):

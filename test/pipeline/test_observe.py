@@ -205,7 +205,9 @@ def test_a_star_tracker_that_jumped_and_came_back(setup: Setup, jump_deg: float)
         lengths.append(len(found))
         seen.append(found.refusal)
         if found.refusal:
-            assert track.geometry is before.geometry and track.followed is before.followed
+            assert (
+                track.geometry is before.geometry and track.tracked_camera is before.tracked_camera
+            )
             assert track.latest_ns == before.latest_ns
     # Beyond the search the jump is refused, within it the stars are still the right ones.
     assert seen == ['', '', '' if jump_deg < 1.5 else 'no_match', '', '']

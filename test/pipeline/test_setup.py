@@ -106,7 +106,7 @@ def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> 
         ({'prior_alignment': [0.0, 0.0, 1.0]}, 'prior_alignment: .* is not a list of 4'),
         ({'method': 'best'}, "method: 'best' is not one of hierarchical, per_image, single"),
         ({'estimate': ['fx', 'fz']}, 'estimate: .* is not one of fx, skew'),
-        ({'min_images': 2.5}, 'min_images: 2.5 is not a whole number'),
+        ({'min_images': 2.5}, 'min_images: 2.5 is not an integer'),
         (
             {'dark_frame': '/no/such/dark.png'},
             'dark_frame: /no/such/dark.png is missing or not an image file',

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_campaign import ensemble, image, SCENARIO, TRUTH, values  # type: ignore[import-not-found]
 
-from starcal_ros.bag import reader
+from starcal_ros.bag.writer import BagWriter
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
@@ -185,7 +185,7 @@ def test_from_pixels_to_a_calibration_that_is_true(setup: Setup) -> None:
 def test_a_bag_with_temperatures_to_a_calibration_with_terms(
     camera_yaml: Path, tmp_path: Path
 ) -> None:
-    with reader.BagWriter(tmp_path / 'warm') as writer:
+    with BagWriter(tmp_path / 'warm') as writer:
         for index in range(4):
             for sample in attitude_samples(SCENARIO, index):
                 quaternion = sample.icrf_from_star_tracker_xyzw

@@ -1,4 +1,4 @@
-"""Synthetic centroids and their bounds against statistics and plain least squares."""
+"""Simulated centroids and their bounds against statistics and least squares."""
 
 from __future__ import annotations
 
@@ -60,10 +60,9 @@ def test_observations_have_the_noise_they_report() -> None:
 @pytest.mark.parametrize(('electrons', 'phase'), [(300.0, 0.0), (3000.0, 0.5), (30000.0, 0.23)])
 def test_the_bound_is_the_scatter_of_fits_to_noisy_stars(electrons: float, phase: float) -> None:
     """
-    Many images of one star, each with its weighted least-squares step from the truth.
+    Scatter of weighted least-squares steps from the truth, over many images of one star.
 
-    That step is efficient, so its scatter is the bound if both the derivatives and the noise that
-    the bound supposes are those of the pixels.
+    The step is efficient, so its scatter equals the bound if derivatives and noise are right.
     """
     side, count = 13, 3000
     place = np.array([[6.0 + phase, 6.0 - phase]])
@@ -131,7 +130,7 @@ def test_parameter_bound_is_the_inverse_of_the_dense_information_matrix() -> Non
 
 
 def test_parameter_bound_is_the_scatter_of_least_squares() -> None:
-    """Monte Carlo of a plain least squares: camera and a free attitude for each image."""
+    """Monte Carlo of least squares with a camera and a free attitude for each image."""
     tiny = dataclasses.replace(scenario('tiny'), image_count=3)
     exact = true_observations(tiny, catalog=CATALOG, centroid_noise=False)
     columns = [0, 1, 2, 5, 6, 7, 8, 9]

@@ -1,4 +1,4 @@
-"""Synthetic pixels against analytic truth and the statistics of noise."""
+"""Simulated pixels against analytic truth and noise statistics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Synthetic scenarios and scenes against analytic truth."""
+"""Simulated scenarios and scenes against analytic truth."""
 
 from __future__ import annotations
 

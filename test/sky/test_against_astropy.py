@@ -1,4 +1,4 @@
-"""Apparent directions, refraction and time scales against astropy and ERFA's own whole chain."""
+"""Apparent directions, refraction and time scales against astropy and the full ERFA chain."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = [
 
 
 def random_stars(count: int) -> StarCatalog:
-    """Stars all over the sky, poles included; the last three are nearby and fast."""
+    """Stars over the whole sky with the poles; the last three are near and fast."""
     rng = np.random.default_rng(19950101)
     pm = rng.normal(0.0, 0.1, (2, count))
     parallax = 0.005 + rng.exponential(0.02, count)  # none so small that ERFA overrides it
@@ -60,7 +60,7 @@ def random_stars(count: int) -> StarCatalog:
 
 
 def places(stars: StarCatalog, time: Time) -> SkyCoord:
-    """The stars of a catalog as astropy has them, moved to a time."""
+    """Stars of a catalog as astropy coordinates at a time."""
     at_epoch = SkyCoord(
         ra=stars.ra_rad * u.rad,
         dec=stars.dec_rad * u.rad,
@@ -146,7 +146,7 @@ def test_the_air_bends_light_as_in_astropy(
 
 @pytest.mark.parametrize('time_s', TIMES_S)
 def test_agrees_with_the_whole_chain_of_erfa(time_s):
-    """ICRS to CIRS by ``atci13``, turned back to the GCRS by its own precession and nutation."""
+    """ICRS to CIRS by ``atci13``, rotated to the GCRS by its precession and nutation."""
     stars = random_stars(500)
     jd1, jd2 = tt_julian_date(time_s * NANOSECONDS_PER_SECOND)
     years = 16.0  # atci13 counts from J2000

@@ -1,4 +1,4 @@
-"""Apparent directions against special relativity and rules of thumb; time scales; bad calls."""
+"""Apparent directions against special relativity and approximations; time scales; bad calls."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ TIME_NS = unix_ns(2024, 5, 1, 3)
 
 
 def zenith(site):
-    """Direction that refraction leaves, by the sum of those of stars around it."""
+    """Zenith direction, from the sum of the directions of stars around it."""
     ring = np.random.default_rng(1).normal(size=(20000, 3))
     ring /= np.linalg.norm(ring, axis=1, keepdims=True)
     _, elevation_rad = through_the_air(ring, TIME_NS, site)

@@ -1,4 +1,4 @@
-"""Attitude samples: checked, sorted, interpolated, and refused with the right reason."""
+"""Attitude samples: validation, order, interpolation, refusals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def random_quaternions(seed: int, n: int) -> np.ndarray:
 
 
 def slerp(q0: np.ndarray, q1: np.ndarray, t: float) -> np.ndarray:
-    """Shoemake's formula, by the shorter way."""
+    """Spherical interpolation by Shoemake's formula, along the shorter arc."""
     cosine = float(q0 @ q1)
     if cosine < 0:
         q1, cosine = -q1, -cosine
@@ -210,7 +210,7 @@ def test_only_the_last_seconds_are_kept() -> None:
 def steady(
     rate_hz: float, seconds: float, start_ns: int = START_NS
 ) -> list[tuple[int, np.ndarray]]:
-    """Samples of a slow turn about z, 1 mrad/s, at a rate."""
+    """Samples of a slow rotation about z, 1 mrad/s."""
     count = int(rate_hz * seconds) + 1
     stamps = [start_ns + round(k / rate_hz * S) for k in range(count)]
     return [(stamp, turned(stamp)) for stamp in stamps]
@@ -223,7 +223,7 @@ def turned(time_ns: int) -> np.ndarray:
 
 @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 10.0, 100.0])
 def test_any_rate_late_doubled_and_out_of_order(rate_hz: float) -> None:
-    """What a steady turn gives at any time does not depend on how its samples came."""
+    """The attitude of a steady rotation does not depend on rate or order of its samples."""
     rng = np.random.default_rng(13)
     samples = steady(rate_hz, 60.0)
     late_s = rng.uniform(0.0, 8.0, len(samples))  # some overtake hundreds of others
@@ -248,7 +248,7 @@ def test_a_dropout_of_minutes_costs_its_own_images_alone() -> None:
 
 @pytest.mark.parametrize('wrong_s', [-(10**9), -4000, -60, 60, 4000, 10**9, 9 * 10**8])
 def test_one_wrong_stamp_costs_nothing(wrong_s: int) -> None:
-    """A sample stamped in the future must not make the true ones too old to keep."""
+    """A sample stamped in the future does not make the others too old to keep."""
     samples = steady(10.0, 60.0)
     k = 300
     wrong = (samples[k][0] + wrong_s * S, random_quaternions(14, 1)[0])
@@ -263,7 +263,7 @@ def test_one_wrong_stamp_costs_nothing(wrong_s: int) -> None:
 
 @pytest.mark.parametrize('back_s', [30, 600, 100_000])
 def test_a_clock_set_back_is_believed(back_s: int) -> None:
-    """Samples of the clock before do not mix with those of the clock now, which come first."""
+    """Samples of the previous and the present clock do not mix; the present ones come first."""
     other = random_quaternions(15, 1)[0]
     before = [(t, other) for t, _ in steady(10.0, 60.0, START_NS + (back_s - 30) * S)]
     now = steady(10.0, 60.0)
@@ -275,7 +275,7 @@ def test_a_clock_set_back_is_believed(back_s: int) -> None:
 
 
 def test_memory_of_a_fast_tracker_is_bounded() -> None:
-    """Five minutes at 100 Hz, 20 s kept: 2000 samples of 40 bytes, and four times that at most."""
+    """Five minutes at 100 Hz, 20 s kept: 2000 samples of 40 bytes, at most four times that."""
     held = AttitudeHistory(keep_s=20.0, jump_s=10.0)
     sample = attitude_sample(START_NS, np.array([0.0, 0.0, 0.0, 1.0]), DIRECT)
     tracemalloc.start()

@@ -30,6 +30,8 @@ from starcal_ros.studies import monte_carlo, summary, trials, workers
 from starcal_ros.studies.monte_carlo import Design, Row
 from starcal_ros.studies.summary import StudyResult
 
+pytestmark = pytest.mark.slow
+
 METHODS = ('per_image', 'single', 'hierarchical')
 ARGUMENTS = ('coverage', '--trials', '4', '--images', '4', '--stars', '20', '--seed', '5')
 SMALL = {

@@ -17,6 +17,8 @@ from starcal_ros.simulation import scenario
 from starcal_ros.studies import monte_carlo, paper, paper_figures, summary, workers
 from starcal_ros.studies.paper import judge, PaperStudy, spread
 
+pytestmark = pytest.mark.slow
+
 NIGHT = scenario.scenario(paper.NIGHT, seed=3)
 
 

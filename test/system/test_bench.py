@@ -1,4 +1,4 @@
-"""The benches: the smallest of them runs, and the solvers it compares find the same minimum."""
+"""The benches run with small sizes, and the compared solvers find the same minimum."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ from scipy.spatial.transform import Rotation
 
 from bench import acquisition
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.star_finder import IdentificationOptions, observe_stars, Shot
+from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
 from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.sky.catalog import load_catalog
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_solver_bench(tmp_path: Path) -> None:
-    """A row for each solver; SciPy ends where our search ends, to a hundredth of a sigma."""
+    """A row for each solver; SciPy and starcal agree to a hundredth of a sigma."""
     found = tmp_path / 'found.json'
     command = [sys.executable, '-m', 'bench', 'solver', '--quick', '--json', str(found)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
@@ -37,7 +39,7 @@ def test_solver_bench(tmp_path: Path) -> None:
 
 
 def test_ensemble_bench(tmp_path: Path) -> None:
-    """Images kept as they come are as good as the best choice of as many, to 5 % of a sigma."""
+    """Images kept from a stream are within 5 % in sigma of the best choice of that size."""
     found = tmp_path / 'found.json'
     command = [sys.executable, '-m', 'bench', 'ensemble', '--quick', '--json', str(found)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
@@ -54,7 +56,7 @@ def test_ensemble_bench(tmp_path: Path) -> None:
 
 
 def test_acquisition_bench() -> None:
-    """No field that must be refused is taken, and each that is not hard is found."""
+    """Scrambled fields are refused, and easy true fields are found."""
     refused = acquisition.scrambled(1, 8)
     rows = {row['field']: row for row in refused.content()['rows']}  # type: ignore[attr-defined]
     assert set(rows) == {*acquisition.SCRAMBLES, 'all'}
@@ -68,14 +70,14 @@ def test_acquisition_bench() -> None:
 
 
 def test_a_match_that_is_right_in_a_part_of_the_image_is_refused() -> None:
-    """A crowded field 2.34 degrees off: 51 stars of a corner were right, and 13 others chance."""
+    """A crowded field 2.34 degrees off: 51 stars of a corner are right, 13 others chance."""
     rng = np.random.default_rng([acquisition.SEED, 1])
     scenario = acquisition.random_fields(rng, 40)
     fields = acquisition.beyond_the_search(scenario, rng, 100)
     image, drawn, attitudes = [next(fields) for _ in range(8)][7]
     right = Rotation.from_quat(drawn.icrf_from_star_tracker_xyzw)
     off_deg = np.degrees((right.inv() * Rotation.from_quat(attitudes)).magnitude())
-    shot = Shot(image, attitudes[int(np.abs(off_deg - 2.34).argmin())], 0.0)
+    shot = Exposure(image, attitudes[int(np.abs(off_deg - 2.34).argmin())], 0.0)
     with pytest.raises(ImageRefused, match='part of the image'):
         observe_stars(
             shot,

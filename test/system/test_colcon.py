@@ -1,4 +1,4 @@
-"""The package in a ROS workspace: colcon builds it, its messages and a node run from there."""
+"""The package in a ROS workspace: colcon builds it; messages and a node run from there."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ INSTALLED = ('launch', 'config', 'bags/tiny')
 NODE_ANSWERS_WITHIN_S = 30.0
 NODE_STOPS_WITHIN_S = 15.0
 
-pytestmark = pytest.mark.timeout(240)  # colcon takes 15 s on two free cores
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(240),  # colcon takes 15 s on two free cores
+]
 
 # The messages in use, not only the Python files that wrap them, must be those of the workspace.
 ORIGINS = """
@@ -125,9 +128,9 @@ def test_node_from_the_install_space_comes_up_and_stops(
 
 def lifecycle_state(name: str, domain_id: int, process: subprocess.Popen) -> int:
     """
-    Return the state that a node answers with when asked.
+    Return the lifecycle state from the service of a node.
 
-    Its name is in the graph before its constructor is through; its answer says that it spins.
+    The name of a node is in the graph before its constructor ends; an answer shows that it spins.
     """
     context = Context()
     rclpy.init(context=context, domain_id=domain_id)

@@ -19,7 +19,7 @@ CONFIG = ROOT / 'config'
 
 
 def test_parameter_file_is_up_to_date() -> None:
-    """What tools/write_parameters.py would write: every parameter, its description, its range."""
+    """The file equals the output of tools/write_parameters.py."""
     path = ROOT / 'tools' / 'write_parameters.py'
     spec = importlib.util.spec_from_file_location('write_parameters', path)
     assert spec is not None and spec.loader is not None

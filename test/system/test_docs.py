@@ -1,4 +1,4 @@
-"""The documents: their commands run, their links lead somewhere, their tables are the code's."""
+"""The documents: commands run, links resolve, tables match the code."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES, PlayerOptions
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').glob('*.md'), *ROOT.glob('bags/*/*.md')])
 OPTIONS = (*OPTION_CLASSES, *NODE_OPTION_CLASSES, PlayerOptions)
@@ -38,7 +40,7 @@ def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
 
 @dataclasses.dataclass(frozen=True)
 class Line:
-    """A line of shell in a document; ``runs``: here and now, not only read."""
+    """A shell line in a document; ``runs``: executed here, not only parsed."""
 
     document: Path
     words: tuple[str, ...]
@@ -69,7 +71,7 @@ LINES = [line for document in DOCUMENTS for line in shell_lines(document)]
 
 
 def lines_of(command: str) -> list[Line]:
-    """The lines that call a program, wherever it stands."""
+    """Lines that call a program."""
     return [line for line in LINES if Path(line.words[0]).name == command]
 
 
@@ -193,7 +195,7 @@ def test_no_command_is_unknown() -> None:
 
 @pytest.mark.parametrize('line', TOOL_LINES, ids=lambda line: ' '.join(line.words)[:60])
 def test_the_tool_takes_the_line(line: Line) -> None:
-    """Every command and option that a document shows is one that the tool has."""
+    """Every command and option in a document exists."""
     words = [re.sub(r'^[NMS]$', '1', word) for word in line.words]  # a number to be given
     args = parser().parse_args(words[1:])  # ends the test where it does not understand
     assert args.command in main._COMMANDS
@@ -206,7 +208,7 @@ RUNNING = sorted({line.document for line in TOOL_LINES if line.runs})
 def test_the_commands_of_a_document_run(
     document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One after the other, as a reader would."""
+    """The commands of a document run in order."""
     shutil.copytree(ROOT / 'bags' / 'tiny', tmp_path / 'bags' / 'tiny')
     monkeypatch.chdir(tmp_path)
     for line in TOOL_LINES:
@@ -267,14 +269,14 @@ def test_scripts_that_are_named_exist() -> None:
 
 
 def interface(directions: str) -> dict[str, str]:
-    """Name -> type of topics or services, from the tables of the interface document."""
+    """Types of topics or services by name, from the tables of the interface document."""
     text = (ROOT / 'docs' / 'icd.md').read_text()
     rows = re.findall(rf'^\| (?:{directions}) \| `([^`]+)` \| \[?(\w+/\w+)', text, re.MULTILINE)
     return dict(rows)
 
 
 def check_ros_arguments(words: tuple[str, ...]) -> None:
-    """Remaps are of topics that a node has, parameters are ones it has."""
+    """Remapped topics and parameters exist in the node."""
     names = {field.name for cls in OPTIONS for field in dataclasses.fields(cls)}
     topics = {name.lstrip('/') for name in interface('sub|pub')}
     for before, word in itertools.pairwise(words):

@@ -1,4 +1,4 @@
-"""The whole flow, bag to products, from outside the process and against the truth."""
+"""Bag to products as a separate process, against the truth."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ from starcal_ros.records import Calibration, CameraGeometry, Image
 from starcal_ros.simulation import bag as simulated_bag
 from starcal_ros.simulation import scenario as synthetic
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 TINY = ROOT / 'bags' / 'tiny'
 INDEPENDENT = ROOT.parent / 'shared' / 'independent'
@@ -48,7 +50,7 @@ def starcal(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 def calibrated(made: simulated_bag.SimulatedBag, folder: Path) -> Calibration:
-    """What the tool makes of a bag in this process, where its warnings are errors."""
+    """Calibration of a bag in this process, where warnings are errors."""
     arguments = ['calibrate', str(made.bag), '--params', str(made.params), '-o', str(folder)]
     assert main.main(arguments) == 0
     return read_calibration(folder / 'calibration.json')
@@ -59,7 +61,7 @@ def read_truth(path: Path) -> CameraGeometry:
 
 
 def normalised_error(calibration: Calibration, truth: CameraGeometry) -> tuple[float, int]:
-    """Squared error of all that was estimated in the metric of its covariance, and how many."""
+    """Squared Mahalanobis error of all estimated parameters, and their number."""
     free = [k for k, name in enumerate(PARAMETER_NAMES) if name in calibration.estimated]
     error = np.r_[
         (calibration.geometry.camera.parameters - truth.camera.parameters)[free],
@@ -74,7 +76,7 @@ def normalised_error(calibration: Calibration, truth: CameraGeometry) -> tuple[f
 
 
 def assert_close_to_truth(calibration: Calibration, truth: CameraGeometry) -> None:
-    """Each parameter within 5 of its own sigmas, all of them together within 5 of theirs."""
+    """Assert each parameter within 5 sigma, and the Mahalanobis error within 5 sigma."""
     prior_is_not_asked = calibration.geometry  # the comparison table wants one
     comparison = demo.compare(calibration, truth, prior_is_not_asked)
     assert comparison.worst_sigmas < 5, '\n'.join(comparison.lines)
@@ -170,7 +172,7 @@ def test_the_tiny_bag_is_small_and_says_what_it_is() -> None:
 
 
 def test_bright_stars_of_the_bag_stand_where_truth_and_attitude_say() -> None:
-    """Conventions of bag and truth file by a formula of this test's own, matrix by matrix."""
+    """Conventions of bag and truth file, by an independent formula."""
     truth = json.loads((TINY / 'truth.json').read_text())
     fx, skew, fy, cx, cy = truth['k_true']
     k1, k2, k3, p1, p2 = truth['d_true']
@@ -235,7 +237,7 @@ def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path: Path) -> None:
     bag.write_bytes(whole[: len(whole) * 7 // 10])
     done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count('\n') == 1 and 'cut off' in done.stderr  # said, once
+    assert done.stderr.count('\n') == 1 and 'truncated' in done.stderr  # said, once
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
     assert 3 <= calibration.images_used < 10
     assert_close_to_truth(calibration, read_truth(TINY / 'truth.json'))
@@ -272,6 +274,7 @@ def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_products: Path
 
 
 @needs_interfaces
+@pytest.mark.nodes
 def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path: Path) -> None:
     psutil = pytest.importorskip('psutil')
     command = [sys.executable, '-m', 'starcal_ros.cli.main', 'demo', '-o', str(tmp_path)]

@@ -1,4 +1,4 @@
-"""The Foxglove layout: every panel is placed, and shows fields that the nodes publish."""
+"""The Foxglove layout: every panel is placed and shows published fields."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ KINDS = {
 
 
 def published() -> dict[str, str]:
-    """Topic -> type, from the table of the interface document, which a test holds to the code."""
+    """Types of topics by name, from the table of the interface document."""
     text = (ROOT / 'docs' / 'icd.md').read_text()
     rows = re.findall(r'^\| pub \| `([^`]+)` \| \[?(\w+)/(\w+)', text, re.MULTILINE)
     return {'/' + name.lstrip('/'): f'{package}/msg/{kind}' for name, package, kind in rows}
 
 
 def paths(content: object, key: str = '') -> Iterator[str]:
-    """Every message path that a panel names."""
+    """Message paths of a panel."""
     if isinstance(content, dict):
         for name, value in content.items():
             yield from paths(value, name)

@@ -27,14 +27,14 @@ assert 'rclpy' not in sys.modules
 
 
 def test_no_start_waits_for_scipy_stats() -> None:
-    """Of the second that a node or a calibration needs to start, it would make a third more."""
+    """Importing scipy.stats would make the start, one second, a third longer."""
     show = 'import sys; from starcal_ros.pipeline import observe, solve; print(*sys.modules)'
     done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
     assert 'scipy.special' in done.stdout.split() and 'scipy.stats' not in done.stdout.split()
 
 
 def test_each_module_imports_alone() -> None:
-    """No module needs another to have been imported first; none pulls ROS in."""
+    """No module needs another one imported first, and none imports ROS."""
     names = [m for m in MODULES if not m.startswith('nodes.')]
     done = subprocess.run(
         [sys.executable, '-c', ALONE, *names], capture_output=True, text=True, check=False

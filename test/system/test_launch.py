@@ -1,7 +1,7 @@
 """
-The launch files, by their syntax tree: ROS's launch is not on PyPI, so none can be run here.
+The launch files, by their syntax tree: launch is not on PyPI, so they cannot be run here.
 
-What they would start is run in `test_faults.py` with the arguments that launch_ros gives a node.
+`test_faults.py` starts the same nodes with the arguments of launch_ros.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ def calls(path: Path, name: str) -> list[ast.Call]:
 
 
 def constants(node: ast.AST) -> list[Any]:
-    """Constants anywhere in a piece of the tree."""
+    """Constants in a part of the tree."""
     return [one.value for one in ast.walk(node) if isinstance(one, ast.Constant)]
 
 
 def declared(path: Path) -> set[str]:
-    """Arguments of a launch file that it names in full."""
+    """Declared arguments of a launch file."""
     return {
         str(call.args[0].value)
         for call in calls(path, 'DeclareLaunchArgument')
@@ -52,14 +52,14 @@ def declared(path: Path) -> set[str]:
 
 
 def used(path: Path) -> set[str]:
-    """Arguments that a launch file asks for by name."""
+    """Arguments used in a launch file."""
     found = (call.args[0] for call in calls(path, 'LaunchConfiguration'))
     return {str(argument.value) for argument in found if isinstance(argument, ast.Constant)}
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
 def test_composed_of_launch_alone(path: Path) -> None:
-    """It compiles, imports launch and launch_ros alone, and every argument says what it is."""
+    """It compiles, imports only launch and launch_ros, and describes every argument."""
     compile(path.read_text(), str(path), 'exec')
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):

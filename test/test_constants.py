@@ -1,10 +1,10 @@
-"""Stamps as people read them."""
+"""The text form of a stamp."""
 
 from __future__ import annotations
 
 import pytest
 
-from starcal_ros.utc import utc_text
+from starcal_ros.constants import utc_text
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,231 @@
+"""Records to MCAP bags, without ROS; equal records give equal bytes."""
+
+from __future__ import annotations
+
+from collections import Counter
+import io
+from pathlib import Path
+from types import TracebackType
+from typing import Any, IO, NamedTuple, TYPE_CHECKING
+
+from mcap.writer import CompressionType, Writer
+import yaml
+
+from starcal_ros.arrays import Floats
+from starcal_ros.bag.typestore import described, make_message, typestore
+from starcal_ros.errors import BagError
+from starcal_ros.messages.calibration import calibration_to_message
+from starcal_ros.messages.images import image_to_message
+from starcal_ros.messages.observations import observations_to_message
+from starcal_ros.messages.telemetry import (
+    attitude_to_message,
+    temperature_to_message,
+    velocity_to_message,
+)
+from starcal_ros.messages.types import (
+    ATTITUDE_TYPE,
+    CALIBRATION_TYPE,
+    IMAGE_TYPE,
+    OBSERVATIONS_TYPE,
+    TEMPERATURE_TYPE,
+    VELOCITY_TYPE,
+)
+from starcal_ros.records import Calibration, Image, StarObservations
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+_CHUNK_BYTES = 4 << 20  # an image or two: lost in a crash, and held in memory by a reader
+
+
+class _Channel(NamedTuple):
+    number: int
+    type_name: str
+    latched: bool
+
+
+class BagWriter:
+    """
+    Writes records to a bag folder, or to a single file if the path ends in ``.mcap``.
+
+    Use it in a ``with`` statement: its end completes the bag and writes ``metadata.yaml``.
+
+    Parameters
+    ----------
+    path : Path or str
+        Created if missing; an existing bag is overwritten.
+    compression : {'zstd', 'lz4', ''}
+    """
+
+    def __init__(self, path: Path | str, compression: str = 'zstd') -> None:
+        path = Path(path)
+        is_file = path.suffix == '.mcap'
+        self.file = path if is_file else path / f'{path.name}_0.mcap'
+        self._compression = CompressionType[(compression or 'none').upper()]
+        self._channels: dict[str, _Channel] = {}
+        self._counts: Counter[str] = Counter()
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._stream: IO[bytes] | None = None
+        self._writer: Any = None
+
+    def __enter__(self) -> Self:
+        """Open the file."""
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            self._stream = self.file.open('wb')
+        except OSError as error:
+            raise BagError(f'{self.file}: cannot be written: {error.strerror}') from error
+        self._start(self._stream)
+        return self
+
+    def _start(self, stream: IO[bytes]) -> None:
+        self._writer = Writer(stream, _CHUNK_BYTES, self._compression)
+        self._writer.start('ros2', library='starcal')
+
+    @classmethod
+    def one_observation(cls, topic: str, record: StarObservations, frame_id: str) -> bytes:
+        """Bytes of a complete bag with a single starcal/StarObservations."""
+        stream = io.BytesIO()
+        writer = cls('one.mcap')
+        writer._start(stream)
+        writer.write_observations(topic, record, frame_id)
+        writer._writer.finish()
+        return stream.getvalue()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Complete the file and write metadata.yaml."""
+        assert self._stream is not None  # __enter__ has set it
+        metadata = yaml.safe_dump(self._metadata(), sort_keys=True)
+        try:
+            self._writer.finish()
+            self._stream.close()
+            self.file.with_name('metadata.yaml').write_text(metadata)
+        except OSError as failure:
+            raise BagError(f'{self.file}: cannot be written: {failure.strerror}') from failure
+
+    def write_image(self, topic: str, image: Image, frame_id: str) -> None:
+        """Write a sensor_msgs/Image."""
+        message = image_to_message(image, frame_id, make_message)
+        self._write(topic, IMAGE_TYPE, image.time_ns, message)
+
+    def write_attitude(self, topic: str, time_ns: int, xyzw: Floats, frame_id: str) -> None:
+        """Write a geometry_msgs/QuaternionStamped in the inertial frame ``frame_id``."""
+        message = attitude_to_message(time_ns, xyzw, frame_id, make_message)
+        self._write(topic, ATTITUDE_TYPE, time_ns, message)
+
+    def write_velocity(
+        self, topic: str, time_ns: int, velocity_m_s: Floats, frame_id: str
+    ) -> None:
+        """Write a geometry_msgs/TwistStamped."""
+        message = velocity_to_message(time_ns, velocity_m_s, frame_id, make_message)
+        self._write(topic, VELOCITY_TYPE, time_ns, message)
+
+    def write_temperature(
+        self, topic: str, time_ns: int, temperature_degc: float, frame_id: str
+    ) -> None:
+        """Write a sensor_msgs/Temperature."""
+        message = temperature_to_message(time_ns, temperature_degc, frame_id, make_message)
+        self._write(topic, TEMPERATURE_TYPE, time_ns, message)
+
+    def write_observations(self, topic: str, record: StarObservations, frame_id: str) -> None:
+        """Write a starcal/StarObservations."""
+        message = observations_to_message(record, frame_id, make_message)
+        self._write(topic, OBSERVATIONS_TYPE, record.time_ns, message)
+
+    def write_calibration(self, topic: str, calibration: Calibration) -> None:
+        """Write a starcal/Calibration."""
+        message = calibration_to_message(calibration, make_message)
+        self._write(topic, CALIBRATION_TYPE, calibration.time_ns, message, latched=True)
+
+    def _write(
+        self, topic: str, type_name: str, time_ns: int, message: object, latched: bool = False
+    ) -> None:
+        channel = self._channels.get(topic) or self._open(topic, type_name, latched)
+        if channel.type_name != type_name:
+            raise ValueError(f'topic: {topic} holds {channel.type_name}, not {type_name}')
+        data = bytes(typestore().serialize_cdr(message, type_name))
+        try:
+            self._writer.add_message(
+                channel.number, time_ns, data, publish_time=time_ns, sequence=self._counts[topic]
+            )
+        except OSError as error:
+            raise BagError(f'{self.file}: cannot be written: {error.strerror}') from error
+        self._counts[topic] += 1
+        self._first_ns = time_ns if self._first_ns is None else min(self._first_ns, time_ns)
+        self._last_ns = max(self._last_ns, time_ns)
+
+    def _open(self, topic: str, type_name: str, latched: bool) -> _Channel:
+        definition, type_hash = described(type_name)
+        schema_id = self._writer.register_schema(type_name, 'ros2msg', definition.encode())
+        metadata = {
+            'offered_qos_profiles': yaml.safe_dump([_qos_profile(latched)], sort_keys=False),
+            'topic_type_hash': type_hash,
+        }
+        number = self._writer.register_channel(topic, 'cdr', schema_id, metadata)
+        self._channels[topic] = _Channel(number, type_name, latched)
+        return self._channels[topic]
+
+    def _metadata(self) -> dict[str, object]:
+        """Content of rosbag2's metadata.yaml, version 9."""
+        first_ns = self._first_ns or 0
+
+        def span() -> dict[str, object]:
+            # A new dict for each call: YAML would write a reference to a shared one.
+            return {
+                'starting_time': {'nanoseconds_since_epoch': first_ns},
+                'duration': {'nanoseconds': max(self._last_ns - first_ns, 0)},
+                'message_count': sum(self._counts.values()),
+            }
+
+        topic_list = [
+            {
+                'topic_metadata': {
+                    'name': topic,
+                    'type': channel.type_name,
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': [_qos_profile(channel.latched)],
+                    'type_description_hash': typestore().hash_rihs01(channel.type_name),
+                },
+                'message_count': self._counts[topic],
+            }
+            for topic, channel in self._channels.items()
+        ]
+        return {
+            'rosbag2_bagfile_information': {
+                'version': 9,
+                'storage_identifier': 'mcap',
+                'relative_file_paths': [self.file.name],
+                **span(),
+                'topics_with_message_count': topic_list,
+                'compression_format': '',
+                'compression_mode': '',
+                'files': [{'path': self.file.name, **span()}],
+                'custom_data': None,
+                'ros_distro': 'jazzy',
+            }
+        }
+
+
+def _qos_profile(latched: bool) -> dict[str, object]:
+    """Offered QoS in the notation of rosbag2: reliable, and transient local if latched."""
+
+    def forever() -> dict[str, int]:
+        return {'sec': 9223372036, 'nsec': 854775807}
+
+    return {
+        'history': 'keep_last',
+        'depth': 1 if latched else 10,
+        'reliability': 'reliable',
+        'durability': 'transient_local' if latched else 'volatile',
+        'deadline': forever(),
+        'lifespan': forever(),
+        'liveliness': 'automatic',
+        'liveliness_lease_duration': forever(),
+        'avoid_ros_namespace_conventions': False,
+    }
