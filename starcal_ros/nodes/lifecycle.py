@@ -283,6 +283,7 @@ def until_told_to_end(
     Its own, or 0 after SIGINT or SIGTERM, or 2 after an error, with one line that names it.
     """
     is_up = False
+    interrupt = _Interrupt()
     try:
         rclpy.init(args=None if args is None else [name, *args])
         is_up = True
@@ -296,7 +297,29 @@ def until_told_to_end(
         print(f'{name}: {one_line(error)}', file=sys.stderr)
         return 2
     finally:
+        interrupt.is_over = True
         end()
+
+
+class _Interrupt:
+    """
+    The first SIGINT or SIGTERM raises KeyboardInterrupt in the main thread; later ones do nothing.
+
+    A second one is common: `ros2 launch` sends SIGINT to a node that the terminal, or whoever
+    ended the process group, has sent one already. It must not cut the end of the node short.
+    """
+
+    def __init__(self) -> None:
+        self.is_over = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            # rclpy's handler shuts ROS down and calls the one before it: this.
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, self._on_signal)
+
+    def _on_signal(self, _number: int, _frame: object) -> None:
+        if not self.is_over:
+            self.is_over = True
+            raise KeyboardInterrupt
 
 
 def end_quietly(node: Node | None) -> None:
