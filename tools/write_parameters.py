@@ -14,7 +14,7 @@ FILE = Path(__file__).parents[1] / 'config' / 'starcal.yaml'
 HEAD = """\
 # Every parameter of starcal with its default: copy what you change, what you leave out keeps its
 # default. The nodes and the tool `starcal` read the same file: /** applies to all, the sections
-# below it to one node. A bad value is refused by name.
+# below it to one node, in any namespace. A bad value is refused by name.
 #
 # camera_info_url has no default that works: name your prior camera.
 # Written by tools/write_parameters.py: change the options dataclasses, then run it.
@@ -31,8 +31,8 @@ def parameter_file() -> str:
     """Return the whole file."""
     sections = {
         '/**': (*OPTION_CLASSES, NodeOptions),
-        'star_observer': (ObserverOptions,),
-        'calibrator': (CalibratorOptions,),
+        '/**/star_observer': (ObserverOptions,),
+        '/**/calibrator': (CalibratorOptions,),
     }
     parts = [
         f'{name}:\n  ros__parameters:\n' + '\n'.join(group(options) for options in classes)

@@ -22,7 +22,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 
 from starcal_ros.errors import StarcalError
-from starcal_ros.nodes.parameters import OptionParameters
+from starcal_ros.nodes.parameters import OptionParameters, unread_sections
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import OPTION_CLASSES
 
@@ -264,6 +264,9 @@ def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | N
     def work() -> int:
         nonlocal node
         node = make_node()
+        given = sys.argv if args is None else args
+        for text in unread_sections(given, node.get_fully_qualified_name(), name):
+            node.get_logger().warning(text)
         executor = MultiThreadedExecutor(_THREADS)
         executor.add_node(node)
         if node.options.values()['autostart'] and not _start(node):
