@@ -153,15 +153,16 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
     """
     values: dict[str, object] = {}
     sections = parameter_sections(path)
-    applied = {
-        name: node
+    applied = [
+        name
         for name in sections
-        for node in ('', *nodes)
-        if section_applies(name, f'/{node}')
-    }
+        if any(section_applies(name, f'/{node}') for node in ('', *nodes))
+    ]
+    named = {meant_node(name, nodes) for name in applied}
     for name in sections:
-        if name not in applied:
-            _check_not_meant(path, name, nodes, set(applied.values()))
+        meant = meant_node(name, nodes)
+        if meant and meant not in named:
+            raise OptionError(f'{path}: section {name!r} is not read: write /**/{meant}')
     if not applied:
         there = ', '.join(sections)
         raise OptionError(
@@ -229,10 +230,3 @@ def meant_node(section: str, nodes: Iterable[str]) -> str:
     """The one of the nodes that a section names, or almost names; empty: none of them."""
     last = section.rpartition('/')[2]
     return next(iter(difflib.get_close_matches(last, nodes, 1, _ALMOST)), '')
-
-
-def _check_not_meant(path: Path, section: str, nodes: tuple[str, ...], applied: set[str]) -> None:
-    """Refuse a section that seems meant for a node that has none of its own."""
-    meant = meant_node(section, nodes)
-    if meant and meant not in applied:
-        raise OptionError(f'{path}: section {section!r} is not read: write /**/{meant}')
