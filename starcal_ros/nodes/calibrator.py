@@ -99,14 +99,13 @@ class Calibrator(StarcalNode):
             self._driver = CameraDriver(
                 self, self._own.set_camera_info_service, self._own.set_camera_info_timeout_s
             )
-        listener = self.create_subscription(
+        self.inputs.add(
             ObservationsMessage,
             'observations',
             self.taking(self._on_observations),
             _OBSERVATIONS,
-            callback_group=collecting,
+            group=collecting,
         )
-        self._listeners.append((self.destroy_subscription, listener))
         for kind, name, answer, group in (
             (Trigger, '~/calibrate', self._on_calibrate, solving),
             (Calibrate, '~/solve', self._on_solve, solving),
@@ -130,6 +129,7 @@ class Calibrator(StarcalNode):
         if self._driver is not None:
             self._driver.close()
             self._driver = None
+        self.inputs.close()
         listeners = getattr(self, '_listeners', [])
         while listeners:
             destroy, entity = listeners.pop()

@@ -22,6 +22,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 
 from starcal_ros.errors import StarcalError
+from starcal_ros.nodes.inputs import Inputs
 from starcal_ros.nodes.parameters import OptionParameters, unread_sections
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import OPTION_CLASSES
@@ -46,13 +47,15 @@ class StarcalNode(LifecycleNode):
         for unknown in self.options.unknown():
             self.get_logger().warning(f'{unknown}: not a parameter of starcal')
         self.failure = ''  # why the last transition failed, one line
+        self.inputs = Inputs(self)
+        self._incompatible: list[str] = []  # publishers that are not received
         self._errors = 0
         self._taken: Counter[str] = Counter()
         self._level: bytes | None = None
         self._diagnostics_lock = threading.Lock()
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._diagnostics_timer = self.create_timer(
-            1.0, self.guarded(self.publish_health), callback_group=MutuallyExclusiveCallbackGroup()
+            1.0, self.guarded(self._each_second), callback_group=MutuallyExclusiveCallbackGroup()
         )
         self._answer_invalid_transitions()
         self._answer_invalid_parameters()
@@ -117,6 +120,13 @@ class StarcalNode(LifecycleNode):
         place = f' in {code.co_name}, line {where.tb_lineno}' if code and where else ''
         self.get_logger().error(f'{type(error).__name__}: {one_line(error)}{place}')
 
+    def _each_second(self) -> None:
+        incompatible = self.inputs.incompatible()
+        for text in set(incompatible) - set(self._incompatible):
+            self.get_logger().warning(f'not received: {text}')
+        self._incompatible = incompatible
+        self.publish_health()
+
     def publish_health(self) -> None:
         """Publish the diagnostics now."""
         if not self.context.ok():
@@ -143,6 +153,8 @@ class StarcalNode(LifecycleNode):
     def _health(self) -> Health:
         if self.is_active:
             level, text, numbers = self.health()
+            if self._incompatible and level == OK:
+                level, text = WARN, 'not received: ' + '; '.join(self._incompatible)
         else:
             state = self._state_machine.current_state[1]
             level, text, numbers = WARN, self.failure or f'not active: {state}', {}

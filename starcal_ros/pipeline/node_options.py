@@ -30,9 +30,10 @@ class ObserverOptions:
         choices=('raw', 'compressed'),
     )
     image_reliability: str = option(
-        'reliable',
-        'reliability asked of the image publisher (best_effort loses large images)',
-        choices=('reliable', 'best_effort'),
+        'auto',
+        'reliability asked of the image publisher; auto: best_effort from one that offers no more,'
+        ' else reliable (best_effort loses large images)',
+        choices=('auto', 'reliable', 'best_effort'),
     )
     image_queue: int = option(20, 'images held while the one before is measured', low=1, high=1000)
     attitude_timeout_s: float = option(
