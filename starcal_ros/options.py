@@ -8,6 +8,7 @@ documentation all come from those fields.
 
 from __future__ import annotations
 
+import array
 from collections.abc import Iterable, Mapping
 import dataclasses
 import difflib
@@ -60,6 +61,8 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
         Naming the option, the value and what was expected.
     """
     default, meta = field.default, field.metadata
+    if isinstance(value, array.array):  # a list, as rclpy hands it over
+        value = value.tolist()
 
     def refuse(expected: str) -> OptionError:
         return OptionError(f'{field.name}: {value!r} is not {expected}')
@@ -103,6 +106,11 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
     if of_text:
         return tuple(text(item) for item in items)
     return tuple(float(number(item)) for item in items)
+
+
+def is_of_ros(name: str) -> bool:
+    """Whether a parameter is one that every ROS node has, as ``ros2 param dump`` writes it."""
+    return name in ('use_sim_time', 'start_type_description_service') or '.' in name
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

@@ -61,6 +61,17 @@ class Calibrator(StarcalNode):
         self._driver: CameraDriver | None = None
         self._status_due = threading.Event()
         self._status_thread: threading.Thread | None = None
+        solving, deciding = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
+        sending = MutuallyExclusiveCallbackGroup()
+        # There in every state: a caller of a service that is not there waits for ever.
+        for kind, name, answer, group in (
+            (Trigger, '~/calibrate', self._on_calibrate, solving),
+            (Calibrate, '~/solve', self._on_solve, solving),
+            (Trigger, '~/reset', self._on_reset, deciding),
+            (Trigger, '~/rollback', self._on_rollback, deciding),
+            (Trigger, '~/send_camera_info', self._on_send_camera_info, sending),
+        ):
+            self.create_service(kind, name, self._answered(answer), callback_group=group)
 
     def configure(self) -> None:
         """Load prior camera, options and the state folder, make the latched publishers."""
@@ -93,8 +104,7 @@ class Calibrator(StarcalNode):
     def activate(self) -> None:
         """Start to collect and to answer."""
         self._listeners: list[tuple[Any, Any]] = []
-        collecting, solving = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
-        deciding, sending = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
+        collecting = MutuallyExclusiveCallbackGroup()
         if self._own.set_camera_info_service:
             self._driver = CameraDriver(
                 self, self._own.set_camera_info_service, self._own.set_camera_info_timeout_s
@@ -106,15 +116,6 @@ class Calibrator(StarcalNode):
             _OBSERVATIONS,
             group=collecting,
         )
-        for kind, name, answer, group in (
-            (Trigger, '~/calibrate', self._on_calibrate, solving),
-            (Calibrate, '~/solve', self._on_solve, solving),
-            (Trigger, '~/reset', self._on_reset, deciding),
-            (Trigger, '~/rollback', self._on_rollback, deciding),
-            (Trigger, '~/send_camera_info', self._on_send_camera_info, sending),
-        ):
-            service = self.create_service(kind, name, self._answered(answer), callback_group=group)
-            self._listeners.append((self.destroy_service, service))
         retry = self.create_timer(_RETRY_S, self.guarded(self._save_again), collecting)
         self._listeners.append((self.destroy_timer, retry))
         self._status_due.set()
@@ -294,6 +295,10 @@ class Calibrator(StarcalNode):
         """Return the service callback with errors answered, logged and counted."""
 
         def run_and_tell(request: Any, response: Any) -> Any:
+            if not self.is_active:
+                state = self._state_machine.current_state[1]
+                response.success, response.message = False, f'not active: {state}'
+                return response
             try:
                 response = answer(request, response)
             except Exception as error:

@@ -72,6 +72,11 @@ class Inputs:
             while self._inputs:
                 self._node.destroy_subscription(self._inputs.pop().subscription)
 
+    def names(self) -> list[str]:
+        """Names of the topics on the graph, after remapping."""
+        with self._lock:
+            return sorted(one.subscription.topic_name for one in self._inputs)
+
     def incompatible(self) -> list[str]:
         """
         Adapt to the publishers there are; the topics of which something is not received, and why.

@@ -134,7 +134,7 @@ class StarcalNode(LifecycleNode):
         level, text, numbers = self._health()
         status = DiagnosticStatus(
             level=level,
-            name=f'starcal: {self.get_name()}',
+            name=f'starcal: {self.get_fully_qualified_name()[1:]}',
             message=text,
             hardware_id=self.get_fully_qualified_name(),
             values=[KeyValue(key=key, value=str(value)) for key, value in numbers.items()],
@@ -172,7 +172,10 @@ class StarcalNode(LifecycleNode):
         """Configure; a bad parameter or file leaves the node unconfigured."""
         self.options.frozen = True
         outcome = self._transition(self.configure, state, super().on_configure)
-        if outcome != TransitionCallbackReturn.SUCCESS:
+        if outcome == TransitionCallbackReturn.SUCCESS:
+            camera = self.options.values()['camera_info_url']
+            self.get_logger().info(f'configured, prior camera {camera}')
+        else:
             self.options.frozen = False
         return outcome
 
@@ -183,6 +186,8 @@ class StarcalNode(LifecycleNode):
         if outcome == TransitionCallbackReturn.FAILURE:
             self.deactivate()
             super().on_deactivate(state)
+        elif outcome == TransitionCallbackReturn.SUCCESS:
+            self.get_logger().info(f'active, listening to {", ".join(self.inputs.names())}')
         return outcome
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:

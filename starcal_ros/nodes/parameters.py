@@ -20,7 +20,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from starcal_ros.errors import OptionError
-from starcal_ros.options import check_value, meant_node, parameter_sections, section_applies
+from starcal_ros.options import (
+    check_value,
+    is_of_ros,
+    meant_node,
+    parameter_sections,
+    section_applies,
+)
 
 
 class OptionParameters:
@@ -61,11 +67,7 @@ class OptionParameters:
     def unknown(self) -> list[str]:
         """Names given at start that no option has: ROS itself passes over a misspelt one."""
         given = getattr(self._node, '_parameter_overrides', {})  # rclpy tells it nowhere else
-        return sorted(
-            name
-            for name in given
-            if name not in self._fields and name != 'use_sim_time' and '.' not in name
-        )
+        return sorted(name for name in given if name not in self._fields and not is_of_ros(name))
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:

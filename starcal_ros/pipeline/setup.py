@@ -27,6 +27,7 @@ from starcal_ros.image.hot_pixels import (
 from starcal_ros.options import (
     from_mapping,
     holds_options,
+    is_of_ros,
     names_of,
     nearest,
     option,
@@ -54,7 +55,7 @@ class SetupOptions:
         length=4,
     )
     star_tracker_frame: str = option('star_tracker', 'name of the star tracker frame')
-    camera_frame: str = option('camera', 'name of the camera optical frame')
+    camera_frame: str = option('camera_optical_frame', 'name of the camera optical frame')
     catalog: str = option('', 'star catalog file; empty: the bundled one')
     dark_frame: str = option(
         '', "dark frame, a PNG or TIFF of the camera's size and depth, subtracted; empty: none"
@@ -110,7 +111,7 @@ def load_setup(values: Mapping[str, object], others: Sequence[type] = ()) -> Set
     """
     known = names_of(*OPTION_CLASSES, *others)
     for name in values:
-        if name not in known and name != 'use_sim_time':
+        if name not in known and not is_of_ros(name):
             raise OptionError(f'{name}: no such parameter{nearest(name, known)}')
     frames = from_mapping(SetupOptions, values)
     prior = _prior(frames)
