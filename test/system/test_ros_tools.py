@@ -25,6 +25,9 @@ pytestmark = [pytest.mark.nodes, pytest.mark.timeout(600)]  # tens of processes 
 ROOT = Path(__file__).parents[2]
 FAST, CYCLONE = 'rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp'
 TRIGGER = 'std_srvs/srv/Trigger'
+STATUS = 'starcal/msg/EnsembleStatus'
+# With the type, so that no daemon is asked, which has the keys of whoever started it.
+ECHO = ('topic', 'echo', '--once', '--qos-durability', 'transient_local')
 Make = Callable[..., RosTools]
 
 
@@ -67,6 +70,8 @@ def test_launch_replay_calibrate_and_record(
     ros2: RosTools, tiny_bag: Path, tmp_path: Path
 ) -> None:
     """The sequence of the README with every launch argument, ended as a terminal ends it."""
+    if 'record' not in ros2.run('bag', '--help').stdout:
+        pytest.skip('ros2 bag record does not load here')
     recorded = tmp_path / 'recorded'
     launch = ros2.start(
         *('launch', 'starcal', 'starcal.launch.py', f'params:={tiny_bag}/params.yaml'),
@@ -83,7 +88,7 @@ def test_launch_replay_calibrate_and_record(
     played = ros2.run('bag', 'play', tiny_bag, '--delay', '3')
     assert played.returncode == 0, played.stderr
     images = 'images: 10\n'
-    ros2.until(images, 'topic', 'echo', '--once', '/opnav/ensemble_status')
+    ros2.until(images, *ECHO, '/opnav/ensemble_status', STATUS)
     answer = ros2.run('service', 'call', '/opnav/calibrator/calibrate', TRIGGER)
     assert 'success=True' in answer.stdout, answer.stdout + launch.said()
     static = ros2.run('topic', 'echo', '--once', '/tf_static', 'tf2_msgs/msg/TFMessage')
@@ -115,7 +120,7 @@ def test_replay_launch(make: Make, tiny_bag: Path) -> None:
         *('rate:=0.0', 'loop:=false', 'image:=/opnav/image_raw'),
         'attitude:=/star_tracker/attitude',
     )
-    ros2.until('images: 10\n', 'topic', 'echo', '--once', '/ensemble_status')
+    ros2.until('images: 10\n', *ECHO, '/ensemble_status', STATUS)
     launch.interrupt()
     assert 'process has died' not in launch.said(), launch.said()
     row(FAST, 'launch', 'ros2 launch starcal replay.launch.py', '10 images')
@@ -202,7 +207,7 @@ def test_policies_are_enforced(make: Make, tiny_bag: Path, tmp_path: Path) -> No
     bag = ('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0', *remaps)
     player = nodes.start_node('bag_player', '--enclave', '/bag_player', *bag)
     assert player.wait() == 0, player.said()
-    operator.until('images: 10\n', 'topic', 'echo', '--once', '/ensemble_status')
+    operator.until('images: 10\n', *ECHO, '/ensemble_status', STATUS)
     answer = operator.run('service', 'call', '/calibrator/calibrate', TRIGGER)
     assert 'success=True' in answer.stdout, answer.stdout + calibrator.said()
     row(CYCLONE, 'sros2', 'ros2 security create_permission', 'nodes work under enforcement')
@@ -211,7 +216,7 @@ def test_policies_are_enforced(make: Make, tiny_bag: Path, tmp_path: Path) -> No
     assert 'calibrator' not in listed and 'star_observer' not in listed
     with pytest.raises(subprocess.TimeoutExpired):
         outsider.run('service', 'call', '/calibrator/reset', TRIGGER, timeout_s=15.0)
-    assert 'images: 10\n' in done(operator.run('topic', 'echo', '--once', '/ensemble_status'))
+    assert 'images: 10\n' in done(operator.run(*ECHO, '/ensemble_status', STATUS))
     row(CYCLONE, 'sros2', 'ros2 node list, service call from outside', 'sees and calls nothing')
 
     denied = nodes.start_node('calibrator', '--enclave', '/bag_player', *params)
