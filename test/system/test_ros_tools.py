@@ -27,7 +27,8 @@ FAST, CYCLONE = 'rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp'
 TRIGGER = 'std_srvs/srv/Trigger'
 STATUS = 'starcal/msg/EnsembleStatus'
 # With the type, so that no daemon is asked, which has the keys of whoever started it.
-ECHO = ('topic', 'echo', '--once', '--qos-durability', 'transient_local')
+LATCHED = ('--qos-durability', 'transient_local', '--qos-reliability', 'reliable')
+ECHO = ('topic', 'echo', '--once', *LATCHED)
 Make = Callable[..., RosTools]
 
 
