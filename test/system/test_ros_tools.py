@@ -16,7 +16,7 @@ import yaml
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
-from ros_tools import find_tools, RosTools
+from ros_tools import find_tools, RosTools  # type: ignore[import-not-found]
 
 from starcal_ros.bag import reader
 
@@ -34,7 +34,8 @@ Make = Callable[..., RosTools]
 
 @pytest.fixture(scope='module')
 def tools(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return find_tools(tmp_path_factory.mktemp('ros2tools'))
+    found: Path = find_tools(tmp_path_factory.mktemp('ros2tools'))
+    return found
 
 
 @pytest.fixture
@@ -64,7 +65,7 @@ def row(rmw: str, tool: str, command: str, outcome: str) -> None:
 
 
 def middleware(ros2: RosTools) -> str:
-    return ros2.environment['RMW_IMPLEMENTATION']
+    return str(ros2.environment['RMW_IMPLEMENTATION'])
 
 
 def test_launch_replay_calibrate_and_record(
