@@ -1,8 +1,10 @@
 # make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, test, bench, lint, docs.
 # make test TESTS='-m nodes' runs a part: what follows is handed to pytest. The whole is two runs:
-# tests that start nodes have the machine to themselves.
+# tests that start nodes have the machine to themselves. VERSIONS=oldest: with the oldest versions of
+# the Python packages that starcal is tested on, in an environment of their own; no linters there.
 ROS_DISTRO ?= jazzy
-VENV := $(if $(filter jazzy,$(ROS_DISTRO)),.venv,.venv-$(ROS_DISTRO))
+VERSIONS ?= newest
+VENV := .venv$(filter-out -jazzy,-$(ROS_DISTRO))$(filter-out -newest,-$(VERSIONS))
 # An environment keeps the interpreter it was made with unless another is asked for.
 PYTHON ?= $(or $(wildcard $(VENV)/bin/python),python3)
 RUN := $(VENV)/bin
@@ -10,7 +12,7 @@ RUN := $(VENV)/bin
 .PHONY: setup demo test bench lint docs help
 
 setup:
-	@$(PYTHON) tools/make_venv.py $(VENV) --ros $(ROS_DISTRO)
+	@$(PYTHON) tools/make_venv.py $(VENV) --ros $(ROS_DISTRO) --versions $(VERSIONS)
 
 demo: setup
 	$(RUN)/starcal demo

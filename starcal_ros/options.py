@@ -7,6 +7,7 @@ parameter file and the documentation are generated from the fields made with `op
 
 from __future__ import annotations
 
+import array
 from collections.abc import Iterable, Mapping
 import dataclasses
 import difflib
@@ -20,6 +21,7 @@ from starcal_ros.errors import OptionError
 
 OptionValue = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 OptionsT = TypeVar('OptionsT')
+_ALMOST = 0.85  # similarity of names from which one is taken for the other, misspelt
 
 
 def option(
@@ -58,6 +60,8 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
         With the option, the value and the expected type or range.
     """
     default, meta = field.default, field.metadata
+    if isinstance(value, array.array):  # a list, as rclpy hands it over
+        value = value.tolist()
 
     def refuse(expected: str) -> OptionError:
         return OptionError(f'{field.name}: {value!r} is not {expected}')
@@ -103,6 +107,11 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
     return tuple(float(number(item)) for item in items)
 
 
+def is_of_ros(name: str) -> bool:
+    """Whether a parameter is one that every ROS node has, as ``ros2 param dump`` writes it."""
+    return name in ('use_sim_time', 'start_type_description_service') or '.' in name
+
+
 def nearest(word: str, known: Iterable[str]) -> str:
     """Suggestion for an unknown word, to append to an error message; '' without a close match."""
     near = difflib.get_close_matches(word, known, 1)
@@ -140,8 +149,44 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
     """
     Parameters of a ROS 2 parameter file that apply to any of the named nodes.
 
-    Sections apply as in ROS: ``/**`` to all nodes, a node name to that node; later sections
-    override earlier ones.
+    Sections apply as in ROS: ``/**`` to all, then a node's own name, in any namespace that it is
+    given with a wildcard or not at all, later ones winning.
+
+    Raises
+    ------
+    OptionError
+        When the file cannot be read or is not a ROS parameter file, or has a section that seems
+        meant for one of the nodes and applies to none.
+    """
+    values: dict[str, object] = {}
+    sections = parameter_sections(path)
+    applied = [
+        name
+        for name in sections
+        if any(section_applies(name, f'/{node}') for node in ('', *nodes))
+    ]
+    named = {meant_node(name, nodes) for name in applied}
+    for name in sections:
+        meant = meant_node(name, nodes)
+        if meant and meant not in named:
+            raise OptionError(f'{path}: section {name!r} is not read: write /**/{meant}')
+    if not applied:
+        there = ', '.join(sections)
+        raise OptionError(
+            f'{path}: not a parameter file for this: no section /**, {" or ".join(nodes)}, '
+            f'only {there[:80]}'
+        )
+    for name in applied:
+        body = sections[name]
+        if not isinstance(body, dict) or not isinstance(body.get('ros__parameters'), dict):
+            raise OptionError(f'{path}: section {name!r} has no ros__parameters')
+        values.update(body['ros__parameters'])
+    return values
+
+
+def parameter_sections(path: Path) -> dict[str, object]:
+    """
+    Content of a ROS 2 parameter file by section: the full name of a node, or a pattern of it.
 
     Raises
     ------
@@ -158,18 +203,37 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
         line = str(error).replace('\n', ' ')
         raise OptionError(f'{path}: not YAML: {line}') from error
     if not isinstance(content, dict):
-        raise OptionError(f'{path}: not a ROS parameter file: it has no node sections')
-    values: dict[str, object] = {}
-    known = {'/**', *nodes, *('/' + n for n in nodes), *('/**/' + n for n in nodes)}
-    if not known & content.keys():
-        there = ', '.join(map(str, content))
-        raise OptionError(
-            f'{path}: no section for /**, {" or ".join(nodes)}; the file has only {there[:80]}'
-        )
-    for section, body in content.items():
-        if section not in known:
-            continue
-        if not isinstance(body, dict) or not isinstance(body.get('ros__parameters'), dict):
-            raise OptionError(f'{path}: section {section!r} has no ros__parameters')
-        values.update(body['ros__parameters'])
-    return values
+        raise OptionError(f'{path}: not a ROS parameter file (no node sections)')
+    return _flat(content, '')
+
+
+def _flat(content: dict[object, object], namespace: str) -> dict[str, object]:
+    """Sections of a file; ROS lets the namespaces of a node enclose it, level by level."""
+    sections: dict[str, object] = {}
+    for key, body in content.items():
+        name = f'{namespace}/{key}' if namespace else str(key)
+        inside = body.values() if isinstance(body, dict) and 'ros__parameters' not in body else ()
+        if inside and all(isinstance(one, dict) for one in inside):
+            sections |= _flat(body, name)  # type: ignore[arg-type]
+        else:
+            sections[name] = body
+    return sections
+
+
+def section_applies(section: str, node: str) -> bool:
+    """Whether rcl gives a section to a node, ``/namespace/name``: * is one part, ** any number."""
+    return _parts_match(section.lstrip('/').split('/'), node.lstrip('/').split('/'))
+
+
+def _parts_match(pattern: list[str], parts: list[str]) -> bool:
+    if not pattern or not parts:
+        return not parts and all(one == '**' for one in pattern)
+    if pattern[0] == '**':
+        return _parts_match(pattern[1:], parts) or _parts_match(pattern, parts[1:])
+    return pattern[0] in ('*', parts[0]) and _parts_match(pattern[1:], parts[1:])
+
+
+def meant_node(section: str, nodes: Iterable[str]) -> str:
+    """The one of the nodes that a section names, or almost names; empty: none of them."""
+    last = section.rpartition('/')[2]
+    return next(iter(difflib.get_close_matches(last, nodes, 1, _ALMOST)), '')

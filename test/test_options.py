@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 
 from starcal_ros.errors import OptionError
-from starcal_ros.options import from_mapping, names_of, option, read_parameter_file
+from starcal_ros.options import (
+    from_mapping,
+    names_of,
+    option,
+    parameter_sections,
+    read_parameter_file,
+    section_applies,
+)
 from starcal_ros.pipeline.setup import OPTION_CLASSES
 
 
@@ -143,6 +150,52 @@ def test_the_later_section_wins_as_in_ros(tmp_path: Path) -> None:
         tmp_path, 'foo:\n  ros__parameters: {a: 1}\n/**:\n  ros__parameters: {a: 2}\n'
     )
     assert read_parameter_file(path, ('foo',)) == {'a': 2}
+
+
+def test_namespaces_may_enclose_a_node(tmp_path: Path) -> None:
+    """As rcl reads them: a level of the file for each part of the name."""
+    text = """
+space:
+  observer:
+    ros__parameters: {a: 1}
+  "**":
+    calibrator: {ros__parameters: {b: 2}}
+"""
+    path = parameter_file(tmp_path, text)
+    assert set(parameter_sections(path)) == {'space/observer', 'space/**/calibrator'}
+
+
+@pytest.mark.parametrize(
+    ('section', 'node', 'applies'),
+    [
+        ('calibrator', '/calibrator', True),
+        ('calibrator', '/space/calibrator', False),
+        ('/**/calibrator', '/calibrator', True),
+        ('/**/calibrator', '/space/west/calibrator', True),
+        ('/*/calibrator', '/space/calibrator', True),
+        ('/*/calibrator', '/calibrator', False),
+        ('/space/**', '/space/west/calibrator', True),
+        ('/space/**', '/ground/calibrator', False),
+        ('space/calibrator', '/space/calibrator', True),
+        ('/**', '/space/calibrator', True),
+        ('/**/observer', '/space/calibrator', False),
+    ],
+)
+def test_a_section_applies_as_in_rcl(section: str, node: str, applies: bool) -> None:
+    assert section_applies(section, node) is applies
+
+
+@pytest.mark.parametrize('section', ['/space/calibrator', 'calibratr', 'space/calibrator'])
+def test_a_section_that_nobody_reads_is_refused(tmp_path: Path, section: str) -> None:
+    """It was passed over without a word, and the node kept its defaults."""
+    path = parameter_file(
+        tmp_path,
+        f'/**:\n  ros__parameters: {{a: 1}}\n{section}:\n  ros__parameters: {{b: 2}}\n'
+        'camera_calibrator:\n  ros__parameters: {c: 3}\n',
+    )
+    with pytest.raises(OptionError, match=r"'.*cal.*' is not read: write /\*\*/calibrator"):
+        read_parameter_file(path, ('observer', 'calibrator'))
+    assert read_parameter_file(path, ('observer',)) == {'a': 1}
 
 
 @pytest.mark.parametrize(

@@ -32,9 +32,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description='Make the environment that starcal runs in.')
     parser.add_argument('venv', type=Path, help='folder of the environment')
     parser.add_argument('--ros', default='jazzy', metavar='DISTRO', help='ROS 2 distribution')
+    parser.add_argument(
+        '--versions',
+        choices=('newest', 'oldest'),
+        default='newest',
+        help='of Python packages: requirements/oldest.txt has those of Ubuntu 24.04',
+    )
     args = parser.parse_args()
     venv = args.venv.absolute()
-    requirements = [ROOT / 'requirements' / f'{name}.txt' for name in ('runtime', 'dev', args.ros)]
+    packages = ('oldest',) if args.versions == 'oldest' else ('runtime', 'dev')
+    names = (*packages, 'colcon', args.ros)
+    requirements = [ROOT / 'requirements' / f'{name}.txt' for name in names]
     check_request(args.ros, requirements[-1])
 
     # The interfaces are generated and compiled by the wheels: new wheels, new interfaces.
@@ -63,7 +71,7 @@ def check_request(distro: str, distro_requirements: Path) -> None:
             f'{sys.executable} is Python {sys.version_info[0]}.{sys.version_info[1]}; '
             'starcal needs 3.10 to 3.13: make setup PYTHON=python3.12'
         )
-    if distro in ('dev', 'runtime') or not distro_requirements.exists():
+    if distro not in ('jazzy', 'kilted') or not distro_requirements.exists():
         sys.exit(f'ROS_DISTRO={distro}: starcal is built for jazzy and kilted')
 
 
@@ -163,6 +171,8 @@ def point_cmake_files_here(venv: Path) -> None:
         old = path.read_text()
         new = re.sub(f'{built_with}/include/python[0-9.]+', sysconfig.get_path('include'), old)
         new = re.sub(f'{built_with}/lib/python[0-9.]+/site-packages', f'{packages_of(venv)}', new)
+        if not (packages_of(venv) / 'numpy/_core/include').exists():  # numpy 1
+            new = new.replace('numpy/_core/include', 'numpy/core/include')
         if new != old:
             path.write_text(new)
 

@@ -34,6 +34,9 @@ from starcal_ros.messages.types import (
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, AttitudeOptions
 
+_SQLITE, _ROS_1 = b'SQLite format 3', b'#ROSBAG V'  # how bags of other kinds begin
+_MAGIC_BYTES = 16
+
 
 @functools.lru_cache(maxsize=256)
 def log_damage(text: str) -> None:
@@ -70,11 +73,11 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
     for file in files:
         try:
             with file.open('rb') as stream:
-                magic = stream.read(len(MAGIC))
+                magic = stream.read(_MAGIC_BYTES)
         except OSError as error:
             raise BagError(f'{file}: cannot be read: {error.strerror}') from error
-        if magic != MAGIC:
-            raise BagError(f'{file}: not an MCAP bag')
+        if not magic.startswith(MAGIC):
+            raise BagError(f'{file}: not an MCAP bag{_how_to_convert(file, magic)}')
     return files
 
 
@@ -262,9 +265,7 @@ def _files_of_folder(folder: Path) -> list[Path]:
     listed = [folder / name for name in names if (folder / name).is_file()]
     found = listed or sorted(folder.glob('*.mcap'), key=_natural)
     if not found:
-        other = (
-            ' (SQLite bag: convert it with ros2 bag convert)' if any(folder.glob('*.db3')) else ''
-        )
+        other = _how_to_convert(folder, _SQLITE) if any(folder.glob('*.db3')) else ''
         inside = next(folder.glob('*/*.mcap'), None)
         near = f' (did you mean {inside.parent}?)' if inside and not other else ''
         raise BagError(f'{folder}: no .mcap files in the folder{other}{near}')
@@ -272,6 +273,22 @@ def _files_of_folder(folder: Path) -> list[Path]:
     if missing and listed:
         raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing')
     return found
+
+
+def _how_to_convert(path: Path, magic: bytes) -> str:
+    """How to make an MCAP bag of a bag of another kind, as the end of a complaint."""
+    if magic.startswith(_SQLITE):
+        # rosbags converts the folder with its metadata.yaml, not the file in it.
+        kind, source = 'an SQLite bag', path.parent if path.suffix == '.db3' else path
+    elif magic.startswith(_ROS_1):
+        kind, source = 'a ROS 1 bag', path
+    else:
+        return ''
+    destination = source.with_name(f'{source.stem}_mcap')
+    return (
+        f' but {kind}: rosbags-convert --src {source} --dst {destination} --dst-storage mcap'
+        ' makes one'
+    )
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -843,7 +843,10 @@ def _freedom(
             unknowns += 3 * int(np.count_nonzero(seen))
         else:
             T = np.diag(tracker_sigma_rad**2)
-            unknowns += float(np.trace(np.linalg.solve(T + P[seen], T), axis1=1, axis2=2).sum())
+            total = T + P[seen]
+            # numpy 1 reads a single matrix beside a stack of them as a stack of vectors.
+            held = np.linalg.solve(total, np.broadcast_to(T, total.shape))
+            unknowns += float(np.trace(held, axis1=1, axis2=2).sum())
     share = 1.0 - unknowns / (2 * max(int(np.count_nonzero(kept)), 1))
     if share <= 0:
         raise NotObservable('fewer residuals than unknowns')

@@ -61,6 +61,17 @@ class Calibrator(StarcalNode):
         self._driver: CameraDriver | None = None
         self._status_due = threading.Event()
         self._status_thread: threading.Thread | None = None
+        solving, deciding = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
+        sending = MutuallyExclusiveCallbackGroup()
+        # There in every state: a caller of a service that is not there waits for ever.
+        for kind, name, answer, group in (
+            (Trigger, '~/calibrate', self._on_calibrate, solving),
+            (Calibrate, '~/solve', self._on_solve, solving),
+            (Trigger, '~/reset', self._on_reset, deciding),
+            (Trigger, '~/rollback', self._on_rollback, deciding),
+            (Trigger, '~/send_camera_info', self._on_send_camera_info, sending),
+        ):
+            self.create_service(kind, name, self._answered(answer), callback_group=group)
 
     def configure(self) -> None:
         """Load the prior camera, options and state folder, create the latched publishers."""
@@ -93,29 +104,18 @@ class Calibrator(StarcalNode):
     def activate(self) -> None:
         """Start to collect observations and to serve requests."""
         self._listeners: list[tuple[Any, Any]] = []
-        collecting, solving = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
-        deciding, sending = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
+        collecting = MutuallyExclusiveCallbackGroup()
         if self._own.set_camera_info_service:
             self._driver = CameraDriver(
                 self, self._own.set_camera_info_service, self._own.set_camera_info_timeout_s
             )
-        listener = self.create_subscription(
+        self.inputs.add(
             ObservationsMessage,
             'observations',
             self.taking(self._on_observations),
             _OBSERVATIONS,
-            callback_group=collecting,
+            group=collecting,
         )
-        self._listeners.append((self.destroy_subscription, listener))
-        for kind, name, answer, group in (
-            (Trigger, '~/calibrate', self._on_calibrate, solving),
-            (Calibrate, '~/solve', self._on_solve, solving),
-            (Trigger, '~/reset', self._on_reset, deciding),
-            (Trigger, '~/rollback', self._on_rollback, deciding),
-            (Trigger, '~/send_camera_info', self._on_send_camera_info, sending),
-        ):
-            service = self.create_service(kind, name, self._answered(answer), callback_group=group)
-            self._listeners.append((self.destroy_service, service))
         retry = self.create_timer(_RETRY_S, self.guarded(self._save_again), collecting)
         self._listeners.append((self.destroy_timer, retry))
         self._status_due.set()
@@ -130,6 +130,7 @@ class Calibrator(StarcalNode):
         if self._driver is not None:
             self._driver.close()
             self._driver = None
+        self.inputs.close()
         listeners = getattr(self, '_listeners', [])
         while listeners:
             destroy, entity = listeners.pop()
@@ -296,6 +297,10 @@ class Calibrator(StarcalNode):
         """Return the service callback wrapped so that errors are answered, logged and counted."""
 
         def run_and_tell(request: Any, response: Any) -> Any:
+            if not self.is_active:
+                state = self._state_machine.current_state[1]
+                response.success, response.message = False, f'not active: {state}'
+                return response
             try:
                 response = answer(request, response)
             except Exception as error:

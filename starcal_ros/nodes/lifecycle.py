@@ -22,7 +22,8 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 
 from starcal_ros.errors import StarcalError
-from starcal_ros.nodes.parameters import OptionParameters
+from starcal_ros.nodes.inputs import Inputs
+from starcal_ros.nodes.parameters import OptionParameters, unread_sections
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import OPTION_CLASSES
 
@@ -45,14 +46,16 @@ class StarcalNode(LifecycleNode):
         self.options = OptionParameters(self, (*OPTION_CLASSES, *NODE_OPTION_CLASSES))
         for unknown in self.options.unknown():
             self.get_logger().warning(f'{unknown}: not a parameter of starcal')
-        self.failure = ''  # one-line reason of the last failed transition
+        self.failure = ''  # why the last transition failed, one line
+        self.inputs = Inputs(self)
+        self._incompatible: list[str] = []  # publishers that are not received
         self._errors = 0
         self._taken: Counter[str] = Counter()
         self._level: bytes | None = None
         self._diagnostics_lock = threading.Lock()
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._diagnostics_timer = self.create_timer(
-            1.0, self.guarded(self.publish_health), callback_group=MutuallyExclusiveCallbackGroup()
+            1.0, self.guarded(self._each_second), callback_group=MutuallyExclusiveCallbackGroup()
         )
         self._answer_invalid_transitions()
         self._answer_invalid_parameters()
@@ -117,6 +120,13 @@ class StarcalNode(LifecycleNode):
         place = f' in {code.co_name}, line {where.tb_lineno}' if code and where else ''
         self.get_logger().error(f'{type(error).__name__}: {one_line(error)}{place}')
 
+    def _each_second(self) -> None:
+        incompatible = self.inputs.incompatible()
+        for text in set(incompatible) - set(self._incompatible):
+            self.get_logger().warning(f'not received: {text}')
+        self._incompatible = incompatible
+        self.publish_health()
+
     def publish_health(self) -> None:
         """Publish the diagnostics now."""
         if not self.context.ok():
@@ -124,7 +134,7 @@ class StarcalNode(LifecycleNode):
         level, text, numbers = self._health()
         status = DiagnosticStatus(
             level=level,
-            name=f'starcal: {self.get_name()}',
+            name=f'starcal: {self.get_fully_qualified_name()[1:]}',
             message=text,
             hardware_id=self.get_fully_qualified_name(),
             values=[KeyValue(key=key, value=str(value)) for key, value in numbers.items()],
@@ -143,6 +153,8 @@ class StarcalNode(LifecycleNode):
     def _health(self) -> Health:
         if self.is_active:
             level, text, numbers = self.health()
+            if self._incompatible and level == OK:
+                level, text = WARN, 'not received: ' + '; '.join(self._incompatible)
         else:
             state = self._state_machine.current_state[1]
             level, text, numbers = WARN, self.failure or f'not active: {state}', {}
@@ -160,7 +172,10 @@ class StarcalNode(LifecycleNode):
         """Configure; with a bad parameter or file the node stays unconfigured."""
         self.options.frozen = True
         outcome = self._transition(self.configure, state, super().on_configure)
-        if outcome != TransitionCallbackReturn.SUCCESS:
+        if outcome == TransitionCallbackReturn.SUCCESS:
+            camera = self.options.values()['camera_info_url']
+            self.get_logger().info(f'configured, prior camera {camera}')
+        else:
             self.options.frozen = False
         return outcome
 
@@ -171,6 +186,8 @@ class StarcalNode(LifecycleNode):
         if outcome == TransitionCallbackReturn.FAILURE:
             self.deactivate()
             super().on_deactivate(state)
+        elif outcome == TransitionCallbackReturn.SUCCESS:
+            self.get_logger().info(f'active, listening to {", ".join(self.inputs.names())}')
         return outcome
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -264,6 +281,9 @@ def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | N
     def work() -> int:
         nonlocal node
         node = make_node()
+        given = sys.argv if args is None else args
+        for text in unread_sections(given, node.get_fully_qualified_name(), name):
+            node.get_logger().warning(text)
         executor = MultiThreadedExecutor(_THREADS)
         executor.add_node(node)
         if node.options.values()['autostart'] and not _start(node):
@@ -284,6 +304,7 @@ def until_told_to_end(
     error.
     """
     is_up = False
+    interrupt = _Interrupt()
     try:
         rclpy.init(args=None if args is None else [name, *args])
         is_up = True
@@ -297,7 +318,29 @@ def until_told_to_end(
         print(f'{name}: {one_line(error)}', file=sys.stderr)
         return 2
     finally:
+        interrupt.is_over = True
         end()
+
+
+class _Interrupt:
+    """
+    The first SIGINT or SIGTERM raises KeyboardInterrupt in the main thread; later ones do nothing.
+
+    A second one is common: `ros2 launch` sends SIGINT to a node that the terminal, or whoever
+    ended the process group, has sent one already. It must not cut the end of the node short.
+    """
+
+    def __init__(self) -> None:
+        self.is_over = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            # rclpy's handler shuts ROS down and calls the one before it: this.
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, self._on_signal)
+
+    def _on_signal(self, _number: int, _frame: object) -> None:
+        if not self.is_over:
+            self.is_over = True
+            raise KeyboardInterrupt
 
 
 def end_quietly(node: Node | None) -> None:

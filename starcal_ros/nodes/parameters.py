@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import dataclasses
+import itertools
+from pathlib import Path
 import sys
 from typing import Any
 
@@ -18,7 +20,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from starcal_ros.errors import OptionError
-from starcal_ros.options import check_value
+from starcal_ros.options import (
+    check_value,
+    is_of_ros,
+    meant_node,
+    parameter_sections,
+    section_applies,
+)
 
 
 class OptionParameters:
@@ -57,13 +65,9 @@ class OptionParameters:
         }
 
     def unknown(self) -> list[str]:
-        """Return the parameters given at start that match no option; ROS ignores them silently."""
-        given = getattr(self._node, '_parameter_overrides', {})  # no public API
-        return sorted(
-            name
-            for name in given
-            if name not in self._fields and name != 'use_sim_time' and '.' not in name
-        )
+        """Names given at start that no option has: ROS itself passes over a misspelt one."""
+        given = getattr(self._node, '_parameter_overrides', {})  # rclpy tells it nowhere else
+        return sorted(name for name in given if name not in self._fields and not is_of_ros(name))
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:
@@ -78,6 +82,33 @@ class OptionParameters:
             except OptionError as error:
                 return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
+
+
+def unread_sections(arguments: Sequence[str], node: str, executable: str) -> list[str]:
+    """
+    One warning for each section of a parameter file that rcl passes over without a word.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        The command line; files follow ``--params-file``.
+    node : str
+        Name of the node with its namespace.
+    executable : str
+        The name that the node has where nobody gives it another.
+    """
+    own = {executable, node.rpartition('/')[2]}
+    warnings = []
+    for flag, file in itertools.pairwise(arguments):
+        sections = parameter_sections(Path(file)) if flag == '--params-file' else {}
+        meant = [name for name in sections if meant_node(name, own)]
+        if any(section_applies(name, node) for name in meant):
+            continue  # the others are those of the same node in other namespaces
+        warnings += [
+            f'{file}: section {name!r} does not apply to {node}: write /**/{executable}'
+            for name in meant
+        ]
+    return warnings
 
 
 def _as_parameter(default: Any) -> Any:

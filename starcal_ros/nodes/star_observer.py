@@ -12,7 +12,6 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import QuaternionStamped, TwistStamped
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Temperature
 from sensor_msgs.msg import Image as ImageMessage
@@ -31,6 +30,7 @@ from starcal_ros.messages.telemetry import (
     velocity_from_message,
 )
 from starcal_ros.nodes.image_queue import ImageQueue, Waiting
+from starcal_ros.nodes.inputs import with_reliability
 from starcal_ros.nodes.lifecycle import Health, OK, run, StarcalNode, WARN
 from starcal_ros.nodes.message_factory import make_message
 from starcal_ros.nodes.sliding_window import Recent
@@ -65,7 +65,6 @@ class StarObserver(StarcalNode):
 
     def __init__(self) -> None:
         super().__init__(NAME)
-        self._listeners: list[Any] = []
         self._publishers_made: list[Any] = []
         self._worker: threading.Thread | None = None
         self._queue: ImageQueue | None = None
@@ -112,28 +111,21 @@ class StarObserver(StarcalNode):
         )
         self._worker = threading.Thread(target=self._measure_all, name='measure')
         self._worker.start()
-        best_effort = self._own.image_reliability == 'best_effort'
-        images = QoSProfile(
-            depth=self._own.image_queue,
-            reliability=(
-                ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-            ),
+        asked = self._own.image_reliability
+        images = with_reliability(
+            QoSProfile(depth=self._own.image_queue),
+            ReliabilityPolicy.BEST_EFFORT
+            if asked == 'best_effort'
+            else ReliabilityPolicy.RELIABLE,
         )
-        for kind, topic, callback, qos in (
-            (CalibrationMessage, 'calibration', self._on_calibration, LATCHED),
-            (TwistStamped, 'velocity', self._on_velocity, _SAMPLES),
-            (Temperature, 'temperature', self._on_temperature, _SAMPLES),
-            (QuaternionStamped, 'attitude', self._on_attitude, _SAMPLES),
-            (*self._image_input(), self._on_image, images),
+        for kind, topic, callback, qos, adapts in (
+            (CalibrationMessage, 'calibration', self._on_calibration, LATCHED, False),
+            (TwistStamped, 'velocity', self._on_velocity, _SAMPLES, True),
+            (Temperature, 'temperature', self._on_temperature, _SAMPLES, True),
+            (QuaternionStamped, 'attitude', self._on_attitude, _SAMPLES, True),
+            (*self._image_input(), self._on_image, images, asked == 'auto'),
         ):
-            listener = self.create_subscription(
-                kind,
-                topic,
-                self.taking(callback),
-                qos,
-                callback_group=MutuallyExclusiveCallbackGroup(),
-            )
-            self._listeners.append(listener)
+            self.inputs.add(kind, topic, self.taking(callback), qos, adapts=adapts)
 
     def _image_input(self) -> tuple[Any, str]:
         if self._own.image_transport == 'raw':
@@ -142,9 +134,8 @@ class StarObserver(StarcalNode):
         return CompressedImage, self.resolve_topic_name('image') + '/compressed'
 
     def deactivate(self) -> None:
-        """Unsubscribe; images still in the queue are dropped."""
-        while self._listeners:
-            self.destroy_subscription(self._listeners.pop())
+        """Stop listening; what still waits in the queue is let go."""
+        self.inputs.close()
         if self._queue is not None and self._worker is not None:
             if len(self._queue):
                 self.get_logger().warning(f'{len(self._queue)} images dropped from the queue')

@@ -30,9 +30,10 @@ class ObserverOptions:
         choices=('raw', 'compressed'),
     )
     image_reliability: str = option(
-        'reliable',
-        'reliability QoS of the image subscription (best_effort loses large images)',
-        choices=('reliable', 'best_effort'),
+        'auto',
+        'reliability asked of the image publisher; auto: best_effort from one that offers no more,'
+        ' else reliable (best_effort loses large images)',
+        choices=('auto', 'reliable', 'best_effort'),
     )
     image_queue: int = option(
         20, 'capacity of the queue of images that wait to be measured', low=1, high=1000

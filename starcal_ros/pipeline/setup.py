@@ -30,6 +30,7 @@ from starcal_ros.lens import COEFFICIENTS
 from starcal_ros.options import (
     from_mapping,
     holds_options,
+    is_of_ros,
     names_of,
     nearest,
     option,
@@ -67,8 +68,8 @@ class SetupOptions:
         length=4,
     )
     star_tracker_frame: str = option('star_tracker', 'name of the star tracker frame')
-    camera_frame: str = option('camera', 'name of the camera optical frame')
-    catalog: str = option('', 'star catalog file; empty: the bundled catalog')
+    camera_frame: str = option('camera_optical_frame', 'name of the camera optical frame')
+    catalog: str = option('', 'star catalog file; empty: the bundled one')
     dark_frame: str = option(
         '', 'dark frame to subtract, a PNG or TIFF of image size and depth; empty: none'
     )
@@ -146,7 +147,7 @@ def load_setup(
     """
     known = names_of(*OPTION_CLASSES, *others)
     for name in values:
-        if name not in known and name != 'use_sim_time':
+        if name not in known and not is_of_ros(name):
             raise OptionError(f'{name}: no such parameter{nearest(name, known)}')
     groups = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS.items()}
     frames: SetupOptions = groups['frames']

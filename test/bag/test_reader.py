@@ -174,7 +174,9 @@ def test_several_topics_of_a_type(tmp_path: Path) -> None:
         ('text.mcap', b'hello', 'not an MCAP bag'),
         ('empty.mcap', b'', 'not an MCAP bag'),
         ('folder/', None, 'no .mcap files'),
-        ('folder/x.db3', b'', 'ros2 bag convert'),
+        ('folder/x.db3', b'', 'an SQLite bag: rosbags-convert --src'),
+        ('x.db3', b'SQLite format 3\0 and more', 'an SQLite bag: rosbags-convert --src'),
+        ('x.bag', b'#ROSBAG V2.0\n', 'x.bag --dst'),
     ],
 )
 def test_not_a_bag(tmp_path: Path, name: str, content: bytes | None, text: str) -> None:

@@ -19,11 +19,12 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import QuaternionStamped
-from sensor_msgs.msg import Image
+from geometry_msgs.msg import QuaternionStamped, TwistStamped
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from sensor_msgs.msg import Image, Temperature
 from std_srvs.srv import Trigger
 
-from starcal.msg import EnsembleStatus, StarObservations
+from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ros.bag import reader
 from starcal_ros.messages.observations import observations_to_message
 from starcal_ros.nodes.message_factory import make_message
@@ -141,3 +142,46 @@ def test_nodes_that_are_not_active(client: Client, start_node: StartNode, tiny_b
         level, text, values = newest(diagnostics, name)
         assert (level, text) == (b'\x01', 'not active: unconfigured')
         assert set(values) == documented()
+
+
+def test_sensor_data_publishers_are_received(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """Best effort, as drivers offer it: all inputs connect, remapped or not."""
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), *REMAPS)
+    start_node('star_observer', ros=ros)
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    publishers = [
+        client.node.create_publisher(kind, topic, qos_profile_sensor_data)
+        for kind, topic in (
+            (QuaternionStamped, '/star_tracker/attitude'),
+            (TwistStamped, '/velocity'),
+            (Temperature, '/temperature'),
+            (Image, '/opnav/image_raw'),
+        )
+    ]
+    client.until(lambda: all(one.get_subscription_count() for one in publishers))
+    # Where all connect, nothing is left to warn of.
+    client.until(
+        lambda: newest(diagnostics, 'star_observer')[:2] == (b'\x00', 'waiting for images')
+    )
+    publishers[0].publish(QuaternionStamped())
+    client.until(lambda: newest(diagnostics, 'star_observer')[2].get('messages') == '1')
+
+
+def test_a_publisher_that_is_not_received_is_named(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """By its name on the graph: the image was asked for as reliable, the calibration latched."""
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), *REMAPS)
+    observer = start_node('star_observer', ros=(*ros, '-p', 'image_reliability:=reliable'))
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    image = client.node.create_publisher(Image, '/opnav/image_raw', qos_profile_sensor_data)
+    refused = '/opnav/image_raw: a publisher offers best effort, reliable is asked'
+    client.until(lambda: newest(diagnostics, 'star_observer')[1] == f'not received: {refused}')
+    assert newest(diagnostics, 'star_observer')[0] == b'\x01'
+    assert refused in observer.said()
+    client.node.destroy_publisher(image)
+    client.node.create_publisher(Calibration, '/calibration', QoSProfile(depth=1))
+    refused = '/calibration: a publisher offers volatile, transient local is asked'
+    client.until(lambda: newest(diagnostics, 'star_observer')[1] == f'not received: {refused}')

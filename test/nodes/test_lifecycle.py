@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+import random
 import signal
 import subprocess
 import sys
+import time
 from typing import Any, TYPE_CHECKING
 
 import pytest
@@ -135,3 +137,53 @@ def test_what_fails_after_a_signal_is_no_error(argument: str, status: int, said:
     command = [sys.executable, '-c', SIGNALLED, argument]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (status, '', said)
+
+
+SIGNALLED_AGAIN = """
+import os, signal, sys, time
+from starcal_ros.nodes.lifecycle import end_quietly, until_told_to_end
+
+def tell():
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):
+        os.kill(os.getpid(), number)
+    time.sleep(0)  # where Python runs the handlers
+
+def work():
+    tell()
+    while True:
+        time.sleep(1.0)
+
+def end():
+    tell()
+    end_quietly(None)
+    tell()
+    print('ended')
+
+sys.exit(until_told_to_end('maker', [], work, end))
+"""
+
+
+def test_signals_do_not_cut_the_end_short() -> None:
+    command = [sys.executable, '-c', SIGNALLED_AGAIN]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, 'ended\n', '')
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_nodes_end_after_several_signals(
+    client: Client, start_node: StartNode, tiny_bag: Path, seed: int
+) -> None:
+    """`ros2 launch` sends SIGINT to a node whose process group may have had one already."""
+    rng = random.Random(seed)
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'))
+    nodes = [start_node(name, ros=ros) for name in ('star_observer', 'calibrator')]
+    managers = [Manager(client, node.name) for node in nodes]
+    client.until(lambda: all(manager.state() == 'active' for manager in managers))
+    for _ in range(rng.choice([2, 3])):
+        for node in nodes:
+            node.tell_to_end(rng.choice([signal.SIGINT, signal.SIGINT, signal.SIGTERM]))
+        # The end takes 0.1 s to 0.5 s: the next signal comes at once, or somewhere in it.
+        time.sleep(rng.choice([0.0, 0.5 * rng.random()]))
+    for node in nodes:
+        assert node.wait() == 0, node.said()
+        assert 'Traceback' not in node.said()

@@ -42,6 +42,34 @@ def test_every_parameter_stands_with_its_default() -> None:
         assert check_value(field, listed[field.name]) == field.default, field.name
 
 
+# Packages of requirements/runtime.txt by their key in rosdep.
+ROSDEP = {
+    'argcomplete': 'python3-argcomplete',
+    'Jinja2': 'python3-jinja2',
+    'matplotlib': 'python3-matplotlib',
+    'numpy': 'python3-numpy',
+    'opencv-python-headless': 'python3-opencv',
+    'PyYAML': 'python3-yaml',
+    'rich': 'python3-rich',
+    'rosbags': 'python3-rosbags-pip',
+    'scipy': 'python3-scipy',
+}
+
+
+def test_a_vehicle_gets_every_package() -> None:
+    """Each one that the code needs has a rosdep key in package.xml, or a pin in the README."""
+    runtime = (ROOT / 'requirements/runtime.txt').read_text().partition('# What these need')[0]
+    needed = {line for line in runtime.splitlines() if '==' in line}
+    package = (ROOT / 'package.xml').read_text()
+    section = (ROOT / 'README.md').read_text().partition('## On a vehicle')[2]
+    for pin in needed - {line for line in needed if line.startswith('setuptools')}:
+        name = pin.partition('==')[0]
+        if name in ROSDEP:
+            assert f'<exec_depend>{ROSDEP[name]}</exec_depend>' in package
+        else:
+            assert pin in section
+
+
 @pytest.mark.parametrize(
     'path', sorted((CONFIG / 'examples').glob('*.yaml')), ids=lambda path: path.stem
 )

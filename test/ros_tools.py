@@ -1,0 +1,131 @@
+"""
+The real ROS 2 tools, where they are: the `ros2` command, launch, rosbag2, sros2, Cyclone DDS.
+
+PyPI has none of them. ``STARCAL_ROS2_TOOLS`` names a folder with ``bin/ros2`` and ``env.sh``;
+without it, ``../shared/ros2tools/install.sh`` beside this repository makes one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+BESIDE = Path(__file__).parents[2] / 'shared' / 'ros2tools' / 'install.sh'
+RUN_S = 100.0  # a command of ros2 takes 2 s; busy cores make that much of it
+
+
+def find_tools(folder: Path) -> Path:
+    """Return the folder of the tools, made in a folder if need be; skip the test without them."""
+    given = os.environ.get('STARCAL_ROS2_TOOLS', '')
+    if given:
+        return Path(given)
+    if not BESIDE.exists():
+        pytest.skip('no real ROS 2 tools: STARCAL_ROS2_TOOLS is not set')
+    command = [str(BESIDE), sys.prefix, str(folder)]
+    made = subprocess.run(command, capture_output=True, text=True, check=False)
+    if made.returncode:
+        pytest.skip(f'the real ROS 2 tools are not for this Python: {made.stderr[-200:]}')
+    return folder
+
+
+class RosTools:
+    """Runs the tools and starts processes with them in their environment, on one middleware."""
+
+    def __init__(self, tools: Path, rmw: str, logs: Path, more: Mapping[str, str]) -> None:
+        shown = subprocess.run(
+            ['bash', '-c', f'. {tools}/env.sh && env -0'], capture_output=True, check=True
+        )
+        lines = shown.stdout.decode().split('\0')
+        self.environment = dict(line.split('=', 1) for line in lines if '=' in line)
+        self.environment |= {'RMW_IMPLEMENTATION': rmw, 'PYTHONUNBUFFERED': '1', **more}
+        if rmw == 'rmw_cyclonedds_cpp':
+            # The wheels' rmw_implementation looks for libraries beside itself alone.
+            self.environment['LD_PRELOAD'] = f'{tools}/native/lib/lib{rmw}.so'
+        self._ros2 = str(tools / 'bin' / 'ros2')
+        self._logs = logs
+        self._started: list[subprocess.Popen[bytes]] = []
+
+    def run(
+        self, *arguments: str | Path, timeout_s: float = RUN_S
+    ) -> subprocess.CompletedProcess[str]:
+        """Run `ros2` with these arguments to its end."""
+        return subprocess.run(
+            [self._ros2, *map(str, arguments)],
+            env=self.environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+        )
+
+    def until(self, expected: str, *arguments: str | Path) -> str:
+        """Output of `ros2`, run again until it holds what is expected."""
+        deadline_s = time.monotonic() + RUN_S
+        while expected not in (done := self.run(*arguments)).stdout:
+            assert time.monotonic() < deadline_s, (arguments, done.stdout, done.stderr)
+        return done.stdout
+
+    def start(self, *arguments: str | Path) -> Started:
+        """Start `ros2` with these arguments."""
+        return self._start([self._ros2, *map(str, arguments)])
+
+    def start_node(self, name: str, *ros: str | Path) -> Started:
+        """Start a node of starcal with ROS arguments."""
+        module = f'starcal_ros.nodes.{name}'
+        return self._start([sys.executable, '-m', module, '--ros-args', *map(str, ros)])
+
+    def _start(self, command: list[str]) -> Started:
+        log = self._logs / f'{len(self._started)}.log'
+        with log.open('wb') as output:
+            process = subprocess.Popen(
+                command,
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        self._started.append(process)
+        return Started(process, log)
+
+    def close(self) -> None:
+        """Kill what has not ended by itself."""
+        for process in self._started:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+class Started:
+    """A process, with its children in a process group, and what it wrote."""
+
+    def __init__(self, process: subprocess.Popen[bytes], log: Path) -> None:
+        self.process, self._log = process, log
+
+    def said(self) -> str:
+        """All that it has written so far."""
+        return self._log.read_text(errors='replace')
+
+    def until_said(self, text: str) -> None:
+        """Wait for a text in what it writes."""
+        deadline_s = time.monotonic() + RUN_S
+        while text not in self.said():
+            assert self.process.poll() is None and time.monotonic() < deadline_s, self.said()
+            time.sleep(0.05)
+
+    def interrupt(self) -> int:
+        """Exit status after SIGINT to the whole process group, as a terminal sends it."""
+        os.killpg(self.process.pid, signal.SIGINT)
+        return self.process.wait(RUN_S)
+
+    def wait(self) -> int:
+        """Exit status when it ends by itself."""
+        return self.process.wait(RUN_S)

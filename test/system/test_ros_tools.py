@@ -1,0 +1,234 @@
+"""
+The nodes and launch files with the real ROS 2 tools, on Fast DDS and on Cyclone DDS.
+
+Run with ``-s``, each test prints a row of the table in docs/reliability.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+import subprocess
+
+import pytest
+import yaml
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from ros_tools import find_tools, RosTools  # type: ignore[import-not-found]
+
+from starcal_ros.bag import reader
+
+pytestmark = [pytest.mark.nodes, pytest.mark.timeout(600)]  # tens of processes of 2 s and more
+
+ROOT = Path(__file__).parents[2]
+FAST, CYCLONE = 'rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp'
+TRIGGER = 'std_srvs/srv/Trigger'
+STATUS = 'starcal/msg/EnsembleStatus'
+# With the type, so that no daemon is asked, which has the keys of whoever started it.
+LATCHED = ('--qos-durability', 'transient_local', '--qos-reliability', 'reliable')
+ECHO = ('topic', 'echo', '--once', *LATCHED)
+Make = Callable[..., RosTools]
+
+
+@pytest.fixture(scope='module')
+def tools(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found: Path = find_tools(tmp_path_factory.mktemp('ros2tools'))
+    return found
+
+
+@pytest.fixture
+def make(tools: Path, tmp_path: Path) -> Iterator[Make]:
+    """Make the tools for a middleware, with more variables of the environment."""
+    made: list[RosTools] = []
+
+    def make(rmw: str, **more: str) -> RosTools:
+        logs = tmp_path / f'logs{len(made)}'
+        logs.mkdir()
+        made.append(RosTools(tools, rmw, logs, {'ROS_LOG_DIR': str(logs), **more}))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+@pytest.fixture(params=[FAST, CYCLONE])
+def ros2(make: Make, request: pytest.FixtureRequest) -> RosTools:
+    """The tools on each middleware in turn."""
+    return make(request.param)
+
+
+def row(rmw: str, tool: str, command: str, outcome: str) -> None:
+    print(f'\n| {tool}, {"Fast" if rmw == FAST else "Cyclone"} DDS | `{command}` | {outcome} |')
+
+
+def middleware(ros2: RosTools) -> str:
+    return str(ros2.environment['RMW_IMPLEMENTATION'])
+
+
+def test_launch_replay_calibrate_and_record(
+    ros2: RosTools, tiny_bag: Path, tmp_path: Path
+) -> None:
+    """The sequence of the README with every launch argument, ended as a terminal ends it."""
+    if 'record' not in ros2.run('bag', '--help').stdout:
+        pytest.skip('ros2 bag record does not load here')
+    recorded = tmp_path / 'recorded'
+    launch = ros2.start(
+        *('launch', 'starcal', 'starcal.launch.py', f'params:={tiny_bag}/params.yaml'),
+        *('namespace:=opnav', 'log_level:=info', 'autostart:=true', 'use_sim_time:=false'),
+        *('respawn:=false', 'image:=/opnav/image_raw', 'attitude:=/star_tracker/attitude'),
+        *('velocity:=/velocity', 'temperature:=/temperature'),
+    )
+    for _ in range(2):  # nodes
+        launch.until_said('active, listening to ')
+    topics = ('/opnav/observations', '/opnav/calibration', '/tf_static')
+    record = ros2.start('bag', 'record', '--storage', 'mcap', '-o', recorded, *topics)
+    record.until_said("Subscribed to topic '/opnav/observations'")
+    ros2.until('Subscription count: 2', 'topic', 'info', '/opnav/observations')
+    played = ros2.run('bag', 'play', tiny_bag, '--delay', '3')
+    assert played.returncode == 0, played.stderr
+    images = 'images: 10\n'
+    ros2.until(images, *ECHO, '/opnav/ensemble_status', STATUS)
+    answer = ros2.run('service', 'call', '/opnav/calibrator/calibrate', TRIGGER)
+    assert 'success=True' in answer.stdout, answer.stdout + launch.said()
+    static = ros2.run('topic', 'echo', '--once', '/tf_static', 'tf2_msgs/msg/TFMessage')
+    assert 'child_frame_id: camera' in static.stdout, static.stderr
+    record.until_said("Subscribed to topic '/opnav/calibration'")
+    row(middleware(ros2), 'launch, rosbag2', 'ros2 launch starcal starcal.launch.py', '10 images')
+    assert record.interrupt() == 0, record.said()
+    counts = {topic.name: topic.count for topic in reader.topics([recorded])}
+    assert counts == {'/opnav/observations': 10, '/opnav/calibration': 1, '/tf_static': 1}
+    launch.interrupt()
+    assert launch.said().count('process has finished cleanly') == 2, launch.said()
+    row(middleware(ros2), 'rosbag2', 'ros2 bag record', 'calibration and observations read back')
+
+
+def test_launch_arguments_are_shown(make: Make) -> None:
+    for file in ('starcal.launch.py', 'replay.launch.py'):
+        shown = make(FAST).run('launch', 'starcal', file, '--show-args')
+        assert shown.returncode == 0 and "'params':" in shown.stdout, shown.stderr
+    row(FAST, 'launch', 'ros2 launch starcal replay.launch.py --show-args', 'every argument')
+
+
+def test_replay_launch(make: Make, tiny_bag: Path) -> None:
+    ros2 = make(FAST)
+    values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())
+    remapped = tiny_bag / 'images.yaml'
+    remapped.write_text(yaml.safe_dump(values))
+    launch = ros2.start(
+        *('launch', 'starcal', 'replay.launch.py', f'params:={remapped}', f'bag:={tiny_bag}'),
+        *('rate:=0.0', 'loop:=false', 'image:=/opnav/image_raw'),
+        'attitude:=/star_tracker/attitude',
+    )
+    ros2.until('images: 10\n', *ECHO, '/ensemble_status', STATUS)
+    launch.interrupt()
+    assert 'process has died' not in launch.said(), launch.said()
+    row(FAST, 'launch', 'ros2 launch starcal replay.launch.py', '10 images')
+
+
+def test_lifecycle_and_parameters(ros2: RosTools, tiny_bag: Path, tmp_path: Path) -> None:
+    """Each transition by its name; services answer while inactive; a dump can be read again."""
+    node = ros2.start_node(
+        *('calibrator', '--params-file', tiny_bag / 'params.yaml'),
+        *('-p', 'autostart:=false'),
+    )
+    ros2.until('unconfigured', 'lifecycle', 'get', '/calibrator')
+    for transition, state in (
+        ('configure', 'inactive'),
+        ('activate', 'active'),
+        ('deactivate', 'inactive'),
+        ('cleanup', 'unconfigured'),
+    ):
+        done = ros2.run('lifecycle', 'set', '/calibrator', transition)
+        assert 'Transitioning successful' in done.stdout, (transition, done.stderr, node.said())
+        assert state in ros2.run('lifecycle', 'get', '/calibrator').stdout
+        if state == 'inactive':
+            answer = ros2.run('service', 'call', '/calibrator/calibrate', TRIGGER)
+            assert "message='not active: inactive'" in answer.stdout, answer.stderr
+    row(middleware(ros2), 'ros2cli', 'ros2 lifecycle set /calibrator ...', 'all four transitions')
+    changed = ros2.run('param', 'set', '/calibrator', 'min_images', '5')
+    assert 'successful' in changed.stdout, changed.stderr
+    refused = ros2.run('param', 'set', '/calibrator', 'star_tracker_sigma_arcsec', '[-1.0, 2.0]')
+    assert 'array(' not in refused.stdout + refused.stderr
+    assert 'star_tracker_sigma_arcsec: ' in refused.stdout + refused.stderr
+    dump = tmp_path / 'dump.yaml'
+    dump.write_text(ros2.until('min_images: 5', 'param', 'dump', '/calibrator'))
+    assert node.interrupt() == 0
+    again = ros2.start_node('calibrator', '--params-file', dump)
+    ros2.until('Integer value is: 5', 'param', 'get', '/calibrator', 'min_images')
+    assert 'not a parameter' not in again.said()
+    row(middleware(ros2), 'ros2cli', 'ros2 param set, get, dump', 'a dump starts a node again')
+
+
+OPERATOR = """<?xml version="1.0" encoding="UTF-8"?>
+<policy version="0.2.0">
+  <enclaves>
+    <enclave path="/operator">
+      <profiles>
+        <profile ns="/" node="*">
+          <topics publish="ALLOW" subscribe="ALLOW"><topic>*</topic></topics>
+          <services reply="ALLOW" request="ALLOW"><service>*</service></services>
+        </profile>
+      </profiles>
+    </enclave>
+  </enclaves>
+</policy>
+"""
+
+
+def test_policies_are_enforced(make: Make, tiny_bag: Path, tmp_path: Path) -> None:
+    """The nodes work; an outsider sees and calls nothing; a node in a wrong enclave is denied."""
+    pytest.importorskip('lxml')
+    pytest.importorskip('cryptography')
+    keys = tmp_path / 'keys'
+    outsider = make(CYCLONE)
+    policies = {path.name.partition('.')[0]: path for path in SECURITY.glob('*.policy.xml')}
+    assert set(policies) == {'star_observer', 'calibrator', 'bag_player'}
+    policies['operator'] = tmp_path / 'operator.policy.xml'
+    policies['operator'].write_text(OPERATOR)
+    done(outsider.run('security', 'create_keystore', keys))
+    for name, policy in policies.items():
+        done(outsider.run('security', 'create_enclave', keys, f'/{name}'))
+        done(outsider.run('security', 'create_permission', keys, f'/{name}', policy))
+    enforced = {
+        'ROS_SECURITY_ENABLE': 'true',
+        'ROS_SECURITY_STRATEGY': 'Enforce',
+        'ROS_SECURITY_KEYSTORE': str(keys),
+    }
+    nodes = make(CYCLONE, **enforced)
+    operator = make(CYCLONE, **enforced, ROS_SECURITY_ENCLAVE_OVERRIDE='/operator')
+
+    params = ('--params-file', tiny_bag / 'params.yaml')
+    observer = nodes.start_node('star_observer', '--enclave', '/star_observer', *params)
+    calibrator = nodes.start_node('calibrator', '--enclave', '/calibrator', *params)
+    for node in (observer, calibrator):
+        node.until_said('active, listening to ')
+    remaps = ('-r', '/opnav/image_raw:=/image', '-r', '/star_tracker/attitude:=/attitude')
+    bag = ('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0', *remaps)
+    player = nodes.start_node('bag_player', '--enclave', '/bag_player', *bag)
+    assert player.wait() == 0, player.said()
+    operator.until('images: 10\n', *ECHO, '/ensemble_status', STATUS)
+    answer = operator.run('service', 'call', '/calibrator/calibrate', TRIGGER)
+    assert 'success=True' in answer.stdout, answer.stdout + calibrator.said()
+    row(CYCLONE, 'sros2', 'ros2 security create_permission', 'nodes work under enforcement')
+
+    listed = done(outsider.run('node', 'list', '--no-daemon', '--spin-time', '5'))
+    assert 'calibrator' not in listed and 'star_observer' not in listed
+    with pytest.raises(subprocess.TimeoutExpired):
+        outsider.run('service', 'call', '/calibrator/reset', TRIGGER, timeout_s=15.0)
+    assert 'images: 10\n' in done(operator.run(*ECHO, '/ensemble_status', STATUS))
+    row(CYCLONE, 'sros2', 'ros2 node list, service call from outside', 'sees and calls nothing')
+
+    denied = nodes.start_node('calibrator', '--enclave', '/bag_player', *params)
+    assert denied.wait() != 0, denied.said()
+    row(CYCLONE, 'sros2', 'calibrator in the enclave of bag_player', 'denied')
+
+
+SECURITY = ROOT / 'config' / 'security'
+
+
+def done(process: subprocess.CompletedProcess[str]) -> str:
+    assert process.returncode == 0, process.stderr
+    return process.stdout
