@@ -44,7 +44,7 @@ def removal_study(estimate: Estimate) -> tuple[Removal, ...]:
     Ends early where the stars cannot be explained without a term.
     """
     problem, state = estimate.problem, estimate.state
-    covariance_px2 = estimate.variance.of(estimate.table.covariance_px2)
+    covariance_px2 = estimate.variance.of(estimate.table.covariance_px2, estimate.table.magnitude)
     measurements = arrange(estimate.table, estimate.kept, covariance_px2)
     solution = minimise(problem, state, measurements)
     cost = solution.normal.cost

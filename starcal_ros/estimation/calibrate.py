@@ -385,7 +385,7 @@ def _search(
 
 
 def _arranged(table: StarTable, verdict: _Verdict) -> Measurements:
-    return arrange(table, verdict.kept, verdict.variance.of(table.covariance_px2))
+    return arrange(table, verdict.kept, verdict.variance.of(table.covariance_px2, table.magnitude))
 
 
 def _estimate(
@@ -515,11 +515,13 @@ def _judge(
     variance, tracker_sigma_rad = CentroidVariance(1.0, 0.0), given_rad
     if options.variance_components:
         freedom = _freedom(problem, state, blocks, before.kept, before.tracker_sigma_rad)
-        variance = estimate_variance(residual_px, table.covariance_px2, before.kept, freedom)
+        variance = estimate_variance(
+            residual_px, table.covariance_px2, table.magnitude, before.kept, freedom
+        )
     kept = _fitting(residual_px, table, variance, options)
     del residual_px
     misfit: Mask = np.zeros(table.image_count, bool)
-    measurements = arrange(table, kept, variance.of(table.covariance_px2))
+    measurements = arrange(table, kept, variance.of(table.covariance_px2, table.magnitude))
     # One rotation for all has no attitude of an image to judge.
     if problem.method != 'single':
         # By the stars that fit: one that does not turns an image of few by more than the tracker.
@@ -543,7 +545,7 @@ def _fitting(
     Not an outlier; not a star that is one in most of its images, or whose residuals together are
     too large (a wrong catalog place, a planet); and in an image that has enough of the others.
     """
-    length2 = squared_sigmas(residual_px, variance.of(table.covariance_px2))
+    length2 = squared_sigmas(residual_px, variance.of(table.covariance_px2, table.magnitude))
     fits = length2 < options.outlier_sigma**2
     star = table.star
     sightings = np.bincount(star)

@@ -33,13 +33,15 @@ class StarTable:
 
     ``image`` (n,) index of the image; ``catalog_id`` (n,); ``star`` (n,) index of the catalog star
     among those that were seen; ``direction_icrf`` (n, 3);
-    ``measured_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``image_count``.
+    ``magnitude`` (n,); ``measured_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv;
+    ``image_count``.
     """
 
     image: NDArray[np.int64]
     catalog_id: NDArray[np.int64]
     star: NDArray[np.int64]
     direction_icrf: Floats
+    magnitude: NDArray[np.float32]
     measured_px: Floats
     covariance_px2: Floats
     image_count: int
@@ -58,6 +60,7 @@ def star_table(images: Sequence[StarObservations]) -> StarTable:
         catalog_id=catalog_id,
         star=np.unique(catalog_id, return_inverse=True)[1],
         direction_icrf=np.concatenate([np.empty((0, 3)), *(i.direction_icrf for i in images)]),
+        magnitude=np.concatenate([np.empty(0, np.float32), *(i.magnitude for i in images)]),
         measured_px=np.concatenate([np.empty((0, 2)), *(i.measured_px for i in images)]),
         covariance_px2=np.concatenate([np.empty((0, 3)), *(i.covariance_px2 for i in images)]),
         image_count=len(images),
