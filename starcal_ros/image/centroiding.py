@@ -25,7 +25,7 @@ from starcal_ros.image.detection import (
     windows_inside,
 )
 from starcal_ros.image.hot_pixels import CORE_PX, hot_in_stamps, lit_alone, NO_HOT_PIXELS
-from starcal_ros.image.psf_field import Instrument, PsfWidth, uniform_width
+from starcal_ros.image.psf_field import Instrument, MIN_PSF_SIGMA_PX, PsfWidth, uniform_width
 from starcal_ros.image.psf_fit import (
     approach,
     border_level_dn,
@@ -52,7 +52,6 @@ SWAMPED_SIGMA = 3.0  # a brighter star nearer than this swamps, though it is mea
 _NEIGHBOUR_NOISE = 0.2  # of the noise of a pixel: less light of a neighbour changes nothing
 _IN_PLACE_PX = 1.5  # of a fit from the brightest pixel: beyond, it has gone elsewhere
 _BRIGHTEST = 60  # stars that show the level of saturation
-_MIN_PSF_SIGMA_PX = 0.45
 _MAX_PSF_SIGMA_PX = 4.0
 
 
@@ -198,7 +197,7 @@ def model_image(
         change = median(fit.shape_change[:, :2].mean(axis=1))
         sigma_before = sigma
         sigma *= float(np.sqrt(np.clip(1.0 + change, 0.5, 2.0)))
-        sigma = float(np.clip(sigma, _MIN_PSF_SIGMA_PX, _MAX_PSF_SIGMA_PX))
+        sigma = float(np.clip(sigma, MIN_PSF_SIGMA_PX, _MAX_PSF_SIGMA_PX))
         if abs(sigma - sigma_before) < 1e-3 * sigma:
             break
     shape_median, shape_scatter = centre_and_scatter(fit.shape_change)

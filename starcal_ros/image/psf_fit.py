@@ -403,7 +403,9 @@ class NoiseSums:
             # A squared normal residual over its variance has a variance of 2.
             sigma = scale[free] * np.sqrt(2.0 * inverse.diagonal())
             if free[-1] == 2 and value[-1] < _SIGNIFICANT * sigma[-1]:
-                free = free[:-1]
+                # Few stars cannot separate the two: the one that shows less goes.
+                gain_shows_less = 1 in free and value[1] * sigma[2] < value[2] * sigma[1]
+                free = [0, 2] if gain_shows_less else [0, 1] if not gain_e_per_dn else [0]
             elif 1 in free and value[free.index(1)] < 0.0:
                 free.remove(1)
             else:
