@@ -138,8 +138,8 @@ def _class_factors(
     ``ratio`` (n,) are the squared residuals per axis over their expected variance.
     """
     parts = _magnitude_classes(magnitude)
-    if len(parts) < 2:
-        return (), ()
+    if len(parts) < 2 or _clipped_mean(ratio) < _FACTOR_LIMITS[0]:
+        return (), ()  # few stars, or residuals without noise whose scale is at its limit
     nodes = np.array([magnitude[part].mean() for part in parts])
     if (np.diff(nodes) <= 0.0).any():
         return (), ()  # too many stars of one magnitude

@@ -22,9 +22,10 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 _MESH_PX = 64  # glare and vignetting vary slowly over it
 _MESH_STEP_PX = (4, 4)  # down and across: 256 samples of a cell give its noise to 5 %
-_GAP_SIGMA = 8.0  # 0 DN so far below the other pixels of a cell marks an invalid pixel
+GAP_SIGMA = 8.0  # 0 DN so far below the other pixels of a cell marks an invalid pixel
 _CUT_OFF = 0.3  # part of a cell at 0 DN from which its lower half no longer shows the noise
 _LEAST_CUT_OFF_DN = 0.5
+_STEEP_PART = 0.2  # of the variance of a cell from which a slope counts
 _MOSTLY_INVALID = 0.75  # invalid part of a cell from which its neighbour stands in for it
 _SPARSE_PX = 256
 _SPARSE_STEP_PX = (32, 8)  # a row that is read is read whole: few rows, many of their pixels
@@ -87,6 +88,7 @@ def measure_background(pixels: Pixels) -> Background:
     noise = np.maximum(noise, tail)
     has_pixels = invalid < _MOSTLY_INVALID * samples.shape[1]
     level, noise = (_filled(values, has_pixels, mesh_shape) for values in (mean + level, noise))
+    noise = np.maximum(_without_slope(noise, level.reshape(mesh_shape), pixels), tail)
     return _background(level, noise, mesh_shape)
 
 
@@ -100,11 +102,8 @@ def sample_background(pixels: Pixels) -> Background:
     samples, mesh_shape = _cells(pixels, _SPARSE_PX, _SPARSE_STEP_PX)
     beside, _ = _cells(pixels[:, 2:], _SPARSE_PX, _SPARSE_STEP_PX, mesh_shape)
     width = min(samples.shape[1], beside.shape[1])
-    apart = samples[:, :width] - beside[:, :width]
-    rank = int(width * 0.6827)
-    _, noise = _clipped(apart, np.partition(np.abs(apart), rank, axis=1)[:, rank])
+    noise = _difference_noise(samples[:, :width], beside[:, :width])
     level = medians(samples[:, ::4].T).astype(np.float32)
-    noise /= math.sqrt(2.0)
     zeros = np.count_nonzero(samples == 0.0, axis=1)
     cut_off = np.flatnonzero(zeros > _CUT_OFF * samples.shape[1])
     if len(cut_off):
@@ -128,6 +127,47 @@ def _noise_above(
     return np.where(zeros > _CUT_OFF * count, noise, np.float32(0.0))
 
 
+def _without_slope(
+    noise: NDArray[np.float32], level_mesh: NDArray[np.float32], pixels: Pixels
+) -> NDArray[np.float32]:
+    """Noise (k,) of the cells; from differences where a slope of the background swamps it."""
+    down, across = mesh_slope(_smooth_mesh(level_mesh), pixels.shape)
+    cell_v, cell_u = np.array(pixels.shape) / level_mesh.shape
+    ramp = (((down * cell_v) ** 2 + (across * cell_u) ** 2) / 12.0).ravel()
+    steep = ramp > _STEEP_PART * noise**2
+    if not steep.any():
+        return noise
+    samples, mesh_shape = _cells(pixels, _MESH_PX, _MESH_STEP_PX)
+    beside, _ = _cells(pixels[:, 2:], _MESH_PX, _MESH_STEP_PX, mesh_shape)
+    width = min(samples.shape[1], beside.shape[1])
+    of_differences = _difference_noise(samples[:, :width], beside[:, :width])
+    return np.where(steep, np.minimum(of_differences, noise), noise)
+
+
+def _difference_noise(
+    samples: NDArray[np.float32], beside: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Noise (k,) from the differences of near pixels (k, n), which no slope enters by much."""
+    apart = samples - beside
+    apart -= np.partition(apart, apart.shape[1] // 2, axis=1)[:, apart.shape[1] // 2, None]
+    rank = int(apart.shape[1] * 0.6827)
+    _, noise = _clipped(apart, np.partition(np.abs(apart), rank, axis=1)[:, rank])
+    return np.asarray(noise / math.sqrt(2.0), np.float32)
+
+
+def mesh_slope(
+    mesh: NDArray[np.float32], shape: tuple[int, ...]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Slopes (rows, cols) of a mesh over an image of ``shape``, down and across, per pixel."""
+    rows, cols = mesh.shape
+    down, across = np.zeros_like(mesh), np.zeros_like(mesh)
+    if rows > 1:
+        down = np.asarray(np.gradient(mesh, shape[0] / rows, axis=0), np.float32)
+    if cols > 1:
+        across = np.asarray(np.gradient(mesh, shape[1] / cols, axis=1), np.float32)
+    return down, across
+
+
 def _quantile(
     ascending: NDArray[np.float32], part: float, first: NDArray[np.int64]
 ) -> NDArray[np.float32]:
@@ -142,7 +182,7 @@ def _gap_above_zero(ascending: NDArray[np.float32], zeros: NDArray[np.int64]) ->
     """Which rows (k,) of sorted samples hold 0 DN far below the noise of their other samples."""
     level = _quantile(ascending, 0.5, zeros)
     spread = level - _quantile(ascending, 0.1587, zeros)
-    return np.asarray((zeros > 0) & (level > _GAP_SIGMA * np.maximum(spread, 1.0)))
+    return np.asarray((zeros > 0) & (level > GAP_SIGMA * np.maximum(spread, 1.0)))
 
 
 def _filled(

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from starcal_ros.image.centroiding import Centroids, CentroidOptions, measure_stars, model_image
+from starcal_ros.image.centroiding import CentroidOptions, Centroids, measure_stars, model_image
 from starcal_ros.image.detection import (
     Background,
     detect,
@@ -93,6 +93,31 @@ def test_undersampled_stars_are_found_and_their_covariance_holds() -> None:
     assert min(found_share) > 0.97
     # 1000 stars: 1.6 %.  The width of the PSF itself is known to 2 %.
     assert np.sqrt(np.concatenate(squared).mean()) == pytest.approx(1.0, abs=0.12)
+
+
+@pytest.mark.parametrize('slope', [0.1, 0.5])
+def test_a_steady_slope_is_subtracted(slope: float) -> None:
+    # In noise per pixel: without it, a slope of 0.5 pulls every star by two of its sigmas.
+    detector = dataclasses.replace(QUIET, psf_sigma_px=1.0, bits=16)
+    normalised, signed = [], []
+    for seed in range(3):
+        xy = star_grid(seed)
+        mean = star_electrons(xy, np.full(len(xy), 2500.0), detector.psf_sigma_px, SHAPE)
+        noise_e = measure_background(
+            expose(np.full(SHAPE, detector.background_electrons), detector,
+                   np.random.default_rng(0))
+        ).noise_dn * detector.electrons_per_dn  # fmt: skip
+        sky = detector.background_electrons + slope * noise_e * np.arange(SHAPE[1])
+        pixels = expose(mean + sky, detector, np.random.default_rng([seed, 1]))
+        found = measured(pixels, xy)
+        good = found.refusal == ''
+        assert good.mean() > 0.8
+        error = (found.xy_px - xy)[good] / np.sqrt(found.covariance_px2[good][:, [0, 2]])
+        normalised.append(error**2)
+        signed.append(error[:, 0])
+    # 600 stars: a mean to 0.04 sigma, an rms to 2 %.
+    assert abs(np.concatenate(signed).mean()) < 0.15
+    assert np.sqrt(np.concatenate(normalised).mean()) == pytest.approx(1.0, abs=0.12)
 
 
 def test_the_gain_is_no_refuge_for_an_error_of_the_psf() -> None:
