@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 _STARS_PER_GROUP = 40  # mean squared residual known to 16 %, sigma to 8 %
 _MOST_GROUPS = 12
 _CLIP_SIGMA = 4.5  # length of a normal residual: one in 25,000 is longer
-_CLASS_P_VALUE = 0.01  # of magnitude classes that differ where none do
+_CLASS_P_VALUE = 0.1  # of classes that differ where none do: then a factor each costs nothing
 _FACTOR_LIMITS = (0.1, 100.0)
 _FEWEST_IMAGES = 3  # whose scatter can contradict a sigma, or one of them the others
 _MISFIT_SIGMA = 6.0  # of an attitude: one in 10^8 is farther off, and a jump is far larger
@@ -90,7 +90,7 @@ def estimate_variance(
     a group, clipped at 4.5 sigma, is its variance; scale and floor are the non-negative line
     through the groups.  The mean and not the median, because stars with long tails move the
     estimate by their mean square.  Then the stars are ranked by magnitude.  Where the classes
-    differ from that line (p-value 1 %) each gets a factor.  With fewer stars than two classes
+    differ from that line (p-value 10 %) each gets a factor.  With fewer stars than two classes
     need there is one class.
     """
     own = 0.5 * (covariance_px2[used, 0] + covariance_px2[used, 2])
