@@ -81,7 +81,7 @@ def whole_frames() -> Mapping[str, tuple[Image, StarObservations]]:
         'accepted_mild_glare': expose(sound + 0.15 * u),
         'accepted_smear': expose(electrons(3.0)),
         'overexposed': expose(sound + limb),
-        'glare': expose(sound + 1.2e4 * np.exp(-np.hypot(u + 60.0, v + 60.0) / 350.0)),
+        'glare': expose(sound + 2.0e3 * (1.0 + np.cos(np.hypot(u + 60.0, v + 60.0) / 40.0))),
         'incomplete_lost': lost,
         'incomplete_torn': torn,
         'no_stars': expose(simulated_images.fixed_pattern(SCENARIO)),

@@ -38,7 +38,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'incomplete': (
         'a part of the image is constant, repeats itself, is shifted or is of an earlier image'
     ),
-    'glare': 'the background is too steep over most of the image',
+    'glare': 'the background bends too much over most of the image to be subtracted',
     'no_stars': 'too few star-like sources in the image',
     'no_match': 'no rotation of the predicted stars explains the sources in the image',
     'too_few_stars': 'fewer stars were measured well than an image needs',

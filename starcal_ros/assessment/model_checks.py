@@ -37,7 +37,7 @@ _GRID = 25
 def model_checks(estimate: Estimate) -> ModelChecks:
     """Return what the stars of an estimate show of the model that it assumes."""
     problem, state = estimate.problem, estimate.state
-    covariance = estimate.variance.of(estimate.table.covariance_px2)
+    covariance = estimate.variance.of(estimate.table.covariance_px2, estimate.table.magnitude)
     covariance = covariance * estimate.repetition[:, None]
     measurements = arrange(estimate.table, estimate.kept, covariance)
     _, blocks = image_blocks(problem, state, measurements)

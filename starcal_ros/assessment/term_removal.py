@@ -42,7 +42,7 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
     # A field beside the lens model stands as it was estimated.
     estimate = _without_field(estimate)
     problem, state = estimate.problem, estimate.state
-    covariance_px2 = estimate.variance.of(estimate.table.covariance_px2)
+    covariance_px2 = estimate.variance.of(estimate.table.covariance_px2, estimate.table.magnitude)
     measurements = arrange(estimate.table, estimate.kept, covariance_px2)
     solution = minimise(problem, state, measurements)
     cost = solution.normal.cost

@@ -411,7 +411,7 @@ class _Verdict:
 
     def covariance_px2(self, table: StarTable) -> Floats:
         """Return the centroid covariances (n, 3) that the search weights with."""
-        return self.variance.of(table.covariance_px2) * self.repetition[:, None]
+        return self.variance.of(table.covariance_px2, table.magnitude) * self.repetition[:, None]
 
     def agrees_with(self, other: _Verdict) -> bool:
         """Whether a search with the one would end where a search with the other does."""
@@ -742,13 +742,16 @@ def _judge(
     variance, tracker_sigma_rad = CentroidVariance(1.0, 0.0), given_rad
     if options.variance_components:
         freedom = _freedom(problem, state, blocks, terms, before.kept, before.tracker_sigma_rad)
-        variance = estimate_variance(residual_px, table.covariance_px2, before.kept, freedom)
+        variance = estimate_variance(
+            residual_px, table.covariance_px2, table.magnitude, before.kept, freedom
+        )
     kept = _fitting(residual_px, table, variance, options)
     groups = pointing_groups(state.camera_from_icrf, float(state.parameters[0]))
     repeated = repetition(table, kept, residual_px, groups)
     del residual_px
     misfit: Mask = np.zeros(table.image_count, bool)
-    measurements = arrange(table, kept, variance.of(table.covariance_px2) * repeated[:, None])
+    weighted = variance.of(table.covariance_px2, table.magnitude) * repeated[:, None]
+    measurements = arrange(table, kept, weighted)
     # One rotation for all has no attitude of an image to judge.
     if problem.method != 'single':
         # By the stars that fit: one that does not turns an image of few by more than the tracker.
@@ -772,7 +775,7 @@ def _fitting(
     Not an outlier; not a star that is one in most of its images, or whose residuals together are
     too large (a wrong catalog place, a planet); and in an image that has enough of the others.
     """
-    length2 = squared_sigmas(residual_px, variance.of(table.covariance_px2))
+    length2 = squared_sigmas(residual_px, variance.of(table.covariance_px2, table.magnitude))
     fits = length2 < options.outlier_sigma**2
     star = table.star
     sightings = np.bincount(star)

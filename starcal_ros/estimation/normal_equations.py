@@ -42,7 +42,8 @@ class StarTable:
     All stars of an ensemble as columns, in image order.
 
     ``image`` (n,) index of the image; ``catalog_id`` (n,); ``star`` (n,) index among the observed
-    catalog stars; ``direction_icrf`` (n, 3); ``measured_px`` (n, 2); ``covariance_px2`` (n, 3) uu,
+    catalog stars; ``direction_icrf`` (n, 3); ``magnitude`` (n,);
+    ``measured_px`` (n, 2); ``covariance_px2`` (n, 3) uu,
     uv, vv; ``image_count``.
     """
 
@@ -50,6 +51,7 @@ class StarTable:
     catalog_id: NDArray[np.int64]
     star: NDArray[np.int64]
     direction_icrf: Floats
+    magnitude: NDArray[np.float32]
     measured_px: Floats
     covariance_px2: Floats
     image_count: int
@@ -68,6 +70,7 @@ def star_table(images: Sequence[StarObservations]) -> StarTable:
         catalog_id=catalog_id,
         star=np.unique(catalog_id, return_inverse=True)[1],
         direction_icrf=np.concatenate([np.empty((0, 3)), *(i.direction_icrf for i in images)]),
+        magnitude=np.concatenate([np.empty(0, np.float32), *(i.magnitude for i in images)]),
         measured_px=np.concatenate([np.empty((0, 2)), *(i.measured_px for i in images)]),
         covariance_px2=np.concatenate([np.empty((0, 3)), *(i.covariance_px2 for i in images)]),
         image_count=len(images),

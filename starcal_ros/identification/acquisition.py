@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import bdtr, pdtrc
@@ -26,7 +27,14 @@ from starcal_ros.robust_statistics import median, medians
 
 # Number of the brightest predictions and sources that vote; all pairs fill one histogram.
 _VOTERS = 100
-_SIDE = 3  # the image is checked in _SIDE x _SIDE parts
+# Where noise or artefacts outnumber the stars, the brightest sources alone are stars.
+_DEPTHS = (60, 30, 15)
+_PAIRS_OF_CUBIC = 8  # that carry a cubic radial distortion besides rotation and scale
+_MOST_CUBIC = 0.15  # of the half diagonal: displacement of the corner of the image
+_SOUND_SHARE = 0.75  # of the brightest sources met by a match that needs no other attempt
+_MET_PX = 2.0  # between a source and the star that it is
+_FEWEST_SOURCES = 6  # fewer cannot pass the test against chance
+_SIDE = 3  # parts of the image along each side, in which a match must hold
 PARTS = _SIDE**2
 _FEWEST_IN_PART = 4  # points in a part for a significant share
 _PART_MAX_P_VALUE = 1e-3  # of the misses in a part, if the match is right
@@ -50,8 +58,36 @@ def acquire(
     ImageRefused
         ``no_match`` if the number of matched predictions is consistent with chance.
     """
-    rotation = _vote(prediction, sources, geometry, reach_px, roll_rad)
-    return _match(prediction, sources, geometry, rotation)
+    best_px, most, refused = None, -1, None
+    for depth in (len(sources.snr), *_DEPTHS):
+        if depth < _FEWEST_SOURCES or (depth in _DEPTHS and depth >= len(sources.snr)):
+            continue
+        brightest = dataclasses.replace(
+            sources, xy_px=sources.xy_px[:depth], snr=sources.snr[:depth]
+        )
+        try:
+            turn = _vote(prediction, brightest, geometry, reach_px, roll_rad)
+            found_px = _match(prediction, brightest, geometry, turn)
+        except ImageRefused as error:
+            # The first attempt uses every source: its numbers describe the image.
+            refused = refused or error
+            continue
+        met = _bright_met(found_px, sources, geometry)
+        if met > most:
+            best_px, most = found_px, met
+        if most >= _SOUND_SHARE * min(len(sources.snr), _DEPTHS[0]):
+            break
+    if best_px is None:
+        raise refused or ImageRefused('no_match', f'{len(sources.snr)} star-like sources')
+    return best_px
+
+
+def _bright_met(predicted_px: Floats, sources: Sources, geometry: CameraGeometry) -> int:
+    """Number of the brightest sources that meet one of the brightest predictions (n, 2)."""
+    camera = geometry.camera
+    inside = in_image(predicted_px, camera.width, camera.height)
+    depth = _DEPTHS[0]
+    return len(_pairs(predicted_px[inside][: 2 * depth], sources.xy_px[:depth], _MET_PX))
 
 
 def _vote(
@@ -84,7 +120,8 @@ def _vote(
     rolls_rad = [k * roll_step for k in sorted(range(-roll_steps, roll_steps + 1), key=abs)]
 
     centre = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    stars = prediction.xy_px[:_VOTERS] - centre
+    # Sources of the image against the predictions of its area and of the margin about it.
+    stars = prediction.xy_px[: min(_VOTERS, 2 * len(sources.snr))] - centre
     seen = sources.xy_px[:_VOTERS] - centre
     votes, roll, low = _fullest_block(stars, seen, cell_px, half_cells, rolls_rad)
     expected = len(stars) * len(seen) * (2 * cell_px) ** 2 / sources.searched_px2
@@ -161,31 +198,42 @@ def _refine_rotation(
     radius; only ``stars`` (rows of the prediction) are matched to the sources.
     """
     camera = geometry.camera
-    rotation, scale = start, 1.0
-    pairs: Indices = np.empty((0, 2), np.int64)
     centre = camera.parameters[3:5]
-    widest = max(8.0, 0.012 * np.hypot(camera.width, camera.height))
-    for radius_px in (widest, widest, widest, widest / 2, widest / 2, widest / 3, widest / 3):
+    half_diagonal_px = 0.5 * np.hypot(camera.width, camera.height)
+    rotation, scale, cubic = start, 1.0, 0.0
+    pairs: NDArray[np.int64] = np.empty((0, 2), np.int64)
+
+    def placed() -> tuple[Floats, Floats, Floats]:
         directions = rotation.apply(prediction.direction_camera)
-        xy = (project(camera, directions) - centre) * scale + centre
+        from_centre = project(camera, directions) - centre
+        radius2 = np.minimum((from_centre**2).sum(axis=1) / half_diagonal_px**2, 2.0)[:, None]
+        xy = centre + from_centre * (scale + cubic * radius2)
+        return xy, directions, np.stack([from_centre, from_centre * radius2], axis=-1)
+
+    widest = max(8.0, 0.012 * 2 * half_diagonal_px)
+    for radius_px in (widest, widest, widest, widest / 2, widest / 2, widest / 3, widest / 3):
+        xy, directions, by_radial = placed()
         pairs = _pairs(xy[stars], sources.xy_px, radius_px)
         if len(pairs) < 4:
             break
         star = stars[pairs[:, 0]]
         residual = sources.xy_px[pairs[:, 1]] - xy[star]
         J_rotation = rotation_jacobian(camera, directions[star])
-        J = np.concatenate([scale * J_rotation, (xy[star] - centre)[:, :, None]], axis=-1)
+        J = np.concatenate([scale * J_rotation, by_radial[star]], axis=-1)
         size = np.linalg.norm(residual, axis=1)
         weight = 1.0 / (1.0 + (size / max(median(size), 0.3)) ** 2)
         root = np.sqrt(weight)[:, None]
+        free = 5 if len(pairs) >= _PAIRS_OF_CUBIC else 4
         step = np.linalg.lstsq(
-            (J * root[:, :, None]).reshape(-1, 4), (residual * root).ravel(), rcond=1e-10
+            (J[:, :, :free] * root[:, :, None]).reshape(-1, free),
+            (residual * root).ravel(),
+            rcond=1e-10,
         )[0]
         rotation = Rotation.from_rotvec(-step[:3]) * rotation
-        scale = float(np.clip(scale * (1.0 + step[3]), 0.75, 1.3))
-    directions = rotation.apply(prediction.direction_camera)
-    xy = (project(camera, directions) - centre) * scale + centre
-    return xy, pairs
+        scale = float(np.clip(scale + step[3], 0.75, 1.3))
+        if free == 5:
+            cubic = float(np.clip(cubic + step[4], -_MOST_CUBIC, _MOST_CUBIC))
+    return placed()[0], pairs
 
 
 def _match(
@@ -219,9 +267,9 @@ def _match(
         pairs = _pairs((xy + correction)[bright], seen.xy_px, radius_px)
     if len(pairs) >= 4:
         xy = xy + correction
-    # Rotation, scale and warp were fitted to the pairs: two parameters can make one false pair.
-    fitted_pairs = 2 + len(warp_powers(len(pairs)))
-    _check_beyond_chance(xy[bright], seen, fitted_pairs, camera.width, camera.height)
+    # Rotation, scale, cubic and warp were fitted to the pairs: two parameters can buy one pair.
+    bought = 3 + len(warp_powers(len(pairs)))
+    _check_beyond_chance(xy[bright], seen, bought, camera.width, camera.height)
     return xy
 
 
@@ -239,7 +287,7 @@ def _check_beyond_chance(
         ``no_match``.
     """
     inside = in_image(predicted_px, width, height)
-    radius_px = 2.0
+    radius_px = _MET_PX
     met = _pairs(predicted_px[inside], sources.xy_px, radius_px)
     matched = len(met)
     density = len(sources.snr) / sources.searched_px2

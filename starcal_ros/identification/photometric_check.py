@@ -17,10 +17,12 @@ from starcal_ros.image.centroiding import Centroids, ImageModel
 from starcal_ros.image.psf_fit import expected_snr
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 
-_FEWEST = 4  # stars for a significant scatter or share
-# The band of a camera differs from V: real stars scatter by 0.15 to 0.3 mag, none of 2000 by
-# 1.5; vignetting may reach 1 mag.  False matches scatter by 1.0 to 1.7 mag.
-_MOST_OFF = 2.0  # largest deviation of one star, in units of the largest scatter
+_FEWEST = 4  # stars whose scatter, or the share of which, means anything
+# A camera's band is not V: stars of a real sky scatter by 0.15 to 0.3 mag, none of 2000 was off
+# by 1.5; a lens may dim its corners by 1.  Stars met by chance scatter by 1.0 to 1.7 mag.
+_BRIGHTEST = 20  # good stars, brightest in the catalog, that give a first zero point
+_FAR_MAG = 0.0  # a star so much brighter than the catalog has it would still not be seen
+_MOST_OFF = 2.0  # of one star, in the largest scatter of all
 
 
 def refuse_by_brightness(
@@ -59,7 +61,18 @@ def refuse_by_brightness(
     good = np.flatnonzero(refusal == '')
     if len(good) < _FEWEST:
         return refusal
+    psf_sigma_px, noise_dn = model.psf_sigma_px or 1.0, model.background.noise_dn
     zero_point = magnitude[good] + 2.5 * np.log10(centroids.flux_dn[good])
+    # Peaks of noise stand near faint catalog stars by chance: by the brightest stars of the
+    # catalog those are too faint to be seen, and what is measured there is not their light.
+    brightest = np.argsort(magnitude[good], kind='stable')[:_BRIGHTEST]
+    highest = median(zero_point[brightest]) + _FAR_MAG
+    most_dn = 10.0 ** (0.4 * (highest - magnitude[good].astype(np.float64)))
+    unseen = expected_snr(most_dn, psf_sigma_px, noise_dn, model.pixel_noise) < min_snr
+    refusal[good[unseen]] = 'faint'
+    good, zero_point = good[~unseen], zero_point[~unseen]
+    if len(good) < _FEWEST:
+        return refusal
     off_mag = np.abs(zero_point - median(zero_point))
     scatter_mag = MAD_TO_SIGMA * median(off_mag)
     if scatter_mag > max_scatter_mag:
@@ -73,7 +86,6 @@ def refuse_by_brightness(
     # Stars bright enough to be detected even if they are fainter by the largest deviation.
     faintest = median(zero_point) - most_mag
     least_dn = 10.0 ** (0.4 * (faintest - magnitude.astype(np.float64)))
-    psf_sigma_px, noise_dn = model.psf_sigma_px or 1.0, model.background.noise_dn
     seen = expected_snr(least_dn, psf_sigma_px, noise_dn, model.pixel_noise) > min_snr
     refusal[seen & (refusal == 'faint')] = 'not_detected'
     kept = refusal == ''

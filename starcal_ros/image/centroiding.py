@@ -17,6 +17,8 @@ from scipy.spatial import cKDTree
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.image.detection import (
     Background,
+    GAP_SIGMA,
+    mesh_slope,
     sample_mesh,
     Sources,
     stamps_about,
@@ -25,7 +27,7 @@ from starcal_ros.image.detection import (
     windows_inside,
 )
 from starcal_ros.image.hot_pixels import CORE_PX, hot_in_stamps, lit_alone, NO_HOT_PIXELS
-from starcal_ros.image.psf_field import Instrument, PsfWidth, uniform_width
+from starcal_ros.image.psf_field import Instrument, MIN_PSF_SIGMA_PX, PsfWidth, uniform_width
 from starcal_ros.image.psf_fit import (
     approach,
     border_level_dn,
@@ -42,15 +44,16 @@ from starcal_ros.image.psf_fit import (
     Stamps,
 )
 from starcal_ros.options import option
+from starcal_ros.records import STAR_REFUSALS
 from starcal_ros.robust_statistics import centre_and_scatter, median
 
+_REFUSAL_NAME = np.dtype(f'U{max(map(len, STAR_REFUSALS))}')  # holds every name uncut
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitive than another
 _MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours
 SWAMPED_SIGMA = 3.0  # a brighter star nearer than this swamps, though it is measured itself
 _NEIGHBOUR_NOISE = 0.2  # of the noise of a pixel: less light of a neighbour changes nothing
 _IN_PLACE_PX = 1.5  # of a fit from the brightest pixel: beyond, it has gone elsewhere
 _BRIGHTEST = 60  # stars that show the level of saturation
-_MIN_PSF_SIGMA_PX = 0.45
 _MAX_PSF_SIGMA_PX = 4.0
 
 
@@ -196,7 +199,7 @@ def model_image(
         change = median(fit.shape_change[:, :2].mean(axis=1))
         sigma_before = sigma
         sigma *= float(np.sqrt(np.clip(1.0 + change, 0.5, 2.0)))
-        sigma = float(np.clip(sigma, _MIN_PSF_SIGMA_PX, _MAX_PSF_SIGMA_PX))
+        sigma = float(np.clip(sigma, MIN_PSF_SIGMA_PX, _MAX_PSF_SIGMA_PX))
         if abs(sigma - sigma_before) < 1e-3 * sigma:
             break
     shape_median, shape_scatter = centre_and_scatter(fit.shape_change)
@@ -279,7 +282,7 @@ def _measure_by_psf(
     shape = (pixels.shape[0], pixels.shape[1])
     radius = stamp_radius_px(psf.sigma_px)
     n = len(predicted_px)
-    refusal = np.full(n, '', dtype='U16')
+    refusal = np.full(n, '', dtype=_REFUSAL_NAME)
     centre = np.rint(np.where(np.isnan(predicted_px), -1e6, predicted_px)).astype(np.int64)
     inside = windows_inside(shape, centre, 1)
     innermost = np.array([shape[1] - 2, shape[0] - 2])
@@ -293,17 +296,22 @@ def _measure_by_psf(
     centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
     centre = np.minimum(np.maximum(centre, 1), innermost)
     stamps, outside = stamps_at_edges(pixels, centre, radius)
+    saturated = (stamps >= model.saturation_dn) & ~outside
     at_px = centre.astype(np.float64)
     noise_dn = sample_mesh(model.background.noise_mesh, shape, at_px)
+    invalid = (stamps == 0.0) & (
+        sample_mesh(model.background.level_mesh, shape, at_px) > GAP_SIGMA * noise_dn
+    )[:, None, None]
+    # The fit has a level and no slope: a slope would pull faint stars up it.
+    stamps -= _slopes(model.background, shape, at_px, radius)
     sigma_px = psf.at(at_px)
-    saturated = (stamps >= model.saturation_dn) & ~outside
     hot = hot_in_stamps(hot_pixels, centre, radius, shape[1]) & ~outside
     level_dn = border_level_dn(stamps)
     hot |= _single_pixels(pixels, stamps, centre, level_dn, noise_dn, model.pixel_noise)
     # The first guess looks at all pixels; to the fit itself these say nothing.
     if hot.any():
         stamps[hot] = level_dn[np.nonzero(hot)[0]]
-    out = saturated | hot | outside
+    out = saturated | hot | outside | invalid
     windows = Stamps(stamps, sigma_px, noise_dn[:, None] ** 2, out if out.any() else None)
     parameters = approach(windows, first_guess(windows, level_dn), model.pixel_noise)
     saturated_pixels = np.count_nonzero(saturated & ~hot, axis=(1, 2))
@@ -335,6 +343,16 @@ def _measure_by_psf(
         noise_dn=noise_dn,
         modelled=modelled,
     )
+
+
+def _slopes(background: Background, shape: tuple[int, int], at_px: Floats, radius: int) -> Floats:
+    """The slope of the background in windows about pixels (n, 2), zero in their middles, DN."""
+    reach = np.arange(-radius, radius + 1).astype(np.float64)
+    down, across = (
+        sample_mesh(slope, shape, at_px)[:, None, None]
+        for slope in mesh_slope(background.level_mesh, shape)
+    )
+    return np.asarray(down * reach[:, None] + across * reach)
 
 
 def _misshapen(fit: PsfFit, model: ImageModel, options: CentroidOptions) -> NDArray[np.bool_]:
@@ -452,7 +470,7 @@ def _measure_by_moments(
     shape = (pixels.shape[0], pixels.shape[1])
     radius = int(np.ceil(options.mask_radius_px))
     n = len(predicted_px)
-    refusal = np.full(n, '', dtype='U16')
+    refusal = np.full(n, '', dtype=_REFUSAL_NAME)
     centre = np.rint(np.nan_to_num(predicted_px, nan=-1e6)).astype(np.int64)
     inside = windows_inside(shape, centre, 2 * radius)
     refusal[~inside] = 'border'

@@ -13,13 +13,18 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.robust_statistics import median, medians
 
 _MESH_PX = 64  # glare and vignetting vary slowly over it
 _MESH_STEP_PX = (4, 4)  # down and across: 256 samples of a cell give its noise to 5 %
+GAP_SIGMA = 8.0  # 0 DN so far below the other pixels of a cell marks an invalid pixel
+_CUT_OFF = 0.3  # part of a cell at 0 DN from which its lower half no longer shows the noise
+_LEAST_CUT_OFF_DN = 0.5
+_STEEP_PART = 0.2  # of the variance of a cell from which a slope counts
+_MOSTLY_INVALID = 0.75  # invalid part of a cell from which its neighbour stands in for it
 _SPARSE_PX = 256
 _SPARSE_STEP_PX = (32, 8)  # a row that is read is read whole: few rows, many of their pixels
 _DETECTION_SIGMA_PX = (
@@ -29,7 +34,9 @@ _DETECTION_SIGMA_PX = (
 _NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
 _ALONG_U, _ALONG_V = np.array([[[1], [0]], [[0], [1]]])  # a step along either axis, (2, 1)
 _RIM_PX = 4  # the filter's own reach, and one pixel for the place of the maximum
-_HOT_PEAK_RATIO = 4.0  # peak over filtered peak: 6.3 for one lit pixel, 2.7 for a 0.7 px star
+# Peak over filtered peak: 6.3 for one lit pixel less its noise; of a star in the middle of a pixel
+# 4.2 for a PSF of 0.45 px (half of the light in that pixel), 4.65 for one of 0.4 px.
+_HOT_PEAK_RATIO = 4.7
 
 
 @dataclass(frozen=True)
@@ -63,17 +70,24 @@ def measure_background(pixels: Pixels) -> Background:
     """
     Background level and noise of an image from the median and the clipped spread of each cell.
 
-    One pixel in sixteen is read.  The noise is at least that of the quantisation to whole DN.
+    One pixel in sixteen is read.  Invalid pixels (0 DN far below all others, such as a masked
+    border) are left out.  The noise is at least that of the quantisation to whole DN.
     """
     samples, mesh_shape = _cells(pixels, _MESH_PX, _MESH_STEP_PX)
     samples.sort(axis=1)
-    count = samples.shape[1]
-    median = samples[:, count // 2].copy()
-    # Below the median lies no star: the lower quantiles alone give the spread.
-    spread = median - samples[:, int(count * 0.1587)]
-    samples -= median[:, None]
-    mean, noise = _clipped(samples, spread)
-    return _background(mean + median, noise, mesh_shape)
+    zeros = np.count_nonzero(samples == 0.0, axis=1)
+    invalid = np.where(_gap_above_zero(samples, zeros), zeros, 0)
+    level = _quantile(samples, 0.5, invalid)
+    # Stars lie above the median only: the lower quantile gives the spread.
+    spread = level - _quantile(samples, 0.1587, invalid)
+    tail = _noise_above(samples, level, np.where(invalid > 0, 0, zeros))
+    samples -= level[:, None]
+    mean, noise = _clipped(samples, spread, np.arange(samples.shape[1]) >= invalid[:, None])
+    noise = np.maximum(noise, tail)
+    has_pixels = invalid < _MOSTLY_INVALID * samples.shape[1]
+    level, noise = (_filled(values, has_pixels, mesh_shape) for values in (mean + level, noise))
+    noise = np.maximum(_without_slope(noise, level.reshape(mesh_shape), pixels), tail)
+    return _background(level, noise, mesh_shape)
 
 
 def sample_background(pixels: Pixels) -> Background:
@@ -86,11 +100,99 @@ def sample_background(pixels: Pixels) -> Background:
     samples, mesh_shape = _cells(pixels, _SPARSE_PX, _SPARSE_STEP_PX)
     beside, _ = _cells(pixels[:, 2:], _SPARSE_PX, _SPARSE_STEP_PX, mesh_shape)
     width = min(samples.shape[1], beside.shape[1])
-    apart = samples[:, :width] - beside[:, :width]
-    rank = int(width * 0.6827)
-    _, noise = _clipped(apart, np.partition(np.abs(apart), rank, axis=1)[:, rank])
+    noise = _difference_noise(samples[:, :width], beside[:, :width])
     level = medians(samples[:, ::4].T).astype(np.float32)
-    return _background(level, noise / math.sqrt(2.0), mesh_shape)
+    zeros = np.count_nonzero(samples == 0.0, axis=1)
+    cut_off = np.flatnonzero(zeros > _CUT_OFF * samples.shape[1])
+    if len(cut_off):
+        tail = _noise_above(np.sort(samples[cut_off], axis=1), level[cut_off], zeros[cut_off])
+        noise[cut_off] = np.maximum(noise[cut_off], tail)
+    return _background(level, noise, mesh_shape)
+
+
+def _noise_above(
+    ascending: NDArray[np.float32], level: NDArray[np.float32], zeros: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """
+    Noise (k,) of the sorted rows (k, n) that the converter cuts off at 0 DN; 0 of the others.
+
+    The lower half of such noise is gone; the upper half is taken at its 2-sigma quantile.  Noise
+    below 1 DN shows in a few pixels only, so that less than 0.5 DN cannot be claimed.
+    """
+    count = ascending.shape[1]
+    above = ascending[:, int(0.9772 * count)] - level
+    noise = np.maximum(0.5 * above, np.float32(_LEAST_CUT_OFF_DN))
+    return np.where(zeros > _CUT_OFF * count, noise, np.float32(0.0))
+
+
+def _without_slope(
+    noise: NDArray[np.float32], level_mesh: NDArray[np.float32], pixels: Pixels
+) -> NDArray[np.float32]:
+    """Noise (k,) of the cells; from differences where a slope of the background swamps it."""
+    down, across = mesh_slope(_smooth_mesh(level_mesh), pixels.shape)
+    cell_v, cell_u = np.array(pixels.shape) / level_mesh.shape
+    ramp = (((down * cell_v) ** 2 + (across * cell_u) ** 2) / 12.0).ravel()
+    steep = ramp > _STEEP_PART * noise**2
+    if not steep.any():
+        return noise
+    samples, mesh_shape = _cells(pixels, _MESH_PX, _MESH_STEP_PX)
+    beside, _ = _cells(pixels[:, 2:], _MESH_PX, _MESH_STEP_PX, mesh_shape)
+    width = min(samples.shape[1], beside.shape[1])
+    of_differences = _difference_noise(samples[:, :width], beside[:, :width])
+    return np.where(steep, np.minimum(of_differences, noise), noise)
+
+
+def _difference_noise(
+    samples: NDArray[np.float32], beside: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Noise (k,) from the differences of near pixels (k, n), which no slope enters by much."""
+    apart = samples - beside
+    apart -= np.partition(apart, apart.shape[1] // 2, axis=1)[:, apart.shape[1] // 2, None]
+    rank = int(apart.shape[1] * 0.6827)
+    _, noise = _clipped(apart, np.partition(np.abs(apart), rank, axis=1)[:, rank])
+    return np.asarray(noise / math.sqrt(2.0), np.float32)
+
+
+def mesh_slope(
+    mesh: NDArray[np.float32], shape: tuple[int, ...]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Slopes (rows, cols) of a mesh over an image of ``shape``, down and across, per pixel."""
+    rows, cols = mesh.shape
+    down, across = np.zeros_like(mesh), np.zeros_like(mesh)
+    if rows > 1:
+        down = np.asarray(np.gradient(mesh, shape[0] / rows, axis=0), np.float32)
+    if cols > 1:
+        across = np.asarray(np.gradient(mesh, shape[1] / cols, axis=1), np.float32)
+    return down, across
+
+
+def _quantile(
+    ascending: NDArray[np.float32], part: float, first: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Quantiles (k,) of the sorted rows (k, n), each from its element ``first`` (k,) on."""
+    count = ascending.shape[1]
+    rank = first + ((count - first) * part).astype(np.int64)
+    row = np.arange(len(ascending))
+    return np.asarray(ascending[row, np.minimum(rank, count - 1)])
+
+
+def _gap_above_zero(ascending: NDArray[np.float32], zeros: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which rows (k,) of sorted samples hold 0 DN far below the noise of their other samples."""
+    level = _quantile(ascending, 0.5, zeros)
+    spread = level - _quantile(ascending, 0.1587, zeros)
+    return np.asarray((zeros > 0) & (level > GAP_SIGMA * np.maximum(spread, 1.0)))
+
+
+def _filled(
+    values: NDArray[np.float32], has_pixels: NDArray[np.bool_], mesh_shape: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Values (k,) of the cells, those without pixels from the nearest cell that has some."""
+    if has_pixels.all() or not has_pixels.any():
+        return values
+    nearest = distance_transform_edt(
+        ~has_pixels.reshape(mesh_shape), return_distances=False, return_indices=True
+    )
+    return np.asarray(values.reshape(mesh_shape)[tuple(nearest)].ravel())
 
 
 def _cells(
@@ -110,10 +212,14 @@ def _cells(
 
 
 def _clipped(
-    samples: NDArray[np.float32], spread: NDArray[np.float32]
+    samples: NDArray[np.float32],
+    spread: NDArray[np.float32],
+    valid: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean and 1-sigma of the rows of samples about zero, without those beyond three spreads."""
     inside = np.abs(samples) <= 3.0 * np.maximum(spread, 1.0)[:, None]
+    if valid is not None:
+        inside &= valid
     kept = np.maximum(np.count_nonzero(inside, axis=1), 1)
     samples = samples * inside
     mean = samples.sum(axis=1) / kept

@@ -48,7 +48,8 @@ class ScreeningOptions:
     )
     max_gradient: float = option(
         0.05,
-        'steepest background that more than half of an image may have, in pixel noise per pixel',
+        'largest change of the slope of the background from one 64 px cell to the next over half'
+        ' of an image, in pixel noise per pixel; a steady slope is subtracted',
         low=0.0,
         high=100.0,
     )
@@ -253,19 +254,22 @@ def _noise_dn(sample: RowSample, alive: NDArray[np.bool_]) -> float:
 
 def _refuse_glare(sample: RowSample, dark: Pixels | None, options: ScreeningOptions) -> None:
     """Refuse a frame whose background is steep over more than half of it."""
-    gradient = background_gradient(sample, dark)
-    if gradient > options.max_gradient:
+    bend = background_bend(sample, dark)
+    if bend > options.max_gradient:
         raise ImageRefused(
-            'glare', f'the background rises by {gradient:.2f} of its noise per pixel'
+            'glare',
+            f'the slope of the background changes by {bend:.2f} of its noise per pixel within'
+            f' {_SEGMENT_PX} px',
         )
 
 
-def background_gradient(sample: RowSample, dark: Pixels | None = None) -> float:
+def background_bend(sample: RowSample, dark: Pixels | None = None) -> float:
     """
-    Median slope of the background over a frame, in pixel noise per pixel.
+    Median change of the slope of the background from one cell to the next, in noise per pixel.
 
-    A slope g pulls the centroid of a star of any flux by up to 5 sigma_px^2 g of its own sigma
-    (Gaussian of width sigma_px, white noise) where the fit does not know of it.
+    A steady slope is subtracted before the stars are fitted.  What the cells leave of a slope g
+    pulls the centroid of a star of any flux by up to 5 sigma_px^2 g of its own sigma (Gaussian of
+    width sigma_px, white noise).
     """
     level = _means(sample.pixels)
     if dark is not None:
@@ -275,10 +279,10 @@ def background_gradient(sample: RowSample, dark: Pixels | None = None) -> float:
     mesh = cv2.resize(level, (level.shape[1], rows), interpolation=cv2.INTER_AREA)
     mesh = mesh.reshape(rows, level.shape[1])
     if min(mesh.shape) < 3:
-        return 0.0  # too small to tell a slope from its stars
-    # A 3 x 3 median takes out what holds a bright star.
+        return 0.0  # too small to separate a slope from its stars
+    # A 3 x 3 median removes cells with a bright star.
     mesh = np.asarray(cv2.medianBlur(mesh, 3), np.float32)
-    down = (mesh[2:, 1:-1] - mesh[:-2, 1:-1]) * (0.5 * rows / height)
-    across = (mesh[1:-1, 2:] - mesh[1:-1, :-2]) * (0.5 / _SEGMENT_PX)
+    down = np.diff(mesh, 2, axis=0)[:, 1:-1] * (rows / height)
+    across = np.diff(mesh, 2, axis=1)[1:-1] / _SEGMENT_PX
     everywhere = np.ones(sample.constant.shape, bool)
     return median(np.hypot(down, across)) / _noise_dn(sample, everywhere)

@@ -21,6 +21,7 @@ from starcal_ros.robust_statistics import centre_and_scatter
 _MEMORY = 0.95  # weight of what is known against each new image: about twenty images count
 _BRIGHT_SNR = 15.0  # of stars that tell the shape of the PSF
 _MOST = 60  # brightest of them, which know all the rest do
+MIN_PSF_SIGMA_PX = 0.3  # 82 % of the light in one pixel: a narrower PSF does not show its width
 _FEWEST = 5  # such stars, or an image tells nothing
 _MAP_CHI2 = 30.0  # five normal deviates squared come to that once in 80,000 times
 
@@ -102,7 +103,7 @@ class Instrument:
 
     def psf_width(self) -> PsfWidth:
         """The width over the field, or one for all of it where no change is significant."""
-        mean = self.width_right[0] / self.width_normal[0, 0]
+        mean = max(self.width_right[0] / self.width_normal[0, 0], MIN_PSF_SIGMA_PX**2)
         uniform = np.array([mean, 0.0, 0.0, 0.0, 0.0, 0.0])
         # A trace of the mean keeps a map solvable whose stars stand in one corner.
         ridge = 1e-6 * self.width_normal[0, 0] * np.eye(6)

@@ -33,6 +33,7 @@ _FIT_STEPS = 4  # stars settle in two or three; what has not by then is no star
 # this part of sigma_px and of the noise of the place, squared, the last step leaves 0.1 of that.
 _SETTLED = 0.3
 _SIGNIFICANT = 3.0  # sigma
+_LIKELY = 1.9  # sigma
 _MOMENTS = np.array([[-1, 0, 1] * 3, [-1] * 3 + [0] * 3 + [1] * 3, [1] * 9], np.float64).T
 MISFIT_SIGMA = 5.0  # 81 pixels of normal noise pass it once in 20,000 stars
 
@@ -402,7 +403,11 @@ class NoiseSums:
             # A squared normal residual over its variance has a variance of 2.
             sigma = scale[free] * np.sqrt(2.0 * inverse.diagonal())
             if free[-1] == 2 and value[-1] < _SIGNIFICANT * sigma[-1]:
-                free = free[:-1]
+                # Few stars cannot separate the two: the gain goes only where nothing shows it.
+                gain_shows_less = (
+                    1 in free and value[1] < sigma[1] and value[2] > _LIKELY * sigma[2]
+                )
+                free = [0, 2] if gain_shows_less else [0, 1] if not gain_e_per_dn else [0]
             elif 1 in free and value[free.index(1)] < 0.0:
                 free.remove(1)
             else:

@@ -69,7 +69,7 @@ def numerical(
     table, state = estimate.table, estimate.state
     q, axes = len(state.focal), len(state.rate)
     measured = [Rotation.from_quat(i.icrf_from_star_tracker_xyzw).inv() for i in ensemble.images]
-    uu, uv, vv = estimate.variance.of(table.covariance_px2).T
+    uu, uv, vv = estimate.variance.of(table.covariance_px2, table.magnitude).T
     C = np.stack([np.stack([uu, uv], axis=-1), np.stack([uv, vv], axis=-1)], axis=-2)
     root_weight = np.linalg.cholesky(np.linalg.inv(C)).transpose(0, 2, 1)
 

@@ -462,8 +462,9 @@ def test_lit_single_pixels_are_no_sources() -> None:
     hot.flat[rng.choice(hot.size, 200, replace=False)] = rng.uniform(300, 6000, 200)
     pixels = expose(hot + QUIET.background_electrons, QUIET, rng)
     sources = detect(pixels, measure_background(pixels), PSF.detection_sigma)
-    # Two of them side by side may pass for a source.
-    assert len(sources.snr) <= 2
+    # Two side by side may pass for a source, and one of 200 whose neighbours' noise helps: half of
+    # the light of an undersampled star is in one pixel, and such stars must not be left out.
+    assert len(sources.snr) <= 3
 
 
 @pytest.mark.parametrize('offset', [(1, 0), (1, 1)])
