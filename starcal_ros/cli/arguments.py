@@ -46,6 +46,21 @@ _HELP: dict[str, tuple[str, str, str]] = {
 
 exit status: 0 a calibration could use the bag; 3 it could not, and why is said; 2 bad input.""",
     ),
+    'diagnose': (
+        'find out why the images of a bag match no star',
+        (
+            'Identifies some of the first images without attitude or alignment, holds attitudes, '
+            'alignment and camera against them, and prints what is wrong, how that is known, and '
+            'the lines of the parameter file that mend it.'
+        ),
+        """\
+  # no image matches: why?
+  starcal diagnose bags/tiny --params bags/tiny/params.yaml
+  # for a program
+  starcal diagnose bags/tiny --params bags/tiny/params.yaml --json
+
+exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad input.""",
+    ),
     'calibrate': (
         'calibrate from bags, without a ROS graph',
         (
@@ -187,6 +202,7 @@ def parser() -> argparse.ArgumentParser:
     for name, add in (
         ('demo', _demo),
         ('inspect', _inspect),
+        ('diagnose', _diagnose),
         ('calibrate', _calibrate),
         ('report', _report),
         ('compare', _compare),
@@ -292,6 +308,13 @@ def _demo(command: argparse.ArgumentParser) -> None:
 def _inspect(command: argparse.ArgumentParser) -> None:
     _bags(command, nargs='+')
     _params(command, 'ROS parameter file: measure the stars with it as well', required=False)
+    _topics(command)
+    command.add_argument('--json', action='store_true', help='print one JSON object instead')
+
+
+def _diagnose(command: argparse.ArgumentParser) -> None:
+    _bags(command, nargs='+')
+    _params(command, 'ROS parameter file: prior camera, mounting and options', required=True)
     _topics(command)
     command.add_argument('--json', action='store_true', help='print one JSON object instead')
 

@@ -181,6 +181,18 @@ def _inspect(args: argparse.Namespace) -> int:
     return EXIT_REFUSED if found.problems else EXIT_ACCEPTED
 
 
+def _diagnose(args: argparse.Namespace) -> int:
+    """Say why the images of a bag match nothing."""
+    from starcal_ros.cli import diagnosis
+
+    found = diagnosis.of_bags(args.bags, _asked(args), _setup(args.params))
+    if args.json:
+        print(json.dumps(diagnosis.content(found), indent=1, allow_nan=False))
+    else:
+        print(diagnosis.text(found))
+    return EXIT_ACCEPTED if found.cause == 'none' else EXIT_REFUSED
+
+
 def _compare(args: argparse.Namespace) -> int:
     """Say how far two calibrations are apart."""
     from starcal_ros.assessment import comparison
@@ -401,6 +413,7 @@ def _make_folder(path: Path) -> None:
 _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     'demo': _demo,
     'inspect': _inspect,
+    'diagnose': _diagnose,
     'calibrate': _calibrate,
     'report': _report,
     'compare': _compare,

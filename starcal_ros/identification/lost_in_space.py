@@ -42,10 +42,10 @@ from starcal_ros.sky.catalog import StarCatalog
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-MAX_LOG10_P_VALUE = -5.0
-_ROUNDS = (14, 20, 28)  # brightest sources of which patterns are formed, round by round
-_REFINED = 25  # best candidates of a lookup that are refined
-_CANDIDATES = 40_000  # of a lookup that are tested, drawn at random from more
+MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of false matches
+_ROUNDS = (12, 18, 24)  # brightest sources of which patterns are formed, round by round
+_REFINED = 10  # best candidates of a lookup that are refined
+_CANDIDATES = 20_000  # of a lookup that are tested, drawn at random from more
 _TESTED = 24  # brightest predictions that a candidate is tested with
 _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
@@ -212,10 +212,11 @@ def _fits(
 def _look_up(
     image: SourceImage, catalog: StarCatalog, scale: int, directions: Floats, before: int
 ) -> _Candidates:
-    """Patterns of directions (n, 3) and of the catalog alike; one source at least from ``before``."""
+    """Patterns of directions (n, 3) alike to ones of the catalog, with one from ``before`` on."""
     index = pattern_index(catalog, scale)
     usable = np.flatnonzero(np.isfinite(directions[:, 0]))
-    chosen = np.array(list(itertools.combinations(usable.tolist(), 4)), np.int64).reshape(-1, 4)
+    every = list(itertools.combinations(usable.tolist(), 4))
+    chosen: Rows = np.array(every, np.int64).reshape(-1, 4)
     chosen = chosen[chosen[:, 3] >= before]
     place_tolerance, size_tolerance = _tolerances(image.half_diagonal_rad)
     order, shape = shapes(directions[chosen])
@@ -242,7 +243,7 @@ def _rotations(catalog: StarCatalog, candidates: _Candidates, plane: Floats) -> 
     seen[..., 2] = 1.0
     seen /= np.linalg.norm(seen, axis=2, keepdims=True)
     stars = catalog.direction_icrs[candidates.stars]
-    return np.einsum('nki,nkj->nij', _triads(seen), _triads(stars))
+    return np.asarray(np.einsum('nki,nkj->nij', _triads(seen), _triads(stars)))
 
 
 def _triads(directions: Floats) -> Floats:
@@ -322,7 +323,7 @@ def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: 
     rows = np.full((len(point), 2 * count), -1, np.int64)
     for k, inside in enumerate(found):
         rows[k, : len(inside)] = inside[: 2 * count]
-    return rows[place.ravel()]
+    return np.asarray(rows[place.ravel()])
 
 
 def _stars_about(image: SourceImage, catalog: StarCatalog, axis: Floats) -> Rows:

@@ -68,18 +68,16 @@ class SourceImage:
 
 @dataclass(frozen=True)
 class SkyFit:
-    """A camera, its rotation, and the brightest stars (n,) that it may show, rows of the catalog."""
+    """A camera, its rotation, and the brightest stars (n,) it may show, rows of the catalog."""
 
     camera_from_icrf: Rotation
     camera: CameraModel
     stars: Rows
 
 
-def refined(
-    image: SourceImage, catalog: StarCatalog, start: SkyFit, pairs: Rows
-) -> SkyFit | None:
+def refined(image: SourceImage, catalog: StarCatalog, start: SkyFit, pairs: Rows) -> SkyFit | None:
     """
-    The fit that a start leads to, the radius of matching closing in; None where it loses the stars.
+    The fit that a start leads to as the radius of matching closes in; None: it loses the stars.
 
     ``pairs`` (k, 2), rows of the catalog and of the sources, are those that gave the start.
     """
@@ -206,7 +204,7 @@ def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tupl
         if n < 5:
             continue
         sources = min(len(image.xy_px), 4 * n)
-        rank, _, apart_px = _mutual(image, xy_px[:n], _JUDGED_PX[-1], sources)
+        _, _, apart_px = _mutual(image, xy_px[:n], _JUDGED_PX[-1], sources)
         for radius_px in _JUDGED_PX:
             hits = int(np.count_nonzero(apart_px < radius_px))
             if hits < 5:
@@ -242,8 +240,5 @@ def _log10_positions(image: SourceImage, radius_px: float) -> float:
     shape = (half_px / f_px) ** 2 + 3 * DISTORTION_RANGE
     centre = 2 * CENTRE_RANGE * image.camera.width * shape / radius_px
     return math.log10(
-        max(tilts_and_roll, 1.0)
-        * max(focal, 1.0)
-        * max(distortion, 1.0)
-        * max(centre, 1.0) ** 2
+        max(tilts_and_roll, 1.0) * max(focal, 1.0) * max(distortion, 1.0) * max(centre, 1.0) ** 2
     )
