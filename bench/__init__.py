@@ -3,5 +3,5 @@
 NAMES = ('solver', 'ensemble', 'measure', 'calibrate', 'observer', 'gate')
 """The benches, each a module with ``run(quick)`` that prints its tables and returns them."""
 
-LONG = ('accuracy', 'acquisition', 'paper', 'faults', 'soak', 'transport')
+LONG = ('accuracy', 'acquisition', 'lost_in_space', 'paper', 'faults', 'soak', 'transport')
 """Those that take some minutes: run when they are named."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -107,7 +108,12 @@ def _calibrate_into(
     try:
         calibration, left = solve.solve_with_residuals(ensemble, setup, inputs=inputs)
     except TooFewObservations as error:
-        raise TooFewObservations(f'{error}{_refused_words(ensemble)}') from error
+        words = f'{error}{_refused_words(ensemble)}'
+        if topics.image and not ensemble.images:
+            from starcal_ros.cli import diagnosis
+
+            words = f'{words}. {diagnosis.in_a_sentence(bags, asked, setup)}'
+        raise TooFewObservations(words.removesuffix('. ')) from error
     _write_products(calibration, folder)
     write_residuals(left, folder / RESIDUALS_FILE)
     thumbnails.write_thumbnails(album.thumbnails(), folder / thumbnails.THUMBNAILS_FOLDER)
@@ -174,6 +180,11 @@ def _inspect(args: argparse.Namespace) -> int:
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:
         found = inspect.inspect(args.bags, _asked(args), setup, on_image=advance)
+    if setup and found.images and not found.stars_per_image and found.chosen:
+        from starcal_ros.cli import diagnosis
+
+        why = diagnosis.in_a_sentence(args.bags, _asked(args), setup)
+        found = dataclasses.replace(found, problems=(*found.problems, why)) if why else found
     if args.json:
         print(json.dumps(inspect.content(found), indent=1, allow_nan=False))
     else:
@@ -303,7 +314,6 @@ def _campaign(args: argparse.Namespace) -> int:
     """Run a Monte Carlo study."""
     # One thread each: trials go side by side, and numbers must not hang on how many there are.
     os.environ.update(OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1')
-    import dataclasses
     import time
 
     from starcal_ros.options import nearest
@@ -359,7 +369,6 @@ def _workers(args: argparse.Namespace) -> int:
 
 def _paper(args: argparse.Namespace) -> int:
     """Show the paper again."""
-    import dataclasses
     import functools
 
     from starcal_ros.pipeline import provenance

@@ -46,7 +46,7 @@ MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of 
 _ROUNDS = (12, 18, 24)  # brightest sources of which patterns are formed, round by round
 _REFINED = 10  # best candidates of a lookup that are refined
 _CANDIDATES = 20_000  # of a lookup that are tested, drawn at random from more
-_TESTED = 24  # brightest predictions that a candidate is tested with
+_TESTED = 16  # brightest predictions that a candidate is tested with
 _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
 _NEAR, _FAR = 0.006, 0.02  # 1-sigma of a candidate's predictions, of the half diagonal
@@ -275,7 +275,7 @@ def _gains(
     gains = np.empty(len(rotation))
     for first in range(0, len(rotation), _CHUNK):
         part = slice(first, first + _CHUNK)
-        stars = _bright_about(catalog, rotation[part, 2], 1.1 * math.atan(half), 2 * _TESTED)
+        stars = _bright_about(catalog, rotation[part, 2], 1.1 * math.atan(half), 3 * _TESTED)
         place = np.einsum('nij,nkj->nki', rotation[part], catalog.direction_icrs[stars])
         ahead = (stars >= 0) & (place[..., 2] > 0.1)
         z = np.where(ahead, place[..., 2], 1.0)
@@ -310,19 +310,20 @@ def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTr
     """Points all over the sky, and the stars that are among the brightest of discs of a radius."""
     radius_rad = math.radians(radius_deg)
     points = sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
-    enough = int(6 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
+    enough = int(9 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
     return cKDTree(points), cKDTree(catalog.direction_icrs[:enough])
 
 
 def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: int) -> Rows:
-    """Rows (n, count) of the brightest stars about axes (n, 3), at least within a radius."""
+    """Rows (n, count) of the brightest stars about axes (n, 3), within a radius or more; or -1."""
     points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
     point, place = np.unique(points.query(axes)[1], return_inverse=True)
     widened = 2 * math.sin(min(1.25 * radius_rad, math.pi) / 2)
     found = stars.query_ball_point(points.data[point], widened, return_sorted=True)
-    rows = np.full((len(point), 2 * count), -1, np.int64)
+    rows = np.full((len(point), count), -1, np.int64)
     for k, inside in enumerate(found):
-        rows[k, : len(inside)] = inside[: 2 * count]
+        few = inside[:count]
+        rows[k, : len(few)] = few
     return np.asarray(rows[place.ravel()])
 
 
@@ -343,10 +344,12 @@ def _result(
     mirrored: bool,
 ) -> SkyMatch:
     """The fit with every source that it explains."""
-    pairs = match(image, catalog, fit, max(radius_px, 1.5), 10_000, 10_000)
+    # Fainter stars than there are sources for would only lie beside false ones.
+    deepest = 2 * len(image.xy_px)
+    pairs = match(image, catalog, fit, max(radius_px, 1.5), deepest, 10_000)
     xy_px = image.xy_px[pairs[:, 1]]
     order = np.argsort(pairs[:, 0])
-    stars, placed = predicted(catalog, fit, 10_000)
+    stars, placed = predicted(catalog, fit, deepest)
     residual = xy_px[order] - placed[np.searchsorted(stars, pairs[order, 0])]
     return SkyMatch(
         camera_from_icrf=fit.camera_from_icrf,
