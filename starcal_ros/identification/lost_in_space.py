@@ -44,14 +44,14 @@ Rows = NDArray[np.int64]
 
 MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of false matches
 _ROUNDS = (12, 18, 24)  # brightest sources of which patterns are formed, round by round
-_REFINED = 10  # best candidates of a lookup that are refined
+_REFINED = 16  # best candidates of a lookup that are refined
 _CANDIDATES = 20_000  # of a lookup that are tested, drawn at random from more
 _TESTED = 16  # brightest predictions that a candidate is tested with
 _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
 _NEAR, _FAR = 0.006, 0.02  # 1-sigma of a candidate's predictions, of the half diagonal
 _SHOWN = 0.6  # share of the bright stars that a right candidate is expected to show
-_LEAST_GAIN = 1.0  # of what the four stars of a pattern have by themselves
+_LEAST_GAIN = 0.8  # of what the four stars of a pattern have by themselves
 
 
 @dataclass(frozen=True)
