@@ -42,7 +42,7 @@ CAUSES = (
 
 IMAGES = 8  # identified
 _TRIED = 14  # looked at for them
-_GIVEN_UP = 3  # looked at where none is identified
+_GIVEN_UP = 2  # looked at where none is identified
 _FEWEST_SOURCES = 6
 _ROTATED_RAD = math.radians(20.0)  # of a right angle about the line of sight
 _FOCAL_SHARE = 0.03  # error of the focal length that an image is still matched with
