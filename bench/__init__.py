@@ -3,5 +3,14 @@
 NAMES = ('solver', 'ensemble', 'measure', 'calibrate', 'observer', 'gate')
 """The benches, each a module with ``run(quick)`` that prints its tables and returns them."""
 
-LONG = ('accuracy', 'trust', 'acquisition', 'paper', 'faults', 'soak', 'transport')
+LONG = (
+    'accuracy',
+    'trust',
+    'acquisition',
+    'lost_in_space',
+    'paper',
+    'faults',
+    'soak',
+    'transport',
+)
 """Those that take some minutes: run when they are named."""

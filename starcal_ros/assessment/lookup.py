@@ -11,6 +11,7 @@ from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project_j
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.detector_field import basis
 
+_CHUNK = 4096  # pixels at a time: the derivatives by a field of 300 terms take 30 MB
 _GRID = 25  # pixels a side over which the common rotation is taken
 
 
@@ -46,13 +47,27 @@ def line_of_sight_table(
 
     ``covariance`` is that of `line_of_sight_jacobian`'s numbers.
     """
-    directions, J = line_of_sight_jacobian(camera, pixels)
+    parts = [pixels[k : k + _CHUNK] for k in range(0, len(pixels), _CHUNK)]
+    found = [_table(camera, covariance, part) for part in parts]
     return LineOfSightTable(
-        pixels,
-        directions,
-        np.sqrt(_trace(_shape_jacobian(camera, directions, J), covariance)) / ARCSECOND_RAD,
-        np.sqrt(_trace(J, covariance)) / ARCSECOND_RAD,
+        pixels, *(np.concatenate(column) for column in zip(*found, strict=True))
     )
+
+
+def _table(
+    camera: CameraModel, covariance: Floats, pixels: Floats
+) -> tuple[Floats, Floats, Floats]:
+    directions, J = line_of_sight_jacobian(camera, pixels)
+    shape = np.sqrt(_trace(_shape_jacobian(camera, directions, J), covariance))
+    return directions, shape / ARCSECOND_RAD, np.sqrt(_trace(J, covariance)) / ARCSECOND_RAD
+
+
+def pixels_every(camera: CameraModel, step_px: float) -> Floats:
+    """Pixels (n, 2) at every step along both axes from pixel (0, 0), u fastest."""
+    u, v = np.meshgrid(
+        np.arange(0.0, camera.width - 0.5, step_px), np.arange(0.0, camera.height - 0.5, step_px)
+    )
+    return np.stack([u.ravel(), v.ravel()], axis=-1)
 
 
 def shape_sigma_rad(camera: CameraModel, covariance: Floats, pixels: Floats) -> Floats:

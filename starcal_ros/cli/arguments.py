@@ -46,6 +46,21 @@ _HELP: dict[str, tuple[str, str, str]] = {
 
 exit status: 0 the bag can be calibrated; 3 it cannot, and the reasons are listed; 2 bad input.""",
     ),
+    'diagnose': (
+        'find out why the images of a bag match no star',
+        (
+            'Identifies some of the first images without attitude or alignment, holds attitudes, '
+            'alignment and camera against them, and prints what is wrong, how that is known, and '
+            'the lines of the parameter file that mend it.'
+        ),
+        """\
+  # no image matches: why?
+  starcal diagnose bags/tiny --params bags/tiny/params.yaml
+  # for a program
+  starcal diagnose bags/tiny --params bags/tiny/params.yaml --json
+
+exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad input.""",
+    ),
     'calibrate': (
         'calibrate from bags, without a ROS graph',
         (
@@ -85,6 +100,19 @@ exit status: 0 the bag can be calibrated; 3 it cannot, and the reasons are liste
         """\
   # from the files of an earlier calibration
   starcal report out""",
+    ),
+    'lookup': (
+        'write a table of lines of sight and their sigma by pixel',
+        (
+            'Writes u_px, v_px, the unit vector x, y, z in the camera frame, shape_sigma_arcsec '
+            '(1-sigma of the direction, common rotation removed) and sigma_arcsec (in the star '
+            'tracker frame), with the field beside the lens model if there is one.'
+        ),
+        """\
+  # 25 x 25 pixels over the detector
+  starcal lookup out -o lines_of_sight.csv
+  # every 16 pixels, for interpolation
+  starcal lookup out -o lines_of_sight.npz --step 16""",
     ),
     'play': (
         'play a bag on the ROS graph',
@@ -287,6 +315,13 @@ def _inspect(command: argparse.ArgumentParser) -> None:
     _json(command)
 
 
+def _diagnose(command: argparse.ArgumentParser) -> None:
+    _bags(command, 'bags', nargs='+')
+    _params(command, 'ROS parameter file: prior camera, mounting and options', required=True)
+    _topics(command)
+    _json(command)
+
+
 def _calibrate(command: argparse.ArgumentParser) -> None:
     _bags(command, 'bags', nargs='+')
     _params(command, 'ROS parameter file: prior camera, mounting and options', required=True)
@@ -307,6 +342,18 @@ def _compare(command: argparse.ArgumentParser) -> None:
         _add(command, name, type=_path, metavar=name.upper(), help=what, completer=completer)
     _output(command, 'FILE', 'plot of the difference over the detector: .png, .svg or .pdf')
     _json(command)
+
+
+def _lookup(command: argparse.ArgumentParser) -> None:
+    what = 'calibration.json or its folder'
+    _add(command, 'calibration', type=_path, metavar='DIR', help=what)
+    what = 'table to write: .csv, .npz or .fits'
+    _output(command, 'FILE', what, required=True)
+    grid = command.add_mutually_exclusive_group()
+    what = 'N x N pixels from corner to corner of the detector, u fastest (default: 25)'
+    grid.add_argument('--points', type=int, default=25, metavar='N', help=what)
+    what = 'a pixel every PX pixels along both axes, in place of --points'
+    grid.add_argument('--step', type=float, metavar='PX', help=what)
 
 
 def _play(command: argparse.ArgumentParser) -> None:
@@ -355,9 +402,11 @@ def _campaign(command: argparse.ArgumentParser) -> None:
 _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     'demo': _demo,
     'inspect': _inspect,
+    'diagnose': _diagnose,
     'calibrate': _calibrate,
     'report': _report,
     'compare': _compare,
+    'lookup': _lookup,
     'play': _play,
     'simulate': _simulate,
     'campaign': _campaign,

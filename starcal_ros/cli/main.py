@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -113,7 +114,12 @@ def _calibrate_into(
     try:
         calibration, left = solve.solve_with_residuals(ensemble, setup, inputs=inputs)
     except TooFewObservations as error:
-        raise TooFewObservations(f'{error}{_refused_words(ensemble)}') from error
+        words = f'{error}{_refused_words(ensemble)}'
+        if topics.image and not ensemble.images:
+            from starcal_ros.cli import diagnosis
+
+            words = f'{words}. {diagnosis.in_a_sentence(bags, asked, setup)}'
+        raise TooFewObservations(words.removesuffix('. ')) from error
     write_products(calibration, folder, left)
     thumbnails.write_thumbnails(album.thumbnails(), folder / thumbnails.THUMBNAILS_FOLDER)
     return calibration
@@ -173,11 +179,29 @@ def _inspect(args: argparse.Namespace) -> int:
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:
         found = inspect.inspect(args.bags, _asked(args), setup, on_image=advance)
+    if setup and found.images and not found.stars_per_image and found.chosen:
+        from starcal_ros.cli import diagnosis
+
+        why = diagnosis.in_a_sentence(args.bags, _asked(args), setup)
+        found = dataclasses.replace(found, problems=(*found.problems, why)) if why else found
     if args.json:
         print(json.dumps(inspect.content(found), indent=1, allow_nan=False))
     else:
         output.print_inspection(found)
     return EXIT_REFUSED if found.problems else EXIT_ACCEPTED
+
+
+def _diagnose(args: argparse.Namespace) -> int:
+    """Say why the images of a bag match nothing."""
+    from starcal_ros.cli import diagnosis
+    from starcal_ros.pipeline.setup import read_setup
+
+    found = diagnosis.of_bags(args.bags, _asked(args), read_setup(args.params))
+    if args.json:
+        print(json.dumps(diagnosis.content(found), indent=1, allow_nan=False))
+    else:
+        print(diagnosis.text(found))
+    return EXIT_ACCEPTED if found.cause == 'none' else EXIT_REFUSED
 
 
 def _compare(args: argparse.Namespace) -> int:
@@ -197,6 +221,29 @@ def _compare(args: argparse.Namespace) -> int:
         output.print_comparison(found)
         if args.output:
             print(f'figure written to {args.output}')
+    return EXIT_ACCEPTED
+
+
+def _lookup(args: argparse.Namespace) -> int:
+    """Write a table of lines of sight by pixel."""
+    from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
+    from starcal_ros.camera import pixel_grid
+    from starcal_ros.products.calibration_json import read_calibration
+    from starcal_ros.products.lookup_table import write_lookup_table
+
+    calibration = read_calibration(_file(args.calibration))
+    camera = calibration.geometry.camera
+    if args.step is not None:
+        if not 0 < args.step <= max(camera.width, camera.height):
+            raise OptionError(f'--step: {args.step:g} px is not within the detector')
+        pixels = pixels_every(camera, args.step)
+    else:
+        if not 2 <= args.points <= 2000:
+            raise OptionError(f'--points: {args.points} is not in the range 2 to 2000')
+        pixels = pixel_grid(camera, args.points, args.points)
+    table = line_of_sight_table(camera, calibration.joint_covariance, pixels)
+    write_lookup_table(table, args.output)
+    print(f'{len(pixels)} lines of sight written to {args.output}')
     return EXIT_ACCEPTED
 
 
@@ -292,7 +339,6 @@ def _campaign(args: argparse.Namespace) -> int:
     """Run a Monte Carlo study."""
     # Trials run in parallel, one thread each; results must not depend on the number of threads.
     os.environ.update(OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1')
-    import dataclasses
     import time
 
     from starcal_ros.options import nearest
@@ -393,9 +439,11 @@ def _make_folder(path: Path) -> None:
 _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     'demo': _demo,
     'inspect': _inspect,
+    'diagnose': _diagnose,
     'calibrate': _calibrate,
     'report': _report,
     'compare': _compare,
+    'lookup': _lookup,
     'play': _play,
     'simulate': _simulate,
     'campaign': _campaign,

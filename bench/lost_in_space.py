@@ -1,0 +1,262 @@
+"""
+Lost in space: how often the stars of a frame are identified without attitude, and how fast.
+
+Beside it tetra3 in its fork cedar-solve on the same frames, and how often random points are taken
+for stars.
+
+A frame is a list of sources: the brightest stars of the catalog in the field, every tenth missing,
+their brightnesses off by 0.3 mag and their places by 0.3 px, and false sources of like
+brightness anywhere.  The camera differs from its prior by up to what `lost_in_space` promises, or
+not at all.  Seeds are fixed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import json
+import math
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import beta
+
+from bench.table import Table
+from starcal_ros.camera import CameraModel, field_radius_rad, project
+from starcal_ros.identification.lost_in_space import find_sky, SkyMatch
+from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
+
+Floats = NDArray[np.float64]
+
+SEED = 416
+WIDTHS_DEG = (4, 8, 15, 25, 40, 55, 70)
+SIZE = (1024, 820)
+FRAMES = 200  # of each width and kind
+SCRAMBLED = 10_000
+KINDS = {
+    '20 stars, 10 false, prior exact': (20, 10, 0.0),
+    '20 stars, 10 false, prior off': (20, 10, 1.0),
+    '10 stars, 20 false, prior off': (10, 20, 1.0),
+    '6 stars, 12 false, prior off': (6, 12, 1.0),
+}
+"""Name -> true and false sources, and how far the camera is off in parts of what is promised."""
+CEDAR = 'cedar-solve==0.5.1'
+CEDAR_WIDTHS_DEG = (15, 25)  # its own database covers 10 to 30 degrees
+CEDAR_FOLDER = Path(__file__).parents[1] / 'build' / 'cedar-solve'
+RIGHT = 0.8  # share of its stars that a match has right
+
+
+@dataclass(frozen=True)
+class Frame:
+    """
+    Sources of a frame, brightest first, and the truth.
+
+    ``xy_px`` (n, 2); ``star`` (n,) rows of the catalog, -1 where false; ``prior`` the camera that
+    is given, ``camera_from_icrf`` the truth.
+    """
+
+    xy_px: Floats
+    star: NDArray[np.int64]
+    prior: CameraModel
+    camera_from_icrf: Rotation
+
+
+def run(quick: bool) -> list[Table]:
+    """Frames to be found, beside tetra3, then random points; half a day, or some minutes."""
+    count, scrambled = (5, 20) if quick else (FRAMES, SCRAMBLED)
+    catalog = load_catalog()
+    return [found(catalog, count), beside_tetra3(catalog, count), random_points(scrambled)]
+
+
+def found(catalog: StarCatalog, count: int) -> Table:
+    """Rate and time for each width and kind of frame."""
+    table = Table(
+        'Frames identified without attitude',
+        ('frame', 'width deg', 'tried', 'found', 'wrong', 'median s', 'p95 s'),
+        notes=['Processor time of one thread; the index, made once, is not in it.'],
+    )
+    for name, kind in KINDS.items():
+        for width_deg in WIDTHS_DEG:
+            right, wrong, times_s = 0, 0, []
+            made = frames(catalog, width_deg, *kind, count)
+            warm = next(frames(catalog, width_deg, 20, 10, 0.0, 1))
+            find_sky(warm.xy_px, warm.prior, catalog)
+            for frame in made:
+                start_s = time.process_time()
+                sky = find_sky(frame.xy_px, frame.prior, catalog)
+                times_s.append(time.process_time() - start_s)
+                if isinstance(sky, SkyMatch):
+                    good = _is_right(frame, sky, catalog)
+                    right, wrong = right + good, wrong + (not good)
+            median_s, p95_s = (float(np.percentile(times_s, p)) for p in (50, 95))
+            table.add(name, width_deg, count, right, wrong, median_s, p95_s)
+            print(*table.rows[-1], flush=True)
+    print(table.text(), flush=True)
+    return table
+
+
+def random_points(count: int) -> Table:
+    """How many frames of random points are taken for stars."""
+    catalog = load_catalog()
+    table = Table(
+        'Random points that must not be identified',
+        ('points', 'widths deg', 'tried', 'identified', '95 % limit', 's each'),
+        notes=['limit: Clopper and Pearson, one-sided; with none it is 3 in those tried.'],
+    )
+    rng = np.random.default_rng([SEED, 99])
+    wrong, start_s = 0, time.process_time()
+    for k in range(count):
+        prior = camera(WIDTHS_DEG[k % len(WIDTHS_DEG)])
+        points = rng.uniform([0, 0], SIZE, ((18, 30, 60)[k % 3], 2))
+        wrong += isinstance(find_sky(points, prior, catalog), SkyMatch)
+    each_s = (time.process_time() - start_s) / count
+    limit = float(beta.ppf(0.95, wrong + 1, count - wrong))
+    table.add('18, 30 and 60', '4 to 70', count, wrong, limit, each_s)
+    print(table.text(), flush=True)
+    return table
+
+
+def beside_tetra3(catalog: StarCatalog, count: int) -> Table:
+    """The same frames for cedar-solve, which is installed in a folder of its own."""
+    table = Table(
+        'The same frames for tetra3 (cedar-solve, its default database, 10 to 30 degrees)',
+        ('frame', 'width deg', 'tried', 'found', 'wrong', 'median s', 'p95 s'),
+        notes=['Told the field to 25 %, 5 s for each frame; its other options as they come.'],
+    )
+    python = _cedar_python()
+    if python is None:
+        table.notes.append('cedar-solve could not be installed.')
+        return table
+    for name, kind in KINDS.items():
+        for width_deg in CEDAR_WIDTHS_DEG:
+            made = list(frames(catalog, width_deg, *kind, count))
+            rows = _cedar(python, made, width_deg)
+            right = wrong = 0
+            for frame, (direction, _) in zip(made, rows, strict=True):
+                if direction is not None:
+                    true = frame.camera_from_icrf.as_matrix()[2]
+                    # Its boresight is that of the middle of the image: the centre may be 5 % off.
+                    near = float(true @ direction) > math.cos(math.radians(0.1 * width_deg))
+                    right, wrong = right + near, wrong + (not near)
+            times_s = [seconds for _, seconds in rows]
+            median_s, p95_s = (float(np.percentile(times_s, p)) for p in (50, 95))
+            table.add(name, width_deg, count, right, wrong, median_s, p95_s)
+    print(table.text(), flush=True)
+    return table
+
+
+def camera(width_deg: float) -> CameraModel:
+    """A camera without distortion of so wide a field."""
+    width, height = SIZE
+    focal_px = width / 2 / math.tan(math.radians(width_deg / 2))
+    ideal = [focal_px, 0, focal_px, (width - 1) / 2, (height - 1) / 2, 0, 0, 0, 0, 0]
+    return CameraModel(width, height, np.array(ideal))
+
+
+def frames(
+    catalog: StarCatalog, width_deg: float, stars: int, false: int, off: float, count: int
+) -> Iterator[Frame]:
+    """Random frames; a field with too few stars in the catalog is drawn anew."""
+    rng = np.random.default_rng([SEED, int(10 * width_deg), stars, false, int(10 * off)])
+    prior = camera(width_deg)
+    half_px = 0.5 * math.hypot(*SIZE)
+    made = 0
+    while made < count:
+        focal_px = float(prior.parameters[0]) * math.exp(off * rng.uniform(-0.223, 0.223))
+        shift_px = rng.normal(size=2)
+        shift_px *= off * rng.uniform() * 0.05 * SIZE[0] / math.hypot(*shift_px)
+        true = prior.replace(
+            fx=focal_px,
+            fy=focal_px,
+            cx=float(prior.parameters[3] + shift_px[0]),
+            cy=float(prior.parameters[4] + shift_px[1]),
+            k1=off * rng.uniform(-0.03, 0.03) * (focal_px / half_px) ** 2,
+        )
+        rotation = Rotation.random(random_state=rng)
+        axis = rotation.as_matrix()[2]
+        rows = cone(catalog, axis, field_radius_rad(true, 60.0))
+        xy_px = project(true, rotation.apply(catalog.direction_icrs[rows]))
+        inside = (xy_px > 2).all(axis=1) & (xy_px < np.array(SIZE) - 3).all(axis=1)
+        inside &= rng.uniform(size=len(rows)) > 0.1
+        rows, xy_px = rows[inside], xy_px[inside]
+        if len(rows) < stars:
+            continue
+        magnitude = catalog.magnitude[rows] + 0.3 * rng.normal(size=len(rows))
+        shown = np.argsort(magnitude)[:stars]
+        faint = rng.choice(magnitude[shown], false) + 0.3 * rng.normal(size=false)
+        order = np.argsort(np.r_[magnitude[shown], faint])
+        places = np.concatenate(
+            [
+                xy_px[shown] + 0.3 * rng.normal(size=(stars, 2)),
+                rng.uniform([0, 0], SIZE, (false, 2)),
+            ]
+        )
+        star = np.r_[rows[shown], np.full(false, -1)]
+        made += 1
+        yield Frame(places[order], star[order], prior, rotation)
+
+
+def _is_right(frame: Frame, sky: SkyMatch, catalog: StarCatalog) -> bool:
+    """Whether most stars are those drawn, or stand within two pixels of them, as in a pair."""
+    drawn = {tuple(xy): star for xy, star in zip(frame.xy_px.tolist(), frame.star, strict=True)}
+    rows = np.array([drawn[tuple(xy)] for xy in sky.xy_px.tolist()], np.int64)
+    places = catalog.direction_icrs
+    apart = np.linalg.norm(places[rows] - places[sky.catalog_index], axis=1)
+    near = apart * float(frame.prior.parameters[0]) < 2.0
+    return float(np.mean((rows >= 0) & near)) >= RIGHT
+
+
+_CEDAR_SCRIPT = """
+import json, sys, time
+import numpy as np
+import tetra3
+solver = tetra3.Tetra3('default_database')
+frames, answers = json.load(open(sys.argv[1])), []
+for k, frame in enumerate([frames['frames'][0], *frames['frames']]):
+    start = time.process_time()
+    found = solver.solve_from_centroids(
+        np.array(frame)[:, ::-1], tuple(frames['size'][::-1]), fov_estimate=frames['width_deg'],
+        fov_max_error=0.25 * frames['width_deg'], solve_timeout=5000)
+    seconds = time.process_time() - start
+    if k:
+        answers.append([found['RA'], found['Dec'], seconds])
+print(json.dumps(answers))
+"""
+
+
+def _cedar(python: Path, made: list[Frame], width_deg: float) -> list[tuple[Floats | None, float]]:
+    """Direction of the middle of each frame as cedar-solve finds it, and its seconds."""
+    with tempfile.NamedTemporaryFile('w', suffix='.json') as file:
+        content = {'frames': [frame.xy_px.tolist() for frame in made], 'size': SIZE}
+        json.dump({**content, 'width_deg': width_deg}, file)
+        file.flush()
+        command = [str(python), '-c', _CEDAR_SCRIPT, file.name]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    rows: list[tuple[Floats | None, float]] = []
+    for ra_deg, dec_deg, seconds in json.loads(done.stdout.splitlines()[-1]):
+        direction = None
+        if ra_deg is not None:
+            ra, dec = math.radians(ra_deg), math.radians(dec_deg)
+            direction = np.array(
+                [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
+            )
+        rows.append((direction, float(seconds)))
+    return rows
+
+
+def _cedar_python() -> Path | None:
+    """The interpreter of a venv with cedar-solve, made at the first use; None: it cannot be."""
+    python = CEDAR_FOLDER / 'bin' / 'python'
+    try:
+        if not python.exists():
+            subprocess.run([sys.executable, '-m', 'venv', str(CEDAR_FOLDER)], check=True)
+        subprocess.run([str(python), '-m', 'pip', 'install', '-q', CEDAR], check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return python

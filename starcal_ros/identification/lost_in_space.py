@@ -1,0 +1,362 @@
+"""
+Which star is which in one image, and where it looks, without attitude or alignment.
+
+Patterns of four of the brightest sources are sought among those of the catalog (`pattern_index`).
+Each that fits gives a rotation and a focal length; the bright stars that it predicts are held
+against the sources.  The best of them are refined, and the first is accepted that chance does not
+explain (`sky_fit`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import functools
+import itertools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.identification.pattern_index import (
+    equivalent,
+    pattern_index,
+    scales_for,
+    shapes,
+    sphere_points,
+)
+from starcal_ros.identification.sky_fit import (
+    FOCAL_RANGE,
+    log10_p_value,
+    match,
+    predicted,
+    refined,
+    SkyFit,
+    SourceImage,
+)
+from starcal_ros.sky.catalog import StarCatalog
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of false matches
+_ROUNDS = (12, 18, 24)  # brightest sources of which patterns are formed, round by round
+_REFINED = 16  # best candidates of a lookup that are refined
+_CANDIDATES = 20_000  # of a lookup that are tested, drawn at random from more
+_TESTED = 16  # brightest predictions that a candidate is tested with
+_CHUNK = 5000  # candidates tested at once: 30 MB
+_MAP_SIDE = 128  # cells of the map of the sources along each side
+_NEAR, _FAR = 0.006, 0.02  # 1-sigma of a candidate's predictions, of the half diagonal
+_SHOWN = 0.6  # share of the bright stars that a right candidate is expected to show
+_LEAST_GAIN = 0.8  # of what the four stars of a pattern have by themselves
+
+
+@dataclass(frozen=True)
+class SkyMatch:
+    """
+    The stars of an image, identified.
+
+    Attributes
+    ----------
+    camera_from_icrf : Rotation
+        Of catalog places (ICRS, epoch of the catalog) to camera axes; aberration is not applied.
+    camera : CameraModel
+        The prior with focal length, principal point and ``k1`` as these stars have it.
+    catalog_index : (n,)
+        Rows of the catalog.
+    xy_px : (n, 2)
+        Sources that are those stars, as given.
+    mirrored : bool
+        The image is a mirror image; rotation and camera are of the image mirrored left to right.
+    log10_p_value : float
+        Decadic logarithm of the expected number of false matches this good.
+    residual_px : float
+        Root mean square of the residuals, per axis.
+    """
+
+    camera_from_icrf: Rotation
+    camera: CameraModel
+    catalog_index: Rows
+    xy_px: Floats
+    mirrored: bool
+    log10_p_value: float
+    residual_px: float
+
+
+@dataclass(frozen=True)
+class NotFound:
+    """Why the stars were not identified, in words, and the least p-value of what was tried."""
+
+    reason: str
+    log10_p_value: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """
+    Patterns of the image that fit ones of the catalog, n of them.
+
+    ``stars`` and ``sources`` (n, 4); ``growth`` (n,): focal length by that of the search.
+    """
+
+    stars: Rows
+    sources: Rows
+    growth: Floats
+
+
+def find_sky(
+    xy_px: Floats,
+    camera: CameraModel,
+    catalog: StarCatalog,
+    try_mirrored: bool = False,
+    max_log10_p_value: float = MAX_LOG10_P_VALUE,
+) -> SkyMatch | NotFound:
+    """
+    The stars that sources (n, 2), brightest first, are.
+
+    ``camera`` is the prior: focal length within 25 %, principal point within 5 % of the width,
+    distortion within 3 % of the radius.  The catalog is sorted by magnitude.  With
+    ``try_mirrored`` the image is tried as a mirror image as well.
+    """
+    if len(xy_px) < 5:
+        return NotFound(f'{len(xy_px)} star-like sources, at least 5 are needed')
+    images = [SourceImage(xy_px, camera)]
+    if try_mirrored:
+        images.append(SourceImage(mirror(xy_px, camera.width), mirrored_camera(camera)))
+    least, before = 0.0, 0
+    for sources in _ROUNDS:
+        ways = itertools.product(_focal_scales(images[0].half_diagonal_rad), enumerate(images))
+        for focal_scale, (mirrored, image) in ways:
+            for scale in scales_for(image.half_diagonal_rad / focal_scale):
+                for fit in _fits(image, catalog, scale, focal_scale, before, sources):
+                    log10_p, radius_px = log10_p_value(image, catalog, fit)
+                    log10_p += math.log10(len(images))
+                    least = min(least, log10_p)
+                    if log10_p < max_log10_p_value:
+                        return _result(image, catalog, fit, radius_px, log10_p, bool(mirrored))
+        if len(xy_px) <= sources:
+            break
+        before = sources
+    return NotFound('no pattern of the sources is one of the catalog beyond chance', least)
+
+
+def mirror(xy_px: Floats, width: int) -> Floats:
+    """Pixels (n, 2) of an image mirrored left to right."""
+    return np.stack([width - 1 - xy_px[:, 0], xy_px[:, 1]], axis=-1)
+
+
+def mirrored_camera(camera: CameraModel) -> CameraModel:
+    """The camera that shows the mirrored sky in an image mirrored left to right."""
+    skew, cx, p2 = (float(camera.parameters[k]) for k in (1, 3, 9))
+    return camera.replace(cx=camera.width - 1 - cx, skew=-skew, p2=-p2)
+
+
+def _focal_scales(half_diagonal_rad: float) -> tuple[float, ...]:
+    """Focal lengths to try, by the prior: in a narrow field a shape does not hang on it."""
+    if half_diagonal_rad < math.radians(12.0):
+        return (1.0,)
+    if half_diagonal_rad < math.radians(24.0):
+        return (1.0, 0.86, 1.16)
+    return (1.0, 0.91, 1.1, 0.83, 1.2)
+
+
+def _tolerances(half_diagonal_rad: float) -> tuple[float, float]:
+    """Largest errors of a place in the shape of a pattern, and of the logarithm of its size."""
+    size = {1: FOCAL_RANGE + 0.05, 3: 0.16, 5: 0.13}[len(_focal_scales(half_diagonal_rad))]
+    return 0.012 + 0.04 * half_diagonal_rad, size
+
+
+@functools.lru_cache(maxsize=8)
+def _shape_tree(catalog: StarCatalog, scale: int, size_weight: float) -> cKDTree:
+    """The shapes of an index by place, the size weighted."""
+    shape = pattern_index(catalog, scale).shape.astype(np.float64)
+    shape[:, 4] *= size_weight
+    return cKDTree(shape, balanced_tree=False, compact_nodes=False)
+
+
+def _fits(
+    image: SourceImage,
+    catalog: StarCatalog,
+    scale: int,
+    focal_scale: float,
+    before: int,
+    sources: int,
+) -> Iterator[SkyFit]:
+    """Refined fits of the patterns of the brightest sources, the most promising first."""
+    fx, fy = focal_scale * image.camera.parameters[[0, 2]]
+    camera = image.camera.replace(fx=float(fx), fy=float(fy))
+    directions = line_of_sight(camera, image.xy_px)
+    candidates = _look_up(image, catalog, scale, directions[:sources], before)
+    if len(candidates.growth) == 0:
+        return
+    plane = directions[:, :2] / directions[:, 2:]
+    rotation = _rotations(catalog, candidates, plane)
+    gain, own = _gains(image, catalog, candidates, plane, rotation)
+    best = np.argsort(-gain, kind='stable')[:_REFINED]
+    for k in best[gain[best] > _LEAST_GAIN * own]:
+        growth = float(candidates.growth[k])
+        start = SkyFit(
+            Rotation.from_matrix(rotation[k]),
+            camera.replace(fx=growth * float(fx), fy=growth * float(fy)),
+            _stars_about(image, catalog, rotation[k, 2]),
+        )
+        pairs = np.stack([candidates.stars[k], candidates.sources[k]], axis=-1)
+        fit = refined(image, catalog, start, pairs)
+        if fit is not None:
+            yield fit
+
+
+def _look_up(
+    image: SourceImage, catalog: StarCatalog, scale: int, directions: Floats, before: int
+) -> _Candidates:
+    """Patterns of directions (n, 3) alike to ones of the catalog, with one from ``before`` on."""
+    index = pattern_index(catalog, scale)
+    usable = np.flatnonzero(np.isfinite(directions[:, 0]))
+    every = list(itertools.combinations(usable.tolist(), 4))
+    chosen: Rows = np.array(every, np.int64).reshape(-1, 4)
+    chosen = chosen[chosen[:, 3] >= before]
+    place_tolerance, size_tolerance = _tolerances(image.half_diagonal_rad)
+    order, shape = shapes(directions[chosen])
+    sources = np.take_along_axis(chosen, order, axis=1)
+    fits = shape[:, 4] < math.log(2 * index.radius_rad) + size_tolerance
+    sources, shape = equivalent(sources[fits], shape[fits])
+    weight = np.array([1.0, 1.0, 1.0, 1.0, place_tolerance / size_tolerance])
+    tree = _shape_tree(catalog, scale, float(weight[4]))
+    found = tree.query_ball_point(shape * weight, place_tolerance, p=np.inf)
+    counts = np.array([len(rows) for rows in found], np.int64)
+    quad = np.fromiter(itertools.chain.from_iterable(found), np.int64, int(counts.sum()))
+    query = np.repeat(np.arange(len(found)), counts)
+    if len(quad) > _CANDIDATES:
+        few = np.random.default_rng(0).choice(len(quad), _CANDIDATES, replace=False)
+        quad, query = quad[few], query[few]
+    growth = np.exp(shape[query, 4] - index.shape[quad, 4])
+    return _Candidates(index.quads[quad], sources[query], growth)
+
+
+def _rotations(catalog: StarCatalog, candidates: _Candidates, plane: Floats) -> Floats:
+    """Rotations (n, 3, 3) from the catalog to the camera of candidates: A to A, B towards B."""
+    seen = np.empty((len(candidates.growth), 4, 3))
+    seen[..., :2] = plane[candidates.sources] / candidates.growth[:, None, None]
+    seen[..., 2] = 1.0
+    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
+    stars = catalog.direction_icrs[candidates.stars]
+    return np.asarray(np.einsum('nki,nkj->nij', _triads(seen), _triads(stars)))
+
+
+def _triads(directions: Floats) -> Floats:
+    """Three axes (n, 3, 3), rows, of four directions (n, 4, 3): their middle, and A towards B."""
+    middle = directions.sum(axis=1)
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    # C and D take part, their lever being their distance from the line of A and B.
+    towards = directions[:, 1] - directions[:, 0]
+    side = np.cross(middle, towards)
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    return np.stack([middle, np.cross(side, middle), side], axis=1)
+
+
+def _gains(
+    image: SourceImage,
+    catalog: StarCatalog,
+    candidates: _Candidates,
+    plane: Floats,
+    rotation: Floats,
+) -> tuple[Floats, float]:
+    """
+    Natural logarithm (n,) of how much likelier the sources are with a candidate than by chance.
+
+    With it the part of that which the four stars of a pattern have by themselves.
+    """
+    half = image.half_diagonal_px / float(image.camera.parameters[0])
+    finite = plane[np.isfinite(plane[:, 0])]
+    gain_map, low, cell = _gain_map(finite, half)
+    gains = np.empty(len(rotation))
+    for first in range(0, len(rotation), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        stars = _bright_about(catalog, rotation[part, 2], 1.1 * math.atan(half), 3 * _TESTED)
+        place = np.einsum('nij,nkj->nki', rotation[part], catalog.direction_icrs[stars])
+        ahead = (stars >= 0) & (place[..., 2] > 0.1)
+        z = np.where(ahead, place[..., 2], 1.0)
+        xy = place[..., :2] / z[..., None] * candidates.growth[part, None, None]
+        at = np.floor((xy - low) / cell).astype(np.int64)
+        inside = ahead & ((at >= 0) & (at < gain_map.shape[::-1])).all(axis=2)
+        inside &= np.cumsum(inside, axis=1) <= _TESTED
+        value = gain_map[np.where(inside, at[..., 1], 0), np.where(inside, at[..., 0], 0)]
+        # An image of few stars shows the brightest alone: the depth that speaks most for it.
+        gains[part] = np.cumsum(value * inside, axis=1).max(axis=1)
+    return gains, 4.0 * float(gain_map.max())
+
+
+def _gain_map(plane: Floats, half: float) -> tuple[Floats, Floats, float]:
+    """Logarithm of the likelihood ratio of a star predicted in each cell of the image plane."""
+    low, high = plane.min(axis=0), plane.max(axis=0)
+    cell = float((high - low).max()) / _MAP_SIDE
+    shape = np.ceil((high - low) / cell).astype(np.int64) + 1
+    u, v = np.meshgrid(*(low[k] + cell * (np.arange(shape[k]) + 0.5) for k in (0, 1)))
+    apart, _ = cKDTree(plane).query(np.stack([u.ravel(), v.ravel()], axis=-1))
+    area = float(np.prod(high - low)) / len(plane)
+    density = sum(
+        0.5 * np.exp(-0.5 * (apart / (s * half)) ** 2) / (2 * math.pi * (s * half) ** 2)
+        for s in (_NEAR, _FAR)
+    )
+    gain = np.log((1.0 - _SHOWN) + _SHOWN * area * density)
+    return gain.reshape(u.shape), low, cell
+
+
+@functools.lru_cache(maxsize=8)
+def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTree]:
+    """Points all over the sky, and the stars that are among the brightest of discs of a radius."""
+    radius_rad = math.radians(radius_deg)
+    points = sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
+    enough = int(9 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
+    return cKDTree(points), cKDTree(catalog.direction_icrs[:enough])
+
+
+def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: int) -> Rows:
+    """Rows (n, count) of the brightest stars about axes (n, 3), within a radius or more; or -1."""
+    points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
+    point, place = np.unique(points.query(axes)[1], return_inverse=True)
+    widened = 2 * math.sin(min(1.25 * radius_rad, math.pi) / 2)
+    found = stars.query_ball_point(points.data[point], widened, return_sorted=True)
+    rows = np.full((len(point), count), -1, np.int64)
+    for k, inside in enumerate(found):
+        few = inside[:count]
+        rows[k, : len(few)] = few
+    return np.asarray(rows[place.ravel()])
+
+
+def _stars_about(image: SourceImage, catalog: StarCatalog, axis: Floats) -> Rows:
+    """Rows of the stars that a camera may show with this axis, three for each source or more."""
+    radius_rad = 1.25 * image.half_diagonal_rad * (1 + FOCAL_RANGE)
+    near = np.flatnonzero(catalog.direction_icrs @ axis > math.cos(min(radius_rad, 1.4)))
+    area = 1.0 / (1.0 - math.cos(min(radius_rad, 1.4))) * (1.0 - math.cos(image.half_diagonal_rad))
+    return near[: int(max(60, 3 * len(image.xy_px)) / area)]
+
+
+def _result(
+    image: SourceImage,
+    catalog: StarCatalog,
+    fit: SkyFit,
+    radius_px: float,
+    log10_p: float,
+    mirrored: bool,
+) -> SkyMatch:
+    """The fit with every source that it explains."""
+    # Fainter stars than there are sources for would only lie beside false ones.
+    deepest = 2 * len(image.xy_px)
+    pairs = match(image, catalog, fit, max(radius_px, 1.5), deepest, 10_000)
+    xy_px = image.xy_px[pairs[:, 1]]
+    order = np.argsort(pairs[:, 0])
+    stars, placed = predicted(catalog, fit, deepest)
+    residual = xy_px[order] - placed[np.searchsorted(stars, pairs[order, 0])]
+    return SkyMatch(
+        camera_from_icrf=fit.camera_from_icrf,
+        camera=fit.camera,
+        catalog_index=pairs[order, 0],
+        xy_px=(mirror(xy_px, image.camera.width) if mirrored else xy_px)[order],
+        mirrored=mirrored,
+        log10_p_value=log10_p,
+        residual_px=float(np.sqrt((residual**2).mean())),
+    )

@@ -1,0 +1,244 @@
+"""
+A camera fitted to the stars it may be showing, and the probability that it shows others.
+
+Rotation, focal length, principal point and one term of radial distortion are fitted, each held
+near its prior as far as that is known.  The probability bounds the expected number of false
+matches of a search through all rotations, focal lengths, principal points and distortions:
+positions in that space that differ by the radius of matching, times the probability that so many
+of the brightest predictions meet a source at random places.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import functools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from scipy.special import betainc
+
+from starcal_ros.camera import CameraModel, project, project_jacobians
+from starcal_ros.sky.catalog import StarCatalog
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+FOCAL_RANGE = 0.25  # of the logarithm of the focal length, to both sides
+CENTRE_RANGE = 0.05  # of the width, to both sides
+DISTORTION_RANGE = 0.03  # of the radius at the corners, to both sides
+_CLOSING_IN = (0.05, 0.04, 0.03, 0.022, 0.015, 0.01, 0.007, 0.005)  # radii, of the half diagonal
+_CROWDED = 0.15  # largest probability that a source lies by chance within the radius of matching
+_MOST_STARS = 200
+_JUDGED_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5)  # radii of matching that a fit is judged at
+_DEPTHS = (6, 8, 11, 15, 20, 30, 50, 80, 130, 200)  # numbers of brightest predictions, likewise
+_LOOKS = 10.0  # independent ones among those radii and numbers, which share most of their stars
+_ALONE = 10.0  # in radii of matching: sources this near to a star crowd it
+
+
+@dataclass(frozen=True)
+class SourceImage:
+    """Sources (n, 2), brightest first, of an image with a prior camera."""
+
+    xy_px: Floats
+    camera: CameraModel
+
+    @functools.cached_property
+    def half_diagonal_px(self) -> float:
+        """Half of the diagonal."""
+        return 0.5 * math.hypot(self.camera.width, self.camera.height)
+
+    @functools.cached_property
+    def half_diagonal_rad(self) -> float:
+        """Half of the diagonal as an angle of the prior camera."""
+        return math.atan(self.half_diagonal_px / float(self.camera.parameters[0]))
+
+    @functools.cached_property
+    def area_px2(self) -> float:
+        """Pixels of the image."""
+        return float(self.camera.width * self.camera.height)
+
+    @functools.cached_property
+    def tree(self) -> cKDTree:
+        """The sources by place."""
+        return cKDTree(self.xy_px)
+
+
+@dataclass(frozen=True)
+class SkyFit:
+    """A camera, its rotation, and the brightest stars (n,) it may show, rows of the catalog."""
+
+    camera_from_icrf: Rotation
+    camera: CameraModel
+    stars: Rows
+
+
+def refined(image: SourceImage, catalog: StarCatalog, start: SkyFit, pairs: Rows) -> SkyFit | None:
+    """
+    The fit that a start leads to as the radius of matching closes in; None: it loses the stars.
+
+    ``pairs`` (k, 2), rows of the catalog and of the sources, are those that gave the start.
+    """
+    fit, prior = start, image.camera
+    half_px = image.half_diagonal_px
+    fit = _step(image, catalog, fit, pairs, 0.02 * half_px)
+    for part in _CLOSING_IN:
+        radius_px = max(part * half_px, 2.0)
+        sources = int(_CROWDED * image.area_px2 / (math.pi * radius_px**2)) + 6
+        pairs = match(image, catalog, fit, radius_px, 2 * sources, sources)
+        if len(pairs) < 5:
+            return None
+        fit = _step(image, catalog, fit, pairs, radius_px / 3)
+        fx = float(fit.camera.parameters[0])
+        if abs(math.log(fx / float(prior.parameters[0]))) > 1.3 * FOCAL_RANGE:
+            return None
+    for _ in range(2):
+        pairs = match(image, catalog, fit, 4.5, _MOST_STARS, _MOST_STARS)
+        if len(pairs) < 5:
+            return None
+        fit = _step(image, catalog, fit, pairs, 1.0)
+    return fit
+
+
+def match(
+    image: SourceImage,
+    catalog: StarCatalog,
+    fit: SkyFit,
+    radius_px: float,
+    most_stars: int,
+    most_sources: int,
+) -> Rows:
+    """Pairs (k, 2) of catalog row and source, each the other's nearest within a radius."""
+    stars, xy_px = predicted(catalog, fit, most_stars)
+    rank, source, _ = _mutual(image, xy_px, radius_px, most_sources)
+    return np.stack([stars[rank], source], axis=-1)
+
+
+def predicted(catalog: StarCatalog, fit: SkyFit, most: int) -> tuple[Rows, Floats]:
+    """The brightest stars (n,) in the image, rows of the catalog, and their pixels (n, 2)."""
+    camera = fit.camera
+    directions = fit.camera_from_icrf.apply(catalog.direction_icrs[fit.stars])
+    xy = project(camera, directions)
+    with np.errstate(invalid='ignore'):
+        inside = (xy > -0.5).all(axis=1) & (xy < [camera.width - 0.5, camera.height - 0.5]).all(
+            axis=1
+        )
+    rank = np.flatnonzero(inside)[:most]
+    return fit.stars[rank], xy[rank]
+
+
+def _mutual(
+    image: SourceImage, xy_px: Floats, radius_px: float, most_sources: int
+) -> tuple[Rows, Rows, Floats]:
+    """Rows of predictions (n, 2) and of sources that are each other's nearest, their distance."""
+    none = np.empty(0, np.int64)
+    seen = image.xy_px[:most_sources]
+    if len(xy_px) == 0 or len(seen) == 0:
+        return none, none, np.empty(0)
+    apart = ((xy_px[:, None] - seen[None]) ** 2).sum(axis=2)
+    source = apart.argmin(axis=1)
+    rank = np.arange(len(xy_px))
+    nearest = apart[rank, source]
+    good = (apart.argmin(axis=0)[source] == rank) & (nearest < radius_px**2)
+    return rank[good], source[good], np.sqrt(nearest[good])
+
+
+def _step(
+    image: SourceImage, catalog: StarCatalog, fit: SkyFit, pairs: Rows, scale_px: float
+) -> SkyFit:
+    """One robust Gauss-Newton step; ``scale_px`` is how well the pairs are believed to fit."""
+    camera, prior, half_px = fit.camera, image.camera, image.half_diagonal_px
+    directions = fit.camera_from_icrf.apply(catalog.direction_icrs[pairs[:, 0]])
+    xy, J_camera, J_rotation = project_jacobians(camera, directions)
+    residual = image.xy_px[pairs[:, 1]] - xy
+    fx, fy, cx, cy = camera.parameters[[0, 2, 3, 4]]
+    # k1 by the displacement in the corner, as a part of the radius there.
+    k1_per_part = (fx / half_px) ** 2
+    J = np.concatenate(
+        [
+            J_rotation,
+            (fx * J_camera[..., 0] + fy * J_camera[..., 2])[..., None],
+            J_camera[..., 3:5],
+            (k1_per_part * J_camera[..., 5])[..., None],
+        ],
+        axis=-1,
+    )
+    size2 = (residual**2).sum(axis=1)
+    root = 1.0 / np.sqrt(scale_px**2 + size2 / 4)
+    part = (camera.parameters[5] - prior.parameters[5]) / k1_per_part
+    off = np.array(
+        [
+            math.log(prior.parameters[0] / fx),
+            prior.parameters[3] - cx,
+            prior.parameters[4] - cy,
+            -part,
+        ]
+    )
+    centre_px = CENTRE_RANGE * camera.width
+    sigma = np.array([FOCAL_RANGE, centre_px, centre_px, DISTORTION_RANGE]) / 1.7
+    A = np.concatenate([(J * root[:, None, None]).reshape(-1, 7), np.zeros((4, 7))])
+    A[-4:, 3:] = np.diag(1.0 / sigma)
+    b = np.concatenate([(residual * root[:, None]).ravel(), off / sigma])
+    N = A.T @ A
+    step = np.linalg.solve(N + 1e-12 * np.diag(np.diag(N)), A.T @ b)
+    growth = math.exp(float(np.clip(step[3], -0.2, 0.2)))
+    k1 = (part + float(np.clip(step[6], -0.05, 0.05))) * (growth * fx / half_px) ** 2
+    changed = camera.replace(
+        fx=growth * fx,
+        fy=growth * fy,
+        cx=cx + float(np.clip(step[4], -centre_px, centre_px)),
+        cy=cy + float(np.clip(step[5], -centre_px, centre_px)),
+        k1=float(prior.parameters[5]) + k1,
+    )
+    return SkyFit(Rotation.from_rotvec(-step[:3]) * fit.camera_from_icrf, changed, fit.stars)
+
+
+def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tuple[float, float]:
+    """Decadic logarithm of the expected number of false matches this good; the radius, px."""
+    _, xy_px = predicted(catalog, fit, _MOST_STARS)
+    best, best_radius_px = 0.0, _JUDGED_PX[-1]
+    depths = [n for n in _DEPTHS if n < len(xy_px)] + [len(xy_px)]
+    for n in depths:
+        if n < 5:
+            continue
+        sources = min(len(image.xy_px), 4 * n)
+        _, _, apart_px = _mutual(image, xy_px[:n], _JUDGED_PX[-1], sources)
+        for radius_px in _JUDGED_PX:
+            hits = int(np.count_nonzero(apart_px < radius_px))
+            if hits < 5:
+                continue
+            q = _chance_of_one(image, xy_px[:n], radius_px, sources)
+            tail = float(betainc(hits, n - hits + 1, q))  # P(Binomial(n, q) >= hits)
+            log10_p = math.log10(max(_LOOKS * tail, 1e-300)) + _log10_positions(image, radius_px)
+            if log10_p < best:
+                best, best_radius_px = log10_p, radius_px
+    return best, best_radius_px
+
+
+def _chance_of_one(image: SourceImage, xy_px: Floats, radius_px: float, sources: int) -> float:
+    """
+    Probability that a source lies within a radius of a star by chance.
+
+    Mean over the stars; where sources crowd about one, as in glare, it is theirs.
+    """
+    everywhere = min(1.0, sources * math.pi * radius_px**2 / image.area_px2)
+    near = image.tree.query_ball_point(xy_px, _ALONE * radius_px, return_length=True)
+    crowded = np.minimum((np.maximum(near, 1) - 1) / _ALONE**2, 1.0)
+    return float(np.maximum(crowded, everywhere).mean())
+
+
+def _log10_positions(image: SourceImage, radius_px: float) -> float:
+    """Decadic logarithm of the number of fits that differ by the radius of matching."""
+    half_px, f_px = image.half_diagonal_px, float(image.camera.parameters[0])
+    tilts_and_roll = 8 * math.pi**2 * f_px**2 * half_px / radius_px**3
+    focal = 2 * FOCAL_RANGE * half_px / radius_px
+    distortion = 2 * DISTORTION_RANGE * half_px / radius_px
+    # A shift of the centre is a rotation but for the second order of the projection and what the
+    # distortion adds.
+    shape = (half_px / f_px) ** 2 + 3 * DISTORTION_RANGE
+    centre = 2 * CENTRE_RANGE * image.camera.width * shape / radius_px
+    return math.log10(
+        max(tilts_and_roll, 1.0) * max(focal, 1.0) * max(distortion, 1.0) * max(centre, 1.0) ** 2
+    )

@@ -1,0 +1,56 @@
+"""Files of lines of sight by pixel: CSV, NumPy archive and FITS table."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.lookup import LineOfSightTable
+from starcal_ros.errors import ProductError
+from starcal_ros.products.files import write_atomically
+
+COLUMNS = ('u_px', 'v_px', 'x', 'y', 'z', 'shape_sigma_arcsec', 'sigma_arcsec')
+"""Pixel, unit vector in the camera frame, and 1-sigma of the direction: see `LineOfSightTable`."""
+
+
+def write_lookup_table(table: LineOfSightTable, path: Path) -> None:
+    """
+    Write a table in the format of the ending of a file: .csv, .npz or .fits.
+
+    Raises
+    ------
+    ProductError
+        For another ending, a file that cannot be written, or .fits without astropy.
+    """
+    values = np.column_stack(
+        [table.pixels, table.direction_camera, table.shape_sigma_arcsec, table.sigma_arcsec]
+    )
+    if path.suffix == '.csv':
+        rows = (','.join(repr(float(value)) for value in row) for row in values)
+        write_atomically(path, '\n'.join([','.join(COLUMNS), *rows]) + '\n')
+    elif path.suffix == '.npz':
+        memory = io.BytesIO()
+        np.savez_compressed(memory, **dict(zip(COLUMNS, values.T, strict=True)))
+        write_atomically(path, memory.getvalue())
+    elif path.suffix == '.fits':
+        write_atomically(path, _fits(values))
+    else:
+        raise ProductError(f'{path}: ends neither in .csv nor in .npz nor in .fits')
+
+
+def _fits(values: Floats) -> bytes:
+    try:
+        from astropy.io import fits
+    except ImportError as error:
+        raise ProductError('a .fits table needs astropy: pip install astropy') from error
+    units = {'px': 'pix', 'arcsec': 'arcsec'}
+    columns = [
+        fits.Column(name=name, format='D', array=column, unit=units.get(name.rsplit('_', 1)[-1]))
+        for name, column in zip(COLUMNS, values.T, strict=True)
+    ]
+    memory = io.BytesIO()
+    fits.BinTableHDU.from_columns(columns, name='LINES_OF_SIGHT').writeto(memory)
+    return memory.getvalue()
