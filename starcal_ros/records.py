@@ -505,8 +505,9 @@ class ModelChecks:
         detector; 0 where none was needed.
     held : tuple of HeldTerm
     step : DetectorStep
-    velocity_error_km_s, velocity_p_value : float
-        Velocity of the observer that the aberration of the stars misses, and the p-value of none.
+    velocity_error_km_s, velocity_sigma_km_s, velocity_p_value : float
+        Velocity of the observer that the aberration of the stars misses, its largest 1-sigma, and
+        the p-value of none.
     image_variation_px, image_variation_p_value : float
         1-sigma change of the camera from image to image in a corner, carried in the covariance;
         and the p-value of none.
@@ -523,6 +524,7 @@ class ModelChecks:
     held: tuple[HeldTerm, ...]
     step: DetectorStep
     velocity_error_km_s: float
+    velocity_sigma_km_s: float
     velocity_p_value: float
     image_variation_px: float
     image_variation_p_value: float

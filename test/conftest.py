@@ -17,6 +17,9 @@ from typing import Any
 
 import pytest
 
+# Read when NumPy is loaded: two tests at once on two cores leave no core for more threads.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
 START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
 NODES = 'starcal_ros.nodes.'
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'

@@ -30,6 +30,7 @@ from starcal_ros.estimation.problem import (
 from starcal_ros.records import DetectorStep, HeldTerm, ModelChecks
 
 _SPEED_OF_LIGHT_KM_S = 299792.458
+_INNER = (0.1, 0.9)  # of the detector: beyond, too few stars lie on one side
 _STEPS = 31  # places along each axis at which a step is looked for
 _GRID = 25
 
@@ -44,7 +45,7 @@ def model_checks(estimate: Estimate) -> ModelChecks:
     field = field_terms(problem, state, measurements)
     camera = estimate.geometry.camera
     test, variation, correlation = estimate.field_test, estimate.variation, estimate.correlation
-    velocity_km_s, velocity_p_value = _velocity(estimate, measurements, blocks, field)
+    velocity = _velocity(estimate, measurements, blocks, field)
     rms_px, worst_px = _field_px(camera)
     return ModelChecks(
         field_p_value=test.p_value if test else float('nan'),
@@ -52,8 +53,9 @@ def model_checks(estimate: Estimate) -> ModelChecks:
         field_worst_px=worst_px,
         held=_held_terms(estimate, blocks, field),
         step=_step(estimate, measurements, blocks, field),
-        velocity_error_km_s=velocity_km_s,
-        velocity_p_value=velocity_p_value,
+        velocity_error_km_s=velocity[0],
+        velocity_sigma_km_s=velocity[1],
+        velocity_p_value=velocity[2],
         image_variation_px=variation.sigma_px,
         image_variation_p_value=variation.p_value,
         correlation_time_s=correlation.correlation_time_s,
@@ -106,8 +108,8 @@ def _held_terms(
 
 def _velocity(
     estimate: Estimate, measurements: Measurements, blocks: Floats, field: LinearTerms | None
-) -> tuple[float, float]:
-    """Length of the velocity that the stars miss, km/s, and the p-value of none."""
+) -> tuple[float, float, float]:
+    """Length of the velocity that the stars miss, its largest 1-sigma, km/s; p-value of none."""
     problem, state = estimate.problem, estimate.state
     camera, R = estimate.geometry.camera, state.camera_from_icrf.as_matrix()
     modes = problem.field_prior
@@ -138,9 +140,12 @@ def _velocity(
     tested = LinearTerms(terms.information[:3, :3], terms.cross[:, :3])
     score = score_of(problem, state, blocks, field, tested, between)
     if not (np.diag(score.information) > 0).all():
-        return 0.0, 1.0
+        return 0.0, float('inf'), 1.0
     missed = np.linalg.solve(score.information, score.gradient)
-    return float(np.linalg.norm(missed)), float(chdtrc(3.0, score.gradient @ missed))
+    least = float(np.linalg.eigvalsh(score.information)[0])
+    sigma = 1.0 / np.sqrt(least) if least > 0 else float('inf')
+    p_value = float(chdtrc(3.0, score.gradient @ missed))
+    return float(np.linalg.norm(missed)), float(sigma), p_value
 
 
 def _step(
@@ -149,7 +154,7 @@ def _step(
     """The most significant step of the detector between two parts."""
     problem, state = estimate.problem, estimate.state
     camera, prior = estimate.geometry.camera, problem.field_prior
-    along = np.linspace(0.0, 1.0, _STEPS + 2)[1:-1]
+    along = np.linspace(*_INNER, _STEPS)
     at = (along * camera.width - 0.5, along * camera.height - 0.5)
 
     def scalars(pixels: Floats) -> Floats:

@@ -43,6 +43,8 @@ _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed b
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns the exit status."""
+    # Read when NumPy is loaded: on matrices of this size two threads of BLAS wait for each other.
+    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     try:
         tool = parser()
         if '_ARGCOMPLETE' in os.environ:  # set by a shell that completes a command line

@@ -8,6 +8,7 @@ action of the system ends the process without one.
 from __future__ import annotations
 
 import importlib
+import os
 import signal
 
 
@@ -27,6 +28,8 @@ def bag_player() -> int:
 
 
 def _run(name: str) -> int:
+    # Read when NumPy is loaded: on matrices of this size two threads of BLAS wait for each other.
+    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:  # unless nohup or a shell ignores it
         signal.signal(signal.SIGINT, signal.SIG_DFL)
