@@ -1,0 +1,201 @@
+"""The field beside the lens model: its basis, its test, its estimate with a true sigma."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.lookup import line_of_sight_table
+from starcal_ros.assessment.model_checks import model_checks
+from starcal_ros.camera import line_of_sight, pixel_grid, project
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.detector_field import basis, degrees, DetectorField
+from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate, estimate_calibration
+from starcal_ros.records import Ensemble
+from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.simulation.scenario import Inertial, Scenario, scenario
+
+WIDTH, HEIGHT = 1296, 1024
+
+
+def of_random_pointings(seed: int, images: int = 12) -> Scenario:
+    rng = np.random.default_rng([seed, 3])
+    fields = np.stack(
+        [
+            rng.uniform(0.0, 360.0, images),
+            np.degrees(np.arcsin(rng.uniform(-0.9, 0.9, images))),
+            rng.uniform(0.0, 360.0, images),
+        ],
+        axis=-1,
+    )
+    pointing = Inertial(tuple((float(a), float(b), float(c)) for a, b, c in fields))
+    return dataclasses.replace(
+        scenario('small', seed), pointing=pointing, image_count=images, magnitude_limit=8.0
+    )
+
+
+def displaced(ensemble: Ensemble, move: Callable[[Floats], Floats]) -> Ensemble:
+    images = tuple(
+        dataclasses.replace(image, measured_px=image.measured_px + move(image.measured_px))
+        for image in ensemble.images
+    )
+    return dataclasses.replace(ensemble, images=images)
+
+
+def ripple(pixels: Floats) -> Floats:
+    """0.2 px rms, waves of half the detector, that no lens model has."""
+    x, y = 4.0 * np.pi * pixels[:, 0] / WIDTH, 3.0 * np.pi * pixels[:, 1] / WIDTH
+    return 0.3 * np.stack([np.sin(x + 0.3) * np.cos(y), np.cos(x - y)], axis=-1)
+
+
+def estimated(given: Scenario, ensemble: Ensemble, **options: object) -> Estimate:
+    changed = CalibrationOptions(
+        star_tracker_sigma_arcsec=given.star_tracker_sigma_arcsec,
+        **options,  # type: ignore[arg-type]
+    )
+    return estimate_calibration(ensemble, given.prior, changed)
+
+
+def honesty(
+    given: Scenario, found: Estimate, move: Callable[[Floats], Floats]
+) -> tuple[float, float]:
+    """Error of the lines of sight over the reported sigma, and the error, arcsec."""
+    camera = given.truth.camera
+    pixels = pixel_grid(camera, 25, 25)
+    at = pixels
+    for _ in range(30):  # a contraction: 0.3 px over hundreds of pixels
+        at = pixels - move(at)
+    true = line_of_sight(camera, at)
+    table = line_of_sight_table(found.geometry.camera, found.joint_covariance, pixels)
+    rotation, _ = Rotation.align_vectors(true, table.direction_camera)
+    error = np.linalg.norm(rotation.apply(table.direction_camera) - true, axis=1) / ARCSECOND_RAD
+    rms = float(np.sqrt(np.mean(error**2)))
+    return rms / float(np.sqrt(np.mean(table.shape_sigma_arcsec**2))), rms
+
+
+def test_the_basis_is_orthonormal_over_the_detector() -> None:
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    u, v = np.meshgrid((nodes + 1) * WIDTH / 2 - 0.5, (nodes + 1) * HEIGHT / 2 - 0.5)
+    phi = basis(np.stack([u.ravel(), v.ravel()], -1), WIDTH, HEIGHT, 8)
+    weight = np.outer(weights, weights).ravel() / 4.0
+    # Gauss-Legendre is exact for these degrees: what is left is rounding.
+    np.testing.assert_allclose((phi.T * weight) @ phi, np.eye(phi.shape[1]), atol=1e-12)
+
+
+def test_a_camera_with_a_field_projects_what_it_sees() -> None:
+    given = scenario('small', 1).truth.camera
+    rng = np.random.default_rng(2)
+    coefficients = 0.2 * rng.normal(size=(2, len(degrees(5))))
+    camera = dataclasses.replace(given, field=DetectorField(WIDTH, HEIGHT, 5, coefficients))
+    pixels = pixel_grid(camera, 9, 7)
+    # Twelve steps of a contraction by 0.05 and less leave under 1e-9 px.
+    np.testing.assert_allclose(
+        project(camera, line_of_sight(camera, pixels)), pixels, rtol=0, atol=1e-9
+    )
+
+
+def test_a_sound_camera_gets_a_field_no_more_often_than_the_p_value_says() -> None:
+    """Forty cameras: p-values under 10 % in 4 of them; 11 and more has a probability of 1e-3."""
+    small = [estimated(*_sound(seed)).field_test for seed in range(1, 41)]
+    p_values = np.array([test.p_value for test in small if test is not None])
+    assert len(p_values) == 40
+    assert (p_values < 0.1).sum() <= 10
+    assert p_values.min() > 1e-5
+
+
+def _sound(seed: int) -> tuple[Scenario, Ensemble]:
+    given = of_random_pointings(seed, images=4)
+    return given, true_observations(given)
+
+
+@pytest.mark.parametrize('method', ['hierarchical', 'per_image', 'single'])
+def test_a_lens_error_is_estimated_with_a_true_sigma(method: str) -> None:
+    given = of_random_pointings(5)
+    if method == 'single':  # which takes the star tracker as perfect
+        given = dataclasses.replace(given, star_tracker_sigma_arcsec=(1e-3,) * 3)
+    ensemble = displaced(true_observations(given), ripple)
+    found = estimated(given, ensemble, method=method)
+    assert found.geometry.camera.field is not None
+    ratio, error_arcsec = honesty(given, found, ripple)
+    # A hundred degrees of freedom scatter the ratio by a tenth; the limits are those of trust.
+    assert 0.7 < ratio < 1.5
+    bare = estimated(given, ensemble, method=method, residual_field=False)
+    assert honesty(given, bare, ripple)[1] > 5 * error_arcsec
+
+
+def test_a_needed_field_that_is_not_estimated_is_known() -> None:
+    given = of_random_pointings(6)
+    found = estimated(given, displaced(true_observations(given), ripple), residual_field=False)
+    assert found.geometry.camera.field is None
+    checks = model_checks(found)
+    assert checks.field_p_value < 1e-12 and checks.field_rms_px == 0.0
+
+
+def test_lost_columns_are_found_where_they_are() -> None:
+    given = of_random_pointings(7)
+
+    def lost(pixels: Floats) -> Floats:
+        return np.stack([-(pixels[:, 0] > 648.0).astype(float), 0.0 * pixels[:, 1]], axis=-1)
+
+    step = model_checks(estimated(given, displaced(true_observations(given), lost))).step
+    assert (step.across, step.moved) == ('u', 'u') and step.p_value < 1e-9
+    assert abs(step.place_px - 648.0) < 0.8 * WIDTH / 30  # the places looked at lie as far apart
+    assert abs(step.size_px) > 0.5
+
+
+def test_a_held_principal_point_that_is_wrong_is_named() -> None:
+    given = of_random_pointings(8)
+    true = given.truth.camera
+    cx = float(true.intrinsics[3]) + 15.0
+    given = dataclasses.replace(
+        given, truth=dataclasses.replace(given.truth, camera=true.replace(cx=cx))
+    )
+    found = estimated(
+        given,
+        true_observations(given),
+        estimate=('fx', 'skew', 'fy', 'cy', 'distortion'),
+        residual_field=False,
+    )
+    (held,) = [term for term in model_checks(found).held if term.name == 'cx']
+    assert held.significance > 10
+    assert abs(held.asked - cx) < 5 * held.sigma
+
+
+def test_a_focal_length_that_breathes_is_carried_in_the_covariance() -> None:
+    given = of_random_pointings(9)
+    rng = np.random.default_rng(9)
+    ensemble = true_observations(given)
+    middle = np.array([WIDTH - 1, HEIGHT - 1]) / 2.0
+    images = []
+    for image in ensemble.images:
+        scale = rng.normal() * 3e-4  # a quarter of a pixel in a corner
+        moved = image.measured_px + scale * (image.measured_px - middle)
+        images.append(dataclasses.replace(image, measured_px=moved))
+    found = estimated(given, Ensemble(tuple(images)))
+    assert found.variation.p_value < 1e-6
+    assert 0.1 < found.variation.sigma_px < 0.5
+    still = estimated(given, ensemble)
+    assert still.variation.p_value > 1e-3
+    assert found.covariance[0, 0] > 10 * still.covariance[0, 0]
+
+
+def test_images_of_one_pointing_that_repeat_their_errors_count_once() -> None:
+    given = of_random_pointings(10, images=3)
+    once = true_observations(given)
+    copies = [
+        dataclasses.replace(image, time_ns=image.time_ns + k)
+        for image in once.images
+        for k in range(5)
+    ]
+    found, alone = (estimated(given, Ensemble(tuple(images))) for images in (copies, once.images))
+    assert found.pointings == 3
+    # All errors come again: five images are worth one.
+    np.testing.assert_allclose(found.repetition[found.kept], 5.0, rtol=0.05)
+    np.testing.assert_allclose(
+        np.sqrt(found.covariance[0, 0] / alone.covariance[0, 0]), 1.0, rtol=0.2
+    )
