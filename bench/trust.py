@@ -68,7 +68,7 @@ WORLDS = (
     *(World('tilted detector', size, 'px', _FIELD) for size in (0.3, 1.0, 3.0)),
     *(World('8th-order radial', size, 'px', _FIELD) for size in (0.3, 1.0, 3.0)),
     *(World('ripple', size, 'px', _FIELD) for size in (0.03, 0.1, 0.3, 1.0)),
-    World('fisheye', 0.0, '', _FIELD),
+    World('fisheye', 0.0, '', ('lens', *_FIELD)),
     *(World('columns lost', size, 'px', ('step',)) for size in (1.0, 3.0)),
     World('odd rows shifted', 1.0, 'px', ('rows', 'step')),
     World('two lenses', 1.0, 'px', ('image to image',)),

@@ -516,6 +516,8 @@ class ModelChecks:
         determine the alignment as well.
     pointings : int
         Number of different pointings.
+    independent_pointings : float
+        Number of images, one that repeats the stars of others counted by what it adds.
     """
 
     field_p_value: float
@@ -531,6 +533,7 @@ class ModelChecks:
     correlation_time_s: float
     independent_images: float
     pointings: int
+    independent_pointings: float
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,14 @@ from starcal_ros.records import (
     CameraGeometry,
     Correlation,
     DetectorMaps,
+    DetectorStep,
     EnsembleStatus,
     GateCheck,
     HalvesComparison,
+    HeldTerm,
+    ModelChecks,
     refused_image,
+    ResidualField,
     StarObservations,
     TemperatureTerms,
     TermRemoval,
@@ -99,6 +103,14 @@ def calibration() -> Calibration:
             TermRemoval('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
             TermRemoval('k3', -0.3, 0.5, 1 / 7, False, 0.3, (0.25, 0.35), 1e-9),
         ),
+        model_checks=model_checks(),
+        field=ResidualField(
+            1,
+            np.array([[0.011, -0.007, 0.003], [0.005, 0.0025, -0.0125]]),
+            np.arange(361.0).reshape(19, 19) / 11,
+            0.4375,
+            0.02,
+        ),
         gate=(
             GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 0.25, 'px', False, 'a word'),
             GateCheck('stars', 'min_stars', 1234.0, 60.0, '', True),
@@ -106,15 +118,49 @@ def calibration() -> Calibration:
     )
 
 
+def model_checks() -> ModelChecks:
+    """Checks of the model with a different number in every field, within the default limits."""
+    return ModelChecks(
+        field_p_value=0.3,
+        field_rms_px=0.009,
+        field_worst_px=0.02,
+        held=(HeldTerm('cx', 647.5, 648.25, 1.5), HeldTerm('k3', 0.01, 0.02, 0.04)),
+        step=DetectorStep('u', 512.5, 'v', -0.015, 0.7),
+        velocity_error_km_s=1.25,
+        velocity_sigma_km_s=0.6,
+        velocity_p_value=0.2,
+        image_variation_px=0.03,
+        image_variation_p_value=0.45,
+        correlation_time_s=12.5,
+        independent_images=7.5,
+        pointings=14,
+        independent_pointings=13.25,
+    )
+
+
+def without_field() -> Calibration:
+    """The calibration of a camera that has a lens model alone."""
+    found = calibration()
+    camera = dataclasses.replace(found.geometry.camera, field=None)
+    geometry = dataclasses.replace(found.geometry, camera=camera)
+    return dataclasses.replace(found, geometry=geometry, field=None)
+
+
+def calibration_of_0_1() -> Calibration:
+    """What a file of version 0.1 holds of it: that version had no field and no model checks."""
+    return dataclasses.replace(without_field(), model_checks=None)
+
+
 def plain_calibration() -> Calibration:
     """A calibration without optional fields."""
     return dataclasses.replace(
-        calibration(),
+        without_field(),
         temperature=None,
         maps=None,
         correlation=None,
         removals=(),
         halves=None,
+        model_checks=None,
         gate=(),
     )
 

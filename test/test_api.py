@@ -16,7 +16,7 @@ from tiny_campaign import ensemble, SCENARIO  # type: ignore[import-not-found]
 import starcal_ros
 from starcal_ros import api
 from starcal_ros.estimation.calibrate import CalibrationOptions, estimate_calibration
-from starcal_ros.records import StarObservations
+from starcal_ros.records import Ensemble, StarObservations
 
 SIGMA_ARCSEC = (10.0, 10.0, 40.0)
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
@@ -58,7 +58,14 @@ def test_arrays_give_the_estimate_of_the_records() -> None:
     ]
     found = starcal_ros.calibrate(images, SCENARIO.prior, star_tracker_sigma_arcsec=SIGMA_ARCSEC)
     options = CalibrationOptions(star_tracker_sigma_arcsec=SIGMA_ARCSEC)
-    expected = estimate_calibration(ensemble(), SCENARIO.prior, options)
+    # Arrays have no magnitudes, by which the variances would be told apart.
+    dark = Ensemble(
+        tuple(
+            dataclasses.replace(image, magnitude=np.full(len(image), np.nan, np.float32))
+            for image in ensemble().images
+        )
+    )
+    expected = estimate_calibration(dark, SCENARIO.prior, options)
     assert found.accepted and found.stars_used == expected.kept.sum()
     # Directions are scaled to unit length once more, which moves their last bit.
     np.testing.assert_allclose(

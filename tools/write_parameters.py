@@ -75,7 +75,11 @@ def as_yaml(value: object) -> str:
         return '[' + ', '.join(as_yaml(item) for item in value) + ']'
     if isinstance(value, str):
         return value if value.isidentifier() else f"'{value}'"
-    return repr(value)
+    text = repr(value)
+    if isinstance(value, float) and '.' not in text:
+        # Without a point YAML 1.1 takes a number with an exponent for a text.
+        text = text.replace('e', '.0e')
+    return text
 
 
 if __name__ == '__main__':

@@ -364,6 +364,14 @@ def _model(
     """Contradictions between the stars and the assumed model, each with the remedy."""
     if found is None:
         return
+    check = _check(
+        estimation,
+        'min_images',
+        'number of independent pointings',
+        round(found.independent_pointings, 2),
+    )
+    note = '' if check.passed else 'images of one pointing repeat their errors: collect others'
+    yield dataclasses.replace(check, note=note)
     missing = found.field_rms_px == 0.0 and found.field_p_value < estimation.max_field_p_value
     check = _check(
         options,
@@ -473,13 +481,18 @@ def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateC
         _map_sigma_px(calibration),
         'px',
     )
-    yield _check(
+    check = _check(
         options,
         'max_line_of_sight_sigma_arcsec',
         'largest 1-sigma of a line of sight',
         float(maps.line_of_sight_sigma_arcsec.max()),
         'arcsec',
     )
+    model = calibration.model_checks
+    if model is not None and model.correlation_time_s > 0:
+        note = f'star-tracker errors are correlated over {model.correlation_time_s:.3g} s'
+        check = dataclasses.replace(check, note=note)
+    yield check
     names = calibration.parameter_names
     limits = np.broadcast_to(options.max_parameter_sigma, len(names)).tolist()
     intrinsic, angles = 5, len(calibration.geometry.camera.parameters)
@@ -551,7 +564,11 @@ def _changes(
             'sigma',
         ),
     ):
-        yield _check(options, parameter, name, found, unit)
+        check = _check(options, parameter, name, found, unit)
+        if parameter == 'max_change_px' and check.passed is False:
+            note = 'the prior camera or its lens model is not of this lens (lens_model)'
+            check = dataclasses.replace(check, note=note)
+        yield check
 
 
 def _step(active: Calibration | None, calibration: Calibration) -> Difference | str:

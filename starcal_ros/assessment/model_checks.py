@@ -61,7 +61,16 @@ def model_checks(estimate: Estimate) -> ModelChecks:
         correlation_time_s=correlation.correlation_time_s,
         independent_images=float(correlation.independent_images.min()),
         pointings=estimate.pointings,
+        independent_pointings=_independent_pointings(estimate),
     )
+
+
+def _independent_pointings(estimate: Estimate) -> float:
+    """Number of images, one that repeats the stars of others counted by what it adds."""
+    image, kept = estimate.table.image, estimate.kept
+    stars = np.bincount(image[kept], minlength=estimate.table.image_count)
+    summed = np.bincount(image[kept], estimate.repetition[kept], estimate.table.image_count)
+    return float((stars[stars > 0] / summed[stars > 0]).sum())
 
 
 def _field_px(camera: CameraModel) -> tuple[float, float]:
@@ -144,8 +153,13 @@ def _velocity(
     missed = np.linalg.solve(score.information, score.gradient)
     least = float(np.linalg.eigvalsh(score.information)[0])
     sigma = 1.0 / np.sqrt(least) if least > 0 else float('inf')
-    p_value = float(chdtrc(3.0, score.gradient @ missed))
-    return float(np.linalg.norm(missed)), float(sigma), p_value
+    chi2 = float(score.gradient @ missed)
+    # Shapes that vary from image to image scatter it as well: what it does not explain of them.
+    variation = estimate.variation
+    left = max(variation.chi2 - chi2, 0.0) / max(variation.degrees_of_freedom - 3, 1)
+    dispersion = max(1.0, left)
+    p_value = float(chdtrc(3.0, chi2 / dispersion))
+    return float(np.linalg.norm(missed)), float(sigma * np.sqrt(dispersion)), p_value
 
 
 def _step(

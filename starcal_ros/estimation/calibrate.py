@@ -55,6 +55,7 @@ from starcal_ros.estimation.residual_field import (
     degree_for,
     FieldPrior,
     polynomials,
+    sees_detector,
     TEST_DEGREE,
 )
 from starcal_ros.estimation.temperature import weakest_term, why_unsupported
@@ -506,18 +507,23 @@ def _with_field(
     found: _Found, table: StarTable, prior: CameraGeometry, options: CalibrationOptions
 ) -> _Found:
     """The search with a field beside the lens model, where the stars show one."""
+    plain = found
     best = _field_prior(found, table, prior.camera, TEST_DEGREE)
-    found = dataclasses.replace(found, field_test=best)
+    if best is None:
+        return plain
+    found = plain = dataclasses.replace(found, field_test=best)
     if not options.residual_field or best.p_value > options.max_field_p_value:
-        return found
+        return plain
     best = _field_prior(found, table, prior.camera, degree_for(best))
     for _ in range(_FIELD_ROUNDS):
+        if best is None:
+            return plain
         found = _settle(_started(found, best), _arranged(table, found.verdict), table, options)
         again = _field_prior(found, table, prior.camera, degree_for(best))
-        if again.is_close_to(best):
+        if again is not None and again.is_close_to(best):
             break
         best = again
-    return found
+    return found if best is not None else plain
 
 
 def _started(found: _Found, prior: FieldPrior) -> _Found:
@@ -536,10 +542,18 @@ def _started(found: _Found, prior: FieldPrior) -> _Found:
     )
 
 
-def _field_prior(found: _Found, table: StarTable, camera: CameraModel, degree: int) -> FieldPrior:
-    """The prior of a field that the residuals at a minimum ask for, in polynomials of a degree."""
+def _field_prior(
+    found: _Found, table: StarTable, camera: CameraModel, degree: int
+) -> FieldPrior | None:
+    """
+    The prior of a field that the residuals at a minimum ask for, in polynomials of a degree.
+
+    None where the lens model has lines of sight for a small part of the detector only.
+    """
     problem, state = found.problem, found.solution.state
     camera = dataclasses.replace(camera, parameters=state.parameters, field=None)
+    if not sees_detector(camera):
+        return None
     measurements = _arranged(table, found.verdict)
     _, blocks = image_blocks(problem, state, measurements)
     terms = scalar_terms_at(

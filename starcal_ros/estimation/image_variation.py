@@ -28,14 +28,22 @@ class ImageVariation:
     """
     How much the shape of the images varies beyond their noise.
 
-    ``sigma_px`` is the 1-sigma displacement of a star in a corner of the detector, ``p_value`` the
-    probability of as much scatter without a change; ``information`` (p, p) is the variance that it
-    adds to the gradient of the cost by the camera parameters.
+    ``sigma_px`` is the 1-sigma displacement of a star in a corner of the detector, ``chi2`` the
+    scatter of the shapes in the metric of their noise with its degrees of freedom;
+    ``information`` (p, p) is the variance that it adds to the gradient of the cost by the camera
+    parameters.
     """
 
     sigma_px: float
-    p_value: float
+    chi2: float
+    degrees_of_freedom: int
     information: Floats
+
+    @property
+    def p_value(self) -> float:
+        """Probability of as much scatter without a change; 1 where it was not tested."""
+        n = self.degrees_of_freedom
+        return float(chdtrc(n, self.chi2)) if n else 1.0
 
 
 def image_variation(blocks: Floats, focal_px: float, radius_px: float) -> ImageVariation:
@@ -47,7 +55,7 @@ def image_variation(blocks: Floats, focal_px: float, radius_px: float) -> ImageV
     A, a = blocks[:, CAMERA, CAMERA], blocks[:, CAMERA, RESIDUAL]
     B, C, c = blocks[:, ROTATION, CAMERA], blocks[:, ROTATION, ROTATION], blocks[:, ROTATION, -1]
     p = A.shape[1]
-    none = ImageVariation(0.0, 1.0, np.zeros((p, p)))
+    none = ImageVariation(0.0, 0.0, 0, np.zeros((p, p)))
     scale = np.einsum('mii->mi', C)
     seen = (scale > 0).all(axis=1)
     seen[seen] = (
@@ -71,9 +79,9 @@ def image_variation(blocks: Floats, focal_px: float, radius_px: float) -> ImageV
     mean = np.linalg.solve(h.sum(axis=0), s.sum(axis=0))
     off = s - h @ mean
     q = float((off * np.linalg.solve(h, off[..., None])[..., 0]).sum())
-    p_value = float(chdtrc(3.0 * (len(h) - 1), q))
-    if p_value > _P_VALUE:
-        return ImageVariation(0.0, p_value, none.information)
+    degrees_of_freedom = 3 * (len(h) - 1)
+    if chdtrc(degrees_of_freedom, q) > _P_VALUE:
+        return ImageVariation(0.0, q, degrees_of_freedom, none.information)
     weight = scaled
     each = off / weight
     centre = (weight * each).sum(axis=0) / weight.sum(axis=0)
@@ -83,4 +91,4 @@ def image_variation(blocks: Floats, focal_px: float, radius_px: float) -> ImageV
     by_mode = H @ D
     information = np.einsum('mpk,k,mqk->pq', by_mode, variance, by_mode)
     sigma_px = float(np.sqrt(variance.sum())) * radius_px / focal_px
-    return ImageVariation(sigma_px, p_value, information)
+    return ImageVariation(sigma_px, q, degrees_of_freedom, information)

@@ -3,10 +3,11 @@ A smooth field over the detector that the lens model lacks: its test, its prior 
 
 The calibration with a field predicts ``u = g(e; xi) + f(u)`` with ``f = Phi(u) c``, Phi the
 polynomials of `detector_field` and ``c ~ N(0, s^2 P W P)``.  W is the covariance of a Gaussian
-process with a squared-exponential kernel of length l (Rasmussen & Williams 2006, ch. 4 and 5),
-projected onto the polynomials; P removes from it what the camera parameters and a common rotation
-can do, so that the lens model describes as much as it can.  Amplitude s and length l are those of
-the largest marginal likelihood.
+process with a squared-exponential kernel of length l, a part of it shorter (Rasmussen & Williams
+2006, ch. 4 and 5), projected onto the polynomials, and of the terms that larger lens models have.
+P removes from it what the camera parameters and a common rotation can do, so that the lens model
+describes as much as it can.  Amplitude s and length l are those of the largest marginal
+likelihood.
 
 With F the information on c and g its gradient, all other unknowns eliminated, the likelihood ratio
 against s = 0 is ``2 log L = sum z_i^2 s^2 L_i / (1 + s^2 L_i) - log(1 + s^2 L_i)`` over the
@@ -33,13 +34,20 @@ from starcal_ros.detector_field import basis, degrees, DetectorField, legendre
 from starcal_ros.estimation.linear_terms import Scalars, Score
 
 TEST_DEGREE = 10
-_MAX_DEGREE = 16
+_MAX_DEGREE = 18
 # Length of the kernel in half lengths of the longer side.  Polynomials of degree 4.2 / length hold
-# all but 1e-4 of its variance: 16 of the shortest, which is a wave of a third of the detector.
-_LENGTHS = (0.26, 0.3, 0.36, 0.43, 0.52, 0.7, 1.0, 1.4)
+# all but 1e-4 of its variance.
+# Lens errors grow towards the corners: a part of the variance has half and a third of the length,
+# as a rational-quadratic kernel has.  Without it the corners of an 8th-order term of 3 px were 2.6
+# sigma off.
+_SCALES = ((1.0, 0.9), (0.5, 0.09), (0.33, 0.01))
+_LENGTHS = (0.26, 0.3, 0.36, 0.43, 0.52, 0.7, 1.0, 1.4, 2.0)
 _DEGREE_TIMES_LENGTH = 4.2
 _AMPLITUDES_PX = np.geomspace(1e-3, 10.0, 41)
 _GRID = 41  # pixels a side at which the lens model's own displacements are taken
+# Of the detector, with a line of sight: a circular image fills 0.4 of a wide one; a lens model that
+# stars in one spot determine folds back around them.
+_LEAST_SEEN = 0.25
 _LEAST_SHARE = 1e-10  # of the variance of a field, under which a mode is left out
 
 
@@ -105,6 +113,12 @@ def polynomials(width: int, height: int, degree: int) -> Scalars:
     return lambda pixels: basis(pixels.T, width, height, degree).T
 
 
+def sees_detector(camera: CameraModel) -> bool:
+    """Whether the lens model has lines of sight for enough of the detector to hold a field."""
+    seen = np.isfinite(line_of_sight(camera, pixel_grid(camera, _GRID, _GRID))[:, 0])
+    return bool(seen.mean() >= _LEAST_SEEN)
+
+
 def spanned_by_lens(camera: CameraModel, free: NDArray[np.int64], degree: int) -> Floats:
     """
     Return an orthonormal basis (2 t, r) of what the lens model and a rotation explain.
@@ -131,12 +145,15 @@ def _kernel_root(width: int, height: int, degree: int, length: float) -> Floats:
     nodes, weights = np.polynomial.legendre.leggauss(64)
     polynomials = legendre(nodes, degree) * (0.5 * weights)
 
-    def along(side: int) -> Floats:
-        apart = (nodes[:, None] - nodes[None, :]) * (side / max(width, height)) / length
+    def along(side: int, own: float) -> Floats:
+        apart = (nodes[:, None] - nodes[None, :]) * (side / max(width, height)) / own
         return np.asarray(polynomials @ np.exp(-0.5 * apart**2) @ polynomials.T)
 
     of_u, of_v = degrees(degree).T
-    covariance = along(width)[np.ix_(of_u, of_u)] * along(height)[np.ix_(of_v, of_v)]
+    covariance = np.zeros((len(of_u), len(of_u)))
+    for part, share in _SCALES:
+        u, v = along(width, part * length), along(height, part * length)
+        covariance += share * u[np.ix_(of_u, of_u)] * v[np.ix_(of_v, of_v)]
     values, vectors = np.linalg.eigh(covariance)
     large = values > _LEAST_SHARE * values.sum()
     root = vectors[:, large] * np.sqrt(values[large])
@@ -161,10 +178,10 @@ def best_prior(
     information = _projected(_projected(score.information, span).T, span)
     gradient = score.gradient - span @ (span.T @ score.gradient)
     best: tuple[float, float, float] = (-np.inf, 0.0, 0.0)
+    patterns = _patterns(camera.width, camera.height, degree, span)
     for length in _LENGTHS:
-        if degree < TEST_DEGREE and _degree_for(length) > degree:
-            continue
-        root = _both(_kernel_root(camera.width, camera.height, degree, length))
+        smooth = _both(_kernel_root(camera.width, camera.height, degree, length))
+        root = np.concatenate([smooth, patterns], axis=1)
         eigenvalues, vectors = np.linalg.eigh(root.T @ information @ root)
         eigenvalues = np.maximum(eigenvalues, 0.0)
         along = vectors.T @ (root.T @ gradient)
@@ -174,7 +191,8 @@ def best_prior(
         k = int(ratio.argmax())
         best = max(best, (float(ratio[k]), length, float(_AMPLITUDES_PX[k])))
     ratio, length, amplitude_px = best
-    root = _both(_kernel_root(camera.width, camera.height, degree, length))
+    smooth = _both(_kernel_root(camera.width, camera.height, degree, length))
+    root = np.concatenate([smooth, patterns], axis=1)
     modes = amplitude_px * (root - span @ (span.T @ root))
     return FieldPrior(
         camera.width, camera.height, degree, modes, amplitude_px, length, float(ratio)
@@ -187,12 +205,41 @@ def degree_for(prior: FieldPrior) -> int:
 
 
 def _degree_for(length: float) -> int:
-    return min(_MAX_DEGREE, int(np.ceil(_DEGREE_TIMES_LENGTH / length)))
+    return min(
+        _MAX_DEGREE,
+        max(TEST_DEGREE, int(np.ceil(_DEGREE_TIMES_LENGTH / (_SCALES[-1][0] * length)))),
+    )
 
 
 def _projected(matrix: Floats, span: Floats) -> Floats:
     """Return the matrix less what its columns have of a span."""
     return np.asarray(matrix - span @ (span.T @ matrix))
+
+
+def _patterns(width: int, height: int, degree: int, span: Floats) -> Floats:
+    """
+    Coefficients (2 t, 7) of the terms that lens models have next, less what the lens model spans.
+
+    Radial of 8th order, thin prism of 2nd and 4th order, tilt; each with a mean square of 1.
+    """
+    u, v = np.meshgrid(np.linspace(0, width - 1, _GRID), np.linspace(0, height - 1, _GRID))
+    pixels = np.stack([u.ravel(), v.ravel()], axis=-1)
+    half = np.array([width - 1, height - 1]) / 2.0
+    xy = (pixels - half) / float(np.hypot(*half))
+    x, y = xy.T
+    r2 = x * x + y * y
+    zero = np.zeros_like(x)
+    moved = [
+        (x * r2**4, y * r2**4),
+        *((power, zero) for power in (r2, r2**2)),
+        *((zero, power) for power in (r2, r2**2)),
+        (x * x, x * y),
+        (x * y, y * y),
+    ]
+    phi = basis(pixels, width, height, degree)
+    found = [np.linalg.lstsq(phi, np.stack(pair, -1), rcond=None)[0].T.ravel() for pair in moved]
+    patterns = _projected(np.stack(found, axis=-1), span)
+    return np.asarray(patterns / np.linalg.norm(patterns, axis=0))
 
 
 def _both(root: Floats) -> Floats:

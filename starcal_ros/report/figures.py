@@ -433,7 +433,9 @@ def term_worth(removals: Sequence[TermRemoval]) -> Markup:
     plot_curves(axes, *curves_of(removals))
     axes.set_xlim(-0.5, len(removals) - 0.5)
     axes.set_xticks(
-        steps, ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])]
+        steps,
+        ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])],
+        rotation=45,  # ten names do not fit beside each other
     )
     axes.set_xlabel('removed, one after the other')
     return _svg(figure, 'terms')

@@ -38,7 +38,7 @@ def plot_curves(axes: Axes, std_px: Floats, map_change_px: Floats) -> None:
               label='change of the map, rms')  # fmt: skip
     axes.set(yscale='log', xlabel='terms removed', ylabel='px')
     axes.set_xticks(steps)
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=9)
 
 
 def plot_removed(axes: Axes, share: Floats, names: Sequence[str]) -> None:

@@ -33,6 +33,7 @@ from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenario
 from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.studies.monte_carlo import Design, Row
 from starcal_ros.studies.summary import StudyResult
+from starcal_ros.studies.trials import PAPER_ESTIMATE
 
 NIGHT = 'paper'
 CALIBRATED_WITH = 15
@@ -111,9 +112,14 @@ class PaperStudy:
 
 @functools.lru_cache(maxsize=1)
 def setup_of(seed: int) -> Setup:
-    """Default options with the prior of the scenario."""
+    """The paper's lens model, without a field, and the prior of the scenario."""
     night = scenario(NIGHT, seed)
-    values = {'star_tracker_sigma_arcsec': night.star_tracker_sigma_arcsec}
+    values: dict[str, object] = {
+        'estimate': PAPER_ESTIMATE,
+        'principal_point_prior': 0.0,
+        'residual_field': False,
+        'star_tracker_sigma_arcsec': night.star_tracker_sigma_arcsec,
+    }
     return load_setup(values, prior=night.prior)
 
 

@@ -35,10 +35,13 @@ FAR_PRINCIPAL_POINT_PX = 100.0
 FAR_ALIGNMENT_RAD = math.radians(0.3)
 LEAST_TRACKER_ARCSEC = 1e-3  # assumed sigma of a perfect star tracker
 
-_NAMES = estimated_parameters(CalibrationOptions(), 'plumb_bob')
+# The paper holds the principal point, which trades with the attitude.
+PAPER_ESTIMATE = ('fx', 'skew', 'fy', 'distortion')
+
+_NAMES = estimated_parameters(CalibrationOptions(estimate=PAPER_ESTIMATE), 'plumb_bob')
 _FREE = [PARAMETER_NAMES.index(name) for name in _NAMES]
 ESTIMATED = np.array([*_FREE, 10, 11, 12])
-"""Rows of the (13, 13) covariance that a calibration with default options estimates."""
+"""Rows of the (13, 13) covariance that a calibration with the paper's choice estimates."""
 
 
 @dataclass(frozen=True)
@@ -261,10 +264,18 @@ def unused_residual_px(camera: CameraModel, field: StarField) -> float:
 
 
 def calibration_options(method: str, tracker_arcsec: float, **other: object) -> CalibrationOptions:
-    """Options that allow few images and stars, with the assumed star tracker sigma per axis."""
+    """
+    Options of the paper's model, for few images and stars.
+
+    Eight camera parameters, or those of ``estimate`` without a prior, and no field; the assumed
+    star tracker sigma is per axis.
+    """
     assumed = max(tracker_arcsec, LEAST_TRACKER_ARCSEC)
     options = CalibrationOptions(
         method=method,
+        estimate=PAPER_ESTIMATE,
+        principal_point_prior=0.0,
+        residual_field=False,
         star_tracker_sigma_arcsec=(assumed, assumed, assumed),
         min_images=2,
         min_stars=10,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any
 
 import numpy as np
 import pytest
-from sample_records import calibration  # type: ignore[import-not-found]
+from sample_records import calibration, model_checks  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment.agreement import movement
@@ -19,8 +20,10 @@ from starcal_ros.records import (
     Calibration,
     CameraGeometry,
     DetectorMaps,
+    DetectorStep,
     GateCheck,
     HalvesComparison,
+    HeldTerm,
 )
 
 CAMERA = CameraModel(
@@ -50,6 +53,8 @@ GOOD: Calibration = dataclasses.replace(
         np.ones((8, 10), np.int64), np.full((16, 20), SIGHT_ARCSEC), np.zeros((16, 20))
     ),
     halves=HalvesComparison(0.05, 0.4, 2.0, 0.4),
+    model_checks=dataclasses.replace(model_checks(), correlation_time_s=0.0),
+    field=None,
 )
 
 
@@ -72,6 +77,11 @@ def checks(
     return {check.option or check.name: check for check in judged(found, options, active)}
 
 
+def limits_in(found: tuple[str, ...]) -> list[str]:
+    """The first word in brackets of each reason: the parameter of the limit."""
+    return [re.findall(r'\((\w+)\)', reason)[0] for reason in found]
+
+
 def only(axis: int, limit: float) -> tuple[float, ...]:
     """Limits of the parameter sigmas: of one alone."""
     return tuple(limit if k == axis else 0.0 for k in range(13))
@@ -91,6 +101,12 @@ def half_covered() -> np.ndarray:
 def with_stars(stars: np.ndarray) -> DetectorMaps:
     assert GOOD.maps is not None
     return dataclasses.replace(GOOD.maps, stars=stars)
+
+
+def with_model(**changes: Any) -> dict[str, Any]:
+    """The checks of the model with some numbers changed."""
+    assert GOOD.model_checks is not None
+    return {'model_checks': dataclasses.replace(GOOD.model_checks, **changes)}
 
 
 def with_sigma(**sigma: float) -> np.ndarray:
@@ -237,6 +253,84 @@ def test_a_good_calibration_passes() -> None:
                 '(min_halves_p_value)'
             ),
         ),
+        (
+            with_model(field_p_value=1e-9, field_rms_px=0.2, field_worst_px=0.75),
+            'max_field_px',
+            0.75,
+            0.7,
+            (
+                'largest field beside the lens model is 0.75 px, over the limit of 0.7 px '
+                '(max_field_px); the p-value of none is 1e-09; the lens model does not describe '
+                'the lens: set residual_field, or another lens_model'
+            ),
+        ),
+        (
+            with_model(held=(HeldTerm('cx', 320.0, 323.0, 1.0),)),
+            'max_held_term_sigma',
+            3.0,
+            2.9,
+            (
+                'distance of cx from its assumed value is 3 sigma, over the limit of 2.9 sigma '
+                '(max_held_term_sigma); the stars put cx at 323, assumed is 320: estimate cx, or '
+                'widen its prior (estimate, prior_sigma)'
+            ),
+        ),
+        (
+            with_model(step=DetectorStep('u', 320.4, 'v', -0.15, 1e-9)),
+            'max_detector_step_px',
+            0.15,
+            0.14,
+            (
+                'step of the detector in v at u = 320 is 0.15 px, over the limit of 0.14 px '
+                '(max_detector_step_px); the p-value is 1e-09; columns or rows are lost or '
+                'shifted there: check the read-out'
+            ),
+        ),
+        (
+            with_model(velocity_error_km_s=8.0, velocity_p_value=1e-9),
+            'max_velocity_error_km_s',
+            8.0,
+            7.9,
+            (
+                'velocity of the observer that the aberration misses is 8 km/s, over the limit of '
+                '7.9 km/s (max_velocity_error_km_s); the p-value is 1e-09; the velocity or the '
+                'clock is wrong, or air bends the light: check the velocity topic, the stamps and '
+                'the site'
+            ),
+        ),
+        (
+            with_model(image_variation_px=0.25, image_variation_p_value=1e-9),
+            'max_image_variation_px',
+            0.25,
+            0.2,
+            (
+                'change of the camera from image to image in a corner is 0.25 px, over the limit '
+                'of 0.2 px (max_image_variation_px); the p-value is 1e-09; focal length or lens '
+                'changes between images: estimate with temperature, or calibrate each state apart'
+            ),
+        ),
+        (
+            with_model(correlation_time_s=12.5),
+            'min_independent_images',
+            7.5,
+            7.6,
+            (
+                'images with independent star-tracker errors is 7.5, under the limit of 7.6 '
+                '(min_independent_images); the errors are correlated over 12.5 s: collect images '
+                'over a longer time'
+            ),
+        ),
+        (
+            with_model(step=DetectorStep('v', 100.0, 'u', 0.5, 1e-4)),
+            'min_model_p_value',
+            1e-4,
+            2e-4,
+            (
+                'step of the detector in u at v = 100 is 0.5 px, over the limit of 0.2 px '
+                '(max_detector_step_px); the p-value is 0.0001; columns or rows are lost or '
+                'shifted there: check the read-out'
+            ),
+        ),
     ],
 )
 def test_each_limit_trips_alone(
@@ -282,7 +376,8 @@ def test_each_limit_of_a_change_trips_alone(
     beyond = GateOptions(**{**others, limit: 0.99 * check.found})
     assert reasons(found, at_limit, active) == ()
     (reason,) = reasons(found, beyond, active)
-    assert reason.startswith(check.name) and reason.endswith(f'({limit})')
+    assert reason.startswith(check.name) and f'({limit})' in reason
+    assert reason.endswith('(lens_model)' if limit == 'max_change_px' else f'({limit})')
     assert ('active calibration' in reason) == (active is not None)
 
 
@@ -330,10 +425,44 @@ def test_every_limit_has_its_check() -> None:
     found = checks(GOOD, options)
     assert all(check.passed for check in found.values())
     limited = {name for name in found if found[name].option}
-    assert limited == names_of(GateOptions) - {'min_halves_p_value'} | {'min_images', 'min_stars'}
+    p_values = {'min_halves_p_value', 'min_model_p_value'}
+    assert limited == names_of(GateOptions) - p_values | {'min_images', 'min_stars'}
     for name in limited - {'min_images', 'min_stars', 'max_parameter_sigma'}:
         assert found[name].limit == getattr(options, name)
     assert 'min_halves_p_value' in found['max_halves_px'].note
+    assert 'the p-value is 0.7' in found['max_detector_step_px'].note
+
+
+def test_a_field_that_is_needed_and_not_estimated_is_refused() -> None:
+    changes = with_model(field_p_value=1e-9, field_rms_px=0.0, field_worst_px=0.0)
+    (reason,) = reasons(dataclasses.replace(GOOD, **changes), GateOptions(max_field_px=1e5))
+    assert 'set residual_field' in reason and '(max_field_px)' in reason
+
+
+def test_images_of_one_pointing_are_not_enough() -> None:
+    changes = with_model(independent_pointings=2.25)
+    (reason,) = reasons(dataclasses.replace(GOOD, **changes), GateOptions())
+    assert reason == (
+        'number of independent pointings is 2.25, under the limit of 3 (min_images); images of '
+        'one pointing repeat their errors: collect others'
+    )
+
+
+def test_a_line_of_sight_with_correlated_errors_says_so() -> None:
+    found = dataclasses.replace(GOOD, **with_model(correlation_time_s=12.5))
+    (reason,) = reasons(found, GateOptions(max_line_of_sight_sigma_arcsec=1.0))
+    assert reason.endswith('star-tracker errors are correlated over 12.5 s')
+
+
+def test_a_velocity_that_the_stars_do_not_determine_is_not_judged() -> None:
+    changes = with_model(velocity_error_km_s=90.0, velocity_sigma_km_s=40.0, velocity_p_value=0.0)
+    check = checks(dataclasses.replace(GOOD, **changes), GateOptions())['max_velocity_error_km_s']
+    assert check.passed is None and check.note == 'the stars determine it to 40 km/s only'
+
+
+def test_a_calibration_of_an_older_file_has_no_checks_of_the_model() -> None:
+    found = checks(dataclasses.replace(GOOD, model_checks=None), GateOptions())
+    assert 'max_detector_step_px' not in found and 'max_field_px' not in found
 
 
 def test_large_counts_are_written_out() -> None:
@@ -365,7 +494,7 @@ def test_every_reason_is_given() -> None:
         termination='no_descent',
         geometry=turned(5.0, k1=6.0),
     )
-    options = [reason.rpartition('(')[2].rstrip(')') for reason in reasons(found, GateOptions())]
+    options = limits_in(reasons(found, GateOptions()))
     assert options == [
         'no_descent', 'max_residual_rms_px', 'max_rejected_fraction', 'min_coverage',
         'max_map_sigma_px', 'max_change_px', 'max_rotation_deg', 'max_step_px',
@@ -447,5 +576,5 @@ def test_a_camera_that_folds_over_is_refused() -> None:
     rotation_rad, left_px = movement(PRIOR, turned(0.0, k1=-10.0))
     assert np.isinf(rotation_rad) and np.isinf(left_px).all()
     folded = dataclasses.replace(GOOD, geometry=turned(0.0, k1=-10.0))
-    options = [r.rpartition('(')[2].rstrip(')') for r in reasons(folded, GateOptions(), None)]
+    options = limits_in(reasons(folded, GateOptions(), None))
     assert options == ['max_map_sigma_px', 'max_change_px', 'max_rotation_deg']

@@ -47,7 +47,10 @@ def test_attitude_errors_are_those_of_the_star_tracker(left: Residuals) -> None:
     off -= off.mean(axis=0)
     # Distortion that is not known exactly turns all images alike: 5 sigma covers the stars' noise.
     assert (np.abs(off) < 5 * left.attitude_sigma_arcsec).all()
-    assert np.abs(put_in).max() > 5 * left.attitude_sigma_arcsec.max()
+    # Around every axis what is left is a small part of the errors.  The sigma of the method single
+    # does not show it: the errors are in its residuals, which give the centroids their variance.
+    varied = np.array(put_in) - np.mean(put_in, axis=0)
+    assert (np.sqrt((off**2).mean(axis=0)) < 0.25 * np.sqrt((varied**2).mean(axis=0))).all()
 
 
 def test_rms_of_images(left: Residuals) -> None:

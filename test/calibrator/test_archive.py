@@ -15,7 +15,12 @@ import time
 from kept_state import activation, collect, images, opened  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from sample_records import assert_same, calibration, observations  # type: ignore[import-not-found]
+from sample_records import (  # type: ignore[import-not-found]
+    assert_same,
+    calibration,
+    calibration_of_0_1,
+    observations,
+)
 
 from starcal_ros.bag import reader as bag_reader
 from starcal_ros.calibrator.archive import _sealed, Activation, Archive, TOPIC
@@ -189,7 +194,9 @@ def test_a_folder_of_version_0_1_is_read(tmp_path: Path) -> None:
     (record,) = history
     found = record.calibration
     assert (record.event, found.number, found.active_since_ns) == (7, 3, 123)
-    expected = dataclasses.replace(calibration(), number=3, active_since_ns=123, gate=found.gate)
+    expected = dataclasses.replace(
+        calibration_of_0_1(), number=3, active_since_ns=123, gate=found.gate
+    )
     assert_same(found, expected)
     assert [check.passed for check in found.gate] == [False, True, None]
 

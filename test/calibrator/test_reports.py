@@ -107,7 +107,7 @@ def test_the_folder_is_as_the_tool_writes_it(
     }  # fmt: skip
     text = page.read_text()
     assert 'calibration 1, active since 2027-01-15 08:00:00.000 UTC' in text
-    assert 'figure-images' in text and 'did not have the images' in text
+    assert 'figure-images' in text and 'without access to the images' in text
     page.unlink()
     assert main.main(['report', str(page.parent)]) == 0
     assert page.read_text() == text

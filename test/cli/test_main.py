@@ -8,6 +8,7 @@ from collections.abc import Callable
 import json
 import os
 from pathlib import Path
+import re
 import shlex
 import shutil
 import subprocess
@@ -235,7 +236,7 @@ def test_bad_parameters(
         ('a: [', ['not YAML']),
         ('/**:\n  camera_info_url: a.yaml\n', ['ros__parameters']),
         ('star_observer:\n  ros__parameters: 3\n', ['star_observer', 'ros__parameters']),
-        ('other_node:\n  ros__parameters: {a: 1}\n', ['no section for /**', 'other_node']),
+        ('other_node:\n  ros__parameters: {a: 1}\n', ['no section /**', 'other_node']),
         ('/**:\n  ros__parameters: {camera_name: a}\n', ['camera_name', 'bad.yaml']),
         ('/**:\n  ros__parameters: {min_images: 3}\n', ['camera_info_url', 'bad.yaml']),
     ],
@@ -247,6 +248,62 @@ def test_bad_parameter_files(run: Run, tmp_path: Path, text: str, words: list[st
     for missing in (tmp_path / 'none.yaml', tmp_path):
         result = run('calibrate', TINY, '--params', missing, '-o', tmp_path / 'out')
         assert_refused(result, str(missing), 'cannot be read')
+
+
+@pytest.fixture(scope='module')
+def lookup_columns() -> list[str]:
+    """Columns of a table of lines of sight, as the interface document has them."""
+    text = (Path(__file__).parents[2] / 'docs' / 'icd.md').read_text()
+    (row,) = (line for line in text.splitlines() if line.startswith('| `starcal lookup '))
+    return re.findall(r'`(\w+)`', row.split('|', 2)[2])
+
+
+def test_lookup_writes_the_columns_of_the_interface_document(
+    run: Run, tmp_path: Path, tiny_products: Path, lookup_columns: list[str]
+) -> None:
+    file = tmp_path / 'table.csv'
+    status, out, err = run('lookup', tiny_products, '-o', file)
+    assert (status, err) == (0, '')
+    assert '625 lines of sight' in out and str(file) in out
+    table = np.genfromtxt(file, delimiter=',', names=True)
+    assert list(table.dtype.names or ()) == lookup_columns
+    assert len(table) == 25 * 25
+    # From corner to corner, u fastest.
+    assert (table['u_px'][0], table['v_px'][0]) == (0.0, 0.0)
+    assert (table['u_px'][24], table['v_px'][24]) == (639.0, 0.0)
+    assert (table['u_px'][-1], table['v_px'][-1]) == (639.0, 511.0)
+    status, _, err = run(
+        'lookup', tiny_products / 'calibration.json', '-o', tmp_path / 'table.npz', '--step', 100
+    )
+    assert (status, err) == (0, '')
+    with np.load(tmp_path / 'table.npz') as archive:
+        assert list(archive.files) == lookup_columns
+        assert sorted(set(archive['u_px'])) == [0, 100, 200, 300, 400, 500, 600]
+        assert sorted(set(archive['v_px'])) == [0, 100, 200, 300, 400, 500]
+
+
+@pytest.mark.parametrize(
+    ('file', 'options', 'words'),
+    [
+        ('a.csv', ('--points', '1'), ['--points', '1 is not in the range 2 to 2000']),
+        ('a.csv', ('--step', '0'), ['--step', '0 px']),
+        ('a.csv', ('--step', '641'), ['--step', '641 px']),
+        ('a.txt', (), ['a.txt', '.csv', '.npz', '.fits']),
+        ('a', (), ['.csv', '.npz', '.fits']),
+        ('none/a.csv', (), ['none', 'cannot be written']),
+    ],
+)
+def test_bad_lookups(
+    run: Run,
+    tmp_path: Path,
+    tiny_products: Path,
+    file: str,
+    options: tuple[str, ...],
+    words: list[str],
+) -> None:
+    assert_refused(run('lookup', tiny_products, '-o', tmp_path / file, *options), *words)
+    assert not (tmp_path / file).exists()
+    assert_refused(run('lookup', tmp_path, '-o', tmp_path / 'a.csv'), 'no calibration.json')
 
 
 def test_outputs_that_cannot_be_written(run: Run, tmp_path: Path) -> None:

@@ -28,7 +28,11 @@ from starcal_ros.simulation.scenario import scenario
 SCENARIO = scenario('tiny', seed=3)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior
 TRACKER_ARCSEC = (10.0, 10.0, 40.0)
-NAMES = estimated_parameters(CalibrationOptions(), 'plumb_bob')
+# The eight parameters of the Cramer-Rao bound, without a prior, and no field beside them.
+EIGHT = CalibrationOptions(
+    estimate=('fx', 'skew', 'fy', 'distortion'), principal_point_prior=0.0, residual_field=False
+)
+NAMES = estimated_parameters(EIGHT, 'plumb_bob')
 FREE = [PARAMETER_NAMES.index(name) for name in NAMES]
 TRIALS = 60
 each_method = pytest.mark.parametrize('method', METHODS)
@@ -73,7 +77,7 @@ def with_noise(
 
 def options(method: str, **other: object) -> CalibrationOptions:
     values: dict[str, object] = {'star_tracker_sigma_arcsec': TRACKER_ARCSEC, **other}
-    return CalibrationOptions(method=method, **values)  # type: ignore[arg-type]
+    return dataclasses.replace(EIGHT, method=method, **values)  # type: ignore[arg-type]
 
 
 def error_of(estimate: Estimate, rows: list[int]) -> np.ndarray:
@@ -134,7 +138,9 @@ def test_without_noise_the_truth_comes_back(method: str, with_principal_point: b
     off = Rotation.from_euler('xyz', [0.2, -0.2, 0.1], degrees=True)
     mounting = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw) * off
     prior = CameraGeometry(prior_camera, mounting.as_quat())
-    found = estimate_calibration(clean(), prior, options(method, estimate=estimate))
+    chosen = options(method, estimate=estimate, residual_field=True)
+    found = estimate_calibration(clean(), prior, chosen)
+    assert found.geometry.camera.field is None
     assert found.termination == 'converged' and found.kept.all()
     error = error_of(found, list(range(13)))
     # 1e-9 of each term at the edge of the field (r = 0.23, f = 1800 px) and of a radian.
@@ -404,7 +410,12 @@ def test_stars_in_one_spot_leave_an_honest_uncertainty(method: str) -> None:
         return image.select(np.hypot(*(image.measured_px - [320, 256]).T) < 40)
 
     spot = with_noise(Ensemble(tuple(middle(image) for image in clean().images)), 1)
-    found = estimate_calibration(spot, PRIOR, options(method, min_stars=10))
+    # All ten parameters, and a field where one can be determined: here it cannot.
+    chosen = CalibrationOptions(
+        method=method, star_tracker_sigma_arcsec=TRACKER_ARCSEC, min_stars=10
+    )
+    found = estimate_calibration(spot, PRIOR, chosen)
+    assert found.geometry.camera.field is None and found.field_test is None
     sigma = np.sqrt(np.diag(found.covariance))
     # 0.022 rad from the axis k1 moves nothing by 0.1 px before it is 5: nobody knows it.
     assert sigma[PARAMETER_NAMES.index('k1')] > 1.0

@@ -286,7 +286,10 @@ def test_a_changing_camera_fits_only_where_it_is_asked_for() -> None:
 @pytest.mark.parametrize('method', METHODS)
 def test_the_prediction_accounts_for_the_terms(method: str) -> None:
     rate_rad = np.zeros(3) if method == 'per_image' else RATE_RAD
-    chosen = options(method, variance_components=False)
+    # With the principal point held: where it trades with an alignment that rotates, as in
+    # `single`, the sigma of the rate depends on the rate, which a prediction takes as zero.
+    estimate_names = ('fx', 'skew', 'fy', 'distortion')
+    chosen = options(method, variance_components=False, estimate=estimate_names)
     ensemble = observed(FOCAL, rate_rad)
     estimate, terms = found(ensemble, chosen)
     assert terms.note == ''
@@ -294,11 +297,8 @@ def test_the_prediction_accounts_for_the_terms(method: str) -> None:
         zip(estimate.shared_names, np.sqrt(np.diag(estimate.shared_covariance)), strict=True)
     )
     names = estimated_names(chosen, 'plumb_bob')
-    assert set(names) == {
-        n
-        for n in sigma
-        if n not in PARAMETER_NAMES or n in estimated_parameters(CalibrationOptions(), 'plumb_bob')
-    }
+    asked = estimated_parameters(chosen, 'plumb_bob')
+    assert set(names) == {n for n in sigma if n not in PARAMETER_NAMES or n in asked}
     predicted = dict(zip(names, predicted_sigma(ensemble, TRUTH, chosen), strict=True))
     # The same formula without the terms in the derivatives: they scale the camera by 0.1 %.
     for name in names:

@@ -10,7 +10,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from sample_records import assert_same, calibration, plain, plain_calibration  # type: ignore[import-not-found]
+from sample_records import (  # type: ignore[import-not-found]
+    assert_same,
+    calibration,
+    plain,
+    plain_calibration,
+    without_field,
+)
 
 from starcal_ros.bag.typestore import make_message, typestore
 from starcal_ros.camera import line_of_sight, project
@@ -35,7 +41,7 @@ def test_calibration_round_trip(make: Any) -> None:
     left_out = dataclasses.replace(
         calibration(), temperature=TemperatureTerms(20.0, note='left out')
     )
-    for record in (calibration(), plain_calibration(), left_out):
+    for record in (calibration(), without_field(), plain_calibration(), left_out):
         assert_same(record, calibration_from_message(calibration_to_message(record, make)))
 
 
@@ -90,7 +96,10 @@ def test_every_field_of_a_record_has_its_field_in_the_message() -> None:
 
 def test_fields_that_an_older_definition_lacks_have_their_defaults() -> None:
     message = calibration_to_message(calibration(), plain)
-    for name in ('temperature', 'maps', 'correlation', 'removals', 'halves', 'gate'):
+    for name in (
+        'temperature', 'maps', 'correlation', 'removals', 'halves', 'model_checks', 'field',
+        'gate',
+    ):  # fmt: skip
         delattr(message, name)
     assert_same(calibration_from_message(message), plain_calibration())
 
@@ -103,6 +112,8 @@ def test_fields_that_an_older_definition_lacks_have_their_defaults() -> None:
         ('maps', 'shape_sigma_arcsec', 'shape_sigma_arcsec: 1 numbers, not 4 x 3'),
         ('correlation', 'matrix', 'matrix: 1 numbers, not 2 x 2'),
         ('removals', 'residual_std_px', 'residual_std_px: 1 numbers, not 2'),
+        ('field', 'coefficients', 'coefficients: 1 numbers, not 2 x 3'),
+        ('field', 'joint_covariance', 'joint_covariance: 1 numbers, not 19 x 19'),
         ('temperature', 'focal_per_degc_sigma', 'focal_per_degc_sigma: 1 numbers, not 2'),
         (
             'temperature',

@@ -181,7 +181,7 @@ def test_nodes_end_after_several_signals(
     client.until(lambda: all(manager.state() == 'active' for manager in managers))
     for _ in range(rng.choice([2, 3])):
         for node in nodes:
-            node.tell_to_end(rng.choice([signal.SIGINT, signal.SIGINT, signal.SIGTERM]))
+            node.send(rng.choice([signal.SIGINT, signal.SIGINT, signal.SIGTERM]))
         # The end takes 0.1 s to 0.5 s: the next signal comes at once, or somewhere in it.
         time.sleep(rng.choice([0.0, 0.5 * rng.random()]))
     for node in nodes:

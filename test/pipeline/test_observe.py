@@ -118,7 +118,7 @@ def test_an_image_without_attitude_is_refused(setup: Setup) -> None:
     ):
         found = observe.observe(image(), held, setup, setup.prior)
         assert found.refusal == reason and found.detail
-        assert found.attitude_gap_s == -1.0
+        assert np.isnan(found.attitude_gap_s)
 
 
 def test_an_image_that_nothing_explains_keeps_its_attitude(setup: Setup) -> None:

@@ -12,7 +12,13 @@ from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from sample_records import assert_same, calibration, plain_calibration  # type: ignore[import-not-found]
+from sample_records import (  # type: ignore[import-not-found]
+    assert_same,
+    calibration,
+    calibration_of_0_1,
+    plain_calibration,
+    without_field,
+)
 
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ProductError
@@ -45,9 +51,10 @@ def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
         {'accepted': False, 'reasons': ('too few stars', 'weak: k3')},
         {'temperature': TemperatureTerms(20.0, note='left out: everything')},
         {'removals': REMOVALS},
+        {'model_checks': dataclasses.replace(calibration().model_checks, held=())},
     )
     records = (dataclasses.replace(plain_calibration(), **changes) for changes in cases)
-    for record in (calibration(), *records):
+    for record in (calibration(), without_field(), *records):
         write_calibration(record, tmp_path / 'calibration.json')
         assert_same(record, read_calibration(tmp_path / 'calibration.json'))
 
@@ -150,7 +157,7 @@ def test_a_file_of_version_0_1_is_read() -> None:
         'turn', 'max_step_turn_deg', math.nan, 0.5, 'deg', None, 'no calibration was in force'
     )
     assert repr(found.gate[-1]) == repr(last)
-    assert_same(calibration(), dataclasses.replace(found, gate=found.gate[:-1]))
+    assert_same(calibration_of_0_1(), dataclasses.replace(found, gate=found.gate[:-1]))
 
 
 def test_an_older_file_is_read(tmp_path: Path) -> None:
@@ -158,7 +165,7 @@ def test_an_older_file_is_read(tmp_path: Path) -> None:
     write_calibration(calibration(), path)
     content = json.loads(path.read_text())
     del content['temperature'], content['maps'], content['correlation'], content['removals']
-    del content['halves'], content['gate']
+    del content['halves'], content['gate'], content['model_checks'], content['field']
     path.write_text(json.dumps(content))
     assert_same(plain_calibration(), read_calibration(path))
 
@@ -179,7 +186,7 @@ def test_an_older_file_is_read(tmp_path: Path) -> None:
             r"ance\[0\]\[2\]: 'a' is not a num",
         ),
         (lambda c: c.update(covariance=[[1.0]]), 'covariance: 1 x 1 numbers, not 13 x 13'),
-        (lambda c: c['parameter_names'].pop(), 'parameters: .* is not ten'),
+        (lambda c: c['parameter_names'].pop(), 'parameters: .* is not 10 finite numbers'),
         (lambda c: c['parameter_names'].__setitem__(9, 'p3'), "key 'distortion.p3' is missing"),
         (lambda c: c['image'].update(width=-1), 'image.width: -1 is not in the range 0 to'),
         (lambda c: c.update(images_used=2**70), 'images_used: .* is not in the range'),
@@ -205,6 +212,16 @@ def test_an_older_file_is_read(tmp_path: Path) -> None:
         (lambda c: c['gate'][0].pop('unit'), r"key 'gate\[0\].unit' is missing"),
         (lambda c: c['gate'][0].update(passed=1), r'gate\[0\].passed: 1 is not true or false'),
         (lambda c: c['correlation']['matrix'].pop(), 'correlation.matrix: 1 x 2 numbers, not'),
+        (lambda c: c['model_checks'].pop('step'), "key 'model_checks.step' is missing"),
+        (
+            lambda c: c['model_checks']['held'][1].update(sigma='a'),
+            r"model_checks.held\[1\].sigma: 'a' is not a number",
+        ),
+        (lambda c: c['field'].update(degree=2), 'field.coefficients: 3 for an axis, not 6'),
+        (
+            lambda c: c['field'].update(joint_covariance=[[1.0]]),
+            'field.joint_covariance: 1 rows, not 19',
+        ),
     ],
 )
 def test_a_damaged_calibration_is_refused_by_file_and_key(tmp_path, change, says) -> None:

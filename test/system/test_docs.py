@@ -75,6 +75,13 @@ def lines_of(command: str) -> list[Line]:
     return [line for line in LINES if Path(line.words[0]).name == command]
 
 
+def pip_lines() -> list[Line]:
+    """Lines that call pip, by its name or as a module of Python; their words from pip on."""
+    called = [dataclasses.replace(line, words=line.words[2:]) for line in lines_of('python3')
+              if line.words[1:3] == ('-m', 'pip')]  # fmt: skip
+    return lines_of('pip') + called
+
+
 TOOL_LINES = lines_of('starcal')
 MAKE_TARGETS = sorted(
     {word for line in lines_of('make') for word in line.words[1:] if '=' not in word}
@@ -188,7 +195,7 @@ def test_topics_and_services_are_names_that_the_nodes_use() -> None:
 
 
 def test_no_command_is_unknown() -> None:
-    known = {'starcal', 'make', 'ros2', 'pip', 'python', *OTHERS}
+    known = {'starcal', 'make', 'ros2', 'pip', 'python', 'python3', *OTHERS}
     for line in LINES:
         assert (Path(line.words[0]).name or line.words[0]) in known, line
 
@@ -260,12 +267,16 @@ def test_make_knows_the_target(target: str) -> None:
 
 
 def test_scripts_that_are_named_exist() -> None:
-    lines = [line.words for line in lines_of('python') if line.words[1:2] == ('-m',)]
+    lines = [
+        line.words
+        for line in (*lines_of('python'), *lines_of('python3'))
+        if line.words[1:2] == ('-m',)
+    ]
     assert lines
     for words in lines:
         module = ROOT / words[2].replace('.', '/')
         ours = module.with_suffix('.py').is_file() or (module / '__main__.py').is_file()
-        assert ours or words[2] in ('pytest', 'cProfile'), words
+        assert ours or words[2] in ('pytest', 'cProfile', 'pip'), words
 
 
 def interface(directions: str) -> dict[str, str]:
@@ -334,10 +345,11 @@ def test_the_documents_show_the_ways_into_the_vehicle() -> None:
 
 def test_versions_to_install_are_the_pinned_ones() -> None:
     pinned = (ROOT / 'requirements' / 'runtime.txt').read_text().splitlines()
-    lines = [line.words for line in lines_of('pip') if line.words[1] == 'install']
+    lines = [line.words for line in pip_lines() if line.words[1] == 'install']
     assert lines
     for words in lines:
-        assert words[2:] and set(words[2:]) <= set(pinned)
+        packages = {word for word in words[2:] if not word.startswith('--')}
+        assert packages and packages <= set(pinned)
 
 
 def test_the_version_of_the_figures_is_that_of_the_package() -> None:

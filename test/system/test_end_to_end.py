@@ -261,7 +261,7 @@ def test_the_demonstration_on_the_real_graph(tmp_path: Path, tiny_products: Path
     done = starcal('demo', '-o', tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert 'sigma' in done.stdout and 'alignment z' in done.stdout
-    assert done.stdout.endswith(f'look at {tmp_path / "report.html"}\n')
+    assert done.stdout.endswith(f'open {tmp_path / "report.html"}\n')
     assert (tmp_path / 'report.html').stat().st_size > 100_000  # with its pictures
     # The nodes and the tool give the same calibration from the same bag.
     nodes = read_calibration(tmp_path / 'calibration.json')
