@@ -20,7 +20,9 @@ from starcal_ros.arrays import Floats
 
 _FEWEST_IMAGES = 8  # fewer show no correlation time
 _SHARES = np.array([0.0, 0.3, 0.6, 0.9, 1.0])  # of the process in the variance of the tracker
-_SCALES = np.geomspace(0.5, 6.0, 12)  # of its standard deviation, in the scatter of the images
+# Of its standard deviation, in the scatter of the images: a perfect star tracker has none, and an
+# image of few stars scatters by far more than the star tracker.
+_SCALES = np.concatenate([[0.0], np.geomspace(0.05, 6.0, 20)])
 _TIMES = 12  # from half the median interval to four times the span
 # Twice the log of the likelihood ratio that white noise exceeds in 7 of 100 ensembles of 14 images
 # and in 1 of 100 of 200, by draws.  Averaging without need makes the sigma 2 times as large.

@@ -45,8 +45,8 @@ _LENGTHS = (0.26, 0.3, 0.36, 0.43, 0.52, 0.7, 1.0, 1.4, 2.0)
 _DEGREE_TIMES_LENGTH = 4.2
 _AMPLITUDES_PX = np.geomspace(1e-3, 10.0, 41)
 _GRID = 41  # pixels a side at which the lens model's own displacements are taken
-# Of the detector, with a line of sight: a circular image fills 0.4 of a wide one; a lens model that
-# stars in one spot determine folds back around them.
+# Of the detector, with a line of sight: a circular image fills 0.4 of a wide one; a lens model
+# that stars in one spot determine folds back around them.
 _LEAST_SEEN = 0.25
 _LEAST_SHARE = 1e-10  # of the variance of a field, under which a mode is left out
 

@@ -140,7 +140,7 @@ def _class_factors(
     if len(parts) < 2 or _clipped_mean(ratio) < _FACTOR_LIMITS[0]:
         return (), ()  # few stars, or residuals without noise whose scale is at its limit
     nodes = np.array([magnitude[part].mean() for part in parts])
-    if (np.diff(nodes) <= 0.0).any():
+    if not (np.diff(nodes) > 0.0).all():
         return (), ()  # too many stars of one magnitude
     mean = np.array([_clipped_mean(ratio[part]) for part in parts])
     # Normal noise has a variance of 1 for the mean square of two axes; tails have more.

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from sample_records import (  # type: ignore[import-not-found]
     assert_same,
-    calibration,
     calibration_of_0_1,
     observations,
 )
