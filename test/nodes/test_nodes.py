@@ -149,9 +149,11 @@ def test_rollback(client: Client, calibrated: list[Any]) -> None:
 
 
 def test_dry_run_and_bad_requests_activate_nothing(client: Client, calibrated: list[Any]) -> None:
-    trial = client.call(Calibrate, '/calibrator/solve', dry_run=True, estimate=['fx', 'fy'])
-    assert trial.success and 'would be activated' in trial.message
-    assert list(trial.calibration.estimated) == ['fx', 'fy']
+    # All but k3, which is zero in truth: the gate would name any other that is held.
+    names = ['fx', 'skew', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2']
+    trial = client.call(Calibrate, '/calibrator/solve', dry_run=True, estimate=names)
+    assert trial.success and 'would be activated' in trial.message, trial.message
+    assert list(trial.calibration.estimated) == names
     bad = client.call(Calibrate, '/calibrator/solve', estimate=['fz'])
     assert not bad.success and 'fz' in bad.message
     assert bad.calibration.stars_used == 0
