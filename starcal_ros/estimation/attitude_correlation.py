@@ -25,7 +25,8 @@ _SHARES = np.array([0.0, 0.3, 0.6, 0.9, 1.0])  # of the process in the variance 
 _SCALES = np.concatenate([[0.0], np.geomspace(0.05, 6.0, 20)])
 _TIMES = 12  # from half the median interval to four times the span
 # Twice the log of the likelihood ratio that white noise exceeds in 7 of 100 ensembles of 14 images
-# and in 1 of 100 of 200, by draws with a coarser grid of scales.  Averaging without need makes the sigma 2 times as large.
+# and in 1 of 100 of 200, by draws with a coarser grid of scales.  Averaging without need makes the
+# sigma 2 times as large.
 _DETECTION = 3.0
 
 
