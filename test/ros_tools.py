@@ -2,12 +2,13 @@
 The real ROS 2 tools, where they are: the `ros2` command, launch, rosbag2, sros2, Cyclone DDS.
 
 PyPI has none of them. ``STARCAL_ROS2_TOOLS`` names a folder with ``bin/ros2`` and ``env.sh``;
-without it, ``../shared/ros2tools/install.sh`` beside this repository makes one.
+without it, ``../shared/ros2tools/install.sh`` beside this repository makes one for Jazzy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import metadata
 import os
 from pathlib import Path
 import signal
@@ -18,6 +19,7 @@ import time
 import pytest
 
 BESIDE = Path(__file__).parents[2] / 'shared' / 'ros2tools' / 'install.sh'
+JAZZY_RCLPY = '7.'  # compiled tools serve the ROS they were built against alone
 RUN_S = 100.0  # a command of ros2 takes 2 s; busy cores make that much of it
 
 
@@ -28,6 +30,8 @@ def find_tools(folder: Path) -> Path:
         return Path(given)
     if not BESIDE.exists():
         pytest.skip('no real ROS 2 tools: STARCAL_ROS2_TOOLS is not set')
+    if not metadata.version('rclpy').startswith(JAZZY_RCLPY):
+        pytest.skip('the real ROS 2 tools beside this repository are built for Jazzy')
     command = [str(BESIDE), sys.prefix, str(folder)]
     made = subprocess.run(command, capture_output=True, text=True, check=False)
     if made.returncode:
