@@ -11,6 +11,7 @@ reported beside them.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from scipy.special import chdtrc, ndtr
@@ -56,7 +57,9 @@ def model_checks(estimate: Estimate) -> ModelChecks:
         velocity_error_km_s=velocity[0],
         velocity_sigma_km_s=velocity[1],
         velocity_p_value=velocity[2],
-        image_variation_px=variation.sigma_px,
+        image_variation_px=variation.corner_sigma_px(
+            float(camera.parameters[0]), _corner_radius_px(camera)
+        ),
         image_variation_p_value=variation.p_value,
         correlation_time_s=correlation.correlation_time_s,
         independent_images=float(correlation.independent_images.min()),
@@ -71,6 +74,11 @@ def _independent_pointings(estimate: Estimate) -> float:
     stars = np.bincount(image[kept], minlength=estimate.table.image_count)
     summed = np.bincount(image[kept], estimate.repetition[kept], estimate.table.image_count)
     return float((stars[stars > 0] / summed[stars > 0]).sum())
+
+
+def _corner_radius_px(camera: CameraModel) -> float:
+    """Distance of a corner of the detector from its middle, px."""
+    return 0.5 * math.hypot(camera.width, camera.height)
 
 
 def _field_px(camera: CameraModel) -> tuple[float, float]:
@@ -154,12 +162,7 @@ def _velocity(
     least = float(np.linalg.eigvalsh(score.information)[0])
     sigma = 1.0 / np.sqrt(least) if least > 0 else float('inf')
     chi2 = float(score.gradient @ missed)
-    # Shapes that vary from image to image scatter it as well: what it does not explain of them.
-    variation = estimate.variation
-    left = max(variation.chi2 - chi2, 0.0) / max(variation.degrees_of_freedom - 3, 1)
-    dispersion = max(1.0, left)
-    p_value = float(chdtrc(3.0, chi2 / dispersion))
-    return float(np.linalg.norm(missed)), float(sigma * np.sqrt(dispersion)), p_value
+    return float(np.linalg.norm(missed)), float(sigma), float(chdtrc(3.0, chi2))
 
 
 def _step(

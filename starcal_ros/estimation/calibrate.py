@@ -23,7 +23,11 @@ from starcal_ros.detector_field import in_degree
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.attitude_correlation import attitude_correlation, AttitudeCorrelation
 from starcal_ros.estimation.covariance import shared_covariance, shared_names
-from starcal_ros.estimation.image_variation import image_variation, ImageVariation
+from starcal_ros.estimation.image_variation import (
+    image_variation,
+    ImageVariation,
+    shape_modes,
+)
 from starcal_ros.estimation.levenberg_marquardt import NotObservable, Solution
 from starcal_ros.estimation.linear_terms import LinearTerms, Score
 from starcal_ros.estimation.normal_equations import (
@@ -47,6 +51,7 @@ from starcal_ros.estimation.problem import (
     reduced_information,
     scalar_terms_at,
     score_of,
+    shape_unknowns,
     State,
 )
 from starcal_ros.estimation.repeated_pointings import pointing_groups, repetition
@@ -54,9 +59,11 @@ from starcal_ros.estimation.residual_field import (
     best_prior,
     degree_for,
     FieldPrior,
+    NO_WAVES,
     polynomials,
     sees_detector,
     TEST_DEGREE,
+    Waves,
 )
 from starcal_ros.estimation.temperature import weakest_term, why_unsupported
 from starcal_ros.estimation.variance_components import (
@@ -206,7 +213,7 @@ class Estimate:
     pointings : int
         Number of different pointings of the images.
     variation : ImageVariation
-        Of the camera from image to image; carried in the covariances.
+        Of the camera from image to image; where there is one, each image has a shape of its own.
     correlation : AttitudeCorrelation
         Of the star-tracker errors in time; carried in the covariances.
     """
@@ -409,6 +416,7 @@ class _Verdict:
     misfit: Mask  # (m,)
     kept: Mask  # (n,)
     repetition: Floats  # (n,) factor on the covariances
+    variation: ImageVariation
 
     def covariance_px2(self, table: StarTable) -> Floats:
         """Return the centroid covariances (n, 3) that the search weights with."""
@@ -422,6 +430,7 @@ class _Verdict:
             and self.variance.is_close_to(other.variance)
             and np.allclose(self.repetition, other.repetition, rtol=0.02)
             and np.allclose(self.tracker_sigma_rad, other.tracker_sigma_rad, rtol=0.02)
+            and self.variation.is_close_to(other.variation)
         )
 
 
@@ -446,6 +455,7 @@ def _search(
         np.zeros(table.image_count, bool),
         everything,
         np.ones(len(table)),
+        ImageVariation(),
     )
     measurements = _arranged(table, verdict)
     solution = _robust_search(problem, start, measurements)
@@ -482,13 +492,14 @@ def _settle(
     iterations, after = found.iterations, found.verdict
     for _ in range(_ROUNDS):
         verdict = after
+        problem, state = _with_shapes(problem, solution.state, verdict.variation)
         problem = dataclasses.replace(
             problem,
             star_tracker_sigma_rad=np.where(
                 verdict.misfit[:, None], np.inf, verdict.tracker_sigma_rad
             ),
         )
-        solution = minimise(problem, solution.state, measurements)
+        solution = minimise(problem, state, measurements)
         iterations += solution.iterations
         _, blocks = image_blocks(problem, solution.state, measurements)
         terms = field_terms(problem, solution.state, measurements)
@@ -503,6 +514,22 @@ def _settle(
     )
 
 
+def _with_shapes(
+    problem: Problem, state: State, variation: ImageVariation
+) -> tuple[Problem, State]:
+    """Problem and state with a shape of each image where the images differ, without elsewhere."""
+    sigma_px = np.array(variation.amplitude_sigma_px)
+    modes, shapes = np.empty((0, 0)), np.empty((0, 0))
+    if len(sigma_px):
+        modes, shapes = shape_modes(problem.camera_count), state.shapes
+        if not shapes.size:
+            shapes = np.zeros((len(state.camera_from_icrf), len(sigma_px)))
+    return (
+        dataclasses.replace(problem, shape_modes=modes, shape_sigma_px=sigma_px),
+        dataclasses.replace(state, shapes=shapes),
+    )
+
+
 def _with_field(
     found: _Found, table: StarTable, prior: CameraGeometry, options: CalibrationOptions
 ) -> _Found:
@@ -514,13 +541,16 @@ def _with_field(
     found = plain = dataclasses.replace(found, field_test=best)
     if not options.residual_field or best.p_value > options.max_field_p_value:
         return plain
-    best = _field_prior(found, table, prior.camera, degree_for(best))
-    for _ in range(_FIELD_ROUNDS):
+    degree = degree_for(best)
+    best = _field_prior(found, table, prior.camera, degree, waves=None)
+    for k in range(_FIELD_ROUNDS):
         if best is None:
             return plain
         found = _settle(_started(found, best), _arranged(table, found.verdict), table, options)
-        again = _field_prior(found, table, prior.camera, degree_for(best))
-        if again is not None and again.is_close_to(best):
+        # The first search was among residuals whose variance held the field.
+        waves = best.waves if k else None
+        again = _field_prior(found, table, prior.camera, degree_for(best), waves)
+        if again is not None and k and again.is_close_to(best):
             break
         best = again
     return found if best is not None else plain
@@ -543,7 +573,11 @@ def _started(found: _Found, prior: FieldPrior) -> _Found:
 
 
 def _field_prior(
-    found: _Found, table: StarTable, camera: CameraModel, degree: int
+    found: _Found,
+    table: StarTable,
+    camera: CameraModel,
+    degree: int,
+    waves: Waves | None = NO_WAVES,
 ) -> FieldPrior | None:
     """
     The prior of a field that the residuals at a minimum ask for, in polynomials of a degree.
@@ -567,7 +601,7 @@ def _field_prior(
         coefficients = in_degree(now, degree)
         gradient = shown.gradient + shown.information @ coefficients
         shown = Score(gradient, shown.information)
-    return best_prior(shown, camera, problem.free, degree)
+    return best_prior(shown, camera, problem.free, degree, waves)
 
 
 def _arranged(table: StarTable, verdict: _Verdict) -> Measurements:
@@ -601,13 +635,14 @@ def _estimate(
         problem, dataclasses.replace(state, camera_from_star_tracker=alignment), blocks
     )
     p = problem.camera_count
-    radius_px = 0.5 * math.hypot(prior.camera.width, prior.camera.height)
     focal_px = float(state.parameters[0])
-    variation = image_variation(blocks, focal_px, radius_px)
     correlated = _correlation(
         found, time_ns, attitude_error_rad, attitude_covariance_rad2, attitude_seen, options
     )
-    full = _with_alike(full, variation, correlated, alignment, len(state.focal))
+    angles = slice(p + len(state.focal), p + len(state.focal) + 3)
+    A = alignment.as_matrix()
+    full[angles, angles] += A @ np.diag(correlated.added_variance_rad2) @ A.T
+    full[:p, :p] += verdict.variation.common_covariance(p)
     information = reduced_information(problem, state, blocks, terms)
     in_modes = len(state.modes)
     shared = np.concatenate([problem.free, np.arange(p, len(information) - in_modes)])
@@ -646,7 +681,7 @@ def _estimate(
         field_test=found.field_test,
         repetition=verdict.repetition,
         pointings=len(np.unique(pointing_groups(state.camera_from_icrf, focal_px))),
-        variation=variation,
+        variation=verdict.variation,
         correlation=correlated,
     )
     return estimate, weakest
@@ -667,23 +702,6 @@ def _correlation(
     return attitude_correlation(
         time_ns[good], error_rad[good], np.einsum('mii->mi', covariance_rad2[good]), excess
     )
-
-
-def _with_alike(
-    full: Floats,
-    variation: ImageVariation,
-    correlated: AttitudeCorrelation,
-    camera_from_star_tracker: Rotation,
-    focal_terms: int,
-) -> Floats:
-    """The covariance of all that is shared with what errors that images have alike add to it."""
-    p = len(variation.information)
-    gain = full[:, :p]
-    full = full + gain @ variation.information @ gain.T
-    angles = slice(p + focal_terms, p + focal_terms + 3)
-    A = camera_from_star_tracker.as_matrix()
-    full[angles, angles] += A @ np.diag(correlated.added_variance_rad2) @ A.T
-    return full
 
 
 def _thermal(state: State, full: Floats, options: CalibrationOptions) -> TemperatureTerms | None:
@@ -766,6 +784,7 @@ def _judge(
     misfit: Mask = np.zeros(table.image_count, bool)
     weighted = variance.of(table.covariance_px2, table.magnitude) * repeated[:, None]
     measurements = arrange(table, kept, weighted)
+    variation = ImageVariation()
     # One rotation for all has no attitude of an image to judge.
     if problem.method != 'single':
         # By the stars that fit: one that does not turns an image of few by more than the tracker.
@@ -777,7 +796,9 @@ def _judge(
         )
         if options.variance_components:
             tracker_sigma_rad = found_rad
-    return _Verdict(variance, tracker_sigma_rad, misfit, kept, repeated), measurements
+            variation = image_variation(blocks, state.shapes)
+    verdict = _Verdict(variance, tracker_sigma_rad, misfit, kept, repeated, variation)
+    return verdict, measurements
 
 
 def _fitting(
@@ -845,9 +866,10 @@ def _freedom(
 
     An attitude that the star tracker holds costs less than three: with P the covariance from the
     stars and T the star tracker's, trace(T (T + P)^-1).  So does a mode of the field that its
-    prior holds: one less its posterior variance.
+    prior holds: one less its posterior variance; and the shape of an image.
     """
     unknowns = float(len(problem.free) + len(state.focal) + len(state.rate))
+    unknowns += shape_unknowns(problem, state, blocks)
     if terms is not None:
         without = dataclasses.replace(problem, field_prior=None)
         shown = score_of(without, state, blocks, None, terms).information

@@ -14,8 +14,14 @@ from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import parameter_names
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.linear_terms import LinearTerms
-from starcal_ros.estimation.normal_equations import ROTATION
-from starcal_ros.estimation.problem import by_shared, Problem, reduced_information, State
+from starcal_ros.estimation.problem import (
+    border_of,
+    by_shared,
+    Problem,
+    reduced_information,
+    State,
+    with_shape_prior,
+)
 from starcal_ros.records import ALIGNMENT_NAMES
 
 
@@ -109,11 +115,13 @@ def _mean_alignment(
     tracker = np.diag(tracker_sigma_rad**2)
     r = len(state.modes)
     k = len(shared) - r
-    rows = by_shared(problem, state, blocks)[good][:, k : k + 3]
-    C, B = rows[:, :, k : k + 3], rows[:, :, :k]
+    rows = by_shared(problem, state, blocks)[good][:, k:-1]
+    C, B = rows[:, :, k:-1], rows[:, :, :k]
+    if state.shapes.size:
+        C = with_shape_prior(problem, C)
     if terms is not None:
-        B = np.concatenate([B, terms.cross[good][:, :, ROTATION].transpose(0, 2, 1)], axis=2)
-    stars, by_shared_unknowns = np.linalg.inv(C), np.linalg.solve(C, B)
+        B = np.concatenate([B, border_of(problem, state, terms).blocks[good]], axis=2)
+    stars, by_shared_unknowns = np.linalg.inv(C)[:, :3, :3], np.linalg.solve(C, B)[:, :3]
     within = stars + by_shared_unknowns @ shared @ by_shared_unknowns.transpose(0, 2, 1)
     weight = 1.0 / np.trace(within + tracker, axis1=1, axis2=2)
     alignment = alignments.mean(weight)

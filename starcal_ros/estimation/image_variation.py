@@ -1,10 +1,15 @@
 """
-A camera that changes from image to image: tested, and carried in the covariance.
+A camera that changes from image to image: its test, and the variances of its shape.
 
 Focal length that breathes, two lenses that alternate, air that flattens the sky: the affine
-shape of each image, its own rotation free, scatters by more than its stars explain.  Three modes
-of shape (scale, stretch, shear) get a variance each by the method of moments (DerSimonian & Laird
-1986), and the calibration, a weighted mean over the images, the covariance that follows.
+shapes of the images, their rotations free, scatter by more than their stars explain.  Then each
+image gets three unknowns of its own (scale, stretch and shear: changes of fx, skew and fy), with a
+Gaussian prior about the camera that all images share.  The variances of the prior are found by the
+method of moments (DerSimonian & Laird 1986).
+
+A lens that breathes does so about its mean.  Stretch and shear that vary come from outside the
+lens, as refraction does, which flattens every image and some more than others: the mean of the
+images is then off by as much as they scatter, and the covariance of the camera carries that.
 """
 
 from __future__ import annotations
@@ -18,9 +23,10 @@ from starcal_ros.arrays import Floats
 from starcal_ros.estimation.levenberg_marquardt import inverse
 from starcal_ros.estimation.normal_equations import CAMERA, RESIDUAL, ROTATION
 
-_P_VALUE = 1e-3  # below which the variances are carried
+_P_VALUE = 1e-2  # below which the images differ; a sound camera loses little if they do not
 _FEWEST_IMAGES = 4
 _MODES = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, -1.0], [0.0, 1.0, 0.0]]).T  # of fx, skew, fy
+_LEAST_SIGMA_PX = 1e-4  # of focal length: 1e-5 px in a corner, and no division by zero
 
 
 @dataclass(frozen=True)
@@ -28,16 +34,14 @@ class ImageVariation:
     """
     How much the shape of the images varies beyond their noise.
 
-    ``sigma_px`` is the 1-sigma displacement of a star in a corner of the detector, ``chi2`` the
-    scatter of the shapes in the metric of their noise with its degrees of freedom;
-    ``information`` (p, p) is the variance that it adds to the gradient of the cost by the camera
-    parameters.
+    ``chi2`` is the scatter of the shapes in the metric of their noise with its degrees of freedom;
+    ``amplitude_sigma_px`` the 1-sigma of scale, stretch and shear as changes of the focal length,
+    px; (0,) where the images do not differ.
     """
 
-    sigma_px: float
-    chi2: float
-    degrees_of_freedom: int
-    information: Floats
+    chi2: float = 0.0
+    degrees_of_freedom: int = 0
+    amplitude_sigma_px: tuple[float, ...] = ()
 
     @property
     def p_value(self) -> float:
@@ -45,17 +49,41 @@ class ImageVariation:
         n = self.degrees_of_freedom
         return float(chdtrc(n, self.chi2)) if n else 1.0
 
+    def corner_sigma_px(self, focal_px: float, radius_px: float) -> float:
+        """1-sigma displacement of a star in a corner ``radius_px`` from the middle."""
+        return float(np.linalg.norm(self.amplitude_sigma_px)) * radius_px / focal_px
 
-def image_variation(blocks: Floats, focal_px: float, radius_px: float) -> ImageVariation:
+    def common_covariance(self, parameter_count: int) -> Floats:
+        """Covariance (p, p) of what all images may have in common, on the camera parameters."""
+        if not self.amplitude_sigma_px:
+            return np.zeros((parameter_count, parameter_count))
+        _, stretch_px, shear_px = self.amplitude_sigma_px
+        # Air changes the scale by as much as it stretches.
+        common = np.square([max(stretch_px, shear_px), stretch_px, shear_px])
+        modes = shape_modes(parameter_count)
+        return np.asarray((modes * common) @ modes.T)
+
+    def is_close_to(self, other: ImageVariation) -> bool:
+        """Whether the sigmas agree to 5 %, or to 1e-3 px: no estimate moves with that."""
+        one, two = np.array(self.amplitude_sigma_px), np.array(other.amplitude_sigma_px)
+        return len(one) == len(two) and bool(np.allclose(one, two, rtol=0.05, atol=1e-3))
+
+
+def shape_modes(parameter_count: int) -> Floats:
+    """Changes (p, 3) of the camera parameters by scale, stretch and shear of an image."""
+    modes = np.zeros((parameter_count, 3))
+    modes[:3] = _MODES
+    return modes
+
+
+def image_variation(blocks: Floats, shapes: Floats) -> ImageVariation:
     """
     Return the variation of the images of `normal_equations.normal_blocks` at a minimum.
 
-    ``radius_px`` is from the middle of the detector to its corner.
+    ``shapes`` are the amplitudes (m, 3) that the images have there; empty: zero.
     """
     A, a = blocks[:, CAMERA, CAMERA], blocks[:, CAMERA, RESIDUAL]
     B, C, c = blocks[:, ROTATION, CAMERA], blocks[:, ROTATION, ROTATION], blocks[:, ROTATION, -1]
-    p = A.shape[1]
-    none = ImageVariation(0.0, 0.0, 0, np.zeros((p, p)))
     scale = np.einsum('mii->mi', C)
     seen = (scale > 0).all(axis=1)
     seen[seen] = (
@@ -65,30 +93,26 @@ def image_variation(blocks: Floats, focal_px: float, radius_px: float) -> ImageV
         > 1e-9
     )
     if np.count_nonzero(seen) < _FEWEST_IMAGES:
-        return none
+        return ImageVariation()
     A, a, B, C, c = A[seen], a[seen], B[seen], C[seen], c[seen]
     back = inverse(C) @ B
-    H = A - B.transpose(0, 2, 1) @ back
-    g = a - np.einsum('mip,mi->mp', back, c)
-    D = np.zeros((p, 3))
-    D[:3] = _MODES
-    h, s = D.T @ H @ D, g @ D
-    scaled = np.einsum('mii->mi', h)
-    if not (scaled > 0).all():
-        return none
+    D = shape_modes(A.shape[1])
+    h = D.T @ (A - B.transpose(0, 2, 1) @ back) @ D
+    s = (a - np.einsum('mip,mi->mp', back, c)) @ D
+    if shapes.size:
+        s = s + np.einsum('mij,mj->mi', h, shapes[seen])
+    weight = np.einsum('mii->mi', h)
+    if not (weight > 0).all():
+        return ImageVariation()
     mean = np.linalg.solve(h.sum(axis=0), s.sum(axis=0))
     off = s - h @ mean
-    q = float((off * np.linalg.solve(h, off[..., None])[..., 0]).sum())
-    degrees_of_freedom = 3 * (len(h) - 1)
-    if chdtrc(degrees_of_freedom, q) > _P_VALUE:
-        return ImageVariation(0.0, q, degrees_of_freedom, none.information)
-    weight = scaled
+    chi2 = float((off * np.linalg.solve(h, off[..., None])[..., 0]).sum())
+    freedom = 3 * (len(h) - 1)
+    if chdtrc(freedom, chi2) > _P_VALUE:
+        return ImageVariation(chi2, freedom)
     each = off / weight
     centre = (weight * each).sum(axis=0) / weight.sum(axis=0)
     excess = (weight * (each - centre) ** 2).sum(axis=0) - (len(h) - 1)
     spread = weight.sum(axis=0) - (weight**2).sum(axis=0) / weight.sum(axis=0)
-    variance = np.maximum(excess / spread, 0.0)
-    by_mode = H @ D
-    information = np.einsum('mpk,k,mqk->pq', by_mode, variance, by_mode)
-    sigma_px = float(np.sqrt(variance.sum())) * radius_px / focal_px
-    return ImageVariation(sigma_px, q, degrees_of_freedom, information)
+    sigma_px = np.sqrt(np.maximum(excess / spread, _LEAST_SIGMA_PX**2))
+    return ImageVariation(chi2, freedom, tuple(sigma_px.tolist()))

@@ -11,7 +11,9 @@ With R_k = camera_from_icrf of image k, the attitude error of the star tracker i
 camera_from_star_tracker and T_k = star_tracker_from_icrf as measured.
 
 Where terms of temperature are estimated (`thermal`), parameters and A are those of the image, and
-the derivatives by what is shared follow by the chain rule, one small matrix for each image.
+the derivatives by what is shared follow by the chain rule, one small matrix for each image.  Where
+the shape of the images varies (`image_variation`), each image has changes of fx, skew and fy of
+its own beside its rotation, with a Gaussian prior.
 """
 
 from __future__ import annotations
@@ -58,6 +60,8 @@ class State:
     focal: Floats = field(default_factory=lambda: np.empty(0))  # (q,) terms of temperature
     rate: Floats = field(default_factory=lambda: np.empty(0))  # (3,) of the alignment, or (0,)
     modes: Floats = field(default_factory=lambda: np.empty(0))  # (r,) amplitudes of the field
+    # (m, h) amplitudes of the shapes of the images, px of focal length
+    shapes: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,10 @@ class Problem:
         Temperature of each image less the reference; (0,) where no term is estimated.
     field_prior : FieldPrior or None
         Of the field that is estimated beside the lens model; None: none is.
+    shape_modes : (p, h)
+        Changes of the camera parameters by which the images differ; h is 0 where they do not.
+    shape_sigma_px : (h,)
+        1-sigma of their amplitudes.
     """
 
     method: str
@@ -93,6 +101,8 @@ class Problem:
     star_tracker_sigma_rad: Floats
     above_reference_k: Floats = field(default_factory=lambda: np.empty(0))
     field_prior: FieldPrior | None = None
+    shape_modes: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    shape_sigma_px: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -136,10 +146,12 @@ def minimise(
 
 
 def image_parameters(problem: Problem, state: State) -> Floats:
-    """Camera parameters: (p,) of all images, or (m, p) where temperature changes them."""
+    """Camera parameters: (p,) of all images, or (m, p) where they differ."""
     if len(state.focal) == 0:
-        return state.parameters
-    return parameters_at(state.parameters, state.focal, problem.above_reference_k)
+        own = state.parameters
+    else:
+        own = parameters_at(state.parameters, state.focal, problem.above_reference_k)
+    return own + state.shapes @ problem.shape_modes.T if state.shapes.size else own
 
 
 def image_alignment(problem: Problem, state: State) -> Rotation:
@@ -211,22 +223,29 @@ def field_terms(
 
 def by_shared(problem: Problem, state: State, blocks: Floats) -> Floats:
     """
-    Matrices (m, p + q + 4, p + q + 4) by camera parameters, focal terms, angles and residual.
+    Matrices (m, p + q + 4 + h, p + q + 4 + h) of the images by all that they depend on.
 
-    From those by the parameters of the image; the same where no focal term is estimated.
+    Rows and columns: camera parameters, focal terms, angles, shapes and residual; from those by
+    the parameters of the image, which they are where there are neither focal terms nor shapes.
     """
-    if len(state.focal) == 0:
+    if not (len(state.focal) or state.shapes.size):
         return blocks
-    E = _focal_chain(problem, state, len(blocks))
+    E = _chain(problem, state, len(blocks))
     return np.asarray(E.transpose(0, 2, 1) @ blocks @ E)
 
 
-def _focal_chain(problem: Problem, state: State, m: int) -> Floats:
-    """Derivatives (m, p + 4, p + q + 4) of the columns of an image by those of `by_shared`."""
-    p, q = problem.camera_count, len(state.focal)
-    E = np.zeros((m, p + 4, p + 4 + q))
-    E[:, :p, : p + q] = parameters_chain(state.parameters, state.focal, problem.above_reference_k)
-    E[:, p:, p + q :] = np.eye(4)
+def _chain(problem: Problem, state: State, m: int) -> Floats:
+    """Derivatives (m, p + 4, p + q + 4 + h) of the columns of an image by those of `by_shared`."""
+    p, q, h = problem.camera_count, len(state.focal), state.shapes.shape[1]
+    E = np.zeros((m, p + 4, p + q + 4 + h))
+    E[:, :p, : p + q] = (
+        parameters_chain(state.parameters, state.focal, problem.above_reference_k)
+        if q
+        else np.eye(p)
+    )
+    E[:, p:-1, p + q : p + q + 3] = np.eye(3)
+    E[:, :p, p + q + 3 : -1] = problem.shape_modes if h else 0.0
+    E[:, -1, -1] = 1.0
     return E
 
 
@@ -242,7 +261,7 @@ def assemble(
 
     Shared unknowns: the free camera parameters, the focal terms, then the alignment angles where
     the method has one alignment, and their rate, and the modes of the field, whose ``terms`` are
-    those of `field_terms`; a block is the rotation of an image.
+    those of `field_terms`; a block is the rotation of an image and its shape.
     """
     normal = _with_all_parameters(problem, state, cost, blocks)
     keep = _estimated(problem, normal)
@@ -286,18 +305,18 @@ def border_of(
     """
     cross = terms.cross
     m, q, _ = cross.shape
-    if len(state.focal):
-        cross = cross @ _focal_chain(problem, state, m)
+    if len(state.focal) or state.shapes.size:
+        cross = cross @ _chain(problem, state, m)
     k = problem.camera_count + len(state.focal)
     camera = cross[:, :, :k].sum(axis=0)
-    rotation = cross[:, :, k : k + 3]
+    own = cross[:, :, k:-1]
     if problem.method == 'single':
-        aligned = np.einsum('mqi,mij->qj', rotation, _turn_chain(problem, state))
+        aligned = np.einsum('mqi,mij->qj', own, _turn_chain(problem, state))
         blocks: Floats = np.zeros((0, 3, q))
     else:
         count = 0 if problem.method == 'per_image' else 3 + len(state.rate)
         aligned = np.zeros((q, count))
-        blocks = rotation.transpose(0, 2, 1)
+        blocks = own.transpose(0, 2, 1)
     if not every_parameter:
         free = np.concatenate([problem.free, np.arange(problem.camera_count, k)])
         camera = camera[:, free]
@@ -345,16 +364,21 @@ def _with_all_parameters(
     C: Floats = np.zeros((0, 3, 3))
     c: Floats = np.zeros((0, 3))
     blocks = by_shared(problem, state, blocks)
-    camera, rotation = slice(0, k), slice(k, k + 3)
+    camera, own = slice(0, k), slice(k, -1)
     if problem.method == 'single':
         total = _by_alignment(problem, state, blocks).sum(axis=0)
         A[...], a[...] = total[:p, :p], total[:p, -1]
     else:
         total = blocks.sum(axis=0)
         A[camera, camera], a[camera] = total[camera, camera], total[camera, -1]
-        B = np.zeros((len(blocks), 3, p))
-        B[:, :, camera] = blocks[:, rotation, camera]
-        C, c = blocks[:, rotation, rotation], blocks[:, rotation, -1]
+        B = np.zeros((len(blocks), blocks.shape[1] - k - 1, p))
+        B[:, :, camera] = blocks[:, own, camera]
+        C, c = blocks[:, own, own], blocks[:, own, -1]
+    if state.shapes.size:
+        off_shape = state.shapes / problem.shape_sigma_px
+        cost += 0.5 * float((off_shape**2).sum())
+        C = with_shape_prior(problem, C)
+        c = np.concatenate([c[:, :3], c[:, 3:] - off_shape / problem.shape_sigma_px], axis=1)
     if problem.method == 'hierarchical':
         residual, J = _whitened_attitude_errors(problem, state)
         information = J.transpose(0, 2, 1) @ J
@@ -364,8 +388,10 @@ def _with_all_parameters(
         to_shared = information @ turn
         A[k:, k:] += (turn.transpose(0, 2, 1) @ to_shared).sum(axis=0)
         a[k:] += np.einsum('mji,mj->mi', turn, gradient).sum(axis=0)
-        B[:, :, k:] = -to_shared
-        C, c = C + information, c - gradient
+        B[:, :3, k:] = -to_shared
+        C, c = C.copy(), c.copy()
+        C[:, :3, :3] += information
+        c[:, :3] -= gradient
     C = _pulled(C)
     of_camera = np.arange(problem.camera_count)
     off = np.zeros(len(of_camera))
@@ -380,9 +406,18 @@ def _with_all_parameters(
     return NormalEquations(cost, A, a, B, C, c)
 
 
+def with_shape_prior(problem: Problem, C: Floats) -> Floats:
+    """The blocks (m, 3 + h, 3 + h) of rotations and shapes with the prior of the shapes."""
+    weight = np.concatenate([np.zeros(3), 1.0 / problem.shape_sigma_px**2])
+    return np.asarray(C + np.diag(weight))
+
+
 def _pulled(C: Floats) -> Floats:
-    """The blocks (m, 3, 3) of the rotations; one on which nothing pulls keeps its rotation."""
-    return np.where(C.any(axis=(1, 2), keepdims=True), C, np.eye(3))
+    """The blocks (m, 3 + h, 3 + h); a rotation on which nothing pulls stays."""
+    still = ~C[:, :3, :3].any(axis=(1, 2), keepdims=True)
+    hold = np.zeros(C.shape[1:])
+    hold[:3, :3] = np.eye(3)
+    return np.where(still, C + hold, C)
 
 
 def _turn_chain(problem: Problem, state: State) -> Floats:
@@ -437,9 +472,10 @@ def information_of_images(problem: Problem, state: State, blocks: Floats) -> Flo
     if problem.method == 'single':
         p = k + 3 + len(state.rate)
         return _by_alignment(problem, state, blocks)[:, :p, :p]
-    camera, rotation = slice(0, k), slice(k, k + 3)
-    A, B = blocks[:, camera, camera], blocks[:, rotation, camera]
-    C = blocks[:, rotation, rotation]
+    camera, own = slice(0, k), slice(k, -1)
+    A, B, C = blocks[:, camera, camera], blocks[:, own, camera], blocks[:, own, own]
+    if state.shapes.size:
+        C = with_shape_prior(problem, C)
     if problem.method == 'hierarchical':
         _, J = _whitened_attitude_errors(problem, state)
         tracker = J.transpose(0, 2, 1) @ J
@@ -448,8 +484,11 @@ def information_of_images(problem: Problem, state: State, blocks: Floats) -> Flo
         stars, A = A, np.zeros((len(blocks), p, p))
         A[:, camera, camera] = stars
         A[:, k:, k:] = turn.transpose(0, 2, 1) @ tracker @ turn
-        B = np.concatenate([B, -tracker @ turn], axis=2)
-        C = C + tracker
+        of_alignment = np.zeros((*B.shape[:2], turn.shape[2]))
+        of_alignment[:, :3] = -tracker @ turn
+        B = np.concatenate([B, of_alignment], axis=2)
+        C = C.copy()
+        C[:, :3, :3] += tracker
     return np.asarray(A - B.transpose(0, 2, 1) @ np.linalg.solve(_pulled(C), B))
 
 
@@ -493,7 +532,7 @@ def attitudes_of_stars_alone(
     seen : (m,) bool
         Whether the image has stars enough; the rows of the others are zero.
     """
-    C = blocks[:, ROTATION, ROTATION]
+    C, c = _rotations_of_stars(problem, state, blocks)
     diagonal = np.einsum('mii->mi', C)
     seen = (diagonal > 0).all(axis=1)
     scale = np.where(seen[:, None], 1.0 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
@@ -503,12 +542,36 @@ def attitudes_of_stars_alone(
     inverse[seen] = np.linalg.inv(scaled[seen])
     inverse *= scale[:, :, None] * scale[:, None, :]
     # Where the star tracker holds the rotation off the stars' minimum, one step leads there.
-    step = np.einsum('mij,mj->mi', inverse, blocks[:, ROTATION, RESIDUAL])
+    step = np.einsum('mij,mj->mi', inverse, c)
     eta = attitude_errors(problem, state, Rotation.from_rotvec(-step) * state.camera_from_icrf)
     camera_from_star_tracker = image_alignment(problem, state).as_matrix()
     star_tracker_from_camera = np.swapaxes(camera_from_star_tracker, -1, -2)
     covariance = star_tracker_from_camera @ inverse @ camera_from_star_tracker
     return np.where(seen[:, None], eta, 0.0), covariance, seen
+
+
+def shape_unknowns(problem: Problem, state: State, blocks: Floats) -> float:
+    """Number of unknowns that the shapes of the images are, less what their prior holds."""
+    if not state.shapes.size:
+        return 0.0
+    k = problem.camera_count + len(state.focal)
+    own = _pulled(by_shared(problem, state, blocks)[:, k:-1, k:-1])
+    C, B = own[:, :3, :3], own[:, :3, 3:]
+    shown = own[:, 3:, 3:] - B.transpose(0, 2, 1) @ np.linalg.pinv(C, hermitian=True) @ B
+    held = np.diag(1.0 / problem.shape_sigma_px**2)
+    return float(np.trace(np.linalg.solve(shown + held, shown), axis1=1, axis2=2).sum())
+
+
+def _rotations_of_stars(problem: Problem, state: State, blocks: Floats) -> tuple[Floats, Floats]:
+    """Information (m, 3, 3) and gradient (m, 3) of the rotations, the shapes eliminated."""
+    if not state.shapes.size:
+        return blocks[:, ROTATION, ROTATION], blocks[:, ROTATION, RESIDUAL]
+    k = problem.camera_count + len(state.focal)
+    own = by_shared(problem, state, blocks)[:, k:, k:]
+    C, c = with_shape_prior(problem, own[:, :-1, :-1]), own[:, :-1, -1].copy()
+    c[:, 3:] -= state.shapes / problem.shape_sigma_px**2
+    back = C[:, :3, 3:] @ np.linalg.inv(C[:, 3:, 3:])
+    return C[:, :3, :3] - back @ C[:, 3:, :3], c[:, :3] - np.einsum('mij,mj->mi', back, c[:, 3:])
 
 
 def _cross_matrix(v: Floats) -> Floats:
@@ -529,14 +592,15 @@ def _move(problem: Problem, state: State, shared: Floats, blocks: Floats) -> Sta
     focal, turned = state.focal + shared[f : f + q], shared[f + q : last]
     modes = state.modes + shared[last:]
     alignment, rotations = state.camera_from_star_tracker, state.camera_from_icrf
+    shapes = state.shapes + blocks[:, 3:] if state.shapes.size else state.shapes
     if problem.method == 'per_image':
-        rotations = Rotation.from_rotvec(-blocks) * rotations
-        return State(parameters, alignment, rotations, focal, state.rate, modes)
+        rotations = Rotation.from_rotvec(-blocks[:, :3]) * rotations
+        return State(parameters, alignment, rotations, focal, state.rate, modes, shapes)
     turn = Rotation.from_rotvec(-turned[:3])
     rate = state.rate + turned[3:]
-    moved = State(parameters, turn * alignment, rotations, focal, rate, modes)
+    moved = State(parameters, turn * alignment, rotations, focal, rate, modes, shapes)
     if problem.method == 'hierarchical':
-        rotations = Rotation.from_rotvec(-blocks) * rotations
+        rotations = Rotation.from_rotvec(-blocks[:, :3]) * rotations
     elif len(rate):
         rotations = image_alignment(problem, moved) * problem.star_tracker_from_icrf
     else:

@@ -9,6 +9,11 @@ P removes from it what the camera parameters and a common rotation can do, so th
 describes as much as it can.  Amplitude s and length l are those of the largest marginal
 likelihood.
 
+A figure error of a lens often has one dominant wave.  Where a kernel that oscillates, the same times
+``cos(k_u du) cos(k_v dv)`` with a long envelope (a spectral mixture, Wilson & Adams 2013), has a
+much larger likelihood for a component of the field, that component has it; a small part of the
+first kernel stays beside it.
+
 With F the information on c and g its gradient, all other unknowns eliminated, the likelihood ratio
 against s = 0 is ``2 log L = sum z_i^2 s^2 L_i / (1 + s^2 L_i) - log(1 + s^2 L_i)`` over the
 eigenvalues L_i of ``W^(1/2) F W^(1/2)``; z_i is the gradient along them in sigma.
@@ -43,12 +48,33 @@ _MAX_DEGREE = 18
 _SCALES = ((1.0, 0.9), (0.5, 0.09), (0.33, 0.01))
 _LENGTHS = (0.26, 0.3, 0.36, 0.43, 0.52, 0.7, 1.0, 1.4, 2.0)
 _DEGREE_TIMES_LENGTH = 4.2
+_ENVELOPES = (1.0, 2.0, 4.0, 8.0)  # of a wave: lengths in half lengths of the longer side
+_SHARE_OF_WAVE = 0.98  # of the variance of a component that has a wave
+_LEAST_GAIN = 20.0  # of twice the log likelihood, for four more numbers that were looked for
+_FASTEST = 16.0  # rad per half length: 2.5 waves across the longer side
+_WAVE_STEP = 0.8  # rad per half length, at first: half the width of a line over the detector
+_REFINEMENTS = 5
+_BEYOND_WAVE = 9.0  # degrees beyond the wave number that hold all but 1e-4 of a wave
 _AMPLITUDES_PX = np.geomspace(1e-3, 10.0, 41)
 _GRID = 41  # pixels a side at which the lens model's own displacements are taken
 # Of the detector, with a line of sight: a circular image fills 0.4 of a wide one; a lens model
 # that stars in one spot determine folds back around them.
 _LEAST_SEEN = 0.25
-_LEAST_SHARE = 1e-10  # of the variance of a field, under which a mode is left out
+_LEAST_SHARE = 1e-8  # of the variance of a field, under which a mode is left out
+
+
+@dataclass(frozen=True)
+class Wave:
+    """Wave numbers along u and v, rad per half length of the longer side, and envelope length."""
+
+    along_u: float
+    along_v: float
+    envelope: float
+
+
+Waves = tuple[Wave | None, Wave | None]
+"""Dominant wave of the u and of the v component."""
+NO_WAVES: Waves = (None, None)
 
 
 @dataclass(frozen=True)
@@ -69,6 +95,7 @@ class FieldPrior:
         l, in half lengths of the longer side of the detector.
     log_likelihood_ratio : float
         Twice the logarithm, against no field.
+    waves : Waves
     """
 
     width: int
@@ -78,6 +105,7 @@ class FieldPrior:
     amplitude_px: float
     length: float
     log_likelihood_ratio: float
+    waves: Waves = NO_WAVES
 
     def is_close_to(self, other: FieldPrior) -> bool:
         """Whether the two stand at the same place of the search, or next to it in amplitude."""
@@ -140,20 +168,29 @@ def spanned_by_lens(camera: CameraModel, free: NDArray[np.int64], degree: int) -
 
 
 @functools.lru_cache(maxsize=16)
-def _kernel_root(width: int, height: int, degree: int, length: float) -> Floats:
+def _kernel_root(
+    width: int, height: int, degree: int, length: float, wave: Wave | None = None
+) -> Floats:
     """Return L (t, r) with ``L L' = W``, the covariance of the coefficients of one component."""
     nodes, weights = np.polynomial.legendre.leggauss(64)
     polynomials = legendre(nodes, degree) * (0.5 * weights)
 
-    def along(side: int, own: float) -> Floats:
-        apart = (nodes[:, None] - nodes[None, :]) * (side / max(width, height)) / own
-        return np.asarray(polynomials @ np.exp(-0.5 * apart**2) @ polynomials.T)
+    def along(side: int, own: float, wave_number: float = 0.0) -> Floats:
+        apart = (nodes[:, None] - nodes[None, :]) * (side / max(width, height))
+        kernel = np.exp(-0.5 * (apart / own) ** 2) * np.cos(wave_number * apart)
+        return np.asarray(polynomials @ kernel @ polynomials.T)
+
+    def both(u: Floats, v: Floats) -> Floats:
+        return np.asarray(u[np.ix_(of_u, of_u)] * v[np.ix_(of_v, of_v)])
 
     of_u, of_v = degrees(degree).T
     covariance = np.zeros((len(of_u), len(of_u)))
     for part, share in _SCALES:
-        u, v = along(width, part * length), along(height, part * length)
-        covariance += share * u[np.ix_(of_u, of_u)] * v[np.ix_(of_v, of_v)]
+        covariance += share * both(along(width, part * length), along(height, part * length))
+    if wave is not None:
+        u = along(width, wave.envelope, wave.along_u)
+        v = along(height, wave.envelope, wave.along_v)
+        covariance = _SHARE_OF_WAVE * both(u, v) + (1.0 - _SHARE_OF_WAVE) * covariance
     values, vectors = np.linalg.eigh(covariance)
     large = values > _LEAST_SHARE * values.sum()
     root = vectors[:, large] * np.sqrt(values[large])
@@ -161,8 +198,49 @@ def _kernel_root(width: int, height: int, degree: int, length: float) -> Floats:
     return np.asarray(root)
 
 
+@dataclass(frozen=True)
+class _Likelihood:
+    """Score of the polynomials of a detector without what the lens model explains."""
+
+    camera: CameraModel
+    degree: int
+    span: Floats
+    information: Floats
+    gradient: Floats
+    patterns: Floats
+
+    def root(self, length: float, waves: Waves) -> Floats:
+        """Root of the prior covariance of an amplitude of 1 px."""
+        size = self.camera.width, self.camera.height
+        u, v = (_kernel_root(*size, self.degree, length, wave) for wave in waves)
+        zero = np.zeros((len(u), v.shape[1])), np.zeros((len(v), u.shape[1]))
+        return np.concatenate([np.block([[u, zero[0]], [zero[1], v]]), self.patterns], axis=1)
+
+    def best_amplitude(self, length: float, waves: Waves) -> tuple[float, float]:
+        """Twice the log of the largest likelihood ratio, and the amplitude in px."""
+        root = self.root(length, waves)
+        eigenvalues, vectors = np.linalg.eigh(root.T @ self.information @ root)
+        eigenvalues = np.maximum(eigenvalues, 0.0)
+        along = vectors.T @ (root.T @ self.gradient)
+        s2 = _AMPLITUDES_PX[:, None] ** 2
+        shrunk = 1.0 + s2 * eigenvalues
+        ratio = (along**2 * s2 / shrunk - np.log(shrunk)).sum(axis=1)
+        k = int(ratio.argmax())
+        return float(ratio[k]), float(_AMPLITUDES_PX[k])
+
+    def posterior_mean(self, length: float, waves: Waves, amplitude_px: float) -> Floats:
+        """Coefficients (2 t,) of the field of largest posterior probability."""
+        modes = amplitude_px * self.root(length, waves)
+        held = modes.T @ self.information @ modes + np.eye(modes.shape[1])
+        return np.asarray(modes @ np.linalg.solve(held, modes.T @ self.gradient))
+
+
 def best_prior(
-    score: Score, camera: CameraModel, free: NDArray[np.int64], degree: int
+    score: Score,
+    camera: CameraModel,
+    free: NDArray[np.int64],
+    degree: int,
+    waves: Waves | None = NO_WAVES,
 ) -> FieldPrior:
     """
     Return the prior of the largest marginal likelihood.
@@ -173,42 +251,93 @@ def best_prior(
         Of the terms of `polynomials` of that degree, at a field of zero.
     free : (f,) int
         Camera parameters that are estimated.
+    waves : Waves or None
+        Dominant waves; None: they are looked for.  None are in the test of no field, whose p-value
+        is of smooth kernels.
     """
     span = spanned_by_lens(camera, free, degree)
-    information = _projected(_projected(score.information, span).T, span)
-    gradient = score.gradient - span @ (span.T @ score.gradient)
-    best: tuple[float, float, float] = (-np.inf, 0.0, 0.0)
-    patterns = _patterns(camera.width, camera.height, degree, span)
-    for length in _LENGTHS:
-        smooth = _both(_kernel_root(camera.width, camera.height, degree, length))
-        root = np.concatenate([smooth, patterns], axis=1)
-        eigenvalues, vectors = np.linalg.eigh(root.T @ information @ root)
-        eigenvalues = np.maximum(eigenvalues, 0.0)
-        along = vectors.T @ (root.T @ gradient)
-        s2 = _AMPLITUDES_PX[:, None] ** 2
-        shrunk = 1.0 + s2 * eigenvalues
-        ratio = (along**2 * s2 / shrunk - np.log(shrunk)).sum(axis=1)
-        k = int(ratio.argmax())
-        best = max(best, (float(ratio[k]), length, float(_AMPLITUDES_PX[k])))
-    ratio, length, amplitude_px = best
-    smooth = _both(_kernel_root(camera.width, camera.height, degree, length))
-    root = np.concatenate([smooth, patterns], axis=1)
+    shown = _Likelihood(
+        camera,
+        degree,
+        span,
+        _projected(_projected(score.information, span).T, span),
+        score.gradient - span @ (span.T @ score.gradient),
+        _patterns(camera.width, camera.height, degree, span),
+    )
+    known = NO_WAVES if waves is None else waves
+    found = [(*shown.best_amplitude(length, known), length) for length in _LENGTHS]
+    ratio, amplitude_px, length = max(found)
+    if waves is None:
+        mean = shown.posterior_mean(length, known, amplitude_px)
+        for component in (0, 1):
+            more = _best_wave(shown, length, known, component, mean)
+            again = shown.best_amplitude(length, more)
+            if again[0] > ratio + _LEAST_GAIN:
+                known, (ratio, amplitude_px) = more, again
+    root = shown.root(length, known)
     modes = amplitude_px * (root - span @ (span.T @ root))
     return FieldPrior(
-        camera.width, camera.height, degree, modes, amplitude_px, length, float(ratio)
+        camera.width, camera.height, degree, modes, amplitude_px, length, ratio, known
     )
+
+
+def _best_wave(
+    shown: _Likelihood, length: float, waves: Waves, component: int, mean: Floats
+) -> Waves:
+    """Waves with the most likely one in a component, from the spectrum of the mean field."""
+
+    def with_wave(wave: Wave) -> Waves:
+        return (wave, waves[1]) if component == 0 else (waves[0], wave)
+
+    def likelihood(wave: Wave) -> float:
+        return shown.best_amplitude(length, with_wave(wave))[0]
+
+    start = _dominant_wave(shown.camera, shown.degree, np.split(mean, 2)[component])
+    best = max(
+        ((likelihood(wave), n, wave) for n, wave in enumerate(_of_envelopes(start))),
+    )
+    step = _WAVE_STEP
+    for _ in range(_REFINEMENTS):
+        value, _, wave = best
+        around = [
+            Wave(abs(wave.along_u + i * step), abs(wave.along_v + j * step), wave.envelope)
+            for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1))
+        ]
+        best = max(best, max((likelihood(one), n, one) for n, one in enumerate(around)))
+        if best[0] == value:
+            step *= 0.5
+    return with_wave(best[2])
+
+
+def _of_envelopes(wave: tuple[float, float]) -> list[Wave]:
+    return [Wave(*wave, envelope) for envelope in _ENVELOPES]
+
+
+def _dominant_wave(
+    camera: CameraModel, degree: int, coefficients: Floats
+) -> tuple[float, float]:
+    """Wave numbers along u and v of the largest power of a component of a field."""
+    longer = max(camera.width, camera.height)
+    u = np.linspace(0.0, camera.width - 1.0, _GRID)
+    v = np.linspace(0.0, camera.height - 1.0, _GRID)
+    pixels = np.stack([grid.ravel() for grid in np.meshgrid(u, v)], axis=-1)
+    values = basis(pixels, camera.width, camera.height, degree) @ coefficients
+    numbers = np.arange(0.0, _FASTEST, _WAVE_STEP)
+    along_u = np.exp(1j * np.outer(numbers, 2.0 * u / longer))
+    along_v = np.exp(1j * np.outer(numbers, 2.0 * v / longer))
+    image = values.reshape(_GRID, _GRID)
+    power = sum(np.abs(one @ image @ along_u.T) ** 2 for one in (along_v, along_v.conj()))
+    j, i = np.unravel_index(int(np.argmax(power)), (len(numbers), len(numbers)))
+    return float(numbers[i]), float(numbers[j])
 
 
 def degree_for(prior: FieldPrior) -> int:
-    """Return the degree of the polynomials that hold a field of this length."""
-    return _degree_for(prior.length)
-
-
-def _degree_for(length: float) -> int:
-    return min(
-        _MAX_DEGREE,
-        max(TEST_DEGREE, int(np.ceil(_DEGREE_TIMES_LENGTH / (_SCALES[-1][0] * length)))),
-    )
+    """Return the degree of the polynomials that hold a field of this length and these waves."""
+    needed = _DEGREE_TIMES_LENGTH / (_SCALES[-1][0] * prior.length)
+    for wave in prior.waves:
+        if wave is not None:
+            needed = max(needed, wave.along_u + _BEYOND_WAVE, wave.along_v + _BEYOND_WAVE)
+    return min(_MAX_DEGREE, max(TEST_DEGREE, int(np.ceil(needed))))
 
 
 def _projected(matrix: Floats, span: Floats) -> Floats:
@@ -240,12 +369,3 @@ def _patterns(width: int, height: int, degree: int, span: Floats) -> Floats:
     found = [np.linalg.lstsq(phi, np.stack(pair, -1), rcond=None)[0].T.ravel() for pair in moved]
     patterns = _projected(np.stack(found, axis=-1), span)
     return np.asarray(patterns / np.linalg.norm(patterns, axis=0))
-
-
-def _both(root: Floats) -> Floats:
-    """Return a root for both components from that for one."""
-    t, r = root.shape
-    whole = np.zeros((2 * t, 2 * r))
-    whole[:t, :r] = root
-    whole[t:, r:] = root
-    return whole
