@@ -492,6 +492,33 @@ class DetectorStep:
 
 
 @dataclass(frozen=True)
+class ResidualBin:
+    """
+    Residuals of images that the other images predict, in a part of the data.
+
+    Attributes
+    ----------
+    by : str
+        ``radius`` (px from the middle of the detector), ``magnitude`` or ``image`` (its number in
+        order of time).
+    low, high : float
+        Of the part.
+    stars : int
+    normalised : float
+        RMS of the residuals over their predicted sigma: 1 where the model and its sigmas hold.
+    sigma : float
+        1-sigma of that by the number of stars.
+    """
+
+    by: str
+    low: float
+    high: float
+    stars: Count
+    normalised: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class ModelChecks:
     """
     What the stars show of the model of the world that the calibration assumes.
@@ -518,6 +545,8 @@ class ModelChecks:
         Number of different pointings.
     independent_pointings : float
         Number of images, one that repeats the stars of others counted by what it adds.
+    cross_validation : tuple of ResidualBin
+        Empty where it was not made: fewer than four images, or an older calibration.
     """
 
     field_p_value: float
@@ -534,6 +563,7 @@ class ModelChecks:
     independent_images: float
     pointings: int
     independent_pointings: float
+    cross_validation: tuple[ResidualBin, ...] = ()
 
 
 @dataclass(frozen=True)

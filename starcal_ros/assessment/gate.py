@@ -23,7 +23,11 @@ from starcal_ros.records import (
     GateCheck,
     HalvesComparison,
     ModelChecks,
+    ResidualBin,
 )
+
+_PART_TOLERANCE = 0.05  # of a normalised residual, within which a part of the data is as predicted
+_PART_SIGMAS = 3.5  # one of twelve parts exceeds it by noise in 1 of 200 calibrations
 
 
 @dataclass(frozen=True)
@@ -141,6 +145,13 @@ class GateOptions:
         ' smaller one is carried in the covariance',
         low=0.0,
         high=1e5,
+    )
+    max_cross_validated_residual: float = option(
+        1.2,
+        'largest RMS of residuals over their predicted sigma in a part of the data (radius,'
+        ' magnitude or time), each image predicted from the others',
+        low=1.0,
+        high=100.0,
     )
     min_independent_images: float = option(
         0.0,
@@ -430,6 +441,7 @@ def _model(
         'focal length or lens changes between images: estimate with temperature, or calibrate '
         'each state apart',
     )
+    yield from _cross_validated(found.cross_validation, options)
     check = _check(
         options,
         'min_independent_images',
@@ -443,6 +455,34 @@ def _model(
             'over a longer time'
         )
     yield dataclasses.replace(check, note=note)
+
+
+def _cross_validated(bins: tuple[ResidualBin, ...], options: GateOptions) -> Iterator[GateCheck]:
+    """The part of the data whose residuals exceed their predicted sigma the most."""
+    if not bins:
+        return
+
+    def excess(part: ResidualBin) -> float:
+        # No part fails for the noise of its few stars.
+        return part.normalised - _PART_SIGMAS * part.sigma
+
+    worst = max(bins, key=excess)
+    doubtful = [
+        f'{part.by} {part.low:.4g} to {part.high:.4g}: {part.normalised:.3f}'
+        for part in bins
+        if abs(part.normalised - 1.0) > max(_PART_TOLERANCE, _PART_SIGMAS * part.sigma)
+    ]
+    check = _check(
+        options,
+        'max_cross_validated_residual',
+        f'residual over predicted sigma at {worst.by} {worst.low:.4g} to {worst.high:.4g}',
+        worst.normalised,
+    )
+    passed = bool(check.passed) or excess(worst) <= options.max_cross_validated_residual
+    note = f'not within {_PART_TOLERANCE:.0%} of 1: {", ".join(doubtful)}' if doubtful else ''
+    if not passed:
+        note += '; the sigma does not hold there: look at the PSF, the lens model or those images'
+    yield dataclasses.replace(check, passed=passed, note=note)
 
 
 def _significant(

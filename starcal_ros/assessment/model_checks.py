@@ -17,6 +17,7 @@ import numpy as np
 from scipy.special import chdtrc, ndtr
 
 from starcal_ros.arrays import Floats, Indices
+from starcal_ros.assessment.cross_validation import cross_validation
 from starcal_ros.camera import CameraModel, pixel_grid, rotation_jacobian
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.linear_terms import linear_terms, LinearTerms
@@ -65,6 +66,7 @@ def model_checks(estimate: Estimate) -> ModelChecks:
         independent_images=float(correlation.independent_images.min()),
         pointings=estimate.pointings,
         independent_pointings=_independent_pointings(estimate),
+        cross_validation=cross_validation(estimate, measurements, blocks, field),
     )
 
 

@@ -519,7 +519,8 @@ def _with_shapes(
 ) -> tuple[Problem, State]:
     """Problem and state with a shape of each image where the images differ, without elsewhere."""
     sigma_px = np.array(variation.amplitude_sigma_px)
-    modes, shapes = np.empty((0, 0)), np.empty((0, 0))
+    modes: Floats = np.empty((0, 0))
+    shapes: Floats = np.empty((0, 0))
     if len(sigma_px):
         modes, shapes = shape_modes(problem.camera_count), state.shapes
         if not shapes.size:
@@ -547,9 +548,11 @@ def _with_field(
         if best is None:
             return plain
         found = _settle(_started(found, best), _arranged(table, found.verdict), table, options)
+        # A smoother kernel of a larger amplitude needs the same degree.
+        degree = max(degree, degree_for(best))
         # The first search was among residuals whose variance held the field.
         waves = best.waves if k else None
-        again = _field_prior(found, table, prior.camera, degree_for(best), waves)
+        again = _field_prior(found, table, prior.camera, degree, waves)
         if again is not None and k and again.is_close_to(best):
             break
         best = again

@@ -82,6 +82,7 @@ class Chunk:
     """Some images of like star count, padded to the largest with stars of no weight."""
 
     image: NDArray[np.int64]  # (m,)
+    row: NDArray[np.int64]  # (m n,) of the table; of stars of no weight, some other star
     direction_icrf: Floats  # (m, 3, n)
     measured_px: Floats  # (2, m n)
     whitener: Floats  # (3, m n): upper triangle, uu, uv, vv
@@ -138,6 +139,7 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
         chunks.append(
             Chunk(
                 chosen,
+                row,
                 direction_icrf.reshape(3, *real.shape).transpose(1, 0, 2),
                 np.ascontiguousarray(table.measured_px[row].T),
                 whitener,

@@ -230,11 +230,11 @@ def by_shared(problem: Problem, state: State, blocks: Floats) -> Floats:
     """
     if not (len(state.focal) or state.shapes.size):
         return blocks
-    E = _chain(problem, state, len(blocks))
+    E = image_chain(problem, state, len(blocks))
     return np.asarray(E.transpose(0, 2, 1) @ blocks @ E)
 
 
-def _chain(problem: Problem, state: State, m: int) -> Floats:
+def image_chain(problem: Problem, state: State, m: int) -> Floats:
     """Derivatives (m, p + 4, p + q + 4 + h) of the columns of an image by those of `by_shared`."""
     p, q, h = problem.camera_count, len(state.focal), state.shapes.shape[1]
     E = np.zeros((m, p + 4, p + q + 4 + h))
@@ -306,7 +306,7 @@ def border_of(
     cross = terms.cross
     m, q, _ = cross.shape
     if len(state.focal) or state.shapes.size:
-        cross = cross @ _chain(problem, state, m)
+        cross = cross @ image_chain(problem, state, m)
     k = problem.camera_count + len(state.focal)
     camera = cross[:, :, :k].sum(axis=0)
     own = cross[:, :, k:-1]

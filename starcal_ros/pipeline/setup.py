@@ -56,9 +56,9 @@ class SetupOptions:
     )
     lens_model: str = option(
         'prior',
-        'lens model that is estimated; prior: that of the prior camera, else the prior camera is'
-        ' converted to it',
-        choices=('prior', *COEFFICIENTS),
+        'lens model that is estimated; prior: that of the prior camera; auto: the smallest that'
+        ' leaves no field beside it; else the prior camera is converted to it',
+        choices=('prior', 'auto', *COEFFICIENTS),
     )
     prior_alignment: tuple[float, ...] = option(
         (0.0, 0.0, 0.0, 1.0),
@@ -170,7 +170,7 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
     if not frames.camera_info_url:
         raise OptionError('camera_info_url: not set; give the camera YAML of the prior camera')
     camera = read_camera_info(frames.camera_info_url)
-    if frames.lens_model not in ('prior', camera.model):
+    if frames.lens_model not in ('prior', 'auto', camera.model):
         camera, worst_px = convert(camera, frames.lens_model)
         if not math.isfinite(worst_px):
             raise OptionError(

@@ -29,11 +29,13 @@ from starcal_ros.estimation.calibrate import (
     estimate_calibration,
     estimated_parameters,
 )
+from starcal_ros.estimation.lens_choice import estimate_with_smallest_lens
 from starcal_ros.options import check_value
 from starcal_ros.pipeline.provenance import provenance_of
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import (
     Calibration,
+    CameraGeometry,
     Ensemble,
     EnsembleStatus,
     HalvesComparison,
@@ -100,13 +102,13 @@ def solve_with_residuals(
 ) -> tuple[Calibration, Residuals]:
     """The calibration of `solve`, and its residuals by star and image."""
     setup = _as_asked_for(setup, method, estimate)
-    result = estimate_calibration(ensemble, setup.prior, setup.calibration)
+    result, prior = _estimate(ensemble, setup)
     halves = HalvesComparison(note='min_halves_p_value is 0')
     if setup.gate.min_halves_p_value > 0:
         # A field is common to both halves: each would show less of it, at twice the time.
         options = dataclasses.replace(setup.calibration, residual_field=False)
         bare = _without_field(ensemble, result.geometry.camera.field)
-        halves = compare_halves(bare, setup.prior, options)
+        halves = compare_halves(bare, prior, options)
     provenance = provenance_of(setup, ensemble, inputs or {})
     calibration = _not_judged(result, ensemble, setup, halves, provenance)
     checks = judge(calibration, setup.prior, active, setup.gate, setup.calibration)
@@ -116,6 +118,13 @@ def solve_with_residuals(
     )
     colour_bp_rp = setup.catalog.colours_bp_rp(result.table.catalog_id)
     return calibration, residuals_of(result, ensemble, colour_bp_rp)
+
+
+def _estimate(ensemble: Ensemble, setup: Setup) -> tuple[Estimate, CameraGeometry]:
+    """The estimate with the lens model that was asked for, and the prior in that model."""
+    if setup.frames.lens_model == 'auto':
+        return estimate_with_smallest_lens(ensemble, setup.prior, setup.calibration)
+    return estimate_calibration(ensemble, setup.prior, setup.calibration), setup.prior
 
 
 def _without_field(ensemble: Ensemble, field: DetectorField | None) -> Ensemble:
