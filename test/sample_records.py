@@ -21,6 +21,7 @@ from starcal_ros.records import (
     HeldTerm,
     ModelChecks,
     refused_image,
+    ResidualBin,
     ResidualField,
     StarObservations,
     TemperatureTerms,
@@ -135,6 +136,10 @@ def model_checks() -> ModelChecks:
         independent_images=7.5,
         pointings=14,
         independent_pointings=13.25,
+        cross_validation=(
+            ResidualBin('radius', 3.5, 320.25, 140, 1.02, 0.04),
+            ResidualBin('magnitude', 1.5, 4.5, 137, 0.97, 0.043),
+        ),
     )
 
 

@@ -60,14 +60,9 @@ def cross_validation(
         By radius, magnitude and time; empty with fewer than four images.
     """
     table = estimate.table
-    found: Floats = np.full(len(table), np.nan)
-    expected: Floats = np.full(len(table), np.nan)
     if table.image_count < _FEWEST_IMAGES:
         return ()
-    problem, state = estimate.problem, estimate.state
-    shared = _shared_information(problem, state, blocks, field)
-    for rows, squared, variance in _images(problem, state, measurements, shared):
-        found[rows], expected[rows] = squared, variance
+    found, expected = predicted_residuals(estimate, measurements, blocks, field)
     used = estimate.kept & np.isfinite(found)
     if not used.any():
         return ()
@@ -80,6 +75,27 @@ def cross_validation(
         *_bins('magnitude', table.magnitude.astype(np.float64), found, expected, used),
         *_bins('image', table.image.astype(np.float64), found, expected, used),
     )
+
+
+def predicted_residuals(
+    estimate: Estimate,
+    measurements: Measurements,
+    blocks: Floats,
+    field: LinearTerms | None,
+) -> tuple[Floats, Floats]:
+    """
+    Return squared whitened residuals (n,) of stars, their image predicted by the others.
+
+    With their expected values (n,); NaN for stars that were not used, and of images without which
+    the others determine no calibration.  Parameters as of `cross_validation`.
+    """
+    problem, state = estimate.problem, estimate.state
+    squared: Floats = np.full(len(estimate.table), np.nan)
+    expected: Floats = np.full(len(estimate.table), np.nan)
+    shared = _shared_information(problem, state, blocks, field)
+    for rows, found, variance in _images(problem, state, measurements, shared):
+        squared[rows], expected[rows] = found, variance
+    return squared, expected
 
 
 def _shared_information(

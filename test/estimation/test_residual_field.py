@@ -81,7 +81,7 @@ def test_a_lens_error_is_estimated_with_a_true_sigma(method: str) -> None:
 
 
 def test_a_dominant_wave_is_found() -> None:
-    """A product of two waves, as a figure error has: few numbers where a smooth kernel has many."""
+    """A product of two waves, as a figure error has."""
     given = of_random_pointings(4, images=6)
     numbers = 5.0, 6.5  # rad per half length of the longer side
 
