@@ -21,9 +21,11 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import PARAMETER_NAMES, project_jacobians, project_parameters
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import CalibrationOptions, estimate_calibration
-from starcal_ros.estimation.normal_equations import arrange, star_table, StarTable
-from starcal_ros.estimation.problem import minimise, Problem, State
+from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.least_squares.normal_equations import arrange, star_table, StarTable
+from starcal_ros.methods.minimise import minimise
+from starcal_ros.methods.problem import Problem, State
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario

@@ -35,9 +35,10 @@ from bench.competitors import (
 )
 from bench.table import Table, verdict
 from starcal_ros.arrays import Floats
-from starcal_ros.estimation.levenberg_marquardt import covariance
-from starcal_ros.estimation.normal_equations import arrange, normal_blocks, RESIDUAL, ROTATION
-from starcal_ros.estimation.problem import minimise, State
+from starcal_ros.least_squares.levenberg_marquardt import covariance
+from starcal_ros.least_squares.normal_equations import arrange, normal_blocks, RESIDUAL, ROTATION
+from starcal_ros.methods.minimise import minimise
+from starcal_ros.methods.problem import State
 from starcal_ros.records import CameraGeometry, Ensemble
 
 LIMIT_S = 60.0  # longest wait for a competitor

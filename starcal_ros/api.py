@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.bag import reader
 from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
-from starcal_ros.estimation.calibrate import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.gate.options import GateOptions
 from starcal_ros.options import names_of, nearest
 from starcal_ros.pipeline import solve, topics
 from starcal_ros.pipeline.provenance import inputs_of

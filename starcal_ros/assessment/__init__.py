@@ -1,1 +1,1 @@
-"""Whether a calibration is good: gate, observability, comparison, residuals."""
+"""How good a calibration is: observability, model checks, comparison, residuals."""

@@ -14,11 +14,8 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation.calibrate import (
-    CalibrationOptions,
-    estimate_calibration,
-    estimated_parameters,
-)
+from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.records import CameraGeometry, Ensemble, HalvesComparison
 
 FEWEST_IMAGES = 6  # of an ensemble that can be cut in two: a scatter needs three images

@@ -19,16 +19,11 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.levenberg_marquardt import inverse
-from starcal_ros.estimation.linear_terms import LinearTerms
-from starcal_ros.estimation.normal_equations import Chunk, Measurements, whitened_chunks
-from starcal_ros.estimation.problem import (
-    image_chain,
-    image_parameters,
-    Problem,
-    reduced_information,
-    State,
-)
+from starcal_ros.least_squares.levenberg_marquardt import inverse
+from starcal_ros.least_squares.linear_terms import LinearTerms
+from starcal_ros.least_squares.normal_equations import Chunk, Measurements, whitened_chunks
+from starcal_ros.methods.assembly import image_chain, reduced_information
+from starcal_ros.methods.problem import image_parameters, Problem, State
 from starcal_ros.records import ResidualBin
 
 _BINS = 4  # of each kind: corners and faint stars stand apart, and each holds a quarter

@@ -20,14 +20,14 @@ from starcal_ros.arrays import Floats, Indices
 from starcal_ros.assessment.cross_validation import cross_validation
 from starcal_ros.camera import CameraModel, pixel_grid, rotation_jacobian
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.linear_terms import linear_terms, LinearTerms
-from starcal_ros.estimation.normal_equations import arrange, Measurements
-from starcal_ros.estimation.problem import (
+from starcal_ros.least_squares.linear_terms import linear_terms, LinearTerms
+from starcal_ros.least_squares.normal_equations import arrange, Measurements
+from starcal_ros.methods.assembly import score_of
+from starcal_ros.methods.problem import (
     field_terms,
     image_blocks,
     image_parameters,
     scalar_terms_at,
-    score_of,
 )
 from starcal_ros.records import DetectorStep, HeldTerm, ModelChecks
 

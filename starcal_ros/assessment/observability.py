@@ -19,18 +19,15 @@ from starcal_ros.camera import (
     project_parameters,
 )
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import (
-    CalibrationOptions,
-    estimated_parameters,
-    FEWEST_STARS,
-    problem_of,
-    start_of,
-)
-from starcal_ros.estimation.covariance import shared_covariance, shared_names
-from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.normal_equations import arrange, star_table
-from starcal_ros.estimation.problem import image_blocks, information_of_images, Problem, State
-from starcal_ros.estimation.temperature import why_unsupported
+from starcal_ros.estimation.calibrate import problem_of, start_of
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.verdict import FEWEST_STARS
+from starcal_ros.least_squares.levenberg_marquardt import NotObservable
+from starcal_ros.least_squares.normal_equations import arrange, star_table
+from starcal_ros.methods.assembly import information_of_images
+from starcal_ros.methods.covariance import shared_covariance, shared_names
+from starcal_ros.methods.problem import image_blocks, Problem, State
+from starcal_ros.model_errors.temperature import why_unsupported
 from starcal_ros.records import (
     CameraGeometry,
     Correlation,

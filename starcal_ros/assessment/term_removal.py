@@ -14,16 +14,11 @@ from scipy.special import chdtrc
 
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
-from starcal_ros.estimation.normal_equations import arrange, Measurements, residuals_px
-from starcal_ros.estimation.problem import (
-    image_blocks,
-    image_parameters,
-    minimise,
-    Problem,
-    reduced_information,
-    State,
-)
+from starcal_ros.least_squares.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.least_squares.normal_equations import arrange, Measurements, residuals_px
+from starcal_ros.methods.assembly import reduced_information
+from starcal_ros.methods.minimise import minimise
+from starcal_ros.methods.problem import image_blocks, image_parameters, Problem, State
 from starcal_ros.records import TermRemoval
 
 _HELD_AT_PRIOR = ('fx', 'fy', 'cx', 'cy')  # skew and distortion terms are held at zero

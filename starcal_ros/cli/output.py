@@ -10,7 +10,7 @@ from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.assessment.comparison import Comparison, DifferenceMap
 from starcal_ros.cli.terminal import print_table, print_verdict
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
-from starcal_ros.estimation import temperature
+from starcal_ros.model_errors import temperature
 from starcal_ros.pipeline.inspect import Inspection, TopicContent
 from starcal_ros.records import Calibration, CameraGeometry
 

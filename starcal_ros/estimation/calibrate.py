@@ -1,9 +1,4 @@
-"""
-From an ensemble of observed images to camera, alignment and covariance.
-
-A robust search from the prior, then least squares on the stars that fit, with the variances of
-centroids and star tracker estimated again and the misfits left out, until nothing changes.
-"""
+"""From an ensemble of observed images to camera, alignment and covariance."""
 
 from __future__ import annotations
 
@@ -14,151 +9,34 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 
 from starcal_ros.arrays import Floats, Mask
-from starcal_ros.camera import ALL_PARAMETER_NAMES, CameraModel, parameter_names
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.detector_field import in_degree
-from starcal_ros.errors import OptionError, TooFewObservations
-from starcal_ros.estimation.attitude_correlation import attitude_correlation, AttitudeCorrelation
-from starcal_ros.estimation.covariance import shared_covariance, shared_names
-from starcal_ros.estimation.image_variation import (
-    image_variation,
-    ImageVariation,
-    shape_modes,
+from starcal_ros.errors import TooFewObservations
+from starcal_ros.estimation.options import (
+    CalibrationOptions,
+    check_enough,
+    check_options,
+    estimated_parameters,
 )
-from starcal_ros.estimation.levenberg_marquardt import NotObservable, Solution
-from starcal_ros.estimation.linear_terms import LinearTerms, Score
-from starcal_ros.estimation.normal_equations import (
-    arrange,
-    Measurements,
-    residuals_px,
-    squared_sigmas,
-    star_table,
-    StarTable,
-)
-from starcal_ros.estimation.problem import (
-    attitude_errors,
-    attitudes_of_stars_alone,
-    field_terms,
-    image_blocks,
-    image_field,
-    image_parameters,
-    METHODS,
-    minimise,
-    Problem,
-    reduced_information,
-    scalar_terms_at,
-    score_of,
-    shape_unknowns,
-    State,
-)
-from starcal_ros.estimation.repeated_pointings import pointing_groups, repetition
-from starcal_ros.estimation.residual_field import (
-    best_prior,
-    degree_for,
-    FieldPrior,
-    NO_WAVES,
-    polynomials,
-    sees_detector,
-    TEST_DEGREE,
-    Waves,
-)
-from starcal_ros.estimation.temperature import weakest_term, why_unsupported
-from starcal_ros.estimation.variance_components import (
-    CentroidVariance,
-    estimate_star_tracker_sigma,
-    estimate_variance,
-)
-from starcal_ros.lens import COEFFICIENTS
-from starcal_ros.options import option
+from starcal_ros.estimation.search import Found, search
+from starcal_ros.estimation.verdict import all_residuals_px, arranged, dropped_stars, free_share
+from starcal_ros.least_squares.levenberg_marquardt import NotObservable
+from starcal_ros.least_squares.linear_terms import LinearTerms
+from starcal_ros.least_squares.normal_equations import squared_sigmas, star_table, StarTable
+from starcal_ros.methods.assembly import reduced_information
+from starcal_ros.methods.covariance import shared_covariance, shared_names
+from starcal_ros.methods.image_unknowns import attitudes_of_stars_alone
+from starcal_ros.methods.problem import field_terms, image_blocks, image_field, Problem, State
+from starcal_ros.model_errors.attitude_correlation import attitude_correlation, AttitudeCorrelation
+from starcal_ros.model_errors.image_variation import ImageVariation
+from starcal_ros.model_errors.repeated_pointings import pointing_groups
+from starcal_ros.model_errors.residual_field import FieldPrior
+from starcal_ros.model_errors.temperature import weakest_term, why_unsupported
+from starcal_ros.model_errors.variance_components import CentroidVariance
 from starcal_ros.records import CameraGeometry, Ensemble, TemperatureTerms
 
-_ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
-_START_FLOOR_PX = 0.05  # until the residuals tell: of the order of what is left in good images
 _TRACKER_EXCESS = 1.3  # found over assumed sigma from which the scatter is suspect
-_FIELD_ROUNDS = 6  # its prior and the variances settle in two or three
-_ROUNDS = 10  # the set of rejected stars settles in two or three
-FEWEST_STARS = 3  # of an image: its rotation fits any one star, and two as good as any
-_FEWEST_SIGHTINGS = 3  # of a star, from which it can be told from its images
-_STAR_CHANCE = 1e-7  # that a good star is dropped for the sum of its residuals
-
-
-@dataclass(frozen=True)
-class CalibrationOptions:
-    """What is estimated, and how."""
-
-    method: str = option(
-        'hierarchical', 'how the attitudes of the images are treated', choices=METHODS
-    )
-    estimate: tuple[str, ...] = option(
-        ('fx', 'skew', 'fy', 'cx', 'cy', 'distortion'),
-        'camera parameters that are estimated; the others are held at the prior; distortion: all'
-        ' coefficients of the lens model',
-        choices=(*ALL_PARAMETER_NAMES, 'distortion'),
-    )
-    star_tracker_sigma_arcsec: tuple[float, ...] = option(
-        (10.0, 10.0, 10.0),
-        '1-sigma of the star tracker attitude about its x, y, z axes, arcsec',
-        low=1e-3,
-        high=3600.0,
-        length=3,
-    )
-    min_images: int = option(
-        3, 'fewest images from which a calibration is made', low=1, high=100000
-    )
-    min_stars: int = option(
-        60, 'fewest star observations from which a calibration is made', low=10, high=1000000
-    )
-    max_images: int = option(
-        400, 'most images kept; beyond it those that add least information go', low=3, high=100000
-    )
-    outlier_sigma: float = option(
-        4.5,
-        'length of a residual, in its sigma, from which a star is left out',
-        low=3.0,
-        high=20.0,
-    )
-    prior_sigma: tuple[float, ...] = option(
-        (0.0,),
-        '1-sigma of the prior of fx, skew, fy, cx, cy (px) and of the coefficients of the lens'
-        ' model, or one number for all; 0: of one that is estimated, nothing is known; of one that'
-        ' is held, it is taken as exact',
-        low=0.0,
-    )
-    principal_point_prior: float = option(
-        0.03,
-        '1-sigma of the prior of cx and cy where prior_sigma gives none, as a fraction of the'
-        ' longer side of the image; 0: none',
-        low=0.0,
-        high=1.0,
-    )
-    variance_components: bool = option(
-        True, 'estimate the sigmas of centroids and star tracker again from the residuals'
-    )
-    residual_field: bool = option(
-        True,
-        'estimate a smooth field over the detector beside the lens model where stars show one',
-    )
-    max_field_p_value: float = option(
-        0.01,
-        'p-value of no field below which one is estimated',
-        low=0.0,
-        high=1.0,
-    )
-    focal_temperature_order: int = option(
-        0, 'degree of the polynomial of focal length in temperature; 0: none', low=0, high=2
-    )
-    alignment_temperature: bool = option(
-        False, 'alignment linear in temperature; not with the method per_image'
-    )
-    reference_temperature_degc: float = option(
-        20.0,
-        'temperature at which camera and alignment are reported where they change with it, degC',
-        low=-273.15,
-        high=1000.0,
-    )
 
 
 @dataclass(frozen=True)
@@ -249,69 +127,6 @@ class Estimate:
     correlation: AttitudeCorrelation
 
 
-def check_options(options: CalibrationOptions, model: str) -> None:
-    """
-    Raise `OptionError` for options that do not go together, or not with a lens model.
-
-    Raises
-    ------
-    OptionError
-        Naming the option.
-    """
-    if options.alignment_temperature and options.method == 'per_image':
-        # Its mean of the images' alignments has no place for a slope: `hierarchical` with a loose
-        # star tracker is the same estimate with one.
-        raise OptionError('alignment_temperature: the method per_image has no common alignment')
-    names = parameter_names(model)
-    for name in estimated_parameters(options, model):
-        if name not in names:
-            raise OptionError(
-                f'estimate: {name} is not a parameter of the lens model {model}, which has '
-                + ', '.join(names)
-            )
-    if len(options.prior_sigma) not in (1, len(names)):
-        raise OptionError(
-            f'prior_sigma: {len(options.prior_sigma)} numbers, but the lens model {model} has '
-            f'{len(names)} parameters: {", ".join(names)}'
-        )
-
-
-def estimated_parameters(options: CalibrationOptions, model: str) -> tuple[str, ...]:
-    """Names of the camera parameters that ``estimate`` asks for, of a lens model."""
-    return tuple(
-        name
-        for asked in options.estimate
-        for name in (COEFFICIENTS[model] if asked == 'distortion' else (asked,))
-    )
-
-
-def check_enough(ensemble: Ensemble, options: CalibrationOptions) -> None:
-    """
-    Raise `TooFewObservations` that says how many images or stars are missing.
-
-    Raises
-    ------
-    TooFewObservations
-        A sentence for a person.
-    """
-    images, stars = len(ensemble.images), ensemble.star_count
-    missing = []
-    if images < options.min_images:
-        missing.append(
-            f'{options.min_images - images} more images are needed '
-            f'({images} of {options.min_images} collected)'
-        )
-    if stars < options.min_stars:
-        missing.append(
-            f'{options.min_stars - stars} more stars are needed '
-            f'({stars} of {options.min_stars} collected)'
-        )
-    if missing:
-        refused = sum(ensemble.refused.values())
-        also = f'; {refused} images were refused' if refused else ''
-        raise TooFewObservations('too few observations: ' + ' and '.join(missing) + also)
-
-
 def estimate_calibration(
     ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> Estimate:
@@ -344,7 +159,8 @@ def estimate_calibration(
     while True:
         start = start_of(problem, prior, order, with_rate)
         try:
-            estimate, weakest = _search(problem, start, table, time_ns, prior, options)
+            found = search(problem, start, table, prior.camera, options)
+            estimate, weakest = _estimate(found, table, time_ns, prior, options)
             why = 'within chance'
         except (NotObservable, np.linalg.LinAlgError) as error:
             if not (order or with_rate):
@@ -407,212 +223,8 @@ def start_of(problem: Problem, prior: CameraGeometry, order: int, with_rate: boo
     )
 
 
-@dataclass(frozen=True)
-class _Verdict:
-    """What the residuals say: the variances, and what is left out."""
-
-    variance: CentroidVariance
-    tracker_sigma_rad: Floats  # (3,)
-    misfit: Mask  # (m,)
-    kept: Mask  # (n,)
-    repetition: Floats  # (n,) factor on the covariances
-    variation: ImageVariation
-
-    def covariance_px2(self, table: StarTable) -> Floats:
-        """Return the centroid covariances (n, 3) that the search weights with."""
-        return self.variance.of(table.covariance_px2, table.magnitude) * self.repetition[:, None]
-
-    def agrees_with(self, other: _Verdict) -> bool:
-        """Whether a search with the one would end where a search with the other does."""
-        return (
-            np.array_equal(self.kept, other.kept)
-            and np.array_equal(self.misfit, other.misfit)
-            and self.variance.is_close_to(other.variance)
-            and np.allclose(self.repetition, other.repetition, rtol=0.02)
-            and np.allclose(self.tracker_sigma_rad, other.tracker_sigma_rad, rtol=0.02)
-            and self.variation.is_close_to(other.variation)
-        )
-
-
-def _search(
-    problem: Problem,
-    start: State,
-    table: StarTable,
-    time_ns: NDArray[np.int64],
-    prior: CameraGeometry,
-    options: CalibrationOptions,
-) -> tuple[Estimate, str]:
-    """
-    Robust search, then least squares with snooping, without a field and, if it must be, with one.
-
-    With the term of temperature to leave out, if any.
-    """
-    everything = np.ones(len(table), bool)
-    given_rad = problem.star_tracker_sigma_rad[0]
-    verdict = _Verdict(
-        CentroidVariance(1.0, _START_FLOOR_PX**2),
-        given_rad,
-        np.zeros(table.image_count, bool),
-        everything,
-        np.ones(len(table)),
-        ImageVariation(),
-    )
-    measurements = _arranged(table, verdict)
-    solution = _robust_search(problem, start, measurements)
-    _, blocks = image_blocks(problem, solution.state, measurements)
-    del measurements  # before the next: they are as large as the table
-    verdict, measurements = _judge(
-        problem, solution.state, blocks, None, table, verdict, given_rad, options
-    )
-    found = _settle(
-        _Found(problem, solution, verdict, solution.iterations), measurements, table, options
-    )
-    del measurements
-    found = _with_field(found, table, prior, options)
-    return _estimate(found, table, time_ns, prior, options)
-
-
-@dataclass(frozen=True)
-class _Found:
-    """Where a search stands: its problem, its minimum, and the verdict that it was made with."""
-
-    problem: Problem
-    solution: Solution[State]
-    verdict: _Verdict
-    iterations: int
-    field_test: FieldPrior | None = None
-
-
-def _settle(
-    found: _Found, measurements: Measurements, table: StarTable, options: CalibrationOptions
-) -> _Found:
-    """Least squares and judgement of its residuals in turns, until the judgement stands."""
-    problem, solution = found.problem, found.solution
-    given_rad = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
-    iterations, after = found.iterations, found.verdict
-    for _ in range(_ROUNDS):
-        verdict = after
-        problem, state = _with_shapes(problem, solution.state, verdict.variation)
-        problem = dataclasses.replace(
-            problem,
-            star_tracker_sigma_rad=np.where(
-                verdict.misfit[:, None], np.inf, verdict.tracker_sigma_rad
-            ),
-        )
-        solution = minimise(problem, state, measurements)
-        iterations += solution.iterations
-        _, blocks = image_blocks(problem, solution.state, measurements)
-        terms = field_terms(problem, solution.state, measurements)
-        after, measurements = _judge(
-            problem, solution.state, blocks, terms, table, verdict, given_rad, options
-        )
-        del blocks
-        if after.agrees_with(verdict):
-            break
-    return dataclasses.replace(
-        found, problem=problem, solution=solution, verdict=verdict, iterations=iterations
-    )
-
-
-def _with_shapes(
-    problem: Problem, state: State, variation: ImageVariation
-) -> tuple[Problem, State]:
-    """Problem and state with a shape of each image where the images differ, without elsewhere."""
-    sigma_px = np.array(variation.amplitude_sigma_px)
-    modes: Floats = np.empty((0, 0))
-    shapes: Floats = np.empty((0, 0))
-    if len(sigma_px):
-        modes, shapes = shape_modes(problem.camera_count), state.shapes
-        if not shapes.size:
-            shapes = np.zeros((len(state.camera_from_icrf), len(sigma_px)))
-    return (
-        dataclasses.replace(problem, shape_modes=modes, shape_sigma_px=sigma_px),
-        dataclasses.replace(state, shapes=shapes),
-    )
-
-
-def _with_field(
-    found: _Found, table: StarTable, prior: CameraGeometry, options: CalibrationOptions
-) -> _Found:
-    """The search with a field beside the lens model, where the stars show one."""
-    plain = found
-    best = _field_prior(found, table, prior.camera, TEST_DEGREE)
-    if best is None:
-        return plain
-    found = plain = dataclasses.replace(found, field_test=best)
-    if not options.residual_field or best.p_value > options.max_field_p_value:
-        return plain
-    degree = degree_for(best)
-    best = _field_prior(found, table, prior.camera, degree, waves=None)
-    for k in range(_FIELD_ROUNDS):
-        if best is None:
-            return plain
-        found = _settle(_started(found, best), _arranged(table, found.verdict), table, options)
-        # A smoother kernel of a larger amplitude needs the same degree.
-        degree = max(degree, degree_for(best))
-        # The first search was among residuals whose variance held the field.
-        waves = best.waves if k else None
-        again = _field_prior(found, table, prior.camera, degree, waves)
-        if again is not None and k and again.is_close_to(best):
-            break
-        best = again
-    return found if best is not None else plain
-
-
-def _started(found: _Found, prior: FieldPrior) -> _Found:
-    """The search with another prior of the field, from the field that there is."""
-    before, state = image_field(found.problem, found.solution.state), found.solution.state
-    modes: Floats = np.zeros(prior.modes.shape[1])
-    if before is not None:
-        coefficients = in_degree(before, prior.degree)
-        modes = np.asarray(np.linalg.lstsq(prior.modes, coefficients, rcond=1e-9)[0])
-    return dataclasses.replace(
-        found,
-        problem=dataclasses.replace(found.problem, field_prior=prior),
-        solution=dataclasses.replace(
-            found.solution, state=dataclasses.replace(state, modes=modes)
-        ),
-    )
-
-
-def _field_prior(
-    found: _Found,
-    table: StarTable,
-    camera: CameraModel,
-    degree: int,
-    waves: Waves | None = NO_WAVES,
-) -> FieldPrior | None:
-    """
-    The prior of a field that the residuals at a minimum ask for, in polynomials of a degree.
-
-    None where the lens model has lines of sight for a small part of the detector only.
-    """
-    problem, state = found.problem, found.solution.state
-    camera = dataclasses.replace(camera, parameters=state.parameters, field=None)
-    if not sees_detector(camera):
-        return None
-    measurements = _arranged(table, found.verdict)
-    _, blocks = image_blocks(problem, state, measurements)
-    terms = scalar_terms_at(
-        problem, state, measurements, polynomials(camera.width, camera.height, degree)
-    )
-    # The field that there is, if any, is part of what the residuals are asked for.
-    without = dataclasses.replace(problem, field_prior=None)
-    shown = score_of(without, state, blocks, None, terms)
-    now = image_field(problem, state)
-    if now is not None:
-        coefficients = in_degree(now, degree)
-        gradient = shown.gradient + shown.information @ coefficients
-        shown = Score(gradient, shown.information)
-    return best_prior(shown, camera, problem.free, degree, waves)
-
-
-def _arranged(table: StarTable, verdict: _Verdict) -> Measurements:
-    return arrange(table, verdict.kept, verdict.covariance_px2(table))
-
-
 def _estimate(
-    found: _Found,
+    found: Found,
     table: StarTable,
     time_ns: NDArray[np.int64],
     prior: CameraGeometry,
@@ -621,13 +233,13 @@ def _estimate(
     """What a search has found, and the term of temperature to leave out, if any."""
     problem, solution, verdict = found.problem, found.solution, found.verdict
     state = solution.state
-    measurements = _arranged(table, verdict)
+    measurements = arranged(table, verdict)
     _, blocks = image_blocks(problem, state, measurements)
     terms = field_terms(problem, state, measurements)
     del measurements
-    residual_px = _residuals(problem, state, table)
+    residual_px = all_residuals_px(problem, state, table)
     kept = verdict.kept
-    freedom = _freedom(problem, state, blocks, terms, kept, verdict.tracker_sigma_rad)
+    freedom = free_share(problem, state, blocks, terms, kept, verdict.tracker_sigma_rad)
     chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()
     lost = np.bincount(table.image[kept], minlength=table.image_count) == 0
     geometry, full, scatter_arcsec = _result(
@@ -673,7 +285,7 @@ def _estimate(
         variance_factor=float(chi2_given / (2 * np.count_nonzero(kept) * freedom)),
         star_tracker_sigma_rad=verdict.tracker_sigma_rad,
         misfit_image=verdict.misfit | lost,
-        dropped_catalog_id=_dropped(table, kept),
+        dropped_catalog_id=dropped_stars(table, kept),
         alignment_scatter_arcsec=scatter_arcsec,
         attitude_error_rad=attitude_error_rad,
         attitude_covariance_rad2=attitude_covariance_rad2,
@@ -691,7 +303,7 @@ def _estimate(
 
 
 def _correlation(
-    found: _Found,
+    found: Found,
     time_ns: NDArray[np.int64],
     error_rad: Floats,
     covariance_rad2: Floats,
@@ -723,126 +335,6 @@ def _thermal(state: State, full: Floats, options: CalibrationOptions) -> Tempera
     )
 
 
-def _robust_search(problem: Problem, start: State, measurements: Measurements) -> Solution[State]:
-    """
-    Search with the robust loss, every image free of the star tracker.
-
-    A star tracker that is said to be better than it is would bend the camera to its attitudes, and
-    then seem to be right.
-    """
-    if problem.method == 'hierarchical':
-        try:
-            free = dataclasses.replace(problem, method='per_image')
-            solution = minimise(free, start, measurements, _ROBUST_SCALE)
-            return dataclasses.replace(solution, state=_with_slope(problem, solution.state))
-        except NotObservable:
-            pass  # so few stars that they need the star tracker
-    return minimise(problem, start, measurements, _ROBUST_SCALE)
-
-
-def _with_slope(problem: Problem, state: State) -> State:
-    """
-    The state with an alignment rate that its rotations show, where one is estimated.
-
-    Median of the slopes between images: left in, a drift would look like scatter or misfits.
-    """
-    if len(state.rate) == 0:
-        return state
-    eta_rad = attitude_errors(problem, state, state.camera_from_icrf)
-    # The frame turns by what is missing from the star tracker's side.
-    turned = state.camera_from_star_tracker.apply(eta_rad)
-    one, other = np.triu_indices(len(turned), 1)
-    apart_k = problem.above_reference_k[other] - problem.above_reference_k[one]
-    differ = apart_k != 0
-    slopes = (turned[other] - turned[one])[differ] / apart_k[differ, None]
-    return dataclasses.replace(state, rate=state.rate + np.median(slopes, axis=0))
-
-
-def _judge(
-    problem: Problem,
-    state: State,
-    blocks: Floats,
-    terms: LinearTerms | None,
-    table: StarTable,
-    before: _Verdict,
-    given_rad: Floats,
-    options: CalibrationOptions,
-) -> tuple[_Verdict, Measurements]:
-    """
-    Variances and misfits from the residuals at a state that the verdict before has led to.
-
-    With the measurements as the verdict has them, which a search with it needs.
-    """
-    residual_px = _residuals(problem, state, table)
-    variance, tracker_sigma_rad = CentroidVariance(1.0, 0.0), given_rad
-    if options.variance_components:
-        freedom = _freedom(problem, state, blocks, terms, before.kept, before.tracker_sigma_rad)
-        variance = estimate_variance(
-            residual_px, table.covariance_px2, table.magnitude, before.kept, freedom
-        )
-    kept = _fitting(residual_px, table, variance, options)
-    groups = pointing_groups(state.camera_from_icrf, float(state.parameters[0]))
-    repeated = repetition(table, kept, residual_px, groups)
-    del residual_px
-    misfit: Mask = np.zeros(table.image_count, bool)
-    weighted = variance.of(table.covariance_px2, table.magnitude) * repeated[:, None]
-    measurements = arrange(table, kept, weighted)
-    variation = ImageVariation()
-    # One rotation for all has no attitude of an image to judge.
-    if problem.method != 'single':
-        # By the stars that fit: one that does not turns an image of few by more than the tracker.
-        _, blocks = image_blocks(problem, state, measurements)
-        eta_rad, covariance_rad2, seen = attitudes_of_stars_alone(problem, state, blocks)
-        fitted = 2 if len(state.rate) else 1  # mean of the attitudes, and slope
-        found_rad, misfit = estimate_star_tracker_sigma(
-            eta_rad, covariance_rad2, seen, given_rad, fitted
-        )
-        if options.variance_components:
-            tracker_sigma_rad = found_rad
-            variation = image_variation(blocks, state.shapes)
-    verdict = _Verdict(variance, tracker_sigma_rad, misfit, kept, repeated, variation)
-    return verdict, measurements
-
-
-def _fitting(
-    residual_px: Floats, table: StarTable, variance: CentroidVariance, options: CalibrationOptions
-) -> Mask:
-    """
-    Return (n,) which stars are used.
-
-    Not an outlier; not a star that is one in most of its images, or whose residuals together are
-    too large (a wrong catalog place, a planet); and in an image that has enough of the others.
-    """
-    length2 = squared_sigmas(residual_px, variance.of(table.covariance_px2, table.magnitude))
-    fits = length2 < options.outlier_sigma**2
-    star = table.star
-    sightings = np.bincount(star)
-    misses = np.bincount(star, ~fits)
-    summed = np.bincount(star, np.where(fits, length2, 0.0))
-    bad_star = (2 * misses > sightings) | (summed > chdtri(2 * sightings, _STAR_CHANCE))
-    fits &= ~(bad_star & (sightings >= _FEWEST_SIGHTINGS))[star]
-    left = np.bincount(table.image[fits], minlength=table.image_count)
-    return np.asarray(fits & (left[table.image] >= FEWEST_STARS))
-
-
-def _dropped(table: StarTable, kept: Mask) -> NDArray[np.int64]:
-    """Catalog stars that were seen often enough to be told apart, and left out of all images."""
-    catalog_id, star = np.unique(table.catalog_id, return_inverse=True)
-    sightings, uses = np.bincount(star), np.bincount(star, kept)
-    return np.asarray(catalog_id[(sightings >= _FEWEST_SIGHTINGS) & (uses == 0)])
-
-
-def _residuals(problem: Problem, state: State, table: StarTable) -> Floats:
-    rotations = state.camera_from_icrf.as_matrix()
-    return residuals_px(
-        table,
-        problem.model,
-        image_parameters(problem, state),
-        rotations,
-        image_field(problem, state),
-    )
-
-
 def _in_coefficients(problem: Problem, covariance: Floats, rows: NDArray[np.int64]) -> Floats:
     """Some rows of a covariance, the modes of a field at its end turned into coefficients."""
     chosen = covariance[np.ix_(rows, rows)]
@@ -854,45 +346,6 @@ def _in_coefficients(problem: Problem, covariance: Floats, rows: NDArray[np.int6
     to_coefficients[:k, :k] = np.eye(k)
     to_coefficients[k:, k:] = modes
     return np.asarray(to_coefficients @ chosen @ to_coefficients.T)
-
-
-def _freedom(
-    problem: Problem,
-    state: State,
-    blocks: Floats,
-    terms: LinearTerms | None,
-    kept: Mask,
-    tracker_sigma_rad: Floats,
-) -> float:
-    """
-    Share of the residuals' degrees of freedom that the fit leaves.
-
-    An attitude that the star tracker holds costs less than three: with P the covariance from the
-    stars and T the star tracker's, trace(T (T + P)^-1).  So does a mode of the field that its
-    prior holds: one less its posterior variance; and the shape of an image.
-    """
-    unknowns = float(len(problem.free) + len(state.focal) + len(state.rate))
-    unknowns += shape_unknowns(problem, state, blocks)
-    if terms is not None:
-        without = dataclasses.replace(problem, field_prior=None)
-        shown = score_of(without, state, blocks, None, terms).information
-        unknowns += len(shown) - float(np.trace(np.linalg.inv(shown + np.eye(len(shown)))))
-    if problem.method == 'single':
-        unknowns += 3
-    else:
-        _, P, seen = attitudes_of_stars_alone(problem, state, blocks)
-        if problem.method == 'per_image':
-            unknowns += 3 * int(np.count_nonzero(seen))
-        else:
-            T = np.diag(tracker_sigma_rad**2)
-            total = T + P[seen]
-            # numpy 1 reads a single matrix beside a stack of them as a stack of vectors.
-            held = np.linalg.solve(total, np.broadcast_to(T, total.shape))
-            unknowns += float(np.trace(held, axis1=1, axis2=2).sum())
-    share = 1.0 - unknowns / (2 * max(int(np.count_nonzero(kept)), 1))
-    if share <= 0:
-        raise NotObservable('fewer residuals than unknowns')
-    return share
 
 
 def _result(

@@ -7,7 +7,8 @@ import math
 
 from starcal_ros.camera import convert
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate, estimate_calibration
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.lens import COEFFICIENTS
 from starcal_ros.records import CameraGeometry, Ensemble
 

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 
 from starcal_ros.arrays import Pixels
-from starcal_ros.assessment.gate import check_gate_options, GateOptions
 from starcal_ros.camera import convert
 from starcal_ros.errors import OptionError
-from starcal_ros.estimation.calibrate import CalibrationOptions, check_options
+from starcal_ros.estimation.options import CalibrationOptions, check_options
+from starcal_ros.gate.options import check_gate_options, GateOptions
 from starcal_ros.identification.star_finder import IdentificationOptions
 from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.image.frame_checks import ScreeningOptions

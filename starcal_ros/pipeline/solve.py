@@ -9,7 +9,6 @@ import math
 import numpy as np
 
 from starcal_ros.assessment.agreement import compare_halves
-from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.assessment.observability import (
     correlation,
@@ -23,13 +22,10 @@ from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import ros_fit
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.detector_field import DetectorField
-from starcal_ros.estimation.calibrate import (
-    CalibrationOptions,
-    Estimate,
-    estimate_calibration,
-    estimated_parameters,
-)
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.lens_choice import estimate_with_smallest_lens
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
+from starcal_ros.gate.judgement import judge, reasons_of
 from starcal_ros.options import check_value
 from starcal_ros.pipeline.provenance import provenance_of
 from starcal_ros.pipeline.setup import Setup

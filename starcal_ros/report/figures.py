@@ -29,7 +29,7 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import OptionError, ProductError
-from starcal_ros.estimation.normal_equations import whitening
+from starcal_ros.least_squares.normal_equations import whitening
 from starcal_ros.records import CameraGeometry, DetectorMaps, TermRemoval
 from starcal_ros.report.term_removal_figure import curves_of, plot_curves
 

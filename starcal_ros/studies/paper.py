@@ -23,8 +23,8 @@ from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.normal_equations import squared_sigmas, star_table
-from starcal_ros.estimation.problem import METHODS
+from starcal_ros.least_squares.normal_equations import squared_sigmas, star_table
+from starcal_ros.methods.problem import METHODS
 from starcal_ros.pipeline.observe import observe
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Ensemble, StarObservations, TermRemoval

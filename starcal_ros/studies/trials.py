@@ -23,8 +23,9 @@ from starcal_ros.assessment.agreement import (
 from starcal_ros.assessment.observability import GRID, line_of_sight_sigma_arcsec, map_sigma_px
 from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import CalibrationOptions, Estimate, estimated_parameters
-from starcal_ros.estimation.normal_equations import arrange, normal_blocks, star_table
+from starcal_ros.estimation.calibrate import Estimate
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
+from starcal_ros.least_squares.normal_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.simulation.scenario import Scenario, scenario
 

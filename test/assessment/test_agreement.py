@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.assessment.agreement import chi_squared, compare_halves, difference, movement
 from starcal_ros.camera import project
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.studies.trials import (
     calibration_options,

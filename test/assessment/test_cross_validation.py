@@ -14,8 +14,8 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.cross_validation import cross_validation, predicted_residuals
 from starcal_ros.camera import project
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.normal_equations import arrange, whitening
-from starcal_ros.estimation.problem import field_terms, image_blocks
+from starcal_ros.least_squares.normal_equations import arrange, whitening
+from starcal_ros.methods.problem import field_terms, image_blocks
 from starcal_ros.records import Ensemble, ResidualBin
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import Scenario

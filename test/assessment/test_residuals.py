@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
-from starcal_ros.estimation.calibrate import CalibrationOptions, estimate_calibration
+from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.products.residuals_npz import read_residuals, write_residuals
 from starcal_ros.simulation import centroids as simulated_centroids
 from starcal_ros.simulation import scenario

@@ -18,12 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.calibrate import (
-    CalibrationOptions,
-    Estimate,
-    estimate_calibration,
-    estimated_parameters,
-)
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.records import Ensemble
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario

@@ -13,14 +13,9 @@ from scipy.stats import chi2
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation.calibrate import (
-    CalibrationOptions,
-    check_enough,
-    Estimate,
-    estimate_calibration,
-    estimated_parameters,
-)
-from starcal_ros.estimation.problem import METHODS
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions, check_enough, estimated_parameters
+from starcal_ros.methods.problem import METHODS
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.simulation.centroids import bound_names, cramer_rao_covariance, true_observations
 from starcal_ros.simulation.scenario import scenario

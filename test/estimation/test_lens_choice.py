@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from starcal_ros.camera import convert, line_of_sight, pixel_grid, project
-from starcal_ros.estimation.calibrate import CalibrationOptions
 from starcal_ros.estimation.lens_choice import estimate_with_smallest_lens
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import Scenario
 

@@ -11,13 +11,9 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.assessment.observability import line_of_sight_sigma_arcsec, map_error_px
 from starcal_ros.camera import CameraModel, project_jacobians
 from starcal_ros.errors import OptionError
-from starcal_ros.estimation.calibrate import (
-    CalibrationOptions,
-    Estimate,
-    estimate_calibration,
-    estimated_parameters,
-)
-from starcal_ros.estimation.normal_equations import arrange, normal_blocks, star_table
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
+from starcal_ros.least_squares.normal_equations import arrange, normal_blocks, star_table
 from starcal_ros.lens import COEFFICIENTS
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.simulation.centroids import true_observations

@@ -20,8 +20,8 @@ from sample_records import (  # type: ignore[import-not-found]
 
 from starcal_ros.bag.typestore import make_message, typestore
 from starcal_ros.camera import line_of_sight, project
-from starcal_ros.estimation import levenberg_marquardt
-from starcal_ros.estimation.calibrate import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.least_squares import levenberg_marquardt
 from starcal_ros.messages.calibration import (
     alignment_to_message,
     calibration_from_message,

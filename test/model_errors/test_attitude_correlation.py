@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.arrays import Floats
-from starcal_ros.estimation.attitude_correlation import attitude_correlation
+from starcal_ros.model_errors.attitude_correlation import attitude_correlation
 
 MINUTE_NS = 60_000_000_000
 SIGMA_RAD = 1e-4

@@ -191,7 +191,7 @@ def estimate_star_tracker_sigma(
     Parameters
     ----------
     eta_rad, covariance_rad2, seen : (m, 3), (m, 3, 3), (m,)
-        Attitude errors from the stars alone (`problem.attitudes_of_stars_alone`).
+        Attitude errors from the stars alone (`image_unknowns.attitudes_of_stars_alone`).
     given_rad : (3,)
         Assumed 1-sigma; returned unchanged where fewer than three images have enough stars.
     fitted : int

@@ -18,14 +18,10 @@ from starcal_ros.assessment.observability import (
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
-from starcal_ros.estimation import temperature
-from starcal_ros.estimation.calibrate import (
-    CalibrationOptions,
-    Estimate,
-    estimate_calibration,
-    estimated_parameters,
-)
-from starcal_ros.estimation.problem import METHODS
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
+from starcal_ros.methods.problem import METHODS
+from starcal_ros.model_errors import temperature
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     CameraGeometry,

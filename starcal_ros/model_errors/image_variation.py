@@ -20,8 +20,8 @@ import numpy as np
 from scipy.special import chdtrc
 
 from starcal_ros.arrays import Floats
-from starcal_ros.estimation.levenberg_marquardt import inverse
-from starcal_ros.estimation.normal_equations import CAMERA, RESIDUAL, ROTATION
+from starcal_ros.least_squares.levenberg_marquardt import inverse
+from starcal_ros.least_squares.normal_equations import CAMERA, RESIDUAL, ROTATION
 
 _P_VALUE = 1e-2  # below which the images differ; a sound camera loses little if they do not
 _FEWEST_IMAGES = 4

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import CameraModel, project, project_jacobians
-from starcal_ros.estimation.normal_equations import (
+from starcal_ros.least_squares.normal_equations import (
     arrange,
     CAMERA,
     normal_blocks,

@@ -12,16 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import parameter_names
-from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
-from starcal_ros.estimation.linear_terms import LinearTerms
-from starcal_ros.estimation.problem import (
+from starcal_ros.least_squares.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.least_squares.linear_terms import LinearTerms
+from starcal_ros.methods.assembly import (
     border_of,
     by_shared,
-    Problem,
     reduced_information,
-    State,
     with_shape_prior,
 )
+from starcal_ros.methods.problem import Problem, State
 from starcal_ros.records import ALIGNMENT_NAMES
 
 

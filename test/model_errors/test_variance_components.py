@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starcal_ros.estimation.variance_components import CentroidVariance, estimate_variance
+from starcal_ros.model_errors.variance_components import CentroidVariance, estimate_variance
 
 
 def covariance_of(own: np.ndarray) -> np.ndarray:

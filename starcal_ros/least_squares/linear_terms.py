@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.detector_field import DetectorField
-from starcal_ros.estimation.levenberg_marquardt import inverse, NormalEquations, NotObservable
-from starcal_ros.estimation.normal_equations import Measurements, whitened_chunks
+from starcal_ros.least_squares.levenberg_marquardt import inverse, NormalEquations, NotObservable
+from starcal_ros.least_squares.normal_equations import Measurements, whitened_chunks
 
 Displacement = Callable[[Floats, Floats, NDArray[np.int64]], Floats]
 """Displacements (2, q, n) px of q unit terms, from pixels (2, n), directions in the camera frame

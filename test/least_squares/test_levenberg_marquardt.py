@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from starcal_ros.estimation.levenberg_marquardt import (
+from starcal_ros.least_squares.levenberg_marquardt import (
     covariance,
     levenberg_marquardt,
     NormalEquations,

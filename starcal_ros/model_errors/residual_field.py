@@ -35,7 +35,7 @@ from starcal_ros.camera import (
     project_jacobians,
 )
 from starcal_ros.detector_field import basis, degrees, DetectorField, legendre
-from starcal_ros.estimation.linear_terms import Scalars, Score
+from starcal_ros.least_squares.linear_terms import Scalars, Score
 
 TEST_DEGREE = 10
 _MAX_DEGREE = 18

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Mask
-from starcal_ros.estimation.normal_equations import StarTable
+from starcal_ros.least_squares.normal_equations import StarTable
 
 _SAME_PX = 1.0  # movement of a star from image to image below which a pointing is the same
 

@@ -1,0 +1,151 @@
+"""Options of a calibration, and whether an ensemble is enough for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from starcal_ros.camera import ALL_PARAMETER_NAMES, parameter_names
+from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.lens import COEFFICIENTS
+from starcal_ros.methods.problem import METHODS
+from starcal_ros.options import option
+from starcal_ros.records import Ensemble
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """What is estimated, and how."""
+
+    method: str = option(
+        'hierarchical', 'how the attitudes of the images are treated', choices=METHODS
+    )
+    estimate: tuple[str, ...] = option(
+        ('fx', 'skew', 'fy', 'cx', 'cy', 'distortion'),
+        'camera parameters that are estimated; the others are held at the prior; distortion: all'
+        ' coefficients of the lens model',
+        choices=(*ALL_PARAMETER_NAMES, 'distortion'),
+    )
+    star_tracker_sigma_arcsec: tuple[float, ...] = option(
+        (10.0, 10.0, 10.0),
+        '1-sigma of the star tracker attitude about its x, y, z axes, arcsec',
+        low=1e-3,
+        high=3600.0,
+        length=3,
+    )
+    min_images: int = option(
+        3, 'fewest images from which a calibration is made', low=1, high=100000
+    )
+    min_stars: int = option(
+        60, 'fewest star observations from which a calibration is made', low=10, high=1000000
+    )
+    max_images: int = option(
+        400, 'most images kept; beyond it those that add least information go', low=3, high=100000
+    )
+    outlier_sigma: float = option(
+        4.5,
+        'length of a residual, in its sigma, from which a star is left out',
+        low=3.0,
+        high=20.0,
+    )
+    prior_sigma: tuple[float, ...] = option(
+        (0.0,),
+        '1-sigma of the prior of fx, skew, fy, cx, cy (px) and of the coefficients of the lens'
+        ' model, or one number for all; 0: of one that is estimated, nothing is known; of one that'
+        ' is held, it is taken as exact',
+        low=0.0,
+    )
+    principal_point_prior: float = option(
+        0.03,
+        '1-sigma of the prior of cx and cy where prior_sigma gives none, as a fraction of the'
+        ' longer side of the image; 0: none',
+        low=0.0,
+        high=1.0,
+    )
+    variance_components: bool = option(
+        True, 'estimate the sigmas of centroids and star tracker again from the residuals'
+    )
+    residual_field: bool = option(
+        True,
+        'estimate a smooth field over the detector beside the lens model where stars show one',
+    )
+    max_field_p_value: float = option(
+        0.01,
+        'p-value of no field below which one is estimated',
+        low=0.0,
+        high=1.0,
+    )
+    focal_temperature_order: int = option(
+        0, 'degree of the polynomial of focal length in temperature; 0: none', low=0, high=2
+    )
+    alignment_temperature: bool = option(
+        False, 'alignment linear in temperature; not with the method per_image'
+    )
+    reference_temperature_degc: float = option(
+        20.0,
+        'temperature at which camera and alignment are reported where they change with it, degC',
+        low=-273.15,
+        high=1000.0,
+    )
+
+
+def check_options(options: CalibrationOptions, model: str) -> None:
+    """
+    Raise `OptionError` for options that do not go together, or not with a lens model.
+
+    Raises
+    ------
+    OptionError
+        Naming the option.
+    """
+    if options.alignment_temperature and options.method == 'per_image':
+        # Its mean of the images' alignments has no place for a slope: `hierarchical` with a loose
+        # star tracker is the same estimate with one.
+        raise OptionError('alignment_temperature: the method per_image has no common alignment')
+    names = parameter_names(model)
+    for name in estimated_parameters(options, model):
+        if name not in names:
+            raise OptionError(
+                f'estimate: {name} is not a parameter of the lens model {model}, which has '
+                + ', '.join(names)
+            )
+    if len(options.prior_sigma) not in (1, len(names)):
+        raise OptionError(
+            f'prior_sigma: {len(options.prior_sigma)} numbers, but the lens model {model} has '
+            f'{len(names)} parameters: {", ".join(names)}'
+        )
+
+
+def estimated_parameters(options: CalibrationOptions, model: str) -> tuple[str, ...]:
+    """Names of the camera parameters that ``estimate`` asks for, of a lens model."""
+    return tuple(
+        name
+        for asked in options.estimate
+        for name in (COEFFICIENTS[model] if asked == 'distortion' else (asked,))
+    )
+
+
+def check_enough(ensemble: Ensemble, options: CalibrationOptions) -> None:
+    """
+    Raise `TooFewObservations` that says how many images or stars are missing.
+
+    Raises
+    ------
+    TooFewObservations
+        A sentence for a person.
+    """
+    images, stars = len(ensemble.images), ensemble.star_count
+    missing = []
+    if images < options.min_images:
+        missing.append(
+            f'{options.min_images - images} more images are needed '
+            f'({images} of {options.min_images} collected)'
+        )
+    if stars < options.min_stars:
+        missing.append(
+            f'{options.min_stars - stars} more stars are needed '
+            f'({stars} of {options.min_stars} collected)'
+        )
+    if missing:
+        refused = sum(ensemble.refused.values())
+        also = f'; {refused} images were refused' if refused else ''
+        raise TooFewObservations('too few observations: ' + ' and '.join(missing) + also)

@@ -1,0 +1,263 @@
+"""
+The search of a calibration.
+
+Robust from the prior, then least squares on the stars that fit, with the variances of centroids
+and star tracker estimated again and the misfits left out, until nothing changes; then, where the
+stars show one, with a field beside the lens model.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.detector_field import in_degree
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.verdict import arranged, judge_residuals, Verdict
+from starcal_ros.least_squares.levenberg_marquardt import NotObservable, Solution
+from starcal_ros.least_squares.linear_terms import Score
+from starcal_ros.least_squares.normal_equations import Measurements, StarTable
+from starcal_ros.methods.assembly import score_of
+from starcal_ros.methods.attitude_errors import attitude_errors
+from starcal_ros.methods.minimise import minimise
+from starcal_ros.methods.problem import (
+    field_terms,
+    image_blocks,
+    image_field,
+    Problem,
+    scalar_terms_at,
+    State,
+)
+from starcal_ros.model_errors.image_variation import ImageVariation, shape_modes
+from starcal_ros.model_errors.residual_field import (
+    best_prior,
+    degree_for,
+    FieldPrior,
+    NO_WAVES,
+    polynomials,
+    sees_detector,
+    TEST_DEGREE,
+    Waves,
+)
+from starcal_ros.model_errors.variance_components import CentroidVariance
+
+_ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
+_START_FLOOR_PX = 0.05  # until the residuals tell: of the order of what is left in good images
+_FIELD_ROUNDS = 6  # its prior and the variances settle in two or three
+_ROUNDS = 10  # the set of rejected stars settles in two or three
+
+
+def search(
+    problem: Problem,
+    start: State,
+    table: StarTable,
+    camera: CameraModel,
+    options: CalibrationOptions,
+) -> Found:
+    """
+    Return where the search ends: robust, then least squares with snooping, with a field if needed.
+
+    ``camera`` is the prior camera.
+
+    Raises
+    ------
+    NotObservable
+        When the stars do not determine all unknowns.
+    """
+    everything = np.ones(len(table), bool)
+    given_rad = problem.star_tracker_sigma_rad[0]
+    verdict = Verdict(
+        CentroidVariance(1.0, _START_FLOOR_PX**2),
+        given_rad,
+        np.zeros(table.image_count, bool),
+        everything,
+        np.ones(len(table)),
+        ImageVariation(),
+    )
+    measurements = arranged(table, verdict)
+    solution = _robust_search(problem, start, measurements)
+    _, blocks = image_blocks(problem, solution.state, measurements)
+    del measurements  # before the next: they are as large as the table
+    verdict, measurements = judge_residuals(
+        problem, solution.state, blocks, None, table, verdict, given_rad, options
+    )
+    found = _settle(
+        Found(problem, solution, verdict, solution.iterations), measurements, table, options
+    )
+    del measurements
+    return _with_field(found, table, camera, options)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where a search stands: its problem, its minimum, and the verdict that it was made with."""
+
+    problem: Problem
+    solution: Solution[State]
+    verdict: Verdict
+    iterations: int
+    field_test: FieldPrior | None = None
+
+
+def _settle(
+    found: Found, measurements: Measurements, table: StarTable, options: CalibrationOptions
+) -> Found:
+    """Least squares and judgement of its residuals in turns, until the judgement stands."""
+    problem, solution = found.problem, found.solution
+    given_rad = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
+    iterations, after = found.iterations, found.verdict
+    for _ in range(_ROUNDS):
+        verdict = after
+        problem, state = _with_shapes(problem, solution.state, verdict.variation)
+        problem = dataclasses.replace(
+            problem,
+            star_tracker_sigma_rad=np.where(
+                verdict.misfit[:, None], np.inf, verdict.tracker_sigma_rad
+            ),
+        )
+        solution = minimise(problem, state, measurements)
+        iterations += solution.iterations
+        _, blocks = image_blocks(problem, solution.state, measurements)
+        terms = field_terms(problem, solution.state, measurements)
+        after, measurements = judge_residuals(
+            problem, solution.state, blocks, terms, table, verdict, given_rad, options
+        )
+        del blocks
+        if after.agrees_with(verdict):
+            break
+    return dataclasses.replace(
+        found, problem=problem, solution=solution, verdict=verdict, iterations=iterations
+    )
+
+
+def _with_shapes(
+    problem: Problem, state: State, variation: ImageVariation
+) -> tuple[Problem, State]:
+    """Problem and state with a shape of each image where the images differ, without elsewhere."""
+    sigma_px = np.array(variation.amplitude_sigma_px)
+    modes: Floats = np.empty((0, 0))
+    shapes: Floats = np.empty((0, 0))
+    if len(sigma_px):
+        modes, shapes = shape_modes(problem.camera_count), state.shapes
+        if not shapes.size:
+            shapes = np.zeros((len(state.camera_from_icrf), len(sigma_px)))
+    return (
+        dataclasses.replace(problem, shape_modes=modes, shape_sigma_px=sigma_px),
+        dataclasses.replace(state, shapes=shapes),
+    )
+
+
+def _with_field(
+    found: Found, table: StarTable, camera: CameraModel, options: CalibrationOptions
+) -> Found:
+    """The search with a field beside the lens model, where the stars show one."""
+    plain = found
+    best = _field_prior(found, table, camera, TEST_DEGREE)
+    if best is None:
+        return plain
+    found = plain = dataclasses.replace(found, field_test=best)
+    if not options.residual_field or best.p_value > options.max_field_p_value:
+        return plain
+    degree = degree_for(best)
+    best = _field_prior(found, table, camera, degree, waves=None)
+    for k in range(_FIELD_ROUNDS):
+        if best is None:
+            return plain
+        found = _settle(_started(found, best), arranged(table, found.verdict), table, options)
+        # A smoother kernel of a larger amplitude needs the same degree.
+        degree = max(degree, degree_for(best))
+        # The first search was among residuals whose variance held the field.
+        waves = best.waves if k else None
+        again = _field_prior(found, table, camera, degree, waves)
+        if again is not None and k and again.is_close_to(best):
+            break
+        best = again
+    return found if best is not None else plain
+
+
+def _started(found: Found, prior: FieldPrior) -> Found:
+    """The search with another prior of the field, from the field that there is."""
+    before, state = image_field(found.problem, found.solution.state), found.solution.state
+    modes: Floats = np.zeros(prior.modes.shape[1])
+    if before is not None:
+        coefficients = in_degree(before, prior.degree)
+        modes = np.asarray(np.linalg.lstsq(prior.modes, coefficients, rcond=1e-9)[0])
+    return dataclasses.replace(
+        found,
+        problem=dataclasses.replace(found.problem, field_prior=prior),
+        solution=dataclasses.replace(
+            found.solution, state=dataclasses.replace(state, modes=modes)
+        ),
+    )
+
+
+def _field_prior(
+    found: Found,
+    table: StarTable,
+    camera: CameraModel,
+    degree: int,
+    waves: Waves | None = NO_WAVES,
+) -> FieldPrior | None:
+    """
+    The prior of a field that the residuals at a minimum ask for, in polynomials of a degree.
+
+    None where the lens model has lines of sight for a small part of the detector only.
+    """
+    problem, state = found.problem, found.solution.state
+    camera = dataclasses.replace(camera, parameters=state.parameters, field=None)
+    if not sees_detector(camera):
+        return None
+    measurements = arranged(table, found.verdict)
+    _, blocks = image_blocks(problem, state, measurements)
+    terms = scalar_terms_at(
+        problem, state, measurements, polynomials(camera.width, camera.height, degree)
+    )
+    # The field that there is, if any, is part of what the residuals are asked for.
+    without = dataclasses.replace(problem, field_prior=None)
+    shown = score_of(without, state, blocks, None, terms)
+    now = image_field(problem, state)
+    if now is not None:
+        coefficients = in_degree(now, degree)
+        gradient = shown.gradient + shown.information @ coefficients
+        shown = Score(gradient, shown.information)
+    return best_prior(shown, camera, problem.free, degree, waves)
+
+
+def _robust_search(problem: Problem, start: State, measurements: Measurements) -> Solution[State]:
+    """
+    Search with the robust loss, every image free of the star tracker.
+
+    A star tracker that is said to be better than it is would bend the camera to its attitudes, and
+    then seem to be right.
+    """
+    if problem.method == 'hierarchical':
+        try:
+            free = dataclasses.replace(problem, method='per_image')
+            solution = minimise(free, start, measurements, _ROBUST_SCALE)
+            return dataclasses.replace(solution, state=_with_slope(problem, solution.state))
+        except NotObservable:
+            pass  # so few stars that they need the star tracker
+    return minimise(problem, start, measurements, _ROBUST_SCALE)
+
+
+def _with_slope(problem: Problem, state: State) -> State:
+    """
+    The state with an alignment rate that its rotations show, where one is estimated.
+
+    Median of the slopes between images: left in, a drift would look like scatter or misfits.
+    """
+    if len(state.rate) == 0:
+        return state
+    eta_rad = attitude_errors(problem, state, state.camera_from_icrf)
+    # The frame turns by what is missing from the star tracker's side.
+    turned = state.camera_from_star_tracker.apply(eta_rad)
+    one, other = np.triu_indices(len(turned), 1)
+    apart_k = problem.above_reference_k[other] - problem.above_reference_k[one]
+    differ = apart_k != 0
+    slopes = (turned[other] - turned[one])[differ] / apart_k[differ, None]
+    return dataclasses.replace(state, rate=state.rate + np.median(slopes, axis=0))

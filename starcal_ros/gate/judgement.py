@@ -1,0 +1,287 @@
+"""The gate: the limits that a calibration must meet to become active, and the checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import dataclasses
+import math
+
+import numpy as np
+
+from starcal_ros.assessment.agreement import Difference, difference, movement
+from starcal_ros.assessment.observability import map_sigma_px
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.gate.model import model_gate
+from starcal_ros.gate.options import GateOptions, limit_check
+from starcal_ros.records import Calibration, CameraGeometry, GateCheck, HalvesComparison
+
+
+def judge(
+    calibration: Calibration,
+    prior: CameraGeometry,
+    active: Calibration | None,
+    options: GateOptions,
+    estimation: CalibrationOptions,
+) -> tuple[GateCheck, ...]:
+    """
+    The checks of the gate on a calibration, each with the value found and whether it passed.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        With its `DetectorMaps`; its verdict is not used.
+    prior : CameraGeometry
+        Camera and alignment before the calibration.
+    active : Calibration or None
+        The calibration that this one would replace.
+    estimation : CalibrationOptions
+        The options of the calibration; they hold some of the limits.
+
+    Returns
+    -------
+    tuple of GateCheck
+        Only the first two where a parameter or a variance is not finite: all others use them.
+
+    Raises
+    ------
+    ValueError
+        When the calibration has no maps.
+    """
+    checks = (_solver(calibration), _numbers(calibration))
+    if not checks[-1].passed:
+        return checks
+    return (
+        *checks,
+        *_fit(calibration, options, estimation),
+        *_halves(calibration.halves, options),
+        *model_gate(calibration.model_checks, options, estimation),
+        *_precision(calibration, options),
+        *_changes(calibration, prior, active, options),
+    )
+
+
+def reasons_of(checks: Iterable[GateCheck]) -> tuple[str, ...]:
+    """A sentence for each check that failed; empty where none did."""
+    return tuple(_reason(check) for check in checks if check.passed is False)
+
+
+def _reason(check: GateCheck) -> str:
+    if not check.option:
+        return check.note
+    side = 'under' if check.is_least else 'over'
+    note = f'; {check.note}' if check.note else ''
+    return (
+        f'{check.name} is {check.found_text}, {side} the limit of {check.limit_text} '
+        f'({check.option}){note}'
+    )
+
+
+def _solver(calibration: Calibration) -> GateCheck:
+    passed = calibration.termination == 'converged'
+    note = '' if passed else f'the solver did not converge ({calibration.termination})'
+    return GateCheck('solver converged', '', math.nan, math.nan, '', passed, note)
+
+
+def _numbers(calibration: Calibration) -> GateCheck:
+    values = np.concatenate(
+        [
+            calibration.geometry.camera.parameters,
+            calibration.geometry.star_tracker_from_camera_xyzw,
+            calibration.covariance.ravel(),
+        ]
+    )
+    note = ''
+    if not np.isfinite(values).all():
+        note = 'a parameter or its covariance is not a finite number'
+    elif (np.diag(calibration.covariance) < 0).any():
+        note = 'a variance is negative'
+    name = 'numbers finite, variances positive'
+    return GateCheck(name, '', math.nan, math.nan, '', not note, note)
+
+
+def _fit(
+    calibration: Calibration, options: GateOptions, estimation: CalibrationOptions
+) -> Iterator[GateCheck]:
+    """Residuals, outliers, and the number of images and stars that fit."""
+    stars = max(calibration.stars_used + calibration.stars_rejected, 1)
+    images, misfits = calibration.images_used, len(calibration.misfit_images_ns)
+    assumed_arcsec = np.array(estimation.star_tracker_sigma_arcsec)
+    estimated_arcsec = np.array(calibration.star_tracker_sigma_arcsec)
+    yield limit_check(
+        options, 'max_residual_rms_px', 'residual per axis', calibration.residual_rms_px, 'px'
+    )
+    yield limit_check(
+        options,
+        'max_rejected_fraction',
+        'fraction of stars left out as outliers',
+        calibration.stars_rejected / stars,
+    )
+    yield limit_check(
+        options,
+        'max_misfit_fraction',
+        'fraction of images whose attitude does not fit',
+        misfits / max(images, 1),
+    )
+    yield limit_check(estimation, 'min_images', 'number of images that fit', images - misfits)
+    yield limit_check(estimation, 'min_stars', 'number of stars that fit', calibration.stars_used)
+    yield limit_check(
+        options,
+        'max_star_tracker_excess',
+        'largest ratio of estimated to assumed star-tracker sigma',
+        float((estimated_arcsec / assumed_arcsec).max()),
+    )
+
+
+def _halves(halves: HalvesComparison | None, options: GateOptions) -> Iterator[GateCheck]:
+    """Agreement of the calibrations of the earlier and of the later images."""
+    halves = halves or HalvesComparison(note='not recorded')
+    for name, parameter, found, unit, p_value in (
+        (
+            'change of the distortion map between the halves of the images',
+            'max_halves_px',
+            halves.shape_px,
+            'px',
+            halves.shape_p_value,
+        ),
+        (
+            'rotation between the halves of the images',
+            'max_halves_rotation_arcsec',
+            halves.rotation_arcsec,
+            'arcsec',
+            halves.p_value,
+        ),
+    ):
+        check = limit_check(options, parameter, name, halves.note or found, unit)
+        if check.passed is None:
+            yield check
+            continue
+        likely = p_value >= options.min_halves_p_value
+        note = (
+            f'the p-value is {p_value:.1g}, {"at least" if likely else "under"} '
+            f'{options.min_halves_p_value:g} (min_halves_p_value)'
+        )
+        yield dataclasses.replace(check, passed=check.passed or likely, note=note)
+
+
+def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateCheck]:
+    """Coverage of the detector and precision of the result."""
+    maps = calibration.maps
+    if maps is None:
+        raise ValueError('calibration: the gate needs its detector maps')
+    yield limit_check(
+        options,
+        'min_coverage',
+        'fraction of the detector with stars that fit',
+        float((maps.stars > 0).mean()),
+    )
+    yield limit_check(
+        options,
+        'max_map_sigma_px',
+        'largest 1-sigma of the distortion map',
+        _map_sigma_px(calibration),
+        'px',
+    )
+    check = limit_check(
+        options,
+        'max_line_of_sight_sigma_arcsec',
+        'largest 1-sigma of a line of sight',
+        float(maps.line_of_sight_sigma_arcsec.max()),
+        'arcsec',
+    )
+    model = calibration.model_checks
+    if model is not None and model.correlation_time_s > 0:
+        note = f'star-tracker errors are correlated over {model.correlation_time_s:.3g} s'
+        check = dataclasses.replace(check, note=note)
+    yield check
+    names = calibration.parameter_names
+    limits = np.broadcast_to(options.max_parameter_sigma, len(names)).tolist()
+    intrinsic, angles = 5, len(calibration.geometry.camera.parameters)
+    for k, (name, sigma, limit) in enumerate(zip(names, calibration.sigma, limits, strict=True)):
+        if limit > 0:
+            unit = 'px' if k < intrinsic else '' if k < angles else 'arcsec'
+            found = float(sigma) / (ARCSECOND_RAD if unit == 'arcsec' else 1.0)
+            yield GateCheck(
+                f'1-sigma of {name}',
+                'max_parameter_sigma',
+                found,
+                limit,
+                unit,
+                found <= limit,
+            )
+    yield limit_check(
+        options,
+        'min_singular_value',
+        'smallest singular value',
+        calibration.singular_values[-1],
+    )
+
+
+def _map_sigma_px(calibration: Calibration) -> float:
+    """Largest 1-sigma of the distortion map; NaN where a pixel has no line of sight."""
+    try:
+        return float(map_sigma_px(calibration.geometry.camera, calibration.joint_covariance).max())
+    except np.linalg.LinAlgError:
+        return math.nan
+
+
+def _changes(
+    calibration: Calibration,
+    prior: CameraGeometry,
+    active: Calibration | None,
+    options: GateOptions,
+) -> Iterator[GateCheck]:
+    """Changes against the prior and against the active calibration."""
+    yield limit_check(
+        options,
+        'max_zero_skew_cost_px',
+        'largest error of camera_info, which has no skew',
+        calibration.zero_skew_cost_px,
+        'px',
+    )
+    rotation_rad, left_px = movement(prior, calibration.geometry)
+    step = _step(active, calibration)
+    no_limit = '' if options.max_step_sigma > 0 else 'no limit is set'
+    of_map, of_sight = 'change of the distortion map', 'rotation of the lines of sight'
+    for parameter, name, found, unit in (
+        ('max_change_px', f'largest {of_map} from the prior', left_px.max(), 'px'),
+        ('max_rotation_deg', f'{of_sight} from the prior', math.degrees(rotation_rad), 'deg'),
+        (
+            'max_step_px',
+            f'largest {of_map} from the active calibration',
+            step if isinstance(step, str) else step.shape_px,
+            'px',
+        ),
+        (
+            'max_step_rotation_deg',
+            f'{of_sight} from the active calibration',
+            step if isinstance(step, str) else math.degrees(step.rotation_rad),
+            'deg',
+        ),
+        (
+            'max_step_sigma',
+            'change of the estimated parameters from the active calibration',
+            no_limit or (step if isinstance(step, str) else step.total.rms_sigma),
+            'sigma',
+        ),
+    ):
+        check = limit_check(options, parameter, name, found, unit)
+        if parameter == 'max_change_px' and check.passed is False:
+            note = 'the prior camera or its lens model is not of this lens (lens_model)'
+            check = dataclasses.replace(check, note=note)
+        yield check
+
+
+def _step(active: Calibration | None, calibration: Calibration) -> Difference | str:
+    """Difference from the active calibration over the parameters that both estimate."""
+    if active is None:
+        return 'no calibration was active'
+    if active.geometry.camera.model != calibration.geometry.camera.model:
+        return f'the active calibration has the lens model {active.geometry.camera.model}'
+    return difference(
+        active.geometry,
+        active.covariance,
+        calibration.geometry,
+        calibration.covariance,
+        tuple(name for name in calibration.estimated if name in active.estimated),
+    )

@@ -1,0 +1,1 @@
+"""Residuals of stars, their normal equations and the solver."""

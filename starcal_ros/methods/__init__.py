@@ -1,0 +1,1 @@
+"""The three methods of calibration as least-squares problems."""

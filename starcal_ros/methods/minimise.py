@@ -1,0 +1,80 @@
+"""The state of least cost of a calibration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Floats
+from starcal_ros.least_squares.levenberg_marquardt import (
+    levenberg_marquardt,
+    NormalEquations,
+    Solution,
+)
+from starcal_ros.least_squares.normal_equations import Measurements
+from starcal_ros.methods.assembly import assemble
+from starcal_ros.methods.problem import (
+    field_terms,
+    image_alignment,
+    image_blocks,
+    Problem,
+    State,
+)
+
+
+def minimise(
+    problem: Problem, start: State, measurements: Measurements, loss_scale: float = np.inf
+) -> Solution[State]:
+    """
+    The state of least cost, by Levenberg-Marquardt.
+
+    ``loss_scale`` is that of `normal_equations.normal_blocks`: infinite is least squares.
+
+    Raises
+    ------
+    NotObservable
+        When the stars do not determine all unknowns.
+    """
+    information: Floats | None = None  # of the modes of the field: the same at every state
+
+    def evaluate(state: State) -> NormalEquations:
+        nonlocal information
+        cost, blocks = image_blocks(problem, state, measurements, loss_scale)
+        if not np.isfinite(cost):
+            return NormalEquations(cost, *(np.empty(0) for _ in range(5)))
+        terms = field_terms(problem, state, measurements, information)
+        information = terms.information if terms else None
+        return assemble(problem, state, cost, blocks, terms)
+
+    def move(state: State, shared: Floats, blocks: Floats) -> State:
+        return _move(problem, state, shared, blocks)
+
+    return levenberg_marquardt(start, evaluate, move)
+
+
+def _move(problem: Problem, state: State, shared: Floats, blocks: Floats) -> State:
+    """Take a step: parameters add, rotations turn (Eq. 11)."""
+    f, q = len(problem.free), len(state.focal)
+    parameters = state.parameters.copy()
+    parameters[problem.free] += shared[:f]
+    r = len(state.modes)
+    last = len(shared) - r
+    focal, turned = state.focal + shared[f : f + q], shared[f + q : last]
+    modes = state.modes + shared[last:]
+    alignment, rotations = state.camera_from_star_tracker, state.camera_from_icrf
+    shapes = state.shapes + blocks[:, 3:] if state.shapes.size else state.shapes
+    if problem.method == 'per_image':
+        rotations = Rotation.from_rotvec(-blocks[:, :3]) * rotations
+        return State(parameters, alignment, rotations, focal, state.rate, modes, shapes)
+    turn = Rotation.from_rotvec(-turned[:3])
+    rate = state.rate + turned[3:]
+    moved = State(parameters, turn * alignment, rotations, focal, rate, modes, shapes)
+    if problem.method == 'hierarchical':
+        rotations = Rotation.from_rotvec(-blocks[:, :3]) * rotations
+    elif len(rate):
+        rotations = image_alignment(problem, moved) * problem.star_tracker_from_icrf
+    else:
+        rotations = turn * rotations
+    return replace(moved, camera_from_icrf=rotations)

@@ -1,0 +1,176 @@
+"""
+The three methods of calibration as least-squares problems (Eqs. 10-19, 25).
+
+- ``per_image`` (the paper's Method 1): every image has its own rotation.
+- ``single`` (Method 2): one rotation for all images, the star tracker taken as perfect.
+- ``hierarchical`` (beyond the paper): one common alignment, and for each image an attitude error
+  of the star tracker's covariance.  The other two are its limits.
+
+With R_k = camera_from_icrf of image k, the attitude error of the star tracker in it is
+``eta_k = -Log(A' R_k T_k')``, a small rotation in the star tracker frame, where A =
+camera_from_star_tracker and T_k = star_tracker_from_icrf as measured.
+
+Where terms of temperature are estimated (`thermal`), parameters and A are those of the image, and
+the derivatives by what is shared follow by the chain rule, one small matrix for each image.  Where
+the shape of the images varies (`image_variation`), each image has changes of fx, skew and fy of
+its own beside its rotation, with a Gaussian prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import parameter_names
+from starcal_ros.detector_field import DetectorField
+from starcal_ros.least_squares.linear_terms import LinearTerms, scalar_terms, Scalars
+from starcal_ros.least_squares.normal_equations import Measurements, normal_blocks
+from starcal_ros.model_errors.residual_field import FieldPrior
+from starcal_ros.model_errors.temperature import parameters_at, turns
+
+METHODS = ('hierarchical', 'per_image', 'single')
+
+
+@dataclass(frozen=True)
+class State:
+    """Where the search stands: camera parameters, alignment and the rotation of every image."""
+
+    parameters: Floats  # (p,)
+    camera_from_star_tracker: Rotation
+    camera_from_icrf: Rotation  # (m,)
+    focal: Floats = field(default_factory=lambda: np.empty(0))  # (q,) terms of temperature
+    rate: Floats = field(default_factory=lambda: np.empty(0))  # (3,) of the alignment, or (0,)
+    modes: Floats = field(default_factory=lambda: np.empty(0))  # (r,) amplitudes of the field
+    # (m, h) amplitudes of the shapes of the images, px of focal length
+    shapes: Floats = field(default_factory=lambda: np.empty((0, 0)))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """
+    What one search is given, for m images.
+
+    Attributes
+    ----------
+    method : str
+    model : str
+        Lens model, of `lens.COEFFICIENTS`; it has p camera parameters.
+    free : (f,) int
+        Camera parameters that are estimated, ascending.
+    prior_parameters, prior_sigma : (p,)
+        Gaussian prior of the camera parameters; infinite sigma: none.
+    star_tracker_from_icrf : Rotation (m,)
+        As measured.
+    star_tracker_sigma_rad : (m, 3)
+        1-sigma of each attitude about the star tracker's axes; infinite: not to be trusted.
+    above_reference_k : (m,)
+        Temperature of each image less the reference; (0,) where no term is estimated.
+    field_prior : FieldPrior or None
+        Of the field that is estimated beside the lens model; None: none is.
+    shape_modes : (p, h)
+        Changes of the camera parameters by which the images differ; h is 0 where they do not.
+    shape_sigma_px : (h,)
+        1-sigma of their amplitudes.
+    """
+
+    method: str
+    model: str
+    free: NDArray[np.int64]
+    prior_parameters: Floats
+    prior_sigma: Floats
+    star_tracker_from_icrf: Rotation
+    star_tracker_sigma_rad: Floats
+    above_reference_k: Floats = field(default_factory=lambda: np.empty(0))
+    field_prior: FieldPrior | None = None
+    shape_modes: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    shape_sigma_px: Floats = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the p camera parameters."""
+        return parameter_names(self.model)
+
+    @property
+    def camera_count(self) -> int:
+        """Number p of the camera parameters."""
+        return len(self.prior_parameters)
+
+
+def image_parameters(problem: Problem, state: State) -> Floats:
+    """Camera parameters: (p,) of all images, or (m, p) where they differ."""
+    if len(state.focal) == 0:
+        own = state.parameters
+    else:
+        own = parameters_at(state.parameters, state.focal, problem.above_reference_k)
+    return own + state.shapes @ problem.shape_modes.T if state.shapes.size else own
+
+
+def image_alignment(problem: Problem, state: State) -> Rotation:
+    """camera_from_star_tracker: of all images, or (m,) where temperature turns it."""
+    if len(state.rate) == 0:
+        return state.camera_from_star_tracker
+    return turns(state.rate, problem.above_reference_k) * state.camera_from_star_tracker
+
+
+def image_blocks(
+    problem: Problem, state: State, measurements: Measurements, loss_scale: float = np.inf
+) -> tuple[float, Floats]:
+    """Cost and the matrices of `normal_equations.normal_blocks` at a state."""
+    return normal_blocks(
+        measurements,
+        problem.model,
+        image_parameters(problem, state),
+        state.camera_from_icrf.as_matrix(),
+        loss_scale,
+        image_field(problem, state),
+    )
+
+
+def image_field(problem: Problem, state: State) -> DetectorField | None:
+    """Field at a state; None where none is estimated."""
+    return problem.field_prior.field(state.modes) if problem.field_prior else None
+
+
+def scalar_terms_at(
+    problem: Problem,
+    state: State,
+    measurements: Measurements,
+    scalars: Scalars,
+    information: Floats | None = None,
+) -> LinearTerms:
+    """Sums of the terms of functions of the pixel at a state."""
+    return scalar_terms(
+        measurements,
+        problem.model,
+        image_parameters(problem, state),
+        state.camera_from_icrf.as_matrix(),
+        scalars,
+        image_field(problem, state),
+        information,
+    )
+
+
+def field_terms(
+    problem: Problem,
+    state: State,
+    measurements: Measurements,
+    information: Floats | None = None,
+) -> LinearTerms | None:
+    """
+    Sums of the modes of the field; None where none is estimated.
+
+    ``information`` is that of an earlier call with the same measurements.
+    """
+    prior = problem.field_prior
+    if prior is None:
+        return None
+    if information is None:
+        terms = scalar_terms_at(problem, state, measurements, prior.polynomials)
+        return terms.in_modes(prior.modes)
+    unused = np.empty((0, 0))
+    terms = scalar_terms_at(problem, state, measurements, prior.polynomials, unused)
+    return LinearTerms(information, prior.modes.T @ terms.cross)

@@ -1,0 +1,1 @@
+"""Errors that no camera parameter describes: their tests and their variances."""
