@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Count, Finite, Floats, Pixels, Shape
-from starcal_ros.camera import CameraModel
+from starcal_ros.camera import CameraModel, check_plausible
+from starcal_ros.constants import MAX_STAMP_NS
 from starcal_ros.detector_field import degrees, DetectorField
 
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
@@ -42,6 +43,10 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'no_stars': 'too few star-like sources in the image',
     'no_match': 'no rotation of the predicted stars explains the sources in the image',
     'too_few_stars': 'fewer stars were measured well than an image needs',
+    'bad_stamp': 'the stamp, with stamp_offset_s, is negative or beyond the range of ROS stamps',
+    'bad_observations': (
+        'the observations hold values that no image or star can have (said by the calibrator)'
+    ),
     'overrun': 'images came faster than they could be measured',
     'internal_error': 'the measurement failed unexpectedly; the log of the node has the cause',
 }
@@ -733,3 +738,36 @@ class Calibration:
     def sigma(self) -> Floats:
         """1-sigma (p,) of `parameter_names`."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+_MOST = 1e15  # of a camera parameter, whose square and cube must stay finite
+_UNIT_TOLERANCE = 1e-6  # of the length of a quaternion: rounding to a text leaves less
+
+
+def check_calibration(calibration: Calibration) -> None:
+    """
+    Check the geometry and the stamps of a calibration from a file or a message.
+
+    The camera of one that the gate refused may be any that a report can show.
+
+    Raises
+    ------
+    ValueError
+        Naming the field and its value.
+    """
+    camera = calibration.geometry.camera
+    if calibration.accepted or calibration.forced:
+        check_plausible(camera)
+    elif np.abs(camera.parameters).max() > _MOST:
+        raise ValueError(f'parameters: {np.abs(camera.parameters).max():.6g} is over {_MOST:g}')
+    rotation = calibration.geometry.star_tracker_from_camera_xyzw
+    if not abs(np.linalg.norm(rotation) - 1.0) < _UNIT_TOLERANCE:
+        raise ValueError(f'alignment.rotation: {rotation.tolist()} is not a unit quaternion')
+    stamps_ns = {
+        'time_ns': calibration.time_ns,
+        'first_image_ns': calibration.first_image_ns,
+        'active_since_ns': calibration.active_since_ns,
+    }
+    for name, stamp_ns in stamps_ns.items():
+        if not 0 <= stamp_ns <= MAX_STAMP_NS:
+            raise ValueError(f'{name}: {stamp_ns} ns is not within the range of ROS stamps')

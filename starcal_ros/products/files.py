@@ -6,6 +6,7 @@ import contextlib
 import os
 from pathlib import Path
 
+from starcal_ros import untrusted
 from starcal_ros.errors import ProductError
 
 OBSERVATIONS_FILE = 'observations.mcap'
@@ -14,21 +15,21 @@ REPORT_FILE = 'report.html'
 PART = '.part'  # ends the name of a file that is not whole yet
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, most_bytes: int) -> str:
     """
     The text of a file in UTF-8.
 
     Raises
     ------
     ProductError
-        When the file cannot be read or is no text.
+        When the file cannot be read, is larger than ``most_bytes`` or is no text.
     """
     try:
-        return path.read_text(encoding='utf-8')
+        return untrusted.read_text(path, most_bytes)
     except OSError as error:
         raise ProductError(f'{path}: cannot be read: {error.strerror}') from error
-    except UnicodeDecodeError as error:
-        raise ProductError(f'{path}: not a text file') from error
+    except ValueError as error:
+        raise ProductError(f'{path}: {error}') from error
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
