@@ -15,14 +15,12 @@ import logging
 from pathlib import Path
 import re
 
-import yaml
-
 from starcal_ros.arrays import Floats
 from starcal_ros.bag.mcap_reader import Damage, MAGIC, RawMessage, read_messages, read_summary
 from starcal_ros.bag.typestore import typestore, typestore_with
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.messages.images import image_from_message, refused_from_message
-from starcal_ros.messages.observations import observations_from_message
+from starcal_ros.messages.observations import checked_observations
 from starcal_ros.messages.telemetry import (
     attitude_from_message,
     temperature_from_message,
@@ -33,9 +31,11 @@ from starcal_ros.messages.types import (
 )
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, AttitudeOptions
+from starcal_ros.untrusted import METADATA_BYTES, read_text, yaml_value
 
 _SQLITE, _ROS_1 = b'SQLite format 3', b'#ROSBAG V'  # how bags of other kinds begin
 _MAGIC_BYTES = 16
+_LONGEST_NAME = 4096  # of a path on Linux
 
 
 @functools.lru_cache(maxsize=256)
@@ -66,7 +66,9 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
     for path in map(Path, paths):
         if path.is_dir():
             files += _files_of_folder(path)
-        elif path.exists():
+        elif path.exists():  # opening a pipe would wait for whoever writes to it
+            if not path.is_file():
+                raise BagError(f'{path}: not a regular file')
             files.append(path)
         else:
             raise BagError(f'{path}: no such bag')
@@ -205,7 +207,7 @@ def read_observations(
     paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
 ) -> Iterator[StarObservations]:
     """
-    Recorded observations of a topic.
+    Recorded observations of a topic; an image with impossible values becomes a refused one.
 
     Raises
     ------
@@ -214,7 +216,8 @@ def read_observations(
     """
     for raw in read_raw(paths, [topic], on_damage):
         try:
-            yield observations_from_message(decode(raw))
+            message = decode(raw)
+            yield checked_observations(message)
         except (AttributeError, ValueError) as error:
             raise BagError(f'{topic}: not readable as observations: {error}') from error
 
@@ -251,19 +254,14 @@ def _decoded(paths: Iterable[Path | str], topic: str, on_damage: Damage) -> Iter
 
 def _files_of_folder(folder: Path) -> list[Path]:
     """MCAP files of a bag folder: those listed in metadata.yaml, else all in the folder."""
-    try:
-        metadata = yaml.safe_load((folder / 'metadata.yaml').read_text())
-        information = metadata['rosbag2_bagfile_information']
-        names = [str(name) for name in information['relative_file_paths']]
-        compression = str(information.get('compression_mode') or '')
-    except (OSError, yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError):
-        names, compression = ([], '')  # a recorder that was killed leaves no valid metadata
+    names, compression = _metadata(folder / 'metadata.yaml')
     if compression:
         raise BagError(
             f'{folder}: compressed by {compression.lower()}; decompress it with ros2 bag convert'
         )
     listed = [folder / name for name in names if (folder / name).is_file()]
-    found = listed or sorted(folder.glob('*.mcap'), key=_natural)
+    here = (path for path in folder.glob('*.mcap') if path.is_file())
+    found = listed or sorted(here, key=_natural)
     if not found:
         other = _how_to_convert(folder, _SQLITE) if any(folder.glob('*.db3')) else ''
         inside = next(folder.glob('*/*.mcap'), None)
@@ -273,6 +271,28 @@ def _files_of_folder(folder: Path) -> list[Path]:
     if missing and listed:
         raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing')
     return found
+
+
+def _metadata(path: Path) -> tuple[list[str], str]:
+    """Names of the files of a bag and its compression, both empty without valid metadata."""
+    try:
+        metadata = yaml_value(read_text(path, METADATA_BYTES))
+        information = metadata['rosbag2_bagfile_information']
+        names = information['relative_file_paths']
+        compression = information.get('compression_mode')
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return [], ''  # a recorder that was killed leaves no valid metadata
+    if not isinstance(names, list) or not all(map(_is_inside, names)):
+        names = []
+    known = isinstance(compression, str) and re.fullmatch(r'\w{1,20}', compression)
+    return names, compression if known and compression.lower() != 'none' else ''
+
+
+def _is_inside(name: object) -> bool:
+    """Whether a value of metadata.yaml names a file below the folder of its bag."""
+    if not isinstance(name, str) or len(name) > _LONGEST_NAME:
+        return False
+    return not Path(name).is_absolute() and '..' not in Path(name).parts
 
 
 def _how_to_convert(path: Path, magic: bytes) -> str:

@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.errors import ImageRefused
-from starcal_ros.messages.fields import make_header, offset_ns, stamp_ns
+from starcal_ros.messages.fields import (
+    is_stamp,
+    make_header,
+    nearest_stamp_ns,
+    offset_ns,
+    stamp_ns,
+)
 from starcal_ros.messages.types import IMAGE_TYPE, Make, Message
 from starcal_ros.records import Image, refused_image, StarObservations
 
