@@ -65,7 +65,7 @@ def shown(value: object) -> str:
 
 def read_text(path: Path, most_bytes: int) -> str:
     """
-    Text of a regular file in UTF-8; never waits, as for a pipe, and never reads more.
+    Text of a regular file in UTF-8.
 
     Raises
     ------
@@ -75,8 +75,25 @@ def read_text(path: Path, most_bytes: int) -> str:
         In one line, for a file that is not regular, is too large or no text.
     """
     try:
+        return read_bytes(path, most_bytes).decode()
+    except UnicodeDecodeError as error:
+        raise ValueError('not a text file') from error
+
+
+def read_bytes(path: Path, most_bytes: int) -> bytes:
+    """
+    Content of a regular file; never waits, as for a pipe, and never reads more.
+
+    Raises
+    ------
+    OSError
+        When the file cannot be read.
+    ValueError
+        In one line, for a file that is not regular or is too large.
+    """
+    try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except UnicodeEncodeError as error:
+    except ValueError as error:  # of a name with NUL or half a surrogate pair
         raise ValueError('not the name of a file') from error
     with open(number, 'rb') as file:
         if not stat.S_ISREG(os.fstat(number).st_mode):
@@ -84,10 +101,7 @@ def read_text(path: Path, most_bytes: int) -> str:
         content = file.read(most_bytes + 1)
     if len(content) > most_bytes:
         raise ValueError(f'larger than {most_bytes // 1024} kB')
-    try:
-        return content.decode()
-    except UnicodeDecodeError as error:
-        raise ValueError('not a text file') from error
+    return content
 
 
 def yaml_value(text: str) -> Any:

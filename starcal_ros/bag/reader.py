@@ -19,6 +19,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.bag.mcap_reader import Damage, MAGIC, RawMessage, read_messages, read_summary
 from starcal_ros.bag.typestore import typestore, typestore_with
 from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.messages.fields import nearest_stamp_ns
 from starcal_ros.messages.images import image_from_message, refused_from_message
 from starcal_ros.messages.observations import checked_observations
 from starcal_ros.messages.telemetry import (
@@ -158,16 +159,22 @@ def read_images(
     topic: str,
     stamp_offset_s: float = 0.0,
     on_damage: Damage = log_damage,
+    size: tuple[int, int] | None = None,
 ) -> Iterator[Image | StarObservations]:
-    """Images of a topic; an image that cannot be decoded becomes refused observations."""
+    """
+    Images of a topic; an image that cannot be decoded becomes refused observations.
+
+    So does a compressed image of another ``size`` (width, height), where one is given.
+    """
     for raw in read_raw(paths, [topic], on_damage):
         try:
             message = decode(raw)
         except BagError as error:
-            yield refused_image(raw.log_time_ns, 0, 0, 'bad_layout', str(error))
+            log_time_ns = nearest_stamp_ns(raw.log_time_ns)
+            yield refused_image(log_time_ns, 0, 0, 'bad_layout', str(error))
             continue
         try:
-            yield image_from_message(message, stamp_offset_s)
+            yield image_from_message(message, stamp_offset_s, size)
         except ImageRefused as refused:
             yield refused_from_message(message, stamp_offset_s, refused)
 

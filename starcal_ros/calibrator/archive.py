@@ -285,6 +285,9 @@ class Archive:
         if damage or len(found) != 1:
             self._set_aside(path, damage[0] if damage else f'{len(found)} images, not one')
             return None
+        if found[0].refusal:
+            self._set_aside(path, f'{found[0].refusal}: {found[0].detail}')
+            return None
         return found[0]
 
     def _read_event(self, path: Path, event: int) -> Activation | None:

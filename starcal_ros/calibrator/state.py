@@ -194,6 +194,8 @@ class CalibratorState:
                 self.trouble = ''
             except ArchiveError as error:
                 self.trouble = str(error)
+            except Exception as error:  # whatever it is, the records are not on disk
+                self.trouble = f'{type(error).__name__}: {" ".join(str(error).split())}'
 
     def disk_free_bytes(self) -> int | None:
         """Free space for the state folder; None without one."""

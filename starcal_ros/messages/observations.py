@@ -98,7 +98,8 @@ def _check_image(record: StarObservations) -> None:
         raise ValueError(f'refusal: {record.refusal[:_LONGEST_NAME]!r} is no known reason')
     if max(record.width, record.height) > MAX_SIDE_PX:
         raise ValueError(f'width, height: {record.width} x {record.height} px is no image')
-    norm = float(np.linalg.norm(record.icrf_from_star_tracker_xyzw))
+    with np.errstate(over='ignore'):
+        norm = float(np.linalg.norm(record.icrf_from_star_tracker_xyzw))
     if not abs(norm - 1.0) <= _UNIT_TOLERANCE:
         raise ValueError(f'attitude: a quaternion of length {norm:.6g}')
     low, high = _DEGC
@@ -119,7 +120,8 @@ def _check_image(record: StarObservations) -> None:
 
 def _check_stars(record: StarObservations) -> None:
     """Raise ValueError for values that no star has."""
-    length = np.linalg.norm(record.direction_icrf, axis=1)
+    with np.errstate(over='ignore'):
+        length = np.linalg.norm(record.direction_icrf, axis=1)
     if (np.abs(length - 1.0) > _DIRECTION_TOLERANCE).any():
         raise ValueError(f'direction_icrf: lengths of {length.min():.6g} to {length.max():.6g}')
     # The first pixel reaches from -0.5 to 0.5.

@@ -26,7 +26,7 @@ from starcal_ros.messages.calibration import (
     calibration_to_message,
     camera_info_to_message,
 )
-from starcal_ros.messages.observations import observations_from_message
+from starcal_ros.messages.observations import checked_observations
 from starcal_ros.messages.status import status_to_message
 from starcal_ros.nodes.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
 from starcal_ros.nodes.message_factory import make_message, message_class
@@ -116,7 +116,7 @@ class Calibrator(StarcalNode):
             _OBSERVATIONS,
             group=collecting,
         )
-        retry = self.create_timer(_RETRY_S, self.guarded(self._save_again), collecting)
+        retry = self.steady_timer(_RETRY_S, self.guarded(self._save_again), collecting)
         self._listeners.append((self.destroy_timer, retry))
         self._status_due.set()
         self._status_thread = threading.Thread(target=self._tell_status, name='status')
@@ -191,7 +191,10 @@ class Calibrator(StarcalNode):
         return OK, 'collecting' if active is None else 'calibration active', numbers
 
     def _on_observations(self, message: Any) -> None:
-        self._state.add(observations_from_message(message))
+        observations = checked_observations(message)
+        if observations.refusal == 'bad_observations':
+            self.get_logger().warning(f'observations refused: {observations.detail}')
+        self._state.add(observations)
         self._status_due.set()
 
     def _save_again(self) -> None:

@@ -267,7 +267,9 @@ def observe_bag(
     if temperature_topic:
         temperatures = sorted(reader.read_temperatures(paths, temperature_topic), key=by_time)
     track = Track(setup.prior)
-    for image in reader.read_images(paths, image_topic, setup.attitude.stamp_offset_s):
+    size = (setup.prior.camera.width, setup.prior.camera.height)
+    offset_s = setup.attitude.stamp_offset_s
+    for image in reader.read_images(paths, image_topic, offset_s, size=size):
         if isinstance(image, StarObservations):
             yield image
             continue

@@ -126,7 +126,11 @@ def test_hand_written_ros_yaml(tmp_path: Path) -> None:
         ('image_width: 640', 'image_width: 99999999', 'image size: 99999999 x 480 is over'),
         ('image_width: 640', 'image_width: ' + 5000 * '9', 'line 1: an integer of 5000 digits'),
         ('image_width: 640', 'image_width: 2026-13-01', "'2026-13-01' is not a whole number"),
-        ('image_width: 640', 'image_width: 640\nimage_width: 1', "line 2: key 'image_width' stands"),
+        (
+            'image_width: 640',
+            'image_width: 640\nimage_width: 1',
+            "line 2: key 'image_width' stands",
+        ),
         ('image_width: 640', '5: 640', 'line 1: key 5 is not a text'),
         ('narrow_stereo', 40 * '[' + 40 * ']', 'line 3: nested deeper than 32'),
         ('narrow_stereo', '"\\0"', 'line 3: a text with a NUL character'),
