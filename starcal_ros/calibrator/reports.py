@@ -16,13 +16,13 @@ import os
 from pathlib import Path
 import shutil
 import subprocess
-import sys
 import threading
 
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.products.files import REPORT_FILE, sync_folder
 from starcal_ros.products.folder import write_observations, write_products
 from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.safe_path import module_command
 
 ACTIVE, CANDIDATE = 'report', 'candidate_report'
 
@@ -137,7 +137,7 @@ class CalibratorReports:
             if not self._is_wanted():
                 return ''
         process = subprocess.Popen(
-            [sys.executable, '-m', 'starcal_ros.cli.main', 'report', str(folder)],
+            [*module_command('starcal_ros.cli.main'), 'report', str(folder)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
