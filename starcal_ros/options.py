@@ -24,6 +24,7 @@ _INT64 = 2**63
 _MOST_CHARACTERS = 4096  # of a text: the longest path of Linux
 _MOST_ITEMS = 100  # of a list; the longest in use has 22 numbers
 _LONGEST_NAME = 100
+_LONGEST_SECTION = 255  # of a topic or node with its namespace, by ROS
 _ALMOST = 0.85  # similarity of names from which one is taken for the other, misspelt
 
 
@@ -219,17 +220,21 @@ def parameter_sections(path: Path) -> dict[str, object]:
         raise OptionError(f'{path}: {error}') from error
     if not isinstance(content, dict):
         raise OptionError(f'{path}: not a ROS parameter file (no node sections)')
-    return _flat(content, '')
+    sections = _flat(content, '')
+    for name in sections:
+        if len(name) > _LONGEST_SECTION:
+            raise OptionError(f'{path}: section {shown(name)} is too long for a name')
+    return sections
 
 
-def _flat(content: dict[str, object], namespace: str) -> dict[str, object]:
+def _flat(content: Mapping[str, object], namespace: str) -> dict[str, object]:
     """Sections of a file; ROS lets the namespaces of a node enclose it, level by level."""
     sections: dict[str, object] = {}
     for key, body in content.items():
         name = f'{namespace}/{key}' if namespace else key
         inside = body.values() if isinstance(body, dict) and 'ros__parameters' not in body else ()
         if inside and all(isinstance(one, dict) for one in inside):
-            sections |= _flat(body, name)
+            sections |= _flat(body, name)  # type: ignore[arg-type]
         else:
             sections[name] = body
     return sections

@@ -29,6 +29,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'bad_layout': 'size, row step and data of the image message do not fit each other',
     'wrong_size': 'the image is not of the size of the prior camera',
     'bad_attitude': 'the attitude about the image is not finite or not of unit length',
+    'frozen_attitude': 'the star tracker repeats an attitude of before, but the stars have moved',
     'no_attitude': 'no attitude sample on both sides of the image',
     'attitude_gap': 'the attitude samples about the image are too far apart',
     'out_of_order': 'the image is stamped before, or at, one already taken',

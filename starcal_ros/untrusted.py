@@ -12,7 +12,7 @@ stay texts.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 import json
 import os
 from pathlib import Path
@@ -48,9 +48,16 @@ _REAL = re.compile(
 _SPECIAL = re.compile(r'([-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN))\Z')
 _LONE = re.compile('[\ud800-\udfff]')
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)  # the other is a hundred times slower
+_TAG = 'tag:yaml.org,2002:'
 _CORE_TAGS = frozenset(
-    f'tag:yaml.org,2002:{kind}' for kind in ('str', 'int', 'float', 'bool', 'null', 'seq', 'map')
+    _TAG + kind for kind in ('str', 'int', 'float', 'bool', 'null', 'seq', 'map')
 )
+_OF_TAG: Mapping[str, type | tuple[type, ...]] = {
+    f'{_TAG}int': int,
+    f'{_TAG}float': (int, float),
+    f'{_TAG}bool': bool,
+    f'{_TAG}null': type(None),
+}
 
 
 def shown(value: object) -> str:
@@ -284,9 +291,7 @@ def _scalar(event: Any) -> Any:
     if tag == '!' or (tag is None and not event.implicit[0]):
         return check_text(text)
     found = check_text(text) if tag and tag.endswith(':str') else _plain(text)
-    kinds = {'int': int, 'float': (int, float), 'bool': bool, 'null': type(None)}
-    wanted = kinds.get(tag.rpartition(':')[2]) if tag else None
-    if wanted and not isinstance(found, wanted):
+    if tag and not isinstance(found, _OF_TAG.get(tag, object)):
         raise ValueError(f'{shown(text)} is not of its tag {tag}')
     return found
 

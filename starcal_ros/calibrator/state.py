@@ -158,6 +158,8 @@ class CalibratorState:
         if dry_run:
             return Answer(True, f'would be activated: {summary(calibration)}', calibration)
         with self._disk, self._records:
+            if self._folder and self._archive is None:
+                return Answer(False, 'not activated: the node was cleaned up meanwhile')
             before = self._history[-1].event if self._history else 0
             event = self._next_event()
             calibration = dataclasses.replace(calibration, number=event, active_since_ns=now_ns)
@@ -169,6 +171,8 @@ class CalibratorState:
     def rollback(self, now_ns: int) -> Answer:
         """Activate the calibration before the active one again."""
         with self._disk, self._records:
+            if self._folder and self._archive is None:
+                return Answer(False, 'not activated: the node was cleaned up meanwhile')
             if not self._history:
                 return Answer(False, 'no calibration is active')
             wanted = self._history[-1].before

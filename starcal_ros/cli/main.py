@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 import dataclasses
+import io
 import json
 import os
 from pathlib import Path
@@ -45,6 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns the exit status."""
     # Read when NumPy is loaded: on matrices of this size two threads of BLAS wait for each other.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+    if isinstance(sys.stdout, io.TextIOWrapper):  # the name of a file need not be UTF-8
+        sys.stdout.reconfigure(errors='backslashreplace')
     try:
         tool = parser()
         if '_ARGCOMPLETE' in os.environ:  # set by a shell that completes a command line

@@ -263,7 +263,9 @@ class Calibrator(StarcalNode):
 
     def _told(self, answer: Answer, response: Any) -> Any:
         """Publish the activated or refused calibration; return the filled response."""
-        if answer.calibration is not None and answer.active:
+        if not self.is_active:
+            pass  # deactivated meanwhile: activation publishes the active calibration
+        elif answer.calibration is not None and answer.active:
             self._publish_calibration(answer.calibration)
             self._show(ACTIVE, answer)
         elif answer.calibration is not None and not answer.success:

@@ -40,6 +40,7 @@ from starcal_ros.records import (
 from starcal_ros.report import figures as report_figures
 from starcal_ros.report.charts import charts_of
 from starcal_ros.report.thumbnails import read_thumbnails, Thumbnail, THUMBNAILS_FOLDER
+from starcal_ros.untrusted import json_value
 
 _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200
@@ -145,7 +146,7 @@ def _context(found: Found) -> Mapping[str, object]:
 
 def _options_of(calibration: Calibration) -> Mapping[str, object]:
     try:
-        options = json.loads(calibration.provenance['options'])
+        options = json_value(calibration.provenance['options'])
     except (KeyError, ValueError):
         return {}
     return options if isinstance(options, dict) else {}
