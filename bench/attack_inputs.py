@@ -25,6 +25,7 @@ from starcal_ros.safe_path import module_command
 _CASES, _QUICK_CASES = 10_000, 100
 _MOST_MB = 1000.0
 _ANSWER_S = 60.0
+_COMPRESSED = ('image_transport:=compressed', 'attitude_timeout_s:=0.0')
 _PLANTED = ('yaml', 'json', 'typing', 'argparse', 'numpy', 'rclpy')  # that the tool imports
 
 
@@ -202,7 +203,9 @@ def _hostile(campaign: Campaign) -> Iterator[Any]:
     ):
         yield changed(change)
     for k in range(50):
-        yield changed(lambda message, k=k: setattr(message, 'refusal', f'reason {k}'))
+        message = campaign.message(record)
+        message.refusal = f'reason {k}'
+        yield message
 
 
 def _long_requests(campaign: Campaign) -> AttackRow:
@@ -293,7 +296,7 @@ def _bombs(campaign: Campaign) -> AttackRow:
     answers: list[Any] = []
     bombs = [_png(40_000, 40_000, 2**30), _png(2**31 - 1, 2**31 - 1, 2**20), _png(640, 512, 2**30)]
     with (
-        campaign.running('star_observer', 'image_transport:=compressed') as process,
+        campaign.running('star_observer', *_COMPRESSED) as process,
         graph.Client() as client,
     ):
         client.collect(StarObservations, 'observations', answers.append, latched=False)

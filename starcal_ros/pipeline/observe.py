@@ -237,7 +237,8 @@ def _held_attitude(
     if across_rad > limit_rad or around_rad > limit_around_rad:
         turned_arcsec = max(across_rad, around_rad) / ARCSECOND_RAD
         raise ImageRefused(
-            'frozen_attitude', f'one attitude, but the stars have turned {turned_arcsec:.0f} arcsec'
+            'frozen_attitude',
+            f'one attitude, but the stars have turned {turned_arcsec:.0f} arcsec',
         )
     return held
 

@@ -365,7 +365,7 @@ def _observed(setup: Setup, step_arcsec: float, is_hung: bool) -> list[str]:
 
 
 def test_a_hung_star_tracker_is_refused_once_the_stars_have_turned(setup: Setup) -> None:
-    """Twice the largest sigma of the star tracker, 40 arcsec, and a tenth of a pixel: 91 arcsec."""
+    """By twice the largest sigma of the star tracker and a tenth of a pixel: 91 arcsec."""
     ok, frozen = '', 'frozen_attitude'
     assert _observed(setup, 72.0, is_hung=True) == [ok, ok, frozen, frozen, frozen]
     assert _observed(setup, 72.0, is_hung=False) == [ok] * 5
