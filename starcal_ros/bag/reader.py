@@ -84,6 +84,19 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
     return files
 
 
+def files_of_bags(paths: Iterable[Path | str]) -> tuple[Path, ...]:
+    """
+    The files that bags are read from, ``metadata.yaml`` of a folder included.
+
+    Raises
+    ------
+    BagError
+        If a path is neither an .mcap file nor a folder that holds some.
+    """
+    paths = tuple(map(Path, paths))
+    return (*mcap_files(paths), *(path / 'metadata.yaml' for path in paths if path.is_dir()))
+
+
 def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple[Topic, ...]:
     """
     Topics with messages, by name.

@@ -29,12 +29,13 @@ from starcal_ros.arrays import Count
 from starcal_ros.bag.reader import read_observations
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.errors import ArchiveError, BagError, ProductError
+from starcal_ros.files import PART, sync_folder
 from starcal_ros.products.calibration_json import (
     calibration_content,
     calibration_from_content,
     SCHEMA,
 )
-from starcal_ros.products.files import PART, sync_folder, write_atomically
+from starcal_ros.products.files import write_atomically
 from starcal_ros.products.json_codec import from_json, to_json
 from starcal_ros.records import Calibration, Ensemble, StarObservations
 

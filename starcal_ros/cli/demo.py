@@ -90,7 +90,7 @@ def run(
     NodeError
         When a node does not start, or ends before the calibration.
     """
-    params = folder / 'params.yaml'
+    params = folder / 'demo_params.yaml'  # not params.yaml: a user's may be there
     content = {'/**': {'ros__parameters': bag.parameters}}
     write_atomically(params, yaml.safe_dump(content, sort_keys=False))
     environment = {**os.environ, **_own_domain()}

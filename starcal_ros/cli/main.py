@@ -83,17 +83,36 @@ def _calibrate(args: argparse.Namespace) -> int:
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
     from starcal_ros.pipeline.provenance import inputs_of
-    from starcal_ros.pipeline.setup import read_setup
+    from starcal_ros.pipeline.setup import files_of, read_setup
 
     setup = read_setup(args.params)
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
+    _check_folder(args.output, args.bags, (args.params, *files_of(setup.frames)))
     inputs = inputs_of((*reader.mcap_files(args.bags), args.params))
     calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
     report = _write_report(args.output)
     output.print_calibration(calibration, setup.prior)
     print(f'products written to {args.output}; {report}')
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
+
+
+def _check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> None:
+    """Check that products in a folder replace no input and do not become part of a bag."""
+    from starcal_ros.bag import reader
+    from starcal_ros.files import same_as_one_of
+    from starcal_ros.products.calibration_json import CALIBRATION_FILE
+    from starcal_ros.products.files import check_not_inputs
+    from starcal_ros.products.folder import PRODUCT_FILES
+    from starcal_ros.report.thumbnails import THUMBNAILS_FOLDER
+
+    bag_files = reader.files_of_bags(bags)
+    if same_as_one_of(folder, [file.parent for file in bag_files]):
+        raise OptionError(f'{folder}: holds the bag that is read; choose another folder (-o)')
+    check_not_inputs([folder / name for name in PRODUCT_FILES], (*bag_files, *files))
+    pictures = folder / THUMBNAILS_FOLDER
+    if pictures.is_dir() and any(pictures.iterdir()) and not (folder / CALIBRATION_FILE).exists():
+        raise OptionError(f'{pictures}: is not of a calibration; choose another folder (-o)')
 
 
 def _calibrate_into(
@@ -114,7 +133,6 @@ def _calibrate_into(
     for record in observations:
         ensemble = solve.add_to_ensemble(ensemble, record, setup)
     _make_folder(folder)
-    # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     write_observations(observations, folder, setup.frames.camera_frame)
     try:
         calibration, left = solve.solve_with_residuals(ensemble, setup, inputs=inputs)
@@ -215,10 +233,13 @@ def _compare(args: argparse.Namespace) -> int:
     from starcal_ros.cli import output
     from starcal_ros.products.calibration_json import read_calibration
 
-    found = comparison.compare(*(read_calibration(_file(p)) for p in (args.a, args.b)))
+    files = [_file(path) for path in (args.a, args.b)]
+    found = comparison.compare(*map(read_calibration, files))
     if args.output:
+        from starcal_ros.products.files import check_not_inputs
         from starcal_ros.report import figures
 
+        check_not_inputs([args.output], [p for file in files for p in _beside(file)])
         figures.write_comparison(found, args.output)
     if args.json:
         print(json.dumps(comparison.content(found), indent=1, allow_nan=False))
@@ -234,9 +255,12 @@ def _lookup(args: argparse.Namespace) -> int:
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
     from starcal_ros.products.calibration_json import read_calibration
+    from starcal_ros.products.files import check_not_inputs
     from starcal_ros.products.lookup_table import write_lookup_table
 
-    calibration = read_calibration(_file(args.calibration))
+    file = _file(args.calibration)
+    check_not_inputs([args.output], _beside(file))
+    calibration = read_calibration(file)
     camera = calibration.geometry.camera
     if args.step is not None:
         if not 0 < args.step <= max(camera.width, camera.height):
@@ -261,6 +285,13 @@ def _file(path: Path) -> Path:
     if not (path / CALIBRATION_FILE).exists():
         raise OptionError(f'{path}: the folder holds no {CALIBRATION_FILE}')
     return path / CALIBRATION_FILE
+
+
+def _beside(calibration: Path) -> list[Path]:
+    """The file of a calibration and the other products in its folder."""
+    from starcal_ros.products.folder import PRODUCT_FILES
+
+    return [calibration, *(calibration.with_name(name) for name in PRODUCT_FILES)]
 
 
 def _play(args: argparse.Namespace) -> int:
@@ -309,6 +340,7 @@ def _demo(args: argparse.Namespace) -> int:
 
     _make_folder(args.output)
     bag = demo.tiny_bag(args.output)
+    _check_folder(args.output, [bag.bag], ())
     print(f'bag {bag.bag}; log files and products in {args.output}')
     with progress_bar(bag.image_count, 'images') as advance:
         calibration, verdict = demo.run(bag, args.output, on_image=advance)
@@ -378,7 +410,7 @@ def _campaign(args: argparse.Namespace) -> int:
     found = summary.conclude(design, rows)
     path = args.output / f'{design.study}.json'
     write_atomically(path, summary.content(found, _software()))
-    path.with_suffix('.png').write_bytes(figures.png(found))
+    write_atomically(path.with_suffix('.png'), figures.png(found))
     print(f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s')
     print('\n'.join(summary.table(found)))
     print(f'written to {path} and {path.with_suffix(".png").name}')

@@ -40,7 +40,11 @@ from starcal_ros.options import (
     read_parameter_file,
 )
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.products.camera_yaml import read_camera_info, with_camera_url_from
+from starcal_ros.products.camera_yaml import (
+    read_camera_info,
+    resolve_url,
+    with_camera_url_from,
+)
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions
@@ -128,6 +132,23 @@ def read_setup(params: Path) -> Setup:
         return load_setup(values, others=NODE_OPTION_CLASSES)
     except OptionError as error:
         raise OptionError(f'{params}: {error}') from error
+
+
+def files_of(frames: SetupOptions) -> tuple[Path, ...]:
+    """
+    The files that options name: prior camera, catalog and dark frame.
+
+    Raises
+    ------
+    ProductError
+        For a camera URL that names no file.
+    """
+    files = [resolve_url(frames.camera_info_url)] if frames.camera_info_url else []
+    if frames.catalog:
+        files.append(Path(frames.catalog))
+    if frames.dark_frame:
+        files.append(Path(frames.dark_frame.removeprefix('file://')))
+    return tuple(files)
 
 
 def load_setup(
