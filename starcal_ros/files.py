@@ -1,5 +1,5 @@
 """
-The one way to write a file, and the one way to read a file from an untrusted folder.
+The one way to write a file.
 
 A file is written beside its place, synced and renamed, and its folder is synced: a reader, a kill
 and a power loss see the old file or the new one, each whole.  A kill may leave the file beside; it
@@ -10,13 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 import contextlib
-import errno
 import fcntl
 import glob
 import os
 from pathlib import Path
 import secrets
-import stat
 from typing import IO
 
 PART = '.part'  # ends the name of a file that is not whole yet
@@ -72,26 +70,6 @@ def sync_folder(folder: Path) -> None:
         os.fsync(number)
     finally:
         os.close(number)
-
-
-def read_regular(path: Path, most_bytes: int, follow_links: bool = False) -> bytes:
-    """
-    Content of a regular file of limited size; a FIFO or a device is refused without waiting.
-
-    Raises
-    ------
-    OSError
-        When it cannot be read, is not a regular file, or is larger.
-    """
-    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow_links else os.O_NOFOLLOW)
-    with os.fdopen(os.open(path, flags), 'rb') as file:
-        found = os.fstat(file.fileno())
-        if not stat.S_ISREG(found.st_mode):
-            raise OSError(errno.EINVAL, 'not a regular file', str(path))
-        content = file.read(most_bytes + 1)
-    if len(content) > most_bytes:
-        raise OSError(errno.EFBIG, f'larger than {most_bytes} bytes', str(path))
-    return content
 
 
 def same_as_one_of(path: Path, others: Iterable[Path]) -> bool:

@@ -50,8 +50,20 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     ),
     'overrun': 'images came faster than they could be measured',
     'internal_error': 'the measurement failed unexpectedly; the log of the node has the cause',
+    'other': 'refused by the sender for a reason that this version does not have',
 }
 """Why an image can be refused: stable name -> meaning."""
+
+
+def counted_refusal(refusal: str) -> str:
+    """
+    The name under which a refused image is counted.
+
+    Unknown ones are one name: the counts are in every status and in a file, and must not grow with
+    the texts that a sender makes up.
+    """
+    return refusal if refusal in IMAGE_REFUSALS else 'other'
+
 
 STAR_REFUSALS: Mapping[str, str] = {
     'not_detected': 'bright enough to be seen, but no source stands there',
@@ -261,6 +273,7 @@ class Ensemble:
         if not refusal and any(image.time_ns == observations.time_ns for image in self.images):
             refusal = 'duplicate'
         if refusal:
+            refusal = counted_refusal(refusal)
             count = self.refused.get(refusal, 0) + 1
             return Ensemble(self.images, {**self.refused, refusal: count})
         return Ensemble((*self.images, observations), self.refused)
@@ -590,7 +603,7 @@ class GateCheck:
     def _text(self, value: float) -> str:
         if not math.isfinite(value):
             return 'not a finite number'
-        number = f'{value:.4g}' if abs(value) < 1e4 else f'{value:.0f}'
+        number = f'{value:.0f}' if 1e4 <= abs(value) < 1e15 else f'{value:.4g}'
         return f'{number} {self.unit}' if self.unit else number
 
 

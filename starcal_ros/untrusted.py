@@ -87,7 +87,7 @@ def read_text(path: Path, most_bytes: int) -> str:
         raise ValueError('not a text file') from error
 
 
-def read_bytes(path: Path, most_bytes: int) -> bytes:
+def read_bytes(path: Path, most_bytes: int, follow_links: bool = True) -> bytes:
     """
     Content of a regular file; never waits, as for a pipe, and never reads more.
 
@@ -98,8 +98,9 @@ def read_bytes(path: Path, most_bytes: int) -> bytes:
     ValueError
         In one line, for a file that is not regular or is too large.
     """
+    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow_links else os.O_NOFOLLOW)
     try:
-        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        number = os.open(path, flags)
     except ValueError as error:  # of a name with NUL or half a surrogate pair
         raise ValueError('not the name of a file') from error
     with open(number, 'rb') as file:

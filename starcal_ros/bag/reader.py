@@ -32,6 +32,7 @@ from starcal_ros.messages.types import (
 )
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, AttitudeOptions
+from starcal_ros.text import printable
 from starcal_ros.untrusted import METADATA_BYTES, read_text, yaml_value
 
 _SQLITE, _ROS_1 = b'SQLite format 3', b'#ROSBAG V'  # how bags of other kinds begin
@@ -42,7 +43,7 @@ _LONGEST_NAME = 4096  # of a path on Linux
 @functools.lru_cache(maxsize=256)
 def log_damage(text: str) -> None:
     """Log damage of a bag as a warning of the logger ``starcal``, each text once."""
-    logging.getLogger('starcal').warning('%s', text)
+    logging.getLogger('starcal').warning('%s', printable(text))
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,8 @@ def files_of_bags(paths: Iterable[Path | str]) -> tuple[Path, ...]:
     BagError
         If a path is neither an .mcap file nor a folder that holds some.
     """
-    paths = tuple(map(Path, paths))
-    return (*mcap_files(paths), *(path / 'metadata.yaml' for path in paths if path.is_dir()))
+    bags = [Path(path) for path in paths]
+    return (*mcap_files(bags), *(bag / 'metadata.yaml' for bag in bags if bag.is_dir()))
 
 
 def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple[Topic, ...]:

@@ -27,7 +27,14 @@ from starcal_ros.cli.arguments import (
     EXIT_REFUSED,
     parser,
 )
-from starcal_ros.cli.terminal import print_verdict, progress_bar, with_progress
+from starcal_ros.cli.terminal import (
+    discard,
+    open_missing_streams,
+    print_text,
+    print_verdict,
+    progress_bar,
+    with_progress,
+)
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
@@ -48,34 +55,45 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     if isinstance(sys.stdout, io.TextIOWrapper):  # the name of a file need not be UTF-8
         sys.stdout.reconfigure(errors='backslashreplace')
+    open_missing_streams()
+    command = ''
     try:
         tool = parser()
         if '_ARGCOMPLETE' in os.environ:  # set by a shell that completes a command line
             import argcomplete
 
             argcomplete.autocomplete(tool)
-        args = tool.parse_args(argv)
-        if args.version:
-            print(_software())
-        elif args.command is None:
-            tool.print_help()
-        else:
-            return _COMMANDS[args.command](args)
-        return EXIT_ACCEPTED
+        try:
+            args = tool.parse_args(argv)
+            command = args.command or ''
+            return _run(args, tool)
+        finally:
+            sys.stdout.flush()  # at the end of Python an error has no handler
     except StarcalError as error:
         return complain(str(error))
     except BrokenPipeError:
         # The reader of our output has ended (starcal ... | head).
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard('stdout')
         return EXIT_BAD_INPUT
     except OSError as error:
+        discard('stdout')
         return complain(f'{error.filename or "input/output"}: {error.strerror or error}')
     except ModuleNotFoundError as error:
-        extra = 'studies' if args.command == 'campaign' else 'report'
-        return complain(_missing_extra(error, extra))
+        return complain(_missing_extra(error, 'studies' if command == 'campaign' else 'report'))
     except KeyboardInterrupt:
         complain('interrupted')
         return EXIT_INTERRUPTED
+
+
+def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:
+    """Run the command that was asked for."""
+    if args.version:
+        print_text(_software())
+    elif args.command is None:
+        tool.print_help()
+    else:
+        return _COMMANDS[args.command](args)
+    return EXIT_ACCEPTED
 
 
 def _calibrate(args: argparse.Namespace) -> int:
@@ -93,7 +111,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
     report = _write_report(args.output)
     output.print_calibration(calibration, setup.prior)
-    print(f'products written to {args.output}; {report}')
+    print_text(f'products written to {args.output}; {report}')
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
 
 
@@ -164,7 +182,7 @@ def _report(args: argparse.Namespace) -> int:
     """Write the report of a folder."""
     from starcal_ros.report import page
 
-    print(f'report written to {page.write_report(args.folder)}')
+    print_text(f'report written to {page.write_report(args.folder)}')
     return EXIT_ACCEPTED
 
 
@@ -208,7 +226,7 @@ def _inspect(args: argparse.Namespace) -> int:
         why = diagnosis.in_a_sentence(args.bags, _asked(args), setup)
         found = dataclasses.replace(found, problems=(*found.problems, why)) if why else found
     if args.json:
-        print(json.dumps(inspect.content(found), indent=1, allow_nan=False))
+        print_text(json.dumps(inspect.content(found), indent=1, allow_nan=False))
     else:
         output.print_inspection(found)
     return EXIT_REFUSED if found.problems else EXIT_ACCEPTED
@@ -221,9 +239,9 @@ def _diagnose(args: argparse.Namespace) -> int:
 
     found = diagnosis.of_bags(args.bags, _asked(args), read_setup(args.params))
     if args.json:
-        print(json.dumps(diagnosis.content(found), indent=1, allow_nan=False))
+        print_text(json.dumps(diagnosis.content(found), indent=1, allow_nan=False))
     else:
-        print(diagnosis.text(found))
+        print_text(diagnosis.text(found))
     return EXIT_ACCEPTED if found.cause == 'none' else EXIT_REFUSED
 
 
@@ -242,11 +260,11 @@ def _compare(args: argparse.Namespace) -> int:
         check_not_inputs([args.output], [p for file in files for p in _beside(file)])
         figures.write_comparison(found, args.output)
     if args.json:
-        print(json.dumps(comparison.content(found), indent=1, allow_nan=False))
+        print_text(json.dumps(comparison.content(found), indent=1, allow_nan=False))
     else:
         output.print_comparison(found)
         if args.output:
-            print(f'figure written to {args.output}')
+            print_text(f'figure written to {args.output}')
     return EXIT_ACCEPTED
 
 
@@ -272,7 +290,7 @@ def _lookup(args: argparse.Namespace) -> int:
         pixels = pixel_grid(camera, args.points, args.points)
     table = line_of_sight_table(camera, calibration.joint_covariance, pixels)
     write_lookup_table(table, args.output)
-    print(f'{len(pixels)} lines of sight written to {args.output}')
+    print_text(f'{len(pixels)} lines of sight written to {args.output}')
     return EXIT_ACCEPTED
 
 
@@ -323,9 +341,9 @@ def _simulate(args: argparse.Namespace) -> int:
     scenario = synthetic.scenario(args.scenario, args.seed)
     with progress_bar(scenario.image_count, 'images') as advance:
         made = simulated_bag.write_bag(scenario, args.output, on_image=lambda _: advance())
-    print(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
-    print(f'truth {made.truth}')
-    print(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
+    print_text(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
+    print_text(f'truth {made.truth}')
+    print_text(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
     return EXIT_ACCEPTED
 
 
@@ -341,14 +359,14 @@ def _demo(args: argparse.Namespace) -> int:
     _make_folder(args.output)
     bag = demo.tiny_bag(args.output)
     _check_folder(args.output, [bag.bag], ())
-    print(f'bag {bag.bag}; log files and products in {args.output}')
+    print_text(f'bag {bag.bag}; log files and products in {args.output}')
     with progress_bar(bag.image_count, 'images') as advance:
         calibration, verdict = demo.run(bag, args.output, on_image=advance)
-    print(verdict)
+    print_text(verdict)
     if calibration is None:
         return EXIT_REFUSED
     beside_truth = demo.compare(calibration, bag.truth, bag.prior)
-    print('\n'.join(beside_truth.lines))
+    print_text('\n'.join(beside_truth.lines))
     good = beside_truth.worst_sigmas <= _DEMO_SIGMAS
     print_verdict(
         good,
@@ -367,7 +385,7 @@ def _demo(args: argparse.Namespace) -> int:
         if same
         else f'starcal calibrate gives another calibration from the bag: {apart_px:.2g} px apart',
     )
-    print(f'open {page.write_report(args.output)}')
+    print_text(f'open {page.write_report(args.output)}')
     good = good and same
     return EXIT_ACCEPTED if good else EXIT_REFUSED
 
@@ -411,9 +429,11 @@ def _campaign(args: argparse.Namespace) -> int:
     path = args.output / f'{design.study}.json'
     write_atomically(path, summary.content(found, _software()))
     write_atomically(path.with_suffix('.png'), figures.png(found))
-    print(f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s')
-    print('\n'.join(summary.table(found)))
-    print(f'written to {path} and {path.with_suffix(".png").name}')
+    print_text(
+        f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s'
+    )
+    print_text('\n'.join(summary.table(found)))
+    print_text(f'written to {path} and {path.with_suffix(".png").name}')
     return EXIT_ACCEPTED
 
 
@@ -456,7 +476,7 @@ def _paper(args: argparse.Namespace) -> int:
     write_atomically(path, paper.page(found, _software()))
     content = {'software': _software(), **paper.numbers(found)}
     write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
-    print(f'written to {path}, with figures in {args.output / "images"}')
+    print_text(f'written to {path}, with figures in {args.output / "images"}')
     return EXIT_ACCEPTED
 
 

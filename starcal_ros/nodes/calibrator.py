@@ -83,8 +83,10 @@ class Calibrator(StarcalNode):
             self._own.state_dir if self._own.state_report else '',
             self._setup.frames.camera_frame,
         )
-        for damage in self._state.damage:
-            self.get_logger().error(damage)
+        for text in (*self._state.damage, *self._state.withheld):
+            self.get_logger().error(text)
+        if self._state.withheld:
+            self._last_gate = f'refused: {self._state.withheld[0]}'
 
         def latched(kind: Any, topic: str) -> Any:
             publisher = self.create_lifecycle_publisher(kind, topic, LATCHED)
@@ -172,10 +174,13 @@ class Calibrator(StarcalNode):
             'camera_driver': 'none' if driver is None else driver.outcome,
             'camera_driver_failures': 0 if driver is None else driver.failures,
             'state_damaged_files': len(state.damage),
+            'state_refused_calibrations': len(state.withheld),
             'disk_free_mb': 'none' if free is None else free // 1_000_000,
         }
         if state.trouble:
             return ERROR, f'state not saved, in memory only: {state.trouble}', numbers
+        if state.withheld:
+            return WARN, '; '.join(state.withheld), numbers
         if active is not None and active.forced:
             return WARN, f'active despite the gate: {"; ".join(active.reasons)}', numbers
         if self.count_publishers(self._calibration.topic_name) > 1:

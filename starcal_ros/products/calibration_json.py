@@ -30,6 +30,7 @@ from starcal_ros.untrusted import json_value, PRODUCT_BYTES, shown
 SCHEMA = 1
 CALIBRATION_FILE = 'calibration.json'
 
+_UNIT_TOLERANCE = 1e-6  # of the length of a quaternion: rounding to a text leaves less
 _INTRINSICS = 5  # the first parameters of every camera model: fx, skew, fy, cx, cy
 _REPLACED = ('geometry', 'parent_frame', 'child_frame')  # by the keys of `_Published`
 # Keys of version 0.1 and their names now, by the key that holds them ('': the object itself).
@@ -192,6 +193,8 @@ def prior_of(calibration: Calibration) -> CameraGeometry | None:
     try:
         numbers = np.array(json_value(calibration.provenance['prior']), np.float64)
         if numbers.shape != (count + 4,):
+            return None
+        if not abs(np.linalg.norm(numbers[count:]) - 1.0) < _UNIT_TOLERANCE:
             return None
         prior = dataclasses.replace(camera, parameters=numbers[:count])
         check_plausible(prior)

@@ -25,6 +25,7 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.bag import reader
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
+from starcal_ros.errors import ProductError
 from starcal_ros.estimation.temperature import summary as thermal_summary
 from starcal_ros.messages.types import OBSERVATIONS_TYPE
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, prior_of, read_calibration
@@ -81,7 +82,14 @@ def write_report(folder: Path) -> Path:
         When a file cannot be read or the report cannot be written.
     """
     path = folder / REPORT_FILE
-    write_atomically(path, render(read_folder(folder)))
+    found = read_folder(folder)
+    try:
+        text = render(found)
+    # A file can hold numbers that no calibration has; the errors of drawing have no common base.
+    except Exception as error:
+        why = f'{type(error).__name__}: {error}'
+        raise ProductError(f'{folder}: the products cannot be drawn: {why}') from error
+    write_atomically(path, text)
     return path
 
 

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import ProductError
-from starcal_ros.files import read_regular
 from starcal_ros.products.files import write_atomically
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.report.annotation import annotate, stretch
+from starcal_ros.untrusted import read_bytes
 
 THUMBNAILS_FOLDER = 'thumbnails'
 _USED = 6  # used images, evenly spread; between this and twice as many are kept
@@ -131,8 +131,8 @@ def read_thumbnails(folder: Path) -> tuple[Thumbnail, ...]:
         if name is None:
             continue
         try:
-            encoded = read_regular(path, _MOST_BYTES)
-        except OSError:
+            encoded = read_bytes(path, _MOST_BYTES, follow_links=False)
+        except (OSError, ValueError):
             continue
         if encoded.startswith(_MAGIC[path.suffix]):
             time_ns = int(name['image_ns'] or name['star_ns'])
