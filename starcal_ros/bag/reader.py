@@ -120,9 +120,11 @@ def _summary(file: Path) -> list[Topic]:
         return []
     found = []
     for number, count in summary.statistics.channel_message_counts.items():
-        channel = summary.channels[number]
-        if count and channel.message_encoding == 'cdr':
-            found.append(Topic(channel.topic, summary.schemas[channel.schema_id].name, count))
+        channel = summary.channels.get(number)
+        schema = summary.schemas.get(channel.schema_id) if channel else None
+        # Without a schema a message has no type: it is not of ROS 2.
+        if count and channel and schema and channel.message_encoding == 'cdr':
+            found.append(Topic(channel.topic, schema.name, count))
     return found
 
 
