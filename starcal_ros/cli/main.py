@@ -53,11 +53,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns the exit status."""
     # Read when NumPy is loaded: on matrices of this size two threads of BLAS wait for each other.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-    if isinstance(sys.stdout, io.TextIOWrapper):  # the name of a file need not be UTF-8
-        sys.stdout.reconfigure(errors='backslashreplace')
-    open_missing_streams()
     command = ''
     try:
+        open_missing_streams()
+        if isinstance(sys.stdout, io.TextIOWrapper):  # the name of a file need not be UTF-8
+            sys.stdout.reconfigure(errors='backslashreplace')
         tool = parser()
         if '_ARGCOMPLETE' in os.environ:  # set by a shell that completes a command line
             import argcomplete
