@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
 import json
@@ -11,6 +11,7 @@ from pathlib import Path
 import shutil
 import tempfile
 import time
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -53,7 +54,7 @@ def write_state(folder: Path, seal: Seal = CHECKSUMS) -> None:
 
 
 @contextlib.contextmanager
-def _copied(sound: Path):  # type: ignore[no-untyped-def]
+def _copied(sound: Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(dir=sound.parent) as folder:
         copy = Path(folder) / 'state'
         shutil.copytree(sound, copy)
@@ -116,7 +117,8 @@ def _changed_setup(k: int, draw: np.random.Generator) -> Setup:
         limits = [c for c in found if c.option.startswith('max_') and hasattr(gate, c.option)]
         chosen = limits[draw.integers(len(limits))]
         if chosen.option != 'max_parameter_sigma':
-            gate = dataclasses.replace(gate, **{chosen.option: draw.uniform(0, 2) * chosen.found})
+            limit: Any = draw.uniform(0, 2) * chosen.found
+            gate = dataclasses.replace(gate, **{chosen.option: limit})
     return dataclasses.replace(setup, prior=prior, gate=gate)
 
 
@@ -210,14 +212,17 @@ def _sparse(path: Path) -> None:
         file.truncate(1 << 40)
 
 
+def fifo_in_place_of(path: Path) -> None:
+    """Replace a file by a FIFO, which nobody writes to."""
+    path.unlink()
+    os.mkfifo(path)
+
+
 _EVENT = 'calibrations/00000003_calibration_00000003.json'
 _STRANGE: dict[str, Callable[[Path], object]] = {
     'FIFO as image': lambda f: os.mkfifo(f / 'ensemble/00000003.mcap'),
     'FIFO as calibration': lambda f: os.mkfifo(f / _EVENT),
-    'FIFO as refused': lambda f: (
-        (f / 'ensemble/refused.json').unlink(),
-        os.mkfifo(f / 'ensemble/refused.json'),
-    ),
+    'FIFO as refused': lambda f: fifo_in_place_of(f / 'ensemble/refused.json'),
     '/dev/zero as image': lambda f: (f / 'ensemble/00000003.mcap').symlink_to('/dev/zero'),
     '/dev/zero as calibration': lambda f: (f / _EVENT).symlink_to('/dev/zero'),
     'link to itself': lambda f: (f / _EVENT).symlink_to(f / _EVENT),

@@ -129,7 +129,8 @@ def _check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> 
         raise OptionError(f'{folder}: holds the bag that is read; choose another folder (-o)')
     check_not_inputs([folder / name for name in PRODUCT_FILES], (*bag_files, *files))
     pictures = folder / THUMBNAILS_FOLDER
-    if pictures.is_dir() and any(pictures.iterdir()) and not (folder / CALIBRATION_FILE).exists():
+    is_old = (folder / CALIBRATION_FILE).exists() and not pictures.is_symlink()
+    if pictures.is_dir() and any(pictures.iterdir()) and not is_old:
         raise OptionError(f'{pictures}: is not of a calibration; choose another folder (-o)')
 
 
