@@ -100,38 +100,20 @@ def _calibrate(args: argparse.Namespace) -> int:
     """Calibrate from bags in one process, as the two nodes do on the graph."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
+    from starcal_ros.cli.output_places import check_folder
     from starcal_ros.pipeline.provenance import inputs_of
     from starcal_ros.pipeline.setup import files_of, read_setup
 
     setup = read_setup(args.params)
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
-    _check_folder(args.output, args.bags, (args.params, *files_of(setup.frames)))
+    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames)))
     inputs = inputs_of((*reader.mcap_files(args.bags), args.params))
     calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
     report = _write_report(args.output)
     output.print_calibration(calibration, setup.prior)
     print_text(f'products written to {args.output}; {report}')
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
-
-
-def _check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> None:
-    """Check that products in a folder replace no input and do not become part of a bag."""
-    from starcal_ros.bag import reader
-    from starcal_ros.files import same_as_one_of
-    from starcal_ros.products.calibration_json import CALIBRATION_FILE
-    from starcal_ros.products.files import check_not_inputs
-    from starcal_ros.products.folder import PRODUCT_FILES
-    from starcal_ros.report.thumbnails import THUMBNAILS_FOLDER
-
-    bag_files = reader.files_of_bags(bags)
-    if same_as_one_of(folder, [file.parent for file in bag_files]):
-        raise OptionError(f'{folder}: holds the bag that is read; choose another folder (-o)')
-    check_not_inputs([folder / name for name in PRODUCT_FILES], (*bag_files, *files))
-    pictures = folder / THUMBNAILS_FOLDER
-    is_old = (folder / CALIBRATION_FILE).exists() and not pictures.is_symlink()
-    if pictures.is_dir() and any(pictures.iterdir()) and not is_old:
-        raise OptionError(f'{pictures}: is not of a calibration; choose another folder (-o)')
 
 
 def _calibrate_into(
@@ -255,10 +237,10 @@ def _compare(args: argparse.Namespace) -> int:
     files = [_file(path) for path in (args.a, args.b)]
     found = comparison.compare(*map(read_calibration, files))
     if args.output:
-        from starcal_ros.products.files import check_not_inputs
+        from starcal_ros.cli.output_places import check_no_product
         from starcal_ros.report import figures
 
-        check_not_inputs([args.output], [p for file in files for p in _beside(file)])
+        check_no_product(args.output, files)
         figures.write_comparison(found, args.output)
     if args.json:
         print_text(json.dumps(comparison.content(found), indent=1, allow_nan=False))
@@ -273,12 +255,12 @@ def _lookup(args: argparse.Namespace) -> int:
     """Write a table of lines of sight by pixel."""
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
+    from starcal_ros.cli.output_places import check_no_product
     from starcal_ros.products.calibration_json import read_calibration
-    from starcal_ros.products.files import check_not_inputs
     from starcal_ros.products.lookup_table import write_lookup_table
 
     file = _file(args.calibration)
-    check_not_inputs([args.output], _beside(file))
+    check_no_product(args.output, [file])
     calibration = read_calibration(file)
     camera = calibration.geometry.camera
     if args.step is not None:
@@ -304,13 +286,6 @@ def _file(path: Path) -> Path:
     if not (path / CALIBRATION_FILE).exists():
         raise OptionError(f'{path}: the folder holds no {CALIBRATION_FILE}')
     return path / CALIBRATION_FILE
-
-
-def _beside(calibration: Path) -> list[Path]:
-    """The file of a calibration and the other products in its folder."""
-    from starcal_ros.products.folder import PRODUCT_FILES
-
-    return [calibration, *(calibration.with_name(name) for name in PRODUCT_FILES)]
 
 
 def _play(args: argparse.Namespace) -> int:
@@ -352,6 +327,7 @@ def _demo(args: argparse.Namespace) -> int:
     """Calibrate the small bag with the real nodes and compare the result with the truth."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import demo
+    from starcal_ros.cli.output_places import check_folder
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.products.folder import write_products
@@ -359,7 +335,7 @@ def _demo(args: argparse.Namespace) -> int:
 
     _make_folder(args.output)
     bag = demo.tiny_bag(args.output)
-    _check_folder(args.output, [bag.bag], ())
+    check_folder(args.output, [bag.bag], ())
     print_text(f'bag {bag.bag}; log files and products in {args.output}')
     with progress_bar(bag.image_count, 'images') as advance:
         calibration, verdict = demo.run(bag, args.output, on_image=advance)
