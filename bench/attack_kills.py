@@ -1,4 +1,11 @@
-"""Kills of each sub-command at random instants: inputs unchanged, outputs whole, old or absent."""
+"""
+Kills of each sub-command: inputs unchanged, outputs whole, old or absent.
+
+Instants are drawn from the processor time of a whole run, so that a busy machine does not move all
+of them to its start.  A kill at random seldom meets a write.  So the state of the output folder is
+also looked at just before each operation of a run on a file in it: that is what a SIGKILL at
+that instant would leave.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +15,7 @@ from dataclasses import dataclass, field
 import hashlib
 import io
 import json
+import math
 import os
 from pathlib import Path
 import random
@@ -20,6 +28,7 @@ import traceback
 
 import cv2
 
+from bench import graph
 from bench.attack_row import AttackRow
 from starcal_ros.bag import reader
 from starcal_ros.cli import entry_point, main
@@ -38,11 +47,13 @@ class Command:
 
     ``arguments`` are in a folder that holds ``in/``, the inputs, and ``out/``.  ``is_repeatable``:
     whether each run writes the same bytes; if not, outputs are checked by reading them.
+    ``starts_nodes``: it waits for other processes, so instants are drawn by the clock.
     """
 
     name: str
     arguments: tuple[str, ...]
     is_repeatable: bool = True
+    starts_nodes: bool = False
 
 
 COMMANDS = (
@@ -57,8 +68,8 @@ COMMANDS = (
     ),
     Command('inspect', ('in/bag', '--params', 'in/bag/params.yaml')),
     Command('diagnose', ('in/bag', '--params', 'in/bag/params.yaml')),
-    Command('play', ('in/bag', '--rate', '5')),
-    Command('demo', ('-o', 'out'), is_repeatable=False),
+    Command('play', ('in/bag', '--rate', '5'), starts_nodes=True),
+    Command('demo', ('-o', 'out'), is_repeatable=False, starts_nodes=True),
 )
 
 
@@ -77,12 +88,16 @@ class _Found:
 
 def rows(quick: bool) -> list[AttackRow]:
     """Rows for the sub-commands; in the short form without those that start nodes."""
-    chosen = [c for c in COMMANDS if not (quick and c.name in ('play', 'demo', 'campaign'))]
+    chosen = [c for c in COMMANDS if not (quick and (c.starts_nodes or c.name == 'campaign'))]
+    writing = [c for c in chosen if 'out' in ' '.join(c.arguments) and not c.starts_nodes]
     times = _TIMES_QUICK if quick else _TIMES
     cv2.setNumThreads(0)  # threads do not survive the fork of a child
     with tempfile.TemporaryDirectory() as folder:
         make_inputs(Path(folder))
-        return [killed(command, Path(folder), times) for command in chosen]
+        return [
+            *(watched(command, Path(folder)) for command in writing),
+            *(killed(command, Path(folder), times) for command in chosen),
+        ]
 
 
 def make_inputs(folder: Path) -> None:
@@ -103,26 +118,56 @@ def _arguments(command: Command, folder: Path) -> list[str]:
     return [command.name, *words]
 
 
-def killed(command: Command, folder: Path, times: int) -> AttackRow:
+def watched(command: Command, folder: Path) -> AttackRow:
+    """Look at the output folder before each operation on a file in it, in two whole runs."""
+    old, arguments = _old_outputs(command, folder), _arguments(command, folder)
+    expected, _ = _whole_run(command, folder, old)
+    found = _Found()
+    for earlier in (old,) if command.name == 'report' else (old, None):
+        _restore(folder, earlier)
+        before = _digests(folder / 'out')
+        states = folder / 'states'
+        Child(folder, arguments, states).wait()
+        for line in states.read_text().splitlines():
+            found.tried += 1
+            _check_outputs(command, folder / 'out', before, expected, found, json.loads(line))
+    for text in found.cut_outputs:
+        print(f'{command.name}: {text}')
+    return AttackRow(
+        f'starcal {command.name}: output folder before each file operation',
+        found.tried,
+        found.tried,
+        len(found.cut_outputs),
+        0,
+    )
+
+
+def killed(command: Command, folder: Path, times: int, until_s: float = math.inf) -> AttackRow:
     """
     Kill a command at random instants, by SIGINT and SIGKILL in turn.
 
-    Every second run replaces the products of an earlier one.
+    Every second pair of runs replaces the products of an earlier one.  No run begins after
+    ``until_s``, by the monotonic clock.
     """
-    old = _old_outputs(command, folder)
-    arguments = _arguments(command, folder)
-    expected, longest_s = _whole_run(arguments, folder, old)
+    old, arguments = _old_outputs(command, folder), _arguments(command, folder)
+    expected, longest_s = _whole_run(command, folder, old)
     inputs = _inputs(folder)
     draw = random.Random(14)
     found = _Found()
     for k in range(times):
+        if time.monotonic() > until_s:
+            break
         _restore(folder, old if k % 4 < 2 or command.name == 'report' else None)
         number = signal.SIGKILL if k % 2 else signal.SIGINT
         before = _digests(folder / 'out')
         child = Child(folder, arguments)
-        ended = child.wait(draw.uniform(0.0, longest_s))
-        found.finished += ended is not None
-        if ended is None:
+        instant_s = draw.uniform(0.0, longest_s)
+        if command.starts_nodes:
+            ended = child.wait(instant_s) is not None
+        else:
+            ended = child.wait_for_processor(instant_s)
+        found.finished += ended
+        if not ended:
             child.send(number)
             found.hangs += child.wait(_SLOWEST_S) is None
         child.send(signal.SIGKILL)  # nodes that the demo has started
@@ -153,6 +198,7 @@ def killed(command: Command, folder: Path, times: int) -> AttackRow:
 def _old_outputs(command: Command, folder: Path) -> Path:
     """Folder with products of an earlier run, other ones than those of the next."""
     old = folder / f'old_{command.name}'
+    shutil.rmtree(old, ignore_errors=True)
     old.mkdir()
     if command.name == 'report':
         shutil.copytree(folder / 'in/a', old, dirs_exist_ok=True)
@@ -168,15 +214,19 @@ def _old_outputs(command: Command, folder: Path) -> Path:
     return old
 
 
-def _whole_run(arguments: list[str], folder: Path, old: Path) -> tuple[Mapping[str, str], float]:
-    """Digests of the outputs of runs that are not killed, and the longest time that one takes."""
+def _whole_run(command: Command, folder: Path, old: Path) -> tuple[Mapping[str, str], float]:
+    """Digests of the outputs of a run that is not killed, and its time, s."""
     _restore(folder, old)
-    start_s = time.monotonic()
-    child = Child(folder, arguments)
+    start_s, before = time.monotonic(), os.times()
+    child = Child(folder, _arguments(command, folder))
     status = child.wait(_SLOWEST_S)
     if status not in (0, 3):
-        raise RuntimeError(f'{arguments[0]} ended with {status}: {child.said()[-500:]}')
-    return _digests(folder / 'out'), time.monotonic() - start_s
+        raise RuntimeError(f'{command.name} ended with {status}: {child.said()[-500:]}')
+    after = os.times()
+    processor_s = after.children_user + after.children_system
+    processor_s -= before.children_user + before.children_system
+    took_s = time.monotonic() - start_s if command.starts_nodes else processor_s
+    return _digests(folder / 'out'), took_s
 
 
 def _restore(folder: Path, old: Path | None) -> None:
@@ -193,9 +243,10 @@ def _check_outputs(
     before: Mapping[str, str],
     expected: Mapping[str, str],
     found: _Found,
+    state: Mapping[str, str] | None = None,
 ) -> None:
-    """Each file must be as before the run, as after a whole one, or absent."""
-    after = _digests(out)
+    """Each file, now or in a recorded state, must be old, as after a whole run, or absent."""
+    after = _digests(out) if state is None else state
     parts = [name for name in after if name.endswith('.part')]
     found.unfinished_files += bool(parts)
     for name, digest in after.items():
@@ -253,13 +304,13 @@ def _changed(before: Mapping[str, str], after: Mapping[str, str]) -> set[str]:
 class Child:
     """The tool in a forked process of its own group, without the seconds that imports take."""
 
-    def __init__(self, folder: Path, arguments: list[str]) -> None:
+    def __init__(self, folder: Path, arguments: list[str], states: Path | None = None) -> None:
         self._log = folder / 'log'
         sys.stdout.flush()
         self._status: int | None = None
         self._number = os.fork()
         if self._number == 0:
-            _run(arguments, self._log)
+            _run(arguments, self._log, folder / 'out', states)
         with contextlib.suppress(OSError):  # it has done so itself, or has ended
             os.setpgid(self._number, self._number)
 
@@ -271,8 +322,15 @@ class Child:
             if number:
                 self._status = os.waitstatus_to_exitcode(status)
             else:
-                time.sleep(min(0.001, max(end_s - time.monotonic(), 0.0)))
+                time.sleep(min(0.005, max(end_s - time.monotonic(), 0.0)))
         return self._status
+
+    def wait_for_processor(self, processor_s: float) -> bool:
+        """Wait until it has used a processor for a time; True where it has ended before."""
+        while self.wait(0.001) is None:
+            if graph.processor_s(self._number) >= processor_s:
+                return False
+        return True
 
     def send(self, number: int) -> None:
         """Send a signal to the group."""
@@ -284,10 +342,12 @@ class Child:
         return self._log.read_text(errors='replace') if self._log.exists() else ''
 
 
-def _run(arguments: list[str], log: Path) -> None:
+def _run(arguments: list[str], log: Path, out: Path, states: Path | None) -> None:
     """In the forked process: run the tool and end."""
     status = 1
     try:
+        if states is not None:
+            _record_states(out, states)
         # SIGINT waits until the tool is called, as it does in a process of its own.
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         os.setpgid(0, 0)
@@ -303,3 +363,25 @@ def _run(arguments: list[str], log: Path) -> None:
         sys.stderr.flush()
     finally:
         os._exit(status)
+
+
+def _record_states(out: Path, states: Path) -> None:
+    """Write the digests of a folder as a line of JSON before each operation on a file in it."""
+    lines = states.open('w')
+    looking = False
+
+    def look(event: str, arguments: tuple[object, ...]) -> None:
+        nonlocal looking
+        if looking or event not in _OPERATIONS or not str(arguments[0]).startswith(str(out)):
+            return
+        if event == 'open' and not int(str(arguments[2])) & (os.O_WRONLY | os.O_RDWR):
+            return
+        looking = True
+        lines.write(json.dumps(_digests(out)) + '\n')
+        lines.flush()
+        looking = False
+
+    sys.addaudithook(look)
+
+
+_OPERATIONS = ('open', 'os.rename', 'os.remove', 'os.rmdir', 'os.mkdir', 'os.truncate', 'os.link')
