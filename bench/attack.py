@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from bench import attack_bags, attack_kills, attack_outputs, attack_state
+from bench import attack_bags, attack_inputs, attack_kills, attack_outputs, attack_state
 from bench.attack_row import AttackRow
 from bench.table import Table
 
@@ -13,6 +13,7 @@ PARTS: tuple[Callable[[bool], list[AttackRow]], ...] = (
     attack_outputs.rows,
     attack_state.rows,
     attack_bags.rows,
+    attack_inputs.rows,
     attack_kills.rows,
 )
 
