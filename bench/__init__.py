@@ -12,5 +12,6 @@ LONG = (
     'faults',
     'soak',
     'transport',
+    'attack',
 )
 """Those that take some minutes: run when they are named."""

@@ -20,9 +20,11 @@ The public functions and records are those of ``__all__``; `api` describes them.
 at its first use, so that ``import starcal_ros`` loads neither NumPy nor OpenCV.
 """
 
-from __future__ import annotations
+from starcal_ros.safe_path import leave_current_folder
 
-from typing import TYPE_CHECKING
+leave_current_folder()  # before any other import, __future__ included
+
+from typing import TYPE_CHECKING  # noqa: E402
 
 if TYPE_CHECKING:
     from starcal_ros.api import (

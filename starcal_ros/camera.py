@@ -35,6 +35,12 @@ from starcal_ros.lens import (
     ideal_points,
 )
 
+MAX_SIDE_PX = 65536
+_MAX_FOCAL_PX = 1e8  # 0.002 arcsec per pixel
+_MIN_FOCAL_OF_SIDE = 0.15  # of a perspective lens: 147 degrees from side to side
+_MAX_COEFFICIENT = 1e15
+_SEEN = 0.5  # part of the detector that must have a line of sight
+
 INTRINSIC_NAMES = ('fx', 'skew', 'fy', 'cx', 'cy')
 
 
@@ -137,6 +143,60 @@ class CameraModel:
         for name, value in parameters.items():
             changed[self.parameter_names.index(name)] = value
         return dataclasses.replace(self, parameters=changed)
+
+
+def check_plausible(camera: CameraModel) -> None:
+    """
+    Check a camera from a file or a message: a real one is far inside these limits.
+
+    Raises
+    ------
+    ValueError
+        Naming the parameter, its value and the likely cause.
+    """
+    width, height = camera.width, camera.height
+    if max(width, height) > MAX_SIDE_PX:
+        raise ValueError(f'image size: {width} x {height} is over {MAX_SIDE_PX} px')
+    fx, skew, fy, cx, cy = camera.intrinsics.tolist()
+    side_px = max(width, height)
+    if camera.model == 'equidistant':
+        least_px = float(np.hypot(width, height)) / (2 * np.pi)
+    else:
+        least_px = _MIN_FOCAL_OF_SIDE * side_px
+    for name, focal_px in (('fx', fx), ('fy', fy)):
+        if focal_px < least_px:
+            raise ValueError(
+                f'{name}: {focal_px:.6g} px is under {least_px:.4g} px, the shortest focal length'
+                f' for an image of {width} x {height}; is it in mm? divide by the pixel size in mm'
+            )
+        if focal_px > _MAX_FOCAL_PX:
+            raise ValueError(f'{name}: {focal_px:.6g} px is over {_MAX_FOCAL_PX:.6g} px')
+    if not 0.1 <= fx / fy <= 10.0:
+        raise ValueError(f'fx, fy: {fx:.6g}, {fy:.6g} px differ by more than a factor of ten')
+    if abs(skew) > 0.1 * fx:
+        raise ValueError(f'skew: {skew:.6g} px is over a tenth of fx')
+    for name, centre_px, size in (('cx', cx, width), ('cy', cy, height)):
+        if not -size <= centre_px <= 2 * size:
+            raise ValueError(f'{name}: {centre_px:.6g} px is far outside of the {size} px')
+    coefficients = camera.distortion
+    if (np.abs(coefficients) > _MAX_COEFFICIENT).any() or _part_seen(camera) < _SEEN:
+        raise ValueError(
+            f'distortion: {", ".join(f"{value:.4g}" for value in coefficients)}: the lens model'
+            ' has no line of sight over most of the detector; check the coefficients'
+        )
+
+
+def _part_seen(camera: CameraModel) -> float:
+    """Part of a grid of pixels that have a line of sight, displaced by less than an image."""
+    grid = pixel_grid(camera, 9, 9)
+    with np.errstate(all='ignore'):
+        try:
+            direction = line_of_sight(camera, grid)
+            moved_px = np.abs(distortion_px(camera, grid)).max(axis=1)
+        except (ArithmeticError, np.linalg.LinAlgError):
+            return 0.0
+    near = moved_px <= max(camera.width, camera.height)
+    return float((np.isfinite(direction).all(axis=1) & near).mean())
 
 
 def distortion_px(camera: CameraModel, pixels: Floats) -> Floats:

@@ -19,3 +19,6 @@ def utc_text(time_ns: int) -> str:
     except (ValueError, OverflowError, OSError):
         return f'{time_ns} ns'  # outside the calendar of datetime
     return f'{whole:%Y-%m-%d %H:%M:%S}.{rest_ns // 1_000_000:03d} UTC'
+
+
+MAX_STAMP_NS = 2**31 * NANOSECONDS_PER_SECOND - 1  # builtin_interfaces/Time: int32 seconds

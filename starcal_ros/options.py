@@ -15,12 +15,16 @@ import math
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
 from starcal_ros.errors import OptionError
+from starcal_ros.untrusted import check_text, PARAMETER_BYTES, read_text, shown, yaml_value
 
 OptionValue = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 OptionsT = TypeVar('OptionsT')
+_INT64 = 2**63
+_MOST_CHARACTERS = 4096  # of a text: the longest path of Linux
+_MOST_ITEMS = 100  # of a list; the longest in use has 22 numbers
+_LONGEST_NAME = 100
+_LONGEST_SECTION = 255  # of a topic or node with its namespace, by ROS
 _ALMOST = 0.85  # similarity of names from which one is taken for the other, misspelt
 
 
@@ -64,11 +68,13 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
         value = value.tolist()
 
     def refuse(expected: str) -> OptionError:
-        return OptionError(f'{field.name}: {value!r} is not {expected}')
+        return OptionError(f'{field.name}: {shown(value)} is not {expected}')
 
     def number(item: object) -> float:
         if isinstance(item, bool) or not isinstance(item, (int, float)):
             raise refuse('a number')
+        if isinstance(item, int) and not -_INT64 <= item < _INT64:
+            raise refuse('within 64 bit')
         if not math.isfinite(item):
             raise refuse('finite')
         low, high = meta['low'], meta['high']
@@ -79,6 +85,12 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
     def text(item: object) -> str:
         if not isinstance(item, str):
             raise refuse('a string')
+        try:
+            check_text(item)
+        except ValueError as error:
+            raise OptionError(f'{field.name}: {error}') from error
+        if len(item) > _MOST_CHARACTERS:
+            raise refuse(f'a text of at most {_MOST_CHARACTERS} characters')
         if meta['choices'] and item not in meta['choices']:
             raise refuse('one of ' + ', '.join(meta['choices']) + nearest(item, meta['choices']))
         return item
@@ -99,11 +111,17 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
     if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
         raise refuse('a list')
     items = list(value)
+    if len(items) > _MOST_ITEMS:
+        raise OptionError(f'{field.name}: {len(items)} values, at most {_MOST_ITEMS} are read')
     if meta['length'] is not None and len(items) != meta['length']:
         raise refuse(f'a list of {meta["length"]} values')
     of_text = meta['choices'] or (isinstance(default, tuple) and isinstance(default[0], str))
     if of_text:
-        return tuple(text(item) for item in items)
+        texts = tuple(text(item) for item in items)
+        if meta['choices'] and len(set(texts)) < len(texts):
+            twice = next(item for item in texts if texts.count(item) > 1)
+            raise OptionError(f'{field.name}: {twice} stands twice')
+        return texts
     return tuple(float(number(item)) for item in items)
 
 
@@ -114,7 +132,8 @@ def is_of_ros(name: str) -> bool:
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """Suggestion for an unknown word, to append to an error message; '' without a close match."""
-    near = difflib.get_close_matches(word, known, 1)
+    # Of a word of a million letters each comparison takes seconds.
+    near = difflib.get_close_matches(word[:_LONGEST_NAME], known, 1)
     return f' (did you mean {near[0]}?)' if near else ''
 
 
@@ -169,7 +188,7 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
     for name in sections:
         meant = meant_node(name, nodes)
         if meant and meant not in named:
-            raise OptionError(f'{path}: section {name!r} is not read: write /**/{meant}')
+            raise OptionError(f'{path}: section {shown(name)} is not read: write /**/{meant}')
     if not applied:
         there = ', '.join(sections)
         raise OptionError(
@@ -179,7 +198,7 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
     for name in applied:
         body = sections[name]
         if not isinstance(body, dict) or not isinstance(body.get('ros__parameters'), dict):
-            raise OptionError(f'{path}: section {name!r} has no ros__parameters')
+            raise OptionError(f'{path}: section {shown(name)} has no ros__parameters')
         values.update(body['ros__parameters'])
     return values
 
@@ -194,24 +213,25 @@ def parameter_sections(path: Path) -> dict[str, object]:
         If the file cannot be read or is not a ROS parameter file.
     """
     try:
-        content = yaml.safe_load(path.read_text())
+        content = yaml_value(read_text(path, PARAMETER_BYTES))
     except OSError as error:
         raise OptionError(f'{path}: cannot be read: {error.strerror}') from error
-    except UnicodeDecodeError as error:
-        raise OptionError(f'{path}: not a text file') from error
-    except yaml.YAMLError as error:
-        line = str(error).replace('\n', ' ')
-        raise OptionError(f'{path}: not YAML: {line}') from error
+    except ValueError as error:
+        raise OptionError(f'{path}: {error}') from error
     if not isinstance(content, dict):
         raise OptionError(f'{path}: not a ROS parameter file (no node sections)')
-    return _flat(content, '')
+    sections = _flat(content, '')
+    for name in sections:
+        if len(name) > _LONGEST_SECTION:
+            raise OptionError(f'{path}: section {shown(name)} is too long for a name')
+    return sections
 
 
-def _flat(content: dict[object, object], namespace: str) -> dict[str, object]:
+def _flat(content: Mapping[str, object], namespace: str) -> dict[str, object]:
     """Sections of a file; ROS lets the namespaces of a node enclose it, level by level."""
     sections: dict[str, object] = {}
     for key, body in content.items():
-        name = f'{namespace}/{key}' if namespace else str(key)
+        name = f'{namespace}/{key}' if namespace else key
         inside = body.values() if isinstance(body, dict) and 'ros__parameters' not in body else ()
         if inside and all(isinstance(one, dict) for one in inside):
             sections |= _flat(body, name)  # type: ignore[arg-type]
@@ -235,5 +255,5 @@ def _parts_match(pattern: list[str], parts: list[str]) -> bool:
 
 def meant_node(section: str, nodes: Iterable[str]) -> str:
     """The one of the nodes that a section names, or almost names; empty: none of them."""
-    last = section.rpartition('/')[2]
+    last = section.rpartition('/')[2][:_LONGEST_NAME]
     return next(iter(difflib.get_close_matches(last, nodes, 1, _ALMOST)), '')

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Count, Finite, Floats, Pixels, Shape
-from starcal_ros.camera import CameraModel
+from starcal_ros.camera import CameraModel, check_plausible
+from starcal_ros.constants import MAX_STAMP_NS
 from starcal_ros.detector_field import degrees, DetectorField
 
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
@@ -28,6 +29,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'bad_layout': 'size, row step and data of the image message do not fit each other',
     'wrong_size': 'the image is not of the size of the prior camera',
     'bad_attitude': 'the attitude about the image is not finite or not of unit length',
+    'frozen_attitude': 'the star tracker repeats an attitude of before, but the stars have moved',
     'no_attitude': 'no attitude sample on both sides of the image',
     'attitude_gap': 'the attitude samples about the image are too far apart',
     'out_of_order': 'the image is stamped before, or at, one already taken',
@@ -42,10 +44,26 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'no_stars': 'too few star-like sources in the image',
     'no_match': 'no rotation of the predicted stars explains the sources in the image',
     'too_few_stars': 'fewer stars were measured well than an image needs',
+    'bad_stamp': 'the stamp, with stamp_offset_s, is negative or beyond the range of ROS stamps',
+    'bad_observations': (
+        'the observations hold values that no image or star can have (said by the calibrator)'
+    ),
     'overrun': 'images came faster than they could be measured',
     'internal_error': 'the measurement failed unexpectedly; the log of the node has the cause',
+    'other': 'refused by the sender for a reason that this version does not have',
 }
 """Why an image can be refused: stable name -> meaning."""
+
+
+def counted_refusal(refusal: str) -> str:
+    """
+    The name under which a refused image is counted.
+
+    Unknown ones are one name: the counts are in every status and in a file, and must not grow with
+    the texts that a sender makes up.
+    """
+    return refusal if refusal in IMAGE_REFUSALS else 'other'
+
 
 STAR_REFUSALS: Mapping[str, str] = {
     'not_detected': 'bright enough to be seen, but no source stands there',
@@ -255,6 +273,7 @@ class Ensemble:
         if not refusal and any(image.time_ns == observations.time_ns for image in self.images):
             refusal = 'duplicate'
         if refusal:
+            refusal = counted_refusal(refusal)
             count = self.refused.get(refusal, 0) + 1
             return Ensemble(self.images, {**self.refused, refusal: count})
         return Ensemble((*self.images, observations), self.refused)
@@ -614,7 +633,7 @@ class GateCheck:
     def _text(self, value: float) -> str:
         if not math.isfinite(value):
             return 'not a finite number'
-        number = f'{value:.4g}' if abs(value) < 1e4 else f'{value:.0f}'
+        number = f'{value:.0f}' if 1e4 <= abs(value) < 1e15 else f'{value:.4g}'
         return f'{number} {self.unit}' if self.unit else number
 
 
@@ -763,3 +782,36 @@ class Calibration:
     def sigma(self) -> Floats:
         """1-sigma (p,) of `parameter_names`."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+_MOST = 1e15  # of a camera parameter, whose square and cube must stay finite
+_UNIT_TOLERANCE = 1e-6  # of the length of a quaternion: rounding to a text leaves less
+
+
+def check_calibration(calibration: Calibration) -> None:
+    """
+    Check the geometry and the stamps of a calibration from a file or a message.
+
+    The camera of one that the gate refused may be any that a report can show.
+
+    Raises
+    ------
+    ValueError
+        Naming the field and its value.
+    """
+    camera = calibration.geometry.camera
+    if calibration.accepted or calibration.forced:
+        check_plausible(camera)
+    elif np.abs(camera.parameters).max() > _MOST:
+        raise ValueError(f'parameters: {np.abs(camera.parameters).max():.6g} is over {_MOST:g}')
+    rotation = calibration.geometry.star_tracker_from_camera_xyzw
+    if not abs(np.linalg.norm(rotation) - 1.0) < _UNIT_TOLERANCE:
+        raise ValueError(f'alignment.rotation: {rotation.tolist()} is not a unit quaternion')
+    stamps_ns = {
+        'time_ns': calibration.time_ns,
+        'first_image_ns': calibration.first_image_ns,
+        'active_since_ns': calibration.active_since_ns,
+    }
+    for name, stamp_ns in stamps_ns.items():
+        if not 0 <= stamp_ns <= MAX_STAMP_NS:
+            raise ValueError(f'{name}: {stamp_ns} ns is not within the range of ROS stamps')

@@ -15,14 +15,13 @@ import logging
 from pathlib import Path
 import re
 
-import yaml
-
 from starcal_ros.arrays import Floats
 from starcal_ros.bag.mcap_reader import Damage, MAGIC, RawMessage, read_messages, read_summary
 from starcal_ros.bag.typestore import typestore, typestore_with
 from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.messages.fields import nearest_stamp_ns
 from starcal_ros.messages.images import image_from_message, refused_from_message
-from starcal_ros.messages.observations import observations_from_message
+from starcal_ros.messages.observations import checked_observations
 from starcal_ros.messages.telemetry import (
     attitude_from_message,
     temperature_from_message,
@@ -33,15 +32,18 @@ from starcal_ros.messages.types import (
 )
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, AttitudeOptions
+from starcal_ros.text import printable
+from starcal_ros.untrusted import METADATA_BYTES, read_text, yaml_value
 
 _SQLITE, _ROS_1 = b'SQLite format 3', b'#ROSBAG V'  # how bags of other kinds begin
 _MAGIC_BYTES = 16
+_LONGEST_NAME = 4096  # of a path on Linux
 
 
 @functools.lru_cache(maxsize=256)
 def log_damage(text: str) -> None:
     """Log damage of a bag as a warning of the logger ``starcal``, each text once."""
-    logging.getLogger('starcal').warning('%s', text)
+    logging.getLogger('starcal').warning('%s', printable(text))
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,9 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
     for path in map(Path, paths):
         if path.is_dir():
             files += _files_of_folder(path)
-        elif path.exists():
+        elif path.exists():  # opening a pipe would wait for whoever writes to it
+            if not path.is_file():
+                raise BagError(f'{path}: not a regular file')
             files.append(path)
         else:
             raise BagError(f'{path}: no such bag')
@@ -79,6 +83,19 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
         if not magic.startswith(MAGIC):
             raise BagError(f'{file}: not an MCAP bag{_how_to_convert(file, magic)}')
     return files
+
+
+def files_of_bags(paths: Iterable[Path | str]) -> tuple[Path, ...]:
+    """
+    The files that bags are read from, ``metadata.yaml`` of a folder included.
+
+    Raises
+    ------
+    BagError
+        If a path is neither an .mcap file nor a folder that holds some.
+    """
+    bags = [Path(path) for path in paths]
+    return (*mcap_files(bags), *(bag / 'metadata.yaml' for bag in bags if bag.is_dir()))
 
 
 def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple[Topic, ...]:
@@ -103,9 +120,11 @@ def _summary(file: Path) -> list[Topic]:
         return []
     found = []
     for number, count in summary.statistics.channel_message_counts.items():
-        channel = summary.channels[number]
-        if count and channel.message_encoding == 'cdr':
-            found.append(Topic(channel.topic, summary.schemas[channel.schema_id].name, count))
+        channel = summary.channels.get(number)
+        schema = summary.schemas.get(channel.schema_id) if channel else None
+        # Without a schema a message has no type: it is not of ROS 2.
+        if count and channel and schema and channel.message_encoding == 'cdr':
+            found.append(Topic(channel.topic, schema.name, count))
     return found
 
 
@@ -156,16 +175,22 @@ def read_images(
     topic: str,
     stamp_offset_s: float = 0.0,
     on_damage: Damage = log_damage,
+    size: tuple[int, int] | None = None,
 ) -> Iterator[Image | StarObservations]:
-    """Images of a topic; an image that cannot be decoded becomes refused observations."""
+    """
+    Images of a topic; an image that cannot be decoded becomes refused observations.
+
+    So does a compressed image of another ``size`` (width, height), where one is given.
+    """
     for raw in read_raw(paths, [topic], on_damage):
         try:
             message = decode(raw)
         except BagError as error:
-            yield refused_image(raw.log_time_ns, 0, 0, 'bad_layout', str(error))
+            log_time_ns = nearest_stamp_ns(raw.log_time_ns)
+            yield refused_image(log_time_ns, 0, 0, 'bad_layout', str(error))
             continue
         try:
-            yield image_from_message(message, stamp_offset_s)
+            yield image_from_message(message, stamp_offset_s, size)
         except ImageRefused as refused:
             yield refused_from_message(message, stamp_offset_s, refused)
 
@@ -205,7 +230,7 @@ def read_observations(
     paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
 ) -> Iterator[StarObservations]:
     """
-    Recorded observations of a topic.
+    Recorded observations of a topic; an image with impossible values becomes a refused one.
 
     Raises
     ------
@@ -214,7 +239,8 @@ def read_observations(
     """
     for raw in read_raw(paths, [topic], on_damage):
         try:
-            yield observations_from_message(decode(raw))
+            message = decode(raw)
+            yield checked_observations(message)
         except (AttributeError, ValueError) as error:
             raise BagError(f'{topic}: not readable as observations: {error}') from error
 
@@ -251,19 +277,14 @@ def _decoded(paths: Iterable[Path | str], topic: str, on_damage: Damage) -> Iter
 
 def _files_of_folder(folder: Path) -> list[Path]:
     """MCAP files of a bag folder: those listed in metadata.yaml, else all in the folder."""
-    try:
-        metadata = yaml.safe_load((folder / 'metadata.yaml').read_text())
-        information = metadata['rosbag2_bagfile_information']
-        names = [str(name) for name in information['relative_file_paths']]
-        compression = str(information.get('compression_mode') or '')
-    except (OSError, yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError):
-        names, compression = ([], '')  # a recorder that was killed leaves no valid metadata
+    names, compression = _metadata(folder / 'metadata.yaml')
     if compression:
         raise BagError(
             f'{folder}: compressed by {compression.lower()}; decompress it with ros2 bag convert'
         )
     listed = [folder / name for name in names if (folder / name).is_file()]
-    found = listed or sorted(folder.glob('*.mcap'), key=_natural)
+    here = (path for path in folder.glob('*.mcap') if path.is_file())
+    found = listed or sorted(here, key=_natural)
     if not found:
         other = _how_to_convert(folder, _SQLITE) if any(folder.glob('*.db3')) else ''
         inside = next(folder.glob('*/*.mcap'), None)
@@ -273,6 +294,28 @@ def _files_of_folder(folder: Path) -> list[Path]:
     if missing and listed:
         raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing')
     return found
+
+
+def _metadata(path: Path) -> tuple[list[str], str]:
+    """Names of the files of a bag and its compression, both empty without valid metadata."""
+    try:
+        metadata = yaml_value(read_text(path, METADATA_BYTES))
+        information = metadata['rosbag2_bagfile_information']
+        names = information['relative_file_paths']
+        compression = information.get('compression_mode')
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return [], ''  # a recorder that was killed leaves no valid metadata
+    if not isinstance(names, list) or not all(map(_is_inside, names)):
+        names = []
+    known = isinstance(compression, str) and re.fullmatch(r'\w{1,20}', compression)
+    return names, compression if known and compression.lower() != 'none' else ''
+
+
+def _is_inside(name: object) -> bool:
+    """Whether a value of metadata.yaml names a file below the folder of its bag."""
+    if not isinstance(name, str) or len(name) > _LONGEST_NAME:
+        return False
+    return not Path(name).is_absolute() and '..' not in Path(name).parts
 
 
 def _how_to_convert(path: Path, magic: bytes) -> str:

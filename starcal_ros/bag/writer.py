@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+import contextlib
 import io
 from pathlib import Path
 from types import TracebackType
@@ -14,6 +15,7 @@ import yaml
 from starcal_ros.arrays import Floats
 from starcal_ros.bag.typestore import described, make_message, typestore
 from starcal_ros.errors import BagError
+from starcal_ros.files import replacing
 from starcal_ros.messages.calibration import calibration_to_message
 from starcal_ros.messages.images import image_to_message
 from starcal_ros.messages.observations import observations_to_message
@@ -48,12 +50,14 @@ class BagWriter:
     """
     Writes records to a bag folder, or to a single file if the path ends in ``.mcap``.
 
-    Use it in a ``with`` statement: its end completes the bag and writes ``metadata.yaml``.
+    Use it in a ``with`` statement: its end replaces the file whole.  After an exception in the
+    block the file that was there before is unchanged.  A folder gets a ``metadata.yaml``, a single
+    file none: the one beside it may belong to another bag.
 
     Parameters
     ----------
     path : Path or str
-        Created if missing; an existing bag is overwritten.
+        The folder is created if missing.
     compression : {'zstd', 'lz4', ''}
     """
 
@@ -61,22 +65,24 @@ class BagWriter:
         path = Path(path)
         is_file = path.suffix == '.mcap'
         self.file = path if is_file else path / f'{path.name}_0.mcap'
+        self._metadata_file = None if is_file else path / 'metadata.yaml'
         self._compression = CompressionType[(compression or 'none').upper()]
         self._channels: dict[str, _Channel] = {}
         self._counts: Counter[str] = Counter()
         self._first_ns: int | None = None
         self._last_ns = 0
-        self._stream: IO[bytes] | None = None
+        self._replacing: contextlib.AbstractContextManager[IO[bytes]] | None = None
         self._writer: Any = None
 
     def __enter__(self) -> Self:
-        """Open the file."""
+        """Open a file beside the place of the bag."""
         try:
             self.file.parent.mkdir(parents=True, exist_ok=True)
-            self._stream = self.file.open('wb')
+            self._replacing = replacing(self.file)
+            stream = self._replacing.__enter__()
         except OSError as error:
             raise BagError(f'{self.file}: cannot be written: {error.strerror}') from error
-        self._start(self._stream)
+        self._start(stream)
         return self
 
     def _start(self, stream: IO[bytes]) -> None:
@@ -99,13 +105,18 @@ class BagWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Complete the file and write metadata.yaml."""
-        assert self._stream is not None  # __enter__ has set it
-        metadata = yaml.safe_dump(self._metadata(), sort_keys=True)
+        """Complete the bag and put it in its place; drop it after an exception."""
+        assert self._replacing is not None  # __enter__ has set it
+        if kind is not None:
+            self._replacing.__exit__(kind, error, traceback)
+            return
         try:
-            self._writer.finish()
-            self._stream.close()
-            self.file.with_name('metadata.yaml').write_text(metadata)
+            with contextlib.ExitStack() as stack:
+                stack.push(self._replacing)
+                self._writer.finish()
+            if self._metadata_file is not None:
+                with replacing(self._metadata_file) as file:
+                    file.write(yaml.safe_dump(self._metadata(), sort_keys=True).encode())
         except OSError as failure:
             raise BagError(f'{self.file}: cannot be written: {failure.strerror}') from failure
 
@@ -149,7 +160,13 @@ class BagWriter:
         channel = self._channels.get(topic) or self._open(topic, type_name, latched)
         if channel.type_name != type_name:
             raise ValueError(f'topic: {topic} holds {channel.type_name}, not {type_name}')
-        data = bytes(typestore().serialize_cdr(message, type_name))
+        try:
+            data = bytes(typestore().serialize_cdr(message, type_name))
+        # The exceptions of a value that its field cannot hold have no common base class.
+        except Exception as error:
+            raise BagError(f'{topic}: a {type_name} cannot be written: {error}') from error
+        # A recording time is not negative; the stamp in the message is written as it is.
+        time_ns = max(time_ns, 0)
         try:
             self._writer.add_message(
                 channel.number, time_ns, data, publish_time=time_ns, sequence=self._counts[topic]

@@ -7,8 +7,12 @@ of MCAP opens.  ``ensemble/refused.json`` counts the refused images.
 (here by a roll-back): a ``calibration.json`` with two more keys.
 
 A file is written beside its place, synced, renamed, and the folder synced; it is never changed
-afterwards.  So at any instant each file is complete or absent.  A checksum detects damage by the
-disk: such a file is renamed to ``….damaged`` and skipped.
+afterwards.  So at any instant each file is complete or absent.
+
+The folder is untrusted input.  Only regular files of limited size are opened.  A file with a wrong
+seal (`calibrator.seal`), or with content that is no image or no calibration, is renamed to
+``….damaged`` and skipped.  With a key, the name of an image carries its HMAC:
+``00000012_<64 digits>.mcap``.
 """
 
 from __future__ import annotations
@@ -17,34 +21,44 @@ from collections.abc import Iterator, Mapping
 import contextlib
 from dataclasses import dataclass, field
 import fcntl
-import hashlib
-import json
+import itertools
 import os
 from pathlib import Path
 import re
 import shutil
+import stat
 from typing import Any
 
 from starcal_ros.arrays import Count
 from starcal_ros.bag.reader import read_observations
 from starcal_ros.bag.writer import BagWriter
+from starcal_ros.calibrator.seal import CHECKSUMS, Seal
+from starcal_ros.calibrator.stored import check_publishable
 from starcal_ros.errors import ArchiveError, BagError, ProductError
+from starcal_ros.files import PART, sync_folder
 from starcal_ros.products.calibration_json import (
     calibration_content,
     calibration_from_content,
     SCHEMA,
 )
-from starcal_ros.products.files import PART, sync_folder, write_atomically
+from starcal_ros.products.files import write_atomically
 from starcal_ros.products.json_codec import from_json, to_json
-from starcal_ros.records import Calibration, Ensemble, StarObservations
+from starcal_ros.records import Calibration, counted_refusal, Ensemble, StarObservations
+from starcal_ros.untrusted import read_bytes
 
 ARCHIVE_SCHEMA = 1
 TOPIC = '/observations'
 
 _ENSEMBLE, _CALIBRATIONS, _EMPTIED = 'ensemble', 'calibrations', 'ensemble.emptied'
 _REFUSED = 'refused.json'
-_EVENT_NAME = re.compile(r'(\d{8,})_calibration_(\d{8,})\.json')
-_NUMBERED = re.compile(r'\.?(\d{8,})[._]')
+_EVENT_NAME = re.compile(r'(\d{8,9})_calibration_(\d{8,9})\.json')
+_IMAGE_NAME = re.compile(r'(\d{8,9})(?:_([0-9a-f]{64}))?\.mcap')
+# Numbers in the names of files that are not read count as given up to this one: a calibrator does
+# not reach it, and a file with a longer number would leave none for those after it.
+_NUMBERED = re.compile(r'\.?(\d{8})[._]')
+_LAST_NUMBER = 999_999_999
+_MOST_BYTES = 64 << 20  # of a file: an image of 10,000 stars has 1 MB
+_MOST_COUNT = 2**32 - 1  # of refused images: that of the message
 
 
 @dataclass(frozen=True)
@@ -105,8 +119,9 @@ class Archive:
         When the folder cannot be made or read, or another process has locked it.
     """
 
-    def __init__(self, folder: Path, frame_id: str) -> None:
+    def __init__(self, folder: Path, frame_id: str, seal: Seal = CHECKSUMS) -> None:
         self.folder = folder
+        self._seal = seal
         self.damage: list[str] = []
         self.last_event = 0
         self._frame_id = frame_id
@@ -115,7 +130,7 @@ class Archive:
         self._refused: dict[str, int] = {}
         self._events: dict[int, Path] = {}  # those on disk
         self._lock = _locked(folder)
-        shutil.rmtree(folder / _EMPTIED, ignore_errors=True)
+        self._finish_emptying()
         for part in folder.glob(f'*/.*{PART}'):
             with contextlib.suppress(OSError):
                 part.unlink()
@@ -145,33 +160,36 @@ class Archive:
     def read_ensemble(self) -> Ensemble:
         """The ensemble on disk, in order of arrival; damaged images are set aside."""
         images = []
-        for path in self._files(_ENSEMBLE, '*.mcap'):
-            image = self._read_image(path)
+        for path, name in self._files(_ENSEMBLE, _IMAGE_NAME):
+            image = self._read_image(path, name)
             if image is not None and image.time_ns not in self._images:
                 images.append(image)
                 self._images[image.time_ns] = _Kept(image, path)
-        for path in self._files(_ENSEMBLE, _REFUSED):
+                self._next_image = max(self._next_image, int(name[1]) + 1)
+        for path, _ in self._files(_ENSEMBLE, re.compile(re.escape(_REFUSED))):
             self._refused = self._read_refused(path)
         return Ensemble(tuple(images), dict(self._refused))
 
+    def set_aside_image(self, time_ns: int, why: str) -> None:
+        """Rename the file of an image that cannot be used, so that it is not read again."""
+        self._set_aside(self._images.pop(time_ns).path, why)
+
     def read_history(self) -> tuple[Activation, ...]:
         """
-        The activations on disk, in order; the calibration of the last is active.
+        The activations on disk, in order, not judged by any gate.
 
         Where the last is damaged, another file of the same calibration replaces it, else the event
         before.
         """
         history: list[Activation] = []
         last_number = 0
-        for path in self._files(_CALIBRATIONS, '*.json'):
-            name = _EVENT_NAME.fullmatch(path.name)
-            if name is None:
-                continue
+        for path, name in self._files(_CALIBRATIONS, _EVENT_NAME):
             event, last_number = int(name[1]), int(name[2])
-            record = self._read_event(path, event)
+            record = self._read_event(path, event, last_number)
             if record is not None:
                 history.append(record)
                 self._events[event] = path
+                self.last_event = max(self.last_event, event)
         same = [record for record in history if record.calibration.number == last_number]
         if same and history[-1].calibration.number != last_number:
             history.append(Activation(self.last_event, same[-1].before, same[-1].calibration))
@@ -200,7 +218,7 @@ class Archive:
                     self._keep_image(image)
             if dict(ensemble.refused) != self._refused:
                 content = _RefusedFile(ARCHIVE_SCHEMA, dict(ensemble.refused))
-                self._write(_ENSEMBLE, _REFUSED, _sealed(to_json(content)))
+                self._write(_ENSEMBLE, _REFUSED, self._seal.sealed(to_json(content)))
                 self._refused = dict(ensemble.refused)
         except ProductError as error:
             raise ArchiveError(f'state_dir: {error}') from error
@@ -219,7 +237,9 @@ class Archive:
             'archive': to_json(_ActivationKeys(ARCHIVE_SCHEMA, record.event, record.before)),
         }
         name = f'{record.event:08d}_calibration_{record.calibration.number:08d}.json'
-        self._events[record.event] = self._write(_CALIBRATIONS, name, _sealed(content))
+        _check_number(record.event)
+        path = self._write(_CALIBRATIONS, name, self._seal.sealed(content))
+        self._events[record.event] = path
         self.last_event = max(self.last_event, record.event)
 
     def _keep_image(self, image: StarObservations) -> None:
@@ -227,8 +247,15 @@ class Archive:
         if stale is not None:
             stale.path.unlink(missing_ok=True)
             del self._images[image.time_ns]
-        data = BagWriter.one_observation(TOPIC, image, self._frame_id)
-        path = self._write(_ENSEMBLE, f'{self._next_image:08d}.mcap', data)
+        number = self._next_image
+        _check_number(number)
+        try:
+            data = BagWriter.one_observation(TOPIC, image, self._frame_id)
+        except BagError as error:
+            raise ArchiveError(f'state_dir: image of {image.time_ns} ns: {error}') from error
+        mark = self._seal.mark(number, data)
+        name = f'{number:08d}_{mark}.mcap' if mark else f'{number:08d}.mcap'
+        path = self._write(_ENSEMBLE, name, data)
         self._images[image.time_ns] = _Kept(image, path)
         self._next_image += 1
 
@@ -251,17 +278,35 @@ class Archive:
                 del self._events[event]
 
     def _empty(self) -> None:
-        shutil.rmtree(self.folder / _EMPTIED, ignore_errors=True)
+        self._finish_emptying()
         (self.folder / _ENSEMBLE).rename(self.folder / _EMPTIED)
         self._images.clear()
         self._refused = {}
         sync_folder(self.folder)
-        shutil.rmtree(self.folder / _EMPTIED, ignore_errors=True)
+        self._finish_emptying()
 
-    def _files(self, folder: str, pattern: str) -> Iterator[Path]:
-        """Files in order of their numbers; the highest number of any file is remembered."""
+    def _finish_emptying(self) -> None:
+        """Remove the images of an emptied ensemble; other files, those set aside too, stay."""
+        emptied = self.folder / _EMPTIED
+        with contextlib.suppress(OSError):
+            for path in list(emptied.iterdir()):
+                if (
+                    _IMAGE_NAME.fullmatch(path.name)
+                    or path.name == _REFUSED
+                    or path.name.endswith(PART)
+                ):
+                    path.unlink()
+                else:
+                    (self.folder / _ENSEMBLE).mkdir(exist_ok=True)
+                    path.rename(_free_name(self.folder / _ENSEMBLE / path.name))
+            emptied.rmdir()
+
+    def _files(
+        self, folder: str, pattern: re.Pattern[str]
+    ) -> Iterator[tuple[Path, re.Match[str]]]:
+        """Regular files with a name, in its order; the highest number of any file is kept."""
         try:
-            names = [path.name for path in (self.folder / folder).iterdir()]
+            names = sorted(path.name for path in (self.folder / folder).iterdir())
         except FileNotFoundError:
             return
         except OSError as error:
@@ -271,24 +316,35 @@ class Archive:
             self._next_image = max(self._next_image, highest + 1)
         else:
             self.last_event = max(self.last_event, highest)
-        for name in sorted(names):
+        for name in names:
+            found = pattern.fullmatch(name)
+            if found is None:
+                continue
             path = self.folder / folder / name
-            if path.match(pattern) and not name.startswith('.'):
-                yield path
+            if stat.S_ISREG(path.lstat().st_mode):
+                yield path, found
+            else:
+                self.damage.append(f'{path}: not a regular file, skipped')
 
-    def _read_image(self, path: Path) -> StarObservations | None:
+    def _read_image(self, path: Path, name: re.Match[str]) -> StarObservations | None:
         damage: list[str] = []
         try:
+            data = read_bytes(path, _MOST_BYTES, follow_links=False)
+            self._seal.check_mark(name[2] or '', int(name[1]), data)
             found = list(read_observations([path], TOPIC, damage.append))
-        except BagError as error:
-            found, damage = [], [str(error)]
+        except (BagError, OSError, ValueError) as error:
+            self._set_aside(path, str(error))
+            return None
         if damage or len(found) != 1:
             self._set_aside(path, damage[0] if damage else f'{len(found)} images, not one')
             return None
+        if found[0].refusal:
+            self._set_aside(path, f'{found[0].refusal}: {found[0].detail}')
+            return None
         return found[0]
 
-    def _read_event(self, path: Path, event: int) -> Activation | None:
-        content = self._unsealed(path, 'schema', SCHEMA)
+    def _read_event(self, path: Path, event: int, number: int) -> Activation | None:
+        content = self._unsealed(path, SCHEMA)
         if content is None:
             return None
         archive = content.get('archive')
@@ -297,41 +353,66 @@ class Archive:
             return None
         try:
             keys = from_json(_ActivationKeys, archive, 'archive')
-            return Activation(event, keys.before, calibration_from_content(path, content))
+            calibration = calibration_from_content(path, content)
+            if (keys.event, calibration.number) != (event, number):
+                raise ValueError(f'is event {keys.event} of calibration {calibration.number}')
+            if keys.before >= event:
+                raise ValueError(f'archive.before: {keys.before} is not before {event}')
+            check_publishable(calibration)
         except (ProductError, ValueError) as error:
             self._set_aside(path, str(error))
             return None
+        return Activation(event, keys.before, calibration)
 
     def _read_refused(self, path: Path) -> dict[str, int]:
-        content = self._unsealed(path, 'schema', ARCHIVE_SCHEMA)
+        content = self._unsealed(path, ARCHIVE_SCHEMA)
         if content is None:
             return {}
+        refused: dict[str, int] = {}
         try:
-            return dict(from_json(_RefusedFile, content).refused)
+            for name, count in from_json(_RefusedFile, content).refused.items():
+                reason = counted_refusal(name)
+                refused[reason] = refused.get(reason, 0) + count
+            if sum(refused.values()) > _MOST_COUNT:
+                raise ValueError(f'refused: more than {_MOST_COUNT} images')
         except ValueError as error:
             self._set_aside(path, str(error))
             return {}
+        return refused
 
-    def _unsealed(self, path: Path, key: str, schema: int) -> Mapping[str, Any] | None:
-        """The JSON object of a file with the right checksum and this schema; else None."""
+    def _unsealed(self, path: Path, schema: int) -> Mapping[str, Any] | None:
+        """The JSON object of a file with the right seals and this schema; else None."""
         try:
-            content = json.loads(path.read_bytes())
-            digest = content.pop('sha256')
-            if digest != _digest(content):
-                raise ValueError('the checksum is wrong')
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-            self._set_aside(path, f'{type(error).__name__}: {error}')
+            content = self._seal.opened(read_bytes(path, _MOST_BYTES, follow_links=False))
+        except (OSError, ValueError) as error:
+            self._set_aside(path, str(error))
             return None
-        if content.get(key) != schema:
+        if content.get('schema') != schema:
             self.damage.append(f'{path}: of another version, skipped')
             return None
-        return dict(content)
+        return content
 
     def _set_aside(self, path: Path, why: str) -> None:
-        aside = path.with_name(f'{path.name}.damaged')
+        aside = _free_name(path.with_name(f'{path.name}.damaged'))
         with contextlib.suppress(OSError):  # on a read-only disk it is skipped where it is
             path.rename(aside)
         self.damage.append(f'{aside}: damaged, set aside: {" ".join(why.split())}')
+
+
+def _free_name(path: Path) -> Path:
+    """The path, with a number after it where a file is there already."""
+    names = itertools.chain(
+        [path], (path.with_name(f'{path.name}{k}') for k in itertools.count(2))
+    )
+    return next(name for name in names if not os.path.lexists(name))
+
+
+def _check_number(number: int) -> None:
+    if number > _LAST_NUMBER:
+        raise ArchiveError(
+            f'state_dir: number {number} has too many digits; move the files with the highest '
+            'numbers to another place'
+        )
 
 
 def _locked(folder: Path) -> int:
@@ -348,15 +429,3 @@ def _locked(folder: Path) -> int:
             raise ArchiveError(f'state_dir: {folder} is in use by another calibrator') from error
         raise ArchiveError(f'state_dir: {folder}: {error.strerror}') from error
     return number
-
-
-def _sealed(content: dict[str, object]) -> str:
-    """JSON text of an object with its checksum as the last key."""
-    sealed = {**content, 'sha256': _digest(content)}
-    return json.dumps(sealed, indent=1, allow_nan=False) + '\n'
-
-
-def _digest(content: Mapping[str, object]) -> str:
-    # Numbers are written with the digits that read back to the same double, so the text is unique.
-    text = json.dumps(content, sort_keys=True, separators=(',', ':'))
-    return hashlib.sha256(text.encode()).hexdigest()

@@ -16,16 +16,19 @@ import os
 from pathlib import Path
 import shutil
 import subprocess
-import sys
 import threading
 
 from starcal_ros.assessment.residuals import Residuals
-from starcal_ros.products.files import REPORT_FILE, sync_folder
-from starcal_ros.products.folder import write_observations, write_products
+from starcal_ros.errors import ArchiveError
+from starcal_ros.files import PART, sync_folder
+from starcal_ros.products.files import REPORT_FILE
+from starcal_ros.products.folder import PRODUCT_FILES, write_observations, write_products
 from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.safe_path import module_command
 
 ACTIVE, CANDIDATE = 'report', 'candidate_report'
 
+_METADATA_OF_0_1 = 'metadata.yaml'  # of observations.mcap, which has none any more
 _NICENESS = 10  # the star observer goes first
 _LONGEST_PAGE_S = 600.0  # a page takes seconds; a processor may be slow and a disk hang
 _LONGEST_CLOSE_S = 5.0  # a disk that hangs must not hold the node
@@ -137,7 +140,7 @@ class CalibratorReports:
             if not self._is_wanted():
                 return ''
         process = subprocess.Popen(
-            [sys.executable, '-m', 'starcal_ros.cli.main', 'report', str(folder)],
+            [*module_command('starcal_ros.cli.main'), 'report', str(folder)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
@@ -168,7 +171,17 @@ class CalibratorReports:
 
 
 def _replace(folder: Path, subject: Subject, frame_id: str) -> None:
-    """Replace the folder by one with new products, without a page yet."""
+    """
+    Replace the folder by one with new products, without a page yet.
+
+    Raises
+    ------
+    ArchiveError
+        When the folder holds other files than those of a report: they are not removed.
+    """
+    foreign = sorted(_names_in(folder) - set(PRODUCT_FILES) - {_METADATA_OF_0_1})
+    if foreign:
+        raise ArchiveError(f'{folder}: holds {foreign[0]}, which is not of a report')
     new, old = (folder.with_name(f'.{folder.name}.{which}') for which in ('new', 'old'))
     _tidy(folder, new, old)
     try:
@@ -182,6 +195,13 @@ def _replace(folder: Path, subject: Subject, frame_id: str) -> None:
         sync_folder(folder.parent)
     finally:
         _tidy(folder, new, old)
+
+
+def _names_in(folder: Path) -> set[str]:
+    """Names of the files in a folder but unfinished ones; none if there is no such folder."""
+    if not folder.is_dir():
+        return set()
+    return {path.name for path in folder.iterdir() if not path.name.endswith(PART)}
 
 
 def _tidy(folder: Path, new: Path, old: Path) -> None:

@@ -10,6 +10,8 @@ import threading
 
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.calibrator.archive import Activation, Archive
+from starcal_ros.calibrator.seal import read_seal
+from starcal_ros.calibrator.stored import refusals_today
 from starcal_ros.errors import ArchiveError, OptionError, StarcalError
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.node_options import CalibratorOptions
@@ -46,9 +48,11 @@ class CalibratorState:
     def __init__(self) -> None:
         self.trouble = ''  # why the last attempt to save failed
         self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
+        self.withheld: tuple[str, ...] = ()  # why the gate of today refuses the last calibration
         self._records = threading.Lock()  # of the records below; never held during a solve
         self._ensemble = Ensemble()
         self._history: tuple[Activation, ...] = ()
+        self._active: Activation | None = None  # of the history
         self._disk = threading.Lock()  # of the archive; taken before the other
         self._archive: Archive | None = None
         self._folder = ''
@@ -57,21 +61,29 @@ class CalibratorState:
         """
         Read the state folder; without one, continue with the records in memory.
 
+        The last calibration is judged by the gate with the present setup before it is active.
+        Where it is refused, the one that a roll-back would return to is judged, and so on;
+        refused ones stay on record.
+
         Raises
         ------
         ArchiveError
             When the folder cannot be used.
         OptionError
-            When its records are of another camera.
+            When all its records are of another camera, or the key cannot be read.
         """
         self._setup, self._options = setup, options
         if not options.state_dir:
-            self._folder = ''
+            with self._records:
+                self._folder = ''
+                self._choose_active()
             return
-        archive = Archive(Path(options.state_dir), setup.frames.camera_frame)
+        seal = read_seal(options.state_key_file)
+        archive = Archive(Path(options.state_dir), setup.frames.camera_frame, seal)
         try:
             ensemble, history = archive.read_ensemble(), archive.read_history()
             _check_size(options.state_dir, ensemble, history, setup)
+            ensemble = _of_size(ensemble, archive, setup)
         except StarcalError:
             archive.close()
             raise
@@ -84,8 +96,25 @@ class CalibratorState:
                 history = history or self._history
             self._ensemble = solving.within_limit(ensemble, setup)
             self._history, self._folder = history, options.state_dir
+            self._choose_active()
             self._archive, self.damage = archive, tuple(archive.damage)
         self.save()
+
+    def _choose_active(self) -> None:
+        """Take the last calibration that the gate of today accepts, and record why not others."""
+        by_event = {record.event: record for record in self._history}
+        record = self._history[-1] if self._history else None
+        withheld = []
+        while record is not None:
+            refusals = refusals_today(record.calibration, self._setup)
+            if not refusals:
+                break
+            withheld.append(
+                f'calibration {record.calibration.number} is not active, the gate refuses it '
+                f'now: {"; ".join(refusals)}'
+            )
+            record = by_event.get(record.before) if record.before < record.event else None
+        self._active, self.withheld = record, tuple(withheld)
 
     def close(self) -> None:
         """Release the state folder; safe to call twice."""
@@ -104,7 +133,7 @@ class CalibratorState:
     def active(self) -> Calibration | None:
         """The active calibration."""
         with self._records:
-            return self._history[-1].calibration if self._history else None
+            return self._active.calibration if self._active else None
 
     def add(self, observations: StarObservations) -> None:
         """Add one image, or count the reason why it was refused."""
@@ -158,7 +187,9 @@ class CalibratorState:
         if dry_run:
             return Answer(True, f'would be activated: {summary(calibration)}', calibration)
         with self._disk, self._records:
-            before = self._history[-1].event if self._history else 0
+            if self._folder and self._archive is None:
+                return Answer(False, 'not activated: the node was cleaned up meanwhile')
+            before = self._active.event if self._active else 0
             event = self._next_event()
             calibration = dataclasses.replace(calibration, number=event, active_since_ns=now_ns)
             self._append(Activation(event, before, calibration))
@@ -169,13 +200,21 @@ class CalibratorState:
     def rollback(self, now_ns: int) -> Answer:
         """Activate the calibration before the active one again."""
         with self._disk, self._records:
-            if not self._history:
+            if self._folder and self._archive is None:
+                return Answer(False, 'not activated: the node was cleaned up meanwhile')
+            if self._active is None:
                 return Answer(False, 'no calibration is active')
-            wanted = self._history[-1].before
+            wanted = self._active.before
             found = [record for record in self._history if record.event == wanted]
             if not found:
                 kept = ' on record' if wanted else ''
                 return Answer(False, f'there is no calibration before the active one{kept}')
+            refusals = refusals_today(found[0].calibration, self._setup)
+            if refusals:
+                number = found[0].calibration.number
+                return Answer(
+                    False, f'calibration {number} is refused by the gate: {"; ".join(refusals)}'
+                )
             calibration = dataclasses.replace(found[0].calibration, active_since_ns=now_ns)
             self._append(Activation(self._next_event(), found[0].before, calibration))
         self.save()
@@ -194,6 +233,8 @@ class CalibratorState:
                 self.trouble = ''
             except ArchiveError as error:
                 self.trouble = str(error)
+            except Exception as error:  # whatever it is, the records are not on disk
+                self.trouble = f'{type(error).__name__}: {" ".join(str(error).split())}'
 
     def disk_free_bytes(self) -> int | None:
         """Free space for the state folder; None without one."""
@@ -206,6 +247,7 @@ class CalibratorState:
 
     def _append(self, record: Activation) -> None:
         self._history = (*self._history, record)[-self._options.calibration_history :]
+        self._active, self.withheld = record, ()
 
     def _answer(self, message: str) -> Answer:
         unsaved = f'; not on disk: {self.trouble}' if self.trouble else ''
@@ -223,14 +265,26 @@ def summary(calibration: Calibration) -> str:
 def _check_size(
     folder: str, ensemble: Ensemble, history: tuple[Activation, ...], setup: Setup
 ) -> None:
+    """Raise OptionError where every record of a folder is of another camera."""
     prior = setup.prior.camera
     sizes = {(image.width, image.height) for image in ensemble.images}
     sizes |= {
         (record.calibration.geometry.camera.width, record.calibration.geometry.camera.height)
         for record in history
     }
-    for width, height in sizes - {(prior.width, prior.height)}:
+    if sizes and (prior.width, prior.height) not in sizes:
+        width, height = min(sizes)
         raise OptionError(
             f'state_dir: {folder} is of a camera of {width} x {height}, '
             f'the prior camera has {prior.width} x {prior.height}'
         )
+
+
+def _of_size(ensemble: Ensemble, archive: Archive, setup: Setup) -> Ensemble:
+    """The ensemble without images of another size, whose files are set aside."""
+    size = (setup.prior.camera.width, setup.prior.camera.height)
+    for image in ensemble.images:
+        if (image.width, image.height) != size:
+            archive.set_aside_image(image.time_ns, f'an image of {image.width} x {image.height}')
+    kept = tuple(one for one in ensemble.images if (one.width, one.height) == size)
+    return Ensemble(kept, ensemble.refused)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable
+import contextlib
 import difflib
 from pathlib import Path
 import re
 import sys
 from typing import Any, NoReturn
+
+from starcal_ros.text import printable
 
 EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_INTERRUPTED = 0, 2, 3, 130
 
@@ -168,7 +171,8 @@ starcal COMMAND --help shows examples of each command.
 
 def complain(text: str) -> int:
     """Print an input error on stderr in one line and return the exit status for it."""
-    print(f'starcal: {" ".join(text.split())}', file=sys.stderr)
+    with contextlib.suppress(OSError):  # nobody reads stderr; the exit status remains
+        print(f'starcal: {printable(" ".join(text.split()))}', file=sys.stderr, flush=True)
     return EXIT_BAD_INPUT
 
 

@@ -12,7 +12,6 @@ import select
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 
 import numpy as np
@@ -26,6 +25,7 @@ from starcal_ros.products.calibration_json import read_calibration
 from starcal_ros.products.camera_yaml import read_camera_info
 from starcal_ros.products.files import write_atomically
 from starcal_ros.records import Calibration, CameraGeometry
+from starcal_ros.safe_path import module_command
 from starcal_ros.simulation import bag as simulated_bag
 from starcal_ros.simulation import scenario
 
@@ -90,7 +90,7 @@ def run(
     NodeError
         When a node does not start, or ends before the calibration.
     """
-    params = folder / 'params.yaml'
+    params = folder / 'demo_params.yaml'  # not params.yaml: a user's may be there
     content = {'/**': {'ros__parameters': bag.parameters}}
     write_atomically(params, yaml.safe_dump(content, sort_keys=False))
     environment = {**os.environ, **_own_domain()}
@@ -157,7 +157,7 @@ def _client_command(bag: DemoBag, result: Path) -> list[str]:
 
 
 def _module_command(name: str) -> list[str]:
-    return [sys.executable, '-m', f'starcal_ros.nodes.{name}']
+    return [*module_command('starcal_ros.nodes.entry_points'), name]
 
 
 def _lines(client: Process, nodes: dict[str, Process]) -> Iterator[str]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 import dataclasses
+import io
 import json
 import os
 from pathlib import Path
@@ -26,7 +27,14 @@ from starcal_ros.cli.arguments import (
     EXIT_REFUSED,
     parser,
 )
-from starcal_ros.cli.terminal import print_verdict, progress_bar, with_progress
+from starcal_ros.cli.terminal import (
+    discard,
+    open_missing_streams,
+    print_text,
+    print_verdict,
+    progress_bar,
+    with_progress,
+)
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
@@ -45,51 +53,66 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns the exit status."""
     # Read when NumPy is loaded: on matrices of this size two threads of BLAS wait for each other.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+    command = ''
     try:
+        open_missing_streams()
+        if isinstance(sys.stdout, io.TextIOWrapper):  # the name of a file need not be UTF-8
+            sys.stdout.reconfigure(errors='backslashreplace')
         tool = parser()
         if '_ARGCOMPLETE' in os.environ:  # set by a shell that completes a command line
             import argcomplete
 
             argcomplete.autocomplete(tool)
-        args = tool.parse_args(argv)
-        if args.version:
-            print(_software())
-        elif args.command is None:
-            tool.print_help()
-        else:
-            return _COMMANDS[args.command](args)
-        return EXIT_ACCEPTED
+        try:
+            args = tool.parse_args(argv)
+            command = args.command or ''
+            return _run(args, tool)
+        finally:
+            sys.stdout.flush()  # at the end of Python an error has no handler
     except StarcalError as error:
         return complain(str(error))
     except BrokenPipeError:
         # The reader of our output has ended (starcal ... | head).
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard('stdout')
         return EXIT_BAD_INPUT
     except OSError as error:
+        discard('stdout')
         return complain(f'{error.filename or "input/output"}: {error.strerror or error}')
     except ModuleNotFoundError as error:
-        extra = 'studies' if args.command == 'campaign' else 'report'
-        return complain(_missing_extra(error, extra))
+        return complain(_missing_extra(error, 'studies' if command == 'campaign' else 'report'))
     except KeyboardInterrupt:
         complain('interrupted')
         return EXIT_INTERRUPTED
+
+
+def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:
+    """Run the command that was asked for."""
+    if args.version:
+        print_text(_software())
+    elif args.command is None:
+        tool.print_help()
+    else:
+        return _COMMANDS[args.command](args)
+    return EXIT_ACCEPTED
 
 
 def _calibrate(args: argparse.Namespace) -> int:
     """Calibrate from bags in one process, as the two nodes do on the graph."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
+    from starcal_ros.cli.output_places import check_folder
     from starcal_ros.pipeline.provenance import inputs_of
-    from starcal_ros.pipeline.setup import read_setup
+    from starcal_ros.pipeline.setup import files_of, read_setup
 
     setup = read_setup(args.params)
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
+    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames)))
     inputs = inputs_of((*reader.mcap_files(args.bags), args.params))
     calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
     report = _write_report(args.output)
     output.print_calibration(calibration, setup.prior)
-    print(f'products written to {args.output}; {report}')
+    print_text(f'products written to {args.output}; {report}')
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
 
 
@@ -111,7 +134,6 @@ def _calibrate_into(
     for record in observations:
         ensemble = solve.add_to_ensemble(ensemble, record, setup)
     _make_folder(folder)
-    # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     write_observations(observations, folder, setup.frames.camera_frame)
     try:
         calibration, left = solve.solve_with_residuals(ensemble, setup, inputs=inputs)
@@ -143,7 +165,7 @@ def _report(args: argparse.Namespace) -> int:
     """Write the report of a folder."""
     from starcal_ros.report import page
 
-    print(f'report written to {page.write_report(args.folder)}')
+    print_text(f'report written to {page.write_report(args.folder)}')
     return EXIT_ACCEPTED
 
 
@@ -187,7 +209,7 @@ def _inspect(args: argparse.Namespace) -> int:
         why = diagnosis.in_a_sentence(args.bags, _asked(args), setup)
         found = dataclasses.replace(found, problems=(*found.problems, why)) if why else found
     if args.json:
-        print(json.dumps(inspect.content(found), indent=1, allow_nan=False))
+        print_text(json.dumps(inspect.content(found), indent=1, allow_nan=False))
     else:
         output.print_inspection(found)
     return EXIT_REFUSED if found.problems else EXIT_ACCEPTED
@@ -200,9 +222,9 @@ def _diagnose(args: argparse.Namespace) -> int:
 
     found = diagnosis.of_bags(args.bags, _asked(args), read_setup(args.params))
     if args.json:
-        print(json.dumps(diagnosis.content(found), indent=1, allow_nan=False))
+        print_text(json.dumps(diagnosis.content(found), indent=1, allow_nan=False))
     else:
-        print(diagnosis.text(found))
+        print_text(diagnosis.text(found))
     return EXIT_ACCEPTED if found.cause == 'none' else EXIT_REFUSED
 
 
@@ -212,17 +234,20 @@ def _compare(args: argparse.Namespace) -> int:
     from starcal_ros.cli import output
     from starcal_ros.products.calibration_json import read_calibration
 
-    found = comparison.compare(*(read_calibration(_file(p)) for p in (args.a, args.b)))
+    files = [_file(path) for path in (args.a, args.b)]
+    found = comparison.compare(*map(read_calibration, files))
     if args.output:
+        from starcal_ros.cli.output_places import check_no_product
         from starcal_ros.report import figures
 
+        check_no_product(args.output, files)
         figures.write_comparison(found, args.output)
     if args.json:
-        print(json.dumps(comparison.content(found), indent=1, allow_nan=False))
+        print_text(json.dumps(comparison.content(found), indent=1, allow_nan=False))
     else:
         output.print_comparison(found)
         if args.output:
-            print(f'figure written to {args.output}')
+            print_text(f'figure written to {args.output}')
     return EXIT_ACCEPTED
 
 
@@ -230,10 +255,13 @@ def _lookup(args: argparse.Namespace) -> int:
     """Write a table of lines of sight by pixel."""
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
+    from starcal_ros.cli.output_places import check_no_product
     from starcal_ros.products.calibration_json import read_calibration
     from starcal_ros.products.lookup_table import write_lookup_table
 
-    calibration = read_calibration(_file(args.calibration))
+    file = _file(args.calibration)
+    check_no_product(args.output, [file])
+    calibration = read_calibration(file)
     camera = calibration.geometry.camera
     if args.step is not None:
         if not 0 < args.step <= max(camera.width, camera.height):
@@ -245,7 +273,7 @@ def _lookup(args: argparse.Namespace) -> int:
         pixels = pixel_grid(camera, args.points, args.points)
     table = line_of_sight_table(camera, calibration.joint_covariance, pixels)
     write_lookup_table(table, args.output)
-    print(f'{len(pixels)} lines of sight written to {args.output}')
+    print_text(f'{len(pixels)} lines of sight written to {args.output}')
     return EXIT_ACCEPTED
 
 
@@ -289,9 +317,9 @@ def _simulate(args: argparse.Namespace) -> int:
     scenario = synthetic.scenario(args.scenario, args.seed)
     with progress_bar(scenario.image_count, 'images') as advance:
         made = simulated_bag.write_bag(scenario, args.output, on_image=lambda _: advance())
-    print(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
-    print(f'truth {made.truth}')
-    print(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
+    print_text(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
+    print_text(f'truth {made.truth}')
+    print_text(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
     return EXIT_ACCEPTED
 
 
@@ -299,6 +327,7 @@ def _demo(args: argparse.Namespace) -> int:
     """Calibrate the small bag with the real nodes and compare the result with the truth."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import demo
+    from starcal_ros.cli.output_places import check_folder
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.products.folder import write_products
@@ -306,14 +335,15 @@ def _demo(args: argparse.Namespace) -> int:
 
     _make_folder(args.output)
     bag = demo.tiny_bag(args.output)
-    print(f'bag {bag.bag}; log files and products in {args.output}')
+    check_folder(args.output, [bag.bag], ())
+    print_text(f'bag {bag.bag}; log files and products in {args.output}')
     with progress_bar(bag.image_count, 'images') as advance:
         calibration, verdict = demo.run(bag, args.output, on_image=advance)
-    print(verdict)
+    print_text(verdict)
     if calibration is None:
         return EXIT_REFUSED
     beside_truth = demo.compare(calibration, bag.truth, bag.prior)
-    print('\n'.join(beside_truth.lines))
+    print_text('\n'.join(beside_truth.lines))
     good = beside_truth.worst_sigmas <= _DEMO_SIGMAS
     print_verdict(
         good,
@@ -332,7 +362,7 @@ def _demo(args: argparse.Namespace) -> int:
         if same
         else f'starcal calibrate gives another calibration from the bag: {apart_px:.2g} px apart',
     )
-    print(f'open {page.write_report(args.output)}')
+    print_text(f'open {page.write_report(args.output)}')
     good = good and same
     return EXIT_ACCEPTED if good else EXIT_REFUSED
 
@@ -375,10 +405,12 @@ def _campaign(args: argparse.Namespace) -> int:
     found = summary.conclude(design, rows)
     path = args.output / f'{design.study}.json'
     write_atomically(path, summary.content(found, _software()))
-    path.with_suffix('.png').write_bytes(figures.png(found))
-    print(f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s')
-    print('\n'.join(summary.table(found)))
-    print(f'written to {path} and {path.with_suffix(".png").name}')
+    write_atomically(path.with_suffix('.png'), figures.png(found))
+    print_text(
+        f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s'
+    )
+    print_text('\n'.join(summary.table(found)))
+    print_text(f'written to {path} and {path.with_suffix(".png").name}')
     return EXIT_ACCEPTED
 
 
@@ -421,7 +453,7 @@ def _paper(args: argparse.Namespace) -> int:
     write_atomically(path, paper.page(found, _software()))
     content = {'software': _software(), **paper.numbers(found)}
     write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
-    print(f'written to {path}, with figures in {args.output / "images"}')
+    print_text(f'written to {path}, with figures in {args.output / "images"}')
     return EXIT_ACCEPTED
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.assessment.comparison import Comparison, DifferenceMap
-from starcal_ros.cli.terminal import print_table, print_verdict
+from starcal_ros.cli.terminal import print_table, print_text, print_verdict
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.model_errors import temperature
 from starcal_ros.pipeline.inspect import Inspection, TopicContent
@@ -38,15 +38,17 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
         )
     print_table(('parameter', 'value', '1-sigma', 'from prior', 'in sigmas'), rows)
     quaternion = calibration.geometry.star_tracker_from_camera_xyzw
-    print(f'alignment xyzw  {np.array2string(quaternion, precision=9, separator=", ")}')
-    print(f'images          {calibration.images_used} used, refused: ', end='')
-    print(_counted(calibration.images_refused))
-    print(f'stars           {calibration.stars_used} used, {calibration.stars_rejected} rejected')
-    print(f'residual        {calibration.residual_rms_px:.4f} px rms per axis')
-    print(f'method          {calibration.method}')
-    print(f'solver          {calibration.iterations} iterations, {calibration.termination}')
+    print_text(f'alignment xyzw  {np.array2string(quaternion, precision=9, separator=", ")}')
+    print_text(f'images          {calibration.images_used} used, refused: ', end='')
+    print_text(_counted(calibration.images_refused))
+    print_text(
+        f'stars           {calibration.stars_used} used, {calibration.stars_rejected} rejected'
+    )
+    print_text(f'residual        {calibration.residual_rms_px:.4f} px rms per axis')
+    print_text(f'method          {calibration.method}')
+    print_text(f'solver          {calibration.iterations} iterations, {calibration.termination}')
     if calibration.temperature is not None:
-        print(f'temperature     {temperature.summary(calibration.temperature)}')
+        print_text(f'temperature     {temperature.summary(calibration.temperature)}')
     if calibration.accepted:
         print_verdict(True, 'verdict         accepted')
     else:
@@ -70,9 +72,9 @@ def print_inspection(inspection: Inspection) -> None:
         left=2,
     )
     for topic in inspection.topics:
-        print(f'{topic.name}: {"; ".join(_topic_notes(topic))}')
+        print_text(f'{topic.name}: {"; ".join(_topic_notes(topic))}')
     for text in inspection.damage:
-        print(f'damage: {text}')
+        print_text(f'damage: {text}')
     if inspection.images:
         _print_images(inspection)
     if inspection.status is not None:
@@ -99,13 +101,15 @@ def _print_images(inspection: Inspection) -> None:
     bad = sum(refused.count for refused in inspection.refused)
     chosen = inspection.chosen
     assert chosen is not None  # images come from a chosen topic
-    print(
+    print_text(
         f'{inspection.images - bad} of {inspection.images} images of '
         f'{chosen.image or chosen.observations} can be used'
         + (f', with the attitudes of {chosen.attitude}' if chosen.attitude else '')
     )
     if inspection.longest_attitude_gap_s >= 0:
-        print(f'longest attitude gap around an image: {inspection.longest_attitude_gap_s:.3g} s')
+        print_text(
+            f'longest attitude gap around an image: {inspection.longest_attitude_gap_s:.3g} s'
+        )
     if inspection.refused:
         print_table(
             ('refused', 'images', 'meaning', 'first'),
@@ -117,7 +121,7 @@ def _print_images(inspection: Inspection) -> None:
         )
     if inspection.stars_per_image:
         stars = inspection.stars_per_image
-        print(
+        print_text(
             f'stars per image: {min(stars)} to {max(stars)}, {sum(stars)} in total; '
             f'refused: {_counted(inspection.refused_stars)}'
         )
@@ -152,15 +156,15 @@ def print_comparison(comparison: Comparison) -> None:
             ('common rotation removed', *_map_cells(comparison.after)),
         ],
     )
-    print(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}"')
+    print_text(f'common rotation {comparison.rotation_rad / ARCSECOND_RAD:.2f}"')
     total = comparison.total
     if total.degrees_of_freedom:
-        print(
+        print_text(
             f'all parameters  chi2 {total.value:.1f}, {total.degrees_of_freedom} degrees of '
             f'freedom, p-value {total.p_value:.3g}'
         )
     for note in comparison.notes:
-        print(f'note: {note}')
+        print_text(f'note: {note}')
 
 
 def _map_cells(found: DifferenceMap) -> Sequence[str]:

@@ -4,10 +4,46 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
+import os
 import sys
 from typing import TypeVar
 
+from starcal_ros.text import printable
+
 T = TypeVar('T')
+
+
+def open_missing_streams() -> None:
+    """
+    Open standard streams that the caller has closed; they then discard what is written.
+
+    Otherwise the next file that is opened would take the place of one, and what a library prints
+    would go into that file.
+    """
+    for number, name in enumerate(('stdin', 'stdout', 'stderr')):
+        try:
+            os.fstat(number)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)
+            if opened != number:
+                os.dup2(opened, number)
+                os.close(opened)
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, 'r' if number == 0 else 'w', closefd=False))
+
+
+def discard(*names: str) -> None:
+    """Discard what is still to be written to standard streams: their reader has ended."""
+    for name in names:
+        with contextlib.suppress(OSError, ValueError):  # in tests they are no files
+            devnull = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(devnull, getattr(sys, name).fileno())
+            os.close(devnull)
+
+
+def print_text(text: str = '', end: str = '\n') -> None:
+    """Print lines with characters that act on a terminal escaped (`printable`)."""
+    print('\n'.join(map(printable, text.split('\n'))), end=end)
 
 
 @contextlib.contextmanager
@@ -53,7 +89,7 @@ def print_table(header: Sequence[str], rows: Iterable[Sequence[str]], left: int 
 
     The first ``left`` columns are left-aligned, the others right-aligned.
     """
-    rows = list(rows)
+    rows = [tuple(map(printable, row)) for row in rows]
     if not sys.stdout.isatty():
         for line in table_lines(header, rows, left):
             print(line)
@@ -91,9 +127,9 @@ def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]], left: int 
 def print_verdict(good: bool, text: str) -> None:
     """Print a verdict, in colour on a terminal."""
     if not sys.stdout.isatty():
-        print(text)
+        print_text(text)
         return
     from rich.console import Console
     from rich.text import Text
 
-    Console().print(Text(text, style='bold green' if good else 'bold red'))
+    Console().print(Text(printable(text), style='bold green' if good else 'bold red'))

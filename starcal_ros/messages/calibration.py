@@ -20,12 +20,11 @@ from starcal_ros.messages.types import (
     Make,
     Message,
 )
-from starcal_ros.records import ALIGNMENT_NAMES, Calibration, CameraGeometry
+from starcal_ros.records import ALIGNMENT_NAMES, Calibration, CameraGeometry, check_calibration
 
 # Fields of the record that the message holds as ``camera`` and ``alignment``.
 _NESTED = ('geometry', 'parent_frame', 'child_frame')
 _OF_CALIBRATION = ('field',)  # of a camera: the calibration holds it with its covariance
-_UNIT_TOLERANCE = 1e-6  # of the length of a quaternion: rounding to a text leaves less
 
 
 def calibration_to_message(calibration: Calibration, make: Make) -> Message:
@@ -67,14 +66,14 @@ def calibration_from_message(message: Message) -> Calibration:
         if tuple(found) != expected:
             raise ValueError(f'{field}: {", ".join(found) or "none"}, not {", ".join(expected)}')
     rotation = quaternion_from_message(message.alignment.rotation)
-    if not abs(np.linalg.norm(rotation) - 1.0) < _UNIT_TOLERANCE:
-        raise ValueError(f'alignment.rotation: {rotation.tolist()} is not a unit quaternion')
-    return Calibration(
+    calibration = Calibration(
         geometry=CameraGeometry(camera, rotation),
         parent_frame=str(message.alignment.parent_frame),
         child_frame=str(message.alignment.child_frame),
         **record_fields(Calibration, message, leave_out=_NESTED),
     )
+    check_calibration(calibration)
+    return calibration
 
 
 def camera_info_to_message(calibration: Calibration, make: Make) -> Message:

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import check_shape, fields_of, FieldType
 from starcal_ros.messages.fields import (
     flat_array,
+    is_stamp,
     make_header,
     make_time,
     quaternion_from_message,
@@ -160,7 +161,7 @@ def record_fields(
         if name in leave_out:
             continue
         if name == 'time_ns':
-            values[name] = stamp_ns(message.header.stamp)
+            values[name] = _stamp_ns(message.header.stamp, 'header.stamp')
             continue
         is_time = _is_time(name, kind)
         field = names.get(name, name.removesuffix('_ns') if is_time else name)
@@ -170,7 +171,7 @@ def record_fields(
             continue
         found = getattr(message, field)
         if is_time:
-            values[name] = stamp_ns(found)
+            values[name] = _stamp_ns(found, field)
         elif name.endswith('_xyzw'):
             values[name] = quaternion_from_message(found)
             _check_finite(values[name], kind, field)
@@ -179,6 +180,13 @@ def record_fields(
                 sizes[str(dimension)] = int(getattr(message, str(dimension)))
             values[name] = _from_field(found, kind, field, sizes)
     return values
+
+
+def _stamp_ns(stamp: Message, field: str) -> int:
+    time_ns = stamp_ns(stamp)
+    if not is_stamp(time_ns):
+        raise ValueError(f'{field}: {time_ns} ns is not within the range of ROS stamps')
+    return time_ns
 
 
 def _from_field(found: Any, kind: FieldType, field: str, sizes: dict[str, int]) -> Any:

@@ -16,13 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
-from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.constants import MAX_STAMP_NS, NANOSECONDS_PER_SECOND
 from starcal_ros.messages.types import Make, Message
 
 
 def stamp_ns(stamp: Message) -> int:
     """Nanoseconds of a builtin_interfaces/Time, exactly."""
     return int(stamp.sec) * NANOSECONDS_PER_SECOND + int(stamp.nanosec)
+
+
+def is_stamp(time_ns: int) -> bool:
+    """Whether a ROS message can hold a time: no clock of ROS is before 1970."""
+    return 0 <= time_ns <= MAX_STAMP_NS
+
+
+def nearest_stamp_ns(time_ns: int) -> int:
+    """The nearest time that a ROS message can hold."""
+    return min(max(time_ns, 0), MAX_STAMP_NS)
 
 
 def offset_ns(seconds: float) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import Any
 
@@ -9,12 +10,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
-from starcal_ros.messages.fields import make_header, offset_ns, stamp_ns
+from starcal_ros.image.file_header import has_surplus, png_header, PNG_HEADER_BYTES
+from starcal_ros.messages.fields import (
+    is_stamp,
+    make_header,
+    nearest_stamp_ns,
+    offset_ns,
+    stamp_ns,
+)
 from starcal_ros.messages.types import IMAGE_TYPE, Make, Message
 from starcal_ros.records import Image, refused_image, StarObservations
 
-_PNG_MAGIC = b'\x89PNG\r\n\x1a\n'
+_MOST_PIXELS = 2**27  # of a camera that is not known: 256 MB of 16 bit
 _PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 
 
@@ -70,22 +79,41 @@ def decode_image(
     return Image(time_ns, pixels)
 
 
-def decode_png(data: Any, time_ns: int) -> Image:
+def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> Image:
     """
     Pixels of a PNG of one channel, 8 or 16 bit.
+
+    A PNG of a few kilobytes can claim gigabytes of pixels, so its header is checked first:
+    against ``size`` (width, height) where that is known, else against a limit for any camera.
 
     Raises
     ------
     ImageRefused
-        ``bad_encoding`` for what is no such PNG; ``bad_layout`` for one that cannot be decoded.
+        ``bad_encoding`` for what is no such PNG; ``wrong_size``; ``bad_layout`` for one that
+        cannot be decoded.
     """
     # A JPEG would decode too, but what it does to a star of two pixels is no measurement.
-    if bytes(data[: len(_PNG_MAGIC)]) != _PNG_MAGIC:
+    header = png_header(bytes(data[:PNG_HEADER_BYTES]))
+    if header is None:
         raise ImageRefused('bad_encoding', 'the compressed image is not a PNG')
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    found = (header.width, header.height)
+    if header.channels != 1:
+        raise ImageRefused('bad_encoding', f'the PNG has {header.channels} channels, not one')
+    if size is not None and found != size:
+        raise ImageRefused(
+            'wrong_size', 'image of {} x {}, prior camera of {} x {}'.format(*found, *size)
+        )
+    if min(found) < 1 or max(found) > MAX_SIDE_PX or math.prod(found) > _MOST_PIXELS:
+        raise ImageRefused('bad_layout', 'the PNG claims {} x {} px'.format(*found))
+    if has_surplus(bytes(data), header):
+        raise ImageRefused('bad_layout', 'the PNG inflates to far more than its pixels')
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
     if pixels is None:
         raise ImageRefused('bad_layout', f'{len(data)} bytes of PNG cannot be decoded')
-    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
+    if pixels.shape != found[::-1] or pixels.dtype not in (np.uint8, np.uint16):
         raise ImageRefused(
             'bad_encoding', f'the PNG is {pixels.dtype} of shape {pixels.shape}, not one channel'
         )
@@ -93,18 +121,25 @@ def decode_png(data: Any, time_ns: int) -> Image:
     return Image(time_ns, pixels)  # type: ignore[arg-type]
 
 
-def image_from_message(message: Message, stamp_offset_s: float = 0.0) -> Image:
+def image_from_message(
+    message: Message, stamp_offset_s: float = 0.0, size: tuple[int, int] | None = None
+) -> Image:
     """
     Image of a sensor_msgs/Image or CompressedImage, its time shifted to the middle of exposure.
+
+    ``size`` (width, height), where known, is that of the prior camera: a compressed image of
+    another is not decoded.
 
     Raises
     ------
     ImageRefused
-        ``bad_encoding`` or ``bad_layout``.
+        ``bad_stamp``, ``bad_encoding``, ``bad_layout`` or ``wrong_size``.
     """
+    time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
+    if not is_stamp(time_ns):
+        raise ImageRefused('bad_stamp', f'{time_ns} ns is not within the range of ROS stamps')
     if not hasattr(message, 'encoding'):
-        time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
-        return decode_png(message.data, time_ns)
+        return decode_png(message.data, time_ns, size)
     return decode_image(
         message.encoding,
         message.width,
@@ -112,7 +147,7 @@ def image_from_message(message: Message, stamp_offset_s: float = 0.0) -> Image:
         message.step,
         bool(message.is_bigendian),
         message.data,
-        stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s),
+        time_ns,
     )
 
 
@@ -120,10 +155,11 @@ def refused_from_message(
     message: Message, stamp_offset_s: float, refused: ImageRefused
 ) -> StarObservations:
     """Return the observations of an image message that cannot be used."""
+    time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
     return refused_image(
-        stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s),
-        int(getattr(message, 'width', 0)),  # a compressed image does not say
-        int(getattr(message, 'height', 0)),
+        nearest_stamp_ns(time_ns),
+        min(int(getattr(message, 'width', 0)), MAX_SIDE_PX),  # a compressed image does not say
+        min(int(getattr(message, 'height', 0)), MAX_SIDE_PX),
         refused.reason,
         refused.detail,
     )

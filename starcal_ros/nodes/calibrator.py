@@ -26,7 +26,7 @@ from starcal_ros.messages.calibration import (
     calibration_to_message,
     camera_info_to_message,
 )
-from starcal_ros.messages.observations import observations_from_message
+from starcal_ros.messages.observations import checked_observations
 from starcal_ros.messages.status import status_to_message
 from starcal_ros.nodes.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
 from starcal_ros.nodes.message_factory import make_message, message_class
@@ -83,8 +83,10 @@ class Calibrator(StarcalNode):
             self._own.state_dir if self._own.state_report else '',
             self._setup.frames.camera_frame,
         )
-        for damage in self._state.damage:
-            self.get_logger().error(damage)
+        for text in (*self._state.damage, *self._state.withheld):
+            self.get_logger().error(text)
+        if self._state.withheld:
+            self._last_gate = f'refused: {self._state.withheld[0]}'
 
         def latched(kind: Any, topic: str) -> Any:
             publisher = self.create_lifecycle_publisher(kind, topic, LATCHED)
@@ -116,7 +118,7 @@ class Calibrator(StarcalNode):
             _OBSERVATIONS,
             group=collecting,
         )
-        retry = self.create_timer(_RETRY_S, self.guarded(self._save_again), collecting)
+        retry = self.steady_timer(_RETRY_S, self.guarded(self._save_again), collecting)
         self._listeners.append((self.destroy_timer, retry))
         self._status_due.set()
         self._status_thread = threading.Thread(target=self._tell_status, name='status')
@@ -172,10 +174,13 @@ class Calibrator(StarcalNode):
             'camera_driver': 'none' if driver is None else driver.outcome,
             'camera_driver_failures': 0 if driver is None else driver.failures,
             'state_damaged_files': len(state.damage),
+            'state_refused_calibrations': len(state.withheld),
             'disk_free_mb': 'none' if free is None else free // 1_000_000,
         }
         if state.trouble:
             return ERROR, f'state not saved, in memory only: {state.trouble}', numbers
+        if state.withheld:
+            return WARN, '; '.join(state.withheld), numbers
         if active is not None and active.forced:
             return WARN, f'active despite the gate: {"; ".join(active.reasons)}', numbers
         if self.count_publishers(self._calibration.topic_name) > 1:
@@ -191,7 +196,10 @@ class Calibrator(StarcalNode):
         return OK, 'collecting' if active is None else 'calibration active', numbers
 
     def _on_observations(self, message: Any) -> None:
-        self._state.add(observations_from_message(message))
+        observations = checked_observations(message)
+        if observations.refusal == 'bad_observations':
+            self.get_logger().warning(f'observations refused: {observations.detail}')
+        self._state.add(observations)
         self._status_due.set()
 
     def _save_again(self) -> None:
@@ -260,7 +268,9 @@ class Calibrator(StarcalNode):
 
     def _told(self, answer: Answer, response: Any) -> Any:
         """Publish the activated or refused calibration; return the filled response."""
-        if answer.calibration is not None and answer.active:
+        if not self.is_active:
+            pass  # deactivated meanwhile: activation publishes the active calibration
+        elif answer.calibration is not None and answer.active:
             self._publish_calibration(answer.calibration)
             self._show(ACTIVE, answer)
         elif answer.calibration is not None and not answer.success:

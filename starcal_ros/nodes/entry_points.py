@@ -2,7 +2,8 @@
 Entry points of the console scripts, with the default action for SIGINT during imports.
 
 The imports take over a second; Python would answer Ctrl-C then with a traceback, the default
-action of the system ends the process without one.
+action of the system ends the process without one.  ``-m starcal_ros.nodes.entry_points NAME``
+runs a node in the same way.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+import sys
 
 
 def star_observer() -> int:
@@ -36,3 +38,7 @@ def _run(name: str) -> int:
     module = importlib.import_module(f'starcal_ros.nodes.{name}')
     signal.signal(signal.SIGINT, before)
     return int(module.main())
+
+
+if __name__ == '__main__':
+    sys.exit(_run(sys.argv.pop(1)))

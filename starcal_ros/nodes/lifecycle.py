@@ -16,6 +16,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 import rclpy
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ROSInterruptException
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -54,8 +55,8 @@ class StarcalNode(LifecycleNode):
         self._level: bytes | None = None
         self._diagnostics_lock = threading.Lock()
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._diagnostics_timer = self.create_timer(
-            1.0, self.guarded(self._each_second), callback_group=MutuallyExclusiveCallbackGroup()
+        self._diagnostics_timer = self.steady_timer(
+            1.0, self.guarded(self._each_second), MutuallyExclusiveCallbackGroup()
         )
         self._answer_invalid_transitions()
         self._answer_invalid_parameters()
@@ -84,6 +85,11 @@ class StarcalNode(LifecycleNode):
     def is_active(self) -> bool:
         """True in the lifecycle state active."""
         return bool(self._state_machine.current_state[1] == 'active')
+
+    def steady_timer(self, period_s: float, callback: Callable[[], None], group: Any) -> Any:
+        """Return a timer that runs in simulated time too, while nobody publishes /clock."""
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        return self.create_timer(period_s, callback, group, clock)
 
     def guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
         """Return the callback wrapped so that its errors are logged and counted."""

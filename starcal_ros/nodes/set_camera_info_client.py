@@ -46,7 +46,7 @@ class CameraDriver:
         self._changed = threading.Condition(threading.RLock())
         group = ReentrantCallbackGroup()
         self._client = node.create_client(SetCameraInfo, service, callback_group=group)
-        self._timer = node.create_timer(_LOOK_S, node.guarded(self._look), group)
+        self._timer = node.steady_timer(_LOOK_S, node.guarded(self._look), group)
 
     def close(self) -> None:
         """Destroy the client; pending calls return."""

@@ -18,10 +18,11 @@ from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import StarObservations as ObservationsMessage
+from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.messages.calibration import calibration_from_message, camera_info_to_message
-from starcal_ros.messages.fields import offset_ns, stamp_ns
+from starcal_ros.messages.fields import nearest_stamp_ns, offset_ns, stamp_ns
 from starcal_ros.messages.images import color_image_to_message, image_from_message
 from starcal_ros.messages.observations import observations_to_message
 from starcal_ros.messages.telemetry import (
@@ -262,8 +263,9 @@ class StarObserver(StarcalNode):
             detail = f'{self._own.image_queue} images were in the queue'
             self._publish(self._refused(waiting, 'overrun', detail))
             return
+        offset_s, camera = self._setup.attitude.stamp_offset_s, self._setup.prior.camera
         try:
-            image = image_from_message(waiting.message, self._setup.attitude.stamp_offset_s)
+            image = image_from_message(waiting.message, offset_s, (camera.width, camera.height))
         except ImageRefused as refused:
             self._publish(self._refused(waiting, refused.reason, refused.detail))
             return
@@ -287,7 +289,8 @@ class StarObserver(StarcalNode):
             self._publish_annotated(image, observations, before.geometry)
 
     def _refused(self, waiting: Waiting, reason: str, detail: str) -> StarObservations:
-        return refused_image(waiting.time_ns, waiting.width, waiting.height, reason, detail)
+        width, height = (min(side, MAX_SIDE_PX) for side in (waiting.width, waiting.height))
+        return refused_image(nearest_stamp_ns(waiting.time_ns), width, height, reason, detail)
 
     def _publish(self, observations: StarObservations) -> None:
         frame_id = self._setup.frames.camera_frame

@@ -59,6 +59,11 @@ class CalibratorOptions:
         '',
         'folder in which the ensemble and the calibrations survive a restart; empty: memory only',
     )
+    state_key_file: str = option(
+        '',
+        'file with a secret key of at least 16 bytes: state files carry an HMAC by it, and one'
+        ' without is set aside; empty: checksums alone, which show damage but no forgery',
+    )
     calibration_history: int = option(
         20,
         'maximum number of calibrations kept for roll-back, including the active one',

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.bag import reader
-from starcal_ros.camera import CameraModel
+from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
@@ -30,7 +31,22 @@ from starcal_ros.sky.attitude import AttitudeHistory
 T = TypeVar('T')
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
+_SAME_ATTITUDE = 1e-12  # of a component; interpolation between equal samples rounds at 1e-16
+_TURN_SIGMAS = 2.0  # of the star tracker: a coarse output may repeat itself within its noise
+_TURN_PX = 0.1  # noise of the turn between two images, of their centroids and the prior camera
 _IMAGES_OF_A_RESTART = 3  # two images may be swapped in transit, three are not
+
+
+@dataclass(frozen=True)
+class HeldAttitude:
+    """
+    Attitude of an image by the star tracker, and the alignment that its stars give with it.
+
+    Both are (4,); the alignment is that of the prior camera, so that two can be compared.
+    """
+
+    icrf_from_star_tracker_xyzw: Floats
+    star_tracker_from_camera_xyzw: Floats
 
 
 @dataclass(frozen=True)
@@ -42,7 +58,8 @@ class Track:
     ``tracked_camera`` measures the next image without a search; None before the first image.
     ``behind`` images in a row, the last of them at ``behind_ns``, were stamped before the last one
     used.  ``seen`` is the last frame of all, used or not,
-    which a stuck camera shows again; ``hot`` the hot pixels found so far.
+    which a stuck camera shows again; ``hot`` the hot pixels found so far.  ``held`` is the first
+    image used at the attitude of the last one.
     """
 
     geometry: CameraGeometry
@@ -52,6 +69,7 @@ class Track:
     behind_ns: int = 0
     seen: Fingerprint | None = None
     hot: HotPixels | None = None
+    held: HeldAttitude | None = None
 
 
 def observe_next(
@@ -98,7 +116,11 @@ def observe_next(
             hot,
             temperature_degc,
         )
-        return _stars(exposure, setup, remembered)
+        observations, after = _stars(exposure, setup, remembered)
+        if not observations.refusal:
+            held = _held_attitude(observations, track.held, setup)
+            after = dataclasses.replace(after, held=held)
+        return observations, after
     except ImageRefused as refused:
         height, width = image.pixels.shape
         observations = refused_image(
@@ -185,6 +207,42 @@ def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservat
     return observations, _with_hot_pixels(after, exposure, observations, setup)
 
 
+def _held_attitude(
+    observations: StarObservations, held: HeldAttitude | None, setup: Setup
+) -> HeldAttitude:
+    """
+    The first image at the attitude of this one.
+
+    Raises
+    ------
+    ImageRefused
+        ``frozen_attitude`` where the attitude is that image's to the last digit, which the noise
+        of a working star tracker never gives, and the stars have turned by more than its sigma.
+    """
+    attitude = observations.icrf_from_star_tracker_xyzw
+    measured = realigned(setup.prior, observations).star_tracker_from_camera_xyzw
+    now = HeldAttitude(attitude, measured)
+    if held is None or np.abs(attitude - held.icrf_from_star_tracker_xyzw).max() > _SAME_ATTITUDE:
+        return now
+    before = Rotation.from_quat(held.star_tracker_from_camera_xyzw)
+    turn = np.abs((before.inv() * Rotation.from_quat(measured)).as_rotvec())
+    across_rad, around_rad = float(np.hypot(turn[0], turn[1])), float(turn[2])
+    camera = setup.prior.camera
+    noise_rad = _TURN_PX / camera.parameters[0]
+    direction = line_of_sight(camera, observations.measured_px)
+    radius = float(np.sqrt(np.nanmean(direction[:, 0] ** 2 + direction[:, 1] ** 2)))
+    sigma_rad = max(setup.calibration.star_tracker_sigma_arcsec) * ARCSECOND_RAD
+    limit_rad = _TURN_SIGMAS * sigma_rad + noise_rad
+    limit_around_rad = _TURN_SIGMAS * sigma_rad + noise_rad / max(radius, noise_rad)
+    if across_rad > limit_rad or around_rad > limit_around_rad:
+        turned_arcsec = max(across_rad, around_rad) / ARCSECOND_RAD
+        raise ImageRefused(
+            'frozen_attitude',
+            f'one attitude, but the stars have turned {turned_arcsec:.0f} arcsec',
+        )
+    return held
+
+
 def _with_hot_pixels(
     track: Track, exposure: Exposure, observations: StarObservations, setup: Setup
 ) -> Track:
@@ -267,7 +325,9 @@ def observe_bag(
     if temperature_topic:
         temperatures = sorted(reader.read_temperatures(paths, temperature_topic), key=by_time)
     track = Track(setup.prior)
-    for image in reader.read_images(paths, image_topic, setup.attitude.stamp_offset_s):
+    size = (setup.prior.camera.width, setup.prior.camera.height)
+    offset_s = setup.attitude.stamp_offset_s
+    for image in reader.read_images(paths, image_topic, offset_s, size=size):
         if isinstance(image, StarObservations):
             yield image
             continue

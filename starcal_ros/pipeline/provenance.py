@@ -7,6 +7,7 @@ import hashlib
 import importlib.metadata
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,9 @@ def inputs_of(files: Iterable[Path]) -> dict[str, str]:
         with path.open('rb') as file:
             while block := file.read(1 << 20):
                 digest.update(block)
-        digests[str(path)] = f'sha256:{digest.hexdigest()}'
+        # The bytes of a name that is not UTF-8 are written as Python writes them, \\xff.
+        name = os.fsencode(path).decode(errors='backslashreplace')
+        digests[name] = f'sha256:{digest.hexdigest()}'
     return digests
 
 

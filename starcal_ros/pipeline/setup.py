@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import contextlib
 import dataclasses
 from dataclasses import dataclass
 import math
@@ -19,6 +20,7 @@ from starcal_ros.estimation.options import CalibrationOptions, check_options
 from starcal_ros.gate.options import check_gate_options, GateOptions
 from starcal_ros.identification.star_finder import IdentificationOptions
 from starcal_ros.image.centroiding import CentroidOptions
+from starcal_ros.image.file_header import most_bytes, png_header, tiff_header
 from starcal_ros.image.frame_checks import ScreeningOptions
 from starcal_ros.image.hot_pixels import (
     FixedPatternOptions,
@@ -38,11 +40,16 @@ from starcal_ros.options import (
     read_parameter_file,
 )
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.products.camera_yaml import read_camera_info, with_camera_url_from
+from starcal_ros.products.camera_yaml import (
+    read_camera_info,
+    resolve_url,
+    with_camera_url_from,
+)
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
+from starcal_ros.untrusted import read_bytes, shown
 
 NODES = ('star_observer', 'calibrator')
 
@@ -127,6 +134,23 @@ def read_setup(params: Path) -> Setup:
         raise OptionError(f'{params}: {error}') from error
 
 
+def files_of(frames: SetupOptions) -> tuple[Path, ...]:
+    """
+    The files that options name: prior camera, catalog and dark frame.
+
+    Raises
+    ------
+    ProductError
+        For a camera URL that names no file.
+    """
+    files = [resolve_url(frames.camera_info_url)] if frames.camera_info_url else []
+    if frames.catalog:
+        files.append(Path(frames.catalog))
+    if frames.dark_frame:
+        files.append(Path(frames.dark_frame.removeprefix('file://')))
+    return tuple(files)
+
+
 def load_setup(
     values: Mapping[str, object],
     others: Sequence[type] = (),
@@ -148,7 +172,8 @@ def load_setup(
     known = names_of(*OPTION_CLASSES, *others)
     for name in values:
         if name not in known and not is_of_ros(name):
-            raise OptionError(f'{name}: no such parameter{nearest(name, known)}')
+            said = name if name.isidentifier() and len(name) < 60 else shown(name)
+            raise OptionError(f'{said}: no such parameter{nearest(name, known)}')
     groups = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS.items()}
     frames: SetupOptions = groups['frames']
     prior = prior or _prior(frames)
@@ -189,9 +214,28 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
 def _read_dark(path: str, width: int, height: int) -> Pixels | None:
     if not path:
         return None
-    dark = cv2.imread(path.removeprefix('file://'), cv2.IMREAD_UNCHANGED)
+    file = Path(path.removeprefix('file://'))
+    try:
+        content = read_bytes(file, most_bytes(width, height))
+    except OSError as error:
+        raise OptionError(f'dark_frame: {path} cannot be read: {error.strerror}') from error
+    except ValueError as error:
+        raise OptionError(f'dark_frame: {path}: {error}') from error
+    header = png_header(content) or tiff_header(content)
+    if header is None:
+        raise OptionError(f'dark_frame: {path} is no PNG or TIFF')
+    # A small file can claim gigabytes of pixels: none is decoded before the size is known.
+    dark = None
+    if (header.width, header.height) == (width, height):
+        with contextlib.suppress(cv2.error):
+            dark = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    else:
+        raise OptionError(
+            f'dark_frame: {path} is {header.width} x {header.height}, '
+            f'expected 8 or 16 bit, one channel of {width} x {height}'
+        )
     if dark is None:
-        raise OptionError(f'dark_frame: {path} is missing or not an image file')
+        raise OptionError(f'dark_frame: {path} is damaged')
     if dark.shape != (height, width) or dark.dtype not in (np.uint8, np.uint16):
         raise OptionError(
             f'dark_frame: {path} is {dark.dtype} of shape {dark.shape}, '

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import dataclasses
 import math
+import warnings
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment.agreement import compare_halves
 from starcal_ros.assessment.model_checks import model_checks
@@ -19,7 +21,7 @@ from starcal_ros.assessment.observability import (
 from starcal_ros.assessment.observability import ensemble_status as _ensemble_status
 from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.assessment.term_removal import removal_study
-from starcal_ros.camera import ros_fit
+from starcal_ros.camera import CameraModel, line_of_sight, ros_fit
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.detector_field import DetectorField
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
@@ -39,18 +41,42 @@ from starcal_ros.records import (
     StarObservations,
 )
 
+_FEWEST_STARS = 3  # two fit their mirror image
+_MOST_OFF = 0.5  # of the RMS size of a constellation; mirrored along an axis it is off by 1.4
+
 
 def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:
     """
     Return the ensemble with one more image, and without the least informative if too many.
 
     An image whose size differs from the prior camera's is counted as refused: it is from another
-    camera.
+    camera.  So is one whose stars no rotation brings near their pixels, as negated directions.
     """
     size, camera = (observations.width, observations.height), setup.prior.camera
     if not observations.refusal and size != (camera.width, camera.height):
         observations = dataclasses.replace(observations, refusal='wrong_size')
+    if not observations.refusal and not _shows_its_stars(observations, camera):
+        observations = dataclasses.replace(observations, refusal='bad_observations')
     return within_limit(ensemble.add(observations), setup)
+
+
+def _shows_its_stars(observations: StarObservations, camera: CameraModel) -> bool:
+    """
+    Whether a rotation brings the directions of the stars near the lines of sight of their pixels.
+
+    Near compared with the size of the constellation: any prior camera is good enough, but a
+    mirrored or mixed-up constellation stays off by its own size.
+    """
+    seen = line_of_sight(camera, observations.measured_px)
+    exists = np.isfinite(seen[:, 0])
+    if exists.sum() < _FEWEST_STARS:
+        return True
+    seen, directions = seen[exists], observations.direction_icrf[exists]
+    spread = float(np.sqrt(((seen - seen.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', UserWarning)  # of stars on one line
+        _, rssd = Rotation.align_vectors(seen, directions)
+    return float(rssd) / math.sqrt(len(seen)) <= _MOST_OFF * spread
 
 
 def within_limit(ensemble: Ensemble, setup: Setup) -> Ensemble:

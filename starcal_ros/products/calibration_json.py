@@ -20,15 +20,17 @@ from typing import Annotated, Any
 import numpy as np
 
 from starcal_ros.arrays import Count, Finite, Floats, Shape
-from starcal_ros.camera import CameraModel
+from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.errors import ProductError
 from starcal_ros.products.files import read_text, write_atomically
 from starcal_ros.products.json_codec import fields_from_json, from_json, to_json
-from starcal_ros.records import ALIGNMENT_NAMES, Calibration, CameraGeometry
+from starcal_ros.records import ALIGNMENT_NAMES, Calibration, CameraGeometry, check_calibration
+from starcal_ros.untrusted import json_value, PRODUCT_BYTES, shown
 
 SCHEMA = 1
 CALIBRATION_FILE = 'calibration.json'
 
+_UNIT_TOLERANCE = 1e-6  # of the length of a quaternion: rounding to a text leaves less
 _INTRINSICS = 5  # the first parameters of every camera model: fx, skew, fy, cx, cy
 _REPLACED = ('geometry', 'parent_frame', 'child_frame')  # by the keys of `_Published`
 # Keys of version 0.1 and their names now, by the key that holds them ('': the object itself).
@@ -130,9 +132,9 @@ def read_calibration(path: Path) -> Calibration:
         Naming the file and the key that is missing or wrong.
     """
     try:
-        content = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise ProductError(f'{path}: not JSON: {error}') from error
+        content = json_value(read_text(path, PRODUCT_BYTES))
+    except ValueError as error:
+        raise ProductError(f'{path}: {error}') from error
     if not isinstance(content, dict):
         raise ProductError(f'{path}: not a calibration (no JSON object)')
     return calibration_from_content(path, content)
@@ -150,17 +152,19 @@ def calibration_from_content(path: Path, content: Mapping[str, Any]) -> Calibrat
     if 'schema' not in content:
         raise ProductError(f'{path}: not a calibration (no key schema)')
     if content['schema'] != SCHEMA:
-        raise ProductError(f'{path}: schema {content["schema"]!r} is not {SCHEMA}')
+        raise ProductError(f'{path}: schema {shown(content["schema"])} is not {SCHEMA}')
     try:
         content = _with_new_names(content)
         published = from_json(_Published, content)
         others = fields_from_json(Calibration, content, leave_out=_REPLACED)
-        return Calibration(
+        calibration = Calibration(
             geometry=published.geometry(),
             parent_frame=published.alignment.parent,
             child_frame=published.alignment.child,
             **others,
         )
+        check_calibration(calibration)
+        return calibration
     except ValueError as error:
         raise ProductError(f'{path}: {" ".join(str(error).split())}') from error
 
@@ -187,12 +191,15 @@ def prior_of(calibration: Calibration) -> CameraGeometry | None:
     camera = calibration.geometry.camera
     count = len(camera.parameters)
     try:
-        numbers = np.array(json.loads(calibration.provenance['prior']), np.float64)
+        numbers = np.array(json_value(calibration.provenance['prior']), np.float64)
         if numbers.shape != (count + 4,):
             return None
+        if not abs(np.linalg.norm(numbers[count:]) - 1.0) < _UNIT_TOLERANCE:
+            return None
         prior = dataclasses.replace(camera, parameters=numbers[:count])
+        check_plausible(prior)
         return CameraGeometry(prior, numbers[count:])
-    except (KeyError, ValueError, TypeError):
+    except (KeyError, ValueError, TypeError, OverflowError):
         return None
 
 

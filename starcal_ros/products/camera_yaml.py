@@ -11,7 +11,7 @@ from urllib.parse import unquote
 import numpy as np
 import yaml
 
-from starcal_ros.camera import CameraModel, ros_fit
+from starcal_ros.camera import CameraModel, check_plausible, ros_fit
 from starcal_ros.errors import ProductError
 from starcal_ros.lens import from_ros_distortion, ros_distortion
 from starcal_ros.products.fields import (
@@ -22,6 +22,7 @@ from starcal_ros.products.fields import (
     whole_number,
 )
 from starcal_ros.products.files import read_text, write_atomically
+from starcal_ros.untrusted import PARAMETER_BYTES, yaml_value
 
 CAMERA_INFO_FILE = 'camera_info.yaml'
 
@@ -73,9 +74,9 @@ def read_camera_info(location: str | Path) -> CameraModel:
     """
     path = resolve_url(location) if isinstance(location, str) else location
     try:
-        content = yaml.safe_load(read_text(path))
-    except yaml.YAMLError as error:
-        raise ProductError(f'{path}: not YAML: {" ".join(str(error).split())}') from error
+        content = yaml_value(read_text(path, PARAMETER_BYTES))
+    except ValueError as error:
+        raise ProductError(f'{path}: {error}') from error
     if not isinstance(content, dict):
         raise ProductError(f'{path}: not a camera YAML (no keys)')
     reader = CheckedValues(path, content)
@@ -84,14 +85,16 @@ def read_camera_info(location: str | Path) -> CameraModel:
     fx, skew, cx, zero, fy, cy = K[:6]
     if zero != 0.0 or K[6:] != [0.0, 0.0, 1.0]:
         raise ProductError(f'{path}: camera_matrix.data: {K} is not [fx s cx 0 fy cy 0 0 1]')
-    distortion_model = content.get('distortion_model', 'plumb_bob')
+    distortion_model = str(content.get('distortion_model', 'plumb_bob'))[:60]
     D = reader.get('distortion_coefficients.data', list_of(finite_number))
     try:
-        model, distortion = from_ros_distortion(str(distortion_model), D)
+        model, distortion = from_ros_distortion(distortion_model, D)
     except ValueError as error:
         raise ProductError(f'{path}: distortion_model: {error}') from error
     try:
-        return CameraModel(width, height, np.r_[fx, skew, fy, cx, cy, distortion], model)
+        camera = CameraModel(width, height, np.r_[fx, skew, fy, cx, cy, distortion], model)
+        check_plausible(camera)
+        return camera
     except ValueError as error:
         raise ProductError(f'{path}: {error}') from error
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from starcal_ros.errors import ProductError
+from starcal_ros.untrusted import shown
 
 T = TypeVar('T')
 
@@ -33,22 +34,18 @@ class CheckedValues:
         try:
             return kind(value)
         except ValueError as error:
-            shown = repr(value)
-            shown = shown if len(shown) <= 60 else shown[:57] + '...'
-            raise ProductError(f'{self.path}: {dotted_key}: {shown} is not {error}') from error
+            raise ProductError(
+                f'{self.path}: {dotted_key}: {shown(value)} is not {error}'
+            ) from error
 
 
 def finite_number(value: object) -> float:
-    """A finite number; a text too, since YAML 1.1 takes ``1e-5`` without a point for one."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+    """A finite number, and no text of one."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ValueError('a number')
-    try:
-        finite = float(value)
-    except (ValueError, OverflowError):
-        raise ValueError('a number') from None
-    if not math.isfinite(finite):
+    if not math.isfinite(value):
         raise ValueError('a finite number')
-    return finite
+    return float(value)
 
 
 def whole_number(value: object) -> int:

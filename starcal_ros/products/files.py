@@ -1,34 +1,33 @@
-"""Files of products, read as text and replaced whole or not at all."""
+"""Files of products: text of limited size, and contents written whole or not at all."""
 
 from __future__ import annotations
 
-import contextlib
-import os
+from collections.abc import Iterable
 from pathlib import Path
 
+from starcal_ros import untrusted
 from starcal_ros.errors import ProductError
+from starcal_ros.files import replacing, same_as_one_of
 
 OBSERVATIONS_FILE = 'observations.mcap'
 REPORT_FILE = 'report.html'
 
-PART = '.part'  # ends the name of a file that is not whole yet
 
-
-def read_text(path: Path) -> str:
+def read_text(path: Path, most_bytes: int) -> str:
     """
     The text of a file in UTF-8.
 
     Raises
     ------
     ProductError
-        When the file cannot be read or is no text.
+        When the file cannot be read, is larger than ``most_bytes`` or is no text.
     """
     try:
-        return path.read_text(encoding='utf-8')
+        return untrusted.read_text(path, most_bytes)
     except OSError as error:
         raise ProductError(f'{path}: cannot be read: {error.strerror}') from error
-    except UnicodeDecodeError as error:
-        raise ProductError(f'{path}: not a text file') from error
+    except ValueError as error:
+        raise ProductError(f'{path}: {error}') from error
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
@@ -38,26 +37,28 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     Raises
     ------
     ProductError
-        When the file cannot be written; the old one then stands as it was.
+        When the file cannot be written; the old one is then unchanged.
     """
-    part = path.with_name(f'.{path.name}.{os.getpid()}{PART}')
     try:
-        with part.open('wb') as file:
+        with replacing(path) as file:
             file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-        sync_folder(path.parent)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
         raise ProductError(f'{path}: cannot be written: {error.strerror}') from error
 
 
-def sync_folder(folder: Path) -> None:
-    """Have the names in a folder, new and gone, outlast a power loss; raises OSError."""
-    number = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(number)
-    finally:
-        os.close(number)
+def check_not_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """
+    Compare the files that a command will write with those that it reads.
+
+    Raises
+    ------
+    ProductError
+        Naming a file that is both: no input is ever replaced.
+    """
+    inputs = tuple(inputs)
+    for path in outputs:
+        if same_as_one_of(path, inputs):
+            raise ProductError(
+                f'{path}: is an input of this command and would be replaced; choose another '
+                'place (-o)'
+            )

@@ -13,11 +13,19 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, write_calibration
 from starcal_ros.products.camera_yaml import CAMERA_INFO_FILE, write_camera_info
-from starcal_ros.products.files import OBSERVATIONS_FILE
+from starcal_ros.products.files import OBSERVATIONS_FILE, REPORT_FILE
 from starcal_ros.products.residuals_npz import RESIDUALS_FILE, write_residuals
 from starcal_ros.records import Calibration, StarObservations
 
 OBSERVATIONS_TOPIC = '/observations'
+PRODUCT_FILES = (
+    CALIBRATION_FILE,
+    CAMERA_INFO_FILE,
+    OBSERVATIONS_FILE,
+    RESIDUALS_FILE,
+    REPORT_FILE,
+)
+"""The files in a folder of products, without the thumbnails."""
 
 
 def write_products(

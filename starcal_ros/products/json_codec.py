@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import AtLeast, check_shape, fields_of, FieldType
+from starcal_ros.untrusted import shown
 
 T = TypeVar('T')
 
@@ -174,6 +175,4 @@ def _array(kind: FieldType, value: object, key: str, sizes: dict[str, int]) -> N
 
 
 def _error(key: str, value: object, expected: str) -> ValueError:
-    shown = repr(value)
-    shown = shown if len(shown) <= 60 else shown[:57] + '...'
-    return ValueError(f'{key or "content"}: {shown} is not {expected}')
+    return ValueError(f'{key or "content"}: {shown(value)} is not {expected}')

@@ -28,8 +28,9 @@ from starcal_ros.assessment.comparison import Comparison, DifferenceMap
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import OptionError, ProductError
+from starcal_ros.errors import OptionError
 from starcal_ros.least_squares.normal_equations import whitening
+from starcal_ros.products.files import write_atomically
 from starcal_ros.records import CameraGeometry, DetectorMaps, TermRemoval
 from starcal_ros.report.term_removal_figure import curves_of, plot_curves
 
@@ -436,6 +437,7 @@ def term_worth(removals: Sequence[TermRemoval]) -> Markup:
         steps,
         ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])],
         rotation=45,  # ten names do not fit beside each other
+        parse_math=False,  # a name from a file may hold a dollar sign
     )
     axes.set_xlabel('removed, one after the other')
     return _svg(figure, 'terms')
@@ -463,10 +465,7 @@ def write_comparison(found: Comparison, path: Path) -> None:
     _difference(right, camera, found.after, 'common rotation removed')
     memory = io.BytesIO()
     figure.savefig(memory, format=path.suffix[1:], dpi=130)
-    try:
-        path.write_bytes(memory.getvalue())
-    except OSError as error:
-        raise ProductError(f'{path}: cannot be written: {error.strerror}') from error
+    write_atomically(path, memory.getvalue())
 
 
 def _difference(axes: Axes, camera: CameraModel, found: DifferenceMap, title: str) -> None:

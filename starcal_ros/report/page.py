@@ -25,6 +25,7 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.bag import reader
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
+from starcal_ros.errors import ProductError
 from starcal_ros.messages.types import OBSERVATIONS_TYPE
 from starcal_ros.model_errors.temperature import summary as thermal_summary
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, prior_of, read_calibration
@@ -40,6 +41,7 @@ from starcal_ros.records import (
 from starcal_ros.report import figures as report_figures
 from starcal_ros.report.charts import charts_of
 from starcal_ros.report.thumbnails import read_thumbnails, Thumbnail, THUMBNAILS_FOLDER
+from starcal_ros.untrusted import json_value
 
 _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200
@@ -80,7 +82,14 @@ def write_report(folder: Path) -> Path:
         When a file cannot be read or the report cannot be written.
     """
     path = folder / REPORT_FILE
-    write_atomically(path, render(read_folder(folder)))
+    found = read_folder(folder)
+    try:
+        text = render(found)
+    # A file can hold numbers that no calibration has; the errors of drawing have no common base.
+    except Exception as error:
+        why = f'{type(error).__name__}: {error}'
+        raise ProductError(f'{folder}: the products cannot be drawn: {why}') from error
+    write_atomically(path, text)
     return path
 
 
@@ -145,7 +154,7 @@ def _context(found: Found) -> Mapping[str, object]:
 
 def _options_of(calibration: Calibration) -> Mapping[str, object]:
     try:
-        options = json.loads(calibration.provenance['options'])
+        options = json_value(calibration.provenance['options'])
     except (KeyError, ValueError):
         return {}
     return options if isinstance(options, dict) else {}

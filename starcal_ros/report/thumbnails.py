@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+import itertools
 from pathlib import Path
 import re
 
@@ -12,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
+from starcal_ros.errors import ProductError
 from starcal_ros.products.files import write_atomically
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.report.annotation import annotate, stretch
+from starcal_ros.untrusted import read_bytes
 
 THUMBNAILS_FOLDER = 'thumbnails'
 _USED = 6  # used images, evenly spread; between this and twice as many are kept
@@ -22,7 +25,13 @@ _REFUSED_OF_A_REASON = 2
 _STARS_OF_A_REASON = 6
 _WIDTH_PX = 480
 _STAR_HALF_PX = 12
-_NAME = re.compile(r'(?P<kind>image|star)_(?P<time_ns>-?\d+)(?:_(?P<reason>[a-z_]+)_(?P<n>\d+))?')
+_NAME = re.compile(
+    r'image_(?P<image_ns>-?\d{1,20})\.jpg'
+    r'|star_(?P<star_ns>-?\d{1,20})_(?P<reason>[a-z_]{1,40})_(?P<n>\d{1,9})\.png'
+)
+_MAGIC = {'.jpg': b'\xff\xd8\xff', '.png': b'\x89PNG\r\n\x1a\n'}
+_MOST_BYTES = 1 << 20  # of a picture: one of 480 x 480 pixels has a quarter
+_MOST_FILES = 1000  # in a folder: a calibration writes under 200
 
 
 @dataclass(frozen=True)
@@ -91,25 +100,43 @@ def write_thumbnails(thumbnails: Iterable[Thumbnail], folder: Path) -> None:
 
     Raises
     ------
-    OSError, ProductError
-        When a file cannot be written.
+    ProductError
+        When a file cannot be written, or the folder is a link.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in folder.iterdir():
-        if _NAME.fullmatch(path.stem):
-            path.unlink()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if folder.is_symlink():
+            raise ProductError(f'{folder}: is a link; remove it or choose another folder')
+        for path in folder.iterdir():
+            if _NAME.fullmatch(path.name):
+                path.unlink()
+    except OSError as error:
+        raise ProductError(f'{folder}: cannot be written: {error.strerror}') from error
     for thumbnail in thumbnails:
         write_atomically(folder / thumbnail.name, thumbnail.encoded)
 
 
 def read_thumbnails(folder: Path) -> tuple[Thumbnail, ...]:
-    """Thumbnails of a folder in time order; none if there is no such folder."""
+    """
+    Thumbnails of a folder in time order; none if there is no such folder.
+
+    Only regular files that begin as a picture does are read: the folder may come from another
+    user, and its content becomes part of the report.
+    """
+    if folder.is_symlink() or not folder.is_dir():
+        return ()
     found = []
-    for path in folder.iterdir() if folder.is_dir() else ():
-        name = _NAME.fullmatch(path.stem)
-        if name is not None:
-            number, reason = int(name['n'] or 0), name['reason'] or ''
-            found.append(Thumbnail(int(name['time_ns']), reason, number, path.read_bytes()))
+    for path in itertools.islice(sorted(folder.iterdir()), _MOST_FILES):
+        name = _NAME.fullmatch(path.name)
+        if name is None:
+            continue
+        try:
+            encoded = read_bytes(path, _MOST_BYTES, follow_links=False)
+        except (OSError, ValueError):
+            continue
+        if encoded.startswith(_MAGIC[path.suffix]):
+            time_ns = int(name['image_ns'] or name['star_ns'])
+            found.append(Thumbnail(time_ns, name['reason'] or '', int(name['n'] or 0), encoded))
     return tuple(sorted(found, key=lambda t: (t.time_ns, t.reason, t.number)))
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from starcal_ros.arrays import Floats
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import BagError, ProductError
 from starcal_ros.products.camera_yaml import write_camera_info
-from starcal_ros.products.files import write_atomically
+from starcal_ros.products.files import read_text, write_atomically
 from starcal_ros.records import AttitudeSample, CameraGeometry
 from starcal_ros.simulation.centroids import (
     bound_names,
@@ -27,9 +29,11 @@ from starcal_ros.simulation.centroids import (
 )
 from starcal_ros.simulation.images import images
 from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenes
+from starcal_ros.untrusted import PRODUCT_BYTES
 
 IMAGE_TOPIC = '/opnav/image_raw'
 ATTITUDE_TOPIC = '/star_tracker/attitude'
+_OF_BAGS = ('metadata.yaml', '*.mcap', '*.db3')
 
 
 @dataclass(frozen=True)
@@ -110,8 +114,22 @@ def write_bag(
         URL of the prior camera in the parameter file; default: a ``file://`` URL.
     on_image : callable
         Called with the index of each image written.
+
+    Raises
+    ------
+    BagError
+        When a file cannot be written, or one that is not of a simulated bag would be replaced.
     """
     writer = BagWriter(path)
+    if path.suffix == '.mcap':
+        beside = (f'{path.stem}.json', f'{path.stem}_params.yaml', f'{path.stem}_camera.yaml')
+    else:
+        beside = ('truth.json', 'params.yaml', 'camera.yaml')
+    truth, params, camera = (writer.file.with_name(name) for name in beside)
+    _check_replaceable(path, writer.file, truth, (params, camera))
+    content = parameters(scenario, camera_url or f'file://{camera.resolve()}')
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
+    truth_text = json.dumps(truth_content(scenario, writer.file.name), indent=1) + '\n'
     with writer:
         for index, image in enumerate(images(scenario)):
             samples = attitude_samples(scenario, index)
@@ -121,17 +139,38 @@ def write_bag(
             for sample in (s for s in samples if s.time_ns > image.time_ns):
                 _write_attitude(writer, sample)
             on_image(index)
-    if path.suffix == '.mcap':
-        beside = (f'{path.stem}.json', f'{path.stem}_params.yaml', f'{path.stem}_camera.yaml')
-    else:
-        beside = ('truth.json', 'params.yaml', 'camera.yaml')
-    truth, params, camera = (writer.file.with_name(name) for name in beside)
-    write_atomically(truth, json.dumps(truth_content(scenario, writer.file.name), indent=1) + '\n')
-    write_camera_info(scenario.prior.camera, camera, 'opnav')
-    content = parameters(scenario, camera_url or f'file://{camera.resolve()}')
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
-    write_atomically(params, text)
+        # Just before the bag replaces an older one, so that they replace theirs together.
+        write_atomically(truth, truth_text)
+        write_camera_info(scenario.prior.camera, camera, 'opnav')
+        write_atomically(params, text)
     return SimulatedBag(path, truth, params, camera)
+
+
+def _check_replaceable(path: Path, bag: Path, truth: Path, others: Iterable[Path]) -> None:
+    """
+    Check that a bag would replace nothing but an earlier simulated one.
+
+    Raises
+    ------
+    BagError
+        Naming a file of another origin.
+    """
+    there = [file for file in (bag, truth, *others) if os.path.lexists(file)]
+    if path != bag:
+        there += [file for end in _OF_BAGS for file in path.glob(end)]
+    if there and not _is_truth_of(bag.name, truth):
+        raise BagError(
+            f'{there[0]}: is not of a simulated bag and would be replaced; choose another place'
+        )
+
+
+def _is_truth_of(bag_name: str, truth: Path) -> bool:
+    """Whether a file is the truth of a simulated bag of this name."""
+    try:
+        content = json.loads(read_text(truth, PRODUCT_BYTES))
+        return bool(content['bag'] == bag_name and content['scenario'])
+    except (ProductError, ValueError, KeyError, TypeError, RecursionError):
+        return False
 
 
 def _write_attitude(writer: BagWriter, sample: AttitudeSample) -> None:

@@ -31,7 +31,10 @@ class AttitudeOptions:
         2.0, 'longest time between the attitude samples before and after an image, s', low=0.0
     )
     stamp_offset_s: float = option(
-        0.0, 'added to image stamps to reach the middle of the exposure on the attitude clock, s'
+        0.0,
+        'added to image stamps to reach the middle of the exposure on the attitude clock, s',
+        low=-1e9,
+        high=1e9,
     )
     attitude_direction: str = option(
         'st_to_inertial',

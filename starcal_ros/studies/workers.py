@@ -7,36 +7,32 @@ import contextlib
 import functools
 import itertools
 import logging
-from multiprocessing import resource_tracker
 import os
+import pickle
 import queue
+import re
 import signal
-import tempfile
+import subprocess
+import sys
 import threading
 from types import FrameType
-from typing import TypeVar
+from typing import Any, TYPE_CHECKING, TypeVar
 
-import dask
-from distributed import Client, Future, LocalCluster
-
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import OptionError, StarcalError
+from starcal_ros.safe_path import module_command
 from starcal_ros.studies.monte_carlo import Design, Row, run_trial
 
-Result = TypeVar('Result')
+if TYPE_CHECKING:
+    from distributed import Client, Future
 
-LOOPBACK = '127.0.0.1'
+Result = TypeVar('Result')
+Process = subprocess.Popen[bytes]
+
 _CONNECT_S = 10.0
 _POLL_S = 0.2  # interval of checks for an interrupt
-_AHEAD = 8  # trials submitted ahead for each worker thread
-_SETTINGS = {
-    'logging': {'distributed': 'critical'},
-    'distributed.worker.daemon': True,  # a worker ends with its parent
-    'distributed.nanny.pre-spawn-environ': {
-        'OMP_NUM_THREADS': 1,
-        'OPENBLAS_NUM_THREADS': 1,
-        'MKL_NUM_THREADS': 1,
-    },
-}
+_AHEAD = 8  # trials submitted ahead for each worker thread of a cluster
+_ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
+_ADDRESS = re.compile(r'(tcp|tls)://[^/\s]+:\d{1,5}')
 
 
 def processors() -> int:
@@ -79,6 +75,8 @@ def run_each(
     ------
     OptionError
         When no scheduler answers at the address.
+    StarcalError
+        When a process ends early.
     """
     if not scheduler and workers == 0:
         results = []
@@ -88,14 +86,92 @@ def run_each(
         return results
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(_interrupts_wait())
-        stack.enter_context(dask.config.set(_SETTINGS))
+        if not scheduler:
+            return _in_processes(function, count, min(workers, count), on_each, stop)
+        import dask
+
+        settings = {'logging': {'distributed': 'critical'}}
+        stack.enter_context(dask.config.set(settings))
         stack.enter_context(_quiet())
-        if scheduler:
-            client = stack.enter_context(_client(scheduler))
-        else:
-            cluster = stack.enter_context(_local_cluster(min(workers, count)))
-            client = stack.enter_context(_client(cluster))
+        client = stack.enter_context(_client(scheduler))
         return _gather(client, function, count, on_each, stop)
+
+
+def _in_processes(
+    function: Callable[[int], Result],
+    count: int,
+    workers: int,
+    on_each: Callable[[], None],
+    stop: threading.Event,
+) -> list[tuple[int, Result]]:
+    """
+    All results, from processes that are reached through their own pipes only.
+
+    No process starts from a copy of this one, whose threads may hold locks, nor listens on a
+    socket, where another user could send it code.
+    """
+    start = pickle.dumps(sys.path) + pickle.dumps(function)
+    numbers = iter(range(count))
+    taking = threading.Lock()
+    answers: queue.SimpleQueue[tuple[int, bool, Any]] = queue.SimpleQueue()
+
+    def converse(process: Process) -> None:
+        assert process.stdin is not None and process.stdout is not None  # both are pipes
+        number = -1
+        try:
+            process.stdin.write(start)
+            while True:
+                with taking:
+                    number = next(numbers, -1)
+                if number < 0:
+                    return
+                pickle.dump(number, process.stdin)
+                process.stdin.flush()
+                answers.put((number, *pickle.load(process.stdout)))
+        except (OSError, EOFError, ValueError, pickle.UnpicklingError):
+            status = process.wait()
+            error = StarcalError(f'a worker process ended with status {status}: out of memory?')
+            answers.put((number, False, error))
+
+    results: list[tuple[int, Result]] = []
+    with _processes(workers) as processes:
+        for process in processes:
+            threading.Thread(target=converse, args=(process,), daemon=True).start()
+        while len(results) < count:
+            if stop.is_set():
+                raise KeyboardInterrupt
+            with contextlib.suppress(queue.Empty):
+                number, success, found = answers.get(timeout=_POLL_S)
+                if not success:
+                    raise found
+                results.append((number, found))
+                on_each()
+    return results
+
+
+@contextlib.contextmanager
+def _processes(count: int) -> Iterator[list[Process]]:
+    """Worker processes, which end here at the latest."""
+    started: list[Process] = []
+    try:
+        for _ in range(count):
+            started.append(
+                subprocess.Popen(
+                    module_command('starcal_ros.studies.worker'),
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    env={**os.environ, **_ONE_THREAD},
+                )
+            )
+        yield started
+    finally:
+        for process in started:
+            process.kill()
+        for process in started:
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                with contextlib.suppress(OSError):  # what was left to write finds no reader
+                    pipe.close()  # type: ignore[union-attr]
 
 
 def _gather(
@@ -155,51 +231,18 @@ def _interrupts_wait() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, before)
 
 
-@contextlib.contextmanager
-def _local_cluster(workers: int) -> Iterator[LocalCluster]:
-    """Worker processes that only this machine can reach."""
-    with tempfile.TemporaryDirectory(prefix='starcal-') as folder:
-        with _no_interrupts_for_children():
-            cluster = LocalCluster(  # type: ignore[no-untyped-call]
-                n_workers=workers,
-                threads_per_worker=1,
-                processes=True,
-                host=LOOPBACK,
-                dashboard_address=None,
-                worker_dashboard_address=None,
-                # Otherwise it opens port 8787 even without a dashboard, or warns if it is in use.
-                scheduler_kwargs={'dashboard_address': f'{LOOPBACK}:0'},
-                silence_logs=logging.CRITICAL,
-                local_directory=folder,
-                memory_limit=0,
-            )
-        with cluster:
-            yield cluster
+def _client(address: str) -> Client:
+    from distributed import Client
 
-
-@contextlib.contextmanager
-def _no_interrupts_for_children() -> Iterator[None]:
-    """
-    Block Ctrl-C in processes started within; this process receives it afterwards.
-
-    The terminal sends it to all processes, and each would print a traceback.
-    """
-    # Started later, it would unblock the signal.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _client(where: LocalCluster | str) -> Client:
+    # Of another scheme Dask prints a traceback after the time-out.
+    if not _ADDRESS.fullmatch(address):
+        raise OptionError(f'--scheduler: {address}: not tcp://HOST:PORT or tls://HOST:PORT')
     try:
         return Client(  # type: ignore[no-untyped-call]
-            where, timeout=_CONNECT_S, set_as_default=False
+            address, timeout=_CONNECT_S, set_as_default=False
         )
-    except (OSError, ValueError) as error:
-        raise OptionError(f'--scheduler: {where}: {error}') from error
+    except (OSError, ValueError, TypeError) as error:
+        raise OptionError(f'--scheduler: {address}: {error}') from error
 
 
 @contextlib.contextmanager

@@ -22,7 +22,8 @@ from sample_records import (  # type: ignore[import-not-found]
 )
 
 from starcal_ros.bag import reader as bag_reader
-from starcal_ros.calibrator.archive import _sealed, Activation, Archive, TOPIC
+from starcal_ros.calibrator.archive import Activation, Archive, TOPIC
+from starcal_ros.calibrator.seal import Seal
 from starcal_ros.errors import ArchiveError
 from starcal_ros.records import Ensemble
 
@@ -206,7 +207,7 @@ def test_a_calibration_of_before_the_gate_told_is_read(tmp_path: Path) -> None:
     (path,) = tmp_path.glob('calibrations/*.json')
     content = json.loads(path.read_text())
     del content['sha256'], content['gate']
-    path.write_text(_sealed(content))
+    path.write_text(Seal().sealed(content))
     with opened(tmp_path) as archive:
         (record,) = archive.read_history()
         assert archive.damage == []
@@ -249,7 +250,7 @@ def test_another_version_is_left_where_it_is(tmp_path: Path, key: str) -> None:
     content = json.loads(path.read_text())
     del content['sha256']
     content[key] = 99 if key == 'schema' else {'schema': 99}
-    path.write_text(_sealed(content))
+    path.write_text(Seal().sealed(content))
     with opened(tmp_path) as archive:
         assert numbers(archive.read_history()) == [(1, 1)]
         assert archive.damage == [f'{path}: of another version, skipped']

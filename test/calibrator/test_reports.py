@@ -102,7 +102,7 @@ def test_the_folder_is_as_the_tool_writes_it(
     page, trouble = told.get(timeout=PAGE_S)
     assert (page, trouble) == (tmp_path / 'report' / 'report.html', '')
     assert {path.name for path in page.parent.iterdir()} == {
-        'calibration.json', 'camera_info.yaml', 'metadata.yaml', 'observations.mcap',
+        'calibration.json', 'camera_info.yaml', 'observations.mcap',
         'report.html', 'residuals.npz',
     }  # fmt: skip
     text = page.read_text()

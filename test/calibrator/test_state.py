@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 import resource
@@ -9,12 +10,14 @@ import resource
 import numpy as np
 import pytest
 
+from starcal_ros.calibrator.archive import Archive
+from starcal_ros.calibrator.seal import CHECKSUMS
 from starcal_ros.calibrator.state import Answer, CalibratorState
 from starcal_ros.errors import ArchiveError, OptionError
 from starcal_ros.pipeline.node_options import CalibratorOptions
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.products.camera_yaml import write_camera_info
-from starcal_ros.records import Ensemble, refused_image, StarObservations
+from starcal_ros.records import CameraGeometry, Ensemble, refused_image, StarObservations
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import scenario
 
@@ -258,3 +261,136 @@ def test_memory_alone(setup: Setup, shown: tuple[StarObservations, ...]) -> None
     state.open(setup, CalibratorOptions())
     active = state.active
     assert active is not None and np.isfinite(active.covariance).all()
+
+
+def test_the_gate_of_today_judges_what_was_stored(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    """With another prior or limit it is not active, stays on disk, and comes back with them."""
+    state = filled(setup, shown, tmp_path)
+    first, second = state.solve(1).calibration, state.solve(2).calibration
+    assert first is not None and second is not None
+    state.close()
+    kept = sorted((tmp_path / 'calibrations').iterdir())
+    camera = setup.prior.camera.replace(fx=2400.0, fy=2400.0)
+    turned = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    tighter = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    for changed, option in (
+        (dataclasses.replace(setup, prior=CameraGeometry(camera, turned)), 'max_change_px'),
+        (dataclasses.replace(setup, prior=CameraGeometry(setup.prior.camera, turned)),
+         'max_rotation_deg'),
+        (dataclasses.replace(setup, gate=tighter), 'max_residual_rms_px'),
+    ):  # fmt: skip
+        state = started(changed, tmp_path)
+        assert state.active is None
+        assert len(state.withheld) == 2 and all(option in text for text in state.withheld)
+        assert state.rollback(3) == Answer(False, 'no calibration is active')
+        assert state.damage == ()
+        state.close()
+        assert sorted((tmp_path / 'calibrations').iterdir()) == kept
+    state = started(setup, tmp_path)
+    assert state.withheld == () and state.active is not None and state.active.number == 2
+    state.close()
+
+
+def test_the_gate_judges_what_is_in_memory_alone(
+    setup: Setup, shown: tuple[StarObservations, ...]
+) -> None:
+    """Cleaned up, configured with a tighter limit, and back."""
+    state = filled(setup, shown)
+    assert state.solve(1).success
+    state.close()
+    tighter = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    state.open(dataclasses.replace(setup, gate=tighter), CalibratorOptions())
+    assert state.active is None and len(state.withheld) == 1
+    state.open(setup, CalibratorOptions())
+    assert state.active is not None and state.withheld == ()
+
+
+def test_a_forged_verdict_does_not_go_past_a_rolled_back_one(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    """Event 3 went back from 2 to 1: where 1 is refused, 2 must not come up again."""
+    state = filled(setup, shown, tmp_path)
+    assert state.solve(1).success and state.solve(2).success and state.rollback(3).success
+    state.close()
+    for path in (tmp_path / 'calibrations').glob('*_calibration_00000001.json'):
+        content = CHECKSUMS.opened(path.read_bytes())
+        path.write_text(CHECKSUMS.sealed({**content, 'accepted': False, 'reasons': ['forged']}))
+    state = started(setup, tmp_path)
+    assert state.active is None
+    assert 'its file states that the gate refused it; forged' in state.withheld[0]
+    state.close()
+
+
+def test_what_was_forced_stays_for_its_own_reasons_only(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    gate = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
+    state = filled(dataclasses.replace(setup, gate=gate), shown, tmp_path)
+    assert state.solve(1, force=True).success
+    state.close()
+    state = started(dataclasses.replace(setup, gate=gate), tmp_path)
+    assert state.active is not None and state.active.forced
+    state.close()
+    tighter = dataclasses.replace(gate, max_map_sigma_px=1e-6)
+    state = started(dataclasses.replace(setup, gate=tighter), tmp_path)
+    assert state.active is None and 'max_map_sigma_px' in state.withheld[0]
+    assert 'max_residual_rms_px' not in state.withheld[0]
+    state.close()
+
+
+def test_reasons_that_a_sender_makes_up_are_one(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    state = started(setup, tmp_path)
+    for k in range(50):
+        state.add(refused_image(k, 640, 512, f'reason {k}', ''))
+    assert dict(state.ensemble.refused) == {'other': 50}
+    assert (tmp_path / 'ensemble' / 'refused.json').stat().st_size < 300
+    state.close()
+
+
+def test_a_reset_keeps_what_was_set_aside(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    filled(setup, shown[:2], tmp_path).close()
+    victim = tmp_path / 'ensemble' / '00000002.mcap'
+    victim.write_bytes(victim.read_bytes()[:-100])
+    (tmp_path / 'ensemble' / 'notes.txt').write_text('mine')
+    state = started(setup, tmp_path)
+    state.reset()
+    state.close()
+    left = sorted(path.name for path in (tmp_path / 'ensemble').iterdir())
+    assert left == ['00000002.mcap.damaged', 'notes.txt']
+
+
+def test_one_image_of_another_size_is_set_aside(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    other = dataclasses.replace(shown[2], width=1280)
+    with contextlib.closing(Archive(tmp_path, 'camera')) as archive:
+        archive.keep(Ensemble((*shown[:2], other)), ())
+    state = started(setup, tmp_path)
+    assert len(state.ensemble.images) == 2
+    assert '00000003.mcap.damaged' in state.damage[0] and 'an image of 1280 x' in state.damage[0]
+    state.close()
+
+
+def test_without_the_key_nothing_is_believed(
+    setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
+) -> None:
+    key = tmp_path / 'key'
+    key.write_bytes(b'sixteen bytes...')
+    filled(setup, shown[:2], tmp_path / 'state').close()
+    options = CalibratorOptions(state_dir=str(tmp_path / 'state'), state_key_file=str(key))
+    state = CalibratorState()
+    state.open(setup, options)
+    assert len(state.ensemble.images) == 0
+    assert all('the HMAC is missing' in text for text in state.damage) and len(state.damage) == 2
+    state.add(shown[0])
+    state.close()
+    state = CalibratorState()
+    state.open(setup, options)
+    assert len(state.ensemble.images) == 1 and state.damage == ()
+    state.close()

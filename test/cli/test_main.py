@@ -24,6 +24,7 @@ from starcal_ros.cli import demo, main
 from starcal_ros.cli.arguments import parser
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.records import Image
+from starcal_ros.safe_path import module_command
 
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 
@@ -475,7 +476,8 @@ def test_play_becomes_the_player(run: Run, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
     run('play', TINY, '--rate', '2', '--remap', 'a:=b', '--remap', 'c:=d')
     (command,) = called
-    assert command[:3] == [sys.executable, '-m', 'starcal_ros.nodes.bag_player']
+    start = module_command('starcal_ros.nodes.bag_player')
+    assert command[: len(start)] == start
     assert f'bag:={TINY.resolve()}' in command and 'rate:=2.0' in command
     assert command[-4:] == ['-r', 'a:=b', '-r', 'c:=d']
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import array
+import struct
 import sys
+import tracemalloc
 from types import SimpleNamespace
 from typing import Any
+import zlib
 
 import cv2
 import numpy as np
@@ -20,7 +23,9 @@ from starcal_ros.messages.images import (
     decode_png,
     image_from_message,
     image_to_message,
+    refused_from_message,
 )
+from starcal_ros.messages.observations import observations_from_message, observations_to_message
 from starcal_ros.records import Image
 
 RAMP = np.arange(12, dtype=np.uint16).reshape(3, 4) * 257 + 3
@@ -101,13 +106,55 @@ def test_png(dtype: Any) -> None:
     np.testing.assert_array_equal(image.pixels, pixels, strict=True)
 
 
+def png(width: int, height: int, raw: bytes = b'') -> bytes:
+    """A PNG of 16 bit with any size in its header and any rows."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        checked = name + data
+        return struct.pack('>I', len(data)) + checked + struct.pack('>I', zlib.crc32(checked))
+
+    header = chunk(b'IHDR', struct.pack('>IIBBBBB', width, height, 16, 0, 0, 0, 0))
+    rows = chunk(b'IDAT', zlib.compress(raw or bytes((1 + 2 * 4) * 3)))
+    return b'\x89PNG\r\n\x1a\n' + header + rows + chunk(b'IEND', b'')
+
+
+def test_a_png_of_another_size_is_not_decoded() -> None:
+    whole = png(4, 3)
+    assert decode_png(whole, 7, (4, 3)).pixels.shape == (3, 4)
+    for size in ((5, 3), (4, 4)):
+        with pytest.raises(ImageRefused, match='wrong_size: image of 4 x 3, prior camera of'):
+            decode_png(whole, 7, size)
+    # 65000 x 65000 of 16 bit would take 8 GB; less than a page is allocated for the refusal.
+    tracemalloc.start()
+    with pytest.raises(ImageRefused, match='wrong_size'):
+        decode_png(png(65000, 65000), 7, (640, 512))
+    assert tracemalloc.get_traced_memory()[1] < 2**20
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize(('sec', 'offset_s'), [(-1, 0.0), (0, -1e-9), (2**31 - 1, 1.0)])
+def test_a_stamp_that_no_message_can_hold_is_refused(sec: int, offset_s: float) -> None:
+    message = image_to_message(Image(0, RAMP), 'camera', make_message)
+    message.header.stamp.sec = sec
+    with pytest.raises(ImageRefused, match='bad_stamp: .* range of ROS stamps') as caught:
+        image_from_message(message, offset_s)
+    record = refused_from_message(message, offset_s, caught.value)
+    assert record.refusal == 'bad_stamp'
+    back = observations_from_message(observations_to_message(record, 'camera', make_message))
+    assert back.time_ns == record.time_ns  # it can be written
+
+
 @pytest.mark.parametrize(
     ('data', 'reason'),
     [
         (b'', 'bad_encoding'),
         (cv2.imencode('.jpg', RAMP.astype(np.uint8))[1].tobytes(), 'bad_encoding'),
         (cv2.imencode('.png', np.zeros((2, 2, 3), np.uint8))[1].tobytes(), 'bad_encoding'),
-        (cv2.imencode('.png', RAMP)[1].tobytes()[:20], 'bad_layout'),
+        (cv2.imencode('.png', RAMP)[1].tobytes()[:20], 'bad_encoding'),
+        (cv2.imencode('.png', RAMP)[1].tobytes()[:40], 'bad_layout'),
+        (png(60000, 60000), 'bad_layout'),
+        (png(2**31 - 1, 2**31 - 1), 'bad_layout'),
+        (png(4, 3, bytes(10**7)), 'bad_layout'),
     ],
 )
 def test_png_refusals(data: bytes, reason: str) -> None:

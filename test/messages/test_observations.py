@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,11 @@ import pytest
 from sample_records import assert_same, observations, plain, TIME_NS  # type: ignore[import-not-found]
 
 from starcal_ros.bag.typestore import make_message
-from starcal_ros.messages.observations import observations_from_message, observations_to_message
+from starcal_ros.messages.observations import (
+    checked_observations,
+    observations_from_message,
+    observations_to_message,
+)
 from starcal_ros.records import refused_image
 
 
@@ -40,6 +45,61 @@ def test_bad_observations_are_refused(field: str, value: Any, text: str) -> None
     setattr(message, field, value)
     with pytest.raises(ValueError, match=text):
         observations_from_message(message)
+
+
+@pytest.mark.parametrize(
+    ('place', 'value', 'text'),
+    [
+        ('header.stamp.sec', -1, 'header.stamp: -876543211 ns is not within the range'),
+        ('header.stamp.nanosec', 2**32 - 1, ''),  # a carry that the stamp can hold
+        ('attitude.w', 0.0, 'attitude: a quaternion of length 0.714'),
+        ('attitude.w', 1e300, 'attitude: a quaternion of length'),
+        ('temperature_degc', 1e300, 'temperature_degc: 1e'),
+        ('background_dn', np.inf, 'background_dn: not finite'),
+        ('width', 2**32 - 1, 'width, height: 4294967295 x 1024 px is no image'),
+        ('refusal', 'x' * 10**6, "refusal: 'x{100}' is no known reason"),
+        ('catalog_digest', 'x' * 10**6, 'refused_star_reasons, catalog_digest: longer'),
+    ],
+)
+def test_a_value_that_no_image_has_is_refused(place: str, value: Any, text: str) -> None:
+    message = observations_to_message(observations(), 'cam', plain)
+    *holders, field = place.split('.')
+    holder = message
+    for name in holders:
+        holder = getattr(holder, name)
+    setattr(holder, field, value)
+    record = checked_observations(message)
+    assert record.refusal == ('bad_observations' if text else '')
+    assert re.match(text, record.detail) and len(record.detail) <= 500
+    # The refusal itself can be published and saved.
+    back = observations_from_message(observations_to_message(record, 'cam', make_message))
+    assert_same(record, back)
+
+
+@pytest.mark.parametrize(
+    ('field', 'value', 'text'),
+    [
+        ('direction_icrf', 0.0, 'direction_icrf: lengths of'),
+        ('direction_icrf', 1e300, 'direction_icrf: lengths of'),
+        ('measured_px', 1e300, r'measured_px: \(1e\+300, '),
+        ('measured_px', -2.0, r'measured_px: \(-2, '),
+        ('covariance_px2', 1e300, 'covariance_px2: '),
+        ('covariance_px2', 1e-300, 'covariance_px2: '),
+        ('snr', np.inf, 'snr: not finite'),
+    ],
+)
+def test_a_value_that_no_star_has_is_refused(field: str, value: float, text: str) -> None:
+    message = observations_to_message(observations(), 'cam', plain)
+    getattr(message, field)[0] = value
+    record = checked_observations(message)
+    assert record.refusal == 'bad_observations' and len(record) == 0
+    assert re.match(text, record.detail)
+
+
+def test_a_long_detail_is_cut() -> None:
+    message = observations_to_message(observations(), 'cam', plain)
+    message.detail = 'x' * 10**6
+    assert len(checked_observations(message).detail) == 500
 
 
 def test_refused_stars_are_found_by_reason() -> None:

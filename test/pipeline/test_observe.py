@@ -16,9 +16,9 @@ from starcal_ros.camera import project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.records import CameraGeometry, Ensemble, Image
+from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, Image
 from starcal_ros.simulation.images import render, star_electrons
-from starcal_ros.simulation.scenario import attitude_samples, scene
+from starcal_ros.simulation.scenario import attitude_samples, Inertial, scene
 from starcal_ros.sky.astrometry import through_the_air
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
 
@@ -342,3 +342,32 @@ def test_a_saturated_star_is_known_as_such_under_a_dark_frame(
     brightest = plain.catalog_id[plain.snr.argmax()]
     reason = found.refused_reason[found.refused_catalog_id == brightest]
     assert [list(found.refused_stars)[code] for code in reason] == ['saturated']
+
+
+def _observed(setup: Setup, step_arcsec: float, is_hung: bool) -> list[str]:
+    """Refusals of five images, each turned by a step; the star tracker may hang at the first."""
+    dec_deg = [20.0 + k * step_arcsec / 3600.0 for k in range(5)]
+    fields = tuple((250.0, dec, 10.0) for dec in dec_deg)
+    drift = dataclasses.replace(SCENARIO, pointing=Inertial(fields))
+    hung = scene(drift, 0).icrf_from_star_tracker_xyzw
+    history = AttitudeHistory()
+    for k in range(5):
+        for sample in attitude_samples(drift, k):
+            xyzw = hung if is_hung else sample.icrf_from_star_tracker_xyzw
+            history.add(sample.time_ns, AttitudeSample(sample.time_ns, xyzw))
+    track, refusals = observe.Track(setup.prior), []
+    for k in range(5):
+        found, track = observe.observe_next(
+            render(drift, scene(drift, k), k), history, setup, track
+        )
+        refusals.append(found.refusal)
+    return refusals
+
+
+def test_a_hung_star_tracker_is_refused_once_the_stars_have_turned(setup: Setup) -> None:
+    """By twice the largest sigma of the star tracker and a tenth of a pixel: 91 arcsec."""
+    ok, frozen = '', 'frozen_attitude'
+    assert _observed(setup, 72.0, is_hung=True) == [ok, ok, frozen, frozen, frozen]
+    assert _observed(setup, 72.0, is_hung=False) == [ok] * 5
+    # A spacecraft that holds its attitude, with a star tracker without noise.
+    assert _observed(setup, 0.0, is_hung=True) == [ok] * 5

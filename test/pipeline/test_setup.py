@@ -109,7 +109,7 @@ def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> 
         ({'min_images': 2.5}, 'min_images: 2.5 is not an integer'),
         (
             {'dark_frame': '/no/such/dark.png'},
-            'dark_frame: /no/such/dark.png is missing or not an image file',
+            'dark_frame: /no/such/dark.png cannot be read: No such file',
         ),
     ],
 )

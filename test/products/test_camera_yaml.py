@@ -116,6 +116,24 @@ def test_hand_written_ros_yaml(tmp_path: Path) -> None:
         ('image_height: 480', 'image_height: 0', '640 x 0 is not an image'),
         ('0, 501, 239.5, 0, 0, 1]', '0, 501]', 'camera_matrix.data: .* is not 9 numbers'),
         ('[500.0, 0.5', '[0, 0.5', 'not positive'),
+        ('[500.0, 0.5', '[1e300, 0.5', r'fx: 1e\+300 px is over 1e\+08 px'),
+        ('[500.0, 0.5', '[35.0, 0.5', 'fx: 35 px is under 96 px, .*; is it in mm'),
+        ('[500.0, 0.5', '[500.0, 60', 'skew: 60 px is over a tenth of fx'),
+        ('0, 501,', '0, 50000,', 'fx, fy: 500, 50000 px differ by more than a factor of ten'),
+        ('319.5', '3e5', 'cx: 300000 px is far outside of the 640 px'),
+        ('-0.1, 1e-2', '1e300, 1e300', 'no line of sight over most of the detector'),
+        ('-0.1, 1e-2', '-50.0, 0.0', 'no line of sight over most of the detector'),
+        ('image_width: 640', 'image_width: 99999999', 'image size: 99999999 x 480 is over'),
+        ('image_width: 640', 'image_width: ' + 5000 * '9', 'line 1: an integer of 5000 digits'),
+        ('image_width: 640', 'image_width: 2026-13-01', "'2026-13-01' is not a whole number"),
+        (
+            'image_width: 640',
+            'image_width: 640\nimage_width: 1',
+            "line 2: key 'image_width' stands",
+        ),
+        ('image_width: 640', '5: 640', 'line 1: key 5 is not a text'),
+        ('narrow_stereo', 40 * '[' + 40 * ']', 'line 3: nested deeper than 32'),
+        ('narrow_stereo', '"\\0"', 'line 3: a text with a NUL character'),
         ('[500.0, 0.5', '[.nan, 0.5', 'camera_matrix.data: .* is not a finite number'),
         ('239.5, 0, 0, 1]', '239.5, 0, 0, 2]', 'camera_matrix.data: .* is not'),
         (
@@ -161,6 +179,7 @@ def test_a_bad_camera_yaml_is_refused_by_file_and_key(tmp_path, old, new, says) 
     ],
 )  # fmt: skip
 def test_every_distortion_model_of_ros(tmp_path, ros_model, D, model, expected) -> None:
+    D, expected = [0.001 * c for c in D], [0.001 * c for c in expected]
     path = tmp_path / 'camera.yaml'
     text = ROS_YAML.replace('plumb_bob', ros_model).replace('[500.0, 0.5', '[500.0, 0.0')
     path.write_text(text.replace('[-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]', str(D)))

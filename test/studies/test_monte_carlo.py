@@ -24,7 +24,7 @@ from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.cli import main
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 from starcal_ros.studies import figures as study_figures
 from starcal_ros.studies import monte_carlo, summary, trials, workers
 from starcal_ros.studies.monte_carlo import Design, Row
@@ -99,24 +99,34 @@ def test_a_cluster_that_is_there_gives_the_same_rows(scheduler: str) -> None:
     assert summary.conclude(design, rows) == here(design)
 
 
-def test_workers_listen_on_loopback_only() -> None:
-    listening = set()
+def test_workers_are_reached_through_no_socket() -> None:
+    """A socket without authentication would let another user run code as this one."""
+    us = psutil.Process()
+    before = set(us.net_connections('all'))
+    opened, seen = set(), 0
 
     def look() -> None:
-        us = psutil.Process()
-        for process in (us, *us.children(recursive=True)):
-            for connection in process.net_connections('inet'):
-                if connection.status == psutil.CONN_LISTEN:
-                    listening.add(connection.laddr.ip)
+        nonlocal seen
+        opened.update(set(us.net_connections('all')) - before)
+        for child in us.children(recursive=True):
+            seen += 1
+            opened.update(child.net_connections('all'))
 
     workers.run_trials(small('coverage'), workers=1, on_trial=look)
-    assert listening == {'127.0.0.1'}
+    assert seen and not opened
+
+
+def test_an_error_and_the_end_of_a_worker_reach_the_caller() -> None:
+    with pytest.raises(ValueError, match='invalid literal'):
+        workers.run_each(functools.partial(int, 'x'), 3, workers=1)  # int('x', 0)
+    with pytest.raises(StarcalError, match='a worker process ended with status 0'):
+        workers.run_each(os._exit, 3, workers=1)  # os._exit(0), then none for 1 and 2
 
 
 def test_interrupted_leaves_in_one_line(tmp_path: Path) -> None:
     started = tool('coverage', '--trials', 100000, '--workers', 1, '-o', tmp_path / 'out')
     deadline = time.monotonic() + 60
-    while len(psutil.Process(started.pid).children()) < 2 and time.monotonic() < deadline:
+    while not psutil.Process(started.pid).children() and time.monotonic() < deadline:
         time.sleep(0.05)
     time.sleep(1.0)  # as far as the trials, mostly; what is asserted holds before too
     children = psutil.Process(started.pid).children(recursive=True)
@@ -308,7 +318,9 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
         (['table1', '--workers', '-1'], '--workers: -1 is not within 0'),
         (['table1', '--workers', '1', '--scheduler', 'x'], 'not allowed with'),
         (['table1', '--scheduler', 'tcp://127.0.0.1:1'], '--scheduler: tcp://127.0.0.1:1: '),
-        (['table1', '--scheduler', 'nonsense'], '--scheduler: nonsense: '),
+        (['table1', '--scheduler', 'nonsense'], '--scheduler: nonsense: not tcp://HOST:PORT'),
+        (['table1', '--scheduler', 'ucx://127.0.0.1:1'], 'ucx://127.0.0.1:1: not tcp://HOST'),
+        (['table1', '--scheduler', 'inproc://1/2/3'], 'inproc://1/2/3: not tcp://HOST:PORT'),
     ],
 )
 def test_bad_arguments_are_one_line(

@@ -1,0 +1,40 @@
+"""
+Entry point of the console script, which answers Ctrl-C at any instant without a traceback.
+
+During imports Python would print one; the default action of the system ends the process silently.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+_AGAIN_S = 0.01
+
+
+def main() -> int:
+    """Run the tool; see `starcal_ros.cli.main.main`."""
+    before = signal.getsignal(signal.SIGINT)
+    is_default = before is signal.default_int_handler  # unless nohup or a shell ignores it
+    if is_default:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from starcal_ros.cli import main as tool
+
+    signal.signal(signal.SIGINT, before)
+    if is_default:
+        sys.unraisablehook = _interrupt_again
+        signal.signal(signal.SIGALRM, signal.default_int_handler)
+    try:
+        return tool.main()
+    finally:
+        if is_default:  # the result stands; Python's own end must not print a traceback
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            signal.signal(signal.SIGALRM, signal.SIG_IGN)
+
+
+def _interrupt_again(lost: sys.UnraisableHookArgs) -> None:
+    """Raise a KeyboardInterrupt again that came in a destructor, where Python drops it."""
+    if lost.exc_type is KeyboardInterrupt:
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+    else:
+        sys.__unraisablehook__(lost)
