@@ -29,7 +29,7 @@ from scipy.stats import beta
 
 from bench.table import Table
 from starcal_ros.camera import CameraModel, field_radius_rad, project
-from starcal_ros.identification.lost_in_space import find_sky, SkyMatch
+from starcal_ros.lost_in_space.search import find_sky, SkyMatch
 from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
 
 Floats = NDArray[np.float64]

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.camera import CameraModel
-from starcal_ros.identification.bright_sources import bright_sources, BrightSources, smear
-from starcal_ros.identification.lost_in_space import find_sky, SkyMatch
+from starcal_ros.lost_in_space.bright_sources import bright_sources, BrightSources, smear
+from starcal_ros.lost_in_space.search import find_sky, SkyMatch
 from starcal_ros.pipeline.attitude_reading import (
     best_reading,
     CLOCK_SEARCH_S,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from starcal_ros.nodes.sliding_window import Recent, WINDOW_S
+from starcal_ros.star_observer.sliding_window import Recent, WINDOW_S
 
 
 class Clock:

@@ -21,14 +21,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.identification.pattern_index import (
+from starcal_ros.lost_in_space.pattern_index import (
     equivalent,
     pattern_index,
     scales_for,
     shapes,
     sphere_points,
 )
-from starcal_ros.identification.sky_fit import (
+from starcal_ros.lost_in_space.sky_fit import (
     FOCAL_RANGE,
     log10_p_value,
     match,

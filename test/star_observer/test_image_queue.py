@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
-from starcal_ros.nodes.image_queue import ImageQueue, Waiting
+from starcal_ros.star_observer.image_queue import ImageQueue, Waiting
 
 SECOND_NS = 10**9
 

@@ -1,0 +1,1 @@
+"""Queue and rates of the star observer, without ROS."""
