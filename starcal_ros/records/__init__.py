@@ -1,0 +1,61 @@
+"""
+The frozen records that pass between the stages: images -> observations -> calibration.
+
+Arrays in records are never changed after construction.  The types of the fields, with their marks
+(`arrays`), are the one description of a record: ``products/json_codec.py`` and
+``messages/codec.py`` write and read JSON and messages from them.
+"""
+
+from starcal_ros.records.calibration import (
+    ALIGNMENT_NAMES,
+    Calibration,
+    calibration_parameter_names,
+    CameraGeometry,
+    Correlation,
+    DetectorMaps,
+    DetectorStep,
+    GateCheck,
+    HalvesComparison,
+    HeldTerm,
+    ModelChecks,
+    ResidualField,
+    TemperatureTerms,
+    TermRemoval,
+)
+from starcal_ros.records.observations import (
+    AttitudeSample,
+    Ensemble,
+    EnsembleStatus,
+    Image,
+    IMAGE_REFUSALS,
+    refused_image,
+    STAR_COLUMNS,
+    STAR_REFUSALS,
+    StarObservations,
+)
+
+__all__ = [
+    'ALIGNMENT_NAMES',
+    'IMAGE_REFUSALS',
+    'STAR_COLUMNS',
+    'STAR_REFUSALS',
+    'AttitudeSample',
+    'Calibration',
+    'CameraGeometry',
+    'Correlation',
+    'DetectorMaps',
+    'DetectorStep',
+    'Ensemble',
+    'EnsembleStatus',
+    'GateCheck',
+    'HalvesComparison',
+    'HeldTerm',
+    'Image',
+    'ModelChecks',
+    'ResidualField',
+    'StarObservations',
+    'TemperatureTerms',
+    'TermRemoval',
+    'calibration_parameter_names',
+    'refused_image',
+]
