@@ -29,7 +29,7 @@ from starcal_ros.identification.star_finder import (
     realigned,
 )
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
-from starcal_ros.image.centroiding import CentroidOptions
+from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.simulation import images as simulated_images
 from starcal_ros.simulation import scenario as synthetic

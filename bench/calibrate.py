@@ -25,7 +25,7 @@ _STAGES = (
     ('  background', 'detection', 'measure_background'),
     ('  prediction', 'prediction', 'predict'),
     ('  match', 'identification', '_find'),
-    ('  PSF and pixel noise', 'centroiding', 'model_image'),
+    ('  PSF and pixel noise', 'image_model', 'model_image'),
     ('  images after the first', 'tracking', 'track_stars'),
     ('  centroids', 'centroiding', 'measure_stars'),
     ('estimate', 'calibration', 'estimate_calibration'),

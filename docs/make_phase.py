@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from starcal_ros.arrays import Floats
-from starcal_ros.image.centroiding import CentroidOptions, measure_stars, model_image
+from starcal_ros.image.centroiding import measure_stars
 from starcal_ros.image.detection import detect, measure_background
+from starcal_ros.image.image_model import CentroidOptions, model_image
 from starcal_ros.simulation.images import expose, star_electrons
 from starcal_ros.simulation.scenario import Detector
 

@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.identification.prediction import Prediction
-from starcal_ros.image.centroiding import Centroids, ImageModel, SWAMPED_SIGMA
+from starcal_ros.image.centroiding import Centroids, SWAMPED_SIGMA
+from starcal_ros.image.image_model import ImageModel
 from starcal_ros.image.psf_fit import neighbour_pull_px, stamp_radius_px
 from starcal_ros.sky.catalog import CLOSE_PAIR_RAD, StarCatalog
 

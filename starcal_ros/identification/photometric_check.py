@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import best_share, missed_parts, part_of, PARTS
-from starcal_ros.image.centroiding import Centroids, ImageModel
-from starcal_ros.image.psf_fit import expected_snr
+from starcal_ros.image.centroiding import Centroids
+from starcal_ros.image.image_model import ImageModel
+from starcal_ros.image.pixel_noise import expected_snr
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 
 _FEWEST = 4  # stars whose scatter, or the share of which, means anything

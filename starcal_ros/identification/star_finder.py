@@ -31,13 +31,7 @@ from starcal_ros.identification.prediction import (
     SPACE,
     within_image,
 )
-from starcal_ros.image.centroiding import (
-    CentroidOptions,
-    Centroids,
-    ImageModel,
-    measure_stars,
-    model_image,
-)
+from starcal_ros.image.centroiding import Centroids, measure_stars
 from starcal_ros.image.detection import (
     Background,
     detect,
@@ -46,6 +40,7 @@ from starcal_ros.image.detection import (
     Sources,
 )
 from starcal_ros.image.hot_pixels import NO_HOT_PIXELS, refuse_on_hot_pixels
+from starcal_ros.image.image_model import CentroidOptions, ImageModel, model_image
 from starcal_ros.image.psf_field import Instrument, learn, MeasuredStars
 from starcal_ros.image.psf_fit import stamp_radius_px
 from starcal_ros.options import option

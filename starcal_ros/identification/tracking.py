@@ -32,13 +32,13 @@ from starcal_ros.identification.star_finder import (
     IdentificationOptions,
     measure_predicted,
 )
-from starcal_ros.image.centroiding import CentroidOptions, known_model
 from starcal_ros.image.detection import (
     Background,
     brightest_near,
     measure_background,
     sample_background,
 )
+from starcal_ros.image.image_model import CentroidOptions, known_model
 from starcal_ros.image.psf_field import Instrument
 from starcal_ros.records import CameraGeometry, StarObservations
 from starcal_ros.robust_statistics import median

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
-from starcal_ros.image.psf_fit import noise_sums, NoiseSums, PixelNoise, PsfFit, select
+from starcal_ros.image.pixel_noise import NoiseSums, PixelNoise
+from starcal_ros.image.psf_fit import noise_sums, PsfFit, select
 from starcal_ros.robust_statistics import centre_and_scatter
 
 _MEMORY = 0.95  # weight of what is known against each new image: about twenty images count

@@ -20,9 +20,9 @@ from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
-from starcal_ros.image.centroiding import saturation_level
 from starcal_ros.image.frame_checks import Fingerprint, fingerprint, sample_rows, screen
 from starcal_ros.image.hot_pixels import HotPixels, learn_hot_pixels
+from starcal_ros.image.image_model import saturation_level
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory

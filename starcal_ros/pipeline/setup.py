@@ -18,7 +18,6 @@ from starcal_ros.camera import convert
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import CalibrationOptions, check_options
 from starcal_ros.identification.star_finder import IdentificationOptions
-from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.image.frame_checks import ScreeningOptions
 from starcal_ros.image.hot_pixels import (
     FixedPatternOptions,
@@ -26,6 +25,7 @@ from starcal_ros.image.hot_pixels import (
     HotPixels,
     NO_HOT_PIXELS,
 )
+from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.lens import COEFFICIENTS
 from starcal_ros.options import (
     from_mapping,

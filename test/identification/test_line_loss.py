@@ -13,7 +13,7 @@ from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.line_loss import find_line_loss
 from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
 from starcal_ros.identification.tracking import start_tracking, track_stars
-from starcal_ros.image.centroiding import CentroidOptions
+from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.simulation.images import render
 from starcal_ros.simulation.scenario import scenario, scene

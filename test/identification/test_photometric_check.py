@@ -10,10 +10,11 @@ import pytest
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.photometric_check import refuse_by_brightness
 from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
-from starcal_ros.image.centroiding import CentroidOptions, Centroids, ImageModel
+from starcal_ros.image.centroiding import Centroids
 from starcal_ros.image.detection import Background
+from starcal_ros.image.image_model import CentroidOptions, ImageModel
+from starcal_ros.image.pixel_noise import PixelNoise
 from starcal_ros.image.psf_field import uniform_width
-from starcal_ros.image.psf_fit import PixelNoise
 from starcal_ros.simulation import images as simulated_images
 from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.sky.catalog import load_catalog

@@ -18,7 +18,7 @@ from starcal_ros.identification.star_finder import (
     observe_stars,
     realigned,
 )
-from starcal_ros.image.centroiding import CentroidOptions
+from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.records import (
     CameraGeometry,
     Image,

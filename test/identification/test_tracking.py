@@ -14,7 +14,7 @@ from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
-from starcal_ros.image.centroiding import CentroidOptions
+from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.simulation.images import render
 from starcal_ros.simulation.scenario import scenario, Scene, scene

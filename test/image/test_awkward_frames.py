@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from starcal_ros.image.centroiding import CentroidOptions, Centroids, measure_stars, model_image
+from starcal_ros.image.centroiding import Centroids, measure_stars
 from starcal_ros.image.detection import (
     Background,
     detect,
@@ -15,7 +15,8 @@ from starcal_ros.image.detection import (
     sample_background,
     sample_mesh,
 )
-from starcal_ros.image.psf_fit import NoiseSums
+from starcal_ros.image.image_model import CentroidOptions, model_image
+from starcal_ros.image.pixel_noise import NoiseSums
 from starcal_ros.simulation.images import expose, star_electrons
 from starcal_ros.simulation.scenario import Detector
 

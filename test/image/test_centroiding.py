@@ -8,16 +8,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from starcal_ros.image.centroiding import (
+from starcal_ros.image.centroiding import Centroids, measure_stars
+from starcal_ros.image.detection import detect, measure_background, sample_mesh
+from starcal_ros.image.image_model import (
     CentroidOptions,
-    Centroids,
     ImageModel,
-    measure_stars,
     model_image,
     saturation_level,
 )
-from starcal_ros.image.detection import detect, measure_background, sample_mesh
-from starcal_ros.image.psf_fit import fit_psf, noise_sums, PixelNoise
+from starcal_ros.image.pixel_noise import PixelNoise
+from starcal_ros.image.psf_fit import fit_psf, noise_sums
 from starcal_ros.records import STAR_REFUSALS
 from starcal_ros.simulation.centroids import centroid_bound
 from starcal_ros.simulation.images import expose, star_electrons

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from bench import acquisition
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
-from starcal_ros.image.centroiding import CentroidOptions
+from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.sky.catalog import load_catalog
 
 pytestmark = pytest.mark.slow
