@@ -44,7 +44,7 @@ from starcal_ros.image.image_model import CentroidOptions, ImageModel, model_ima
 from starcal_ros.image.psf_field import Instrument, learn, MeasuredStars
 from starcal_ros.image.psf_fit import stamp_radius_px
 from starcal_ros.options import option
-from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import StarCatalog
 
@@ -211,7 +211,7 @@ def measure_predicted(
         centroids.fit,
         centroids.psf_sigma_px,
         centroids.noise_dn,
-        (refusal == '') & alone,
+        (refusal == StarRefusal.NONE) & alone,
     )
     shown_dn = model.saturation_dn if np.isfinite(model.saturation_dn) else 0.0
     return observations, learn(instrument, stars, model.pixel_noise, shown_dn, (width, height))
@@ -228,11 +228,12 @@ def _observations(
     """Observations with used and refused stars; refused as a whole with too few stars."""
     height, width = exposure.image.pixels.shape
     index = prediction.catalog_index
-    good = centroids.refusal == ''
+    good = centroids.refusal == StarRefusal.NONE
     left_out = ~good
-    names, code, counts = np.unique(
+    refusals, reason, counts = np.unique(
         centroids.refusal[left_out], return_inverse=True, return_counts=True
     )
+    names = [StarRefusal(code).label for code in refusals]
     measured = np.count_nonzero(good)
     few = measured < fewest
     if few:
@@ -252,10 +253,10 @@ def _observations(
         covariance_px2=centroids.covariance_px2[good],
         flux_dn=centroids.flux_dn[good].astype(np.float32),
         snr=centroids.snr[good].astype(np.float32),
-        refused_stars=dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        refused_stars=dict(zip(names, counts.tolist(), strict=True)),
         refused_catalog_id=catalog.id[index][left_out],
         refused_px=prediction.xy_px[left_out].astype(np.float32),
-        refused_reason=code.astype(np.uint8),
+        refused_reason=reason.astype(np.uint8),
         background_dn=model.background.level_dn,
         noise_dn=model.background.noise_dn,
         psf_sigma_px=model.psf_sigma_px,
@@ -324,7 +325,7 @@ def _find(
     return acquire(prediction, sources, geometry, reach_px, roll_rad), sources
 
 
-def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.str_]:
+def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.uint8]:
     """
     Refusal reasons (n,) of the centroids, with displaced stars as ``ambiguous``.
 
@@ -332,7 +333,7 @@ def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) ->
     """
     refusal = centroids.refusal.copy()
     sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
-    good = np.nonzero(refusal == '')[0]
+    good = np.nonzero(refusal == StarRefusal.NONE)[0]
     if len(good) < 4:
         return refusal
     expected_px, measured_px = predicted_px[good], centroids.xy_px[good]
@@ -341,7 +342,7 @@ def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) ->
     )
     off_px = np.hypot(*(measured_px - expected_px - correction).T)
     limit_px = np.maximum(5.0 * np.hypot(sigma_px[good], 0.75 * scatter_px), 0.3)
-    refusal[good[off_px > np.minimum(limit_px, 2.0)]] = 'ambiguous'
+    refusal[good[off_px > np.minimum(limit_px, 2.0)]] = StarRefusal.AMBIGUOUS
     return refusal
 
 
@@ -354,7 +355,7 @@ def _refuse_line_loss(predicted_px: Floats, centroids: Centroids, shape: tuple[i
     ImageRefused
         ``incomplete``.
     """
-    good = np.isin(centroids.refusal, ('', 'not_detected'))
+    good = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
     variance_px2 = 0.5 * (centroids.covariance_px2[good, 0] + centroids.covariance_px2[good, 2])
     loss = find_line_loss(predicted_px[good], centroids.xy_px[good], np.sqrt(variance_px2), shape)
     if loss is not None:

@@ -40,9 +40,8 @@ from starcal_ros.image.psf_fit import (
     stamp_radius_px,
     Stamps,
 )
-from starcal_ros.records import STAR_REFUSALS
+from starcal_ros.records import StarRefusal
 
-_REFUSAL_NAME = np.dtype(f'U{max(map(len, STAR_REFUSALS))}')  # holds every name uncut
 _MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours
 SWAMPED_SIGMA = 3.0  # a brighter star nearer than this swamps, though it is measured itself
 _NEIGHBOUR_NOISE = 0.2  # of the noise of a pixel: less light of a neighbour changes nothing
@@ -55,7 +54,7 @@ class Centroids:
     Measured stars.
 
     ``xy_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``flux_dn``, ``snr`` (n,);
-    ``refusal`` (n,) text: empty where the star is good, else a name of `STAR_REFUSALS`.
+    ``refusal`` (n,) uint8 codes of `StarRefusal`, 0 where the star is good.
     ``fit`` is None for moments; ``psf_sigma_px``, ``noise_dn`` (n,) are what it was made with, and
     the light of the stars ``modelled`` (n,) was taken from their neighbours.
     """
@@ -64,7 +63,7 @@ class Centroids:
     covariance_px2: Floats
     flux_dn: Floats
     snr: Floats
-    refusal: NDArray[np.str_]
+    refusal: NDArray[np.uint8]
     fit: PsfFit | None
     psf_sigma_px: Floats
     noise_dn: Floats
@@ -102,7 +101,7 @@ def _measure_by_psf(
     shape = (pixels.shape[0], pixels.shape[1])
     radius = stamp_radius_px(psf.sigma_px)
     n = len(predicted_px)
-    refusal = np.full(n, '', dtype=_REFUSAL_NAME)
+    refusal = np.full(n, StarRefusal.NONE, np.uint8)
     centre = np.rint(np.where(np.isnan(predicted_px), -1e6, predicted_px)).astype(np.int64)
     inside = windows_inside(shape, centre, 1)
     innermost = np.array([shape[1] - 2, shape[0] - 2])
@@ -145,13 +144,13 @@ def _measure_by_psf(
     )
     fit = fit_at(windows, parameters, model.pixel_noise)
     for bad, reason in (
-        (~inside, 'border'),
-        (saturated_pixels > options.max_saturated_pixels, 'saturated'),
-        ((fit.snr < options.min_snr) | ~np.isfinite(fit.snr), 'faint'),
-        (np.abs(fit.parameters[:, :2]).max(axis=1) > _IN_PLACE_PX, 'not_detected'),
-        (_misshapen(fit, model, options), 'elongated'),
+        (~inside, StarRefusal.BORDER),
+        (saturated_pixels > options.max_saturated_pixels, StarRefusal.SATURATED),
+        ((fit.snr < options.min_snr) | ~np.isfinite(fit.snr), StarRefusal.FAINT),
+        (np.abs(fit.parameters[:, :2]).max(axis=1) > _IN_PLACE_PX, StarRefusal.NOT_DETECTED),
+        (_misshapen(fit, model, options), StarRefusal.ELONGATED),
     ):
-        refusal[bad & (refusal == '')] = reason
+        refusal[bad & (refusal == StarRefusal.NONE)] = reason
     return Centroids(
         xy_px=centre + fit.parameters[:, :2],
         covariance_px2=fit.covariance[:, [0, 0, 1], [0, 1, 1]],
@@ -290,10 +289,10 @@ def _measure_by_moments(
     shape = (pixels.shape[0], pixels.shape[1])
     radius = int(np.ceil(options.mask_radius_px))
     n = len(predicted_px)
-    refusal = np.full(n, '', dtype=_REFUSAL_NAME)
+    refusal = np.full(n, StarRefusal.NONE, np.uint8)
     centre = np.rint(np.nan_to_num(predicted_px, nan=-1e6)).astype(np.int64)
     inside = windows_inside(shape, centre, 2 * radius)
-    refusal[~inside] = 'border'
+    refusal[~inside] = StarRefusal.BORDER
     centre = np.clip(centre, 2 * radius, [shape[1] - 2 * radius - 1, shape[0] - 2 * radius - 1])
     w = 2 * radius + 1
     best = stamps_about(pixels, centre, radius).reshape(n, w * w).argmax(axis=1)
@@ -335,12 +334,12 @@ def _measure_by_moments(
     size = np.maximum(moment_xx + moment_yy, 1e-12)
     ellipticity = np.hypot(moment_xx - moment_yy, 2 * moment_xy) / size
     for bad, reason in (
-        (stamps.max(axis=(1, 2)) >= model.saturation_dn, 'saturated'),
-        (snr < options.min_snr, 'faint'),
-        (count < options.min_pixels, 'too_few_pixels'),
-        (ellipticity > options.max_shape_change, 'elongated'),
+        (stamps.max(axis=(1, 2)) >= model.saturation_dn, StarRefusal.SATURATED),
+        (snr < options.min_snr, StarRefusal.FAINT),
+        (count < options.min_pixels, StarRefusal.TOO_FEW_PIXELS),
+        (ellipticity > options.max_shape_change, StarRefusal.ELONGATED),
     ):
-        refusal[bad & (refusal == '')] = reason
+        refusal[bad & (refusal == StarRefusal.NONE)] = reason
     return Centroids(
         xy_px=centre + np.stack([x, y], axis=-1),
         covariance_px2=covariance,

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.options import option
+from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 
 _SCANNED_PX = 1 << 19  # of one image, in 0.1 ms; larger images are scanned in turns
@@ -152,12 +153,12 @@ def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> NDA
 
 def refuse_on_hot_pixels(
     xy_px: Floats,
-    refusal: NDArray[np.str_],
+    refusal: NDArray[np.uint8],
     hot: Indices,
     width: int,
     window_px: int,
     psf_sigma_px: float,
-) -> NDArray[np.str_]:
+) -> NDArray[np.uint8]:
     """
     Refusals (n,) of stars at (n, 2), with ``hot_pixel`` where one is the cause.
 
@@ -169,11 +170,13 @@ def refuse_on_hot_pixels(
         return refusal
     v, u = np.divmod(hot, width)
     tree = cKDTree(np.stack([u, v], axis=-1))
-    asked = np.flatnonzero(np.isin(refusal, ('', 'elongated', 'ambiguous')))
+    asked = np.flatnonzero(
+        np.isin(refusal, (StarRefusal.NONE, StarRefusal.ELONGATED, StarRefusal.AMBIGUOUS))
+    )
     core, _ = tree.query(xy_px[asked], distance_upper_bound=CORE_PX)
     window, _ = tree.query(xy_px[asked], p=np.inf, distance_upper_bound=window_px + 0.5)
     at_peak = np.isfinite(core) & (psf_sigma_px < _WIDE_PSF_PX)
-    cause = at_peak | (np.isfinite(window) & (refusal[asked] != ''))
+    cause = at_peak | (np.isfinite(window) & (refusal[asked] != StarRefusal.NONE))
     changed = refusal.copy()
-    changed[asked[cause]] = 'hot_pixel'
+    changed[asked[cause]] = StarRefusal.HOT_PIXEL
     return changed

@@ -32,6 +32,7 @@ from starcal_ros.records.observations import (
     STAR_COLUMNS,
     STAR_REFUSALS,
     StarObservations,
+    StarRefusal,
 )
 
 __all__ = [
@@ -54,6 +55,7 @@ __all__ = [
     'ModelChecks',
     'ResidualField',
     'StarObservations',
+    'StarRefusal',
     'TemperatureTerms',
     'TermRemoval',
     'calibration_parameter_names',

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import dataclasses
 from dataclasses import dataclass
+from enum import IntEnum
 import math
 from typing import Annotated
 
@@ -37,16 +38,42 @@ IMAGE_REFUSALS: Mapping[str, str] = {
 }
 """Why an image can be refused: stable name -> meaning."""
 
+
+class StarRefusal(IntEnum):
+    """
+    Why a single predicted star is left out; the codes of ``uint8`` arrays.
+
+    Messages and files hold the `label`, because codes of another version may differ.
+    """
+
+    meaning: str
+
+    def __new__(cls, code: int, meaning: str = '') -> StarRefusal:
+        """Return a member with its meaning."""
+        member = int.__new__(cls, code)
+        member._value_ = code
+        member.meaning = meaning
+        return member
+
+    NONE = 0, 'the star is used'
+    AMBIGUOUS = 1, 'off the place or the brightness that the other stars give it'
+    BLEND = 2, 'another catalog star or source is in the measuring window'
+    BORDER = 3, 'the core of the star, or its window by moments, leaves the image'
+    ELONGATED = 4, 'not the shape of a star: smear, cosmic ray, hot pixel or galaxy'
+    FAINT = 5, 'signal-to-noise below the limit'
+    HOT_PIXEL = 6, 'the light of the star falls on a hot pixel'
+    NOT_DETECTED = 7, 'bright enough to be seen, but no source stands there'
+    SATURATED = 8, 'a pixel of the star is saturated'
+    TOO_FEW_PIXELS = 9, 'too few pixels stand above the noise'
+
+    @property
+    def label(self) -> str:
+        """Name in messages and files."""
+        return self.name.lower()
+
+
 STAR_REFUSALS: Mapping[str, str] = {
-    'not_detected': 'bright enough to be seen, but no source stands there',
-    'border': 'the core of the star, or its window by moments, leaves the image',
-    'blend': 'another catalog star or source is in the measuring window',
-    'saturated': 'a pixel of the star is saturated',
-    'too_few_pixels': 'too few pixels stand above the noise',
-    'elongated': 'not the shape of a star: smear, cosmic ray, hot pixel or galaxy',
-    'hot_pixel': 'the light of the star falls on a hot pixel',
-    'faint': 'signal-to-noise below the limit',
-    'ambiguous': 'off the place or the brightness that the other stars give it',
+    refusal.label: refusal.meaning for refusal in StarRefusal if refusal is not StarRefusal.NONE
 }
 """Why a single predicted star can be left out: stable name -> meaning."""
 

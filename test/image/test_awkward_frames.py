@@ -17,6 +17,7 @@ from starcal_ros.image.detection import (
 )
 from starcal_ros.image.image_model import CentroidOptions, model_image
 from starcal_ros.image.pixel_noise import NoiseSums
+from starcal_ros.records import StarRefusal
 from starcal_ros.simulation.images import expose, star_electrons
 from starcal_ros.simulation.scenario import Detector
 
@@ -87,7 +88,7 @@ def test_undersampled_stars_are_found_and_their_covariance_holds() -> None:
         nearest = np.linalg.norm(xy[:, None] - sources.xy_px[None], axis=2).min(axis=1)
         found_share.append((nearest < 1.0).mean())
         found = measured(pixels, xy)
-        good = found.refusal == ''
+        good = found.refusal == StarRefusal.NONE
         assert good.mean() > 0.95
         error = found.xy_px - xy
         squared.append(error[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
@@ -111,7 +112,7 @@ def test_a_steady_slope_is_subtracted(slope: float) -> None:
         sky = detector.background_electrons + slope * noise_e * np.arange(SHAPE[1])
         pixels = expose(mean + sky, detector, np.random.default_rng([seed, 1]))
         found = measured(pixels, xy)
-        good = found.refusal == ''
+        good = found.refusal == StarRefusal.NONE
         assert good.mean() > 0.8
         error = (found.xy_px - xy)[good] / np.sqrt(found.covariance_px2[good][:, [0, 2]])
         normalised.append(error**2)
