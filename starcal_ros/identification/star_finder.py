@@ -90,6 +90,17 @@ class IdentificationOptions:
 
 
 @dataclass(frozen=True)
+class StarSearch:
+    """Catalog and options with which the stars of an image are found and measured."""
+
+    catalog: StarCatalog
+    centroid: CentroidOptions = dataclasses.field(default_factory=CentroidOptions)
+    identification: IdentificationOptions = dataclasses.field(
+        default_factory=IdentificationOptions
+    )
+
+
+@dataclass(frozen=True)
 class Exposure:
     """
     One image with its attitude, observer velocity, site and hot pixels.
@@ -109,9 +120,7 @@ class Exposure:
 def observe_stars(
     exposure: Exposure,
     geometry: CameraGeometry,
-    catalog: StarCatalog,
-    centroid_options: CentroidOptions,
-    options: IdentificationOptions,
+    search: StarSearch,
 ) -> tuple[StarObservations, Instrument | None]:
     """
     Observations of one image without a track, and the PSF and gain measured from them.
@@ -124,13 +133,13 @@ def observe_stars(
     ImageRefused
         ``no_stars``, ``no_match`` or ``incomplete``.
     """
-    image = exposure.image
+    image, options = exposure.image, search.identification
     background = measure_background(image.pixels)
     prediction = predict(
         geometry,
         exposure.icrf_from_star_tracker_xyzw,
         image.time_ns,
-        catalog,
+        search.catalog,
         options.magnitude_limit,
         math.radians(options.acquisition_radius_deg),
         exposure.velocity_m_s,
@@ -140,16 +149,14 @@ def observe_stars(
         raise ImageRefused(
             'no_match', f'{len(prediction.catalog_index)} catalog stars in the field'
         )
-    predicted_px, sources = _find(
-        image.pixels, background, prediction, geometry, centroid_options, options
-    )
-    model = model_image(image.pixels, background, sources, centroid_options)
+    predicted_px, sources = _find(image.pixels, background, prediction, geometry, search)
+    model = model_image(image.pixels, background, sources, search.centroid)
     if model.psf is None:
         # The brightest stars may all be saturated: fit the PSF to fainter ones.
-        sources = detect(image.pixels, background, centroid_options.detection_sigma)
-        model = model_image(image.pixels, background, sources, centroid_options)
+        sources = detect(image.pixels, background, search.centroid.detection_sigma)
+        model = model_image(image.pixels, background, sources, search.centroid)
     prediction = dataclasses.replace(prediction, xy_px=predicted_px)
-    return measure_predicted(exposure, prediction, model, None, catalog, centroid_options, options)
+    return measure_predicted(exposure, prediction, model, None, search)
 
 
 def measure_predicted(
@@ -157,9 +164,7 @@ def measure_predicted(
     prediction: Prediction,
     model: ImageModel,
     instrument: Instrument | None,
-    catalog: StarCatalog,
-    centroid_options: CentroidOptions,
-    options: IdentificationOptions,
+    search: StarSearch,
 ) -> tuple[StarObservations, Instrument | None]:
     """
     Observations from corrected predictions, and the updated PSF and gain.
@@ -173,10 +178,11 @@ def measure_predicted(
         ``incomplete`` if image lines are lost, ``no_match`` if the brightnesses contradict the
         catalog.
     """
+    catalog, options = search.catalog, search.identification
     height, width = exposure.image.pixels.shape
     shown = within_image(prediction, width, height)
     centroids = measure_stars(
-        exposure.image.pixels, shown.xy_px, model, centroid_options, exposure.hot_pixels
+        exposure.image.pixels, shown.xy_px, model, search.centroid, exposure.hot_pixels
     )
     centroids, alone = separate(shown, catalog, centroids, model, options.max_blend_sigma)
     _refuse_line_loss(shown.xy_px, centroids, (height, width))
@@ -196,7 +202,7 @@ def measure_predicted(
         shown.xy_px,
         centroids,
         model,
-        centroid_options.min_snr,
+        search.centroid.min_snr,
         options.max_brightness_scatter_mag,
         (height, width),
     )
@@ -289,8 +295,7 @@ def _find(
     background: Background,
     prediction: Prediction,
     geometry: CameraGeometry,
-    centroid_options: CentroidOptions,
-    options: IdentificationOptions,
+    search: StarSearch,
 ) -> tuple[Floats, Sources]:
     """
     Predicted pixels (n, 2) corrected to match the sources of the image, and those sources.
@@ -303,21 +308,21 @@ def _find(
     ImageRefused
         ``no_stars`` or ``no_match``.
     """
-    camera = geometry.camera
+    camera, options = geometry.camera, search.identification
     inside = in_image(prediction.xy_px, camera.width, camera.height)
     near = detect_near(
         pixels,
         background,
         prediction.xy_px[inside][:_NEAREST],
         options.search_radius_px,
-        centroid_options.detection_sigma,
+        search.centroid.detection_sigma,
     )
     try:
         reach_px = float(options.search_radius_px)
         return acquire(prediction, near, geometry, reach_px, _NEAREST_ROLL_RAD), near
     except ImageRefused:
         pass
-    sources = detect(pixels, background, centroid_options.detection_sigma)
+    sources = detect(pixels, background, search.centroid.detection_sigma)
     if len(sources.snr) < 4:
         raise ImageRefused('no_stars', f'{len(sources.snr)} star-like sources')
     reach_px = math.radians(options.acquisition_radius_deg) * float(camera.parameters[0])

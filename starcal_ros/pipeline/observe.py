@@ -157,7 +157,7 @@ def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservat
     if track.tracked_camera is not None:
         try:
             observations, tracked_camera = track_stars(
-                exposure, track.tracked_camera, setup.catalog, setup.centroid, setup.identification
+                exposure, track.tracked_camera, setup.star_search
             )
             # Accurate to a few pixels with the camera of the search, whose window is wider.
             geometry = dataclasses.replace(
@@ -170,9 +170,7 @@ def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservat
             return observations, _with_hot_pixels(after, exposure, observations, setup)
         except ImageRefused:
             pass  # the full search finds the reason of refusal
-    observations, instrument = observe_stars(
-        exposure, track.geometry, setup.catalog, setup.centroid, setup.identification
-    )
+    observations, instrument = observe_stars(exposure, track.geometry, setup.star_search)
     if observations.refusal:
         return observations, track
     geometry = realigned(track.geometry, observations)

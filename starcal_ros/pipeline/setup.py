@@ -17,7 +17,7 @@ from starcal_ros.assessment.gate import check_gate_options, GateOptions
 from starcal_ros.camera import convert
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import CalibrationOptions, check_options
-from starcal_ros.identification.star_finder import IdentificationOptions
+from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
 from starcal_ros.image.frame_checks import ScreeningOptions
 from starcal_ros.image.hot_pixels import (
     FixedPatternOptions,
@@ -93,6 +93,11 @@ class Setup:
     dark: Pixels | None
     dark_pedestal_dn: int = 0
     hot: HotPixels = NO_HOT_PIXELS
+
+    @property
+    def star_search(self) -> StarSearch:
+        """Catalog and options with which the stars of an image are found."""
+        return StarSearch(self.catalog, self.centroid, self.identification)
 
     def options(self) -> dict[str, OptionValue]:
         """Every option of every stage, by name."""

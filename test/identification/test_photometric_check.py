@@ -9,10 +9,15 @@ import pytest
 
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.photometric_check import refuse_by_brightness
-from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
+from starcal_ros.identification.star_finder import (
+    Exposure,
+    IdentificationOptions,
+    observe_stars,
+    StarSearch,
+)
 from starcal_ros.image.centroiding import Centroids
 from starcal_ros.image.detection import Background
-from starcal_ros.image.image_model import CentroidOptions, ImageModel
+from starcal_ros.image.image_model import ImageModel
 from starcal_ros.image.pixel_noise import PixelNoise
 from starcal_ros.image.psf_field import uniform_width
 from starcal_ros.records import StarRefusal
@@ -140,11 +145,10 @@ def test_no_star_of_a_field_that_is_there_in_part_is_wrong(attitude_xyzw: list[f
     scenario = dataclasses.replace(base, pointing=field, image_count=12)
     drawn = synthetic.scene(scenario, 11)
     image = simulated_images.render(scenario, drawn, 11)
-    options = IdentificationOptions()
     shot = Exposure(image, np.array(attitude_xyzw), 0.0)
-    catalog = load_catalog(None, options.magnitude_limit)
+    catalog = load_catalog(None, IdentificationOptions().magnitude_limit)
     try:
-        found, _ = observe_stars(shot, scenario.prior, catalog, CentroidOptions(), options)
+        found, _ = observe_stars(shot, scenario.prior, StarSearch(catalog))
     except ImageRefused:
         return
     place = dict(zip(drawn.catalog_id.tolist(), drawn.pixel_px, strict=True))
