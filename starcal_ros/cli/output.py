@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import math
 
 import numpy as np
 
@@ -104,7 +105,7 @@ def _print_images(inspection: Inspection) -> None:
         f'{chosen.image or chosen.observations} can be used'
         + (f', with the attitudes of {chosen.attitude}' if chosen.attitude else '')
     )
-    if inspection.longest_attitude_gap_s >= 0:
+    if math.isfinite(inspection.longest_attitude_gap_s):
         print(f'longest attitude gap around an image: {inspection.longest_attitude_gap_s:.3g} s')
     if inspection.refused:
         print_table(

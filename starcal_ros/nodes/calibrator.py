@@ -165,7 +165,7 @@ class Calibrator(StarcalNode):
                 f'refused_{reason}': count
                 for reason, count in {**_NONE_REFUSED, **ensemble.refused}.items()
             },
-            'in_force': 'none' if active is None else active.number,
+            'active': 'none' if active is None else active.number,
             'calibration_age_s': age_s,
             'last_gate': self._last_gate,
             'last_answer': last.message,

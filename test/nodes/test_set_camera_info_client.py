@@ -71,7 +71,7 @@ def test_driver_is_told_and_its_failures_are_seen(
     )
     diagnostics = client.collect(DiagnosticArray, '/diagnostics')
     nothing = client.call(Trigger, '/calibrator/send_camera_info')
-    assert (nothing.success, nothing.message) == (False, 'no calibration is in force')
+    assert (nothing.success, nothing.message) == (False, 'no calibration is active')
     fill(client, tiny_observations)
     assert client.call(Trigger, '/calibrator/calibrate').success
     client.until(told(diagnostics, 'service not available; will be sent when it is', b'\x01'))

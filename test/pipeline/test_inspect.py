@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 import json
+import math
 from pathlib import Path
 
 import cv2
@@ -98,6 +99,18 @@ def test_verdicts_are_those_of_the_calibration(
     gap = next(r for r in full.refused if r.reason == 'attitude_gap')
     assert gap.first_ns == tiny_images[1].time_ns and 'over 2 s' in gap.detail
     assert full.status is not None and full.status.images == 5
+    assert full.longest_attitude_gap_s == max(o.attitude_gap_s for o in observed if not o.refusal)
+
+
+def test_an_attitude_gap_that_is_not_recorded_is_nan(
+    tmp_path: Path, setup: Setup, tiny_images: list[Image]
+) -> None:
+    """Images without attitudes have no gap; nor have recordings that left it out."""
+    path = tmp_path / 'images.mcap'
+    with BagWriter(path) as writer:
+        writer.write_image(IMAGE, tiny_images[0], 'camera')
+        writer.write_attitude(ATTITUDE, 0, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+    assert math.isnan(inspect.inspect([path], ASKED).longest_attitude_gap_s)
 
 
 def test_the_topics_are_told(tmp_path: Path, tiny_images: list[Image]) -> None:
