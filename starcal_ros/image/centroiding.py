@@ -1,8 +1,8 @@
 """
 Star centroids with covariance, by moments (Eqs. 8, 9) or by PSF fits.
 
-The moment method is the paper's; the fit goes beyond it.  What both need to know of an image, its
-PSF, pixel noise and saturation, is found from its own brighter stars where the options do not say.
+The moment method is that of the paper; the fit goes beyond it.  Both use the PSF, the pixel noise
+and the saturation level of `image_model`.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ from starcal_ros.image.psf_fit import (
 )
 from starcal_ros.records import StarRefusal
 
-_MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours
-SWAMPED_SIGMA = 3.0  # a brighter star nearer than this swamps, though it is measured itself
-_NEIGHBOUR_NOISE = 0.2  # of the noise of a pixel: less light of a neighbour changes nothing
-_IN_PLACE_PX = 1.5  # of a fit from the brightest pixel: beyond, it has gone elsewhere
+_MODELLED_SNR = 4.0  # of stars that are modelled, to subtract their light from their neighbours
+SWAMPED_SIGMA = 3.0  # a star with a brighter one nearer than this cannot be separated from it
+_NEIGHBOUR_NOISE = 0.2  # of the pixel noise; less light of a neighbour is neglected
+_IN_PLACE_PX = 1.5  # from the brightest pixel; a fit that ends farther away is not of the star
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class Centroids:
 
     ``xy_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``flux_dn``, ``snr`` (n,);
     ``refusal`` (n,) uint8 codes of `StarRefusal`, 0 where the star is good.
-    ``fit`` is None for moments; ``psf_sigma_px``, ``noise_dn`` (n,) are what it was made with, and
-    the light of the stars ``modelled`` (n,) was taken from their neighbours.
+    ``fit`` is None for moments; ``psf_sigma_px``, ``noise_dn`` (n,) are PSF width and noise of the
+    fit; ``modelled`` (n,) masks the stars whose light was subtracted from their neighbours.
     """
 
     xy_px: Floats
@@ -80,9 +80,8 @@ def measure_stars(
     """
     Centroids of the stars near predicted pixels (n, 2), by the method of the options.
 
-    The brighter of two neighbours is to come first.  Where the image does not tell its PSF width,
-    the moment method is used.  ``hot_pixels`` (k,), numbers row by row from 0, sorted, take no
-    part in a fit.
+    The brighter of two neighbours must come first.  Without a PSF the moment method is used.
+    ``hot_pixels`` (k,), flat indices row by row from 0, sorted, are left out of a fit.
     """
     if options.centroid == 'psf' and model.psf is not None:
         return _measure_by_psf(pixels, predicted_px, model, model.psf, options, hot_pixels)
@@ -106,12 +105,12 @@ def _measure_by_psf(
     inside = windows_inside(shape, centre, 1)
     innermost = np.array([shape[1] - 2, shape[0] - 2])
     centre = np.minimum(np.maximum(centre, 1), innermost)
-    # The window goes where the star is: the brightest pixel next to the prediction.
+    # The window is centred on the brightest pixel next to the prediction.
     near = windows_about(pixels, centre, 1)
     near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0
     near = near.reshape(n, 9)
     best = near.argmax(axis=1)
-    best[near[:, 4] == near.max(axis=1)] = 4  # of a saturated plateau, the pixel predicted
+    best[near[:, 4] == near.max(axis=1)] = 4  # on a saturated plateau, the predicted pixel
     centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
     centre = np.minimum(np.maximum(centre, 1), innermost)
     stamps, outside = stamps_at_edges(pixels, centre, radius)
@@ -121,13 +120,13 @@ def _measure_by_psf(
     invalid = (stamps == 0.0) & (
         sample_mesh(model.background.level_mesh, shape, at_px) > GAP_SIGMA * noise_dn
     )[:, None, None]
-    # The fit has a level and no slope: a slope would pull faint stars up it.
+    # The fit has a level and no slope: a slope in the data would bias faint stars.
     stamps -= _slopes(model.background, shape, at_px, radius)
     sigma_px = psf.at(at_px)
     hot = hot_in_stamps(hot_pixels, centre, radius, shape[1]) & ~outside
     level_dn = border_level_dn(stamps)
     hot |= _single_pixels(pixels, stamps, centre, level_dn, noise_dn, model.pixel_noise)
-    # The first guess looks at all pixels; to the fit itself these say nothing.
+    # The first guess uses all pixels; the fit leaves these out.
     if hot.any():
         stamps[hot] = level_dn[np.nonzero(hot)[0]]
     out = saturated | hot | outside | invalid
@@ -165,7 +164,7 @@ def _measure_by_psf(
 
 
 def _slopes(background: Background, shape: tuple[int, int], at_px: Floats, radius: int) -> Floats:
-    """The slope of the background in windows about pixels (n, 2), zero in their middles, DN."""
+    """Slope of the background in windows about pixels (n, 2), DN, zero in their middles."""
     reach = np.arange(-radius, radius + 1).astype(np.float64)
     down, across = (
         sample_mesh(slope, shape, at_px)[:, None, None]
@@ -175,7 +174,7 @@ def _slopes(background: Background, shape: tuple[int, int], at_px: Floats, radiu
 
 
 def _misshapen(fit: PsfFit, model: ImageModel, options: CentroidOptions) -> NDArray[np.bool_]:
-    """Which stars (n,) are not of the shape that those of the image share."""
+    """Mask (n,) of the stars whose shape differs from the common one of the image."""
     departure = np.abs(fit.shape_change - model.shape_median)
     limit = np.maximum(options.max_shape_change, 4.0 * model.shape_scatter)
     other = ((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1)
@@ -191,9 +190,9 @@ def _without_neighbours(
     noise: PixelNoise,
 ) -> tuple[Stamps, Floats, NDArray[np.bool_]]:
     """
-    The stamps without the light of those neighbours that are measured themselves.
+    Stamps without the light of the neighbours that can be modelled.
 
-    Also the parameters (n, 4), near those of their fit, and (n,) which stars those are.
+    Also the parameters (n, 4) near the minimum of the fit, and a mask (n,) of the modelled stars.
     """
     flux, sigma_px = parameters[:, 2], stamps.sigma_px
     snr = expected_snr(flux, sigma_px, np.sqrt(stamps.noise2_dn2[:, 0]), noise)
@@ -202,25 +201,25 @@ def _without_neighbours(
     if len(stamps) < 2:
         return stamps, parameters, modelled
     widest_px = float(sigma_px.max())
-    # A star out of the stamp lights it with its wing.
+    # The wing of a star outside the stamp adds light to it.
     reach_px = math.sqrt(2.0) * (stamps.width // 2) + 2.0 * widest_px
     pairs = cKDTree(centre).query_pairs(reach_px, output_type='ndarray')
     apart_px = np.hypot(*(predicted_px[pairs[:, 0]] - predicted_px[pairs[:, 1]]).T)
-    # Both would be fitted to the light of the brighter one, which comes first.
+    # Both fits would follow the light of the brighter one, which comes first.
     modelled[pairs[apart_px < max(3.0, 3.0 * widest_px)].max(axis=1)] = False
-    # Nothing frees the fainter of two that look like one: `blends` refuses it.
+    # The fainter of two unresolved stars cannot be separated: `blending` refuses it.
     pairs = pairs[apart_px >= SWAMPED_SIGMA * float(sigma_px.min())]
     star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
-    told = modelled[other]
-    star, other = star[told], other[told]
+    subtracted = modelled[other]
+    star, other = star[subtracted], other[subtracted]
     if not len(star):
         return stamps, parameters, modelled
     away_px = (centre[other] - centre[star]).astype(np.float64)
-    freed = stamps
+    separated = stamps
     touched = np.zeros(len(stamps), bool)
     little_dn = _NEIGHBOUR_NOISE * np.sqrt(stamps.noise2_dn2[star, 0])
     light: Floats = np.zeros((len(star), stamps.width**2))
-    # Twice: the light of a neighbour is known better once it is freed from that of its own.
+    # Twice: the light of a neighbour is more accurate without that of its own neighbours.
     for _ in range(2):
         before = light
         light = light_in_stamps(
@@ -229,21 +228,21 @@ def _without_neighbours(
         if not (np.abs(light - before).max(axis=1, initial=0.0) > little_dn).any():
             break
         lit = light.max(axis=1, initial=0.0) > little_dn
-        # Also those that light was taken from before and is given back to.
+        # Includes stars to which earlier subtracted light is returned.
         touched[star[lit]] = True
         again = np.flatnonzero(touched)
         neighbours = np.zeros((len(stamps), stamps.width**2))
         np.add.at(neighbours, star[lit], light[lit])
-        # The light is taken off, its photon noise stays.
-        freed = Stamps(
+        # The light is subtracted, its photon noise stays.
+        separated = Stamps(
             stamps.data_dn - neighbours.reshape(stamps.data_dn.shape),
             sigma_px,
             stamps.noise2_dn2 + neighbours / (noise.gain_e_per_dn * noise.background),
             stamps.out,
         )
         parameters = parameters.copy()
-        parameters[again] = approach(freed.select(again), parameters[again], noise)
-    return freed, parameters, modelled
+        parameters[again] = approach(separated.select(again), parameters[again], noise)
+    return separated, parameters, modelled
 
 
 def _single_pixels(
@@ -255,9 +254,9 @@ def _single_pixels(
     noise: PixelNoise,
 ) -> NDArray[np.bool_]:
     """
-    Which pixels (n, w, w) of the stamps are lit alone, away from the core of the star.
+    Mask (n, w, w) of single lit pixels of the stamps away from the core of the star.
 
-    Cosmic rays, and hot pixels not known yet: the light of a star lights those next to it too.
+    They are cosmic rays or new hot pixels: the light of a star extends to adjacent pixels.
     """
     above_dn = stamps - level_dn[:, None, None]
     radius = stamps.shape[1] // 2
@@ -270,7 +269,7 @@ def _single_pixels(
     lit_dn = above_dn[star, row, column]
     inner = (u >= 1) & (u < pixels.shape[1] - 1) & (v >= 1) & (v < pixels.shape[0] - 1)
     inner &= lit_dn**2 > least_dn[star] ** 2 + MISFIT_SIGMA**2 * lit_dn / noise.gain_e_per_dn
-    star, row, column, v, u = (of[inner] for of in (star, row, column, v, u))
+    star, row, column, v, u = (values[inner] for values in (star, row, column, v, u))
     alone = lit_alone(pixels, v, u, level_dn[star])
     single = np.zeros(stamps.shape, bool)
     single[star[alone], row[alone], column[alone]] = True
@@ -283,8 +282,8 @@ def _measure_by_moments(
     """
     Centroids as centres of intensity over a mask (Eqs. 8, 9).
 
-    The brightest pixel of the region of interest is found, the window recentred there, and the
-    mask is every pixel within ``mask_radius_px`` above ``mask_threshold_sigma``.
+    The window is centred on the brightest pixel of the region of interest; the mask holds the
+    pixels within ``mask_radius_px`` that are above ``mask_threshold_sigma``.
     """
     shape = (pixels.shape[0], pixels.shape[1])
     radius = int(np.ceil(options.mask_radius_px))
@@ -325,7 +324,7 @@ def _measure_by_moments(
         )
         / (total**2)[:, None]
     )
-    # A mask of one pixel would claim no error at all: no centroid is known better than its pixel.
+    # A mask of one pixel would give a covariance of zero.
     count = mask.sum(axis=(1, 2))
     snr = flux / np.sqrt(np.maximum(variance.sum(axis=(1, 2)), 1e-12))
     moment_xx = (weight * dx * dx).sum(axis=(1, 2)) / total

@@ -21,14 +21,14 @@ from starcal_ros.image.psf_fit import fit_psf, noise_sums, stamp_radius_px
 from starcal_ros.options import option
 from starcal_ros.robust_statistics import centre_and_scatter, median
 
-_BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitive than another
-_BRIGHTEST = 60  # stars that show the level of saturation
+_BELOW_PLATEAU = 0.98  # pixels of a plateau differ by their sensitivity
+_BRIGHTEST = 60  # stars that may show the level of saturation
 _MAX_PSF_SIGMA_PX = 4.0
 
 
 @dataclass(frozen=True)
 class CentroidOptions:
-    """How stars are measured."""
+    """Options for the detection and measurement of stars."""
 
     centroid: str = option('psf', 'how centroids are measured', choices=('psf', 'moment'))
     detection_sigma: float = option(
@@ -72,11 +72,11 @@ class CentroidOptions:
 @dataclass(frozen=True)
 class ImageModel:
     """
-    What is known of an image before its single stars are measured.
+    Background, PSF, pixel noise and saturation of an image, for the measurement of its stars.
 
-    ``psf`` is None where too few bright stars stand in the image to tell.
-    ``shape_median`` and ``shape_scatter`` (3,) are what `PsfFit.shape_change` is for its stars:
-    a real lens has no circular stars, and what all stars share makes none of them suspect.
+    ``psf`` is None if the image has too few bright stars.  ``shape_median`` and ``shape_scatter``
+    (3,) are median and scatter of `PsfFit.shape_change` of its stars: the stars of a real lens are
+    not circular, and a shape common to all of them is no reason to refuse one.
     """
 
     background: Background
@@ -88,22 +88,22 @@ class ImageModel:
 
     @property
     def psf_sigma_px(self) -> float:
-        """Mean Gaussian width of the stars; 0 where not known."""
+        """Mean Gaussian width of the stars; 0 without a PSF."""
         return self.psf.sigma_px if self.psf else 0.0
 
 
 def saturation_level(pixels: Pixels, options: CentroidOptions) -> float:
     """
-    Pixel value from which a pixel counts as saturated, DN; 0 where the pixels show none.
+    Pixel value from which a pixel counts as saturated, DN; 0 if no pixel is.
 
-    Where the options do not say: the greatest value when it is a plateau or the end of the data
-    type or of a 10, 12 or 14 bit range.
+    Without the option ``saturation_dn`` it is the greatest value, if that is a plateau or the end
+    of the data type or of a 10, 12 or 14 bit range.
     """
     if options.saturation_dn > 0:
         return options.saturation_dn
     peak = int(pixels.max(initial=0))
     ends = (255,) if pixels.dtype == np.uint8 else (1023, 4095, 16383, 65535)
-    # Four pixels at one greatest value: photon noise does not do that far above the background.
+    # Far above the background, photon noise does not give four pixels the same greatest value.
     plateau = peak in ends or np.count_nonzero(pixels == peak) >= 4
     return _BELOW_PLATEAU * peak if plateau else 0.0
 
@@ -168,9 +168,9 @@ def known_model(
     options: CentroidOptions,
 ) -> ImageModel:
     """
-    What the images before have shown, for an image whose stars stand at predicted pixels (n, 2).
+    Model of an image from the images before it; its stars lie at predicted pixels (n, 2).
 
-    The predictions are sorted, brightest first: if anything of the image is saturated, they are.
+    The predictions are sorted, brightest first: the saturated pixels of an image are theirs.
     """
     shape = (pixels.shape[0], pixels.shape[1])
     centre = np.rint(predicted_px).astype(np.int64)
@@ -190,7 +190,7 @@ def known_model(
 
 
 def _isolated(xy_px: Floats, distance_px: float) -> Floats:
-    """Return the points without another one nearer than a distance."""
+    """Return the points that have no other point within a distance."""
     if len(xy_px) < 2:
         return xy_px
     separation = np.linalg.norm(xy_px[:, None] - xy_px[None], axis=-1)

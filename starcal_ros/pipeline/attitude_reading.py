@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-
-Floats = NDArray[np.float64]
 
 _AGREE_RAD = math.radians(0.5)  # alignments of one reading that agree
 CLOCK_SEARCH_S = 61.0

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starcal_ros.camera import CameraModel
 from starcal_ros.lost_in_space.bright_sources import bright_sources, BrightSources, smear
@@ -32,8 +31,6 @@ from starcal_ros.pipeline.attitude_reading import (
 )
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
-
-Floats = NDArray[np.float64]
 
 CAUSES = (
     'none', 'mirrored', 'rotated', 'attitude_direction', 'quaternion_order', 'prior_alignment',
