@@ -104,10 +104,11 @@ def test_workers_listen_on_loopback_only() -> None:
 
     def look() -> None:
         us = psutil.Process()
-        for process in (us, *us.children(recursive=True)):
-            for connection in process.net_connections('inet'):
-                if connection.status == psutil.CONN_LISTEN:
-                    listening.add(connection.laddr.ip)
+        ours = {process.pid for process in (us, *us.children(recursive=True))}
+        # Not those of a Process: their name differs between psutil 5 and 6.
+        for connection in psutil.net_connections('inet'):
+            if connection.pid in ours and connection.status == psutil.CONN_LISTEN:
+                listening.add(connection.laddr.ip)
 
     workers.run_trials(small('coverage'), workers=1, on_trial=look)
     assert listening == {'127.0.0.1'}
