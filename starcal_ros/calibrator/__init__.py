@@ -1,1 +1,1 @@
-"""What a calibrator keeps between requests, without ROS."""
+"""State of a calibrator between requests, without ROS."""

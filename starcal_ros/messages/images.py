@@ -77,9 +77,9 @@ def decode_png(data: Any, time_ns: int) -> Image:
     Raises
     ------
     ImageRefused
-        ``bad_encoding`` for what is no such PNG; ``bad_layout`` for one that cannot be decoded.
+        ``bad_encoding`` for another format; ``bad_layout`` for a PNG that cannot be decoded.
     """
-    # A JPEG would decode too, but what it does to a star of two pixels is no measurement.
+    # A JPEG would decode too, but its compression changes stars of two pixels.
     if bytes(data[: len(_PNG_MAGIC)]) != _PNG_MAGIC:
         raise ImageRefused('bad_encoding', 'the compressed image is not a PNG')
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -122,7 +122,7 @@ def refused_from_message(
     """Return the observations of an image message that cannot be used."""
     return refused_image(
         stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s),
-        int(getattr(message, 'width', 0)),  # a compressed image does not say
+        int(getattr(message, 'width', 0)),  # not in the message of a compressed image
         int(getattr(message, 'height', 0)),
         refused.reason,
         refused.detail,

@@ -68,7 +68,7 @@ def temperature_from_message(message: Message) -> tuple[int, float]:
 def temperature_to_message(
     time_ns: int, temperature_degc: float, frame_id: str, make: Make
 ) -> Message:
-    """Return a sensor_msgs/Temperature; its variance is not known, which ROS writes as 0."""
+    """Return a sensor_msgs/Temperature; its variance is 0, which stands for unknown in ROS."""
     return make(
         TEMPERATURE_TYPE,
         header=make_header(time_ns, frame_id, make),

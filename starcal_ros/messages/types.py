@@ -1,4 +1,4 @@
-"""The types of the messages, and what stands for one that rclpy or rosbags has made."""
+"""Names of the message types, and a type for messages made by rclpy or rosbags."""
 
 from __future__ import annotations
 

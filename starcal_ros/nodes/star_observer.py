@@ -134,7 +134,7 @@ class StarObserver(StarcalNode):
         return CompressedImage, self.resolve_topic_name('image') + '/compressed'
 
     def deactivate(self) -> None:
-        """Stop listening; what still waits in the queue is let go."""
+        """Close the inputs and drop the images in the queue."""
         self.inputs.close()
         if self._queue is not None and self._worker is not None:
             if len(self._queue):

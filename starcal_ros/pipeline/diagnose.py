@@ -1,9 +1,9 @@
 """
-Why the images of a set match no star: the set-up held against what the images show by themselves.
+Reason why images match no stars: set-up and attitudes compared with the images alone.
 
-Some images are identified without attitude or alignment.  Each gives the true rotation of the
-camera; with the attitude on the wire, read in one of the ways it can be meant, it gives the
-alignment.  The right reading is the one whose alignment is the same for all images.
+Some images are identified without attitude or alignment, which gives the rotation of the camera.
+With the recorded attitude it gives the alignment, under each convention that the attitude may
+follow.  The right convention is the one with the same alignment in all images.
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ class Solved:
 @dataclass(frozen=True)
 class Diagnosis:
     """
-    Why images match nothing.
+    Reason why images match no stars, with its evidence and its remedy.
 
-    ``cause`` is one of `CAUSES`; ``found`` the value that was found, None where there is none;
-    ``sentence`` says both in words, ``evidence`` how it is known, ``mend`` are lines of the
-    parameter file.
+    ``cause`` is one of `CAUSES`; ``found`` the value that was found, None if there is none;
+    ``sentence`` states both, ``evidence`` lists the findings behind them, ``mend`` the lines of
+    the parameter file that correct it.
     """
 
     cause: str
@@ -103,7 +103,7 @@ def solve_images(
         sources = bright_sources(image.pixels)
         sky = None
         same_size = (width, height) == (camera.width, camera.height)
-        if same_size and smear(sources) is None:  # what streaks show is no pattern of points
+        if same_size and smear(sources) is None:  # streaks have no centroids for a pattern
             sky = find_sky(sources.xy_px, prior, catalog, try_mirrored=True)
         if isinstance(sky, SkyMatch):
             found.append(sky)
@@ -332,7 +332,7 @@ def _camera_off(
 
 
 def _brightness_slope(image: Solved, catalog: StarCatalog) -> float | None:
-    """Power of the catalog's brightness that unsaturated stars have; None: too few to tell."""
+    """Exponent of measured over catalog brightness of unsaturated stars; None with too few."""
     place = {tuple(xy): k for k, xy in enumerate(image.sources.xy_px.tolist())}
     rows = np.array([place.get(tuple(xy), -1) for xy in image.sky.xy_px.tolist()], np.int64)
     peak = image.sources.peak_dn

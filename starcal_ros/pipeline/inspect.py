@@ -188,6 +188,8 @@ def inspect(
 def content(inspection: Inspection) -> dict[str, object]:
     """JSON object of an inspection; a number that is not finite is null."""
     made = dataclasses.asdict(inspection)
+    if not math.isfinite(inspection.longest_attitude_gap_s):
+        made['longest_attitude_gap_s'] = None
     if inspection.status is not None:
         status = made['status']
         status['coverage'] = inspection.status.coverage.tolist()

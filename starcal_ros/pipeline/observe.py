@@ -38,7 +38,7 @@ class Track:
     """
     State of an image sequence.
 
-    ``geometry`` is what an image is searched with; ``latest_ns`` stamps the last one used.
+    ``geometry`` predicts the stars of a searched image; ``latest_ns`` stamps the last one used.
     ``tracked_camera`` measures the next image without a search; None before the first image.
     ``behind`` images in a row, the last of them at ``behind_ns``, were stamped before the last one
     used.  ``seen`` is the last frame of all, used or not,
@@ -152,7 +152,7 @@ def _after_order(track: Track, time_ns: int) -> Track:
 
 
 def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservations, Track]:
-    """The stars where the images before say, or else where a search of the image finds them."""
+    """Stars of an image by the track of the images before it, or else by a search."""
     time_ns = exposure.image.time_ns
     if track.tracked_camera is not None:
         try:
@@ -186,7 +186,7 @@ def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservat
 def _with_hot_pixels(
     track: Track, exposure: Exposure, observations: StarObservations, setup: Setup
 ) -> Track:
-    """The track with the hot pixels that an image shows, which is aligned as the track says."""
+    """Track with the hot pixels of an image that has the alignment of the track."""
     icrf_from_star_tracker = Rotation.from_quat(exposure.icrf_from_star_tracker_xyzw)
     hot = learn_hot_pixels(
         track.hot or setup.hot,

@@ -24,7 +24,7 @@ class CheckedValues:
         self._content = content
 
     def get(self, dotted_key: str, kind: Callable[[object], T]) -> T:
-        """Value at a key, as `kind` returns it; `kind` raises ValueError('what is expected')."""
+        """Value at a key, converted by `kind`, which raises ValueError with the expected form."""
         value: object = self._content
         for key in dotted_key.split('.'):
             if not isinstance(value, dict) or key not in value:

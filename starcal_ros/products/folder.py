@@ -1,7 +1,7 @@
 """
 The folder of products of a calibration, as the tool and the calibrator write it.
 
-``products/files.py`` and the modules of the single files describe what is in it.
+``products/files.py`` and the modules of the single files describe the content.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ def from_json(record_type: type[T], content: object, key: str = '') -> T:
     Raises
     ------
     ValueError
-        In one line that names the key and what was expected.
+        In one line with the key and the expected form.
     """
     values = fields_from_json(record_type, content, key)
     try:
@@ -57,7 +57,7 @@ def fields_from_json(
     Raises
     ------
     ValueError
-        In one line that names the key and what was expected.
+        In one line with the key and the expected form.
     """
     if not isinstance(content, dict):
         raise _error(key, content, 'an object')

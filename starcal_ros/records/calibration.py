@@ -50,7 +50,7 @@ class TemperatureTerms:
     alignment_rate_rad_per_degc, alignment_rate_rad_per_degc_sigma : tuple of 0 or 3 float
         Passive small rotation in the camera frame per degree, and its 1-sigma.
     note : str
-        Terms that were asked for and left out, with the reason; may be empty.
+        Requested terms that were left out, with the reason; may be empty.
 
     Raises
     ------
@@ -212,10 +212,10 @@ class ResidualField:
 @dataclass(frozen=True)
 class HeldTerm:
     """
-    A camera parameter that is held, or bound by its prior, and what the stars ask for.
+    A camera parameter that is held or bound by its prior, with its estimate from the stars.
 
-    ``assumed`` is the value that it is held at or its prior, ``asked`` the one that the stars give
-    it, ``sigma`` the 1-sigma of their difference where the assumption is true.
+    ``assumed`` is the held or prior value, ``asked`` the estimate from the stars, ``sigma`` the
+    1-sigma of their difference if the assumption is true.
     """
 
     name: str
@@ -248,7 +248,7 @@ class DetectorStep:
 @dataclass(frozen=True)
 class ModelChecks:
     """
-    What the stars show of the model of the world that the calibration assumes.
+    Tests of the model that the calibration assumes.
 
     Attributes
     ----------
@@ -271,7 +271,7 @@ class ModelChecks:
     pointings : int
         Number of different pointings.
     independent_pointings : float
-        Number of images, one that repeats the stars of others counted by what it adds.
+        Number of images; one that repeats the stars of others counts by its new information.
     """
 
     field_p_value: float
@@ -298,7 +298,7 @@ class GateCheck:
     Attributes
     ----------
     name : str
-        What is checked, in words.
+        Description of the check.
     option : str
         The parameter that sets the limit: a lower limit where its name begins with ``min_``, else
         an upper limit.  Empty for a check without a number.
@@ -309,7 +309,7 @@ class GateCheck:
     passed : bool or None
         None where it was not checked.
     note : str
-        Why it was not checked, or what else decided; may be empty.
+        Why it was not checked, or another reason for the result; may be empty.
     """
 
     name: str
@@ -390,7 +390,7 @@ class Calibration:
         Names of the star tracker frame and of the camera frame.
     provenance : mapping of str to str
     temperature : TemperatureTerms or None
-        None where no change with temperature was asked for.
+        None if no change with temperature was requested.
     maps : DetectorMaps or None
     correlation : Correlation or None
         None where not recorded.

@@ -22,7 +22,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'no_attitude': 'no attitude sample on both sides of the image',
     'attitude_gap': 'the attitude samples about the image are too far apart',
     'out_of_order': 'the image is stamped before, or at, one already taken',
-    'duplicate': 'the ensemble holds an image of the same stamp (said by the calibrator)',
+    'duplicate': 'the ensemble holds an image of the same stamp (reported by the calibrator)',
     'overexposed': 'too large a part of the image is saturated',
     'blank': 'every pixel has the same value',
     'frozen': 'the pixels are those of an earlier image with another stamp',
@@ -136,11 +136,11 @@ class StarObservations:
     background_dn, noise_dn : float
         Median background and 1-sigma noise of one pixel.
     psf_sigma_px : float
-        Gaussian width of the stars; 0 where not known.
+        Gaussian width of the stars; 0 if unknown.
     catalog_digest : str
         Which catalog the identifiers refer to.
     temperature_degc : float
-        Of the camera; NaN where not known.
+        Temperature of the camera; NaN if unknown.
     """
 
     time_ns: int
@@ -247,8 +247,8 @@ class Ensemble:
         """
         Return the ensemble with one more image, kept or counted by its reason.
 
-        One with the stamp of an image held is counted as ``duplicate``, and the first stands,
-        whatever the later one holds: a recording played twice does not count twice.
+        An image with the stamp of one in the ensemble is counted as ``duplicate`` and the first
+        one stays, so that a recording played twice does not count twice.
         """
         refusal = observations.refusal
         if not refusal and any(image.time_ns == observations.time_ns for image in self.images):

@@ -49,7 +49,7 @@ def test_calibrate_and_inspect_end_with_it(
     params = ['--params', str(wrong_params)]
     assert main.main(['calibrate', str(TINY), *params, '-o', str(tmp_path / 'out')]) == 2
     error = capsys.readouterr().err
-    assert 'Set attitude_direction: st_to_inertial. (starcal diagnose says more)' in error
+    assert 'Set attitude_direction: st_to_inertial. (details: starcal diagnose)' in error
     assert error.count('\n') == 1
     assert main.main(['inspect', str(TINY), *params, '--json']) == 3
     problems = json.loads(capsys.readouterr().out)['problems']
