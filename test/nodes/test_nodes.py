@@ -530,7 +530,7 @@ class Interrupt:
         if name == 'starcal_ros.pipeline.setup':
             signal.raise_signal(signal.SIGINT)
 sys.meta_path.insert(0, Interrupt())
-from starcal_ros.nodes import entry_points
+from starcal_ros import entry_points
 entry_points.{}()
 """
 
