@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`starcal calibrate` as a process, from bag to products."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Lost in space: how often the stars of a frame are identified without attitude, and how fast.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Draw the centroid error against the pixel phase: ``python -m docs.make_phase [FILE]``.
 

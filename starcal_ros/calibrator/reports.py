@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The reports of a calibrator: folders as of ``starcal calibrate``, in its state folder.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Command-line arguments of the `starcal` tool: commands, their options, and examples of each."""
 
 from __future__ import annotations

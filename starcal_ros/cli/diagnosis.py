@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`starcal diagnose`: the images and attitudes of bags, and why they do not go together."""
 
 from __future__ import annotations

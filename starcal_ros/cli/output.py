@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Tables and lines that the tool prints for a calibration, a bag and a comparison."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Correction of centroids for catalog neighbours, and refusal of blended stars."""
 
 from __future__ import annotations

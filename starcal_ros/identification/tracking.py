@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Stars of an image with a track: measurement in windows without a search of the whole image.
 

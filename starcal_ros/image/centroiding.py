@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Star centroids with covariance, by moments (Eqs. 8, 9) or by PSF fits.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Hot pixels from a dark frame, and from images between which the stars move over the detector.
 

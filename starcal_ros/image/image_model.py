@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """PSF, pixel noise and saturation of an image, from its own stars or from images before it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Noise of a pixel, and its estimate from the residuals of fitted stars.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Width of the PSF over the field, and pixel noise, estimated over a sequence of images.
 

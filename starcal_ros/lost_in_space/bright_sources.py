@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Brightest star-like sources of an image by their total light, saturated ones included."""
 
 from __future__ import annotations

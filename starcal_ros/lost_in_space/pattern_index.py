@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Index of patterns of four catalog stars by their shape, which is free of scale and rotation.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Fit of a camera and its rotation to candidate stars, and the p-value of the match.
 

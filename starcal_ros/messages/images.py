@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Images from messages of any encoding that is taken, and to messages."""
 
 from __future__ import annotations

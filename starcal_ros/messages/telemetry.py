@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Attitudes, velocities and temperatures of the spacecraft, to messages and back."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Calibrator node: subscribes to star observations, publishes calibrations."""
 
 from __future__ import annotations

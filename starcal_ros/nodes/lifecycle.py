@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Lifecycle node base class: starts itself, survives callback errors, publishes diagnostics."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """ROS parameters declared from options dataclasses."""
 
 from __future__ import annotations

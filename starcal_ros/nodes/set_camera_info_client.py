@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Client of the camera driver's set_camera_info service: sends each activated calibration."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Star observer node: subscribes to images and attitudes, publishes star observations."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Reason why images match no stars: set-up and attitudes compared with the images alone.
 

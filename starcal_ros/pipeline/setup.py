@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Setup of a calibration: options of every stage, with the files they name loaded."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The folder of products of a calibration, as the tool and the calibrator write it.
 

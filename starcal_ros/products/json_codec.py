@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Records to JSON and back, from the types of their fields and the marks on them (`arrays`).
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Records of a calibration: camera and alignment, covariance, checks and provenance."""
 
 from __future__ import annotations

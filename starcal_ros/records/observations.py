@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Records of images and of the stars measured in them."""
 
 from __future__ import annotations

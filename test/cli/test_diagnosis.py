@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`starcal diagnose`, and what `calibrate` and `inspect` say where no image matches."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Pull of neighbours on centroids, against fits to mean images."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Frames with lost lines are refused; frames with a wrong prior are not."""
 
 from __future__ import annotations

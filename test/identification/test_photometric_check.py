@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Brightnesses expose false matches and do not affect true ones."""
 
 from __future__ import annotations

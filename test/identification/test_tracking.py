@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Tracking: the same stars as a search, or a lost track."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Frames that are no textbook: cut off at black, masked borders, undersampled stars, slopes."""
 
 from __future__ import annotations

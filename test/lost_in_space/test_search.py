@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Stars identified without attitude: found where they are, refused where they are not."""
 
 from __future__ import annotations

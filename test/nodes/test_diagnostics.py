@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Diagnostics of the running nodes: keys and levels as in docs/icd.md."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """set_camera_info client: each active calibration is sent; failures of a real service."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Codes of star refusals, and their names in messages and files."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`pip install .` without extras, and the packages that the nodes leave out."""
 
 from __future__ import annotations
