@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The pip side of the package; its version has one home, package.xml."""
 
 from pathlib import Path

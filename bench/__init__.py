@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Benches of time, memory, accuracy and identification, some against other packages."""
 
 NAMES = ('solver', 'ensemble', 'measure', 'calibrate', 'observer', 'gate')

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 From pixels to a calibration, against the Cramer-Rao bound: cameras, PSF widths, star trackers.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Acquisition: rates of false matches and of fields found.
 
@@ -27,9 +28,9 @@ from starcal_ros.identification.star_finder import (
     IdentificationOptions,
     observe_stars,
     realigned,
+    StarSearch,
 )
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
-from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.simulation import images as simulated_images
 from starcal_ros.simulation import scenario as synthetic
@@ -131,13 +132,13 @@ def trial(
 ) -> Found:
     """Search or track one image, and compare its stars with the true ones."""
     exposure = Exposure(image, icrf_from_star_tracker_xyzw, 0.0)
-    centroid, options = CentroidOptions(), IdentificationOptions()
+    search = StarSearch(catalog)
     start_s = time.process_time()
     try:
         if isinstance(known, TrackedCamera):
-            stars, _ = track_stars(exposure, known, catalog, centroid, options)
+            stars, _ = track_stars(exposure, known, search)
         else:
-            stars, _ = observe_stars(exposure, known, catalog, centroid, options)
+            stars, _ = observe_stars(exposure, known, search)
     except ImageRefused:
         return Found(accepted=False, wrong=False, seconds=time.process_time() - start_s)
     seconds = time.process_time() - start_s
@@ -155,9 +156,7 @@ def tracked_from(
 ) -> TrackedCamera | CameraGeometry:
     """Track from an image with the right attitude, to measure other images with."""
     exposure = Exposure(image, drawn.icrf_from_star_tracker_xyzw, 0.0)
-    stars, instrument = observe_stars(
-        exposure, prior, catalog, CentroidOptions(), IdentificationOptions()
-    )
+    stars, instrument = observe_stars(exposure, prior, StarSearch(catalog))
     return start_tracking(realigned(prior, stars), stars, instrument) or prior
 
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Attacks on files, state, bags and the tool: how many were tried and survived, what was lost."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Attacks by bags: definitions of messages, channels without one, names that act on a terminal."""
 
 from __future__ import annotations

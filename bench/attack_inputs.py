@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Attacks by untrusted text and messages: fuzzed files, and hostile messages to real nodes."""
 
 from __future__ import annotations

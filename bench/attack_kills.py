@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Kills of each sub-command: inputs unchanged, outputs whole, old or absent.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Attacks on outputs: -o that names inputs, products with odd values, links, closed streams."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A row of the table of ``python -m bench attack``."""
 
 from __future__ import annotations

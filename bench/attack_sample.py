@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The sound files that attacks change: a bag, its calibration and its observations."""
 
 from __future__ import annotations

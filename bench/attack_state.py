@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Attacks on the state folder of a calibrator: other setups, forged files, files that are none."""
 
 from __future__ import annotations

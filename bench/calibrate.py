@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`starcal calibrate` as a process, from bag to products."""
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ TARGET_S = 6.0
 # Cumulative times; indented stages are parts of the one above.
 _STAGES = (
     ('import of Python modules', 'importlib._bootstrap', '_find_and_load'),
-    ('load options, camera, catalog', 'camera_setup', 'load_setup'),
-    ('read images from the bag', 'bag', 'read_images'),
-    ('measure and identify stars', 'sequence', 'observe_next'),
-    ('  background', 'detection', 'measure_background'),
-    ('  prediction', 'prediction', 'predict'),
-    ('  match', 'identification', '_find'),
-    ('  PSF and pixel noise', 'centroiding', 'model_image'),
-    ('  images after the first', 'tracking', 'track_stars'),
-    ('  centroids', 'centroiding', 'measure_stars'),
-    ('estimate', 'calibration', 'estimate_calibration'),
-    ('digest of the bag', 'cli', '_digest'),
+    ('load options, camera, catalog', 'pipeline/setup', 'load_setup'),
+    ('read images from the bag', 'bag/reader', 'read_images'),
+    ('measure and identify stars', 'pipeline/observe', 'observe_next'),
+    ('  background', 'image/detection', 'measure_background'),
+    ('  prediction', 'identification/prediction', 'predict'),
+    ('  match', 'identification/star_finder', '_find'),
+    ('  PSF and pixel noise', 'image/image_model', 'model_image'),
+    ('  images after the first', 'identification/tracking', 'track_stars'),
+    ('  centroids', 'image/centroiding', 'measure_stars'),
+    ('estimate', 'estimation/calibrate', 'estimate_calibration'),
+    ('digest of the observations', 'pipeline/provenance', '_digest'),
 )
 
 
@@ -101,9 +102,20 @@ def _stages(profile: Path) -> Table:
     total_s = stats.total_tt  # type: ignore[attr-defined]
     table = Table('Share of the time by stage, from cProfile', ('stage', 'calls', 's', 'share %'))
     for stage, module, function in _STAGES:
-        for (file, _, name), (_, calls, _, cumulative_s, _) in found.items():
-            stem = file.removeprefix('<frozen ').removesuffix('>').removesuffix('.py')
-            if name == function and (stem == module or stem.endswith(f'starcal_ros/{module}')):
-                table.add(stage, calls, cumulative_s, 100 * cumulative_s / total_s)
+        rows = [
+            (calls, cumulative_s)
+            for (file, _, name), (_, calls, _, cumulative_s, _) in found.items()
+            if name == function and _module(file) == module
+        ]
+        if not rows:
+            raise LookupError(f'{module}.{function} was not called: is the stage still there?')
+        for calls, cumulative_s in rows:
+            table.add(stage, calls, cumulative_s, 100 * cumulative_s / total_s)
     table.add('all', None, total_s, 100.0)
     return table
+
+
+def _module(file: str) -> str:
+    """Path of a profiled file in the package, without its suffix; or name of a frozen module."""
+    stem = file.removeprefix('<frozen ').removesuffix('>').removesuffix('.py')
+    return stem.rpartition('starcal_ros/')[2]

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A small simulated campaign with its observations and calibration, for benches with nodes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 One least-squares problem of stars for several solvers: starcal, Ceres, SciPy, OpenCV.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Faults on real nodes: malformed messages, kills, full disks, duplicate nodes, damaged bags.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Hypothesis on text and messages from outside: ``python -m bench.fuzz_inputs KIND COUNT [SECONDS]``.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A separate ROS graph for a bench: node processes, a client, and their resource usage."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Lost in space: how often the stars of a frame are identified without attitude, and how fast.
 
@@ -28,11 +29,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import beta
 
 from bench.table import Table
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, field_radius_rad, project
-from starcal_ros.identification.lost_in_space import find_sky, SkyMatch
+from starcal_ros.lost_in_space.search import find_sky, SkyMatch
 from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
-
-Floats = NDArray[np.float64]
 
 SEED = 416
 WIDTHS_DEG = (4, 8, 15, 25, 40, 55, 70)

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Stars of one frame: `observe.observe_next` against the detectors of sep and photutils.
 

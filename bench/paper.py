@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 `starcal calibrate` on the campaign of the paper: 359 images of 2592 x 2048, bag to products.
 

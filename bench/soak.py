@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Two hours of flight at speed: 10,000 images through both nodes, on the real graph.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The least-squares search against Ceres, SciPy and OpenCV, with the same stars and start.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Result tables of benches, as aligned text and as plain values."""
 
 from __future__ import annotations

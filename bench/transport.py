@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Fast DDS with and without config/fastdds.xml: latency of a small and a large message.
 

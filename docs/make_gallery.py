@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Draw the pictures of docs/gallery.md: ``python -m docs.make_gallery [DIR]``.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Draw the pictures of the README and the documents: ``python -m docs.make_images [DIR]``.
 

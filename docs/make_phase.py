@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Draw the centroid error against the pixel phase: ``python -m docs.make_phase [FILE]``.
 
@@ -15,8 +16,10 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from starcal_ros.arrays import Floats
-from starcal_ros.image.centroiding import CentroidOptions, measure_stars, model_image
+from starcal_ros.image.centroiding import measure_stars
 from starcal_ros.image.detection import detect, measure_background
+from starcal_ros.image.image_model import CentroidOptions, model_image
+from starcal_ros.records import StarRefusal
 from starcal_ros.simulation.images import expose, star_electrons
 from starcal_ros.simulation.scenario import Detector
 
@@ -47,7 +50,7 @@ def measure(method: str, flux_electrons: float) -> tuple[Floats, Floats, float]:
         sources = detect(pixels, background, options.detection_sigma)
         model = model_image(pixels, background, sources, options)
         found = measure_stars(pixels, xy, model, options)
-        good = found.refusal == ''
+        good = found.refusal == StarRefusal.NONE
         errors.append((found.xy_px - xy)[good].ravel())
         phases.append((xy - np.rint(xy))[good].ravel())
         snr.append(found.snr[good])

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Write the tables of docs/icd.md from the code: ``python -m docs.make_tables [--check]``.
 

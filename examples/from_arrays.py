@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Calibrate a camera from numpy arrays: centroids, star directions and attitudes.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Calibrate a camera from a bag: ``python from_bag.py BAG PARAMS CALIBRATION_JSON``."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Launch the star observer and the calibrator, with one parameter file for both."""
 
 from launch.actions import DeclareLaunchArgument

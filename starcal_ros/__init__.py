@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 In-flight geometric calibration of a spacecraft camera from images of stars.
 

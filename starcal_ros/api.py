@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The public functions of the package, for use without ROS; imported as attributes of `starcal_ros`.
 
@@ -149,9 +150,9 @@ def calibrate(
     Parameters
     ----------
     images : iterable of StarObservations
-        As of `observations_of`.
+        As `observations_of` returns them.
     prior : CameraGeometry
-        Camera and alignment to start from; what is not estimated is held there.
+        Camera and alignment to start from; parameters that are not estimated keep these values.
     **options
         Fields of `CalibrationOptions` and `GateOptions` by name, such as ``method``, ``estimate``
         or ``star_tracker_sigma_arcsec``; parameter files have the same names.
@@ -167,7 +168,7 @@ def calibrate(
     OptionError
         For an unknown option or a bad value.
     TooFewObservations
-        When the images do not determine what is to be estimated.
+        When the images do not determine the parameters to be estimated.
     """
     known = names_of(CalibrationOptions, GateOptions)
     for name in options:
@@ -250,7 +251,7 @@ def lines_of_sight(
     frame: Literal['camera', 'star_tracker'] = 'camera',
 ) -> Floats:
     """
-    Unit vectors (..., 3) towards what pixels (..., 2) see; the inverse of `project`.
+    Unit vectors (..., 3) of the lines of sight of pixels (..., 2); the inverse of `project`.
 
     Parameters
     ----------

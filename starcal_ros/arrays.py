@@ -1,5 +1,6 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Array types, and the marks that state what a field of a record may hold.
+Array types, and marks for shape and range of the fields of records.
 
 A mark stands in the type of the field, ``Annotated[Floats, Shape(('k', 'k'))]``.  The codecs of
 files and messages read the fields of a record with their marks (`fields_of`), so a field is
@@ -46,7 +47,7 @@ class AtLeast:
 
 @dataclass(frozen=True)
 class Finite:
-    """Numbers that must be finite; without this mark, NaN stands for a number not known."""
+    """Numbers that must be finite; without this mark, NaN stands for an unknown number."""
 
 
 Count = Annotated[int, AtLeast(0)]

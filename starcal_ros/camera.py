@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The camera: an ideal image plane, a lens model, skew; its inverse and derivatives.
 

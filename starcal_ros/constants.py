@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Physical and angular constants, each with its authority; the text form of a stamp."""
 
 from __future__ import annotations

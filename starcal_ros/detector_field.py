@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Smooth vector fields over a detector: displacements that no lens model describes.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Exceptions that a caller may catch; each text is one line that names cause and remedy."""
 
 from __future__ import annotations

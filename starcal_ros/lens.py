@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Lens models: from the ideal image plane to the distorted one, and the derivatives.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Options: dataclass fields with a description, a unit and a range; reading of parameter files.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The door for text from outside: bounded regular files, strict YAML and JSON, plain values only.
 

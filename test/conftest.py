@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Fixtures for tests with nodes: a separate ROS domain, node processes, a client."""
 
 from __future__ import annotations

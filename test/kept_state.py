@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Writer of a state folder, for tests that kill its process."""
 
 from __future__ import annotations

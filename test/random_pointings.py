@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Campaigns of random pointings with a fault of the lens, and whether their sigma is true."""
 
 from __future__ import annotations

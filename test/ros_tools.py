@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The real ROS 2 tools, where they are: the `ros2` command, launch, rosbag2, sros2, Cyclone DDS.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Random star catalogs, planets in a field, and a detector without defects."""
 
 from __future__ import annotations

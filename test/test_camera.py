@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Every camera model: derivatives, inverse, the fold of the distortion, fits."""
 
 from __future__ import annotations

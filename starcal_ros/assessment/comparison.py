@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Two calibrations beside each other: parameters, alignment, and the lines of sight."""
 
 from __future__ import annotations

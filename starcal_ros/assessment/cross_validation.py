@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Residuals of each image, predicted from the other images, by radius, magnitude and time.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Lines of sight of pixels with their sigmas: the whole camera as a table."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Observability of an ensemble: information, predicted sigmas, coverage, line-of-sight maps."""
 
 from __future__ import annotations

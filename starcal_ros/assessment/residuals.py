@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Residuals of a calibration, per star and per image."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Significance of each term of the camera: calibrations with fewer and fewer terms (paper, Fig. 8).
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Message types for bags: those of ROS 2 Jazzy and of starcal, as rosbags types."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Records to MCAP bags, without ROS; equal records give equal bytes."""
 
 from __future__ import annotations

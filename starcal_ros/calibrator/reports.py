@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The reports of a calibrator: folders as of ``starcal calibrate``, in its state folder.
 
@@ -52,7 +53,7 @@ class CalibratorReports:
 
     Parameters
     ----------
-    tell : callable
+    on_page : callable
         Called from a separate thread with the path of a page and the reason why it is missing, in
         one line; empty where it is there.
 
@@ -62,9 +63,9 @@ class CalibratorReports:
         Why the last page is missing; empty where it is there.
     """
 
-    def __init__(self, tell: Callable[[Path, str], None]) -> None:
+    def __init__(self, on_page: Callable[[Path, str], None]) -> None:
         self.trouble = ''
-        self._tell = tell
+        self._on_page = on_page
         # For all below; never held while waiting for a disk or a process.
         self._lock = threading.Lock()
         self._state_dir: Path | None = None
@@ -132,7 +133,7 @@ class CalibratorReports:
                 if is_wanted:
                     self.trouble = trouble
             if is_wanted:
-                self._tell(folder / REPORT_FILE, trouble)
+                self._on_page(folder / REPORT_FILE, trouble)
 
     def _make_page(self, folder: Path) -> str:
         """Render the page; returns why it is missing, or an empty text."""

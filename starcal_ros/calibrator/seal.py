@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Seals of state files: a checksum against damage and, with a key, an HMAC against forgery.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The ensemble and the active calibration of a calibrator, in memory and on disk."""
 
 from __future__ import annotations

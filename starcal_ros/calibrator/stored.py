@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Judgement of a stored calibration before it is active: its numbers and the gate of today."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Command-line arguments of the `starcal` tool: commands, their options, and examples of each."""
 
 from __future__ import annotations
@@ -52,9 +53,9 @@ exit status: 0 the bag can be calibrated; 3 it cannot, and the reasons are liste
     'diagnose': (
         'find out why the images of a bag match no star',
         (
-            'Identifies some of the first images without attitude or alignment, holds attitudes, '
-            'alignment and camera against them, and prints what is wrong, how that is known, and '
-            'the lines of the parameter file that mend it.'
+            'Identifies some of the first images without attitude or alignment, compares the '
+            'attitudes, alignment and camera with them, and prints the error, the evidence for it '
+            'and the lines of the parameter file that correct it.'
         ),
         """\
   # no image matches: why?

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Demonstration: calibrates a small bag with the real nodes and compares with the truth."""
 
 from __future__ import annotations

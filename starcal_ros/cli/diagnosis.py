@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`starcal diagnose`: the images and attitudes of bags, and why they do not go together."""
 
 from __future__ import annotations
@@ -50,15 +51,15 @@ def content(found: Diagnosis) -> dict[str, object]:
 
 
 def text(found: Diagnosis) -> str:
-    """A diagnosis in words."""
-    lines = [found.sentence, '', 'how it is known:', *(f'  {line}' for line in found.evidence)]
+    """Diagnosis as text for a terminal."""
+    lines = [found.sentence, '', 'evidence:', *(f'  {line}' for line in found.evidence)]
     if found.mend:
         lines += ['', 'in the parameter file:', *(f'  {line}' for line in found.mend)]
     return '\n'.join(lines)
 
 
 def in_a_sentence(paths: Sequence[Path], asked: Topics, setup: Setup) -> str:
-    """The diagnosis of bags as the end of a complaint; empty where it finds nothing wrong."""
+    """Diagnosis of bags in one sentence; empty without a finding."""
     try:
         found = of_bags(paths, asked, setup)
     except BagError:
@@ -66,7 +67,7 @@ def in_a_sentence(paths: Sequence[Path], asked: Topics, setup: Setup) -> str:
     if found.cause == 'none':
         return ''
     lines = '; '.join(line for line in found.mend if not line.startswith('#'))
-    return f'{found.sentence}{f" Set {lines}." if lines else ""} (starcal diagnose says more)'
+    return f'{found.sentence}{f" Set {lines}." if lines else ""} (details: starcal diagnose)'
 
 
 def _images(paths: Sequence[Path], topic: str, setup: Setup) -> Iterator[Image]:

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Entry point of the console script, which answers Ctrl-C at any instant without a traceback.
 

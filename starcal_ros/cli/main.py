@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The `starcal` tool.
 
@@ -179,7 +180,7 @@ def _write_report(folder: Path) -> str:
 
 
 def _missing_extra(error: ModuleNotFoundError, extra: str) -> str:
-    """One line that names the extra to install; raises what is missing for another reason."""
+    """One line that names the extra to install; raises errors of other modules again."""
     if error.name not in _MODULES_OF_EXTRAS:
         raise error
     return f"{error.name} is not installed: pip install 'starcal_ros[{extra}]'"
@@ -216,7 +217,7 @@ def _inspect(args: argparse.Namespace) -> int:
 
 
 def _diagnose(args: argparse.Namespace) -> int:
-    """Say why the images of a bag match nothing."""
+    """Print the reason why the images of a bag match no stars."""
     from starcal_ros.cli import diagnosis
     from starcal_ros.pipeline.setup import read_setup
 

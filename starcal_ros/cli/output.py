@@ -1,8 +1,10 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Tables and lines that the tool prints for a calibration, a bag and a comparison."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import math
 
 import numpy as np
 
@@ -106,7 +108,7 @@ def _print_images(inspection: Inspection) -> None:
         f'{chosen.image or chosen.observations} can be used'
         + (f', with the attitudes of {chosen.attitude}' if chosen.attitude else '')
     )
-    if inspection.longest_attitude_gap_s >= 0:
+    if math.isfinite(inspection.longest_attitude_gap_s):
         print_text(
             f'longest attitude gap around an image: {inspection.longest_attitude_gap_s:.3g} s'
         )

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Places of outputs: no command replaces an input, or a file of another origin."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """From an ensemble of observed images to camera, alignment and covariance."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The smallest lens model that describes the stars of an ensemble."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Options of a calibration, and whether an ensemble is enough for them."""
 
 from __future__ import annotations

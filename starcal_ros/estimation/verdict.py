@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Variances and misfits: the conclusions from the residuals of a search."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The gate: the limits that a calibration must meet to become active, and the checks."""
 
 from __future__ import annotations

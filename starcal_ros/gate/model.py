@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Gate checks of the model that a calibration assumes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Correction of centroids for catalog neighbours, and refusal of blended stars."""
 
 from __future__ import annotations
@@ -11,8 +12,10 @@ from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.identification.prediction import Prediction
-from starcal_ros.image.centroiding import Centroids, ImageModel, SWAMPED_SIGMA
+from starcal_ros.image.centroiding import Centroids, SWAMPED_SIGMA
+from starcal_ros.image.image_model import ImageModel
 from starcal_ros.image.psf_fit import neighbour_pull_px, stamp_radius_px
+from starcal_ros.records import StarRefusal
 from starcal_ros.sky.catalog import CLOSE_PAIR_RAD, StarCatalog
 
 _PULL_UNCERTAINTY = 0.25  # relative, of a neighbour's flux from its V magnitude: colours differ
@@ -133,9 +136,9 @@ def separate(
     size_px = np.sqrt((pulls.uncertain_px**2).sum(axis=1) + 2.0 * unlisted_px**2)
     beyond = size_px > max_blend_sigma * sigma_px
     refusal = centroids.refusal.copy()
-    refusal[(pulls.swamped | beyond) & (refusal == '')] = 'blend'
+    refusal[(pulls.swamped | beyond) & (refusal == StarRefusal.NONE)] = StarRefusal.BLEND
     # Its light was attributed to the brighter star.
-    refusal[pulls.outshone & (refusal == 'faint')] = 'blend'
+    refusal[pulls.outshone & (refusal == StarRefusal.FAINT)] = StarRefusal.BLEND
     u, v = pulls.uncertain_px.T
     separated = dataclasses.replace(
         centroids,

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Detection of lost image lines from the measured stars.
 
@@ -44,7 +45,7 @@ def find_line_loss(
 
     ``predicted_px``, ``measured_px`` (n, 2) of the good stars, ``sigma_px`` (n,) noise per axis.
     For each tested row, a robust fit of the residuals with a polynomial in u and v and a step.  A
-    smooth error of the prior is no jump, whatever its size.
+    smooth error of the prior, even a large one, is not a jump.
     """
     # The smooth part can take up half of a jump.
     away_px = np.hypot(*(measured_px - predicted_px).T) - 2.0 * sigma_px

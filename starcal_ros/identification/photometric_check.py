@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Comparison of measured brightnesses with catalog magnitudes.
 
@@ -13,8 +14,10 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import best_share, missed_parts, part_of, PARTS
-from starcal_ros.image.centroiding import Centroids, ImageModel
-from starcal_ros.image.psf_fit import expected_snr
+from starcal_ros.image.centroiding import Centroids
+from starcal_ros.image.image_model import ImageModel
+from starcal_ros.image.pixel_noise import expected_snr
+from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 
 _FEWEST = 4  # stars whose scatter, or the share of which, means anything
@@ -33,7 +36,7 @@ def refuse_by_brightness(
     min_snr: float,
     max_scatter_mag: float,
     shape: tuple[int, int],
-) -> NDArray[np.str_]:
+) -> NDArray[np.uint8]:
     """
     Refusal reasons (n,) after a comparison of measured brightness with catalog magnitude.
 
@@ -58,7 +61,7 @@ def refuse_by_brightness(
         ``no_match`` if the brightnesses of most stars contradict the match.
     """
     refusal = centroids.refusal.copy()
-    good = np.flatnonzero(refusal == '')
+    good = np.flatnonzero(refusal == StarRefusal.NONE)
     if len(good) < _FEWEST:
         return refusal
     psf_sigma_px, noise_dn = model.psf_sigma_px or 1.0, model.background.noise_dn
@@ -69,7 +72,7 @@ def refuse_by_brightness(
     highest = median(zero_point[brightest]) + _FAR_MAG
     most_dn = 10.0 ** (0.4 * (highest - magnitude[good].astype(np.float64)))
     unseen = expected_snr(most_dn, psf_sigma_px, noise_dn, model.pixel_noise) < min_snr
-    refusal[good[unseen]] = 'faint'
+    refusal[good[unseen]] = StarRefusal.FAINT
     good, zero_point = good[~unseen], zero_point[~unseen]
     if len(good) < _FEWEST:
         return refusal
@@ -82,14 +85,14 @@ def refuse_by_brightness(
             f' but their brightnesses scatter by {scatter_mag:.1f} mag',
         )
     most_mag = max(_MOST_OFF * max_scatter_mag, 5.0 * scatter_mag)
-    refusal[good[off_mag > most_mag]] = 'ambiguous'
+    refusal[good[off_mag > most_mag]] = StarRefusal.AMBIGUOUS
     # Stars bright enough to be detected even if they are fainter by the largest deviation.
     faintest = median(zero_point) - most_mag
     least_dn = 10.0 ** (0.4 * (faintest - magnitude.astype(np.float64)))
     seen = expected_snr(least_dn, psf_sigma_px, noise_dn, model.pixel_noise) > min_snr
-    refusal[seen & (refusal == 'faint')] = 'not_detected'
-    kept = refusal == ''
-    gone = seen & ((refusal == 'not_detected') | (refusal == 'ambiguous'))
+    refusal[seen & (refusal == StarRefusal.FAINT)] = StarRefusal.NOT_DETECTED
+    kept = refusal == StarRefusal.NONE
+    gone = seen & ((refusal == StarRefusal.NOT_DETECTED) | (refusal == StarRefusal.AMBIGUOUS))
     if np.count_nonzero(gone) < _FEWEST - 1:
         return refusal
     height, width = shape
@@ -99,5 +102,5 @@ def refuse_by_brightness(
     if missed_parts(shown, found).any():
         # Accept only parts with at least half the share of the best one.
         accepted = (shown > 0) & (found >= 0.5 * best_share(shown, found) * shown)
-        refusal[kept & ~accepted[part]] = 'ambiguous'
+        refusal[kept & ~accepted[part]] = StarRefusal.AMBIGUOUS
     return refusal

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Predicted pixels of catalog stars from attitude, alignment and camera model."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Stars of one image without a track: prediction, acquisition and measurement.
 
@@ -31,13 +32,7 @@ from starcal_ros.identification.prediction import (
     SPACE,
     within_image,
 )
-from starcal_ros.image.centroiding import (
-    CentroidOptions,
-    Centroids,
-    ImageModel,
-    measure_stars,
-    model_image,
-)
+from starcal_ros.image.centroiding import Centroids, measure_stars
 from starcal_ros.image.detection import (
     Background,
     detect,
@@ -46,10 +41,11 @@ from starcal_ros.image.detection import (
     Sources,
 )
 from starcal_ros.image.hot_pixels import NO_HOT_PIXELS, refuse_on_hot_pixels
+from starcal_ros.image.image_model import CentroidOptions, ImageModel, model_image
 from starcal_ros.image.psf_field import Instrument, learn, MeasuredStars
 from starcal_ros.image.psf_fit import stamp_radius_px
 from starcal_ros.options import option
-from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import StarCatalog
 
@@ -95,6 +91,17 @@ class IdentificationOptions:
 
 
 @dataclass(frozen=True)
+class StarSearch:
+    """Catalog and options with which the stars of an image are found and measured."""
+
+    catalog: StarCatalog
+    centroid: CentroidOptions = dataclasses.field(default_factory=CentroidOptions)
+    identification: IdentificationOptions = dataclasses.field(
+        default_factory=IdentificationOptions
+    )
+
+
+@dataclass(frozen=True)
 class Exposure:
     """
     One image with its attitude, observer velocity, site and hot pixels.
@@ -114,9 +121,7 @@ class Exposure:
 def observe_stars(
     exposure: Exposure,
     geometry: CameraGeometry,
-    catalog: StarCatalog,
-    centroid_options: CentroidOptions,
-    options: IdentificationOptions,
+    search: StarSearch,
 ) -> tuple[StarObservations, Instrument | None]:
     """
     Observations of one image without a track, and the PSF and gain measured from them.
@@ -129,13 +134,13 @@ def observe_stars(
     ImageRefused
         ``no_stars``, ``no_match`` or ``incomplete``.
     """
-    image = exposure.image
+    image, options = exposure.image, search.identification
     background = measure_background(image.pixels)
     prediction = predict(
         geometry,
         exposure.icrf_from_star_tracker_xyzw,
         image.time_ns,
-        catalog,
+        search.catalog,
         options.magnitude_limit,
         math.radians(options.acquisition_radius_deg),
         exposure.velocity_m_s,
@@ -145,16 +150,14 @@ def observe_stars(
         raise ImageRefused(
             'no_match', f'{len(prediction.catalog_index)} catalog stars in the field'
         )
-    predicted_px, sources = _find(
-        image.pixels, background, prediction, geometry, centroid_options, options
-    )
-    model = model_image(image.pixels, background, sources, centroid_options)
+    predicted_px, sources = _find(image.pixels, background, prediction, geometry, search)
+    model = model_image(image.pixels, background, sources, search.centroid)
     if model.psf is None:
         # The brightest stars may all be saturated: fit the PSF to fainter ones.
-        sources = detect(image.pixels, background, centroid_options.detection_sigma)
-        model = model_image(image.pixels, background, sources, centroid_options)
+        sources = detect(image.pixels, background, search.centroid.detection_sigma)
+        model = model_image(image.pixels, background, sources, search.centroid)
     prediction = dataclasses.replace(prediction, xy_px=predicted_px)
-    return measure_predicted(exposure, prediction, model, None, catalog, centroid_options, options)
+    return measure_predicted(exposure, prediction, model, None, search)
 
 
 def measure_predicted(
@@ -162,9 +165,7 @@ def measure_predicted(
     prediction: Prediction,
     model: ImageModel,
     instrument: Instrument | None,
-    catalog: StarCatalog,
-    centroid_options: CentroidOptions,
-    options: IdentificationOptions,
+    search: StarSearch,
 ) -> tuple[StarObservations, Instrument | None]:
     """
     Observations from corrected predictions, and the updated PSF and gain.
@@ -178,10 +179,11 @@ def measure_predicted(
         ``incomplete`` if image lines are lost, ``no_match`` if the brightnesses contradict the
         catalog.
     """
+    catalog, options = search.catalog, search.identification
     height, width = exposure.image.pixels.shape
     shown = within_image(prediction, width, height)
     centroids = measure_stars(
-        exposure.image.pixels, shown.xy_px, model, centroid_options, exposure.hot_pixels
+        exposure.image.pixels, shown.xy_px, model, search.centroid, exposure.hot_pixels
     )
     centroids, alone = separate(shown, catalog, centroids, model, options.max_blend_sigma)
     _refuse_line_loss(shown.xy_px, centroids, (height, width))
@@ -201,7 +203,7 @@ def measure_predicted(
         shown.xy_px,
         centroids,
         model,
-        centroid_options.min_snr,
+        search.centroid.min_snr,
         options.max_brightness_scatter_mag,
         (height, width),
     )
@@ -216,7 +218,7 @@ def measure_predicted(
         centroids.fit,
         centroids.psf_sigma_px,
         centroids.noise_dn,
-        (refusal == '') & alone,
+        (refusal == StarRefusal.NONE) & alone,
     )
     shown_dn = model.saturation_dn if np.isfinite(model.saturation_dn) else 0.0
     return observations, learn(instrument, stars, model.pixel_noise, shown_dn, (width, height))
@@ -233,11 +235,12 @@ def _observations(
     """Observations with used and refused stars; refused as a whole with too few stars."""
     height, width = exposure.image.pixels.shape
     index = prediction.catalog_index
-    good = centroids.refusal == ''
+    good = centroids.refusal == StarRefusal.NONE
     left_out = ~good
-    names, code, counts = np.unique(
+    refusals, reason, counts = np.unique(
         centroids.refusal[left_out], return_inverse=True, return_counts=True
     )
+    names = [StarRefusal(code).label for code in refusals]
     measured = np.count_nonzero(good)
     few = measured < fewest
     if few:
@@ -257,10 +260,10 @@ def _observations(
         covariance_px2=centroids.covariance_px2[good],
         flux_dn=centroids.flux_dn[good].astype(np.float32),
         snr=centroids.snr[good].astype(np.float32),
-        refused_stars=dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        refused_stars=dict(zip(names, counts.tolist(), strict=True)),
         refused_catalog_id=catalog.id[index][left_out],
         refused_px=prediction.xy_px[left_out].astype(np.float32),
-        refused_reason=code.astype(np.uint8),
+        refused_reason=reason.astype(np.uint8),
         background_dn=model.background.level_dn,
         noise_dn=model.background.noise_dn,
         psf_sigma_px=model.psf_sigma_px,
@@ -293,8 +296,7 @@ def _find(
     background: Background,
     prediction: Prediction,
     geometry: CameraGeometry,
-    centroid_options: CentroidOptions,
-    options: IdentificationOptions,
+    search: StarSearch,
 ) -> tuple[Floats, Sources]:
     """
     Predicted pixels (n, 2) corrected to match the sources of the image, and those sources.
@@ -307,21 +309,21 @@ def _find(
     ImageRefused
         ``no_stars`` or ``no_match``.
     """
-    camera = geometry.camera
+    camera, options = geometry.camera, search.identification
     inside = in_image(prediction.xy_px, camera.width, camera.height)
     near = detect_near(
         pixels,
         background,
         prediction.xy_px[inside][:_NEAREST],
         options.search_radius_px,
-        centroid_options.detection_sigma,
+        search.centroid.detection_sigma,
     )
     try:
         reach_px = float(options.search_radius_px)
         return acquire(prediction, near, geometry, reach_px, _NEAREST_ROLL_RAD), near
     except ImageRefused:
         pass
-    sources = detect(pixels, background, centroid_options.detection_sigma)
+    sources = detect(pixels, background, search.centroid.detection_sigma)
     if len(sources.snr) < 4:
         raise ImageRefused('no_stars', f'{len(sources.snr)} star-like sources')
     reach_px = math.radians(options.acquisition_radius_deg) * float(camera.parameters[0])
@@ -329,7 +331,7 @@ def _find(
     return acquire(prediction, sources, geometry, reach_px, roll_rad), sources
 
 
-def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.str_]:
+def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.uint8]:
     """
     Refusal reasons (n,) of the centroids, with displaced stars as ``ambiguous``.
 
@@ -337,7 +339,7 @@ def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) ->
     """
     refusal = centroids.refusal.copy()
     sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
-    good = np.nonzero(refusal == '')[0]
+    good = np.nonzero(refusal == StarRefusal.NONE)[0]
     if len(good) < 4:
         return refusal
     expected_px, measured_px = predicted_px[good], centroids.xy_px[good]
@@ -346,7 +348,7 @@ def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) ->
     )
     off_px = np.hypot(*(measured_px - expected_px - correction).T)
     limit_px = np.maximum(5.0 * np.hypot(sigma_px[good], 0.75 * scatter_px), 0.3)
-    refusal[good[off_px > np.minimum(limit_px, 2.0)]] = 'ambiguous'
+    refusal[good[off_px > np.minimum(limit_px, 2.0)]] = StarRefusal.AMBIGUOUS
     return refusal
 
 
@@ -359,7 +361,7 @@ def _refuse_line_loss(predicted_px: Floats, centroids: Centroids, shape: tuple[i
     ImageRefused
         ``incomplete``.
     """
-    good = np.isin(centroids.refusal, ('', 'not_detected'))
+    good = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
     variance_px2 = 0.5 * (centroids.covariance_px2[good, 0] + centroids.covariance_px2[good, 2])
     loss = find_line_loss(predicted_px[good], centroids.xy_px[good], np.sqrt(variance_px2), shape)
     if loss is not None:

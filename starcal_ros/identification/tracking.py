@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Stars of an image with a track: measurement in windows without a search of the whole image.
 
@@ -29,29 +30,29 @@ from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.prediction import Prediction, visible
 from starcal_ros.identification.star_finder import (
     Exposure,
-    IdentificationOptions,
     measure_predicted,
+    StarSearch,
 )
-from starcal_ros.image.centroiding import CentroidOptions, known_model
 from starcal_ros.image.detection import (
     Background,
     brightest_near,
     measure_background,
     sample_background,
 )
+from starcal_ros.image.image_model import known_model
 from starcal_ros.image.psf_field import Instrument
 from starcal_ros.records import CameraGeometry, StarObservations
 from starcal_ros.robust_statistics import median
-from starcal_ros.sky.catalog import cone, StarCatalog
+from starcal_ros.sky.catalog import cone
 
 _GUIDES = 24  # brightest predictions, searched in windows
 _NEIGHBOUR_PX = 3.0  # offsets of all guides agree to this under a roll of 0.1 degrees
 _MAX_P_VALUE = 1e-9  # of the matches in the windows, if the prediction is wrong
 _GOOD_SNR = 10.0  # of stars that correct the prediction
-_STEADY_PX = 1.0  # turn that the next image finds anew as well, from wherever it starts
+_STEADY_PX = 1.0  # smaller rotations are left to the search in the next image
 _SYSTEMATIC_PX = 0.15  # rms from which the camera of the prediction is corrected
-# How far the camera that predicts may be from the one before, 1-sigma: a part of the focal length
-# for the intrinsics, and the distortion of a lens that is not quite known.
+# 1-sigma of the predicting camera about the one before: intrinsics as parts of the focal length,
+# and distortion for a lens with an inaccurate prior.
 _INTRINSIC_SIGMA = np.array([0.01, 1e-3, 0.01, 0.01, 0.01])
 _COEFFICIENT_SIGMA = {'k1': 0.05, 'k2': 0.1, 'k3': 0.1, 'k4': 0.05, 'k5': 0.1, 'k6': 0.1}
 _SMALL_SIGMA = 1e-3  # of the other coefficients: decentring, thin prism, tilt
@@ -88,9 +89,7 @@ def start_tracking(
 def track_stars(
     exposure: Exposure,
     before: TrackedCamera,
-    catalog: StarCatalog,
-    centroid_options: CentroidOptions,
-    options: IdentificationOptions,
+    search: StarSearch,
 ) -> tuple[StarObservations, TrackedCamera]:
     """
     Observations of the next image, and the updated track.
@@ -101,13 +100,11 @@ def track_stars(
         ``no_match`` if the track is lost, ``too_few_stars`` or ``incomplete``.
     """
     pixels = exposure.image.pixels
-    prediction = _predict(exposure, before, catalog, options)
+    prediction = _predict(exposure, before, search)
     # Moments depend on the local background; a PSF fit estimates its own.
-    fitted = centroid_options.centroid == 'psf'
+    fitted = search.centroid.centroid == 'psf'
     background = sample_background(pixels) if fitted else measure_background(pixels)
-    rotation_rad = _find_rotation(
-        pixels, background, prediction, before.geometry.camera, centroid_options, options
-    )
+    rotation_rad = _find_rotation(pixels, background, prediction, before.geometry.camera, search)
     rotation = Rotation.from_rotvec(-rotation_rad)
     direction_camera = rotation.apply(prediction.direction_camera)
     prediction = dataclasses.replace(
@@ -115,9 +112,9 @@ def track_stars(
         direction_camera=direction_camera,
         xy_px=project(before.geometry.camera, direction_camera),
     )
-    model = known_model(pixels, background, before.instrument, prediction.xy_px, centroid_options)
+    model = known_model(pixels, background, before.instrument, prediction.xy_px, search.centroid)
     observations, instrument = measure_predicted(
-        exposure, prediction, model, before.instrument, catalog, centroid_options, options
+        exposure, prediction, model, before.instrument, search
     )
     if observations.refusal:
         raise ImageRefused(observations.refusal, observations.detail)
@@ -132,9 +129,7 @@ def track_stars(
     return observations, TrackedCamera(corrected, radius_rad, instrument)
 
 
-def _predict(
-    exposure: Exposure, before: TrackedCamera, catalog: StarCatalog, options: IdentificationOptions
-) -> Prediction:
+def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> Prediction:
     """Apparent catalog stars in the field, brightest first."""
     camera = before.geometry.camera
     icrf_from_camera = (
@@ -142,7 +137,8 @@ def _predict(
         * Rotation.from_quat(before.geometry.star_tracker_from_camera_xyzw)
     ).as_matrix()
     # The catalog, and so the rows of a cone, are sorted by magnitude.
-    index = cone(catalog, icrf_from_camera[:, 2], before.field_radius_rad, options.magnitude_limit)
+    catalog, limit = search.catalog, search.identification.magnitude_limit
+    index = cone(catalog, icrf_from_camera[:, 2], before.field_radius_rad, limit)
     index, direction_icrf = visible(
         catalog, index, exposure.image.time_ns, exposure.velocity_m_s, exposure.site
     )
@@ -163,8 +159,7 @@ def _find_rotation(
     background: Background,
     prediction: Prediction,
     camera: CameraModel,
-    centroid_options: CentroidOptions,
-    options: IdentificationOptions,
+    search: StarSearch,
 ) -> Floats:
     """
     Small passive rotation (3,) of the camera, rad, from the predictions to the stars.
@@ -174,13 +169,13 @@ def _find_rotation(
     ImageRefused
         ``no_match``.
     """
-    reach_px = options.search_radius_px
+    reach_px = search.identification.search_radius_px
     xy = prediction.xy_px
     rim = reach_px + 4.0
     inside = ((xy > rim) & (xy < [camera.width - 1 - rim, camera.height - 1 - rim])).all(axis=1)
     guides = np.nonzero(inside)[0][:_GUIDES]
     place_px, found = brightest_near(
-        pixels, background, xy[guides], reach_px, centroid_options.detection_sigma
+        pixels, background, xy[guides], reach_px, search.centroid.detection_sigma
     )
     guides, place_px = guides[found], place_px[found]
     lost = ImageRefused('no_match', f'{len(guides)} of the brightest stars match a source')

@@ -1,1 +1,2 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """From pixels to measured stars."""

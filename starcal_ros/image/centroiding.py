@@ -1,8 +1,9 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Star centroids with covariance, by moments (Eqs. 8, 9) or by PSF fits.
 
-The moment method is the paper's; the fit goes beyond it.  What both need to know of an image, its
-PSF, pixel noise and saturation, is found from its own brighter stars where the options do not say.
+The moment method is that of the paper; the fit goes beyond it.  Both use the PSF, the pixel noise
+and the saturation level of `image_model`.
 """
 
 from __future__ import annotations
@@ -20,107 +21,32 @@ from starcal_ros.image.detection import (
     GAP_SIGMA,
     mesh_slope,
     sample_mesh,
-    Sources,
     stamps_about,
     stamps_at_edges,
     windows_about,
     windows_inside,
 )
 from starcal_ros.image.hot_pixels import CORE_PX, hot_in_stamps, lit_alone, NO_HOT_PIXELS
-from starcal_ros.image.psf_field import Instrument, MIN_PSF_SIGMA_PX, PsfWidth, uniform_width
+from starcal_ros.image.image_model import CentroidOptions, ImageModel
+from starcal_ros.image.pixel_noise import expected_snr, PixelNoise
+from starcal_ros.image.psf_field import PsfWidth
 from starcal_ros.image.psf_fit import (
     approach,
     border_level_dn,
-    expected_snr,
     first_guess,
     fit_at,
-    fit_psf,
     light_in_stamps,
     MISFIT_SIGMA,
-    noise_sums,
-    PixelNoise,
     PsfFit,
     stamp_radius_px,
     Stamps,
 )
-from starcal_ros.options import option
-from starcal_ros.records import STAR_REFUSALS
-from starcal_ros.robust_statistics import centre_and_scatter, median
+from starcal_ros.records import StarRefusal
 
-_REFUSAL_NAME = np.dtype(f'U{max(map(len, STAR_REFUSALS))}')  # holds every name uncut
-_BELOW_PLATEAU = 0.98  # pixels of a plateau differ by what one is more sensitive than another
-_MODELLED_SNR = 4.0  # of stars whose own measurement says how they light their neighbours
-SWAMPED_SIGMA = 3.0  # a brighter star nearer than this swamps, though it is measured itself
-_NEIGHBOUR_NOISE = 0.2  # of the noise of a pixel: less light of a neighbour changes nothing
-_IN_PLACE_PX = 1.5  # of a fit from the brightest pixel: beyond, it has gone elsewhere
-_BRIGHTEST = 60  # stars that show the level of saturation
-_MAX_PSF_SIGMA_PX = 4.0
-
-
-@dataclass(frozen=True)
-class CentroidOptions:
-    """How stars are measured."""
-
-    centroid: str = option('psf', 'how centroids are measured', choices=('psf', 'moment'))
-    detection_sigma: float = option(
-        5.0, 'signal-to-noise ratio at which a source is detected', low=3.0, high=100.0
-    )
-    min_snr: float = option(
-        5.0, 'least signal-to-noise ratio of a star that is used', low=2.0, high=1000.0
-    )
-    mask_radius_px: float = option(
-        3.0, 'radius of the mask of the moment method, px', low=1.0, high=10.0
-    )
-    mask_threshold_sigma: float = option(
-        3.0, 'threshold of that mask above the background, in background noise', low=0.0, high=50.0
-    )
-    min_pixels: int = option(
-        4, 'least number of pixels above that threshold in the mask', low=1, high=100
-    )
-    saturation_dn: float = option(
-        0.0,
-        'pixel value from which a star counts as saturated, DN; 0: found from the image',
-        low=0.0,
-    )
-    max_saturated_pixels: int = option(
-        40,
-        'most saturated pixels of a star that is used, which the PSF fit places by the others;'
-        ' 0 for a detector that blooms',
-        low=0,
-        high=200,
-    )
-    gain_e_per_dn: float = option(
-        0.0, 'detector gain, electrons per DN; 0: found from the image', low=0.0
-    )
-    max_shape_change: float = option(
-        0.35,
-        'largest departure of the second moments of a star from those of the PSF, as a fraction',
-        low=0.05,
-        high=5.0,
-    )
-
-
-@dataclass(frozen=True)
-class ImageModel:
-    """
-    What is known of an image before its single stars are measured.
-
-    ``psf`` is None where too few bright stars stand in the image to tell.
-    ``shape_median`` and ``shape_scatter`` (3,) are what `PsfFit.shape_change` is for its stars:
-    a real lens has no circular stars, and what all stars share makes none of them suspect.
-    """
-
-    background: Background
-    psf: PsfWidth | None
-    pixel_noise: PixelNoise
-    saturation_dn: float
-    shape_median: Floats
-    shape_scatter: Floats
-
-    @property
-    def psf_sigma_px(self) -> float:
-        """Mean Gaussian width of the stars; 0 where not known."""
-        return self.psf.sigma_px if self.psf else 0.0
+_MODELLED_SNR = 4.0  # of stars that are modelled, to subtract their light from their neighbours
+SWAMPED_SIGMA = 3.0  # a star with a brighter one nearer than this cannot be separated from it
+_NEIGHBOUR_NOISE = 0.2  # of the pixel noise; less light of a neighbour is neglected
+_IN_PLACE_PX = 1.5  # from the brightest pixel; a fit that ends farther away is not of the star
 
 
 @dataclass(frozen=True)
@@ -129,126 +55,20 @@ class Centroids:
     Measured stars.
 
     ``xy_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``flux_dn``, ``snr`` (n,);
-    ``refusal`` (n,) text: empty where the star is good, else a name of `STAR_REFUSALS`.
-    ``fit`` is None for moments; ``psf_sigma_px``, ``noise_dn`` (n,) are what it was made with, and
-    the light of the stars ``modelled`` (n,) was taken from their neighbours.
+    ``refusal`` (n,) uint8 codes of `StarRefusal`, 0 where the star is good.
+    ``fit`` is None for moments; ``psf_sigma_px``, ``noise_dn`` (n,) are PSF width and noise of the
+    fit; ``modelled`` (n,) masks the stars whose light was subtracted from their neighbours.
     """
 
     xy_px: Floats
     covariance_px2: Floats
     flux_dn: Floats
     snr: Floats
-    refusal: NDArray[np.str_]
+    refusal: NDArray[np.uint8]
     fit: PsfFit | None
     psf_sigma_px: Floats
     noise_dn: Floats
     modelled: NDArray[np.bool_]
-
-
-def saturation_level(pixels: Pixels, options: CentroidOptions) -> float:
-    """
-    Pixel value from which a pixel counts as saturated, DN; 0 where the pixels show none.
-
-    Where the options do not say: the greatest value when it is a plateau or the end of the data
-    type or of a 10, 12 or 14 bit range.
-    """
-    if options.saturation_dn > 0:
-        return options.saturation_dn
-    peak = int(pixels.max(initial=0))
-    ends = (255,) if pixels.dtype == np.uint8 else (1023, 4095, 16383, 65535)
-    # Four pixels at one greatest value: photon noise does not do that far above the background.
-    plateau = peak in ends or np.count_nonzero(pixels == peak) >= 4
-    return _BELOW_PLATEAU * peak if plateau else 0.0
-
-
-def model_image(
-    pixels: Pixels, background: Background, sources: Sources, options: CentroidOptions
-) -> ImageModel:
-    """
-    PSF width, pixel noise and saturation of an image from its own brighter sources.
-
-    The width is the median over up to 80 bright, unsaturated, isolated sources; gain and PSF
-    error are a robust regression of the squared residuals of their pixels on their signal.
-    """
-    saturation_dn = saturation_level(pixels, options) or np.inf
-    gain = options.gain_e_per_dn
-    unknown = ImageModel(
-        background, None, PixelNoise(gain or 1.0, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
-    )
-    shape = (pixels.shape[0], pixels.shape[1])
-    bright = sources.xy_px[sources.snr > 15.0][:400]
-    nearest = np.rint(bright).astype(np.int64)
-    bright = bright[pixels[nearest[:, 1], nearest[:, 0]] < saturation_dn]
-    xy = _isolated(bright, 12.0)[:80]
-    sigma = 1.2
-    if len(xy) < 5:
-        return unknown
-    noise_model = PixelNoise(gain or 1.0, 0.02)
-    for _ in range(6):
-        radius = stamp_radius_px(sigma)
-        centre = np.rint(xy).astype(np.int64)
-        inside = windows_inside(shape, centre, radius)
-        xy, centre = xy[inside], centre[inside]
-        stamps = stamps_about(pixels, centre, radius)
-        clean = stamps.max(axis=(1, 2)) < saturation_dn
-        xy, centre, stamps = xy[clean], centre[clean], stamps[clean]
-        if len(xy) < 5:
-            return unknown
-        noise_dn = sample_mesh(background.noise_mesh, shape, xy)
-        fit = fit_psf(stamps, sigma, noise_dn, noise_model)
-        change = median(fit.shape_change[:, :2].mean(axis=1))
-        sigma_before = sigma
-        sigma *= float(np.sqrt(np.clip(1.0 + change, 0.5, 2.0)))
-        sigma = float(np.clip(sigma, MIN_PSF_SIGMA_PX, _MAX_PSF_SIGMA_PX))
-        if abs(sigma - sigma_before) < 1e-3 * sigma:
-            break
-    shape_median, shape_scatter = centre_and_scatter(fit.shape_change)
-    limit = np.maximum(options.max_shape_change, 3.0 * shape_scatter)
-    star_like = (np.abs(fit.shape_change - shape_median) < limit).all(axis=1)
-    stamps, noise_dn = stamps[star_like], noise_dn[star_like]
-    for _ in range(3):
-        fit = fit_psf(stamps, sigma, noise_dn, noise_model)
-        noise_model = noise_sums(fit, noise_dn, noise_model).pixel_noise(gain)
-    psf = uniform_width(sigma, shape[1], shape[0])
-    return ImageModel(background, psf, noise_model, saturation_dn, shape_median, shape_scatter)
-
-
-def known_model(
-    pixels: Pixels,
-    background: Background,
-    known: Instrument,
-    predicted_px: Floats,
-    options: CentroidOptions,
-) -> ImageModel:
-    """
-    What the images before have shown, for an image whose stars stand at predicted pixels (n, 2).
-
-    The predictions are sorted, brightest first: if anything of the image is saturated, they are.
-    """
-    shape = (pixels.shape[0], pixels.shape[1])
-    centre = np.rint(predicted_px).astype(np.int64)
-    centre = centre[windows_inside(shape, centre, 2)][:_BRIGHTEST]
-    cores = windows_about(pixels, centre, 2)
-    saturation_dn = saturation_level(cores, options)
-    if saturation_dn == 0 and _BELOW_PLATEAU * cores.max(initial=0) <= known.saturation_dn:
-        saturation_dn = known.saturation_dn
-    return ImageModel(
-        background,
-        known.psf_width(),
-        known.noise.pixel_noise(options.gain_e_per_dn),
-        saturation_dn or np.inf,
-        known.shape_median,
-        known.shape_scatter,
-    )
-
-
-def _isolated(xy_px: Floats, distance_px: float) -> Floats:
-    """Return the points without another one nearer than a distance."""
-    if len(xy_px) < 2:
-        return xy_px
-    separation = np.linalg.norm(xy_px[:, None] - xy_px[None], axis=-1)
-    np.fill_diagonal(separation, np.inf)
-    return np.asarray(xy_px[separation.min(axis=1) > distance_px])
 
 
 def measure_stars(
@@ -261,9 +81,8 @@ def measure_stars(
     """
     Centroids of the stars near predicted pixels (n, 2), by the method of the options.
 
-    The brighter of two neighbours is to come first.  Where the image does not tell its PSF width,
-    the moment method is used.  ``hot_pixels`` (k,), numbers row by row from 0, sorted, take no
-    part in a fit.
+    The brighter of two neighbours must come first.  Without a PSF the moment method is used.
+    ``hot_pixels`` (k,), flat indices row by row from 0, sorted, are left out of a fit.
     """
     if options.centroid == 'psf' and model.psf is not None:
         return _measure_by_psf(pixels, predicted_px, model, model.psf, options, hot_pixels)
@@ -282,17 +101,17 @@ def _measure_by_psf(
     shape = (pixels.shape[0], pixels.shape[1])
     radius = stamp_radius_px(psf.sigma_px)
     n = len(predicted_px)
-    refusal = np.full(n, '', dtype=_REFUSAL_NAME)
+    refusal = np.full(n, StarRefusal.NONE, np.uint8)
     centre = np.rint(np.where(np.isnan(predicted_px), -1e6, predicted_px)).astype(np.int64)
     inside = windows_inside(shape, centre, 1)
     innermost = np.array([shape[1] - 2, shape[0] - 2])
     centre = np.minimum(np.maximum(centre, 1), innermost)
-    # The window goes where the star is: the brightest pixel next to the prediction.
+    # The window is centred on the brightest pixel next to the prediction.
     near = windows_about(pixels, centre, 1)
     near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0
     near = near.reshape(n, 9)
     best = near.argmax(axis=1)
-    best[near[:, 4] == near.max(axis=1)] = 4  # of a saturated plateau, the pixel predicted
+    best[near[:, 4] == near.max(axis=1)] = 4  # on a saturated plateau, the predicted pixel
     centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
     centre = np.minimum(np.maximum(centre, 1), innermost)
     stamps, outside = stamps_at_edges(pixels, centre, radius)
@@ -302,13 +121,13 @@ def _measure_by_psf(
     invalid = (stamps == 0.0) & (
         sample_mesh(model.background.level_mesh, shape, at_px) > GAP_SIGMA * noise_dn
     )[:, None, None]
-    # The fit has a level and no slope: a slope would pull faint stars up it.
+    # The fit has a level and no slope: a slope in the data would bias faint stars.
     stamps -= _slopes(model.background, shape, at_px, radius)
     sigma_px = psf.at(at_px)
     hot = hot_in_stamps(hot_pixels, centre, radius, shape[1]) & ~outside
     level_dn = border_level_dn(stamps)
     hot |= _single_pixels(pixels, stamps, centre, level_dn, noise_dn, model.pixel_noise)
-    # The first guess looks at all pixels; to the fit itself these say nothing.
+    # The first guess uses all pixels; the fit leaves these out.
     if hot.any():
         stamps[hot] = level_dn[np.nonzero(hot)[0]]
     out = saturated | hot | outside | invalid
@@ -325,13 +144,13 @@ def _measure_by_psf(
     )
     fit = fit_at(windows, parameters, model.pixel_noise)
     for bad, reason in (
-        (~inside, 'border'),
-        (saturated_pixels > options.max_saturated_pixels, 'saturated'),
-        ((fit.snr < options.min_snr) | ~np.isfinite(fit.snr), 'faint'),
-        (np.abs(fit.parameters[:, :2]).max(axis=1) > _IN_PLACE_PX, 'not_detected'),
-        (_misshapen(fit, model, options), 'elongated'),
+        (~inside, StarRefusal.BORDER),
+        (saturated_pixels > options.max_saturated_pixels, StarRefusal.SATURATED),
+        ((fit.snr < options.min_snr) | ~np.isfinite(fit.snr), StarRefusal.FAINT),
+        (np.abs(fit.parameters[:, :2]).max(axis=1) > _IN_PLACE_PX, StarRefusal.NOT_DETECTED),
+        (_misshapen(fit, model, options), StarRefusal.ELONGATED),
     ):
-        refusal[bad & (refusal == '')] = reason
+        refusal[bad & (refusal == StarRefusal.NONE)] = reason
     return Centroids(
         xy_px=centre + fit.parameters[:, :2],
         covariance_px2=fit.covariance[:, [0, 0, 1], [0, 1, 1]],
@@ -346,7 +165,7 @@ def _measure_by_psf(
 
 
 def _slopes(background: Background, shape: tuple[int, int], at_px: Floats, radius: int) -> Floats:
-    """The slope of the background in windows about pixels (n, 2), zero in their middles, DN."""
+    """Slope of the background in windows about pixels (n, 2), DN, zero in their middles."""
     reach = np.arange(-radius, radius + 1).astype(np.float64)
     down, across = (
         sample_mesh(slope, shape, at_px)[:, None, None]
@@ -356,7 +175,7 @@ def _slopes(background: Background, shape: tuple[int, int], at_px: Floats, radiu
 
 
 def _misshapen(fit: PsfFit, model: ImageModel, options: CentroidOptions) -> NDArray[np.bool_]:
-    """Which stars (n,) are not of the shape that those of the image share."""
+    """Mask (n,) of the stars whose shape differs from the common one of the image."""
     departure = np.abs(fit.shape_change - model.shape_median)
     limit = np.maximum(options.max_shape_change, 4.0 * model.shape_scatter)
     other = ((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1)
@@ -372,9 +191,9 @@ def _without_neighbours(
     noise: PixelNoise,
 ) -> tuple[Stamps, Floats, NDArray[np.bool_]]:
     """
-    The stamps without the light of those neighbours that are measured themselves.
+    Stamps without the light of the neighbours that can be modelled.
 
-    Also the parameters (n, 4), near those of their fit, and (n,) which stars those are.
+    Also the parameters (n, 4) near the minimum of the fit, and a mask (n,) of the modelled stars.
     """
     flux, sigma_px = parameters[:, 2], stamps.sigma_px
     snr = expected_snr(flux, sigma_px, np.sqrt(stamps.noise2_dn2[:, 0]), noise)
@@ -383,25 +202,25 @@ def _without_neighbours(
     if len(stamps) < 2:
         return stamps, parameters, modelled
     widest_px = float(sigma_px.max())
-    # A star out of the stamp lights it with its wing.
+    # The wing of a star outside the stamp adds light to it.
     reach_px = math.sqrt(2.0) * (stamps.width // 2) + 2.0 * widest_px
     pairs = cKDTree(centre).query_pairs(reach_px, output_type='ndarray')
     apart_px = np.hypot(*(predicted_px[pairs[:, 0]] - predicted_px[pairs[:, 1]]).T)
-    # Both would be fitted to the light of the brighter one, which comes first.
+    # Both fits would follow the light of the brighter one, which comes first.
     modelled[pairs[apart_px < max(3.0, 3.0 * widest_px)].max(axis=1)] = False
-    # Nothing frees the fainter of two that look like one: `blends` refuses it.
+    # The fainter of two unresolved stars cannot be separated: `blending` refuses it.
     pairs = pairs[apart_px >= SWAMPED_SIGMA * float(sigma_px.min())]
     star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
-    told = modelled[other]
-    star, other = star[told], other[told]
+    subtracted = modelled[other]
+    star, other = star[subtracted], other[subtracted]
     if not len(star):
         return stamps, parameters, modelled
     away_px = (centre[other] - centre[star]).astype(np.float64)
-    freed = stamps
+    separated = stamps
     touched = np.zeros(len(stamps), bool)
     little_dn = _NEIGHBOUR_NOISE * np.sqrt(stamps.noise2_dn2[star, 0])
     light: Floats = np.zeros((len(star), stamps.width**2))
-    # Twice: the light of a neighbour is known better once it is freed from that of its own.
+    # Twice: the light of a neighbour is more accurate without that of its own neighbours.
     for _ in range(2):
         before = light
         light = light_in_stamps(
@@ -410,21 +229,21 @@ def _without_neighbours(
         if not (np.abs(light - before).max(axis=1, initial=0.0) > little_dn).any():
             break
         lit = light.max(axis=1, initial=0.0) > little_dn
-        # Also those that light was taken from before and is given back to.
+        # Includes stars to which earlier subtracted light is returned.
         touched[star[lit]] = True
         again = np.flatnonzero(touched)
         neighbours = np.zeros((len(stamps), stamps.width**2))
         np.add.at(neighbours, star[lit], light[lit])
-        # The light is taken off, its photon noise stays.
-        freed = Stamps(
+        # The light is subtracted, its photon noise stays.
+        separated = Stamps(
             stamps.data_dn - neighbours.reshape(stamps.data_dn.shape),
             sigma_px,
             stamps.noise2_dn2 + neighbours / (noise.gain_e_per_dn * noise.background),
             stamps.out,
         )
         parameters = parameters.copy()
-        parameters[again] = approach(freed.select(again), parameters[again], noise)
-    return freed, parameters, modelled
+        parameters[again] = approach(separated.select(again), parameters[again], noise)
+    return separated, parameters, modelled
 
 
 def _single_pixels(
@@ -436,9 +255,9 @@ def _single_pixels(
     noise: PixelNoise,
 ) -> NDArray[np.bool_]:
     """
-    Which pixels (n, w, w) of the stamps are lit alone, away from the core of the star.
+    Mask (n, w, w) of single lit pixels of the stamps away from the core of the star.
 
-    Cosmic rays, and hot pixels not known yet: the light of a star lights those next to it too.
+    They are cosmic rays or new hot pixels: the light of a star extends to adjacent pixels.
     """
     above_dn = stamps - level_dn[:, None, None]
     radius = stamps.shape[1] // 2
@@ -451,7 +270,7 @@ def _single_pixels(
     lit_dn = above_dn[star, row, column]
     inner = (u >= 1) & (u < pixels.shape[1] - 1) & (v >= 1) & (v < pixels.shape[0] - 1)
     inner &= lit_dn**2 > least_dn[star] ** 2 + MISFIT_SIGMA**2 * lit_dn / noise.gain_e_per_dn
-    star, row, column, v, u = (of[inner] for of in (star, row, column, v, u))
+    star, row, column, v, u = (values[inner] for values in (star, row, column, v, u))
     alone = lit_alone(pixels, v, u, level_dn[star])
     single = np.zeros(stamps.shape, bool)
     single[star[alone], row[alone], column[alone]] = True
@@ -464,16 +283,16 @@ def _measure_by_moments(
     """
     Centroids as centres of intensity over a mask (Eqs. 8, 9).
 
-    The brightest pixel of the region of interest is found, the window recentred there, and the
-    mask is every pixel within ``mask_radius_px`` above ``mask_threshold_sigma``.
+    The window is centred on the brightest pixel of the region of interest; the mask holds the
+    pixels within ``mask_radius_px`` that are above ``mask_threshold_sigma``.
     """
     shape = (pixels.shape[0], pixels.shape[1])
     radius = int(np.ceil(options.mask_radius_px))
     n = len(predicted_px)
-    refusal = np.full(n, '', dtype=_REFUSAL_NAME)
+    refusal = np.full(n, StarRefusal.NONE, np.uint8)
     centre = np.rint(np.nan_to_num(predicted_px, nan=-1e6)).astype(np.int64)
     inside = windows_inside(shape, centre, 2 * radius)
-    refusal[~inside] = 'border'
+    refusal[~inside] = StarRefusal.BORDER
     centre = np.clip(centre, 2 * radius, [shape[1] - 2 * radius - 1, shape[0] - 2 * radius - 1])
     w = 2 * radius + 1
     best = stamps_about(pixels, centre, radius).reshape(n, w * w).argmax(axis=1)
@@ -506,7 +325,7 @@ def _measure_by_moments(
         )
         / (total**2)[:, None]
     )
-    # A mask of one pixel would claim no error at all: no centroid is known better than its pixel.
+    # A mask of one pixel would give a covariance of zero.
     count = mask.sum(axis=(1, 2))
     snr = flux / np.sqrt(np.maximum(variance.sum(axis=(1, 2)), 1e-12))
     moment_xx = (weight * dx * dx).sum(axis=(1, 2)) / total
@@ -515,12 +334,12 @@ def _measure_by_moments(
     size = np.maximum(moment_xx + moment_yy, 1e-12)
     ellipticity = np.hypot(moment_xx - moment_yy, 2 * moment_xy) / size
     for bad, reason in (
-        (stamps.max(axis=(1, 2)) >= model.saturation_dn, 'saturated'),
-        (snr < options.min_snr, 'faint'),
-        (count < options.min_pixels, 'too_few_pixels'),
-        (ellipticity > options.max_shape_change, 'elongated'),
+        (stamps.max(axis=(1, 2)) >= model.saturation_dn, StarRefusal.SATURATED),
+        (snr < options.min_snr, StarRefusal.FAINT),
+        (count < options.min_pixels, StarRefusal.TOO_FEW_PIXELS),
+        (ellipticity > options.max_shape_change, StarRefusal.ELONGATED),
     ):
-        refusal[bad & (refusal == '')] = reason
+        refusal[bad & (refusal == StarRefusal.NONE)] = reason
     return Centroids(
         xy_px=centre + np.stack([x, y], axis=-1),
         covariance_px2=covariance,

@@ -1,7 +1,8 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Where light stands in an image: background, and star-like sources above it.
+Background of an image, and the star-like sources above it.
 
-Nothing here knows which star is which, nor measures one to better than a fifth of a pixel.
+Positions of sources are good to a fifth of a pixel; `centroiding` measures the identified stars.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ _MESH_STEP_PX = (4, 4)  # down and across: 256 samples of a cell give its noise 
 GAP_SIGMA = 8.0  # 0 DN so far below the other pixels of a cell marks an invalid pixel
 _CUT_OFF = 0.3  # part of a cell at 0 DN from which its lower half no longer shows the noise
 _LEAST_CUT_OFF_DN = 0.5
-_STEEP_PART = 0.2  # of the variance of a cell from which a slope counts
+_STEEP_PART = 0.2  # part of the variance of a cell from which a slope is corrected
 _MOSTLY_INVALID = 0.75  # invalid part of a cell from which its neighbour stands in for it
 _SPARSE_PX = 256
-_SPARSE_STEP_PX = (32, 8)  # a row that is read is read whole: few rows, many of their pixels
+_SPARSE_STEP_PX = (32, 8)  # memory is read row by row: few rows, many of their pixels
 _DETECTION_SIGMA_PX = (
     1.0  # matched filter of detection; 0.7 to 1.5 px stars lose under 10 % of S/N
 )
@@ -34,17 +35,18 @@ _DETECTION_SIGMA_PX = (
 _NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
 _ALONG_U, _ALONG_V = np.array([[[1], [0]], [[0], [1]]])  # a step along either axis, (2, 1)
 _RIM_PX = 4  # the filter's own reach, and one pixel for the place of the maximum
-# Peak over filtered peak: 6.3 for one lit pixel less its noise; of a star in the middle of a pixel
-# 4.2 for a PSF of 0.45 px (half of the light in that pixel), 4.65 for one of 0.4 px.
+# Peak over filtered peak: 6.3 for a single lit pixel without noise; for a star centred on a pixel
+# 4.2 with a PSF of 0.45 px (half of the light in that pixel) and 4.65 with one of 0.4 px.
 _HOT_PEAK_RATIO = 4.7
 
 
 @dataclass(frozen=True)
 class Background:
     """
-    Background level and 1-sigma noise on a coarse mesh, DN, with what the whole image shows.
+    Background level and 1-sigma noise, DN, on a coarse mesh and for the whole image.
 
-    ``level_mesh`` and ``noise_mesh`` are (rows, cols) float32 over equal parts of the image.
+    ``level_mesh`` and ``noise_mesh`` are (rows, cols) float32 over equal parts of the image;
+    ``level_dn`` and ``noise_dn`` are their medians.
     """
 
     level_mesh: NDArray[np.float32]
@@ -58,7 +60,7 @@ class Sources:
     """
     Star-like local maxima of an image, brightest first.
 
-    ``xy_px`` (n, 2); ``snr`` (n,); ``searched_px2`` the area of the image that was looked at.
+    ``xy_px`` (n, 2); ``snr`` (n,); ``searched_px2`` the searched area of the image.
     """
 
     xy_px: Floats
@@ -92,10 +94,10 @@ def measure_background(pixels: Pixels) -> Background:
 
 def sample_background(pixels: Pixels) -> Background:
     """
-    Background level and noise of an image from one pixel in 128, for fits that find their level.
+    Background level and noise from one pixel in 128, for fits that estimate their own level.
 
-    The noise is that of the differences of near pixels, which a gradient in the large cells does
-    not touch.
+    The noise is that of the differences of near pixels, so that a gradient over a large cell does
+    not enter it.
     """
     samples, mesh_shape = _cells(pixels, _SPARSE_PX, _SPARSE_STEP_PX)
     beside, _ = _cells(pixels[:, 2:], _SPARSE_PX, _SPARSE_STEP_PX, mesh_shape)
@@ -114,10 +116,10 @@ def _noise_above(
     ascending: NDArray[np.float32], level: NDArray[np.float32], zeros: NDArray[np.int64]
 ) -> NDArray[np.float32]:
     """
-    Noise (k,) of the sorted rows (k, n) that the converter cuts off at 0 DN; 0 of the others.
+    Noise (k,) of the sorted rows (k, n) that the converter cuts off at 0 DN; 0 for other rows.
 
-    The lower half of such noise is gone; the upper half is taken at its 2-sigma quantile.  Noise
-    below 1 DN shows in a few pixels only, so that less than 0.5 DN cannot be claimed.
+    The lower half of such noise is lost; the upper half gives the noise by its 2-sigma quantile.
+    Noise below 1 DN changes only a few pixels, so that the result is at least 0.5 DN.
     """
     count = ascending.shape[1]
     above = ascending[:, int(0.9772 * count)] - level
@@ -128,7 +130,7 @@ def _noise_above(
 def _without_slope(
     noise: NDArray[np.float32], level_mesh: NDArray[np.float32], pixels: Pixels
 ) -> NDArray[np.float32]:
-    """Noise (k,) of the cells; from differences where a slope of the background swamps it."""
+    """Noise (k,) of the cells, from differences where the slope of the background exceeds it."""
     down, across = mesh_slope(_smooth_mesh(level_mesh), pixels.shape)
     cell_v, cell_u = np.array(pixels.shape) / level_mesh.shape
     ramp = (((down * cell_v) ** 2 + (across * cell_u) ** 2) / 12.0).ravel()
@@ -145,7 +147,7 @@ def _without_slope(
 def _difference_noise(
     samples: NDArray[np.float32], beside: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Noise (k,) from the differences of near pixels (k, n), which no slope enters by much."""
+    """Noise (k,) from the differences of near pixels (k, n), almost free of slopes."""
     apart = samples - beside
     apart -= np.partition(apart, apart.shape[1] // 2, axis=1)[:, apart.shape[1] // 2, None]
     rank = int(apart.shape[1] * 0.6827)
@@ -177,7 +179,7 @@ def _quantile(
 
 
 def _gap_above_zero(ascending: NDArray[np.float32], zeros: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which rows (k,) of sorted samples hold 0 DN far below the noise of their other samples."""
+    """Mask (k,) of the sorted rows that hold 0 DN far below the noise of their other samples."""
     level = _quantile(ascending, 0.5, zeros)
     spread = level - _quantile(ascending, 0.1587, zeros)
     return np.asarray((zeros > 0) & (level > GAP_SIGMA * np.maximum(spread, 1.0)))
@@ -186,7 +188,7 @@ def _gap_above_zero(ascending: NDArray[np.float32], zeros: NDArray[np.int64]) ->
 def _filled(
     values: NDArray[np.float32], has_pixels: NDArray[np.bool_], mesh_shape: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Values (k,) of the cells, those without pixels from the nearest cell that has some."""
+    """Values (k,) of the cells; a cell without pixels takes that of the nearest cell with some."""
     if has_pixels.all() or not has_pixels.any():
         return values
     nearest = distance_transform_edt(
@@ -201,7 +203,7 @@ def _cells(
     step_px: tuple[int, int],
     mesh_shape: tuple[int, int] | None = None,
 ) -> tuple[NDArray[np.float32], tuple[int, int]]:
-    """Every so many pixels of equal cells of an image, one row for each cell; rows, columns."""
+    """Thinned pixels of equal cells of an image, a row for each cell; (rows, columns) of cells."""
     height, width = pixels.shape
     rows, cols = mesh_shape or (max(1, height // cell_px), max(1, width // cell_px))
     cell_v, cell_u = height // rows, width // cols
@@ -216,7 +218,7 @@ def _clipped(
     spread: NDArray[np.float32],
     valid: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean and 1-sigma of the rows of samples about zero, without those beyond three spreads."""
+    """Mean and 1-sigma of each row of samples about zero, without values beyond three spreads."""
     inside = np.abs(samples) <= 3.0 * np.maximum(spread, 1.0)[:, None]
     if valid is not None:
         inside &= valid
@@ -231,14 +233,14 @@ def _clipped(
 def _background(
     level: NDArray[np.float32], noise: NDArray[np.float32], mesh_shape: tuple[int, int]
 ) -> Background:
-    """Smooth level and noise of the cells; no noise is under that of rounding to whole DN."""
+    """Smoothed level and noise of the cells; the noise is at least that of rounding to DN."""
     level_mesh = _smooth_mesh(level.reshape(mesh_shape))
     noise_mesh = _smooth_mesh(np.maximum(noise, math.sqrt(1.0 / 12.0)).reshape(mesh_shape))
     return Background(level_mesh, noise_mesh, median(level_mesh), median(noise_mesh))
 
 
 def _smooth_mesh(mesh: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the mesh after a 3 x 3 median, which takes out cells that hold a bright star."""
+    """Return the mesh after a 3 x 3 median, which removes cells with a bright star."""
     mesh = np.ascontiguousarray(mesh, np.float32)
     return np.asarray(cv2.medianBlur(mesh, 3), np.float32) if min(mesh.shape) >= 3 else mesh
 
@@ -248,7 +250,7 @@ def sample_mesh(mesh: NDArray[np.float32], shape: tuple[int, int], xy_px: Floats
     rows, cols = mesh.shape
     row = (xy_px[:, 1] + 0.5) * rows / shape[0] - 0.5
     column = (xy_px[:, 0] + 0.5) * cols / shape[1] - 0.5
-    # SciPy's, as cv2.remap takes at most 32767 points.
+    # SciPy's function, because cv2.remap takes at most 32767 points.
     return np.asarray(map_coordinates(mesh, [row, column], np.float64, order=1, mode='nearest'))
 
 
@@ -267,7 +269,7 @@ def detect(pixels: Pixels, background: Background, detection_sigma: float) -> So
         np.float32,
     )
     lowest = detection_sigma * _NOISE_LEFT * float(background.noise_mesh.min())
-    # Few pixels pass the lowest threshold: everything after looks at those alone.
+    # Few pixels pass the lowest threshold; all later steps use only those.
     v, u = np.nonzero(filtered > lowest)
     inner = (u >= 2) & (u < width - 2) & (v >= 2) & (v < height - 2)
     v, u = v[inner], u[inner]
@@ -303,9 +305,9 @@ def detect_near(
     """
     The brightest star-like source in a square window about each predicted pixel (n, 2).
 
-    The paper's way ("Extracting star centroids"): its cost does not grow with the image.  Same
-    filter, threshold and rejection of single lit pixels as `detect`; a source that several windows
-    share is listed once.
+    The method of the paper ("Extracting star centroids"): its cost does not grow with the image.
+    Filter, threshold and rejection of single lit pixels are those of `detect`; a source in several
+    windows is listed once.
     """
     shape = (pixels.shape[0], pixels.shape[1])
     centre = np.rint(predicted_px).astype(np.int64)
@@ -331,9 +333,9 @@ def brightest_near(
     detection_sigma: float,
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """
-    Place (n, 2) of the brightest source in a window about each predicted pixel, and if there is.
+    Place (n, 2) of the brightest source near each predicted pixel, and a mask (n,) of the found.
 
-    As `detect_near`, but row by row.  The windows must lie in the image with 4 px to spare.
+    As `detect_near`, with a row for each window.  The windows must lie 4 px inside the image.
     """
     centre = np.rint(predicted_px).astype(np.int64)
     xy, snr = _brightest(pixels, background, centre, reach_px)
@@ -343,7 +345,7 @@ def brightest_near(
 def _brightest(
     pixels: Pixels, background: Background, centre: NDArray[np.int64], reach_px: int
 ) -> tuple[Floats, Floats]:
-    """Place (n, 2) and signal-to-noise (n,) of the star-like maximum of windows; 0 for none."""
+    """Place (n, 2) and signal-to-noise (n,) of the star-like maximum of each window; 0 if none."""
     shape = (pixels.shape[0], pixels.shape[1])
     half = reach_px + _RIM_PX
     windows = windows_about(pixels, centre, half).astype(np.float32)
@@ -351,7 +353,7 @@ def _brightest(
     windows -= level[:, None, None].astype(np.float32)
     filtered = np.zeros_like(windows)
     if len(windows):
-        # One above the other: what the filter takes over the joints stays in the rim.
+        # All windows stacked in one image: light filtered across a joint stays in the rim.
         cv2.GaussianBlur(
             windows.reshape(-1, 2 * half + 1),
             (7, 7),
@@ -369,7 +371,7 @@ def _brightest(
     )
     xy = centre + np.stack([u, v], axis=-1) - half
     noise = sample_mesh(background.noise_mesh, shape, xy.astype(np.float64))
-    # At the rim of the window it is the flank of something outside.
+    # A maximum at the rim of the window is the flank of a source outside.
     star_like = (np.abs(xy - centre) < reach_px).all(axis=1)
     star_like &= windows[n, v, u] < _HOT_PEAK_RATIO * peak
     snr = np.where(star_like, peak / (_NOISE_LEFT * noise), 0.0)
@@ -386,16 +388,16 @@ def _parabola_vertex(
 
 
 def windows_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Pixels:
-    """Square windows (n, 2 radius + 1, 2 radius + 1) about integer pixels (n, 2), inside."""
+    """Square windows (n, 2 radius + 1, 2 radius + 1) about integer pixels (n, 2), all inside."""
     side = 2 * radius + 1
-    # The types of NumPy forget what the pixels are.
+    # The type stubs of NumPy drop the type of the pixels here.
     every: Any = np.lib.stride_tricks.sliding_window_view(pixels, (side, side))
     windows: Pixels = every[centre[:, 1] - radius, centre[:, 0] - radius]
     return windows
 
 
 def stamps_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Floats:
-    """As `windows_about`, to reckon with."""
+    """As `windows_about`, as float64."""
     return windows_about(pixels, centre, radius).astype(np.float64)
 
 
@@ -403,9 +405,9 @@ def stamps_at_edges(
     pixels: Pixels, centre: NDArray[np.int64], radius: int
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """
-    As `stamps_about`, for windows that may leave the image, and which of their pixels do.
+    As `stamps_about` for windows that may leave the image, and a mask of their pixels outside.
 
-    What lies outside repeats the pixel at the edge.
+    Pixels outside repeat the pixel at the edge.
     """
     shape = (pixels.shape[0], pixels.shape[1])
     largest = np.array([shape[1] - 1, shape[0] - 1])
@@ -426,7 +428,7 @@ def stamps_at_edges(
 def windows_inside(
     shape: tuple[int, int], centre: NDArray[np.int64], radius: int
 ) -> NDArray[np.bool_]:
-    """Return (n,) whether a window about each integer pixel lies within the image."""
+    """Mask (n,) of the integer pixels whose window lies within the image."""
     height, width = shape
     u, v = centre[:, 0], centre[:, 1]
     return (u >= radius) & (u < width - radius) & (v >= radius) & (v < height - radius)

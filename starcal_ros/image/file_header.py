@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Size and channels of a PNG or TIFF, and bounds of its pixels, read before one is decoded."""
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Whether a frame as a whole can be measured, judged before any star is looked for.
+Checks of a frame as a whole, before any star is searched.
 
-A sample of rows, each with the row below it, tells all that is asked here: 5 % of the pixels of a
-five-megapixel frame.  Noise makes a row of a sound frame unlike every other row, of any frame.
+A sample of rows, each with the row below it, is enough for all checks: 5 % of the pixels of a
+five-megapixel frame.  Noise makes a row of an intact frame differ from every other row of any
+frame.
 """
 
 from __future__ import annotations
@@ -27,15 +29,15 @@ from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 
 _ROWS = 64
 _GOLDEN = 0.618034
-_BELOW_STEP_PX = 8  # of the row below, which is compared only
+_BELOW_STEP_PX = 8  # the row below is only compared: every eighth pixel is enough
 _SEGMENT_PX = 64  # a piece of a row: as wide as a cell in which a background is taken as flat
-# Where converters of 8 to 16 bits end, in the low or in the high bits of 16.
+# Largest values of converters of 8 to 16 bits, in the low or in the high bits of 16.
 _ENDS_DN = (255, 1023, 4095, 16383, 65472, 65520, 65532, 65535)
 
 
 @dataclass(frozen=True)
 class ScreeningOptions:
-    """What makes a frame unfit as a whole."""
+    """Limits beyond which a frame is refused as a whole."""
 
     max_saturated_fraction: float = option(
         0.2, 'largest part of an image that is saturated', low=0.0, high=1.0
@@ -58,10 +60,10 @@ class ScreeningOptions:
 @dataclass(frozen=True)
 class Fingerprint:
     """
-    What a frame is known by when it comes again.
+    Checksums of a frame, to recognise it when it is delivered again.
 
-    ``rows`` (k,) are checksums of the rows that hold noise, 0 of the others; ``whole`` is a digest
-    of all pixels where no row does, else empty.
+    ``rows`` (k,) are checksums of the sampled rows that hold noise, 0 for the others; ``whole`` is
+    a digest of all pixels if no row holds noise, else empty.
     """
 
     time_ns: int
@@ -72,12 +74,11 @@ class Fingerprint:
 @dataclass(frozen=True)
 class RowSample:
     """
-    Every so many rows of a frame.
+    Rows of a frame at almost regular distances, with the rows below them.
 
-    ``row`` (k,) their numbers, ``step`` their mean distance; ``pixels`` (k, width) they, and
-    ``below`` every eighth pixel of the rows below them;
-    ``noisy`` (k, m) whether a segment holds noise; ``constant`` (k, m) whether all its pixels have
-    one value.
+    ``row`` (k,) numbers of the rows, ``step`` their mean distance, px; ``pixels`` (k, width) the
+    rows; ``below`` every eighth pixel of the rows below them; ``noisy`` (k, m) mask of the
+    segments that hold noise; ``constant`` (k, m) mask of the segments with a single pixel value.
     """
 
     row: NDArray[np.int64]
@@ -88,8 +89,8 @@ class RowSample:
     constant: NDArray[np.bool_]
 
     @functools.cached_property
-    def telling(self) -> NDArray[np.bool_]:
-        """Rows (k,) that no other row equals by chance."""
+    def distinctive(self) -> NDArray[np.bool_]:
+        """Mask (k,) of the rows that no other row equals by chance."""
         return np.asarray(self.noisy.mean(axis=1) >= 0.5)
 
 
@@ -98,8 +99,8 @@ def sample_rows(pixels: Pixels) -> RowSample:
     height = len(pixels)
     step = max(1, height // _ROWS)
     count = max(1, (height - 1) // step)
-    # Spread within their steps, so that packets lost at a regular distance do not all fall
-    # between; the same in each quarter, so that a quarter that is shown twice is known again.
+    # Irregular within their steps, so that packets lost at a regular distance do not all fall
+    # between the rows; the same in each quarter, so that a repeated quarter is recognised.
     within = (np.arange(count) % (_ROWS // 4)) * _GOLDEN % 1.0
     row = np.arange(count) * step + (within * step).astype(np.int64)
     picked = pixels[row]
@@ -110,15 +111,15 @@ def sample_rows(pixels: Pixels) -> RowSample:
         pixels=picked,
         below=pixels[np.minimum(row + 1, height - 1), ::_BELOW_STEP_PX],
         step=step,
-        # A quarter, less what a mean is rounded by: noise of a third of the quantisation step
-        # gives it, a star or two do not.
+        # A quarter, less the rounding of a mean: noise of a third of the quantisation step makes
+        # so many pixels differ, a star or two do not.
         noisy=unlike > 0.249,
         constant=unlike == 0.0,
     )
 
 
 def _segments(rows: Pixels) -> Pixels:
-    """Rows (k, width) cut into segments (k, m, length), without what is left over at the end."""
+    """Rows (k, width) cut into segments (k, m, length), without an incomplete last one."""
     k, width = rows.shape
     length = min(_SEGMENT_PX, width)
     count = width // length
@@ -133,16 +134,16 @@ def _means(rows: Pixels) -> NDArray[np.float32]:
 def _mean_of_each(segments: NDArray[Any]) -> NDArray[np.float32]:
     """Means (k, m) of (k, m, length)."""
     length = segments.shape[2]
-    # As a product: the sum of many short rows of whole numbers takes ten times as long.
+    # As a product: NumPy takes ten times as long for sums of many short rows of integers.
     return segments.astype(np.float32) @ np.full(length, 1.0 / length, np.float32)
 
 
 def fingerprint(image: Image, sample: RowSample) -> Fingerprint:
-    """What a frame is known by when it comes again."""
-    telling = sample.telling
-    rows = np.array([zlib.crc32(row) for row in sample.pixels], np.uint32) * telling
-    # Without noise a few rows may well be those of another frame: only all pixels tell.
-    whole = b'' if telling.any() else hashlib.blake2b(image.pixels.tobytes()).digest()
+    """Checksums of a frame by its sampled rows."""
+    distinctive = sample.distinctive
+    rows = np.array([zlib.crc32(row) for row in sample.pixels], np.uint32) * distinctive
+    # Without noise a few rows may equal those of another frame: only all pixels are decisive.
+    whole = b'' if distinctive.any() else hashlib.blake2b(image.pixels.tobytes()).digest()
     return Fingerprint(image.time_ns, rows, whole)
 
 
@@ -160,11 +161,11 @@ def screen(
     Parameters
     ----------
     before : Fingerprint or None
-        Of the frame before, whether it was used or not.
+        Previous frame, used or not.
     saturation_dn : float
         Pixel value from which a pixel counts as saturated; 0: the end of the converter's range.
     dark : (height, width) or None
-        Its slopes are no glare.
+        Dark frame; its slopes do not count as glare.
 
     Raises
     ------
@@ -183,11 +184,11 @@ def screen(
 def _saturated(
     sample: RowSample, saturation_dn: float, options: ScreeningOptions
 ) -> NDArray[np.bool_]:
-    """Segments (k, m) that are saturated throughout, unless the frame is refused."""
+    """Mask (k, m) of the segments that are saturated throughout; refuses an overexposed frame."""
     peak = int(sample.pixels.max())
     if not saturation_dn:
         saturation_dn = 0.98 * peak if peak in _ENDS_DN else peak + 1.0
-    # Whole numbers: against a float every pixel would be made one.
+    # An integer: compared with a float, every pixel would be converted.
     least_dn = math.ceil(saturation_dn)
     if least_dn > peak:
         return np.zeros(sample.constant.shape, bool)
@@ -198,16 +199,16 @@ def _saturated(
 
 
 def _refuse_repeated(seen: Fingerprint, before: Fingerprint, options: ScreeningOptions) -> None:
-    """Refuse what the frame before has shown: all of it, or some rows."""
+    """Refuse a frame that repeats the previous frame, as a whole or in some rows."""
     if len(before.rows) != len(seen.rows):
         return
     since_s = (seen.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
-    telling = seen.rows != 0
-    same = telling & (before.rows == seen.rows)
-    everywhere = telling.any() and same.sum() == telling.sum()
+    distinctive = seen.rows != 0
+    same = distinctive & (before.rows == seen.rows)
+    everywhere = distinctive.any() and same.sum() == distinctive.sum()
     if everywhere or (seen.whole and seen.whole == before.whole):
         if since_s == 0.0:
-            return  # the same frame delivered twice is no camera that is stuck
+            return  # the same frame delivered twice: the camera is not stuck
         raise ImageRefused('frozen', f'the pixels of the image {since_s:.3f} s before')
     part = float(same.mean())
     if part > options.max_lost_fraction:
@@ -221,20 +222,20 @@ def _refuse_incomplete(
     saturated: NDArray[np.bool_],
     options: ScreeningOptions,
 ) -> None:
-    """Refuse a frame of which a part did not come through."""
-    telling = sample.telling
+    """Refuse a frame with lost parts: repeated rows or constant segments."""
+    distinctive = sample.distinctive
     _, first = np.unique(seen.rows, return_index=True)
-    again = np.ones(len(telling), bool)
+    again = np.ones(len(distinctive), bool)
     again[first] = False
     again |= (sample.pixels[:, ::_BELOW_STEP_PX] == sample.below).all(axis=1)
-    repeated = float((telling & again).mean())
+    repeated = float((distinctive & again).mean())
     if repeated > options.max_lost_fraction:
         raise ImageRefused('incomplete', f'{repeated:.0%} of its rows repeat others')
     values = _segments(sample.pixels)[:, :, 0].astype(np.float64)
     alive = ~sample.constant
     if alive.all() or not alive.any():
         return
-    # A dark sky that the converter cuts off at zero is constant too, but fades into noise.
+    # A dark sky that the converter cuts off at zero is constant too, but with a gradual edge.
     off_px = np.abs(values - median(values[alive])) > 5.0 * _noise_dn(sample, alive)
     sharp = sample.noisy[alive].mean() > 0.9
     lost = float((sample.constant & ~saturated & (off_px | sharp)).mean())
@@ -243,12 +244,12 @@ def _refuse_incomplete(
 
 
 def _noise_dn(sample: RowSample, alive: NDArray[np.bool_]) -> float:
-    """1-sigma noise of a pixel, from differences to the pixel below: no slope enters them."""
-    # One of a segment: 2500 of five megapixels tell the noise to 2 %.
+    """1-sigma noise of a pixel, from differences to the pixel below, which are free of slopes."""
+    # One pixel of each segment: 2500 of five megapixels give the noise to 2 %.
     here = _segments(sample.pixels)[:, :, 0].astype(np.int32)
     below = sample.below[:, :: _SEGMENT_PX // _BELOW_STEP_PX][:, : here.shape[1]]
     spread = median(np.abs(here - below)[alive])
-    # The second is the noise of rounding to whole DN.
+    # The second value is the noise of rounding to whole DN.
     return max(MAD_TO_SIGMA * spread / math.sqrt(2.0), math.sqrt(1.0 / 12.0))
 
 
@@ -267,9 +268,9 @@ def background_bend(sample: RowSample, dark: Pixels | None = None) -> float:
     """
     Median change of the slope of the background from one cell to the next, in noise per pixel.
 
-    A steady slope is subtracted before the stars are fitted.  What the cells leave of a slope g
-    pulls the centroid of a star of any flux by up to 5 sigma_px^2 g of its own sigma (Gaussian of
-    width sigma_px, white noise).
+    A steady slope is subtracted before the stars are fitted.  A remaining slope g pulls the
+    centroid of a star of any flux by up to 5 sigma_px^2 g of its own sigma (Gaussian of width
+    sigma_px, white noise).
     """
     level = _means(sample.pixels)
     if dark is not None:

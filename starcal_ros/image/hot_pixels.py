@@ -1,7 +1,8 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Hot pixels: from a dark frame, and learnt from images as the stars move over the detector.
+Hot pixels from a dark frame, and from images between which the stars move over the detector.
 
-A single lit pixel that is lit again after the sky has moved on belongs to the detector.
+A single pixel that is lit again after the sky has moved on is a defect of the detector.
 """
 
 from __future__ import annotations
@@ -16,20 +17,21 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.options import option
+from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 
-_SCANNED_PX = 1 << 19  # of one image, in 0.1 ms; larger images are scanned in turns
+_SCANNED_PX = 1 << 19  # pixels scanned per image, in 0.1 ms; larger images are scanned by strips
 _MOVED_PX = 5.0  # the light of a star that has moved so far has left its pixels
-SPILT = 0.2  # mean of the four next pixels over the peak: 0.24 for a star of 0.45 px
-_BESIDE = np.array([[1, -1, 0, 0], [0, 0, 1, -1]])[:, :, None]  # rows and columns away
-CORE_PX = 1.5  # a star on a hot pixel itself has lost its peak
-_WIDE_PSF_PX = 1.5  # no pixel of a star so wide holds 7 % of its light: the fit goes without it
-_MOST = 100_000  # a detector with more has another fault, and the list stays small
+SPILT = 0.2  # mean of the four adjacent pixels over the peak: 0.24 for a star of 0.45 px
+_BESIDE = np.array([[1, -1, 0, 0], [0, 0, 1, -1]])[:, :, None]  # offsets in rows and columns
+CORE_PX = 1.5  # a hot pixel this near spoils the peak of a star
+_WIDE_PSF_PX = 1.5  # no pixel of such a star holds 7 % of its light: the fit can omit one
+_MOST = 100_000  # bounds the list; a detector with more has another fault
 
 
 @dataclass(frozen=True)
 class FixedPatternOptions:
-    """What counts as a hot pixel."""
+    """Options for the search of hot pixels."""
 
     hot_pixel_sigma: float = option(
         10.0,
@@ -42,7 +44,7 @@ class FixedPatternOptions:
 
 @dataclass(frozen=True)
 class Strip:
-    """Single lit pixels of one part of the detector, sorted, and where the camera looked."""
+    """Single lit pixels of one part of the detector, sorted, and the attitude of the camera."""
 
     lit: Indices
     icrf_from_camera: Rotation
@@ -51,22 +53,22 @@ class Strip:
 @dataclass(frozen=True)
 class HotPixels:
     """
-    What is known of a detector's hot pixels.
+    Hot pixels of a detector found so far, and the state of the search.
 
-    ``index`` (n,) are their numbers, row by row from 0, sorted; ``strips`` the parts of the
-    detector as they were last seen, and ``turn`` which of them is to be looked at next.
+    ``index`` (n,) flat pixel indices, row by row from 0, sorted; ``strips`` the parts of the
+    detector as last scanned; ``next_strip`` the number of the part to be scanned next.
     """
 
     index: Indices
     strips: tuple[Strip | None, ...] = ()
-    turn: int = 0
+    next_strip: int = 0
 
 
 NO_HOT_PIXELS = HotPixels(np.empty(0, np.int64))
 
 
 def hot_in_dark(dark: Pixels | None, options: FixedPatternOptions) -> HotPixels:
-    """Hot pixels of a dark frame: those far above its median, by the spread of all its pixels."""
+    """Hot pixels of a dark frame: far above its median, in units of the spread of its pixels."""
     if dark is None:
         return NO_HOT_PIXELS
     level = median(dark)
@@ -85,36 +87,38 @@ def learn_hot_pixels(
     options: FixedPatternOptions,
 ) -> HotPixels:
     """
-    What is known after one more image, of which one strip is looked at.
+    Hot pixels after one more image, of which one strip is scanned.
 
-    ``pixels`` (height, width) are without the dark frame.  ``icrf_from_camera`` says where the
-    camera looked: a strip tells once that has moved since it was last seen.
+    ``pixels`` (height, width) are without the dark frame.  A strip is compared with its last scan
+    once ``icrf_from_camera`` has moved the stars by more than a PSF.
     """
     height = pixels.shape[0]
     count = -(-pixels.size // _SCANNED_PX)
     strips = known.strips or (None,) * count
-    before = strips[known.turn]
-    turn = (known.turn + 1) % count
+    before = strips[known.next_strip]
+    following = (known.next_strip + 1) % count
     if before is not None:
         moved_px = (before.icrf_from_camera.inv() * icrf_from_camera).magnitude() * focal_px
         if moved_px < _MOVED_PX:
-            return HotPixels(known.index, strips, turn)
-    rows = (known.turn * height // count, (known.turn + 1) * height // count)
+            return HotPixels(known.index, strips, following)
+    rows = (known.next_strip * height // count, (known.next_strip + 1) * height // count)
     lit = _single_lit(pixels, rows, background_dn, options.hot_pixel_sigma * noise_dn)
     index = known.index
     if before is not None:
         again = np.intersect1d(before.lit, lit, assume_unique=True)
         index = np.union1d(index, again)[:_MOST]
     seen = Strip(lit, icrf_from_camera)
-    return HotPixels(index, (*strips[: known.turn], seen, *strips[known.turn + 1 :]), turn)
+    return HotPixels(
+        index, (*strips[: known.next_strip], seen, *strips[known.next_strip + 1 :]), following
+    )
 
 
 def _single_lit(
     pixels: Pixels, rows: tuple[int, int], background_dn: float, threshold_dn: float
 ) -> Indices:
-    """Numbers of the pixels of some rows that are lit while the four next to them are not."""
+    """Flat indices of the pixels in some rows that are lit while their four neighbours are not."""
     height, width = pixels.shape
-    # Whole numbers: against a float every pixel would be made one.
+    # An integer: compared with a float, every pixel would be converted.
     floor_dn = min(max(math.floor(background_dn + threshold_dn), 0), np.iinfo(pixels.dtype).max)
     lit = np.flatnonzero(pixels[rows[0] : rows[1]] > floor_dn)
     v, u = np.divmod(lit + rows[0] * width, width)
@@ -127,14 +131,14 @@ def _single_lit(
 def lit_alone(
     pixels: Pixels, v: Indices, u: Indices, background_dn: float | Floats
 ) -> NDArray[np.bool_]:
-    """Which pixels (k,), none at the rim, stand out from the four next to them as no star does."""
+    """Mask (k,) of pixels, none at the rim, that exceed the adjacent ones by more than a star."""
     beside = pixels[v + _BESIDE[0], u + _BESIDE[1]].sum(axis=0, dtype=np.float64)
     peak = pixels[v, u] - background_dn
     return np.asarray(0.25 * beside - background_dn < SPILT * peak)
 
 
 def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> NDArray[np.bool_]:
-    """Which pixels (n, 2 radius + 1, 2 radius + 1) of windows about pixels (n, 2) are hot."""
+    """Mask (n, 2 radius + 1, 2 radius + 1) of the hot pixels in windows about pixels (n, 2)."""
     side = 2 * radius + 1
     found = np.zeros((len(centre), side, side), bool)
     if len(hot) == 0:
@@ -152,28 +156,30 @@ def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> NDA
 
 def refuse_on_hot_pixels(
     xy_px: Floats,
-    refusal: NDArray[np.str_],
+    refusal: NDArray[np.uint8],
     hot: Indices,
     width: int,
     window_px: int,
     psf_sigma_px: float,
-) -> NDArray[np.str_]:
+) -> NDArray[np.uint8]:
     """
-    Refusals (n,) of stars at (n, 2), with ``hot_pixel`` where one is the cause.
+    Codes (n,) of `StarRefusal` for stars at (n, 2), ``HOT_PIXEL`` where one is the cause.
 
-    A hot pixel at the peak spoils a star of few pixels, as what is left of it tells little.  One
-    elsewhere in the window, half ``window_px`` wide, is the cause where the star was refused for
-    its shape.
+    A hot pixel at the peak spoils a star of few pixels, because the other pixels hold little of
+    its light.  A hot pixel elsewhere in the window (half width ``window_px``) is the cause if the
+    star was refused for its shape.
     """
     if len(hot) == 0:
         return refusal
     v, u = np.divmod(hot, width)
     tree = cKDTree(np.stack([u, v], axis=-1))
-    asked = np.flatnonzero(np.isin(refusal, ('', 'elongated', 'ambiguous')))
-    core, _ = tree.query(xy_px[asked], distance_upper_bound=CORE_PX)
-    window, _ = tree.query(xy_px[asked], p=np.inf, distance_upper_bound=window_px + 0.5)
+    candidates = np.flatnonzero(
+        np.isin(refusal, (StarRefusal.NONE, StarRefusal.ELONGATED, StarRefusal.AMBIGUOUS))
+    )
+    core, _ = tree.query(xy_px[candidates], distance_upper_bound=CORE_PX)
+    window, _ = tree.query(xy_px[candidates], p=np.inf, distance_upper_bound=window_px + 0.5)
     at_peak = np.isfinite(core) & (psf_sigma_px < _WIDE_PSF_PX)
-    cause = at_peak | (np.isfinite(window) & (refusal[asked] != ''))
+    cause = at_peak | (np.isfinite(window) & (refusal[candidates] != StarRefusal.NONE))
     changed = refusal.copy()
-    changed[asked[cause]] = 'hot_pixel'
+    changed[candidates[cause]] = StarRefusal.HOT_PIXEL
     return changed

@@ -1,9 +1,10 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-What images say of their camera's light: the width of the PSF over the field, and the pixel noise.
+Width of the PSF over the field, and pixel noise, estimated over a sequence of images.
 
-One image knows its PSF to a percent or so and its gain to some ten; the sums of `Instrument` are
-added up from image to image, old ones fading, so that an ensemble knows them better and a change
-of focus is followed.
+One image gives its PSF to about 1 % and its gain to about 10 %.  The sums of `Instrument` are
+accumulated from image to image with decaying weight, so that the estimates improve over a sequence
+and still follow a change of focus.
 """
 
 from __future__ import annotations
@@ -15,15 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
-from starcal_ros.image.psf_fit import noise_sums, NoiseSums, PixelNoise, PsfFit, select
+from starcal_ros.image.pixel_noise import NoiseSums, PixelNoise
+from starcal_ros.image.psf_fit import noise_sums, PsfFit, select
 from starcal_ros.robust_statistics import centre_and_scatter
 
-_MEMORY = 0.95  # weight of what is known against each new image: about twenty images count
-_BRIGHT_SNR = 15.0  # of stars that tell the shape of the PSF
-_MOST = 60  # brightest of them, which know all the rest do
-MIN_PSF_SIGMA_PX = 0.3  # 82 % of the light in one pixel: a narrower PSF does not show its width
-_FEWEST = 5  # such stars, or an image tells nothing
-_MAP_CHI2 = 30.0  # five normal deviates squared come to that once in 80,000 times
+_MEMORY = 0.95  # weight of the earlier images at each new one: about twenty images count
+_BRIGHT_SNR = 15.0  # of stars that determine the shape of the PSF
+_MOST = 60  # brightest of them; fainter ones add almost nothing
+MIN_PSF_SIGMA_PX = 0.3  # 82 % of the light in one pixel: a smaller width cannot be measured
+_FEWEST = 5  # such stars, or an image is not used
+_MAP_CHI2 = 30.0  # chi^2 of five terms by chance once in 80,000 times
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class PsfWidth:
     height: int
 
     def at(self, xy_px: Floats) -> Floats:
-        """Width (n,) in px at pixels (n, 2), within a factor of 1.5 of that at the middle."""
+        """Width (n,), px, at pixels (n, 2), limited to a factor of 1.5 of that in the middle."""
         middle = float(self.coefficients[0])
         if not self.coefficients[1:].any():
             return np.full(len(xy_px), np.sqrt(middle))
@@ -49,17 +51,17 @@ class PsfWidth:
 
     @functools.cached_property
     def sigma_px(self) -> float:
-        """Width in px that is the mean of the variance over the detector."""
+        """Root of the mean variance over the detector, px."""
         return float(np.sqrt(self.coefficients @ [1.0, 0.0, 0.0, 1 / 3, 0.0, 1 / 3]))
 
 
 @dataclass(frozen=True)
 class MeasuredStars:
     """
-    Stars of an image as they were fitted.
+    Fitted stars of an image.
 
-    ``xy_px`` (n, 2); ``sigma_px``, ``noise_dn`` (n,) with which each was fitted; ``usable`` (n,)
-    marks those that stand alone and are good.
+    ``xy_px`` (n, 2); ``sigma_px``, ``noise_dn`` (n,) PSF width and noise used in each fit;
+    ``usable`` (n,) mask of the isolated stars that were not refused.
     """
 
     xy_px: Floats
@@ -84,12 +86,12 @@ def width_basis(xy_px: Floats, width: int, height: int) -> Floats:
 @dataclass(frozen=True)
 class Instrument:
     """
-    What the images so far have shown.
+    PSF, pixel noise and saturation level from the images so far.
 
     ``width_normal`` (6, 6) and ``width_right`` (6,) are the normal equations of `PsfWidth`,
-    ``noise`` those of the pixel noise.  ``shape_median`` and ``shape_scatter`` (3,) are what
-    `PsfFit.shape_change` is for the bright stars.  ``saturation_dn`` is the level of saturation
-    where an image has shown one, else 0.
+    ``noise`` those of the pixel noise.  ``shape_median`` and ``shape_scatter`` (3,) are median and
+    scatter of `PsfFit.shape_change` of the bright stars.  ``saturation_dn`` is the level of
+    saturation, DN; 0 if no image shows one.
     """
 
     width: int
@@ -102,10 +104,10 @@ class Instrument:
     saturation_dn: float
 
     def psf_width(self) -> PsfWidth:
-        """The width over the field, or one for all of it where no change is significant."""
+        """Width over the field; the same everywhere if no change is significant."""
         mean = max(self.width_right[0] / self.width_normal[0, 0], MIN_PSF_SIGMA_PX**2)
         uniform = np.array([mean, 0.0, 0.0, 0.0, 0.0, 0.0])
-        # A trace of the mean keeps a map solvable whose stars stand in one corner.
+        # A small ridge keeps the map solvable if all stars lie in one corner.
         ridge = 1e-6 * self.width_normal[0, 0] * np.eye(6)
         full = np.linalg.solve(self.width_normal + ridge, self.width_right)
         gained = full @ self.width_right - mean * self.width_right[0]
@@ -120,14 +122,14 @@ def learn(
     size: tuple[int, int],
 ) -> Instrument | None:
     """
-    What is known after one more image, from its stars; ``before`` where they are too few.
+    PSF, pixel noise and saturation after one more image; ``before`` if it has too few stars.
 
     Parameters
     ----------
     expected : PixelNoise
-        With which the stars were fitted.
+        Noise model used in the fits.
     saturation_dn : float
-        Level of saturation that the image shows; 0 for none.
+        Level of saturation found in the image; 0 if none.
     size : (int, int)
         Width and height of the detector.
     """
@@ -139,7 +141,7 @@ def learn(
     variance = stars.sigma_px[bright] ** 2
     median, scatter = centre_and_scatter(fit.shape_change)
     change = fit.shape_change[:, :2].mean(axis=1)
-    # One star may be off by the scatter of all, or by more: a companion or a cosmic ray.
+    # A companion or a cosmic ray moves one star by more than the scatter of all.
     spread2 = 0.25 * (fit.shape_sigma[:, :2] ** 2).sum(axis=1) + 0.5 * scatter[:2].mean() ** 2
     off2 = (change - median[:2].mean()) ** 2 / spread2
     weight = (off2 < 9.0) / (spread2 * variance**2)

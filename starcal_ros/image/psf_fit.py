@@ -1,19 +1,9 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Gaussian fits to stars, all stars of an image at once.
 
 A pixel-integrated circular Gaussian with free position, flux and local background, weighted by the
 noise of each pixel, attains the Cramer-Rao bound of the stamp.
-
-Noise of a pixel with background-free signal S of a star of flux F, in digital numbers (DN)::
-
-    variance = background noise_dn^2 + S / gain + psf_error^2 S F
-
-``background`` is how much more a pixel beside a star scatters than one of the open sky, and
-``psf_error`` is how far the real PSF is from the Gaussian.  That error is of one sign over several
-pixels, and largest beside the core: no noise that weights could hold down.  A fit that trusts the
-core less for its sake leans on the wings, where the Gaussian is worst.  So the weights are of the
-noise alone, and the error of the PSF is in the covariance.  With F in its term it grows as the
-square of the brightness, and photon noise as the brightness: that tells one from the other.
 """
 
 from __future__ import annotations
@@ -27,45 +17,30 @@ from scipy.special import erf, ndtr
 
 from starcal_ros.arrays import Floats
 from starcal_ros.image.hot_pixels import CORE_PX, SPILT
+from starcal_ros.image.pixel_noise import NoiseSums, PixelNoise
 
-_FIT_STEPS = 4  # stars settle in two or three; what has not by then is no star
-# A step of s leaves s / SNR of the way for faint stars and s^2 / sigma_px for bright ones.  Below
-# this part of sigma_px and of the noise of the place, squared, the last step leaves 0.1 of that.
+_FIT_STEPS = 4  # stars converge in two or three; other sources may not
+# After a step s, s / SNR of the way remains for faint stars and s^2 / sigma_px for bright ones.
+# With s^2 below this part of sigma_px times the position noise, the last step leaves 0.1 of it.
 _SETTLED = 0.3
-_SIGNIFICANT = 3.0  # sigma
-_LIKELY = 1.9  # sigma
 _MOMENTS = np.array([[-1, 0, 1] * 3, [-1] * 3 + [0] * 3 + [1] * 3, [1] * 9], np.float64).T
-MISFIT_SIGMA = 5.0  # 81 pixels of normal noise pass it once in 20,000 stars
-
-
-@dataclass(frozen=True)
-class PixelNoise:
-    """Noise of a pixel: ``background noise^2 + S / gain + psf_error^2 S F``, S of it, F of all."""
-
-    gain_e_per_dn: float
-    psf_error: float
-    background: float = 1.0
-
-    def variance(self, signal_dn: Floats, noise_dn: Floats, flux_dn: Floats) -> Floats:
-        """Variance in DN^2; negative signal counts as none."""
-        signal = np.maximum(signal_dn, 0.0)
-        per_signal = 1.0 / self.gain_e_per_dn + self.psf_error**2 * np.maximum(flux_dn, 0.0)
-        return np.asarray(self.background * noise_dn**2 + per_signal * signal)
+MISFIT_SIGMA = 5.0  # normal noise in 81 pixels exceeds it for one star in 20,000
 
 
 @dataclass(frozen=True)
 class PsfFit:
     """
-    Gaussian fits to stamps: position relative to the stamp's centre, flux, background.
+    Gaussian fits to stamps.
 
-    ``parameters`` (n, 4): x, y (px), flux, background (DN).  ``covariance`` (n, 4, 4) of them.
+    ``parameters`` (n, 4): x, y from the centre of the stamp (px), flux, background (DN).
+    ``covariance`` (n, 4, 4) of the parameters.
     ``snr`` (n,): flux over its 1-sigma from the noise alone.
-    ``worst_pixel_sigma`` (n,): the pixel that fits worst, in its own noise.
+    ``worst_pixel_sigma`` (n,): largest residual of a pixel in units of its noise.
     ``shape_change`` and ``shape_sigma`` (n, 3): departure of the second moments xx, yy, xy from
-    those of the PSF as a fraction of its variance, and their 1-sigma.
-    ``signal_dn`` and ``residual_dn`` (n, p): the light of the star in each pixel of its stamp and
-    what the fit leaves, NaN where the pixel took no part; ``freedom`` (n, p): the part of the
-    variance of a pixel that the fit has left in its residual.
+    those of the PSF as a fraction of its variance, and its 1-sigma.
+    ``signal_dn`` and ``residual_dn`` (n, p): light of the star in each pixel of its stamp, and
+    residual of the fit, NaN for pixels that were left out; ``freedom`` (n, p): part of the
+    variance of a pixel that remains in its residual after the fit.
     """
 
     parameters: Floats
@@ -85,25 +60,25 @@ def select(fit: PsfFit, stars: NDArray[np.intp] | NDArray[np.bool_]) -> PsfFit:
 
 
 def stamp_radius_px(psf_sigma_px: float) -> int:
-    """Half width of the fitting window: beyond 3 sigma nothing tells the place of a star."""
+    """Half width of the fitting window; beyond 3 sigma a PSF gives no position information."""
     return min(max(math.ceil(3.0 * psf_sigma_px), 3), 12)
 
 
 @dataclass(frozen=True)
 class Stamps:
     """
-    Square windows about stars, and what a fit needs to know of each pixel.
+    Square windows about stars, with PSF width and noise for their fits.
 
     Parameters
     ----------
     data_dn : (n, w, w)
-        Pixel values; the star within a pixel or so of the middle.
+        Pixel values, DN; the star within a pixel or so of the middle.
     sigma_px : (n,)
         Width of the PSF at each star.
     noise2_dn2 : (n, 1) or (n, w * w)
         Variance of each star's pixels, or of each pixel, without the star's own light.
     out : (n, w, w), optional
-        Pixels that say nothing of the star, saturated or hot, and take no part.
+        Mask of the pixels to leave out: saturated, hot, outside the image.
     """
 
     data_dn: Floats
@@ -127,11 +102,11 @@ class Stamps:
 
     @property
     def valid(self) -> NDArray[np.bool_] | None:
-        """Which pixels (n, w * w) take part; None: all."""
+        """Mask (n, w * w) of the pixels to be fitted; None: all."""
         return None if self.out is None else ~self.out.reshape(len(self), self.width**2)
 
     def select(self, stars: NDArray[np.intp]) -> Stamps:
-        """Return the windows of some stars, by row number, ascending and each once."""
+        """Return the windows of some stars, by ascending row number without repetition."""
         if len(stars) == len(self):
             return self
         return Stamps(
@@ -157,7 +132,7 @@ def fit_psf(
     noise_dn : (n,)
         Noise at each star, without its own light.
     pixel_noise : PixelNoise
-        How the noise grows with signal.
+        Increase of the noise with the signal.
     """
     sigma_px = np.broadcast_to(np.asarray(sigma_px, np.float64), (len(stamps),))
     windows = Stamps(stamps, sigma_px, noise_dn[:, None] ** 2)
@@ -167,11 +142,11 @@ def fit_psf(
 
 def approach(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> Floats:
     """
-    Parameters (n, 4) after some steps towards the fit: x, y (px), flux, background (DN).
+    Parameters (n, 4) one step before the minimum: x, y (px), flux, background (DN).
 
-    Gauss-Newton with the weights renewed from the model at each step, so that the noise of the
-    data does not bias them; a step in position is at most half a pixel.  Stars that one more step
-    brings to the fit, such as `fit_at` takes, are left alone.
+    Gauss-Newton with weights from the model of each step, so that the noise of the data does not
+    bias them; a step in position is at most half a pixel.  The iteration of a star ends when the
+    step that `fit_at` adds reaches the minimum.
     """
     parameters = parameters.copy()
     active = np.arange(len(stamps))
@@ -180,7 +155,7 @@ def approach(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> Flo
             break
         chosen = stamps.select(active)
         parameters[active], step, normal = _nearer(chosen, parameters[active], pixel_noise)
-        # The noise of the place with flux and background known, the smaller one.
+        # Position noise for fixed flux and background: a lower bound, and cheap.
         place_sigma_px = 1.0 / np.sqrt(np.einsum('nii->ni', normal)[:, :2])
         limit_px2 = _SETTLED * place_sigma_px * chosen.sigma_px[:, None]
         active = active[(step[:, :2] ** 2 > limit_px2).any(axis=1)]
@@ -202,10 +177,10 @@ def _nearer(
 
 def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFit:
     """
-    Fits to stamps whose parameters (n, 4) are near: the last step, and what is known of it.
+    Fits to stamps from parameters (n, 4) near the minimum: last step, covariance and residuals.
 
-    A pixel that alone does not fit, such as a cosmic ray on the flank of a bright star, takes no
-    part.
+    A single pixel that does not fit, such as a cosmic ray on the flank of a bright star, is left
+    out.
     """
     # Second moments: one linear step from the solution, in units of the PSF variance.
     rows, light, root_weight = _whitened_rows(parameters, stamps, pixel_noise, 7)
@@ -221,7 +196,7 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
         covariance[spoilt] = np.linalg.inv(normal[spoilt, :4, :4])
         last[spoilt] = (covariance[spoilt] @ gradient[spoilt, :4, None])[:, :, 0]
         residual[spoilt] = _after(last[spoilt], rows[spoilt])
-    # Of the inverse of the whole only the columns of the moments are wanted.
+    # Only the columns of the moments of the 7 x 7 inverse are needed.
     of_shape = np.linalg.solve(normal, np.broadcast_to(np.eye(7)[:, 4:], (len(normal), 7, 3)))
     shape_step = (gradient[:, None, :] @ of_shape)[:, 0]
     shape_variance = of_shape[:, [4, 5, 6], [0, 1, 2]]
@@ -230,7 +205,7 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     snr = parameters[:, 2] / np.sqrt(covariance[:, 2, 2])
     misfit = residual
     if pixel_noise.psf_error > 0:
-        # Of a pixel's variance, this many times what its weight holds is the error of the PSF.
+        # Variance of a pixel from the PSF error over that in its weight.
         flux = np.maximum(parameters[:, 2, None], 0.0)
         excess = pixel_noise.psf_error**2 * flux * light * root_weight**2
         misfit = residual / np.sqrt(1.0 + excess)
@@ -253,7 +228,7 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
 
 
 def _after(step: Floats, rows: Floats) -> Floats:
-    """Residuals (n, p) that a step (n, 4) leaves of those of the rows, to first order."""
+    """Residuals (n, p) of the rows after a step (n, 4), to first order."""
     return np.asarray(rows[:, -1] - (step[:, None, :] @ rows[:, :4])[:, 0])
 
 
@@ -261,10 +236,10 @@ def _single_misfits(
     sigmas: Floats, light: Floats, parameters: Floats, stamps: Stamps
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """
-    Rows (k,) of stars with one pixel lit too much that does not spill over, and that pixel.
+    Rows (k,) of stars with one pixel too bright while its neighbours are not, and that pixel.
 
-    Not of the core: a star that has lost its peak is hardly measured.  ``sigmas`` (n, p) are the
-    residuals in the noise of each pixel, ``light`` (n, p) is that of the stars.
+    Pixels of the core are excluded: a star cannot be measured well without its peak.  ``sigmas``
+    (n, p) are the residuals in units of pixel noise, ``light`` (n, p) the light of the stars.
     """
     width = stamps.width
     star = np.flatnonzero(sigmas.max(axis=1, initial=0.0) > MISFIT_SIGMA)
@@ -284,27 +259,18 @@ def _single_misfits(
     return star[alone], pixel[alone]
 
 
-def expected_snr(
-    flux_dn: Floats, sigma_px: float | Floats, noise_dn: float | Floats, noise: PixelNoise
-) -> Floats:
-    """Signal-to-noise (n,) of stars of a flux, from their photons and 4 pi sigma^2 px of sky."""
-    flux = np.maximum(flux_dn, 0.0)
-    sky_dn2 = 4.0 * math.pi * sigma_px**2 * noise.background * noise_dn**2
-    return np.asarray(flux / np.sqrt(sky_dn2 + flux / noise.gain_e_per_dn))
-
-
 def first_guess(windows: Stamps, background: Floats) -> Floats:
     """
-    Parameters (n, 4) from which the fit starts: the centre of the light next to the middle.
+    Start parameters (n, 4) of the fit, from the centre of light of the middle 3 x 3 pixels.
 
-    ``background`` (n,) is that of `border_level_dn`.
+    ``background`` (n,) is the result of `border_level_dn`.
     """
     stamps, sigma_px, c = windows.data_dn, windows.sigma_px, windows.width // 2
     core = stamps[:, c - 1 : c + 2, c - 1 : c + 2].reshape(-1, 9)
     off_x, off_y, total = (core @ _MOMENTS).T
     total = total - 9.0 * background
-    share = erf(1.5 / (math.sqrt(2.0) * sigma_px))  # of the light in three pixels
-    # The outer two of three pixels differ by this much for each pixel of the way.
+    share = erf(1.5 / (math.sqrt(2.0) * sigma_px))  # part of the light in three pixels
+    # Difference of the outer two of three pixels for an offset of one pixel.
     slope = 2.0 * (_gauss(0.5 / sigma_px) - _gauss(1.5 / sigma_px)) / sigma_px
     per_light = share / slope / np.maximum(total, 1e-12)
     guess = np.stack([off_x * per_light, off_y * per_light, total / share**2, background], axis=-1)
@@ -322,7 +288,7 @@ def border_level_dn(stamps: Floats) -> Floats:
 
 
 def light_in_stamps(place_px: Floats, flux_dn: Floats, sigma_px: Floats, width: int) -> Floats:
-    """Light (k, width^2) in stamps of stars at (k, 2) from their middles, in or out of them."""
+    """Light (k, width^2) in stamps from stars at (k, 2) from their middles, inside or outside."""
     count = len(flux_dn)
     value, _, _ = _profile(
         np.concatenate([place_px[:, 0], place_px[:, 1]]),
@@ -343,9 +309,9 @@ def neighbour_pull_px(
     pixel_noise: PixelNoise,
 ) -> Floats:
     """
-    How far (k, 2) the light of a neighbour pulls the fitted place of a star.
+    Shift (k, 2) of the fitted position of a star by the light of a neighbour.
 
-    That is where the fit ends on the light of both without noise.
+    It is the position that the fit finds in the noise-free light of both stars.
 
     Parameters
     ----------
@@ -353,7 +319,7 @@ def neighbour_pull_px(
     offset_px : (k, 2)
         From the star to its neighbour.
     sigma_px, noise_dn, pixel_noise
-        Width of the PSF, and the noise as in `fit_psf`.
+        Width of the PSF, and noise as in `fit_psf`.
     """
     width = 2 * stamp_radius_px(sigma_px) + 1
     count = len(flux_dn)
@@ -366,74 +332,25 @@ def neighbour_pull_px(
     ).reshape(2, count, width, width)
     stamps = Stamps(own + other, sigma, np.full((count, 1), noise_dn**2))
     alone = np.stack([*np.zeros((2, count)), flux_dn, np.zeros(count)], axis=-1)
-    # The second step leaves a hundredth of the pull.
+    # After two steps a hundredth of the shift remains.
     for _ in range(2):
         alone, _, _ = _nearer(stamps, alone, pixel_noise)
     return alone[:, :2]
 
 
-@dataclass(frozen=True)
-class NoiseSums:
-    """
-    What residuals say of the pixel noise: a regression of their squares on noise_dn^2, S and S F.
-
-    ``normal`` (3, 3) and ``right`` (3,), with each pixel weighted by its own expected spread.
-    Sums of several images can be added.
-    """
-
-    normal: Floats
-    right: Floats
-
-    def pixel_noise(self, gain_e_per_dn: float = 0.0) -> PixelNoise:
-        """
-        Noise with which the squared residuals are their variance.
-
-        A gain that is given (not 0) is kept.  An error of the PSF that is not significant is
-        none: it would take its share of the photon noise with it.
-        """
-        per_signal = 1.0 / gain_e_per_dn if gain_e_per_dn else 0.0
-        found = np.array([1.0, per_signal, 0.0])
-        right = self.right - self.normal[:, 1] * per_signal
-        free = [0, 2] if gain_e_per_dn else [0, 1, 2]
-        scale = 1.0 / np.sqrt(np.maximum(self.normal.diagonal(), 1e-300))
-        correlation = self.normal * scale * scale[:, None] + 1e-9 * np.eye(3)
-        while free:
-            inverse = np.linalg.inv(correlation[free][:, free])
-            value = scale[free] * (inverse @ (scale * right)[free])
-            # A squared normal residual over its variance has a variance of 2.
-            sigma = scale[free] * np.sqrt(2.0 * inverse.diagonal())
-            if free[-1] == 2 and value[-1] < _SIGNIFICANT * sigma[-1]:
-                # Few stars cannot separate the two: the gain goes only where nothing shows it.
-                gain_shows_less = (
-                    1 in free and value[1] < sigma[1] and value[2] > _LIKELY * sigma[2]
-                )
-                free = [0, 2] if gain_shows_less else [0, 1] if not gain_e_per_dn else [0]
-            elif 1 in free and value[free.index(1)] < 0.0:
-                free.remove(1)
-            else:
-                found[free] = value
-                break
-        background, per_signal, error2 = found
-        return PixelNoise(
-            1.0 / min(max(float(per_signal), 1e-4), 1e4),
-            math.sqrt(min(max(float(error2), 0.0), 0.25)),
-            min(max(float(background), 0.25), 4.0),
-        )
-
-
 def noise_sums(fit: PsfFit, noise_dn: Floats, expected: PixelNoise) -> NoiseSums:
     """
-    Sums from the pixels of the stars of a fit, weighted by the noise expected of them.
+    Sums over the pixels of fitted stars, weighted by their expected variance.
 
-    ``noise_dn`` (n,).  Each residual is freed from what the fit itself has taken of it; one of
-    more than five sigma is something else.
+    ``noise_dn`` (n,).  Each squared residual is corrected for the degrees of freedom of the fit;
+    residuals of more than five sigma are left out.
     """
     noise2 = noise_dn[:, None] ** 2
     signal = np.maximum(fit.signal_dn, 0.0)
     flux = np.maximum(fit.parameters[:, 2, None], 0.0)
     variance = expected.variance(signal, noise_dn[:, None], flux)
     squared = fit.residual_dn**2 / fit.freedom
-    # NaN, a pixel that took no part, is not below either.
+    # NaN, a pixel that was left out, is not below either.
     keep = squared < 25.0 * variance
     weight = keep / variance
     signal = signal * weight
@@ -451,7 +368,7 @@ def _profile(
     """
     Pixel-integrated Gaussian along one axis with its first and second derivative by the centre.
 
-    ``centre`` and ``sigma_px`` (n,), from the middle of ``width`` pixels; results are (n, width).
+    ``centre`` (n,) from the middle of ``width`` pixels, ``sigma_px`` (n,); results are (n, width).
     The derivative by sigma^2 is half of the second one by the centre (heat equation).
     """
     edges = np.arange(width + 1) - width / 2.0
@@ -470,10 +387,10 @@ def _psf_rows(
     parameters: Floats, data: Floats, sigma_px: Floats, width: int, count: int
 ) -> Floats:
     """
-    Derivatives of stamps by x, y, flux, background, and last their residual.
+    Derivatives of stamps by x, y, flux, background, and as the last row their residual.
 
-    ``data`` is (n, width^2); the result (n, count + 1, width^2).  With a count of 7, after the
-    background by the second moments xx, yy, xy as fractions of the PSF's variance.
+    ``data`` is (n, width^2); the result (n, count + 1, width^2).  A count of 7 adds, after the
+    background, derivatives by the second moments xx, yy, xy as fractions of the PSF variance.
     """
     n = len(parameters)
     x, y, flux, level = parameters.T
@@ -482,7 +399,7 @@ def _psf_rows(
     )
     rows = np.empty((n, count + 1, width * width))
     flux = flux[:, None]
-    # Spread over the stamp first: products of long rows take a third of those of short ones.
+    # Spread over the stamp first: products of long rows take a third of the time of short ones.
     px, py = _in_each_row(value[:n]), value[n:].repeat(width, axis=1)
     flux_px1 = _in_each_row(flux * first[:n])
     py1 = first[n:].repeat(width, axis=1)
@@ -516,9 +433,9 @@ def _whitened_rows(
     parameters: Floats, stamps: Stamps, pixel_noise: PixelNoise, count: int
 ) -> tuple[Floats, Floats, Floats]:
     """
-    The rows of `_psf_rows` over the noise of each pixel, 0 for those that take no part.
+    Rows of `_psf_rows` over the noise of each pixel, 0 for pixels that are left out.
 
-    Also the light (n, p) of the stars, and (n, p) one over that noise.
+    Also the light (n, p) of the stars, and the inverse (n, p) of that noise.
     """
     rows = _psf_rows(parameters, stamps.flat_dn, stamps.sigma_px, stamps.width, count)
     light = np.maximum(parameters[:, 2, None], 0.0) * rows[:, 2]
@@ -535,8 +452,8 @@ def _normal(rows: Floats) -> tuple[Floats, Floats]:
     """
     Normal matrices (n, k, k) and gradients (n, k) of many small least-squares problems.
 
-    ``rows`` (n, k + 1, p) are the derivatives and the residual, whitened.  A trace on the diagonal
-    keeps a stamp without light solvable.
+    ``rows`` (n, k + 1, p) are the whitened derivatives and residual.  A small addition to the
+    diagonal keeps a stamp without light solvable.
     """
     k = rows.shape[1] - 1
     product = rows[:, :k] @ rows.transpose(0, 2, 1)

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Levenberg-Marquardt on bordered block-diagonal normal equations (Eqs. 20-26).
 

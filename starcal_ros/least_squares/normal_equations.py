@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Residuals of star observations and their normal matrices, image by image (Eqs. 15, 27-37).
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A calibration to a message and back, and to the standard messages for a camera."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Records to messages and back, from the types of their fields and the marks on them (`arrays`).
 
@@ -11,7 +12,7 @@ bool, int, float, str                  the same
 int, name ends with ``_ns``            builtin_interfaces/Time, without that ending
 ``time_ns``                            ``header.stamp``
 (4,) array, name ends with ``_xyzw``   geometry_msgs/Quaternion
-bool or None                           uint8: 0 no, 1 yes, 2 not known
+bool or None                           uint8: 0 no, 1 yes, 2 unknown
 tuple or array of numbers              sequence of their type, arrays row by row
 size named in a `Shape` by a word      uint32 of that name
 record                                 its message

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Images from messages of any encoding that is taken, and to messages."""
 
 from __future__ import annotations
@@ -89,10 +90,10 @@ def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> 
     Raises
     ------
     ImageRefused
-        ``bad_encoding`` for what is no such PNG; ``wrong_size``; ``bad_layout`` for one that
-        cannot be decoded.
+        ``bad_encoding`` for another format; ``wrong_size``; ``bad_layout`` for a PNG that cannot
+        be decoded.
     """
-    # A JPEG would decode too, but what it does to a star of two pixels is no measurement.
+    # A JPEG would decode too, but its compression changes stars of two pixels.
     header = png_header(bytes(data[:PNG_HEADER_BYTES]))
     if header is None:
         raise ImageRefused('bad_encoding', 'the compressed image is not a PNG')
@@ -158,7 +159,7 @@ def refused_from_message(
     time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
     return refused_image(
         nearest_stamp_ns(time_ns),
-        min(int(getattr(message, 'width', 0)), MAX_SIDE_PX),  # a compressed image does not say
+        min(int(getattr(message, 'width', 0)), MAX_SIDE_PX),  # not in a compressed image
         min(int(getattr(message, 'height', 0)), MAX_SIDE_PX),
         refused.reason,
         refused.detail,

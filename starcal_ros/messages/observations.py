@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Star observations of an image to a message and back."""
 
 from __future__ import annotations

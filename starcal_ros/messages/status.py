@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The status of an ensemble to a message."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Attitudes, velocities and temperatures of the spacecraft, to messages and back."""
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def temperature_from_message(message: Message) -> tuple[int, float]:
 def temperature_to_message(
     time_ns: int, temperature_degc: float, frame_id: str, make: Make
 ) -> Message:
-    """Return a sensor_msgs/Temperature; its variance is not known, which ROS writes as 0."""
+    """Return a sensor_msgs/Temperature; its variance is 0, which stands for unknown in ROS."""
     return make(
         TEMPERATURE_TYPE,
         header=make_header(time_ns, frame_id, make),

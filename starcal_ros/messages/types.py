@@ -1,4 +1,5 @@
-"""The types of the messages, and what stands for one that rclpy or rosbags has made."""
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Names of the message types, and a type for messages made by rclpy or rosbags."""
 
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Normal equations of each method, from the matrices of the images (Eqs. 16-19)."""
 
 from __future__ import annotations

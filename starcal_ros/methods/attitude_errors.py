@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Star-tracker errors of the images, and their derivatives."""
 
 from __future__ import annotations

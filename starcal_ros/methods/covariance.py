@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Covariance of the shared parameters: camera, focal terms, alignment and its rate.
 

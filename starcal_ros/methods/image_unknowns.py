@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Rotations and shapes of the images as the stars alone show them."""
 
 from __future__ import annotations

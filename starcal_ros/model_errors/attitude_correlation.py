@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Star-tracker errors that are alike from image to image: how much the mean of the images is worth.
 

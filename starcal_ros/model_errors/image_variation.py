@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 A camera that changes from image to image: its test, and the variances of its shape.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Images of one pointing: the same stars on the same pixels are not new knowledge of each pixel.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 A smooth field over the detector that the lens model lacks: its test, its prior and its modes.
 

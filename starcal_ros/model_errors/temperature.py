@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Temperature dependence of focal length and alignment (beyond the paper; as in NASA's GIANT).
 

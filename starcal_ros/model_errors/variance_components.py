@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Variance components: the sigmas of centroids and star tracker, estimated from the residuals.
 

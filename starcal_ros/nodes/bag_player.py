@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Bag player node: publishes the messages of an MCAP bag unchanged."""
 
 from __future__ import annotations

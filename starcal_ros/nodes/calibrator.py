@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Calibrator node: subscribes to star observations, publishes calibrations."""
 
 from __future__ import annotations
@@ -167,7 +168,7 @@ class Calibrator(StarcalNode):
                 f'refused_{reason}': count
                 for reason, count in {**_NONE_REFUSED, **ensemble.refused}.items()
             },
-            'in_force': 'none' if active is None else active.number,
+            'active': 'none' if active is None else active.number,
             'calibration_age_s': age_s,
             'last_gate': self._last_gate,
             'last_answer': last.message,

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Client of ``starcal demo``: waits for the nodes and their images, then requests a calibration.
 

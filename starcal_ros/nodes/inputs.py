@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Subscriptions, and the publishers that they cannot connect to: reported, or adapted to."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Lifecycle node base class: starts itself, survives callback errors, publishes diagnostics."""
 
 from __future__ import annotations
@@ -332,8 +333,8 @@ class _Interrupt:
     """
     The first SIGINT or SIGTERM raises KeyboardInterrupt in the main thread; later ones do nothing.
 
-    A second one is common: `ros2 launch` sends SIGINT to a node that the terminal, or whoever
-    ended the process group, has sent one already. It must not cut the end of the node short.
+    A second one is common: `ros2 launch` sends SIGINT to a node that has already received one with
+    its process group. It must not interrupt the shutdown of the node.
     """
 
     def __init__(self) -> None:

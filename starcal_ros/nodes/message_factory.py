@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Construction of rclpy messages: the ``make`` argument of the functions in `messages`."""
 
 from __future__ import annotations

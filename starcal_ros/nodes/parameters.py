@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """ROS parameters declared from options dataclasses."""
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class OptionParameters:
 
     def unknown(self) -> list[str]:
         """Names given at start that no option has: ROS itself passes over a misspelt one."""
-        given = getattr(self._node, '_parameter_overrides', {})  # rclpy tells it nowhere else
+        given = getattr(self._node, '_parameter_overrides', {})  # rclpy has no other access to it
         return sorted(name for name in given if name not in self._fields and not is_of_ros(name))
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
@@ -95,7 +96,7 @@ def unread_sections(arguments: Sequence[str], node: str, executable: str) -> lis
     node : str
         Name of the node with its namespace.
     executable : str
-        The name that the node has where nobody gives it another.
+        Name of the node without a remapping.
     """
     own = {executable, node.rpartition('/')[2]}
     warnings = []

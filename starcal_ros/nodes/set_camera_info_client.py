@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Client of the camera driver's set_camera_info service: sends each activated calibration."""
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class CameraDriver:
         """Send the last one again and wait; return True if accepted, and a message."""
         with self._changed:
             if self._camera_info is None:
-                return False, 'no calibration is in force'
+                return False, 'no calibration is active'
             self._begin()
             self._changed.wait_for(
                 lambda: self._closed or not (self._is_due or self._call), 3 * self._timeout_s

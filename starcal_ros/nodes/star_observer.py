@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Star observer node: subscribes to images and attitudes, publishes star observations."""
 
 from __future__ import annotations
@@ -30,11 +31,9 @@ from starcal_ros.messages.telemetry import (
     temperature_from_message,
     velocity_from_message,
 )
-from starcal_ros.nodes.image_queue import ImageQueue, Waiting
 from starcal_ros.nodes.inputs import with_reliability
 from starcal_ros.nodes.lifecycle import Health, OK, run, StarcalNode, WARN
 from starcal_ros.nodes.message_factory import make_message
-from starcal_ros.nodes.sliding_window import Recent
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.node_options import ObserverOptions
@@ -48,6 +47,8 @@ from starcal_ros.records import (
 )
 from starcal_ros.report.annotation import annotate
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
+from starcal_ros.star_observer.image_queue import ImageQueue, Waiting
+from starcal_ros.star_observer.sliding_window import Recent
 
 NAME = 'star_observer'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -135,7 +136,7 @@ class StarObserver(StarcalNode):
         return CompressedImage, self.resolve_topic_name('image') + '/compressed'
 
     def deactivate(self) -> None:
-        """Stop listening; what still waits in the queue is let go."""
+        """Close the inputs and drop the images in the queue."""
         self.inputs.close()
         if self._queue is not None and self._worker is not None:
             if len(self._queue):

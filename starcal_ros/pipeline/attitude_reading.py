@@ -1,8 +1,9 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-The way attitudes are meant that fits images whose true rotation is known.
+Convention of the recorded attitudes, found from images with a measured rotation.
 
-With the rotation of the camera each attitude gives the alignment of the camera.  Read in the right
-order, direction and clock, all give the same one.
+The rotation of the camera and an attitude together give the alignment of the camera.  With the
+right order and direction of the quaternion and the right clock, it is the same for all images.
 """
 
 from __future__ import annotations
@@ -15,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-
-Floats = NDArray[np.float64]
 
 _AGREE_RAD = math.radians(0.5)  # alignments of one reading that agree
 CLOCK_SEARCH_S = 61.0
@@ -56,7 +56,7 @@ class SetUp:
 
 @dataclass(frozen=True)
 class Placed:
-    """An image whose rotation is known: its stamp and ``camera_from_icrf``."""
+    """Stamp of an image and its measured rotation ``camera_from_icrf``."""
 
     time_ns: int
     camera_from_icrf: Rotation
@@ -124,7 +124,7 @@ def _agreeing_best(readings: Sequence[Reading], images: int, setup: SetUp) -> Re
         return None
 
     def rank(item: tuple[int, Reading]) -> tuple[float, ...]:
-        """Agreement first; images of one attitude agree under all: then the prior speaks."""
+        """Agreement, then the prior: images with one attitude agree under all conventions."""
         number, reading = item
         near = setup.star_tracker_from_camera is not None and not is_off(reading, setup)
         return (-reading.agreeing, not near, number)

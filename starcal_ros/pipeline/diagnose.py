@@ -1,9 +1,10 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Why the images of a set match no star: the set-up held against what the images show by themselves.
+Reason why images match no stars: set-up and attitudes compared with the images alone.
 
-Some images are identified without attitude or alignment.  Each gives the true rotation of the
-camera; with the attitude on the wire, read in one of the ways it can be meant, it gives the
-alignment.  The right reading is the one whose alignment is the same for all images.
+Some images are identified without attitude or alignment, which gives the rotation of the camera.
+With the recorded attitude it gives the alignment, under each convention that the attitude may
+follow.  The right convention is the one with the same alignment in all images.
 """
 
 from __future__ import annotations
@@ -13,11 +14,10 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starcal_ros.camera import CameraModel
-from starcal_ros.identification.bright_sources import bright_sources, BrightSources, smear
-from starcal_ros.identification.lost_in_space import find_sky, SkyMatch
+from starcal_ros.lost_in_space.bright_sources import bright_sources, BrightSources, smear
+from starcal_ros.lost_in_space.search import find_sky, SkyMatch
 from starcal_ros.pipeline.attitude_reading import (
     best_reading,
     CLOCK_SEARCH_S,
@@ -32,8 +32,6 @@ from starcal_ros.pipeline.attitude_reading import (
 )
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
-
-Floats = NDArray[np.float64]
 
 CAUSES = (
     'none', 'mirrored', 'rotated', 'attitude_direction', 'quaternion_order', 'prior_alignment',
@@ -61,11 +59,11 @@ class Solved:
 @dataclass(frozen=True)
 class Diagnosis:
     """
-    Why images match nothing.
+    Reason why images match no stars, with its evidence and its remedy.
 
-    ``cause`` is one of `CAUSES`; ``found`` the value that was found, None where there is none;
-    ``sentence`` says both in words, ``evidence`` how it is known, ``mend`` are lines of the
-    parameter file.
+    ``cause`` is one of `CAUSES`; ``found`` the value that was found, None if there is none;
+    ``sentence`` states both, ``evidence`` lists the findings behind them, ``mend`` the lines of
+    the parameter file that correct it.
     """
 
     cause: str
@@ -106,7 +104,7 @@ def solve_images(
         sources = bright_sources(image.pixels)
         sky = None
         same_size = (width, height) == (camera.width, camera.height)
-        if same_size and smear(sources) is None:  # what streaks show is no pattern of points
+        if same_size and smear(sources) is None:  # streaks have no centroids for a pattern
             sky = find_sky(sources.xy_px, prior, catalog, try_mirrored=True)
         if isinstance(sky, SkyMatch):
             found.append(sky)
@@ -335,7 +333,7 @@ def _camera_off(
 
 
 def _brightness_slope(image: Solved, catalog: StarCatalog) -> float | None:
-    """Power of the catalog's brightness that unsaturated stars have; None: too few to tell."""
+    """Exponent of measured over catalog brightness of unsaturated stars; None with too few."""
     place = {tuple(xy): k for k, xy in enumerate(image.sources.xy_px.tolist())}
     rows = np.array([place.get(tuple(xy), -1) for xy in image.sky.xy_px.tolist()], np.int64)
     peak = image.sources.peak_dn

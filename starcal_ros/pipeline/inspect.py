@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Contents of a bag and the images that a calibration would refuse, by the calibration's code."""
 
 from __future__ import annotations
@@ -6,6 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
+import math
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +95,7 @@ class Inspection:
     refused : tuple of Refused
         Refused images, most frequent reason first.
     longest_attitude_gap_s : float
-        Between the attitude samples around an accepted image; -1 if no image is accepted.
+        Between the attitude samples around an accepted image; NaN if none records it.
     measured : bool
         Whether the stars were measured; if not, an image may still be refused for its stars.
     stars_per_image : tuple of int
@@ -172,7 +174,9 @@ def inspect(
         chosen=chosen,
         images=len(seen),
         refused=_refused(seen),
-        longest_attitude_gap_s=max((o.attitude_gap_s for o in used), default=-1.0),
+        longest_attitude_gap_s=max(
+            (o.attitude_gap_s for o in used if math.isfinite(o.attitude_gap_s)), default=math.nan
+        ),
         measured=measured,
         stars_per_image=tuple(len(o) for o in used) if measured else (),
         refused_stars=dict(sum((Counter(o.refused_stars) for o in used), Counter())),
@@ -185,6 +189,8 @@ def inspect(
 def content(inspection: Inspection) -> dict[str, object]:
     """JSON object of an inspection; a number that is not finite is null."""
     made = dataclasses.asdict(inspection)
+    if not math.isfinite(inspection.longest_attitude_gap_s):
+        made['longest_attitude_gap_s'] = None
     if inspection.status is not None:
         status = made['status']
         status['coverage'] = inspection.status.coverage.tolist()

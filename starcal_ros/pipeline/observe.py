@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Star observations of an image sequence; each image is predicted from those before it."""
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
-from starcal_ros.image.centroiding import saturation_level
 from starcal_ros.image.frame_checks import Fingerprint, fingerprint, sample_rows, screen
 from starcal_ros.image.hot_pixels import HotPixels, learn_hot_pixels
+from starcal_ros.image.image_model import saturation_level
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
@@ -54,7 +55,7 @@ class Track:
     """
     State of an image sequence.
 
-    ``geometry`` is what an image is searched with; ``latest_ns`` stamps the last one used.
+    ``geometry`` predicts the stars of a searched image; ``latest_ns`` stamps the last one used.
     ``tracked_camera`` measures the next image without a search; None before the first image.
     ``behind`` images in a row, the last of them at ``behind_ns``, were stamped before the last one
     used.  ``seen`` is the last frame of all, used or not,
@@ -174,12 +175,12 @@ def _after_order(track: Track, time_ns: int) -> Track:
 
 
 def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservations, Track]:
-    """The stars where the images before say, or else where a search of the image finds them."""
+    """Stars of an image by the track of the images before it, or else by a search."""
     time_ns = exposure.image.time_ns
     if track.tracked_camera is not None:
         try:
             observations, tracked_camera = track_stars(
-                exposure, track.tracked_camera, setup.catalog, setup.centroid, setup.identification
+                exposure, track.tracked_camera, setup.star_search
             )
             # Accurate to a few pixels with the camera of the search, whose window is wider.
             geometry = dataclasses.replace(
@@ -192,9 +193,7 @@ def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservat
             return observations, _with_hot_pixels(after, exposure, observations, setup)
         except ImageRefused:
             pass  # the full search finds the reason of refusal
-    observations, instrument = observe_stars(
-        exposure, track.geometry, setup.catalog, setup.centroid, setup.identification
-    )
+    observations, instrument = observe_stars(exposure, track.geometry, setup.star_search)
     if observations.refusal:
         return observations, track
     geometry = realigned(track.geometry, observations)
@@ -246,7 +245,7 @@ def _held_attitude(
 def _with_hot_pixels(
     track: Track, exposure: Exposure, observations: StarObservations, setup: Setup
 ) -> Track:
-    """The track with the hot pixels that an image shows, which is aligned as the track says."""
+    """Track with the hot pixels of an image that has the alignment of the track."""
     icrf_from_star_tracker = Rotation.from_quat(exposure.icrf_from_star_tracker_xyzw)
     hot = learn_hot_pixels(
         track.hot or setup.hot,

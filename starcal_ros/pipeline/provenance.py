@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Provenance of a calibration: software, options, catalog, prior and observations."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Setup of a calibration: options of every stage, with the files they name loaded."""
 
 from __future__ import annotations
@@ -18,8 +19,7 @@ from starcal_ros.camera import convert
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions, check_options
 from starcal_ros.gate.options import check_gate_options, GateOptions
-from starcal_ros.identification.star_finder import IdentificationOptions
-from starcal_ros.image.centroiding import CentroidOptions
+from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
 from starcal_ros.image.file_header import most_bytes, png_header, tiff_header
 from starcal_ros.image.frame_checks import ScreeningOptions
 from starcal_ros.image.hot_pixels import (
@@ -28,6 +28,7 @@ from starcal_ros.image.hot_pixels import (
     HotPixels,
     NO_HOT_PIXELS,
 )
+from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.lens import COEFFICIENTS
 from starcal_ros.options import (
     from_mapping,
@@ -100,6 +101,11 @@ class Setup:
     dark: Pixels | None
     dark_pedestal_dn: int = 0
     hot: HotPixels = NO_HOT_PIXELS
+
+    @property
+    def star_search(self) -> StarSearch:
+        """Catalog and options with which the stars of an image are found."""
+        return StarSearch(self.catalog, self.centroid, self.identification)
 
     def options(self) -> dict[str, OptionValue]:
         """Every option of every stage, by name."""

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """From an ensemble to a calibration: collect, solve, and judge by the gate."""
 
 from __future__ import annotations

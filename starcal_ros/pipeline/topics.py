@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Topics of a bag that a calibration reads."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The ROS camera YAML, ``camera_info.yaml``, both ways, and the URLs that name one."""
 
 from __future__ import annotations

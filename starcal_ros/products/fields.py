@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Values of YAML files, each checked for its kind; an error names file and key.
 
@@ -25,7 +26,7 @@ class CheckedValues:
         self._content = content
 
     def get(self, dotted_key: str, kind: Callable[[object], T]) -> T:
-        """Value at a key, as `kind` returns it; `kind` raises ValueError('what is expected')."""
+        """Value at a key, converted by `kind`, which raises ValueError with the expected form."""
         value: object = self._content
         for key in dotted_key.split('.'):
             if not isinstance(value, dict) or key not in value:

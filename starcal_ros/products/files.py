@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Files of products: text of limited size, and contents written whole or not at all."""
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The folder of products of a calibration, as the tool and the calibrator write it.
 
-``products/files.py`` and the modules of the single files describe what is in it.
+``products/files.py`` and the modules of the single files describe the content.
 """
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Records to JSON and back, from the types of their fields and the marks on them (`arrays`).
 
@@ -39,7 +40,7 @@ def from_json(record_type: type[T], content: object, key: str = '') -> T:
     Raises
     ------
     ValueError
-        In one line that names the key and what was expected.
+        In one line with the key and the expected form.
     """
     values = fields_from_json(record_type, content, key)
     try:
@@ -58,7 +59,7 @@ def fields_from_json(
     Raises
     ------
     ValueError
-        In one line that names the key and what was expected.
+        In one line with the key and the expected form.
     """
     if not isinstance(content, dict):
         raise _error(key, content, 'an object')

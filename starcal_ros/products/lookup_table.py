@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Files of lines of sight by pixel: CSV, NumPy archive and FITS table."""
 
 from __future__ import annotations

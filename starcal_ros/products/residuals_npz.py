@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Read and write the residuals of a calibration, ``residuals.npz``."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Annotated pictures of images with their predicted, measured and refused stars."""
 
 from __future__ import annotations

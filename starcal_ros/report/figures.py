@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Figures of the report as inline SVG, and the figure of a comparison as a file.
 

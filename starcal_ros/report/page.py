@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Report of a calibration as one self-contained HTML file, ``report.html``.
 

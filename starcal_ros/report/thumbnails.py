@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Thumbnails of a few images and refused stars, stored beside the products for the report."""
 
 from __future__ import annotations

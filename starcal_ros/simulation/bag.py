@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Simulated scenarios as bags, with files of their truth and of the prior of a calibration."""
 
 from __future__ import annotations

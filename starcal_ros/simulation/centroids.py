@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Simulated centroids without pixels, and Cramer-Rao bounds.
 
@@ -111,7 +112,7 @@ def centroid_bound(
     pixels_px: Floats, flux_electrons: Floats, detector: Detector, shape: tuple[int, int]
 ) -> tuple[Floats, Floats]:
     """
-    Cramer-Rao bound of the centroids of single stars, flux free and background known.
+    Cramer-Rao bound of the centroids of single stars, flux free and background fixed.
 
     Saturated pixels and pixels outside the detector carry no information.
 
@@ -157,7 +158,7 @@ def cramer_rao_covariance(
     """
     Cramer-Rao bound of the covariance of the named camera parameters.
 
-    Without names: of `bound_names`.
+    Without ``names``, those of `bound_names`.
 
     Every star above the signal-to-noise limit counts, with its own bound; the attitude of each
     image is free and the parameters not named are held.

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Apparent directions of catalog stars: motion, parallax, light bending, aberration, refraction.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Star-tracker attitude samples: validation, storage in time order, interpolation."""
 
 from __future__ import annotations

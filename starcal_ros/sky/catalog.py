@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Star catalog: positions at one epoch, proper motions and magnitudes; reading and cone search.
 

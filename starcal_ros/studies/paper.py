@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Reproduction of the paper: its night is simulated, and calibrated from a few of the images.
 

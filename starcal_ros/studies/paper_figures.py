@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Figures 5 to 8 of the paper, from a simulated night."""
 
 from __future__ import annotations

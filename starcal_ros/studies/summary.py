@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Summaries of Monte Carlo studies: errors relative to bounds and to reported covariances."""
 
 from __future__ import annotations

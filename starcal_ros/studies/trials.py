@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Trials of a Monte Carlo study: star fields with known truth, and errors of their calibration.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Process that calls a function for the numbers that its parent sends: ``python -m`` of this module.
 

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Parallel trials, in processes of this machine or on a running Dask cluster."""
 
 from __future__ import annotations

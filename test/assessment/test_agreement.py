@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Differences of calibrations: p-values of pure noise, and changes midway."""
 
 from __future__ import annotations

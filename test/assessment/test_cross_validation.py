@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Residuals of images that the others predict, against calibrations without those images."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """What a calibration leaves over: truth from the simulation, the file both ways, bad files."""
 
 from __future__ import annotations

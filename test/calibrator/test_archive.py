@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The state folder: what was kept comes back, through kills, damage and a full disk."""
 
 from __future__ import annotations

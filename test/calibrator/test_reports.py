@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Reports in a state folder: made by a process of its own, in nobody's way."""
 
 from __future__ import annotations

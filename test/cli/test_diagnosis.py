@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`starcal diagnose`, and what `calibrate` and `inspect` say where no image matches."""
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def test_calibrate_and_inspect_end_with_it(
     params = ['--params', str(wrong_params)]
     assert main.main(['calibrate', str(TINY), *params, '-o', str(tmp_path / 'out')]) == 2
     error = capsys.readouterr().err
-    assert 'Set attitude_direction: st_to_inertial. (starcal diagnose says more)' in error
+    assert 'Set attitude_direction: st_to_inertial. (details: starcal diagnose)' in error
     assert error.count('\n') == 1
     assert main.main(['inspect', str(TINY), *params, '--json']) == 3
     problems = json.loads(capsys.readouterr().out)['problems']

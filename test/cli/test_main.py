@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The tool from a user's side: exit status, one line for bad input, never a traceback."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The calibration against SciPy: the same cost from the formulas, minimised densely.
 

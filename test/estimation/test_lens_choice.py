@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The lens model that is chosen: the smallest that describes the stars."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The gate: every limit trips by itself, with its own reason, and nothing that is NaN passes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Acquisition without pixels: predictions match their sources, or the image is refused."""
 
 from __future__ import annotations

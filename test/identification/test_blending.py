@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Pull of neighbours on centroids, against fits to mean images."""
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ import pytest
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.identification.blending import neighbour_pulls, unlisted_pull_px
 from starcal_ros.identification.star_finder import IdentificationOptions
-from starcal_ros.image.centroiding import ImageModel
 from starcal_ros.image.detection import Background
+from starcal_ros.image.image_model import ImageModel
+from starcal_ros.image.pixel_noise import PixelNoise
 from starcal_ros.image.psf_field import uniform_width
-from starcal_ros.image.psf_fit import fit_psf, PixelNoise, stamp_radius_px
+from starcal_ros.image.psf_fit import fit_psf, stamp_radius_px
 from starcal_ros.simulation.images import star_electrons
 
 OPTIONS = IdentificationOptions()

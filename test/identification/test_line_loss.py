@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Frames with lost lines are refused; frames with a wrong prior are not."""
 
 from __future__ import annotations
@@ -11,9 +12,13 @@ import pytest
 
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.line_loss import find_line_loss
-from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
+from starcal_ros.identification.star_finder import (
+    Exposure,
+    IdentificationOptions,
+    observe_stars,
+    StarSearch,
+)
 from starcal_ros.identification.tracking import start_tracking, track_stars
-from starcal_ros.image.centroiding import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.simulation.images import render
 from starcal_ros.simulation.scenario import scenario, scene
@@ -21,7 +26,7 @@ from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 SCENARIO = scenario('tiny', seed=31)
 PRIOR = SCENARIO.prior
-OPTIONS, CENTROIDS = IdentificationOptions(), CentroidOptions()
+OPTIONS = IdentificationOptions()
 SHAPE = (PRIOR.camera.height, PRIOR.camera.width)
 
 
@@ -59,14 +64,14 @@ priors = pytest.mark.parametrize('prior', [PRIOR, WRONG], ids=['prior', 'wrong p
 @priors
 @pytest.mark.parametrize('index', range(10))
 def test_an_intact_frame_is_accepted(prior: CameraGeometry, index: int) -> None:
-    assert not observe_stars(exposure(index), prior, catalog(), CENTROIDS, OPTIONS)[0].refusal
+    assert not observe_stars(exposure(index), prior, StarSearch(catalog()))[0].refusal
 
 
 @priors
 @pytest.mark.parametrize(('row', 'lost'), [(100, 2), (100, 3), (256, 1), (256, 3), (380, 2)])
 def test_lost_rows_are_found(prior: CameraGeometry, row: int, lost: int) -> None:
     with pytest.raises(ImageRefused, match='incomplete: stars below row') as refused:
-        observe_stars(with_lost_rows(0, row, lost), prior, catalog(), CENTROIDS, OPTIONS)
+        observe_stars(with_lost_rows(0, row, lost), prior, StarSearch(catalog()))
     row_found, down_px = re.findall(r'row (\d+) .*, ([-+.\d]+)\)', refused.value.detail)[0]
     assert abs(int(row_found) - row) < 40  # a tenth of the rows holds a dozen stars
     assert float(down_px) == pytest.approx(-lost, abs=0.3)  # the smooth part takes some
@@ -74,12 +79,12 @@ def test_lost_rows_are_found(prior: CameraGeometry, row: int, lost: int) -> None
 
 @pytest.mark.parametrize('lost', [1, 2, 3])
 def test_lost_rows_are_found_while_tracking(lost: int) -> None:
-    observations, instrument = observe_stars(exposure(0), PRIOR, catalog(), CENTROIDS, OPTIONS)
+    observations, instrument = observe_stars(exposure(0), PRIOR, StarSearch(catalog()))
     known = start_tracking(PRIOR, observations, instrument)
     assert known is not None
-    assert not track_stars(exposure(1), known, catalog(), CENTROIDS, OPTIONS)[0].refusal
+    assert not track_stars(exposure(1), known, StarSearch(catalog()))[0].refusal
     with pytest.raises(ImageRefused, match='incomplete'):
-        track_stars(with_lost_rows(1, 256, lost), known, catalog(), CENTROIDS, OPTIONS)
+        track_stars(with_lost_rows(1, 256, lost), known, StarSearch(catalog()))
 
 
 def places(n: int, seed: int = 1) -> np.ndarray:

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Brightnesses expose false matches and do not affect true ones."""
 
 from __future__ import annotations
@@ -9,11 +10,18 @@ import pytest
 
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.photometric_check import refuse_by_brightness
-from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
-from starcal_ros.image.centroiding import CentroidOptions, Centroids, ImageModel
+from starcal_ros.identification.star_finder import (
+    Exposure,
+    IdentificationOptions,
+    observe_stars,
+    StarSearch,
+)
+from starcal_ros.image.centroiding import Centroids
 from starcal_ros.image.detection import Background
+from starcal_ros.image.image_model import ImageModel
+from starcal_ros.image.pixel_noise import PixelNoise
 from starcal_ros.image.psf_field import uniform_width
-from starcal_ros.image.psf_fit import PixelNoise
+from starcal_ros.records import StarRefusal
 from starcal_ros.simulation import images as simulated_images
 from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.sky.catalog import load_catalog
@@ -44,7 +52,7 @@ def sky(count: int, scatter_mag: float, seed: int = 1) -> tuple[np.ndarray, np.n
         covariance_px2=np.tile([0.01, 0.0, 0.01], (count, 1)),
         flux_dn=flux,
         snr=many + 50.0,
-        refusal=np.full(count, '', 'U16'),
+        refusal=np.full(count, StarRefusal.NONE, np.uint8),
         fit=None,
         psf_sigma_px=many + 0.95,
         noise_dn=many + 2.0,
@@ -62,7 +70,7 @@ def judged(magnitude: np.ndarray, place: np.ndarray, centroids: Centroids) -> np
 def test_a_true_sky_is_left_alone(count: int, scatter_mag: float) -> None:
     # 5 sigma of what is measured: of four stars the scatter itself is known to a half.
     for seed in range(20):
-        assert (judged(*sky(count, scatter_mag, seed)) == '').all()
+        assert (judged(*sky(count, scatter_mag, seed)) == StarRefusal.NONE).all()
 
 
 def test_brightnesses_drawn_anew_are_no_match() -> None:
@@ -75,7 +83,9 @@ def test_brightnesses_drawn_anew_are_no_match() -> None:
 
 
 def test_a_camera_far_from_the_band_of_the_catalog_need_not_be_asked() -> None:
-    assert (refuse_by_brightness(*sky(60, 1.5), MODEL, MIN_SNR, 100.0, SHAPE) == '').all()
+    assert (
+        refuse_by_brightness(*sky(60, 1.5), MODEL, MIN_SNR, 100.0, SHAPE) == StarRefusal.NONE
+    ).all()
 
 
 def test_one_star_unlike_the_others_is_ambiguous() -> None:
@@ -83,7 +93,7 @@ def test_one_star_unlike_the_others_is_ambiguous() -> None:
     flux = centroids.flux_dn.copy()
     flux[[3, 40]] *= [10.0, 0.1]
     refusal = judged(magnitude, place, dataclasses.replace(centroids, flux_dn=flux))
-    assert np.flatnonzero(refusal == 'ambiguous').tolist() == [3, 40]
+    assert np.flatnonzero(refusal == StarRefusal.AMBIGUOUS).tolist() == [3, 40]
 
 
 def test_a_bright_star_that_is_gone_is_not_called_faint() -> None:
@@ -92,27 +102,27 @@ def test_a_bright_star_that_is_gone_is_not_called_faint() -> None:
     gone, limit = np.argsort(magnitude)[[0, 1]], 12.5
     magnitude[7] = limit
     refusal = centroids.refusal.copy()
-    refusal[[*gone, 7]] = 'faint'
+    refusal[[*gone, 7]] = StarRefusal.FAINT
     found = judged(magnitude, place, dataclasses.replace(centroids, refusal=refusal))
-    assert (found[gone] == 'not_detected').all() and found[7] == 'faint'
+    assert (found[gone] == StarRefusal.NOT_DETECTED).all() and found[7] == StarRefusal.FAINT
 
 
 def test_the_few_of_a_part_that_misses_its_stars_are_ambiguous() -> None:
     magnitude, place, centroids = sky(300, 0.2)
     corner = (place > [427, 342]).all(axis=1)
     met = np.flatnonzero(corner)[:3]
-    refusal = np.where(corner, 'not_detected', centroids.refusal)
-    refusal[met] = ''
+    refusal = np.where(corner, StarRefusal.NOT_DETECTED, centroids.refusal)
+    refusal[met] = StarRefusal.NONE
     assert corner.sum() > 20
     found = judged(magnitude, place, dataclasses.replace(centroids, refusal=refusal))
-    assert (found[met] == 'ambiguous').all()
-    assert (found[~corner] == '').all()
+    assert (found[met] == StarRefusal.AMBIGUOUS).all()
+    assert (found[~corner] == StarRefusal.NONE).all()
 
 
 def test_stars_missing_everywhere_are_no_sign_of_a_wrong_match() -> None:
     magnitude, place, centroids = sky(300, 0.2)
     rng = np.random.default_rng(3)
-    refusal = np.where(rng.uniform(size=300) < 0.6, 'not_detected', centroids.refusal)
+    refusal = np.where(rng.uniform(size=300) < 0.6, StarRefusal.NOT_DETECTED, centroids.refusal)
     found = judged(magnitude, place, dataclasses.replace(centroids, refusal=refusal))
     np.testing.assert_array_equal(found, refusal)
 
@@ -136,11 +146,10 @@ def test_no_star_of_a_field_that_is_there_in_part_is_wrong(attitude_xyzw: list[f
     scenario = dataclasses.replace(base, pointing=field, image_count=12)
     drawn = synthetic.scene(scenario, 11)
     image = simulated_images.render(scenario, drawn, 11)
-    options = IdentificationOptions()
     shot = Exposure(image, np.array(attitude_xyzw), 0.0)
-    catalog = load_catalog(None, options.magnitude_limit)
+    catalog = load_catalog(None, IdentificationOptions().magnitude_limit)
     try:
-        found, _ = observe_stars(shot, scenario.prior, catalog, CentroidOptions(), options)
+        found, _ = observe_stars(shot, scenario.prior, StarSearch(catalog))
     except ImageRefused:
         return
     place = dict(zip(drawn.catalog_id.tolist(), drawn.pixel_px, strict=True))

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The polynomial correction: recovery of a known one, and number of terms by star count."""
 
 from __future__ import annotations

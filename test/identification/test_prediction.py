@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Predicted stars against the simulated scene."""
 
 from __future__ import annotations

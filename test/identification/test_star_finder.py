@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Identification of simulated images: right stars or none, with wrong alignment or attitude."""
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from starcal_ros.identification.star_finder import (
     IdentificationOptions,
     observe_stars,
     realigned,
+    StarSearch,
 )
-from starcal_ros.image.centroiding import CentroidOptions
+from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.records import (
     CameraGeometry,
     Image,
@@ -53,7 +55,7 @@ def observed(
     options: IdentificationOptions = OPTIONS,
 ) -> StarObservations:
     exposure = Exposure(image, icrf_from_star_tracker_xyzw, 0.5)
-    return observe_stars(exposure, geometry, catalog(), CENTROIDS, options)[0]
+    return observe_stars(exposure, geometry, StarSearch(catalog(), CENTROIDS, options))[0]
 
 
 def turned(geometry: CameraGeometry, turn: Rotation) -> CameraGeometry:
@@ -214,7 +216,7 @@ def test_one_spoilt_star_is_left_out_by_its_reason(
 
     def seen(pixels: np.ndarray) -> StarObservations:
         exposure = Exposure(Image(image.time_ns, pixels), one.icrf_from_star_tracker_xyzw, 0.5)
-        return observe_stars(exposure, PRIOR, catalog(), options, OPTIONS)[0]
+        return observe_stars(exposure, PRIOR, StarSearch(catalog(), options))[0]
 
     before = seen(image.pixels)
     apart = np.linalg.norm(one.pixel_px[:, None] - one.pixel_px[None], axis=-1)
@@ -304,9 +306,9 @@ def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure() -> None:
     marked = dataclasses.replace(catalog(), close_pair=np.ones(len(catalog()), bool))
     before = observed(image, one.icrf_from_star_tracker_xyzw)
     exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
-    after, _ = observe_stars(exposure, PRIOR, marked, CENTROIDS, OPTIONS)
+    after, _ = observe_stars(exposure, PRIOR, StarSearch(marked, CENTROIDS))
     strict = dataclasses.replace(OPTIONS, max_blend_sigma=0.1)
-    fewer, _ = observe_stars(exposure, PRIOR, marked, CENTROIDS, strict)
+    fewer, _ = observe_stars(exposure, PRIOR, StarSearch(marked, CENTROIDS, strict))
     assert fewer.refused_stars['blend'] > after.refused_stars['blend']
     both, i, j = np.intersect1d(before.catalog_id, after.catalog_id, return_indices=True)
     more_px2 = after.covariance_px2[j] - before.covariance_px2[i]

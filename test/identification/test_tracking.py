@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Tracking: the same stars as a search, or a lost track."""
 
 from __future__ import annotations
@@ -12,9 +13,14 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
+from starcal_ros.identification.star_finder import (
+    Exposure,
+    IdentificationOptions,
+    observe_stars,
+    StarSearch,
+)
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
-from starcal_ros.image.centroiding import CentroidOptions
+from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.simulation.images import render
 from starcal_ros.simulation.scenario import scenario, Scene, scene
@@ -50,7 +56,7 @@ def searched(
     index: int, geometry: CameraGeometry = PRIOR
 ) -> tuple[StarObservations, TrackedCamera]:
     observations, instrument = observe_stars(
-        exposure(index), geometry, catalog(), CENTROIDS, OPTIONS
+        exposure(index), geometry, StarSearch(catalog(), CENTROIDS, OPTIONS)
     )
     known = start_tracking(geometry, observations, instrument)
     assert known is not None
@@ -58,7 +64,7 @@ def searched(
 
 
 def followed(image: Exposure, before: TrackedCamera) -> tuple[StarObservations, TrackedCamera]:
-    return track_stars(image, before, catalog(), CENTROIDS, OPTIONS)
+    return track_stars(image, before, StarSearch(catalog(), CENTROIDS, OPTIONS))
 
 
 @pytest.mark.parametrize('index', [1, 2, 5])
@@ -103,7 +109,9 @@ def test_a_width_that_changes_over_the_field_is_learnt() -> None:
         one = scene(soft, index)
         image = Exposure(render(soft, one, index), one.icrf_from_star_tracker_xyzw, 0.5)
         if known is None:
-            observations, instrument = observe_stars(image, PRIOR, catalog(), CENTROIDS, OPTIONS)
+            observations, instrument = observe_stars(
+                image, PRIOR, StarSearch(catalog(), CENTROIDS, OPTIONS)
+            )
             known = start_tracking(PRIOR, observations, instrument)
             assert known is not None
         else:

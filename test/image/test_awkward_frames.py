@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Frames that are no textbook: cut off at black, masked borders, undersampled stars, slopes."""
 
 from __future__ import annotations
@@ -7,7 +8,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from starcal_ros.image.centroiding import CentroidOptions, Centroids, measure_stars, model_image
+from starcal_ros.image.centroiding import Centroids, measure_stars
 from starcal_ros.image.detection import (
     Background,
     detect,
@@ -15,7 +16,9 @@ from starcal_ros.image.detection import (
     sample_background,
     sample_mesh,
 )
-from starcal_ros.image.psf_fit import NoiseSums
+from starcal_ros.image.image_model import CentroidOptions, model_image
+from starcal_ros.image.pixel_noise import NoiseSums
+from starcal_ros.records import StarRefusal
 from starcal_ros.simulation.images import expose, star_electrons
 from starcal_ros.simulation.scenario import Detector
 
@@ -86,7 +89,7 @@ def test_undersampled_stars_are_found_and_their_covariance_holds() -> None:
         nearest = np.linalg.norm(xy[:, None] - sources.xy_px[None], axis=2).min(axis=1)
         found_share.append((nearest < 1.0).mean())
         found = measured(pixels, xy)
-        good = found.refusal == ''
+        good = found.refusal == StarRefusal.NONE
         assert good.mean() > 0.95
         error = found.xy_px - xy
         squared.append(error[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
@@ -110,7 +113,7 @@ def test_a_steady_slope_is_subtracted(slope: float) -> None:
         sky = detector.background_electrons + slope * noise_e * np.arange(SHAPE[1])
         pixels = expose(mean + sky, detector, np.random.default_rng([seed, 1]))
         found = measured(pixels, xy)
-        good = found.refusal == ''
+        good = found.refusal == StarRefusal.NONE
         assert good.mean() > 0.8
         error = (found.xy_px - xy)[good] / np.sqrt(found.covariance_px2[good][:, [0, 2]])
         normalised.append(error**2)

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Hot pixels are learnt from the images, known from a dark frame, and never measured as stars."""
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from starcal_ros.image.hot_pixels import (
     learn_hot_pixels,
     refuse_on_hot_pixels,
 )
+from starcal_ros.records import StarRefusal
 from starcal_ros.simulation import images as simulated_images
 from starcal_ros.simulation import scenario
 
@@ -112,27 +114,33 @@ def test_hot_pixels_of_a_dark_frame() -> None:
 @pytest.mark.parametrize(
     ('offset', 'before', 'after'),
     [
-        ((0.0, 0.0), '', 'hot_pixel'),  # in the core
-        ((1.0, -1.0), '', 'hot_pixel'),
-        ((2.0, 0.0), '', ''),  # beside it: the fit does without the pixel
-        ((3.0, 3.0), 'elongated', 'hot_pixel'),  # in the window, and the cause
-        ((6.0, 0.0), 'elongated', 'elongated'),  # elsewhere
-        ((0.0, 0.0), 'faint', 'faint'),  # it would be left out anyway
+        ((0.0, 0.0), StarRefusal.NONE, StarRefusal.HOT_PIXEL),  # in the core
+        ((1.0, -1.0), StarRefusal.NONE, StarRefusal.HOT_PIXEL),
+        # Beside it: the fit does without the pixel.
+        ((2.0, 0.0), StarRefusal.NONE, StarRefusal.NONE),
+        ((3.0, 3.0), StarRefusal.ELONGATED, StarRefusal.HOT_PIXEL),  # in the window, and the cause
+        ((6.0, 0.0), StarRefusal.ELONGATED, StarRefusal.ELONGATED),  # elsewhere
+        ((0.0, 0.0), StarRefusal.FAINT, StarRefusal.FAINT),  # it would be left out anyway
     ],
 )
-def test_stars_on_hot_pixels(offset: tuple[float, float], before: str, after: str) -> None:
+def test_stars_on_hot_pixels(
+    offset: tuple[float, float], before: StarRefusal, after: StarRefusal
+) -> None:
     """A PSF of one pixel, fitted in a window of four pixels about the star."""
     hot = np.array([50 * WIDTH + 70])
     star = np.array([[70.0, 50.0]]) + offset
-    found = refuse_on_hot_pixels(star, np.array([before], 'U16'), hot, WIDTH, 4, 1.0)
+    found = refuse_on_hot_pixels(star, np.array([before], np.uint8), hot, WIDTH, 4, 1.0)
     assert found.tolist() == [after]
 
 
 def test_a_wide_star_on_a_hot_pixel_does_without_it() -> None:
     """No pixel of a PSF of two pixels holds a twentieth of its light."""
     hot, star = np.array([50 * WIDTH + 70]), np.array([[70.0, 50.0]])
-    for refusal, expected in (('', ''), ('elongated', 'hot_pixel')):
-        found = refuse_on_hot_pixels(star, np.array([refusal], 'U16'), hot, WIDTH, 7, 2.0)
+    for refusal, expected in (
+        (StarRefusal.NONE, StarRefusal.NONE),
+        (StarRefusal.ELONGATED, StarRefusal.HOT_PIXEL),
+    ):
+        found = refuse_on_hot_pixels(star, np.array([refusal], np.uint8), hot, WIDTH, 7, 2.0)
         assert found.tolist() == [expected]
 
 

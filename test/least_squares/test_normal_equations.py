@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Normal matrices and cost against the dense Jacobian."""
 
 from __future__ import annotations

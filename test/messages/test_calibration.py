@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages of a calibration: round trips, what is refused, and what other readers see."""
 
 from __future__ import annotations

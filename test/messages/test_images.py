@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages of images: every layout, what is refused, and round trips."""
 
 from __future__ import annotations

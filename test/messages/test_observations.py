@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages of star observations: round trips, and what is refused."""
 
 from __future__ import annotations

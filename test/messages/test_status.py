@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages of the status of an ensemble."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Star-tracker errors in time: white ones cost nothing, wandering ones widen the sigma."""
 
 from __future__ import annotations

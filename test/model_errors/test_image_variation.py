@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Images that differ in shape: found, estimated, and carried in the covariance."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The field beside the lens model: its basis, its test, its estimate with a true sigma."""
 
 from __future__ import annotations

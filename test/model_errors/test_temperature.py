@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Temperature terms: recovery, errors within sigma, omission of insignificant terms."""
 
 from __future__ import annotations

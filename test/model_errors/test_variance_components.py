@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Variances estimated from residuals whose variance is known."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Diagnostics of the running nodes: keys and levels as in docs/icd.md."""
 
 from __future__ import annotations
@@ -114,7 +115,7 @@ def test_calibrator_diagnostics_match_the_document(
     assert level == b'\x01' and text.startswith('set aside as damaged: ')
     assert '00000001_calibration_00000001.json' in text
     assert values['state_damaged_files'] == '1'
-    assert (values['in_force'], values['calibration_age_s']) == ('none', 'none')
+    assert (values['active'], values['calibration_age_s']) == ('none', 'none')
     assert (values['last_gate'], values['camera_driver']) == ('none', 'none')
 
     status = client.latched(EnsembleStatus, 'ensemble_status')
@@ -123,7 +124,7 @@ def test_calibrator_diagnostics_match_the_document(
         observations.publish(observations_to_message(image, 'camera', make_message))
     client.until(lambda: status and status[-1].images == len(tiny_observations.images))
     assert client.call(Trigger, '/calibrator/calibrate').success
-    client.until(lambda: newest(diagnostics, 'calibrator')[2].get('in_force') != 'none')
+    client.until(lambda: newest(diagnostics, 'calibrator')[2].get('active') != 'none')
     _, _, values = newest(diagnostics, 'calibrator')
     assert set(values) == documented('calibrator')
     assert values['last_gate'] == 'accepted'

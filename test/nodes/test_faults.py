@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Faults on real processes: the short form of the bench, and replay with /clock."""
 
 from __future__ import annotations

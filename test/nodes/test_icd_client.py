@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Test of an integrator: only generated interfaces and the names of the ICD.
 

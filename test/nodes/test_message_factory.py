@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Conversions of every record to a generated message, its serialised bytes, and back."""
 
 from __future__ import annotations

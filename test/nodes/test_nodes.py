@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The nodes as processes: services, refusals, faults, parameters, signals."""
 
 from __future__ import annotations
@@ -530,7 +531,7 @@ class Interrupt:
         if name == 'starcal_ros.pipeline.setup':
             signal.raise_signal(signal.SIGINT)
 sys.meta_path.insert(0, Interrupt())
-from starcal_ros.nodes import entry_points
+from starcal_ros import entry_points
 entry_points.{}()
 """
 

@@ -1,9 +1,13 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """set_camera_info client: each active calibration is sent; failures of a real service."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+import subprocess
+import sys
 from typing import Any, TYPE_CHECKING
 
 import pytest
@@ -17,6 +21,7 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 from sensor_msgs.srv import SetCameraInfo
 from std_srvs.srv import Trigger
@@ -28,6 +33,43 @@ from starcal_ros.nodes.message_factory import make_message
 pytestmark = pytest.mark.nodes
 
 SERVICE = '/opnav/set_camera_info'
+
+# Keeps the camera that it receives in a file, as drivers do; SIGTERM ends it.
+DRIVER = """
+from pathlib import Path
+import sys
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.serialization import serialize_message
+from sensor_msgs.srv import SetCameraInfo
+
+def keep(request, response):
+    part = Path(sys.argv[1] + '.part')
+    part.write_bytes(serialize_message(request.camera_info))
+    part.rename(sys.argv[1])
+    response.success = True
+    return response
+
+rclpy.init()
+node = rclpy.create_node('camera_driver')
+node.create_service(SetCameraInfo, sys.argv[2], keep)
+try:
+    rclpy.spin(node)
+except ExternalShutdownException:
+    pass
+node.destroy_node()
+"""
+
+
+@contextmanager
+def driver(kept: Path) -> Iterator[None]:
+    """A camera driver in a process of its own."""
+    process = subprocess.Popen([sys.executable, '-c', DRIVER, str(kept), SERVICE])
+    try:
+        yield
+    finally:
+        process.terminate()
+        assert process.wait(60) == 0
 
 
 def fill(client: Client, ensemble: Ensemble) -> None:
@@ -71,7 +113,7 @@ def test_driver_is_told_and_its_failures_are_seen(
     )
     diagnostics = client.collect(DiagnosticArray, '/diagnostics')
     nothing = client.call(Trigger, '/calibrator/send_camera_info')
-    assert (nothing.success, nothing.message) == (False, 'no calibration is in force')
+    assert (nothing.success, nothing.message) == (False, 'no calibration is active')
     fill(client, tiny_observations)
     assert client.call(Trigger, '/calibrator/calibrate').success
     client.until(told(diagnostics, 'service not available; will be sent when it is', b'\x01'))
@@ -123,3 +165,31 @@ def test_without_a_driver(client: Client, start_node: StartNode, tiny_bag: Path)
     start_node('calibrator', ros=('--params-file', str(tiny_bag / 'params.yaml')))
     answer = client.call(Trigger, '/calibrator/send_camera_info')
     assert not answer.success and 'set_camera_info_service' in answer.message
+
+
+def test_a_driver_process_that_restarts(
+    client: Client,
+    start_node: StartNode,
+    tiny_bag: Path,
+    tiny_observations: Ensemble,
+    tmp_path: Path,
+) -> None:
+    """A driver in another process receives the calibration that was active before it started."""
+    start_node(
+        'calibrator',
+        ros=(
+            *('--params-file', str(tiny_bag / 'params.yaml')),
+            *('-p', f'set_camera_info_service:={SERVICE}'),
+        ),
+    )
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    fill(client, tiny_observations)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    published = client.latched(CameraInfo, 'camera_info')
+    client.until(lambda: published)
+    for name in ('first', 'second'):
+        kept = tmp_path / name
+        with driver(kept):
+            client.until(kept.exists)
+            client.until(told(diagnostics, 'accepted', b'\x00'))
+        assert deserialize_message(kept.read_bytes(), CameraInfo) == published[-1]

@@ -1,9 +1,11 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """What is said of a bag before it is calibrated, held against what a calibration then does."""
 
 from __future__ import annotations
 
 from collections import Counter
 import json
+import math
 from pathlib import Path
 
 import cv2
@@ -14,6 +16,7 @@ from starcal_ros.bag import reader
 from starcal_ros.bag.typestore import make_message
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.cli import main
+from starcal_ros.cli.arguments import EXIT_REFUSED
 from starcal_ros.messages.fields import make_header
 from starcal_ros.messages.telemetry import attitude_from_message
 from starcal_ros.messages.types import COMPRESSED_TYPE
@@ -98,6 +101,22 @@ def test_verdicts_are_those_of_the_calibration(
     gap = next(r for r in full.refused if r.reason == 'attitude_gap')
     assert gap.first_ns == tiny_images[1].time_ns and 'over 2 s' in gap.detail
     assert full.status is not None and full.status.images == 5
+    assert full.longest_attitude_gap_s == max(o.attitude_gap_s for o in observed if not o.refusal)
+
+
+def test_an_attitude_gap_that_is_not_recorded_is_nan(
+    tmp_path: Path, tiny_images: list[Image], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An image without attitudes on both sides has no gap; JSON, which has no NaN, holds null."""
+    path = tmp_path / 'images.mcap'
+    with BagWriter(path) as writer:
+        writer.write_image(IMAGE, tiny_images[0], 'camera')
+        writer.write_attitude(ATTITUDE, 0, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
+    assert math.isnan(inspect.inspect([path], ASKED).longest_attitude_gap_s)
+    assert main.main(['inspect', str(path), '--json']) == EXIT_REFUSED
+    assert json.loads(capsys.readouterr().out)['longest_attitude_gap_s'] is None
+    assert main.main(['inspect', str(path)]) == EXIT_REFUSED
+    assert 'longest attitude gap' not in capsys.readouterr().out
 
 
 def test_the_topics_are_told(tmp_path: Path, tiny_images: list[Image]) -> None:

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Provenance: from what it says a calibration can be repeated."""
 
 from __future__ import annotations

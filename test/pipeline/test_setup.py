@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The setup: what it holds of the parameters, and what it refuses."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Records to JSON and back by the types of their fields: a new field needs no other edit."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Simulated scenarios and scenes against analytic truth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Apparent directions, refraction and time scales against astropy and the full ERFA chain."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The bundled catalog against the literature and itself; searches against brute force."""
 
 from __future__ import annotations

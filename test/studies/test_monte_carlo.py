@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Monte Carlo studies: the same from any number of workers, and true to what is known."""
 
 from __future__ import annotations

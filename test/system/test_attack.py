@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A short form of `python -m bench attack`: all survived, nothing lost, nothing wrong."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Untrusted text and messages: the short form of the attacks, and what they are made of."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The benches run with small sizes, and the compared solvers find the same minimum."""
 
 from __future__ import annotations
@@ -13,8 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from bench import acquisition
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.star_finder import Exposure, IdentificationOptions, observe_stars
-from starcal_ros.image.centroiding import CentroidOptions
+from starcal_ros.identification.star_finder import (
+    Exposure,
+    observe_stars,
+    StarSearch,
+)
 from starcal_ros.sky.catalog import load_catalog
 
 pytestmark = pytest.mark.slow
@@ -82,7 +86,5 @@ def test_a_match_that_is_right_in_a_part_of_the_image_is_refused() -> None:
         observe_stars(
             shot,
             scenario.prior,
-            load_catalog(None, 9.0),
-            CentroidOptions(),
-            IdentificationOptions(),
+            StarSearch(load_catalog(None, 9.0)),
         )

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The package in a ROS workspace: colcon builds it; messages and a node run from there."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The parameter files: complete, up to date, and read by nodes and tool alike."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Bag to products as a separate process, against the truth."""
 
 from __future__ import annotations

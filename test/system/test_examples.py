@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The scripts and the notebook of examples/, run as their reader would."""
 
 from __future__ import annotations

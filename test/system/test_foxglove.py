@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The Foxglove layout: every panel is placed and shows published fields."""
 
 from __future__ import annotations

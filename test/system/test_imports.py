@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Each module imports alone, and start-up imports stay small; see also `make lint`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`pip install .` without extras, and the packages that the nodes leave out."""
 
 from __future__ import annotations
@@ -5,6 +6,8 @@ from __future__ import annotations
 from importlib import metadata
 import json
 from pathlib import Path
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -100,6 +103,29 @@ def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path
         assert refused.returncode == 2
         assert f"is not installed: pip install 'starcal_ros[{extra}]'" in refused.stderr
         assert refused.stderr.count('\n') == 1
+
+
+@pytest.mark.slow
+def test_pip_lines_of_the_readme(flight_install: Path) -> None:
+    """Pip accepts each line that installs from the clone, with every extra that it names."""
+    lines = re.findall(r'`pip install ([^`]+)`', (ROOT / 'README.md').read_text())
+    assert '.' in lines and "'.[report]'" in lines
+    pip = (sys.executable, '-m', 'pip', 'install', '--dry-run')
+    offline = ('--no-deps', '--no-index', '--no-build-isolation')
+    for line in lines:
+        tried = run(*pip, *offline, *shlex.split(line), cwd=flight_install.parent / 'sources')
+        assert tried.returncode == 0, tried.stderr
+        assert 'does not provide the extra' not in tried.stderr
+
+
+@pytest.mark.slow
+def test_python_lines_of_the_readme(flight_install: Path, tmp_path: Path) -> None:
+    """The calibration in three lines runs without ROS and without extras."""
+    (block,) = re.findall(r'```python\n(.*?)```', (ROOT / 'README.md').read_text(), re.DOTALL)
+    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
+    done = run(flight_install / 'bin/python', '-c', block, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout.startswith('True [')
 
 
 @pytest.mark.slow

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 The launch files, by their syntax tree: launch is not on PyPI, so they cannot be run here.
 
@@ -80,7 +81,7 @@ def test_nodes_are_those_that_are_installed(path: Path) -> None:
         assert set(given) <= NODE_KEYWORDS
         assert constants(given['package']) == ['starcal']
         for executable in constants(given['executable']) or NODES:
-            assert f'{executable} = starcal_ros.nodes.entry_points:{executable}' in installed
+            assert f'{executable} = starcal_ros.entry_points:{executable}' in installed
     assert calls(path, 'Node')
 
 

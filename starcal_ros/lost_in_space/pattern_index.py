@@ -1,10 +1,11 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Patterns of four catalog stars, found again by their shape whatever their scale and rotation.
+Index of patterns of four catalog stars by their shape, which is free of scale and rotation.
 
 The shape of a pattern is that of Lang et al. 2010, AJ 139, 1782, section 2.1: in the tangent plane
 at its middle, the two stars farthest apart, A and B, span a frame with A at 0 and B at 1 + i; the
-places of the other two, C and D, in it are four numbers.  The distance of A and B is a fifth,
-which a camera with a roughly known focal length measures roughly.
+positions of the other two, C and D, in it are four numbers.  The fifth number is the distance of A
+and B, which a camera measures as accurately as its focal length.
 """
 
 from __future__ import annotations
@@ -18,18 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcal_ros.arrays import Floats, Indices
 from starcal_ros.sky.catalog import StarCatalog
-
-Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 _SMALLEST_DEG = 1.6
 _STEP = math.sqrt(2.0)
 _SCALES = 10  # discs of 1.6 to 36 degrees of radius
-_SPACING = 0.7  # of disc centres, in their radius: two thirds of a disc is shared with the next
+_SPACING = 0.7  # of disc centres, in disc radii: adjacent discs share two thirds of their area
 _STARS = (7, 8, 9, 10, 11, 12, 13, 14, 14, 14)  # of a disc: about a million patterns at most
-_DEPTH = 3.0  # stars over the sky, in those that the discs would need if all were equally rich
-# Of A and B, C and D in each order: what a canonical pattern may have been seen as.
+_DEPTH = 3.0  # stars indexed over the number needed for a sky of even density
+# Orders of A, B, C, D in which noise may show a canonical pattern.
 _ORDERS = np.array([[0, 1, 2, 3], [0, 1, 3, 2], [1, 0, 2, 3], [1, 0, 3, 2]])
 _PAIRS = np.array(list(itertools.combinations(range(4), 2)))
 _OTHERS = np.array([[k for k in range(4) if k not in pair] for pair in _PAIRS])
@@ -40,17 +39,17 @@ class PatternIndex:
     """
     Patterns within discs of one size all over the sky.
 
-    ``quads`` (q, 4) rows of the catalog, in the order A, B, C, D; ``tree`` holds their shapes
-    (q, 5), the size weighted as `shapes` is told; ``radius_rad`` of the discs.
+    ``quads`` (q, 4) rows of the catalog in the order A, B, C, D; ``shape`` (q, 5) their shapes
+    (`shapes`); ``radius_rad`` radius of the discs.
     """
 
     radius_rad: float
-    quads: Rows
+    quads: Indices
     shape: NDArray[np.float32]
 
 
 def scales_for(half_diagonal_rad: float) -> list[int]:
-    """Numbers of the scales whose discs are half to a whole field large, the smaller first."""
+    """Numbers of the scales whose discs are half to a whole field wide, smallest first."""
     fitting = [
         k
         for k in range(_SCALES)
@@ -62,9 +61,9 @@ def scales_for(half_diagonal_rad: float) -> list[int]:
 @functools.lru_cache(maxsize=_SCALES)
 def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
     """
-    All patterns of the brightest stars of each disc of a scale; about a second, then kept.
+    Index of the patterns of the brightest stars of each disc of a scale.
 
-    The catalog is sorted by magnitude.
+    It takes about a second and is kept in memory.  The catalog is sorted by magnitude.
     """
     radius_rad = math.radians(_SMALLEST_DEG * _STEP**scale)
     of_disc = _STARS[scale]
@@ -83,18 +82,18 @@ def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
     )
 
 
-def shapes(directions: Floats) -> tuple[Rows, Floats]:
+def shapes(directions: Floats) -> tuple[Indices, Floats]:
     """
     Shapes of patterns of four directions (n, 4, 3).
 
     Returns
     -------
     order : (n, 4)
-        Which of the four are A, B, C and D: A and B so that C and D have a mean place below one
-        half along A to B, C the one nearer to A along it.
+        Indices of A, B, C and D: the mean of C and D along A to B is below one half, and C is
+        nearer to A along it.
     shape : (n, 5)
-        Places of C and D in the frame of A and B, and the natural logarithm of their distance,
-        rad.
+        Positions of C and D in the frame of A and B, and the natural logarithm of the distance of
+        A and B, rad.
     """
     points = _tangent_points(directions)
     length2 = np.abs(points[:, _PAIRS[:, 0]] - points[:, _PAIRS[:, 1]]) ** 2
@@ -113,11 +112,11 @@ def shapes(directions: Floats) -> tuple[Rows, Floats]:
     return order, np.stack([c.real, c.imag, d.real, d.imag, size], axis=-1)
 
 
-def equivalent(order: Rows, shape: Floats) -> tuple[Rows, Floats]:
+def equivalent(order: Indices, shape: Floats) -> tuple[Indices, Floats]:
     """
     Each pattern (n, 4), (n, 5) in its four possible orders: (4 n, 4), (4 n, 5).
 
-    Noise may have put a pattern on the other side of a border between them.
+    Noise may move a pattern across the border between two orders.
     """
     c = shape[:, 0] + 1j * shape[:, 1]
     d = shape[:, 2] + 1j * shape[:, 3]
@@ -129,10 +128,10 @@ def equivalent(order: Rows, shape: Floats) -> tuple[Rows, Floats]:
 
 
 def _tangent_points(directions: Floats) -> NDArray[np.complex128]:
-    """Complex places (n, 4) in the tangent plane at the mean of four directions (n, 4, 3)."""
+    """Complex positions (n, 4) in the tangent plane at the mean of four directions (n, 4, 3)."""
     middle = directions.mean(axis=1)
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    # Any two axes across will do: a shape does not hang on their rotation.
+    # Any two perpendicular axes: a shape does not depend on their rotation.
     least = np.abs(middle).argmin(axis=1)
     x = np.cross(middle, np.eye(3)[least])
     x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -144,7 +143,7 @@ def _tangent_points(directions: Floats) -> NDArray[np.complex128]:
 
 
 def sphere_points(count: int) -> Floats:
-    """Unit vectors (count, 3) spread evenly over the sphere: a Fibonacci lattice."""
+    """Unit vectors (count, 3) at even distances over the sphere: a Fibonacci lattice."""
     k = np.arange(count) + 0.5
     z = 1.0 - 2.0 * k / count
     longitude = k * math.pi * (3.0 - math.sqrt(5.0))
@@ -152,8 +151,8 @@ def sphere_points(count: int) -> Floats:
     return np.stack([r * np.cos(longitude), r * np.sin(longitude), z], axis=-1)
 
 
-def brightest_within(stars: Floats, centres: Floats, radius_rad: float, count: int) -> Rows:
-    """Rows (p, count) of the brightest of stars (n, 3), sorted, about centres (p, 3); -1: none."""
+def brightest_within(stars: Floats, centres: Floats, radius_rad: float, count: int) -> Indices:
+    """Rows (p, count) of the brightest of sorted stars (n, 3) about centres (p, 3); -1: none."""
     tree = cKDTree(stars)
     found = tree.query_ball_point(centres, 2 * math.sin(radius_rad / 2), return_sorted=True)
     rows = np.full((len(centres), count), -1, np.int64)

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Stars identified without attitude: found where they are, refused where they are not."""
 
 from __future__ import annotations
@@ -10,14 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from bench.lost_in_space import camera, Frame, frames
 from starcal_ros.camera import line_of_sight
-from starcal_ros.identification.lost_in_space import (
+from starcal_ros.lost_in_space.pattern_index import equivalent, shapes, sphere_points
+from starcal_ros.lost_in_space.search import (
     find_sky,
     mirror,
     mirrored_camera,
     NotFound,
     SkyMatch,
 )
-from starcal_ros.identification.pattern_index import equivalent, shapes, sphere_points
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 

@@ -1,10 +1,11 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Statistics of the last minute."""
 
 from __future__ import annotations
 
 import pytest
 
-from starcal_ros.nodes.sliding_window import Recent, WINDOW_S
+from starcal_ros.star_observer.sliding_window import Recent, WINDOW_S
 
 
 class Clock:

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Statistics of numbers that arrived in the last minute."""
 
 from __future__ import annotations

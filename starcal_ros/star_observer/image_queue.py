@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Queue of images in order of arrival; each waits for its attitude."""
 
 from __future__ import annotations

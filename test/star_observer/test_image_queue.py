@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The image queue: order, waiting, overrun, close."""
 
 from __future__ import annotations
@@ -5,7 +6,7 @@ from __future__ import annotations
 import threading
 import time
 
-from starcal_ros.nodes.image_queue import ImageQueue, Waiting
+from starcal_ros.star_observer.image_queue import ImageQueue, Waiting
 
 SECOND_NS = 10**9
 

@@ -1,11 +1,12 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-A camera fitted to the stars it may be showing, and the probability that it shows others.
+Fit of a camera and its rotation to candidate stars, and the p-value of the match.
 
-Rotation, focal length, principal point and one term of radial distortion are fitted, each held
-near its prior as far as that is known.  The probability bounds the expected number of false
-matches of a search through all rotations, focal lengths, principal points and distortions:
-positions in that space that differ by the radius of matching, times the probability that so many
-of the brightest predictions meet a source at random places.
+Rotation, focal length, principal point and one term of radial distortion are fitted, each within
+the range of its prior.  The p-value is an upper bound of the expected number of false matches in a
+search through all rotations, focal lengths, principal points and distortions: the number of
+positions in that space that differ by the radius of matching, times the probability that as many
+of the brightest predictions fall near a source by chance.
 """
 
 from __future__ import annotations
@@ -15,27 +16,33 @@ import functools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import betainc
 
+from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera import CameraModel, project, project_jacobians
 from starcal_ros.sky.catalog import StarCatalog
 
-Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
-
-FOCAL_RANGE = 0.25  # of the logarithm of the focal length, to both sides
-CENTRE_RANGE = 0.05  # of the width, to both sides
-DISTORTION_RANGE = 0.03  # of the radius at the corners, to both sides
-_CLOSING_IN = (0.05, 0.04, 0.03, 0.022, 0.015, 0.01, 0.007, 0.005)  # radii, of the half diagonal
+FOCAL_RANGE = 0.25  # half range of the logarithm of the focal length
+CENTRE_RANGE = 0.05  # half range of the principal point, in widths
+DISTORTION_RANGE = 0.03  # half range of the distortion in the corners, over the radius
+_CLOSING_IN = (
+    0.05,
+    0.04,
+    0.03,
+    0.022,
+    0.015,
+    0.01,
+    0.007,
+    0.005,
+)  # radii of matching, in half diagonals
 _CROWDED = 0.15  # largest probability that a source lies by chance within the radius of matching
 _MOST_STARS = 200
-_JUDGED_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5)  # radii of matching that a fit is judged at
-_DEPTHS = (6, 8, 11, 15, 20, 30, 50, 80, 130, 200)  # numbers of brightest predictions, likewise
-_LOOKS = 10.0  # independent ones among those radii and numbers, which share most of their stars
-_ALONE = 10.0  # in radii of matching: sources this near to a star crowd it
+_JUDGED_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5)  # radii of matching for the p-value
+_DEPTHS = (6, 8, 11, 15, 20, 30, 50, 80, 130, 200)  # numbers of brightest predictions for it
+_LOOKS = 10.0  # independent tests among them: most of their stars are common
+_ALONE = 10.0  # radius about a star for the local density of sources, in radii of matching
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,7 @@ class SourceImage:
 
     @functools.cached_property
     def half_diagonal_px(self) -> float:
-        """Half of the diagonal."""
+        """Half of the diagonal, px."""
         return 0.5 * math.hypot(self.camera.width, self.camera.height)
 
     @functools.cached_property
@@ -57,29 +64,31 @@ class SourceImage:
 
     @functools.cached_property
     def area_px2(self) -> float:
-        """Pixels of the image."""
+        """Area of the image, px^2."""
         return float(self.camera.width * self.camera.height)
 
     @functools.cached_property
     def tree(self) -> cKDTree:
-        """The sources by place."""
+        """Search tree of the sources."""
         return cKDTree(self.xy_px)
 
 
 @dataclass(frozen=True)
 class SkyFit:
-    """A camera, its rotation, and the brightest stars (n,) it may show, rows of the catalog."""
+    """Camera, rotation, and catalog rows (n,) of the brightest stars that may be in the image."""
 
     camera_from_icrf: Rotation
     camera: CameraModel
-    stars: Rows
+    stars: Indices
 
 
-def refined(image: SourceImage, catalog: StarCatalog, start: SkyFit, pairs: Rows) -> SkyFit | None:
+def refined(
+    image: SourceImage, catalog: StarCatalog, start: SkyFit, pairs: Indices
+) -> SkyFit | None:
     """
-    The fit that a start leads to as the radius of matching closes in; None: it loses the stars.
+    Fit from a start with decreasing radius of matching; None if it loses the stars.
 
-    ``pairs`` (k, 2), rows of the catalog and of the sources, are those that gave the start.
+    ``pairs`` (k, 2), rows of the catalog and of the sources, belong to the start.
     """
     fit, prior = start, image.camera
     half_px = image.half_diagonal_px
@@ -109,15 +118,15 @@ def match(
     radius_px: float,
     most_stars: int,
     most_sources: int,
-) -> Rows:
-    """Pairs (k, 2) of catalog row and source, each the other's nearest within a radius."""
+) -> Indices:
+    """Pairs (k, 2) of catalog row and source that are mutually nearest within a radius."""
     stars, xy_px = predicted(catalog, fit, most_stars)
     rank, source, _ = _mutual(image, xy_px, radius_px, most_sources)
     return np.stack([stars[rank], source], axis=-1)
 
 
-def predicted(catalog: StarCatalog, fit: SkyFit, most: int) -> tuple[Rows, Floats]:
-    """The brightest stars (n,) in the image, rows of the catalog, and their pixels (n, 2)."""
+def predicted(catalog: StarCatalog, fit: SkyFit, most: int) -> tuple[Indices, Floats]:
+    """Catalog rows (n,) of the brightest stars in the image, and their pixels (n, 2)."""
     camera = fit.camera
     directions = fit.camera_from_icrf.apply(catalog.direction_icrs[fit.stars])
     xy = project(camera, directions)
@@ -131,8 +140,8 @@ def predicted(catalog: StarCatalog, fit: SkyFit, most: int) -> tuple[Rows, Float
 
 def _mutual(
     image: SourceImage, xy_px: Floats, radius_px: float, most_sources: int
-) -> tuple[Rows, Rows, Floats]:
-    """Rows of predictions (n, 2) and of sources that are each other's nearest, their distance."""
+) -> tuple[Indices, Indices, Floats]:
+    """Rows of the mutually nearest predictions (n, 2) and sources, and their distances, px."""
     none = np.empty(0, np.int64)
     seen = image.xy_px[:most_sources]
     if len(xy_px) == 0 or len(seen) == 0:
@@ -146,15 +155,15 @@ def _mutual(
 
 
 def _step(
-    image: SourceImage, catalog: StarCatalog, fit: SkyFit, pairs: Rows, scale_px: float
+    image: SourceImage, catalog: StarCatalog, fit: SkyFit, pairs: Indices, scale_px: float
 ) -> SkyFit:
-    """One robust Gauss-Newton step; ``scale_px`` is how well the pairs are believed to fit."""
+    """One robust Gauss-Newton step; ``scale_px`` is the expected residual of a pair."""
     camera, prior, half_px = fit.camera, image.camera, image.half_diagonal_px
     directions = fit.camera_from_icrf.apply(catalog.direction_icrs[pairs[:, 0]])
     xy, J_camera, J_rotation = project_jacobians(camera, directions)
     residual = image.xy_px[pairs[:, 1]] - xy
     fx, fy, cx, cy = camera.parameters[[0, 2, 3, 4]]
-    # k1 by the displacement in the corner, as a part of the radius there.
+    # k1 as displacement in the corner over the radius there.
     k1_per_part = (fx / half_px) ** 2
     J = np.concatenate(
         [
@@ -196,7 +205,7 @@ def _step(
 
 
 def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tuple[float, float]:
-    """Decadic logarithm of the expected number of false matches this good; the radius, px."""
+    """Decadic logarithm of the expected number of false matches this good, and its radius, px."""
     _, xy_px = predicted(catalog, fit, _MOST_STARS)
     best, best_radius_px = 0.0, _JUDGED_PX[-1]
     depths = [n for n in _DEPTHS if n < len(xy_px)] + [len(xy_px)]
@@ -221,7 +230,7 @@ def _chance_of_one(image: SourceImage, xy_px: Floats, radius_px: float, sources:
     """
     Probability that a source lies within a radius of a star by chance.
 
-    Mean over the stars; where sources crowd about one, as in glare, it is theirs.
+    Mean over the stars; a star among many sources, as in glare, has their local density.
     """
     everywhere = min(1.0, sources * math.pi * radius_px**2 / image.area_px2)
     near = image.tree.query_ball_point(xy_px, _ALONE * radius_px, return_length=True)
@@ -235,8 +244,8 @@ def _log10_positions(image: SourceImage, radius_px: float) -> float:
     tilts_and_roll = 8 * math.pi**2 * f_px**2 * half_px / radius_px**3
     focal = 2 * FOCAL_RANGE * half_px / radius_px
     distortion = 2 * DISTORTION_RANGE * half_px / radius_px
-    # A shift of the centre is a rotation but for the second order of the projection and what the
-    # distortion adds.
+    # A shift of the principal point equals a rotation to first order; the rest is the second
+    # order of the projection and of the distortion.
     shape = (half_px / f_px) ** 2 + 3 * DISTORTION_RANGE
     centre = 2 * CENTRE_RANGE * image.camera.width * shape / radius_px
     return math.log10(

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
 Entry points of the console scripts, with the default action for SIGINT during imports.
 

@@ -1,4 +1,5 @@
-"""The brightest star-like sources of an image by all of their light, as a first guess at stars."""
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Brightest star-like sources of an image by their total light, saturated ones included."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Pixels
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.image.detection import (
     Background,
     detect,
@@ -18,21 +19,19 @@ from starcal_ros.image.detection import (
     stamps_at_edges,
 )
 
-Floats = NDArray[np.float64]
-
 _DETECTION_SIGMA = 5.0
-_STAMP_PX = 7  # half a window: a saturated star of 10 px fits in
-_APART_PX = 10.0  # of two sources nearer than this the fainter is taken for a part of the other
-_MEASURED = 400  # brightest by their peak
+_STAMP_PX = 7  # half width of a window; it holds a saturated star of 10 px
+_APART_PX = 10.0  # the fainter of two sources nearer than this counts as a part of the other
+_MEASURED = 400  # sources measured, brightest by their peak
 _KEPT = 200
-_SMEARED = 2.0  # length by width from which a source is a streak
-_STREAKS = 8  # fewest sources that tell
+_SMEARED = 2.0  # length over width from which a source is a streak
+_STREAKS = 8  # fewest sources for a result
 
 
 @dataclass(frozen=True)
 class BrightSources:
     """
-    Sources, brightest first.
+    Sources of an image, brightest first.
 
     ``xy_px`` (n, 2) centroids; ``flux_dn`` (n,); ``peak_dn`` (n,) brightest pixel, background
     included; ``long_px``, ``wide_px`` (n,): 1-sigma extents along the longest axis and across;
@@ -51,10 +50,10 @@ class BrightSources:
 
 def bright_sources(pixels: Pixels) -> BrightSources:
     """
-    Sources of an image by the light of a window of 15 x 15 pixels, brightest first.
+    Sources of an image, ranked by the light in windows of 15 x 15 pixels, brightest first.
 
-    Saturated stars keep their rank, and their several maxima are one source.  A centroid is good
-    to some tenths of a pixel.
+    Saturated stars keep their rank, and several maxima of one star are one source.  A centroid is
+    good to a few tenths of a pixel.
     """
     background = measure_background(pixels)
     found = detect(pixels, background, _DETECTION_SIGMA)
@@ -68,7 +67,7 @@ def bright_sources(pixels: Pixels) -> BrightSources:
     light = stamps - level[:, None, None]
     light[outside | (light < 3.0 * noise[:, None, None])] = 0.0
     reach = np.arange(-_STAMP_PX, _STAMP_PX + 1)
-    # Two rounds: the second about the first centroid, a neighbour at the rim weighs less.
+    # Two rounds: the second is centred on the first centroid, which reduces neighbours at the rim.
     offset = np.zeros((len(centre), 2))
     for radius_px in (4.0, 5.0):
         u, v = (
@@ -99,25 +98,24 @@ def bright_sources(pixels: Pixels) -> BrightSources:
 
 def smear(sources: BrightSources) -> tuple[float, float] | None:
     """
-    Length of the streaks that stars have become, px, and their direction, rad; None: points.
+    Length, px, and direction, rad, of smeared stars; None if the stars are points.
 
-    Streaks of a slew point one way; those of a tracker that rolls do not, and are not told from
-    galaxies here.
+    Only streaks with a common direction count, as in a slew; streaks of a roll are not detected.
     """
     bright = sources.long_px[:40] > 0
     ratio = sources.long_px[:40][bright] / np.maximum(sources.wide_px[:40][bright], 0.3)
     if len(ratio) < _STREAKS or np.median(ratio) < _SMEARED:
         return None
-    double = np.exp(2j * sources.along_rad[:40][bright]).mean()  # an axis has no head
+    double = np.exp(2j * sources.along_rad[:40][bright]).mean()  # an axis has two directions
     if abs(double) < 0.5:
         return None
-    # The standard deviation of an even line is its length by the square root of twelve.
+    # The standard deviation of a uniform line is its length over the square root of twelve.
     length_px = math.sqrt(12.0) * float(np.median(sources.long_px[:40][bright]))
     return length_px, 0.5 * float(np.angle(double))
 
 
 def _extents(light: Floats, reach: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
-    """Longest and shortest 1-sigma extent (n,) of windows, and the direction of the longest."""
+    """Longest and shortest 1-sigma extent (n,) in windows, and the direction of the longest."""
     flux = np.maximum(light.sum(axis=(1, 2)), 1e-9)
     u = (light.sum(axis=1) * reach).sum(axis=1) / flux
     v = (light.sum(axis=2) * reach).sum(axis=1) / flux
@@ -133,7 +131,7 @@ def _extents(light: Floats, reach: NDArray[np.int64]) -> tuple[Floats, Floats, F
 
 
 def _apart(xy_px: Floats) -> NDArray[np.int64]:
-    """Rows, brightest first, of those of points (n, 2) that no brighter one is near."""
+    """Rows of the points (n, 2), brightest first, without a brighter one nearby."""
     kept = np.ones(len(xy_px), bool)
     if len(xy_px):
         for first, second in cKDTree(xy_px).query_pairs(_APART_PX, output_type='ndarray'):

@@ -1,10 +1,11 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Which star is which in one image, and where it looks, without attitude or alignment.
+Identification of the stars of one image without attitude or alignment.
 
-Patterns of four of the brightest sources are sought among those of the catalog (`pattern_index`).
-Each that fits gives a rotation and a focal length; the bright stars that it predicts are held
-against the sources.  The best of them are refined, and the first is accepted that chance does not
-explain (`sky_fit`).
+Patterns of four of the brightest sources are looked up among those of the catalog
+(`pattern_index`).  Each match gives a rotation and a focal length, and the bright stars predicted
+with them are compared with the sources.  The best candidates are refined; the first one with a
+significant p-value is accepted (`sky_fit`).
 """
 
 from __future__ import annotations
@@ -16,19 +17,19 @@ import itertools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.identification.pattern_index import (
+from starcal_ros.lost_in_space.pattern_index import (
     equivalent,
     pattern_index,
     scales_for,
     shapes,
     sphere_points,
 )
-from starcal_ros.identification.sky_fit import (
+from starcal_ros.lost_in_space.sky_fit import (
     FOCAL_RANGE,
     log10_p_value,
     match,
@@ -39,38 +40,35 @@ from starcal_ros.identification.sky_fit import (
 )
 from starcal_ros.sky.catalog import StarCatalog
 
-Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
-
 MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of false matches
 _ROUNDS = (12, 18, 24)  # brightest sources of which patterns are formed, round by round
-_REFINED = 16  # best candidates of a lookup that are refined
-_CANDIDATES = 20_000  # of a lookup that are tested, drawn at random from more
-_TESTED = 16  # brightest predictions that a candidate is tested with
+_REFINED = 16  # number of best candidates of a lookup that are refined
+_CANDIDATES = 20_000  # tested candidates of a lookup, drawn at random from more
+_TESTED = 16  # brightest predictions used to test a candidate
 _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
-_NEAR, _FAR = 0.006, 0.02  # 1-sigma of a candidate's predictions, of the half diagonal
-_SHOWN = 0.6  # share of the bright stars that a right candidate is expected to show
-_LEAST_GAIN = 0.8  # of what the four stars of a pattern have by themselves
+_NEAR, _FAR = 0.006, 0.02  # 1-sigma of the predictions of a candidate, in half diagonals
+_SHOWN = 0.6  # expected share of the bright stars that a true candidate shows
+_LEAST_GAIN = 0.8  # of the gain of the four stars of a pattern alone
 
 
 @dataclass(frozen=True)
 class SkyMatch:
     """
-    The stars of an image, identified.
+    Identified stars of an image.
 
     Attributes
     ----------
     camera_from_icrf : Rotation
-        Of catalog places (ICRS, epoch of the catalog) to camera axes; aberration is not applied.
+        From catalog directions (ICRS, epoch of the catalog) to camera axes; no aberration applied.
     camera : CameraModel
-        The prior with focal length, principal point and ``k1`` as these stars have it.
+        The prior with focal length, principal point and ``k1`` fitted to these stars.
     catalog_index : (n,)
         Rows of the catalog.
     xy_px : (n, 2)
-        Sources that are those stars, as given.
+        Pixels of those stars, as given.
     mirrored : bool
-        The image is a mirror image; rotation and camera are of the image mirrored left to right.
+        The image is a mirror image; rotation and camera are for the image mirrored left to right.
     log10_p_value : float
         Decadic logarithm of the expected number of false matches this good.
     residual_px : float
@@ -79,7 +77,7 @@ class SkyMatch:
 
     camera_from_icrf: Rotation
     camera: CameraModel
-    catalog_index: Rows
+    catalog_index: Indices
     xy_px: Floats
     mirrored: bool
     log10_p_value: float
@@ -88,7 +86,7 @@ class SkyMatch:
 
 @dataclass(frozen=True)
 class NotFound:
-    """Why the stars were not identified, in words, and the least p-value of what was tried."""
+    """Why the stars were not identified, and the log10 p-value of the best fit."""
 
     reason: str
     log10_p_value: float = 0.0
@@ -97,13 +95,13 @@ class NotFound:
 @dataclass(frozen=True)
 class _Candidates:
     """
-    Patterns of the image that fit ones of the catalog, n of them.
+    Patterns of the image that match patterns of the catalog.
 
-    ``stars`` and ``sources`` (n, 4); ``growth`` (n,): focal length by that of the search.
+    ``stars`` and ``sources`` (n, 4); ``growth`` (n,): focal length over that of the search.
     """
 
-    stars: Rows
-    sources: Rows
+    stars: Indices
+    sources: Indices
     growth: Floats
 
 
@@ -115,11 +113,11 @@ def find_sky(
     max_log10_p_value: float = MAX_LOG10_P_VALUE,
 ) -> SkyMatch | NotFound:
     """
-    The stars that sources (n, 2), brightest first, are.
+    Identified stars among sources (n, 2), brightest first, or why there are none.
 
     ``camera`` is the prior: focal length within 25 %, principal point within 5 % of the width,
     distortion within 3 % of the radius.  The catalog is sorted by magnitude.  With
-    ``try_mirrored`` the image is tried as a mirror image as well.
+    ``try_mirrored`` the mirror image is searched too.
     """
     if len(xy_px) < 5:
         return NotFound(f'{len(xy_px)} star-like sources, at least 5 are needed')
@@ -149,13 +147,13 @@ def mirror(xy_px: Floats, width: int) -> Floats:
 
 
 def mirrored_camera(camera: CameraModel) -> CameraModel:
-    """The camera that shows the mirrored sky in an image mirrored left to right."""
+    """Camera of the image mirrored left to right."""
     skew, cx, p2 = (float(camera.parameters[k]) for k in (1, 3, 9))
     return camera.replace(cx=camera.width - 1 - cx, skew=-skew, p2=-p2)
 
 
 def _focal_scales(half_diagonal_rad: float) -> tuple[float, ...]:
-    """Focal lengths to try, by the prior: in a narrow field a shape does not hang on it."""
+    """Focal lengths to try, over the prior; in a narrow field shapes do not depend on it."""
     if half_diagonal_rad < math.radians(12.0):
         return (1.0,)
     if half_diagonal_rad < math.radians(24.0):
@@ -164,14 +162,14 @@ def _focal_scales(half_diagonal_rad: float) -> tuple[float, ...]:
 
 
 def _tolerances(half_diagonal_rad: float) -> tuple[float, float]:
-    """Largest errors of a place in the shape of a pattern, and of the logarithm of its size."""
+    """Largest error of the shape of a pattern, and of the logarithm of its size."""
     size = {1: FOCAL_RANGE + 0.05, 3: 0.16, 5: 0.13}[len(_focal_scales(half_diagonal_rad))]
     return 0.012 + 0.04 * half_diagonal_rad, size
 
 
 @functools.lru_cache(maxsize=8)
 def _shape_tree(catalog: StarCatalog, scale: int, size_weight: float) -> cKDTree:
-    """The shapes of an index by place, the size weighted."""
+    """Search tree of the shapes of an index, the size weighted."""
     shape = pattern_index(catalog, scale).shape.astype(np.float64)
     shape[:, 4] *= size_weight
     return cKDTree(shape, balanced_tree=False, compact_nodes=False)
@@ -185,7 +183,7 @@ def _fits(
     before: int,
     sources: int,
 ) -> Iterator[SkyFit]:
-    """Refined fits of the patterns of the brightest sources, the most promising first."""
+    """Refined fits from patterns of the brightest sources, most likely first."""
     fx, fy = focal_scale * image.camera.parameters[[0, 2]]
     camera = image.camera.replace(fx=float(fx), fy=float(fy))
     directions = line_of_sight(camera, image.xy_px)
@@ -212,11 +210,11 @@ def _fits(
 def _look_up(
     image: SourceImage, catalog: StarCatalog, scale: int, directions: Floats, before: int
 ) -> _Candidates:
-    """Patterns of directions (n, 3) alike to ones of the catalog, with one from ``before`` on."""
+    """Matches of patterns of directions (n, 3) with at least one from row ``before`` on."""
     index = pattern_index(catalog, scale)
     usable = np.flatnonzero(np.isfinite(directions[:, 0]))
     every = list(itertools.combinations(usable.tolist(), 4))
-    chosen: Rows = np.array(every, np.int64).reshape(-1, 4)
+    chosen: Indices = np.array(every, np.int64).reshape(-1, 4)
     chosen = chosen[chosen[:, 3] >= before]
     place_tolerance, size_tolerance = _tolerances(image.half_diagonal_rad)
     order, shape = shapes(directions[chosen])
@@ -237,7 +235,7 @@ def _look_up(
 
 
 def _rotations(catalog: StarCatalog, candidates: _Candidates, plane: Floats) -> Floats:
-    """Rotations (n, 3, 3) from the catalog to the camera of candidates: A to A, B towards B."""
+    """Rotations (n, 3, 3) of candidates from the catalog to the camera."""
     seen = np.empty((len(candidates.growth), 4, 3))
     seen[..., :2] = plane[candidates.sources] / candidates.growth[:, None, None]
     seen[..., 2] = 1.0
@@ -247,10 +245,10 @@ def _rotations(catalog: StarCatalog, candidates: _Candidates, plane: Floats) -> 
 
 
 def _triads(directions: Floats) -> Floats:
-    """Three axes (n, 3, 3), rows, of four directions (n, 4, 3): their middle, and A towards B."""
+    """Axes (n, 3, 3), in rows, of four directions (n, 4, 3): their middle, and A towards B."""
     middle = directions.sum(axis=1)
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    # C and D take part, their lever being their distance from the line of A and B.
+    # C and D enter through the middle.
     towards = directions[:, 1] - directions[:, 0]
     side = np.cross(middle, towards)
     side /= np.linalg.norm(side, axis=1, keepdims=True)
@@ -265,9 +263,9 @@ def _gains(
     rotation: Floats,
 ) -> tuple[Floats, float]:
     """
-    Natural logarithm (n,) of how much likelier the sources are with a candidate than by chance.
+    Log-likelihood ratio (n,) of the sources with a candidate to that by chance.
 
-    With it the part of that which the four stars of a pattern have by themselves.
+    Also the part of it that the four stars of a pattern alone give.
     """
     half = image.half_diagonal_px / float(image.camera.parameters[0])
     finite = plane[np.isfinite(plane[:, 0])]
@@ -284,13 +282,13 @@ def _gains(
         inside = ahead & ((at >= 0) & (at < gain_map.shape[::-1])).all(axis=2)
         inside &= np.cumsum(inside, axis=1) <= _TESTED
         value = gain_map[np.where(inside, at[..., 1], 0), np.where(inside, at[..., 0], 0)]
-        # An image of few stars shows the brightest alone: the depth that speaks most for it.
+        # An image of few stars shows only the brightest: take the best depth.
         gains[part] = np.cumsum(value * inside, axis=1).max(axis=1)
     return gains, 4.0 * float(gain_map.max())
 
 
 def _gain_map(plane: Floats, half: float) -> tuple[Floats, Floats, float]:
-    """Logarithm of the likelihood ratio of a star predicted in each cell of the image plane."""
+    """Log-likelihood ratio of a star predicted in each cell of the image plane."""
     low, high = plane.min(axis=0), plane.max(axis=0)
     cell = float((high - low).max()) / _MAP_SIDE
     shape = np.ceil((high - low) / cell).astype(np.int64) + 1
@@ -307,15 +305,15 @@ def _gain_map(plane: Floats, half: float) -> tuple[Floats, Floats, float]:
 
 @functools.lru_cache(maxsize=8)
 def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTree]:
-    """Points all over the sky, and the stars that are among the brightest of discs of a radius."""
+    """Search trees of points all over the sky and of the stars that discs of a radius need."""
     radius_rad = math.radians(radius_deg)
     points = sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
     enough = int(9 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
     return cKDTree(points), cKDTree(catalog.direction_icrs[:enough])
 
 
-def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: int) -> Rows:
-    """Rows (n, count) of the brightest stars about axes (n, 3), within a radius or more; or -1."""
+def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: int) -> Indices:
+    """Rows (n, count) of the brightest stars within about a radius of axes (n, 3); -1 if fewer."""
     points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
     point, place = np.unique(points.query(axes)[1], return_inverse=True)
     widened = 2 * math.sin(min(1.25 * radius_rad, math.pi) / 2)
@@ -327,8 +325,8 @@ def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: 
     return np.asarray(rows[place.ravel()])
 
 
-def _stars_about(image: SourceImage, catalog: StarCatalog, axis: Floats) -> Rows:
-    """Rows of the stars that a camera may show with this axis, three for each source or more."""
+def _stars_about(image: SourceImage, catalog: StarCatalog, axis: Floats) -> Indices:
+    """Rows of the stars that may be in the image with this axis, at least three per source."""
     radius_rad = 1.25 * image.half_diagonal_rad * (1 + FOCAL_RANGE)
     near = np.flatnonzero(catalog.direction_icrs @ axis > math.cos(min(radius_rad, 1.4)))
     area = 1.0 / (1.0 - math.cos(min(radius_rad, 1.4))) * (1.0 - math.cos(image.half_diagonal_rad))
@@ -343,8 +341,8 @@ def _result(
     log10_p: float,
     mirrored: bool,
 ) -> SkyMatch:
-    """The fit with every source that it explains."""
-    # Fainter stars than there are sources for would only lie beside false ones.
+    """Result of a fit with all sources that match it."""
+    # Stars fainter than the sources would match only false ones.
     deepest = 2 * len(image.xy_px)
     pairs = match(image, catalog, fit, max(radius_px, 1.5), deepest, 10_000)
     xy_px = image.xy_px[pairs[:, 1]]

@@ -1,0 +1,70 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+The frozen records that pass between the stages: images -> observations -> calibration.
+
+Arrays in records are never changed after construction.  The types of the fields, with their marks
+(`arrays`), are the one description of a record: ``products/json_codec.py`` and
+``messages/codec.py`` write and read JSON and messages from them.
+"""
+
+from starcal_ros.records.calibration import (
+    ALIGNMENT_NAMES,
+    Calibration,
+    calibration_parameter_names,
+    CameraGeometry,
+    check_calibration,
+    Correlation,
+    DetectorMaps,
+    DetectorStep,
+    GateCheck,
+    HalvesComparison,
+    HeldTerm,
+    ModelChecks,
+    ResidualBin,
+    ResidualField,
+    TemperatureTerms,
+    TermRemoval,
+)
+from starcal_ros.records.observations import (
+    AttitudeSample,
+    counted_refusal,
+    Ensemble,
+    EnsembleStatus,
+    Image,
+    IMAGE_REFUSALS,
+    refused_image,
+    STAR_COLUMNS,
+    STAR_REFUSALS,
+    StarObservations,
+    StarRefusal,
+)
+
+__all__ = [
+    'ALIGNMENT_NAMES',
+    'IMAGE_REFUSALS',
+    'STAR_COLUMNS',
+    'STAR_REFUSALS',
+    'AttitudeSample',
+    'Calibration',
+    'CameraGeometry',
+    'Correlation',
+    'DetectorMaps',
+    'DetectorStep',
+    'Ensemble',
+    'EnsembleStatus',
+    'GateCheck',
+    'HalvesComparison',
+    'HeldTerm',
+    'Image',
+    'ModelChecks',
+    'ResidualBin',
+    'ResidualField',
+    'StarObservations',
+    'StarRefusal',
+    'TemperatureTerms',
+    'TermRemoval',
+    'calibration_parameter_names',
+    'check_calibration',
+    'counted_refusal',
+    'refused_image',
+]

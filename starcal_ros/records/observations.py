@@ -1,0 +1,299 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Records of images and of the stars measured in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import dataclasses
+from dataclasses import dataclass
+from enum import IntEnum
+import math
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.arrays import Count, Finite, Floats, Pixels, Shape
+
+IMAGE_REFUSALS: Mapping[str, str] = {
+    'bad_encoding': 'the pixel encoding is not one of mono8, mono16, 8UC1, 16UC1',
+    'bad_layout': 'size, row step and data of the image message do not fit each other',
+    'wrong_size': 'the image is not of the size of the prior camera',
+    'bad_attitude': 'the attitude about the image is not finite or not of unit length',
+    'frozen_attitude': 'the star tracker repeats an attitude of before, but the stars have moved',
+    'no_attitude': 'no attitude sample on both sides of the image',
+    'attitude_gap': 'the attitude samples about the image are too far apart',
+    'out_of_order': 'the image is stamped before, or at, one already taken',
+    'duplicate': 'the ensemble holds an image of the same stamp (reported by the calibrator)',
+    'overexposed': 'too large a part of the image is saturated',
+    'blank': 'every pixel has the same value',
+    'frozen': 'the pixels are those of an earlier image with another stamp',
+    'incomplete': (
+        'a part of the image is constant, repeats itself, is shifted or is of an earlier image'
+    ),
+    'glare': 'the background bends too much over most of the image to be subtracted',
+    'no_stars': 'too few star-like sources in the image',
+    'no_match': 'no rotation of the predicted stars explains the sources in the image',
+    'too_few_stars': 'fewer stars were measured well than an image needs',
+    'bad_stamp': 'the stamp, with stamp_offset_s, is negative or beyond the range of ROS stamps',
+    'bad_observations': (
+        'the observations hold values that no image or star can have (reported by the calibrator)'
+    ),
+    'overrun': 'images came faster than they could be measured',
+    'internal_error': 'the measurement failed unexpectedly; the log of the node has the cause',
+    'other': 'refused by the sender for a reason that this version does not have',
+}
+"""Why an image can be refused: stable name -> meaning."""
+
+
+def counted_refusal(refusal: str) -> str:
+    """
+    Name under which a refused image is counted.
+
+    Unknown ones are one name: the counts are in every status and in a file, and must not grow with
+    the texts of a sender.
+    """
+    return refusal if refusal in IMAGE_REFUSALS else 'other'
+
+
+class StarRefusal(IntEnum):
+    """
+    Why a single predicted star is left out; the codes of ``uint8`` arrays.
+
+    Messages and files hold the `label`, because codes of another version may differ.
+    """
+
+    meaning: str
+
+    def __new__(cls, code: int, meaning: str = '') -> StarRefusal:
+        """Return a member with its meaning."""
+        member = int.__new__(cls, code)
+        member._value_ = code
+        member.meaning = meaning
+        return member
+
+    NONE = 0, 'the star is used'
+    AMBIGUOUS = 1, 'off the place or the brightness that the other stars give it'
+    BLEND = 2, 'another catalog star or source is in the measuring window'
+    BORDER = 3, 'the core of the star, or its window by moments, leaves the image'
+    ELONGATED = 4, 'not the shape of a star: smear, cosmic ray, hot pixel or galaxy'
+    FAINT = 5, 'signal-to-noise below the limit'
+    HOT_PIXEL = 6, 'the light of the star falls on a hot pixel'
+    NOT_DETECTED = 7, 'bright enough to be seen, but no source stands there'
+    SATURATED = 8, 'a pixel of the star is saturated'
+    TOO_FEW_PIXELS = 9, 'too few pixels stand above the noise'
+
+    @property
+    def label(self) -> str:
+        """Name in messages and files."""
+        return self.name.lower()
+
+
+STAR_REFUSALS: Mapping[str, str] = {
+    refusal.label: refusal.meaning for refusal in StarRefusal if refusal is not StarRefusal.NONE
+}
+"""Why a single predicted star can be left out: stable name -> meaning."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """
+    One image as its camera gave it.
+
+    ``time_ns`` is the middle of the exposure; ``pixels`` is (height, width) uint8 or uint16 in
+    native byte order.
+    """
+
+    time_ns: int
+    pixels: Pixels
+
+
+@dataclass(frozen=True)
+class AttitudeSample:
+    """One star-tracker attitude: takes star-tracker coordinates to ICRF; (4,) xyzw, unit."""
+
+    time_ns: int
+    icrf_from_star_tracker_xyzw: Floats
+
+
+@dataclass(frozen=True)
+class StarObservations:
+    """
+    The stars measured and identified in one image, or why it was refused.
+
+    Attributes
+    ----------
+    time_ns : int
+        Middle of the exposure.
+    width, height : int
+        Image size, px.
+    refusal, detail : str
+        Empty, or a name of `IMAGE_REFUSALS` and the finding in words.
+    icrf_from_star_tracker_xyzw : (4,)
+        Star tracker attitude at ``time_ns``; identity where there is none.
+    attitude_gap_s : float
+        Time between the two samples around the image; NaN without a sample on both sides.
+    catalog_id : (n,) int64
+    direction_icrf : (n, 3)
+        Apparent unit directions, ICRF axes.
+    magnitude : (n,) float32
+    measured_px : (n, 2)
+        (u, v) of each star.
+    covariance_px2 : (n, 3)
+        uu, uv, vv of ``measured_px``.
+    flux_dn, snr : (n,) float32
+    refused_stars : mapping
+        Name of `STAR_REFUSALS` -> number of predicted stars left out for it.
+    refused_catalog_id : (m,) int64
+        Those stars; empty in older recordings.
+    refused_px : (m, 2) float32
+        Expected (u, v) of each by the match of the others; for display, not for measurement.
+    refused_reason : (m,) uint8
+        Which key of ``refused_stars``, counted from 0 in its order.
+    background_dn, noise_dn : float
+        Median background and 1-sigma noise of one pixel.
+    psf_sigma_px : float
+        Gaussian width of the stars; 0 if unknown.
+    catalog_digest : str
+        Which catalog the identifiers refer to.
+    temperature_degc : float
+        Temperature of the camera; NaN if unknown.
+    """
+
+    time_ns: int
+    width: Count
+    height: Count
+    refusal: str
+    detail: str
+    icrf_from_star_tracker_xyzw: Annotated[Floats, Finite(), Shape((4,))]
+    attitude_gap_s: float
+    catalog_id: Annotated[NDArray[np.int64], Shape(('n',))]
+    direction_icrf: Annotated[Floats, Finite(), Shape(('n', 3))]
+    magnitude: Annotated[NDArray[np.float32], Shape(('n',))]
+    measured_px: Annotated[Floats, Finite(), Shape(('n', 2))]
+    covariance_px2: Annotated[Floats, Finite(), Shape(('n', 3))]
+    flux_dn: Annotated[NDArray[np.float32], Shape(('n',))]
+    snr: Annotated[NDArray[np.float32], Shape(('n',))]
+    refused_stars: Mapping[str, Count]
+    background_dn: float
+    noise_dn: float
+    psf_sigma_px: float
+    catalog_digest: str
+    temperature_degc: float = math.nan
+    refused_catalog_id: Annotated[NDArray[np.int64], Shape(('m',))] = dataclasses.field(
+        default_factory=lambda: np.empty(0, np.int64)
+    )
+    refused_px: Annotated[NDArray[np.float32], Finite(), Shape(('m', 2))] = dataclasses.field(
+        default_factory=lambda: np.empty((0, 2), np.float32)
+    )
+    refused_reason: Annotated[NDArray[np.uint8], Shape(('m',))] = dataclasses.field(
+        default_factory=lambda: np.empty(0, np.uint8)
+    )
+
+    def __len__(self) -> int:
+        """Return the number of stars."""
+        return len(self.catalog_id)
+
+    def refused_places(self) -> dict[str, NDArray[np.float32]]:
+        """Places (k, 2) of the refused stars by the name of their reason, px."""
+        return {
+            name: self.refused_px[self.refused_reason == code]
+            for code, name in enumerate(self.refused_stars)
+        }
+
+    def select(self, keep: NDArray[np.bool_]) -> StarObservations:
+        """Return the same image with only the stars of an (n,) mask."""
+        return dataclasses.replace(
+            self, **{name: getattr(self, name)[keep] for name in STAR_COLUMNS}
+        )
+
+
+STAR_COLUMNS = (
+    'catalog_id',
+    'direction_icrf',
+    'magnitude',
+    'measured_px',
+    'covariance_px2',
+    'flux_dn',
+    'snr',
+)
+"""The fields of `StarObservations` that hold one row per star."""
+
+
+def refused_image(
+    time_ns: int, width: int, height: int, refusal: str, detail: str, **known: object
+) -> StarObservations:
+    """Observations without stars: the record of an image that cannot be used."""
+    empty = StarObservations(
+        time_ns=time_ns,
+        width=width,
+        height=height,
+        refusal=refusal,
+        detail=detail,
+        icrf_from_star_tracker_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+        attitude_gap_s=math.nan,
+        catalog_id=np.empty(0, np.int64),
+        direction_icrf=np.empty((0, 3)),
+        magnitude=np.empty(0, np.float32),
+        measured_px=np.empty((0, 2)),
+        covariance_px2=np.empty((0, 3)),
+        flux_dn=np.empty(0, np.float32),
+        snr=np.empty(0, np.float32),
+        refused_stars={},
+        background_dn=0.0,
+        noise_dn=0.0,
+        psf_sigma_px=0.0,
+        catalog_digest='',
+    )
+    return dataclasses.replace(empty, **known)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """The input of a calibration: usable images in order of arrival, and counts of the others."""
+
+    images: tuple[StarObservations, ...] = ()
+    refused: Mapping[str, int] = dataclasses.field(default_factory=dict)
+
+    @property
+    def star_count(self) -> int:
+        """Number of star observations."""
+        return sum(len(image) for image in self.images)
+
+    def add(self, observations: StarObservations) -> Ensemble:
+        """
+        Return the ensemble with one more image, kept or counted by its reason.
+
+        An image with the stamp of one in the ensemble is counted as ``duplicate`` and the first
+        one stays, so that a recording played twice does not count twice.
+        """
+        refusal = observations.refusal
+        if not refusal and any(image.time_ns == observations.time_ns for image in self.images):
+            refusal = 'duplicate'
+        if refusal:
+            refusal = counted_refusal(refusal)
+            count = self.refused.get(refusal, 0) + 1
+            return Ensemble(self.images, {**self.refused, refusal: count})
+        return Ensemble((*self.images, observations), self.refused)
+
+
+@dataclass(frozen=True)
+class EnsembleStatus:
+    """
+    Images and stars collected so far, and the precision of a calibration made from them.
+
+    ``coverage`` is (rows, cols) star observations per focal-plane cell;
+    ``predicted_sigma`` is 1-sigma per ``parameter_names``, inf where not observable;
+    ``images_saved`` counts the images on disk, which survive a crash or a power loss.
+    """
+
+    time_ns: int
+    images: Count
+    stars: Count
+    min_images: Count
+    min_stars: Count
+    refused: Mapping[str, Count]
+    coverage: Annotated[NDArray[np.int64], Shape(('coverage_rows', 'coverage_cols'))]
+    parameter_names: Annotated[tuple[str, ...], Shape(('k',))]
+    predicted_sigma: Annotated[Floats, Shape(('k',))]
+    images_saved: Count = 0

@@ -1,0 +1,34 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Codes of star refusals, and their names in messages and files."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from starcal_ros.records import STAR_REFUSALS, StarRefusal
+
+
+def test_codes_fit_their_arrays() -> None:
+    """Zero is a star that is used, so that an array of zeros refuses none."""
+    assert not StarRefusal.NONE.value and StarRefusal.NONE.label not in STAR_REFUSALS
+    np.testing.assert_array_equal(np.array(list(StarRefusal), np.uint8), list(StarRefusal))
+
+
+def test_names_ascend_with_their_codes() -> None:
+    """Messages list the names in order of the codes: as sorted, which is how 0.1 wrote them."""
+    assert list(STAR_REFUSALS) == sorted(STAR_REFUSALS)
+
+
+def test_names_are_those_of_0_1() -> None:
+    """The names are published in docs/icd.md, and recordings hold them."""
+    assert set(STAR_REFUSALS) == {
+        'not_detected',
+        'border',
+        'blend',
+        'saturated',
+        'too_few_pixels',
+        'elongated',
+        'hot_pixel',
+        'faint',
+        'ambiguous',
+    }
