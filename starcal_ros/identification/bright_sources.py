@@ -22,6 +22,7 @@ Floats = NDArray[np.float64]
 
 _DETECTION_SIGMA = 5.0
 _STAMP_PX = 7  # half a window: a saturated star of 10 px fits in
+LONGEST_STREAK_PX = 2.0 * _STAMP_PX - 1  # that a window shows whole, its ends blurred
 _APART_PX = 10.0  # of two sources nearer than this the fainter is taken for a part of the other
 _MEASURED = 400  # brightest by their peak
 _KEPT = 200

@@ -9,11 +9,12 @@ explain (`sky_fit`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import functools
 import itertools
 import math
+import time
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,8 @@ Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of false matches
-_ROUNDS = (12, 18, 24)  # brightest sources of which patterns are formed, round by round
+ROUNDS = ((0, 12), (12, 18), (18, 24))
+"""Brightest sources of which patterns are formed, with one of each range, round by round."""
 _REFINED = 16  # best candidates of a lookup that are refined
 _CANDIDATES = 20_000  # of a lookup that are tested, drawn at random from more
 _TESTED = 16  # brightest predictions that a candidate is tested with
@@ -113,21 +115,26 @@ def find_sky(
     catalog: StarCatalog,
     try_mirrored: bool = False,
     max_log10_p_value: float = MAX_LOG10_P_VALUE,
+    rounds: Sequence[tuple[int, int]] = ROUNDS,
+    deadline_s: float = math.inf,
 ) -> SkyMatch | NotFound:
     """
     The stars that sources (n, 2), brightest first, are.
 
     ``camera`` is the prior: focal length within 25 %, principal point within 5 % of the width,
     distortion within 3 % of the radius.  The catalog is sorted by magnitude.  With
-    ``try_mirrored`` the image is tried as a mirror image as well.
+    ``try_mirrored`` the image is tried as a mirror image as well.  Of `ROUNDS`, those asked for
+    are searched, until the processor time of the thread reaches ``deadline_s``.
     """
     if len(xy_px) < 5:
         return NotFound(f'{len(xy_px)} star-like sources, at least 5 are needed')
     images = [SourceImage(xy_px, camera)]
     if try_mirrored:
         images.append(SourceImage(mirror(xy_px, camera.width), mirrored_camera(camera)))
-    least, before = 0.0, 0
-    for sources in _ROUNDS:
+    least = 0.0
+    for before, sources in rounds:
+        if len(xy_px) <= before:
+            break
         ways = itertools.product(_focal_scales(images[0].half_diagonal_rad), enumerate(images))
         for focal_scale, (mirrored, image) in ways:
             for scale in scales_for(image.half_diagonal_rad / focal_scale):
@@ -137,9 +144,8 @@ def find_sky(
                     least = min(least, log10_p)
                     if log10_p < max_log10_p_value:
                         return _result(image, catalog, fit, radius_px, log10_p, bool(mirrored))
-        if len(xy_px) <= sources:
-            break
-        before = sources
+                if time.thread_time() > deadline_s:
+                    return NotFound('the time given for the search is over', least)
     return NotFound('no pattern of the sources is one of the catalog beyond chance', least)
 
 

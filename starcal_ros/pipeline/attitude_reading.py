@@ -8,6 +8,7 @@ order, direction and clock, all give the same one.
 from __future__ import annotations
 
 from collections.abc import Sequence
+import dataclasses
 from dataclasses import dataclass
 import math
 
@@ -22,9 +23,12 @@ Floats = NDArray[np.float64]
 
 _AGREE_RAD = math.radians(0.5)  # alignments of one reading that agree
 CLOCK_SEARCH_S = 61.0
-_CLOCK_STEP_S = 0.05
-_CLOCK_GAIN = 3.0  # by which a shift makes alignments agree better, at least
+_COARSE_STEP_S, _FINE_STEP_S = 0.25, 0.025
+_CLEAR = 3.0  # by which one reading must agree better than another to be the right one
 _CLOCK_LEAST_RAD = math.radians(0.02)  # a scatter under this is no clock's
+_CLOCK_IMAGES = 3  # fewest: the shift itself takes part of what two images show
+_ALIKE_RAD = math.radians(0.003)  # a scatter under this is that of the stars
+_WRONG_ALIGNMENT_RAD = math.radians(25.0)  # chance alone comes so near in one case of 200
 _DIRECTIONS = ('st_to_inertial', 'inertial_to_st')
 
 
@@ -96,40 +100,79 @@ def is_off(reading: Reading, setup: SetUp) -> bool:
     return tilt_rad > setup.acquisition_rad or abs(roll_rad) > setup.acquisition_roll_rad
 
 
+def quarter_turns(reading: Reading, setup: SetUp) -> int:
+    """
+    Quarter turns about the line of sight, 1 to 3, that alone mend the prior alignment; or 0.
+
+    Counted from the camera's +x towards its +y.
+    """
+    prior = setup.star_tracker_from_camera
+    if prior is None or not is_off(reading, setup):
+        return 0
+    for turns in (1, 2, 3):
+        turned = prior * Rotation.from_euler('z', 90.0 * turns, degrees=True)
+        if not is_off(reading, dataclasses.replace(setup, star_tracker_from_camera=turned)):
+            return turns
+    return 0
+
+
 def best_reading(
     solved: Sequence[Placed], attitudes: WireAttitudes, setup: SetUp
 ) -> Reading | None:
-    """The reading whose alignments agree best, the one set up first; None where none does."""
-    at_stamps = readings(solved, attitudes, setup, 0.0)
-    best = _agreeing_best(at_stamps, len(solved), setup)
-    if best is not None and best.scatter_rad < _CLOCK_LEAST_RAD:
-        return best
-    shifted = _shifted(solved, attitudes, setup)
-    if shifted is None:
-        return best
-    if best is None or (
-        shifted.agreeing >= best.agreeing and shifted.scatter_rad * _CLOCK_GAIN < best.scatter_rad
-    ):
-        return shifted
-    return best
+    """
+    The reading that fits images, at least one, the one set up where it fits; None if none does.
+
+    Images that do not turn fit all readings: the prior alignment then decides, and where it fits
+    none either, so does the answer None.
+    """
+    fit = _fitting(readings(solved, attitudes, setup, 0.0), len(solved), setup)
+    least_rad = min((reading.scatter_rad for reading in fit), default=math.inf)
+    if len(solved) >= _CLOCK_IMAGES and least_rad > _CLOCK_LEAST_RAD:
+        shifted = _shifted(solved, attitudes, setup)
+        most = max((reading.agreeing for reading in fit), default=0)
+        if shifted is not None and (
+            not fit or (shifted.agreeing >= most and shifted.scatter_rad * _CLEAR < least_rad)
+        ):
+            return shifted
+    return _likeliest(fit, setup)
 
 
-def _agreeing_best(readings: Sequence[Reading], images: int, setup: SetUp) -> Reading | None:
-    """The best of readings under which most of the images agree."""
-    enough = max(2 if images < 4 else 3, math.ceil(0.6 * images))
-    if images == 1 or (setup.star_tracker_from_camera is None and images < 3):
-        enough = images
-    fit = [reading for reading in readings if reading.agreeing >= enough]
-    if not fit:
-        return None
+def _fitting(found: Sequence[Reading], images: int, setup: SetUp) -> list[Reading]:
+    """Readings under which most of the images agree, and about as many as under the best."""
+    enough = images if images < 3 else max(3, math.ceil(0.6 * images))
+    if setup.star_tracker_from_camera is not None and images == 3:
+        enough = 2  # one of the attitudes may be wrong
+    fit = [reading for reading in found if reading.agreeing >= enough]
+    most = max((reading.agreeing for reading in fit), default=0)
+    fit = [reading for reading in fit if reading.agreeing >= 0.8 * most]
+    least_rad = min((max(r.scatter_rad, _ALIKE_RAD) for r in fit), default=0.0)
+    return [reading for reading in fit if reading.scatter_rad < _CLEAR * least_rad]
 
-    def rank(item: tuple[int, Reading]) -> tuple[float, ...]:
-        """Agreement first; images of one attitude agree under all: then the prior speaks."""
-        number, reading = item
-        near = setup.star_tracker_from_camera is not None and not is_off(reading, setup)
-        return (-reading.agreeing, not near, number)
 
-    return min(enumerate(fit), key=rank)[1]
+def _likeliest(fit: Sequence[Reading], setup: SetUp) -> Reading | None:
+    """The one of readings that fit alike that the prior alignment goes with."""
+    if len(fit) < 2:
+        return next(iter(fit), None)
+    given = next((reading for reading in fit if _is_given(reading, setup)), None)
+    if setup.star_tracker_from_camera is None:
+        return given
+    near = [reading for reading in fit if not is_off(reading, setup)]
+    if near:
+        return given if given in near else near[0]
+    turned = [reading for reading in fit if quarter_turns(reading, setup)]
+    close = [
+        reading
+        for reading in fit
+        if (setup.star_tracker_from_camera.inv() * reading.star_tracker_from_camera).magnitude()
+        < _WRONG_ALIGNMENT_RAD
+    ]
+    likely = [reading for reading in fit if reading in turned or reading in close]
+    return likely[0] if len(likely) == 1 else None
+
+
+def _is_given(reading: Reading, setup: SetUp) -> bool:
+    """Whether a reading is the one set up."""
+    return reading.order == 'xyzw' and reading.direction == setup.attitude_direction
 
 
 def readings(
@@ -204,30 +247,40 @@ def _at(
 
 
 def _shifted(solved: Sequence[Placed], attitudes: WireAttitudes, setup: SetUp) -> Reading | None:
-    """The shift of the stamps at which the attitudes agree best; None where none does."""
-    coarse = np.arange(-CLOCK_SEARCH_S, CLOCK_SEARCH_S + 1e-9, 0.25)
-    fine = np.arange(-0.3, 0.3 + 1e-9, _CLOCK_STEP_S / 2)
-    best: Reading | None = None
-    for direction in sorted(_DIRECTIONS, key=lambda name: name != setup.attitude_direction):
-        for order in ('xyzw', 'wxyz'):
+    """The reading and the shift of the stamps that most images agree under; None: no shift."""
+    coarse = np.arange(-CLOCK_SEARCH_S, CLOCK_SEARCH_S + 1e-9, _COARSE_STEP_S)
+    fine = np.arange(-0.3, 0.3 + 1e-9, _FINE_STEP_S)
+    found = []
+    directions = sorted(_DIRECTIONS, key=lambda name: name != setup.attitude_direction)
+    for order in ('xyzw', 'wxyz'):
+        for direction in directions:
+            tried = [
+                _reading(solved, attitudes, setup, order, direction, float(s)) for s in coarse
+            ]
+            near = min(tried, key=lambda r: (-r.agreeing, r.scatter_rad)).shift_s
+            tried += [
+                _reading(solved, attitudes, setup, order, direction, float(near + s)) for s in fine
+            ]
+            found.append(_middle_of_best(tried))
+    fit = _fitting(found, len(solved), setup)
+    return fit[0] if fit else None
 
-            def tried(
-                shifts: NDArray[np.floating], order: str = order, direction: str = direction
-            ) -> Reading:
-                made = [
-                    _reading(solved, attitudes, setup, order, direction, float(s)) for s in shifts
-                ]
-                return min(made, key=lambda r: (-r.agreeing, r.scatter_rad))
 
-            near = tried(coarse)
-            one = tried(near.shift_s + fine)
-            if one.agreeing < max(3, math.ceil(0.6 * len(solved))):
-                continue
-            if best is None or (-one.agreeing, 3 * one.scatter_rad) < (
-                -best.agreeing,
-                best.scatter_rad,
-            ):
-                best = one
-        if best is not None:
-            return best
-    return best
+def _middle_of_best(tried: Sequence[Reading]) -> Reading:
+    """The best of shifts; where a range of them is as good, as for a camera at rest, its middle."""
+    best = min(tried, key=lambda r: (-r.agreeing, r.scatter_rad))
+    limit_rad = max(1.2 * best.scatter_rad, _ALIKE_RAD)
+    by_shift = sorted(tried, key=lambda r: r.shift_s)
+    at = by_shift.index(best)
+    first = last = at
+    while first > 0 and _as_good(by_shift[first - 1], best, limit_rad):
+        first -= 1
+    while last + 1 < len(by_shift) and _as_good(by_shift[last + 1], best, limit_rad):
+        last += 1
+    middle_s = 0.5 * (by_shift[first].shift_s + by_shift[last].shift_s)
+    nearest = min(by_shift[first : last + 1], key=lambda r: abs(r.shift_s - middle_s))
+    return dataclasses.replace(nearest, shift_s=middle_s)
+
+
+def _as_good(reading: Reading, best: Reading, limit_rad: float) -> bool:
+    return reading.agreeing == best.agreeing and reading.scatter_rad <= limit_rad

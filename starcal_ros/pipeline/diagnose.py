@@ -8,16 +8,15 @@ alignment.  The right reading is the one whose alignment is the same for all ima
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+import dataclasses
 from dataclasses import dataclass
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.camera import CameraModel
-from starcal_ros.identification.bright_sources import bright_sources, BrightSources, smear
-from starcal_ros.identification.lost_in_space import find_sky, SkyMatch
+from starcal_ros.identification.bright_sources import LONGEST_STREAK_PX, smear
 from starcal_ros.pipeline.attitude_reading import (
     best_reading,
     CLOCK_SEARCH_S,
@@ -25,10 +24,18 @@ from starcal_ros.pipeline.attitude_reading import (
     is_off,
     off_by,
     Placed,
+    quarter_turns,
     Reading,
     readings,
     SetUp,
     WireAttitudes,
+)
+from starcal_ros.pipeline.identified import (
+    FEWEST_SOURCES,
+    Identified,
+    identify_images,
+    SEARCH_S,
+    Solved,
 )
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
@@ -40,22 +47,9 @@ CAUSES = (
     'focal_length', 'clock', 'smear', 'no_stars', 'not_linear', 'unknown',
 )  # fmt: skip
 
-IMAGES = 8  # identified
-_TRIED = 14  # looked at for them
-_GIVEN_UP = 2  # looked at where none is identified
-_FEWEST_SOURCES = 6
-_ROTATED_RAD = math.radians(20.0)  # of a right angle about the line of sight
 _FOCAL_SHARE = 0.03  # error of the focal length that an image is still matched with
 _LINEAR_SLOPE = 0.65  # of brightness against that of the catalog; a display gamma of 2.2 has 0.45
-
-
-@dataclass(frozen=True)
-class Solved:
-    """An image that was identified, and its sources."""
-
-    time_ns: int
-    sky: SkyMatch
-    sources: BrightSources
+_SAME_ALIGNMENT_RAD = math.radians(3.0)  # of one written in another way and the one found
 
 
 @dataclass(frozen=True)
@@ -63,78 +57,61 @@ class Diagnosis:
     """
     Why images match nothing.
 
-    ``cause`` is one of `CAUSES`; ``found`` the value that was found, None where there is none;
-    ``sentence`` says both in words, ``evidence`` how it is known, ``mend`` are lines of the
-    parameter file.
+    ``cause`` is one of `CAUSES`, ``also`` are others found with it; ``found`` the value that was
+    found, None where there is none; ``sentence`` says both in words, ``evidence`` how it is known,
+    ``mend`` are lines of the parameter file.
     """
 
     cause: str
     found: float | str | list[float] | None
     sentence: str
-    evidence: tuple[str, ...]
+    evidence: tuple[str, ...] = ()
     mend: tuple[str, ...] = ()
+    also: tuple[str, ...] = ()
 
 
 def diagnose(
-    images: Iterable[Image], attitudes: WireAttitudes, setup: SetUp, catalog: StarCatalog
+    images: Iterable[Image],
+    attitudes: WireAttitudes,
+    setup: SetUp,
+    catalog: StarCatalog,
+    search_s: float = SEARCH_S,
 ) -> Diagnosis:
     """
     The cause that keeps the first images from matching, found from those images.
 
-    The catalog is sorted by magnitude, as `load_catalog` gives it.
+    The catalog is sorted by magnitude, as `load_catalog` gives it.  ``search_s`` limits the time
+    that the identification may take.
     """
-    solved, seen = [], []
-    for image in solve_images(images, setup.camera, catalog):
-        if isinstance(image, Solved):
-            solved.append(image)
-            seen.append(image.sources)
-        else:
-            seen.append(image)
-    if not solved:
-        return _nothing_found(seen, setup)
-    return _held_against(solved, len(seen), attitudes, setup, catalog)
+    found = identify_images(images, setup.camera, catalog, search_s)
+    if not found.solved:
+        return _nothing_found(found, setup)
+    return _held_against(found.solved, len(found.seen), attitudes, setup, catalog)
 
 
-def solve_images(
-    images: Iterable[Image], camera: CameraModel, catalog: StarCatalog
-) -> Iterator[Solved | BrightSources]:
-    """Each image identified without attitude, or its sources; ends when enough are identified."""
-    found: list[SkyMatch] = []
-    prior = camera
-    for tried, image in enumerate(images, start=1):
-        height, width = image.pixels.shape
-        sources = bright_sources(image.pixels)
-        sky = None
-        same_size = (width, height) == (camera.width, camera.height)
-        if same_size and smear(sources) is None:  # what streaks show is no pattern of points
-            sky = find_sky(sources.xy_px, prior, catalog, try_mirrored=True)
-        if isinstance(sky, SkyMatch):
-            found.append(sky)
-            yield Solved(image.time_ns, sky, sources)
-        else:
-            yield sources
-        if len(found) == IMAGES or tried == _TRIED or (tried == _GIVEN_UP and not found):
-            return
-
-
-def _nothing_found(seen: Sequence[BrightSources], setup: SetUp) -> Diagnosis:
+def _nothing_found(found: Identified, setup: SetUp) -> Diagnosis:
     """The cause where no image was identified."""
+    seen = found.seen
+    if not seen and found.other_sizes:
+        return _of_another_size(found.other_sizes[0], setup)
+    if not seen:
+        return Diagnosis('no_stars', 0, 'There is no image that can be read.')
     counts = [len(sources.xy_px) for sources in seen]
     streaks = [streak for streak in map(smear, seen) if streak is not None]
-    if not seen:
-        return Diagnosis('no_stars', 0, 'There is no image that can be read.', ())
     looked = f'{len(seen)} images looked at, {int(np.median(counts))} star-like sources each'
     if 2 * len(streaks) > len(seen):
         length_px = float(np.median([length for length, _ in streaks]))
+        about = 'about' if length_px < LONGEST_STREAK_PX else 'at least'
+        length_px = min(length_px, LONGEST_STREAK_PX)
         return Diagnosis(
             'smear',
             round(length_px, 1),
-            f'The stars are streaks about {length_px:.0f} px long: the camera moves during the'
+            f'The stars are streaks {about} {length_px:.0f} px long: the camera moves during the'
             ' exposure.',
             (looked, 'the sources are more than twice as long as wide, and all point one way'),
             ('# no parameter mends this: expose for a shorter time, or while not slewing',),
         )
-    if np.median(counts) < _FEWEST_SOURCES:
+    if np.median(counts) < FEWEST_SOURCES:
         level = float(np.median([s.background.level_dn for s in seen]))
         noise = float(np.median([s.background.noise_dn for s in seen]))
         return Diagnosis(
@@ -152,10 +129,25 @@ def _nothing_found(seen: Sequence[BrightSources], setup: SetUp) -> Diagnosis:
         'No image can be identified, and why was not found.',
         (
             looked,
-            'no pattern of them is one of the sky, mirrored or not',
+            'no pattern of them was found in the sky, mirrored or not, in the time of the search',
             f'tried: focal lengths within 25 % of {focal_px:.0f} px, {width_deg:.1f} deg wide',
         ),
         ('# check camera_info_url: focal length in pixels, size of the image',),
+    )
+
+
+def _of_another_size(size: tuple[int, int], setup: SetUp) -> Diagnosis:
+    """No cause can be named where the prior camera is of another image size."""
+    camera = setup.camera
+    return Diagnosis(
+        'unknown',
+        None,
+        f'The images are {size[0]} x {size[1]}, the prior camera is of {camera.width} x'
+        f' {camera.height}.',
+        ('images of another size are of another camera, binned, or cut',),
+        (
+            '# in the file of camera_info_url: the size of the images, focal length in their pixels',
+        ),
     )
 
 
@@ -166,106 +158,171 @@ def _held_against(
     setup: SetUp,
     catalog: StarCatalog,
 ) -> Diagnosis:
-    """The cause where images were identified."""
+    """The causes where images were identified, the one that hides the others first."""
     worst = max(image.sky.log10_p_value for image in solved)
     stars = [len(image.sky.xy_px) for image in solved]
-    evidence = [f'{len(solved)} of {tried} images identified without attitude, {min(stars)} to']
-    evidence[0] += f' {max(stars)} stars each; expected false matches: under 10^{worst:.0f} each'
-    mirrored = sum(image.sky.mirrored for image in solved) * 2 > len(solved)
-    alike = [
-        Placed(image.time_ns, image.sky.camera_from_icrf)
-        for image in solved
-        if image.sky.mirrored == mirrored
+    evidence = [
+        f'{len(solved)} of {tried} images identified without attitude, {min(stars)} to'
+        f' {max(stars)} stars each; expected false matches: under 10^{worst:.0f} each'
     ]
-    reading = best_reading(alike, attitudes, setup)
-    if mirrored:
-        return _mirrored(reading, setup, evidence)
-    if reading is None:
-        return _no_reading(attitudes, setup, evidence)
-    evidence.append(
-        f'read as {in_words(reading)}, the attitudes of {reading.agreeing} of {len(alike)} images'
+    placed = [Placed(image.time_ns, image.camera_from_icrf) for image in solved]
+    reading = best_reading(placed, attitudes, setup)
+    findings: list[Diagnosis | None] = []
+    if solved[0].sky.mirrored:
+        findings.append(_mirrored(reading, setup))
+    if reading is not None:
+        evidence += _agreement(reading, placed, attitudes, setup)
+        findings += [_order(reading), _direction(reading, setup), _clock(reading, setup)]
+        if solved[0].quarter_turned:
+            findings.append(_sides_exchanged(reading, setup))
+        elif not solved[0].sky.mirrored:
+            findings.append(_alignment(reading, setup))
+    elif not solved[0].sky.mirrored:
+        findings.append(_no_reading(placed, attitudes, setup))
+    findings += [_focal_length(solved, setup, evidence), _tone_curve(solved, catalog)]
+    return _joined([one for one in findings if one is not None], evidence)
+
+
+def _joined(findings: Sequence[Diagnosis], evidence: list[str]) -> Diagnosis:
+    """The first of the findings, with the remedies of all of them."""
+    if not findings:
+        sentence = 'Attitudes, alignment and camera fit the images.'
+        return Diagnosis('none', None, sentence, tuple(evidence))
+    first, *others = findings
+    for one in findings:
+        evidence += one.evidence
+    evidence += [f'besides: {one.sentence}' for one in others]
+    return dataclasses.replace(
+        first,
+        evidence=tuple(evidence),
+        mend=tuple(line for one in findings for line in one.mend),
+        also=tuple(one.cause for one in others),
+    )
+
+
+def _agreement(
+    reading: Reading, placed: Sequence[Placed], attitudes: WireAttitudes, setup: SetUp
+) -> list[str]:
+    """Evidence for a reading, and against the one set up where that is another."""
+    lines = [
+        f'read as {in_words(reading)}, the attitudes of {reading.agreeing} of {len(placed)} images'
         f' give one alignment to {math.degrees(reading.scatter_rad):.3f} degrees'
+    ]
+    given = readings(placed, attitudes, setup, 0.0)[0]
+    if (reading.order, reading.direction) != (given.order, given.direction):
+        lines.append(
+            f'read as {in_words(given)}, as they are now, those of {given.agreeing} agree to'
+            f' {math.degrees(given.scatter_rad):.3f} degrees'
+        )
+    return lines
+
+
+def _order(reading: Reading) -> Diagnosis | None:
+    """The order of the quaternion as a cause; None: it is right."""
+    if reading.order == 'xyzw':
+        return None
+    return Diagnosis(
+        'quaternion_order',
+        'wxyz',
+        'The attitude quaternions are sent with w first; the message has x, y, z, w.',
+        mend=('# no parameter mends this: send x, y, z, w in the fields of that name',),
     )
-    given = readings(alike, attitudes, setup, 0.0)[0]
-    if reading is not given and given.agreeing < reading.agreeing:
-        evidence.append(
-            f'read as {in_words(given)}, as they are now, those of {given.agreeing} do'
-        )
-    quaternion = reading.star_tracker_from_camera.as_quat(canonical=True)
-    values = [round(float(q), 7) for q in quaternion]
-    mend = [f'prior_alignment: {values}'] if is_off(reading, setup) else []
-    if reading.order == 'wxyz':
-        direction = reading.direction
-        if direction != setup.attitude_direction:
-            mend.append(f'attitude_direction: {direction}')
-        return Diagnosis(
-            'quaternion_order',
-            'wxyz',
-            'The attitude quaternions are sent with w first; the message has x, y, z, w.',
-            tuple(evidence),
-            ('# no parameter mends this: send x, y, z, w in the fields of that name', *mend),
-        )
-    if reading.direction != setup.attitude_direction:
-        return Diagnosis(
-            'attitude_direction',
-            reading.direction,
-            f'The attitude quaternions are {in_words(reading)}, not {setup.attitude_direction}.',
-            tuple(evidence),
-            (f'attitude_direction: {reading.direction}', *mend),
-        )
-    if reading.shift_s:
-        offset_s = round(setup.stamp_offset_s + reading.shift_s, 2)
-        return Diagnosis(
-            'clock',
-            offset_s,
-            f'The stamps of the images are {abs(reading.shift_s):.2f} s'
-            f' {"behind" if reading.shift_s > 0 else "ahead of"} those of the attitudes.',
-            (*evidence, 'the attitude at the shifted stamps gives one alignment, at others not'),
-            (f'stamp_offset_s: {offset_s}', *mend),
-        )
-    if setup.star_tracker_from_camera is None or is_off(reading, setup):
-        return _alignment_off(reading, setup, evidence, values)
-    return _camera_off(solved, setup, catalog, evidence)
 
 
-def _alignment_off(
-    reading: Reading, setup: SetUp, evidence: list[str], values: list[float]
-) -> Diagnosis:
-    """The cause where only the alignment does not fit."""
+def _direction(reading: Reading, setup: SetUp) -> Diagnosis | None:
+    """The direction of the attitudes as a cause; None: it is right."""
+    if reading.direction == setup.attitude_direction:
+        return None
+    return Diagnosis(
+        'attitude_direction',
+        reading.direction,
+        f'The attitude quaternions are {in_words(reading)}, not {setup.attitude_direction}.',
+        mend=(f'attitude_direction: {reading.direction}',),
+    )
+
+
+def _clock(reading: Reading, setup: SetUp) -> Diagnosis | None:
+    """The stamps as a cause; None: they are right."""
+    if not reading.shift_s:
+        return None
+    offset_s = round(setup.stamp_offset_s + reading.shift_s, 2)
+    return Diagnosis(
+        'clock',
+        offset_s,
+        f'The stamps of the images are {abs(reading.shift_s):.2f} s'
+        f' {"behind" if reading.shift_s > 0 else "ahead of"} those of the attitudes.',
+        ('the attitude at the shifted stamps gives one alignment, at others not',),
+        (f'stamp_offset_s: {offset_s}',),
+    )
+
+
+def _alignment(reading: Reading, setup: SetUp) -> Diagnosis | None:
+    """The prior alignment as a cause; None: it is near enough."""
+    if not is_off(reading, setup):
+        return None
+    values = alignment_values(reading)
     mend = (f'prior_alignment: {values}',)
-    if setup.star_tracker_from_camera is None:
+    prior = setup.star_tracker_from_camera
+    if prior is None:
         sentence = 'prior_alignment is not given; the images show it.'
-        return Diagnosis('prior_alignment', values, sentence, tuple(evidence), mend)
-    tilt_rad, roll_rad = off_by(reading, setup)
-    evidence.append(
-        f'prior_alignment points {math.degrees(tilt_rad):.1f} degrees away from it and is rolled'
-        f' by {math.degrees(roll_rad):.1f} degrees'
-    )
-    right_angles = round(roll_rad / (math.pi / 2))
-    left_rad = abs(roll_rad - right_angles * math.pi / 2)
-    if right_angles and left_rad < _ROTATED_RAD and tilt_rad < _ROTATED_RAD:
-        degrees = (90 * right_angles) % 360
+        return Diagnosis('prior_alignment', values, sentence, (), mend)
+    tilt_deg, roll_deg = (math.degrees(angle) for angle in off_by(reading, setup))
+    evidence = [
+        f'prior_alignment points {tilt_deg:.1f} degrees away from it and is rolled by'
+        f' {roll_deg:.1f} degrees'
+    ]
+    turns = quarter_turns(reading, setup)
+    if turns:
+        degrees, way = {
+            1: (90.0, ' counterclockwise'),
+            2: (180.0, ''),
+            3: (90.0, ' clockwise'),
+        }[turns]
         return Diagnosis(
             'rotated',
-            float(degrees),
-            f'The image is rotated by {degrees} degrees against prior_alignment.',
+            degrees,
+            f'The image is rotated by {degrees:.0f} degrees{way} against prior_alignment.',
             tuple(evidence),
             mend,
         )
+    found = reading.star_tracker_from_camera
+    if (prior * found).magnitude() < _SAME_ALIGNMENT_RAD:
+        evidence.append('prior_alignment is the inverse of it: camera from star tracker')
+    w_first = type(prior).from_quat(prior.as_quat()[[1, 2, 3, 0]])
+    if (w_first.inv() * found).magnitude() < _SAME_ALIGNMENT_RAD:
+        evidence.append('prior_alignment is given with w first')
     return Diagnosis(
         'prior_alignment',
         values,
-        f'prior_alignment points {math.degrees(tilt_rad):.1f} degrees away from where the images'
-        ' show the camera, and is rolled by'
-        f' {math.degrees(roll_rad):.1f} degrees.',
+        f'prior_alignment points {tilt_deg:.1f} degrees away from where the images show the'
+        f' camera, and is rolled by {roll_deg:.1f} degrees.',
         tuple(evidence),
         mend,
     )
 
 
-def _mirrored(reading: Reading | None, setup: SetUp, evidence: list[str]) -> Diagnosis:
+def alignment_values(reading: Reading) -> list[float]:
+    """The alignment of a reading as `prior_alignment` has it."""
+    quaternion = reading.star_tracker_from_camera.as_quat(canonical=True)
+    return [round(float(q), 7) for q in quaternion]
+
+
+def _sides_exchanged(reading: Reading, setup: SetUp) -> Diagnosis:
+    """The cause where the images have the sides of the prior camera exchanged."""
+    upside_down = setup.star_tracker_from_camera is not None and quarter_turns(reading, setup) == 2
+    way = 'counterclockwise' if upside_down else 'clockwise'
+    back = 'clockwise' if upside_down else 'counterclockwise'
+    return Diagnosis(
+        'rotated',
+        90.0,
+        f'The image is rotated by 90 degrees {way}.',
+        ('its sides are those of the prior camera exchanged',),
+        (f'# no parameter mends this: turn the images {back} where they are read out',),
+    )
+
+
+def _mirrored(reading: Reading | None, setup: SetUp) -> Diagnosis:
     """The cause where the images are mirror images."""
-    evidence.append('the patterns of the sky are there when the image is mirrored, not as it is')
     how = 'left to right'
     if reading is not None and setup.star_tracker_from_camera is not None:
         _, roll_rad = off_by(reading, setup)
@@ -275,14 +332,25 @@ def _mirrored(reading: Reading | None, setup: SetUp, evidence: list[str]) -> Dia
         'mirrored',
         how,
         f'The image is mirrored {how}.',
-        tuple(evidence),
+        ('the patterns of the sky are there when the image is mirrored, not as it is',),
         (f'# no parameter mends this: mirror the images {how} where they are read out',),
     )
 
 
-def _no_reading(attitudes: WireAttitudes, setup: SetUp, evidence: list[str]) -> Diagnosis:
-    """The cause where no reading of the attitudes gives one alignment."""
-    evidence.append(
+def _no_reading(placed: Sequence[Placed], attitudes: WireAttitudes, setup: SetUp) -> Diagnosis:
+    """No cause can be named where no reading of the attitudes is the right one."""
+    several = [r for r in readings(placed, attitudes, setup, 0.0) if r.agreeing == len(placed)]
+    if len(several) > 1:
+        names = ' and '.join(in_words(reading) for reading in several)
+        return Diagnosis(
+            'unknown',
+            None,
+            'The stars are identified, but attitudes that do not turn leave open how they are'
+            ' meant, and prior_alignment goes with no way to read them.',
+            (f'the images give one alignment read as {names}',),
+            ('# give a bag in which the spacecraft turns, or a prior_alignment to 1 degree',),
+        )
+    tried = (
         f'no reading of the {len(attitudes.time_ns)} attitudes, at shifts of up to'
         f' {CLOCK_SEARCH_S:.0f} s, gives one alignment for most of the images'
     )
@@ -290,47 +358,42 @@ def _no_reading(attitudes: WireAttitudes, setup: SetUp, evidence: list[str]) -> 
         'unknown',
         None,
         'The stars of the images are identified, but the attitudes do not go with them.',
-        tuple(evidence),
+        (tried,),
         ('# check that the attitudes are those of this spacecraft, star tracker and time',),
     )
 
 
-def _camera_off(
-    solved: Sequence[Solved], setup: SetUp, catalog: StarCatalog, evidence: list[str]
-) -> Diagnosis:
-    """The cause where attitudes and alignment fit: the focal length, the brightnesses, or none."""
+def _focal_length(solved: Sequence[Solved], setup: SetUp, evidence: list[str]) -> Diagnosis | None:
+    """The focal length as a cause; None: it is near enough."""
     prior_px = float(setup.camera.parameters[0])
-    by_stars = max(solved, key=lambda image: len(image.sky.xy_px))
     focal_px = float(np.median([image.sky.camera.parameters[0] for image in solved]))
-    off = focal_px / prior_px - 1.0
     evidence.append(
         f'the images show a focal length of {focal_px:.1f} px, the prior {prior_px:.1f}'
     )
-    if abs(off) > _FOCAL_SHARE:
-        return Diagnosis(
-            'focal_length',
-            round(focal_px, 2),
-            f'The focal length of the prior camera, {prior_px:.0f} px, is'
-            f' {abs(100 * (prior_px / focal_px - 1)):.0f} %'
-            f' too {"short" if off > 0 else "long"}.',
-            tuple(evidence),
-            (f'# in the file of camera_info_url: fx = fy = {focal_px:.1f}',),
-        )
-    slope = _brightness_slope(by_stars, catalog)
-    if slope is not None and slope < _LINEAR_SLOPE:
-        evidence.append(f'brightness grows with that of the catalog to the power {slope:.2f}')
-        return Diagnosis(
-            'not_linear',
-            round(slope, 2),
-            'The images are not linear in the light: they have been through a tone curve.',
-            tuple(evidence),
-            ('# no parameter mends this: record raw images',),
-        )
+    off = focal_px / prior_px - 1.0
+    if abs(off) <= _FOCAL_SHARE:
+        return None
     return Diagnosis(
-        'none',
-        None,
-        'Attitudes, alignment and camera fit the images.',
-        tuple(evidence),
+        'focal_length',
+        round(focal_px, 2),
+        f'The focal length of the prior camera, {prior_px:.0f} px, is'
+        f' {abs(100 * (prior_px / focal_px - 1)):.0f} %'
+        f' too {"short" if off > 0 else "long"}.',
+        mend=(f'# in the file of camera_info_url: fx = fy = {focal_px:.1f}',),
+    )
+
+
+def _tone_curve(solved: Sequence[Solved], catalog: StarCatalog) -> Diagnosis | None:
+    """A tone curve as a cause; None: the images are linear, or show too few stars for it."""
+    slope = _brightness_slope(max(solved, key=lambda image: len(image.sky.xy_px)), catalog)
+    if slope is None or slope >= _LINEAR_SLOPE:
+        return None
+    return Diagnosis(
+        'not_linear',
+        round(slope, 2),
+        'The images are not linear in the light: they have been through a tone curve.',
+        (f'brightness grows with that of the catalog to the power {slope:.2f}',),
+        ('# no parameter mends this: record raw images',),
     )
 
 
