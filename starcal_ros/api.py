@@ -21,6 +21,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.bag import reader
 from starcal_ros.camera import CameraModel, line_of_sight, project
+from starcal_ros.diagnosis.bags import aligned_by_bags
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 from starcal_ros.estimation.calibrate import CalibrationOptions
 from starcal_ros.options import names_of, nearest
@@ -215,6 +216,7 @@ def calibrate_bag(
         temperature=temperature_topic,
         observations=observations_topic,
     )
+    setup, _ = aligned_by_bags(paths, asked, setup)
     images = topics.read(paths, topics.choose_topics(paths, asked, setup), setup)
     inputs = inputs_of((*reader.mcap_files(paths), Path(params)))
     return solve.solve(_ensemble(images, setup), setup, inputs=inputs)

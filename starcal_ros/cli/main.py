@@ -79,6 +79,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     """Calibrate from bags in one process, as the two nodes do on the graph."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
+    from starcal_ros.estimation.calibrate import tracker_sigma_is_given
     from starcal_ros.pipeline.provenance import inputs_of
     from starcal_ros.pipeline.setup import read_setup
 
@@ -86,9 +87,16 @@ def _calibrate(args: argparse.Namespace) -> int:
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
     inputs = inputs_of((*reader.mcap_files(args.bags), args.params))
+    setup = _aligned(args, setup)
     calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
     report = _write_report(args.output)
     output.print_calibration(calibration, setup.prior)
+    if not tracker_sigma_is_given(setup.calibration):
+        sigma = ', '.join(f'{arcsec:.1f}' for arcsec in calibration.star_tracker_sigma_arcsec)
+        print(
+            f'star tracker    {sigma}" (x, y, z) from the scatter: star_tracker_sigma_arcsec'
+            ' is not given'
+        )
     print(f'products written to {args.output}; {report}')
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
 
@@ -125,6 +133,16 @@ def _calibrate_into(
     write_products(calibration, folder, left)
     thumbnails.write_thumbnails(album.thumbnails(), folder / thumbnails.THUMBNAILS_FOLDER)
     return calibration
+
+
+def _aligned(args: argparse.Namespace, setup: Setup) -> Setup:
+    """The setup with the prior alignment that the images show, where none is given."""
+    from starcal_ros.diagnosis.bags import aligned_by_bags
+
+    setup, found = aligned_by_bags(args.bags, _asked(args), setup)
+    if found:
+        print(found, file=sys.stderr)
+    return setup
 
 
 def _asked(args: argparse.Namespace) -> Topics:
@@ -176,7 +194,7 @@ def _inspect(args: argparse.Namespace) -> int:
     from starcal_ros.pipeline import inspect
     from starcal_ros.pipeline.setup import read_setup
 
-    setup = read_setup(args.params) if args.params else None
+    setup = _aligned(args, read_setup(args.params)) if args.params else None
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:
@@ -196,9 +214,10 @@ def _inspect(args: argparse.Namespace) -> int:
 def _diagnose(args: argparse.Namespace) -> int:
     """Say why the images of a bag match nothing."""
     from starcal_ros.cli import diagnosis
+    from starcal_ros.diagnosis.bags import diagnose_bags
     from starcal_ros.pipeline.setup import read_setup
 
-    found = diagnosis.of_bags(args.bags, _asked(args), read_setup(args.params))
+    found = diagnose_bags(args.bags, _asked(args), read_setup(args.params))
     if args.json:
         print(json.dumps(diagnosis.content(found), indent=1, allow_nan=False))
     else:

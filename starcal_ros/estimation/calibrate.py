@@ -72,6 +72,7 @@ _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the 
 _START_FLOOR_PX = 0.05  # until the residuals tell: of the order of what is left in good images
 _TRACKER_EXCESS = 1.3  # found over assumed sigma from which the scatter is suspect
 _FIELD_ROUNDS = 6  # its prior and the variances settle in two or three
+_USUAL_TRACKER_ARCSEC = 10.0  # until the scatter tells
 _ROUNDS = 10  # the set of rejected stars settles in two or three
 FEWEST_STARS = 3  # of an image: its rotation fits any one star, and two as good as any
 _FEWEST_SIGHTINGS = 3  # of a star, from which it can be told from its images
@@ -92,9 +93,10 @@ class CalibrationOptions:
         choices=(*ALL_PARAMETER_NAMES, 'distortion'),
     )
     star_tracker_sigma_arcsec: tuple[float, ...] = option(
-        (10.0, 10.0, 10.0),
-        '1-sigma of the star tracker attitude about its x, y, z axes, arcsec',
-        low=1e-3,
+        (0.0, 0.0, 0.0),
+        '1-sigma of the star tracker attitude about its x, y, z axes, arcsec; zeros: estimated'
+        ' from the scatter of the images',
+        low=0.0,
         high=3600.0,
         length=3,
     )
@@ -255,6 +257,11 @@ def check_options(options: CalibrationOptions, model: str) -> None:
         # Its mean of the images' alignments has no place for a slope: `hierarchical` with a loose
         # star tracker is the same estimate with one.
         raise OptionError('alignment_temperature: the method per_image has no common alignment')
+    if tracker_sigma_is_given(options) and min(options.star_tracker_sigma_arcsec) < 1e-3:
+        raise OptionError(
+            f'star_tracker_sigma_arcsec: {list(options.star_tracker_sigma_arcsec)} has a sigma of'
+            ' zero; give three, or none'
+        )
     names = parameter_names(model)
     for name in estimated_parameters(options, model):
         if name not in names:
@@ -267,6 +274,18 @@ def check_options(options: CalibrationOptions, model: str) -> None:
             f'prior_sigma: {len(options.prior_sigma)} numbers, but the lens model {model} has '
             f'{len(names)} parameters: {", ".join(names)}'
         )
+
+
+def tracker_sigma_is_given(options: CalibrationOptions) -> bool:
+    """Whether a star tracker sigma is assumed, in place of the scatter of the images alone."""
+    return any(options.star_tracker_sigma_arcsec)
+
+
+def assumed_tracker_sigma_rad(options: CalibrationOptions) -> Floats:
+    """1-sigma (3,) of the star tracker that an estimate starts with."""
+    if not tracker_sigma_is_given(options):
+        return np.full(3, _USUAL_TRACKER_ARCSEC * ARCSECOND_RAD)
+    return np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
 
 
 def estimated_parameters(options: CalibrationOptions, model: str) -> tuple[str, ...]:
@@ -381,7 +400,7 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
             np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
         ).inv(),
         star_tracker_sigma_rad=np.tile(
-            np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD, (len(ensemble.images), 1)
+            assumed_tracker_sigma_rad(options), (len(ensemble.images), 1)
         ),
         above_reference_k=np.array([image.temperature_degc for image in ensemble.images])
         - options.reference_temperature_degc,
@@ -478,7 +497,7 @@ def _settle(
 ) -> _Found:
     """Least squares and judgement of its residuals in turns, until the judgement stands."""
     problem, solution = found.problem, found.solution
-    given_rad = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
+    given_rad = assumed_tracker_sigma_rad(options)
     iterations, after = found.iterations, found.verdict
     for _ in range(_ROUNDS):
         verdict = after
@@ -662,8 +681,10 @@ def _correlation(
 ) -> AttitudeCorrelation:
     """Correlation in time of the star-tracker errors of the images that fit."""
     good = seen & ~found.verdict.misfit
-    assumed_rad = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
-    excess = bool((found.verdict.tracker_sigma_rad > _TRACKER_EXCESS * assumed_rad).any())
+    assumed_rad = assumed_tracker_sigma_rad(options)
+    excess = tracker_sigma_is_given(options) and bool(
+        (found.verdict.tracker_sigma_rad > _TRACKER_EXCESS * assumed_rad).any()
+    )
     return attitude_correlation(
         time_ns[good], error_rad[good], np.einsum('mii->mi', covariance_rad2[good]), excess
     )
@@ -773,7 +794,7 @@ def _judge(
         eta_rad, covariance_rad2, seen = attitudes_of_stars_alone(problem, state, blocks)
         fitted = 2 if len(state.rate) else 1  # mean of the attitudes, and slope
         found_rad, misfit = estimate_star_tracker_sigma(
-            eta_rad, covariance_rad2, seen, given_rad, fitted
+            eta_rad, covariance_rad2, seen, given_rad, fitted, tracker_sigma_is_given(options)
         )
         if options.variance_components:
             tracker_sigma_rad = found_rad

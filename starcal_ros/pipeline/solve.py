@@ -7,6 +7,7 @@ import dataclasses
 import math
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment.agreement import compare_halves
 from starcal_ros.assessment.gate import judge, reasons_of
@@ -29,9 +30,10 @@ from starcal_ros.estimation.calibrate import (
     estimate_calibration,
     estimated_parameters,
 )
+from starcal_ros.identification.star_finder import realigned
 from starcal_ros.options import check_value
 from starcal_ros.pipeline.provenance import provenance_of
-from starcal_ros.pipeline.setup import Setup
+from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.records import (
     Calibration,
     Ensemble,
@@ -40,6 +42,8 @@ from starcal_ros.records import (
     ResidualField,
     StarObservations,
 )
+
+_ALIGNING = 20  # images, of whose alignments the middle one is taken
 
 
 def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:
@@ -55,13 +59,31 @@ def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: S
     return within_limit(ensemble.add(observations), setup)
 
 
+def aligned_by(ensemble: Ensemble, setup: Setup) -> Setup:
+    """The setup; where it has no prior alignment, with that of the middle one of the images."""
+    if setup.is_aligned or not ensemble.images:
+        return setup
+    shown = Rotation.from_quat(
+        np.array(
+            [
+                realigned(setup.prior, image).star_tracker_from_camera_xyzw
+                for image in ensemble.images[:_ALIGNING]
+            ]
+        )
+    )
+    apart = np.abs(shown.as_quat() @ shown.as_quat().T)  # cosines of half angles
+    return aligned(setup, shown[int(np.median(apart, axis=1).argmax())].as_quat())
+
+
 def within_limit(ensemble: Ensemble, setup: Setup) -> Ensemble:
     """Return the ensemble without its least informative images, down to ``max_images``."""
+    setup = aligned_by(ensemble, setup)
     return keep_most_informative(ensemble, setup.prior, setup.calibration)
 
 
 def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
     """Images and stars collected, and the predicted precision of a calibration from them."""
+    setup = aligned_by(ensemble, setup)
     return _ensemble_status(ensemble, setup.prior, setup.calibration)
 
 
@@ -99,7 +121,7 @@ def solve_with_residuals(
     active: Calibration | None = None,
 ) -> tuple[Calibration, Residuals]:
     """The calibration of `solve`, and its residuals by star and image."""
-    setup = _as_asked_for(setup, method, estimate)
+    setup = aligned_by(ensemble, _as_asked_for(setup, method, estimate))
     result = estimate_calibration(ensemble, setup.prior, setup.calibration)
     halves = HalvesComparison(note='min_halves_p_value is 0')
     if setup.gate.min_halves_p_value > 0:

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from starcal_ros.bag import reader
 from starcal_ros.camera import CameraModel
+from starcal_ros.diagnosis.attitude_reading import SetUp, WireAttitudes
+from starcal_ros.diagnosis.diagnose import CAUSES, diagnose, Diagnosis
 from starcal_ros.messages.telemetry import attitude_from_message
-from starcal_ros.pipeline.attitude_reading import SetUp, WireAttitudes
-from starcal_ros.pipeline.diagnose import CAUSES, diagnose, Diagnosis
 from starcal_ros.records import Image
 from starcal_ros.simulation import images as simulated_images
 from starcal_ros.simulation import scenario as synthetic
@@ -320,7 +320,7 @@ def unaligned(night: Night) -> Night:
         ((conjugated, lambda n: turned(n, 40)), ['attitude_direction', 'prior_alignment']),
         ((conjugated, half_turned), ['attitude_direction', 'rotated']),
         ((conjugated, unaligned), ['attitude_direction', 'prior_alignment']),
-        ((w_first, conjugated), ['quaternion_order', 'attitude_direction']),
+        ((conjugated, w_first), ['quaternion_order', 'attitude_direction']),
         ((w_first, lambda n: turned(n, 6)), ['quaternion_order', 'prior_alignment']),
         ((w_first, unaligned), ['quaternion_order', 'prior_alignment']),
         ((half_turned, lambda n: turned(n, 12)), ['prior_alignment']),

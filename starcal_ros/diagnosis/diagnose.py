@@ -16,8 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.identification.bright_sources import LONGEST_STREAK_PX, smear
-from starcal_ros.pipeline.attitude_reading import (
+from starcal_ros.diagnosis.attitude_reading import (
     best_reading,
     CLOCK_SEARCH_S,
     in_words,
@@ -30,13 +29,14 @@ from starcal_ros.pipeline.attitude_reading import (
     SetUp,
     WireAttitudes,
 )
-from starcal_ros.pipeline.identified import (
+from starcal_ros.diagnosis.identified import (
     FEWEST_SOURCES,
     Identified,
     identify_images,
     SEARCH_S,
     Solved,
 )
+from starcal_ros.identification.bright_sources import LONGEST_STREAK_PX, smear
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
 
@@ -59,7 +59,7 @@ class Diagnosis:
 
     ``cause`` is one of `CAUSES`, ``also`` are others found with it; ``found`` the value that was
     found, None where there is none; ``sentence`` says both in words, ``evidence`` how it is known,
-    ``mend`` are lines of the parameter file.
+    ``mend`` are lines of the parameter file.  ``images`` agree on how the attitudes are meant.
     """
 
     cause: str
@@ -68,6 +68,12 @@ class Diagnosis:
     evidence: tuple[str, ...] = ()
     mend: tuple[str, ...] = ()
     also: tuple[str, ...] = ()
+    images: int = 0
+
+    def in_a_sentence(self) -> str:
+        """Cause and remedy, as the end of a complaint."""
+        lines = '; '.join(line for line in self.mend if not line.startswith('#'))
+        return f'{self.sentence}{f" Set {lines}." if lines else ""} (starcal diagnose says more)'
 
 
 def diagnose(
@@ -180,7 +186,8 @@ def _held_against(
     elif not solved[0].sky.mirrored:
         findings.append(_no_reading(placed, attitudes, setup))
     findings += [_focal_length(solved, setup, evidence), _tone_curve(solved, catalog)]
-    return _joined([one for one in findings if one is not None], evidence)
+    joined = _joined([one for one in findings if one is not None], evidence)
+    return dataclasses.replace(joined, images=0 if reading is None else reading.agreeing)
 
 
 def _joined(findings: Sequence[Diagnosis], evidence: list[str]) -> Diagnosis:
@@ -267,10 +274,8 @@ def _alignment(reading: Reading, setup: SetUp) -> Diagnosis | None:
         sentence = 'prior_alignment is not given; the images show it.'
         return Diagnosis('prior_alignment', values, sentence, (), mend)
     tilt_deg, roll_deg = (math.degrees(angle) for angle in off_by(reading, setup))
-    evidence = [
-        f'prior_alignment points {tilt_deg:.1f} degrees away from it and is rolled by'
-        f' {roll_deg:.1f} degrees'
-    ]
+    away = f'{tilt_deg:.1f} degrees away from it and is rolled by {roll_deg:.1f} degrees'
+    evidence = [f'prior_alignment points {away}']
     turns = quarter_turns(reading, setup)
     if turns:
         degrees, way = {
