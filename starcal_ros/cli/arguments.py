@@ -71,6 +71,8 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
         """\
   # the bag in the repository
   starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out
+  # an hour of it, every third image, and its two halves compared
+  starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out --to +3600 --every 3 --split-half
   # two bags together, with several cameras in them
   starcal calibrate night1 night2.mcap --params camera1.yaml -o out --image-topic /camera1/image
   # repeat from the recorded observations, with other options and without images
@@ -328,6 +330,13 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
     what = 'folder for the products, created if absent; existing products are replaced'
     _output(command, 'DIR', what, required=True)
     _topics(command)
+    when = 'UTC in ISO 8601, seconds since 1970, or +seconds after the first image'
+    _add(command, '--from', dest='from_time', metavar='T', help=f'use images from T on: {when}')
+    _add(command, '--to', dest='to_time', metavar='T', help='use images up to T')
+    _add(command, '--first', type=int, metavar='N', help='use only the first N of these images')
+    _add(command, '--every', type=int, metavar='K', help='use only every K-th of these images')
+    what = 'compare calibrations of the images of odd and of even number, DIR/odd and DIR/even'
+    _add(command, '--split-half', action='store_true', help=what)
 
 
 def _report(command: argparse.ArgumentParser) -> None:

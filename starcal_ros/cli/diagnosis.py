@@ -32,10 +32,10 @@ def text(found: Diagnosis) -> str:
     return '\n'.join(lines)
 
 
-def in_a_sentence(paths: Sequence[Path], asked: Topics, setup: Setup) -> str:
-    """The diagnosis of bags as the end of a complaint; empty where it finds nothing wrong."""
+def of_a_failure(paths: Sequence[Path], asked: Topics, setup: Setup) -> Diagnosis | None:
+    """The diagnosis of bags whose images match nothing; None where it finds nothing wrong."""
     try:
         found = diagnose_bags(paths, asked, setup)
     except BagError:
-        return ''
-    return '' if found.cause == 'none' else found.in_a_sentence()
+        return None
+    return None if found.cause == 'none' else found

@@ -10,7 +10,7 @@ stderr; 130 interrupted.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 import dataclasses
 import json
 import os
@@ -26,17 +26,15 @@ from starcal_ros.cli.arguments import (
     EXIT_REFUSED,
     parser,
 )
-from starcal_ros.cli.terminal import print_verdict, progress_bar, with_progress
-from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
+from starcal_ros.cli.folders import make_folder, missing_extra
+from starcal_ros.cli.terminal import print_verdict, progress_bar
+from starcal_ros.errors import OptionError, StarcalError
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
 # --help answers at once.
 if TYPE_CHECKING:
-    from starcal_ros.pipeline.setup import Setup
     from starcal_ros.pipeline.topics import Topics
-    from starcal_ros.records import Calibration, Ensemble
 
-_MODULES_OF_EXTRAS = ('dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')  # setup.cfg
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
 
@@ -69,80 +67,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         return complain(f'{error.filename or "input/output"}: {error.strerror or error}')
     except ModuleNotFoundError as error:
         extra = 'studies' if args.command == 'campaign' else 'report'
-        return complain(_missing_extra(error, extra))
+        return complain(missing_extra(error, extra))
     except KeyboardInterrupt:
         complain('interrupted')
         return EXIT_INTERRUPTED
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    """Calibrate from bags in one process, as the two nodes do on the graph."""
-    from starcal_ros.bag import reader
-    from starcal_ros.cli import output
-    from starcal_ros.estimation.calibrate import tracker_sigma_is_given
-    from starcal_ros.pipeline.provenance import inputs_of
-    from starcal_ros.pipeline.setup import read_setup
+    """Calibrate from bags."""
+    from starcal_ros.cli.calibrate import calibrate
 
-    setup = read_setup(args.params)
-    if args.output.exists() and not args.output.is_dir():
-        raise OptionError(f'{args.output}: not a folder')
-    inputs = inputs_of((*reader.mcap_files(args.bags), args.params))
-    setup = _aligned(args, setup)
-    calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
-    report = _write_report(args.output)
-    output.print_calibration(calibration, setup.prior)
-    if not tracker_sigma_is_given(setup.calibration):
-        sigma = ', '.join(f'{arcsec:.1f}' for arcsec in calibration.star_tracker_sigma_arcsec)
-        print(
-            f'star tracker    {sigma}" (x, y, z) from the scatter: star_tracker_sigma_arcsec'
-            ' is not given'
-        )
-    print(f'products written to {args.output}; {report}')
-    return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
-
-
-def _calibrate_into(
-    folder: Path, bags: Sequence[Path], asked: Topics, setup: Setup, inputs: Mapping[str, str]
-) -> Calibration:
-    """Calibrate from bags and write the files that a report is made from."""
-    from starcal_ros.pipeline import solve
-    from starcal_ros.pipeline import topics as bag_topics
-    from starcal_ros.products.folder import write_observations, write_products
-    from starcal_ros.records import Ensemble
-    from starcal_ros.report import thumbnails
-
-    topics = bag_topics.choose_topics(bags, asked, setup)
-    album = thumbnails.Album()
-    records = bag_topics.read(bags, topics, setup, album.show)
-    observations = list(with_progress(records, bag_topics.count(bags, topics), 'images'))
-    ensemble = Ensemble()
-    for record in observations:
-        ensemble = solve.add_to_ensemble(ensemble, record, setup)
-    _make_folder(folder)
-    # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
-    write_observations(observations, folder, setup.frames.camera_frame)
-    try:
-        calibration, left = solve.solve_with_residuals(ensemble, setup, inputs=inputs)
-    except TooFewObservations as error:
-        words = f'{error}{_refused_words(ensemble)}'
-        if topics.image and not ensemble.images:
-            from starcal_ros.cli import diagnosis
-
-            words = f'{words}. {diagnosis.in_a_sentence(bags, asked, setup)}'
-        raise TooFewObservations(words.removesuffix('. ')) from error
-    write_products(calibration, folder, left)
-    thumbnails.write_thumbnails(album.thumbnails(), folder / thumbnails.THUMBNAILS_FOLDER)
-    return calibration
-
-
-def _aligned(args: argparse.Namespace, setup: Setup) -> Setup:
-    """The setup with the prior alignment that the images show, where none is given."""
-    from starcal_ros.diagnosis.bags import aligned_by_bags
-
-    setup, found = aligned_by_bags(args.bags, _asked(args), setup)
-    if found:
-        print(found, file=sys.stderr)
-    return setup
+    return calibrate(args, _asked(args))
 
 
 def _asked(args: argparse.Namespace) -> Topics:
@@ -165,36 +100,19 @@ def _report(args: argparse.Namespace) -> int:
     return EXIT_ACCEPTED
 
 
-def _write_report(folder: Path) -> str:
-    """Write the report of a folder; returns where it is, or why there is none."""
-    try:
-        from starcal_ros.report import page
-    except ModuleNotFoundError as error:
-        return f'no report: {_missing_extra(error, "report")}'
-    return f'look at {page.write_report(folder)}'
-
-
-def _missing_extra(error: ModuleNotFoundError, extra: str) -> str:
-    """One line that names the extra to install; raises what is missing for another reason."""
-    if error.name not in _MODULES_OF_EXTRAS:
-        raise error
-    return f"{error.name} is not installed: pip install 'starcal_ros[{extra}]'"
-
-
-def _refused_words(ensemble: Ensemble) -> str:
-    counted = ', '.join(f'{reason} {count}' for reason, count in ensemble.refused.items())
-    return f' ({counted})' if counted else ''
-
-
 def _inspect(args: argparse.Namespace) -> int:
     """List the contents of a bag and the images that a calibration would refuse."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
+    from starcal_ros.diagnosis.bags import aligned_by_bags
     from starcal_ros.messages.types import COMPRESSED_TYPE, IMAGE_TYPE, OBSERVATIONS_TYPE
     from starcal_ros.pipeline import inspect
     from starcal_ros.pipeline.setup import read_setup
 
-    setup = _aligned(args, read_setup(args.params)) if args.params else None
+    setup = None
+    if args.params:
+        setup, aligned = aligned_by_bags(args.bags, _asked(args), read_setup(args.params))
+        print(aligned, end='\n' if aligned else '', file=sys.stderr)
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:
@@ -202,8 +120,10 @@ def _inspect(args: argparse.Namespace) -> int:
     if setup and found.images and not found.stars_per_image and found.chosen:
         from starcal_ros.cli import diagnosis
 
-        why = diagnosis.in_a_sentence(args.bags, _asked(args), setup)
-        found = dataclasses.replace(found, problems=(*found.problems, why)) if why else found
+        why = diagnosis.of_a_failure(args.bags, _asked(args), setup)
+        if why:
+            problems = (*found.problems, why.in_a_sentence())
+            found = dataclasses.replace(found, problems=problems)
     if args.json:
         print(json.dumps(inspect.content(found), indent=1, allow_nan=False))
     else:
@@ -318,12 +238,13 @@ def _demo(args: argparse.Namespace) -> int:
     """Calibrate the small bag with the real nodes and compare the result with the truth."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import demo
+    from starcal_ros.cli.calibrate import calibrate_into
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.products.folder import write_products
     from starcal_ros.report import page
 
-    _make_folder(args.output)
+    make_folder(args.output)
     bag = demo.tiny_bag(args.output)
     print(f'bag {bag.bag}; log files and products in {args.output}')
     with progress_bar(bag.image_count, 'images') as advance:
@@ -341,7 +262,7 @@ def _demo(args: argparse.Namespace) -> int:
     )
     # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
     setup = load_setup(bag.parameters)
-    again = _calibrate_into(args.output, [bag.bag], Topics(), setup, {})
+    again, _ = calibrate_into(args.output, [bag.bag], Topics(), setup, {})
     write_products(calibration, args.output)
     apart_px = float(comparison.compare(calibration, again).before.length_px.max())
     same = apart_px <= _DEMO_SAME_PX
@@ -386,7 +307,7 @@ def _campaign(args: argparse.Namespace) -> int:
     )
     monte_carlo.check(design)
     workers = _workers(args)
-    _make_folder(args.output)
+    make_folder(args.output)
     start = time.monotonic()
     with progress_bar(design.trials, 'trials') as advance:
         rows = run_trials(design, workers, args.scheduler, advance)
@@ -426,7 +347,7 @@ def _paper(args: argparse.Namespace) -> int:
     )
     monte_carlo.check(table1)
     images = scenario(paper.NIGHT, args.seed).image_count
-    _make_folder(args.output / 'images')
+    make_folder(args.output / 'images')
     with progress_bar(images, 'frames') as advance:
         frame = functools.partial(paper.observe_frame, args.seed)
         frames = run_each(frame, images, workers, args.scheduler, advance)
@@ -448,13 +369,6 @@ def _software() -> str:
     from starcal_ros.pipeline.provenance import software_version
 
     return f'starcal {software_version()}'
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OptionError(f'{path}: cannot create the folder: {error.strerror}') from error
 
 
 _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {

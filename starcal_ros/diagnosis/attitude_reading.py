@@ -267,7 +267,7 @@ def _shifted(solved: Sequence[Placed], attitudes: WireAttitudes, setup: SetUp) -
 
 
 def _middle_of_best(tried: Sequence[Reading]) -> Reading:
-    """The best of shifts; where a range of them is as good, as for a camera at rest, its middle."""
+    """The best of shifts; where a range is as good, as for a camera at rest, its middle."""
     best = min(tried, key=lambda r: (-r.agreeing, r.scatter_rad))
     limit_rad = max(1.2 * best.scatter_rad, _ALIKE_RAD)
     by_shift = sorted(tried, key=lambda r: r.shift_s)

@@ -151,9 +151,7 @@ def _of_another_size(size: tuple[int, int], setup: SetUp) -> Diagnosis:
         f'The images are {size[0]} x {size[1]}, the prior camera is of {camera.width} x'
         f' {camera.height}.',
         ('images of another size are of another camera, binned, or cut',),
-        (
-            '# in the file of camera_info_url: the size of the images, focal length in their pixels',
-        ),
+        ('# in the file of camera_info_url: size of the images, focal length in their pixels',),
     )
 
 
@@ -167,10 +165,9 @@ def _held_against(
     """The causes where images were identified, the one that hides the others first."""
     worst = max(image.sky.log10_p_value for image in solved)
     stars = [len(image.sky.xy_px) for image in solved]
-    evidence = [
-        f'{len(solved)} of {tried} images identified without attitude, {min(stars)} to'
-        f' {max(stars)} stars each; expected false matches: under 10^{worst:.0f} each'
-    ]
+    chance = f'expected false matches: under 10^{worst:.0f} each'
+    identified = f'{len(solved)} of {tried} images identified without attitude'
+    evidence = [f'{identified}, {min(stars)} to {max(stars)} stars each; {chance}']
     placed = [Placed(image.time_ns, image.camera_from_icrf) for image in solved]
     reading = best_reading(placed, attitudes, setup)
     findings: list[Diagnosis | None] = []
@@ -211,10 +208,9 @@ def _agreement(
     reading: Reading, placed: Sequence[Placed], attitudes: WireAttitudes, setup: SetUp
 ) -> list[str]:
     """Evidence for a reading, and against the one set up where that is another."""
-    lines = [
-        f'read as {in_words(reading)}, the attitudes of {reading.agreeing} of {len(placed)} images'
-        f' give one alignment to {math.degrees(reading.scatter_rad):.3f} degrees'
-    ]
+    alike = f'give one alignment to {math.degrees(reading.scatter_rad):.3f} degrees'
+    of = f'{reading.agreeing} of {len(placed)} images'
+    lines = [f'read as {in_words(reading)}, the attitudes of {of} {alike}']
     given = readings(placed, attitudes, setup, 0.0)[0]
     if (reading.order, reading.direction) != (given.order, given.direction):
         lines.append(

@@ -28,6 +28,7 @@ from starcal_ros.records import CameraGeometry, Image, refused_image, StarObserv
 from starcal_ros.sky.attitude import AttitudeHistory
 
 T = TypeVar('T')
+Wanted = Callable[[int], bool]
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
 _IMAGES_OF_A_RESTART = 3  # two images may be swapped in transit, three are not
@@ -246,12 +247,13 @@ def observe_bag(
     velocity_topic: str = '',
     temperature_topic: str = '',
     on_image: OnImage | None = None,
+    wanted: Wanted | None = None,
 ) -> Iterator[StarObservations]:
     """
     Observations of every image of a bag, in bag order, with one image in memory at a time.
 
     ``on_image`` is called with each decoded image, its observations and the geometry that
-    predicted its stars.
+    predicted its stars.  Images whose stamp is not ``wanted`` are passed over.
 
     Raises
     ------
@@ -268,6 +270,8 @@ def observe_bag(
         temperatures = sorted(reader.read_temperatures(paths, temperature_topic), key=by_time)
     track = Track(setup.prior)
     for image in reader.read_images(paths, image_topic, setup.attitude.stamp_offset_s):
+        if wanted is not None and not wanted(image.time_ns):
+            continue
         if isinstance(image, StarObservations):
             yield image
             continue

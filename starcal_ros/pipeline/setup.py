@@ -38,7 +38,12 @@ from starcal_ros.options import (
     read_parameter_file,
 )
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.products.camera_yaml import read_camera_info, with_camera_url_from
+from starcal_ros.products.camera_yaml import (
+    DEFAULT_CAMERA_NAME,
+    read_camera_info,
+    read_camera_name,
+    with_camera_url_from,
+)
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions
@@ -98,6 +103,7 @@ class Setup:
     dark_pedestal_dn: int = 0
     hot: HotPixels = NO_HOT_PIXELS
     is_aligned: bool = True
+    camera_name: str = DEFAULT_CAMERA_NAME
 
     def options(self) -> dict[str, OptionValue]:
         """Every option of every stage, by name."""
@@ -170,6 +176,9 @@ def load_setup(
         dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
         hot=hot_in_dark(dark, groups['fixed_pattern']),
         is_aligned=is_aligned,
+        camera_name=read_camera_name(frames.camera_info_url)
+        if frames.camera_info_url
+        else DEFAULT_CAMERA_NAME,
     )
 
 

@@ -29,6 +29,7 @@ from starcal_ros.estimation.temperature import summary as thermal_summary
 from starcal_ros.messages.types import OBSERVATIONS_TYPE
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, prior_of, read_calibration
 from starcal_ros.products.files import OBSERVATIONS_FILE, REPORT_FILE, write_atomically
+from starcal_ros.products.not_calibrated import read_not_calibrated
 from starcal_ros.products.residuals_npz import read_residuals, RESIDUALS_FILE
 from starcal_ros.records import (
     Calibration,
@@ -39,6 +40,7 @@ from starcal_ros.records import (
 )
 from starcal_ros.report import figures as report_figures
 from starcal_ros.report.charts import charts_of
+from starcal_ros.report.failure_page import write_failure_page
 from starcal_ros.report.thumbnails import read_thumbnails, Thumbnail, THUMBNAILS_FOLDER
 
 _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
@@ -74,11 +76,16 @@ def write_report(folder: Path) -> Path:
     """
     Write ``report.html`` from the product files of a folder and return its path.
 
+    Where the last calibration into the folder failed, it is the page of that failure.
+
     Raises
     ------
     ProductError, BagError
         When a file cannot be read or the report cannot be written.
     """
+    failure = read_not_calibrated(folder)
+    if failure is not None:
+        return write_failure_page(failure, folder)
     path = folder / REPORT_FILE
     write_atomically(path, render(read_folder(folder)))
     return path
