@@ -34,6 +34,7 @@ from starcal_ros.errors import OptionError, StarcalError
 # --help answers at once.
 if TYPE_CHECKING:
     from starcal_ros.pipeline.topics import Topics
+    from starcal_ros.simulation.mistakes import Mistakes
 
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
@@ -149,8 +150,11 @@ def _compare(args: argparse.Namespace) -> int:
     """Compare two calibrations."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import output
+    from starcal_ros.cli.truth import is_truth
     from starcal_ros.products.calibration_json import read_calibration
 
+    if args.b.suffix == '.json' and is_truth(args.b):
+        return _compare_with_truth(args)
     found = comparison.compare(*(read_calibration(_file(p)) for p in (args.a, args.b)))
     if args.output:
         from starcal_ros.report import figures
@@ -162,6 +166,18 @@ def _compare(args: argparse.Namespace) -> int:
         output.print_comparison(found)
         if args.output:
             print(f'figure written to {args.output}')
+    return EXIT_ACCEPTED
+
+
+def _compare_with_truth(args: argparse.Namespace) -> int:
+    """Compare a calibration with the truth of a simulated bag."""
+    from starcal_ros.cli import truth
+    from starcal_ros.products.calibration_json import read_calibration
+
+    if args.output:
+        raise OptionError('--output: a plot needs two calibrations')
+    found = truth.compare_with(read_calibration(_file(args.a)), args.b)
+    print(json.dumps(truth.content(found), indent=1) if args.json else '\n'.join(found.lines))
     return EXIT_ACCEPTED
 
 
@@ -225,13 +241,51 @@ def _simulate(args: argparse.Namespace) -> int:
         raise OptionError(f'--scenario: {args.scenario!r} is not one of {known}')
     if args.seed < 0:
         raise OptionError(f'--seed: {args.seed} is negative')
-    scenario = synthetic.scenario(args.scenario, args.seed)
+    if args.images is not None and args.images < 1:
+        raise OptionError(f'--images: {args.images} is not 1 or more')
+    if args.stars_per_image is not None and args.stars_per_image < 1:
+        raise OptionError(f'--stars-per-image: {args.stars_per_image} is not 1 or more')
+    camera_seed = args.seed if args.camera_seed is None else args.camera_seed
+    if camera_seed < 0:
+        raise OptionError(f'--camera-seed: {camera_seed} is negative')
+    scenario = synthetic.scenario(args.scenario, camera_seed)
+    scenario = dataclasses.replace(
+        scenario,
+        seed=args.seed,
+        image_count=args.images or scenario.image_count,
+        stars_per_image=args.stars_per_image,
+    )
+    mistakes = _mistakes(args)
     with progress_bar(scenario.image_count, 'images') as advance:
-        made = simulated_bag.write_bag(scenario, args.output, on_image=lambda _: advance())
+        made = simulated_bag.write_bag(
+            scenario, args.output, on_image=lambda _: advance(), mistakes=mistakes
+        )
     print(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
     print(f'truth {made.truth}')
     print(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
     return EXIT_ACCEPTED
+
+
+def _mistakes(args: argparse.Namespace) -> Mistakes:
+    from starcal_ros.simulation.mistakes import Mistakes
+
+    if not 1 <= args.smear <= 200:
+        raise OptionError(f'--smear: {args.smear} px is not within 1 to 200')
+    if not 0.2 <= args.gamma <= 5.0:
+        raise OptionError(f'--gamma: {args.gamma:g} is not within 0.2 to 5')
+    if not -90.0 < args.focal_error < 400.0:
+        raise OptionError(f'--focal-error: {args.focal_error:g} % is not within -90 to 400')
+    return Mistakes(
+        flip=args.flip or '',
+        rotate_deg=args.rotate,
+        attitude_direction=args.attitude_direction,
+        quaternion_order=args.quaternion_order,
+        alignment_error_deg=args.alignment_error,
+        focal_error_percent=args.focal_error,
+        clock_error_s=args.clock_error,
+        smear_px=args.smear,
+        gamma=args.gamma,
+    )
 
 
 def _demo(args: argparse.Namespace) -> int:
@@ -346,10 +400,13 @@ def _paper(args: argparse.Namespace) -> int:
         paper.TABLE_1, seed=args.seed, trials=args.trials or paper.TABLE_1.trials
     )
     monte_carlo.check(table1)
-    images = scenario(paper.NIGHT, args.seed).image_count
+    night = scenario(paper.NIGHT, args.seed).image_count
+    if args.images and (len(args.images) > 1 or not 6 <= args.images[0] <= night):
+        raise OptionError(f'--images: {args.images} is not one number of 6 to {night}')
+    images = args.images[0] if args.images else night
     make_folder(args.output / 'images')
     with progress_bar(images, 'frames') as advance:
-        frame = functools.partial(paper.observe_frame, args.seed)
+        frame = functools.partial(paper.observe_frame_of, args.seed, images)
         frames = run_each(frame, images, workers, args.scheduler, advance)
     with progress_bar(table1.trials, 'trials') as advance:
         rows = run_trials(table1, workers, args.scheduler, advance)
