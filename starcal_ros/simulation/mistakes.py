@@ -58,11 +58,12 @@ class Mistakes:
             light = np.clip(pixels.astype(np.float64) - np.median(pixels), 0.0, None) / full
             curved = 0.05 * full + 0.9 * full * light ** (1 / self.gamma)
             pixels = _as_before(curved, pixels, full)
-        pixels = np.rot90(pixels, self.rotate_deg // 90)
+        turned: Pixels = np.rot90(pixels, self.rotate_deg // 90)  # type: ignore[assignment]
         if self.flip:
-            pixels = pixels[:, ::-1] if self.flip == 'left-right' else pixels[::-1]
+            turned = turned[:, ::-1] if self.flip == 'left-right' else turned[::-1]
         late_ns = round(self.clock_error_s * NANOSECONDS_PER_SECOND)
-        return Image(image.time_ns + late_ns, np.ascontiguousarray(pixels))
+        # A copy without gaps, of the same type.
+        return Image(image.time_ns + late_ns, turned.copy())
 
     def attitude(self, icrf_from_star_tracker_xyzw: Floats) -> Floats:
         """An attitude as it is written."""

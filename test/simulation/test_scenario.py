@@ -17,6 +17,7 @@ from starcal_ros.simulation.scenario import (
     Inertial,
     scenario,
     SCENARIOS,
+    scene,
 )
 
 
