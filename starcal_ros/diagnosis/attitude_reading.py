@@ -187,6 +187,28 @@ def readings(
     ]
 
 
+def expected_rotations(attitudes: WireAttitudes, setup: SetUp, time_ns: int) -> list[Rotation]:
+    """
+    The rotations ``camera_from_icrf`` of an image by each reading, the one set up first.
+
+    With those of a camera that is rolled by quarter turns; none without a prior alignment.
+    """
+    prior = setup.star_tracker_from_camera
+    if prior is None:
+        return []
+    at_ns = np.array([time_ns], np.int64)
+    directions = sorted(_DIRECTIONS, key=lambda name: name != setup.attitude_direction)
+    read = []
+    for order in ('xyzw', 'wxyz'):
+        quaternion = _at(attitudes, at_ns, order, setup.max_attitude_gap_s)[0]
+        if np.isfinite(quaternion).all():
+            sent = Rotation.from_quat(quaternion)
+            inertial = {'st_to_inertial': sent, 'inertial_to_st': sent.inv()}
+            read += [(inertial[name] * prior).inv() for name in directions]
+    rolls = [Rotation.from_euler('z', 90.0 * turns, degrees=True) for turns in (0, 2, 1, 3)]
+    return [roll * rotation for roll in rolls for rotation in read]
+
+
 def _reading(
     solved: Sequence[Placed],
     attitudes: WireAttitudes,

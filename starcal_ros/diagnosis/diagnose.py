@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 import dataclasses
 from dataclasses import dataclass
+import functools
 import math
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from starcal_ros.diagnosis.attitude_reading import (
     best_reading,
     CLOCK_SEARCH_S,
+    expected_rotations,
     in_words,
     is_off,
     off_by,
@@ -48,7 +50,7 @@ CAUSES = (
 )  # fmt: skip
 
 _FOCAL_SHARE = 0.03  # error of the focal length that an image is still matched with
-_LINEAR_SLOPE = 0.65  # of brightness against that of the catalog; a display gamma of 2.2 has 0.45
+_LINEAR_SLOPE = 0.5  # of brightness against that of the catalog; a display gamma of 2.2 has 0.45
 _SAME_ALIGNMENT_RAD = math.radians(3.0)  # of one written in another way and the one found
 
 
@@ -89,7 +91,8 @@ def diagnose(
     The catalog is sorted by magnitude, as `load_catalog` gives it.  ``search_s`` limits the time
     that the identification may take.
     """
-    found = identify_images(images, setup.camera, catalog, search_s)
+    guesses = functools.partial(expected_rotations, attitudes, setup)
+    found = identify_images(images, setup.camera, catalog, search_s, guesses=guesses)
     if not found.solved:
         return _nothing_found(found, setup)
     return _held_against(found.solved, len(found.seen), attitudes, setup, catalog)

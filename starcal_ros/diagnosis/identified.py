@@ -7,7 +7,7 @@ that is found gives the focal length and the handedness to the others, which are
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 import dataclasses
 from dataclasses import dataclass
 import time
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.identification.bright_sources import bright_sources, BrightSources, smear
 from starcal_ros.identification.lost_in_space import (
+    confirm_sky,
     find_sky,
     mirror,
     mirrored_camera,
@@ -70,17 +71,23 @@ class _Pending:
     quarter_turned: bool
 
 
+Guesses = Callable[[int], Sequence[Rotation]]
+"""Rotations ``camera_from_icrf`` that an image of a stamp may have, always in the same order."""
+
+
 def identify_images(
     images: Iterable[Image],
     camera: CameraModel,
     catalog: StarCatalog,
     search_s: float = SEARCH_S,
     most: int = IMAGES,
+    guesses: Guesses = lambda _: (),
 ) -> Identified:
     """
     The first images that can be identified, at most ``most``, in the order of their stamps.
 
-    The search ends ``search_s`` after its start at the latest, in processor time of this thread.
+    ``guesses`` are tried before the sky is searched.  The search ends ``search_s`` after its start
+    at the latest, in processor time of this thread.
     """
     deadline_s = time.thread_time() + search_s
     solved: list[Solved] = []
@@ -104,7 +111,10 @@ def identify_images(
         if len(sources.xy_px) >= FEWEST_SOURCES and smear(sources) is None:
             one = _Pending(image.time_ns, sources, turned)
             searched += 1
-            if not _search(one, ROUNDS[0], camera, catalog, solved, deadline_s):
+            confirmed = _confirmed(one, guesses(one.time_ns), camera, catalog, solved)
+            if confirmed is not None:
+                solved.append(confirmed)
+            elif not _search(one, ROUNDS[0], camera, catalog, solved, deadline_s):
                 pending.append(one)
         if len(solved) == most or searched == _SEARCHED or looked_at == _LOOKED_AT:
             break
@@ -121,6 +131,25 @@ def identify_images(
     return Identified(
         tuple(sorted(alike, key=lambda one: one.time_ns)), tuple(seen), tuple(other_sizes)
     )
+
+
+def _confirmed(
+    one: _Pending,
+    guessed: Sequence[Rotation],
+    camera: CameraModel,
+    catalog: StarCatalog,
+    solved: Sequence[Solved],
+) -> Solved | None:
+    """An image identified by one of its guessed rotations."""
+    ways = [solved[0].sky.mirrored] if solved else [False, True]
+    for mirrored in ways:
+        for rotation in guessed:
+            sky = confirm_sky(one.sources.xy_px, camera, catalog, rotation, mirrored)
+            if isinstance(sky, SkyMatch):
+                return Solved(
+                    one.time_ns, sky, one.sources, sky.camera_from_icrf, one.quarter_turned
+                )
+    return None
 
 
 def _search(

@@ -47,6 +47,11 @@ MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of 
 ROUNDS = ((0, 12), (12, 18), (18, 24))
 """Brightest sources of which patterns are formed, with one of each range, round by round."""
 _REFINED = 16  # best candidates of a lookup that are refined
+_GUESSED, _ALIKE = (
+    0.2,
+    0.03,
+)  # largest shift of a guess, and of one star to the next: half diagonals
+_OF_A_GUESS = 40  # brightest stars and sources
 _CANDIDATES = 20_000  # of a lookup that are tested, drawn at random from more
 _TESTED = 16  # brightest predictions that a candidate is tested with
 _CHUNK = 5000  # candidates tested at once: 30 MB
@@ -147,6 +152,42 @@ def find_sky(
                 if time.thread_time() > deadline_s:
                     return NotFound('the time given for the search is over', least)
     return NotFound('no pattern of the sources is one of the catalog beyond chance', least)
+
+
+def confirm_sky(
+    xy_px: Floats,
+    camera: CameraModel,
+    catalog: StarCatalog,
+    camera_from_icrf: Rotation,
+    mirrored: bool = False,
+) -> SkyMatch | NotFound:
+    """The stars that sources are, as `find_sky`, by a rotation known to 10 % of a field."""
+    image = SourceImage(xy_px, camera)
+    if mirrored:
+        image = SourceImage(mirror(xy_px, camera.width), mirrored_camera(camera))
+    stars = _stars_about(image, catalog, camera_from_icrf.as_matrix()[2])
+    start = SkyFit(camera_from_icrf, image.camera, stars)
+    pairs = _shifted_alike(image, catalog, start)
+    fit = refined(image, catalog, start, pairs) if len(pairs) >= 5 else None
+    if fit is None:
+        return NotFound('the stars are not where they were expected')
+    log10_p, radius_px = log10_p_value(image, catalog, fit)
+    if log10_p >= MAX_LOG10_P_VALUE:
+        return NotFound('the stars are not where they were expected', log10_p)
+    return _result(image, catalog, fit, radius_px, log10_p, mirrored)
+
+
+def _shifted_alike(image: SourceImage, catalog: StarCatalog, start: SkyFit) -> Rows:
+    """Pairs (k, 2) of catalog row and source whose shifts are the most alike."""
+    stars, xy_px = predicted(catalog, start, _OF_A_GUESS)
+    shift = (image.xy_px[None, :_OF_A_GUESS] - xy_px[:, None]) / image.half_diagonal_px
+    rank, source = np.nonzero(np.hypot(shift[..., 0], shift[..., 1]) < _GUESSED)
+    if len(rank) == 0:
+        return np.empty((0, 2), np.int64)
+    tree = cKDTree(shift[rank, source])
+    alike = tree.query_ball_point(tree.data, _ALIKE)
+    chosen = np.array(max(alike, key=len))
+    return np.stack([stars[rank[chosen]], source[chosen]], axis=-1)
 
 
 def mirror(xy_px: Floats, width: int) -> Floats:
