@@ -216,10 +216,10 @@ def _agreement(
     lines = [f'read as {in_words(reading)}, the attitudes of {of} {alike}']
     given = readings(placed, attitudes, setup, 0.0)[0]
     if (reading.order, reading.direction) != (given.order, given.direction):
-        lines.append(
-            f'read as {in_words(given)}, as they are now, those of {given.agreeing} agree to'
-            f' {math.degrees(given.scatter_rad):.3f} degrees'
-        )
+        agree = f'those of {given.agreeing} agree to {math.degrees(given.scatter_rad):.3f} degrees'
+        if given.agreeing < 2:
+            agree = 'no two agree'
+        lines.append(f'read as {in_words(given)}, as they are now, {agree}')
     return lines
 
 

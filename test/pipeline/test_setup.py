@@ -165,7 +165,7 @@ def test_zeros_stand_for_an_alignment_not_given(camera_yaml: Path) -> None:
 def test_a_quaternion_of_another_norm_is_refused_with_it(camera_yaml: Path) -> None:
     with pytest.raises(OptionError, match=r'prior_alignment: .* its norm is 1\.1$'):
         load_setup(values(camera_yaml, prior_alignment=[0.0, 0.0, 0.0, 1.1]))
-    with pytest.raises(OptionError, match=r'its norm is 90\.56.*angles in degrees are no quaternion'):
+    with pytest.raises(OptionError, match=r'norm is 90\.559.*angles in degrees are no quat'):
         load_setup(values(camera_yaml, prior_alignment=[90.0, 0.0, 10.0, 1.0]))
 
 
