@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats
 from starcal_ros.bag import reader
 from starcal_ros.camera import CameraModel, line_of_sight, project
+from starcal_ros.diagnosis.bags import aligned_by_bags
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.gate.options import GateOptions
@@ -216,6 +217,7 @@ def calibrate_bag(
         temperature=temperature_topic,
         observations=observations_topic,
     )
+    setup, _ = aligned_by_bags(paths, asked, setup)
     images = topics.read(paths, topics.choose_topics(paths, asked, setup), setup)
     inputs = inputs_of((*reader.mcap_files(paths), Path(params)))
     return solve.solve(_ensemble(images, setup), setup, inputs=inputs)

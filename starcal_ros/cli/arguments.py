@@ -75,6 +75,8 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
         """\
   # the bag in the repository
   starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out
+  # the images of the first 30 s, and a comparison of its two halves
+  starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out --to +30 --split-half
   # two bags together, with several cameras in them
   starcal calibrate night1 night2.mcap --params camera1.yaml -o out --image-topic /camera1/image
   # repeat from the recorded observations, with other options and without images
@@ -90,6 +92,8 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
         """\
   # two runs
   starcal compare out again
+  # with the truth of a simulated bag
+  starcal compare out sim/truth.json
   # with a map of the difference over the detector
   starcal compare out again -o difference.png
   # machine-readable output
@@ -141,7 +145,11 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   # calibrate them
   starcal calibrate sim --params sim/params.yaml -o out
   # another draw of the camera and the noise
-  starcal simulate -o sim2 --scenario small --seed 2""",
+  starcal simulate -o sim2 --scenario small --seed 2
+  # the camera of sim with other noise, twelve stars in each image
+  starcal simulate -o sim3 --scenario small --seed 3 --camera-seed 1 --stars-per-image 12
+  # a mistake to rehearse
+  starcal simulate -o mirrored --scenario tiny --flip""",
     ),
     'campaign': (
         'run a Monte Carlo study of the calibration',
@@ -152,7 +160,9 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   # a shorter run: two noise levels, twenty trials
   starcal campaign table1 -o studies --trials 20 --tracker 0 20
   # the whole night of the paper from pixels, with its figures, in some minutes
-  starcal campaign paper -o paper""",
+  starcal campaign paper -o paper
+  # twelve frames of it, in a minute
+  starcal campaign paper -o paper --images 12 --trials 20""",
     ),
 }
 
@@ -333,6 +343,13 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
     what = 'folder for the products, created if absent; existing products are replaced'
     _output(command, 'DIR', what, required=True)
     _topics(command)
+    when = 'UTC in ISO 8601, seconds since 1970, or +seconds after the first image'
+    _add(command, '--from', dest='from_time', metavar='T', help=f'use images from T on: {when}')
+    _add(command, '--to', dest='to_time', metavar='T', help='use images up to T')
+    _add(command, '--first', type=int, metavar='N', help='use only the first N of these images')
+    _add(command, '--every', type=int, metavar='K', help='use only every K-th of these images')
+    what = 'compare calibrations of the images of odd and of even number, DIR/odd and DIR/even'
+    _add(command, '--split-half', action='store_true', help=what)
 
 
 def _report(command: argparse.ArgumentParser) -> None:
@@ -379,6 +396,44 @@ def _simulate(command: argparse.ArgumentParser) -> None:
     what = 'scenario: tiny, small or paper'
     _add(command, '--scenario', required=True, metavar='NAME', help=what, completer=_scenarios)
     _seed(command, 'seed of the truth and the noise')
+    what = (
+        'seed of the camera and its mounting: the same camera with other noise (default: --seed)'
+    )
+    _add(command, '--camera-seed', type=int, metavar='N', help=what)
+    what = 'number of images (default: that of the scenario)'
+    _add(command, '--images', type=int, metavar='N', help=what)
+    what = 'draw only the N brightest stars of each image'
+    _add(command, '--stars-per-image', type=int, metavar='N', help=what)
+    _mistakes(command)
+
+
+def _mistakes(command: argparse.ArgumentParser) -> None:
+    mistakes = command.add_argument_group('mistakes to rehearse, see "starcal diagnose"')
+    what = 'mirror the images (default where no side is given: left-right)'
+    mistakes.add_argument(
+        '--flip', nargs='?', const='left-right', choices=('left-right', 'top-bottom'), help=what
+    )
+    what = 'turn the images counterclockwise by so many degrees'
+    mistakes.add_argument('--rotate', type=int, choices=(0, 90, 180, 270), default=0, help=what)
+    what = 'direction of the attitudes in the bag; the parameter file has st_to_inertial'
+    directions = ('st_to_inertial', 'inertial_to_st')
+    mistakes.add_argument(
+        '--attitude-direction', choices=directions, default=directions[0], help=what
+    )
+    what = 'order of the numbers of the quaternions in the bag'
+    mistakes.add_argument(
+        '--quaternion-order', choices=('xyzw', 'wxyz'), default='xyzw', help=what
+    )
+    for name, metavar, what in (
+        ('alignment-error', 'DEG', 'error of the prior alignment, degrees'),
+        ('focal-error', 'PERCENT', 'error of the prior focal length, percent'),
+        ('clock-error', 'S', 'stamps of the images late by so many seconds'),
+    ):
+        mistakes.add_argument(f'--{name}', type=float, default=0.0, metavar=metavar, help=what)
+    what = 'length of the streak that a star becomes, px'
+    mistakes.add_argument('--smear', type=int, default=1, metavar='PX', help=what)
+    what = 'tone curve: pixel values grow with light to the power 1/G'
+    mistakes.add_argument('--gamma', type=float, default=1.0, metavar='G', help=what)
 
 
 def _campaign(command: argparse.ArgumentParser) -> None:

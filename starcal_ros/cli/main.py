@@ -11,7 +11,7 @@ stderr; 130 interrupted.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 import dataclasses
 import io
 import json
@@ -28,24 +28,22 @@ from starcal_ros.cli.arguments import (
     EXIT_REFUSED,
     parser,
 )
+from starcal_ros.cli.folders import make_folder, missing_extra
 from starcal_ros.cli.terminal import (
     discard,
     open_missing_streams,
     print_text,
     print_verdict,
     progress_bar,
-    with_progress,
 )
-from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
+from starcal_ros.errors import OptionError, StarcalError
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
 # --help answers at once.
 if TYPE_CHECKING:
-    from starcal_ros.pipeline.setup import Setup
     from starcal_ros.pipeline.topics import Topics
-    from starcal_ros.records import Calibration, Ensemble
+    from starcal_ros.simulation.mistakes import Mistakes
 
-_MODULES_OF_EXTRAS = ('dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')  # setup.cfg
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
 
@@ -80,7 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         discard('stdout')
         return complain(f'{error.filename or "input/output"}: {error.strerror or error}')
     except ModuleNotFoundError as error:
-        return complain(_missing_extra(error, 'studies' if command == 'campaign' else 'report'))
+        extra = 'studies' if command == 'campaign' else 'report'
+        return complain(missing_extra(error, extra))
     except KeyboardInterrupt:
         complain('interrupted')
         return EXIT_INTERRUPTED
@@ -98,56 +97,10 @@ def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    """Calibrate from bags in one process, as the two nodes do on the graph."""
-    from starcal_ros.bag import reader
-    from starcal_ros.cli import output
-    from starcal_ros.cli.output_places import check_folder
-    from starcal_ros.pipeline.provenance import inputs_of
-    from starcal_ros.pipeline.setup import files_of, read_setup
+    """Calibrate from bags."""
+    from starcal_ros.cli.calibrate import calibrate
 
-    setup = read_setup(args.params)
-    if args.output.exists() and not args.output.is_dir():
-        raise OptionError(f'{args.output}: not a folder')
-    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames)))
-    inputs = inputs_of((*reader.mcap_files(args.bags), args.params))
-    calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
-    report = _write_report(args.output)
-    output.print_calibration(calibration, setup.prior)
-    print_text(f'products written to {args.output}; {report}')
-    return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
-
-
-def _calibrate_into(
-    folder: Path, bags: Sequence[Path], asked: Topics, setup: Setup, inputs: Mapping[str, str]
-) -> Calibration:
-    """Calibrate from bags and write the files that a report is made from."""
-    from starcal_ros.pipeline import solve
-    from starcal_ros.pipeline import topics as bag_topics
-    from starcal_ros.products.folder import write_observations, write_products
-    from starcal_ros.records import Ensemble
-    from starcal_ros.report import thumbnails
-
-    topics = bag_topics.choose_topics(bags, asked, setup)
-    album = thumbnails.Album()
-    records = bag_topics.read(bags, topics, setup, album.show)
-    observations = list(with_progress(records, bag_topics.count(bags, topics), 'images'))
-    ensemble = Ensemble()
-    for record in observations:
-        ensemble = solve.add_to_ensemble(ensemble, record, setup)
-    _make_folder(folder)
-    write_observations(observations, folder, setup.frames.camera_frame)
-    try:
-        calibration, left = solve.solve_with_residuals(ensemble, setup, inputs=inputs)
-    except TooFewObservations as error:
-        words = f'{error}{_refused_words(ensemble)}'
-        if topics.image and not ensemble.images:
-            from starcal_ros.cli import diagnosis
-
-            words = f'{words}. {diagnosis.in_a_sentence(bags, asked, setup)}'
-        raise TooFewObservations(words.removesuffix('. ')) from error
-    write_products(calibration, folder, left)
-    thumbnails.write_thumbnails(album.thumbnails(), folder / thumbnails.THUMBNAILS_FOLDER)
-    return calibration
+    return calibrate(args, _asked(args))
 
 
 def _asked(args: argparse.Namespace) -> Topics:
@@ -170,36 +123,19 @@ def _report(args: argparse.Namespace) -> int:
     return EXIT_ACCEPTED
 
 
-def _write_report(folder: Path) -> str:
-    """Write the report of a folder; returns where it is, or why there is none."""
-    try:
-        from starcal_ros.report import page
-    except ModuleNotFoundError as error:
-        return f'no report: {_missing_extra(error, "report")}'
-    return f'look at {page.write_report(folder)}'
-
-
-def _missing_extra(error: ModuleNotFoundError, extra: str) -> str:
-    """One line that names the extra to install; raises errors of other modules again."""
-    if error.name not in _MODULES_OF_EXTRAS:
-        raise error
-    return f"{error.name} is not installed: pip install 'starcal_ros[{extra}]'"
-
-
-def _refused_words(ensemble: Ensemble) -> str:
-    counted = ', '.join(f'{reason} {count}' for reason, count in ensemble.refused.items())
-    return f' ({counted})' if counted else ''
-
-
 def _inspect(args: argparse.Namespace) -> int:
     """List the contents of a bag and the images that a calibration would refuse."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
+    from starcal_ros.diagnosis.bags import aligned_by_bags
     from starcal_ros.messages.types import COMPRESSED_TYPE, IMAGE_TYPE, OBSERVATIONS_TYPE
     from starcal_ros.pipeline import inspect
     from starcal_ros.pipeline.setup import read_setup
 
-    setup = read_setup(args.params) if args.params else None
+    setup = None
+    if args.params:
+        setup, aligned = aligned_by_bags(args.bags, _asked(args), read_setup(args.params))
+        print(aligned, end='\n' if aligned else '', file=sys.stderr)
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:
@@ -207,8 +143,10 @@ def _inspect(args: argparse.Namespace) -> int:
     if setup and found.images and not found.stars_per_image and found.chosen:
         from starcal_ros.cli import diagnosis
 
-        why = diagnosis.in_a_sentence(args.bags, _asked(args), setup)
-        found = dataclasses.replace(found, problems=(*found.problems, why)) if why else found
+        why = diagnosis.of_a_failure(args.bags, _asked(args), setup)
+        if why:
+            problems = (*found.problems, why.in_a_sentence())
+            found = dataclasses.replace(found, problems=problems)
     if args.json:
         print_text(json.dumps(inspect.content(found), indent=1, allow_nan=False))
     else:
@@ -219,9 +157,10 @@ def _inspect(args: argparse.Namespace) -> int:
 def _diagnose(args: argparse.Namespace) -> int:
     """Print the reason why the images of a bag match no stars."""
     from starcal_ros.cli import diagnosis
+    from starcal_ros.diagnosis.bags import diagnose_bags
     from starcal_ros.pipeline.setup import read_setup
 
-    found = diagnosis.of_bags(args.bags, _asked(args), read_setup(args.params))
+    found = diagnose_bags(args.bags, _asked(args), read_setup(args.params))
     if args.json:
         print_text(json.dumps(diagnosis.content(found), indent=1, allow_nan=False))
     else:
@@ -233,9 +172,12 @@ def _compare(args: argparse.Namespace) -> int:
     """Compare two calibrations."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import output
+    from starcal_ros.cli.truth import is_truth
     from starcal_ros.products.calibration_json import read_calibration
 
     files = [_file(path) for path in (args.a, args.b)]
+    if files[1].suffix == '.json' and is_truth(files[1]):
+        return _compare_with_truth(args)
     found = comparison.compare(*map(read_calibration, files))
     if args.output:
         from starcal_ros.cli.output_places import check_no_product
@@ -249,6 +191,18 @@ def _compare(args: argparse.Namespace) -> int:
         output.print_comparison(found)
         if args.output:
             print_text(f'figure written to {args.output}')
+    return EXIT_ACCEPTED
+
+
+def _compare_with_truth(args: argparse.Namespace) -> int:
+    """Compare a calibration with the truth of a simulated bag."""
+    from starcal_ros.cli import truth
+    from starcal_ros.products.calibration_json import read_calibration
+
+    if args.output:
+        raise OptionError('--output: a plot needs two calibrations')
+    found = truth.compare_with(read_calibration(_file(args.a)), args.b)
+    print(json.dumps(truth.content(found), indent=1) if args.json else '\n'.join(found.lines))
     return EXIT_ACCEPTED
 
 
@@ -315,26 +269,65 @@ def _simulate(args: argparse.Namespace) -> int:
         raise OptionError(f'--scenario: {args.scenario!r} is not one of {known}')
     if args.seed < 0:
         raise OptionError(f'--seed: {args.seed} is negative')
-    scenario = synthetic.scenario(args.scenario, args.seed)
+    if args.images is not None and args.images < 1:
+        raise OptionError(f'--images: {args.images} is not 1 or more')
+    if args.stars_per_image is not None and args.stars_per_image < 1:
+        raise OptionError(f'--stars-per-image: {args.stars_per_image} is not 1 or more')
+    camera_seed = args.seed if args.camera_seed is None else args.camera_seed
+    if camera_seed < 0:
+        raise OptionError(f'--camera-seed: {camera_seed} is negative')
+    scenario = synthetic.scenario(args.scenario, camera_seed)
+    scenario = dataclasses.replace(
+        scenario,
+        seed=args.seed,
+        image_count=args.images or scenario.image_count,
+        stars_per_image=args.stars_per_image,
+    )
+    mistakes = _mistakes(args)
     with progress_bar(scenario.image_count, 'images') as advance:
-        made = simulated_bag.write_bag(scenario, args.output, on_image=lambda _: advance())
+        made = simulated_bag.write_bag(
+            scenario, args.output, on_image=lambda _: advance(), mistakes=mistakes
+        )
     print_text(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
     print_text(f'truth {made.truth}')
     print_text(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
     return EXIT_ACCEPTED
 
 
+def _mistakes(args: argparse.Namespace) -> Mistakes:
+    from starcal_ros.simulation.mistakes import Mistakes
+
+    if not 1 <= args.smear <= 200:
+        raise OptionError(f'--smear: {args.smear} px is not within 1 to 200')
+    if not 0.2 <= args.gamma <= 5.0:
+        raise OptionError(f'--gamma: {args.gamma:g} is not within 0.2 to 5')
+    if not -90.0 < args.focal_error < 400.0:
+        raise OptionError(f'--focal-error: {args.focal_error:g} % is not within -90 to 400')
+    return Mistakes(
+        flip=args.flip or '',
+        rotate_deg=args.rotate,
+        attitude_direction=args.attitude_direction,
+        quaternion_order=args.quaternion_order,
+        alignment_error_deg=args.alignment_error,
+        focal_error_percent=args.focal_error,
+        clock_error_s=args.clock_error,
+        smear_px=args.smear,
+        gamma=args.gamma,
+    )
+
+
 def _demo(args: argparse.Namespace) -> int:
     """Calibrate the small bag with the real nodes and compare the result with the truth."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import demo
+    from starcal_ros.cli.calibrate import calibrate_into
     from starcal_ros.cli.output_places import check_folder
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.products.folder import write_products
     from starcal_ros.report import page
 
-    _make_folder(args.output)
+    make_folder(args.output)
     bag = demo.tiny_bag(args.output)
     check_folder(args.output, [bag.bag], ())
     print_text(f'bag {bag.bag}; log files and products in {args.output}')
@@ -353,7 +346,7 @@ def _demo(args: argparse.Namespace) -> int:
     )
     # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
     setup = load_setup(bag.parameters)
-    again = _calibrate_into(args.output, [bag.bag], Topics(), setup, {})
+    again, _ = calibrate_into(args.output, [bag.bag], Topics(), setup, {})
     write_products(calibration, args.output)
     apart_px = float(comparison.compare(calibration, again).before.length_px.max())
     same = apart_px <= _DEMO_SAME_PX
@@ -398,7 +391,7 @@ def _campaign(args: argparse.Namespace) -> int:
     )
     monte_carlo.check(design)
     workers = _workers(args)
-    _make_folder(args.output)
+    make_folder(args.output)
     start = time.monotonic()
     with progress_bar(design.trials, 'trials') as advance:
         rows = run_trials(design, workers, args.scheduler, advance)
@@ -439,10 +432,13 @@ def _paper(args: argparse.Namespace) -> int:
         paper.TABLE_1, seed=args.seed, trials=args.trials or paper.TABLE_1.trials
     )
     monte_carlo.check(table1)
-    images = scenario(paper.NIGHT, args.seed).image_count
-    _make_folder(args.output / 'images')
+    night = scenario(paper.NIGHT, args.seed).image_count
+    if args.images and (len(args.images) > 1 or not 6 <= args.images[0] <= night):
+        raise OptionError(f'--images: {args.images} is not one number of 6 to {night}')
+    images = args.images[0] if args.images else night
+    make_folder(args.output / 'images')
     with progress_bar(images, 'frames') as advance:
-        frame = functools.partial(paper.observe_frame, args.seed)
+        frame = functools.partial(paper.observe_frame_of, args.seed, images)
         frames = run_each(frame, images, workers, args.scheduler, advance)
     with progress_bar(table1.trials, 'trials') as advance:
         rows = run_trials(table1, workers, args.scheduler, advance)
@@ -462,13 +458,6 @@ def _software() -> str:
     from starcal_ros.pipeline.provenance import software_version
 
     return f'starcal {software_version()}'
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OptionError(f'{path}: cannot create the folder: {error.strerror}') from error
 
 
 _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {

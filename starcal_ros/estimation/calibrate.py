@@ -15,10 +15,12 @@ from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.options import (
+    assumed_tracker_sigma_rad,
     CalibrationOptions,
     check_enough,
     check_options,
     estimated_parameters,
+    tracker_sigma_is_given,
 )
 from starcal_ros.estimation.search import Found, search
 from starcal_ros.estimation.verdict import all_residuals_px, arranged, dropped_stars, free_share
@@ -205,7 +207,7 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
             np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
         ).inv(),
         star_tracker_sigma_rad=np.tile(
-            np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD, (len(ensemble.images), 1)
+            assumed_tracker_sigma_rad(options), (len(ensemble.images), 1)
         ),
         above_reference_k=np.array([image.temperature_degc for image in ensemble.images])
         - options.reference_temperature_degc,
@@ -313,8 +315,10 @@ def _correlation(
 ) -> AttitudeCorrelation:
     """Correlation in time of the star-tracker errors of the images that fit."""
     good = seen & ~found.verdict.misfit
-    assumed_rad = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
-    excess = bool((found.verdict.tracker_sigma_rad > _TRACKER_EXCESS * assumed_rad).any())
+    assumed_rad = assumed_tracker_sigma_rad(options)
+    excess = tracker_sigma_is_given(options) and bool(
+        (found.verdict.tracker_sigma_rad > _TRACKER_EXCESS * assumed_rad).any()
+    )
     return attitude_correlation(
         time_ns[good], error_rad[good], np.einsum('mii->mi', covariance_rad2[good]), excess
     )

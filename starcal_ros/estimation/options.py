@@ -5,12 +5,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import ALL_PARAMETER_NAMES, parameter_names
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.lens import COEFFICIENTS
 from starcal_ros.methods.problem import METHODS
 from starcal_ros.options import option
 from starcal_ros.records import Ensemble
+
+_USUAL_TRACKER_ARCSEC = 10.0  # until the scatter of the images replaces it
 
 
 @dataclass(frozen=True)
@@ -27,9 +33,10 @@ class CalibrationOptions:
         choices=(*ALL_PARAMETER_NAMES, 'distortion'),
     )
     star_tracker_sigma_arcsec: tuple[float, ...] = option(
-        (10.0, 10.0, 10.0),
-        '1-sigma of the star tracker attitude about its x, y, z axes, arcsec',
-        low=1e-3,
+        (0.0, 0.0, 0.0),
+        '1-sigma of the star tracker attitude about its x, y, z axes, arcsec; zeros: estimated'
+        ' from the scatter of the images',
+        low=0.0,
         high=3600.0,
         length=3,
     )
@@ -102,6 +109,11 @@ def check_options(options: CalibrationOptions, model: str) -> None:
         # Its mean of the images' alignments has no place for a slope: `hierarchical` with a loose
         # star tracker is the same estimate with one.
         raise OptionError('alignment_temperature: the method per_image has no common alignment')
+    if tracker_sigma_is_given(options) and min(options.star_tracker_sigma_arcsec) < 1e-3:
+        raise OptionError(
+            f'star_tracker_sigma_arcsec: {list(options.star_tracker_sigma_arcsec)} has a sigma of'
+            ' zero; give three, or none'
+        )
     names = parameter_names(model)
     for name in estimated_parameters(options, model):
         if name not in names:
@@ -114,6 +126,18 @@ def check_options(options: CalibrationOptions, model: str) -> None:
             f'prior_sigma: {len(options.prior_sigma)} numbers, but the lens model {model} has '
             f'{len(names)} parameters: {", ".join(names)}'
         )
+
+
+def tracker_sigma_is_given(options: CalibrationOptions) -> bool:
+    """Whether a star tracker sigma is assumed, in place of the scatter of the images alone."""
+    return any(options.star_tracker_sigma_arcsec)
+
+
+def assumed_tracker_sigma_rad(options: CalibrationOptions) -> Floats:
+    """1-sigma (3,) of the star tracker at the start of an estimate."""
+    if not tracker_sigma_is_given(options):
+        return np.full(3, _USUAL_TRACKER_ARCSEC * ARCSECOND_RAD)
+    return np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
 
 
 def estimated_parameters(options: CalibrationOptions, model: str) -> tuple[str, ...]:

@@ -16,9 +16,8 @@ import numpy as np
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
-from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.detector_field import in_degree
-from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.options import assumed_tracker_sigma_rad, CalibrationOptions
 from starcal_ros.estimation.verdict import arranged, judge_residuals, Verdict
 from starcal_ros.least_squares.levenberg_marquardt import NotObservable, Solution
 from starcal_ros.least_squares.linear_terms import Score
@@ -110,7 +109,7 @@ def _settle(
 ) -> Found:
     """Least squares and judgement of its residuals in turns, until the judgement stands."""
     problem, solution = found.problem, found.solution
-    given_rad = np.array(options.star_tracker_sigma_arcsec) * ARCSECOND_RAD
+    given_rad = assumed_tracker_sigma_rad(options)
     iterations, after = found.iterations, found.verdict
     for _ in range(_ROUNDS):
         verdict = after

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from starcal_ros.arrays import Floats, Mask
-from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
 from starcal_ros.least_squares.levenberg_marquardt import NotObservable
 from starcal_ros.least_squares.linear_terms import LinearTerms
 from starcal_ros.least_squares.normal_equations import (
@@ -112,7 +112,7 @@ def judge_residuals(
         eta_rad, covariance_rad2, seen = attitudes_of_stars_alone(problem, state, blocks)
         fitted = 2 if len(state.rate) else 1  # mean of the attitudes, and slope
         found_rad, misfit = estimate_star_tracker_sigma(
-            eta_rad, covariance_rad2, seen, given_rad, fitted
+            eta_rad, covariance_rad2, seen, given_rad, fitted, tracker_sigma_is_given(options)
         )
         if options.variance_components:
             tracker_sigma_rad = found_rad

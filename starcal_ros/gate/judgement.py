@@ -130,7 +130,9 @@ def _fit(
         options,
         'max_star_tracker_excess',
         'largest ratio of estimated to assumed star-tracker sigma',
-        float((estimated_arcsec / assumed_arcsec).max()),
+        float((estimated_arcsec / assumed_arcsec).max())
+        if assumed_arcsec.all()
+        else 'star_tracker_sigma_arcsec is not given',
     )
 
 

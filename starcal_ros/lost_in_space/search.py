@@ -10,11 +10,12 @@ significant p-value is accepted (`sky_fit`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import functools
 import itertools
 import math
+import time
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -41,8 +42,12 @@ from starcal_ros.lost_in_space.sky_fit import (
 from starcal_ros.sky.catalog import StarCatalog
 
 MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of false matches
-_ROUNDS = (12, 18, 24)  # brightest sources of which patterns are formed, round by round
+ROUNDS = ((0, 12), (12, 18), (18, 24))
+"""Brightest sources of which patterns are formed, with one of each range, round by round."""
 _REFINED = 16  # number of best candidates of a lookup that are refined
+_GUESSED = 0.2  # largest shift of a guess, half diagonals
+_ALIKE = 0.03  # largest shift of one star to the next, half diagonals
+_OF_A_GUESS = 40  # brightest stars and sources
 _CANDIDATES = 20_000  # tested candidates of a lookup, drawn at random from more
 _TESTED = 16  # brightest predictions used to test a candidate
 _CHUNK = 5000  # candidates tested at once: 30 MB
@@ -111,21 +116,26 @@ def find_sky(
     catalog: StarCatalog,
     try_mirrored: bool = False,
     max_log10_p_value: float = MAX_LOG10_P_VALUE,
+    rounds: Sequence[tuple[int, int]] = ROUNDS,
+    deadline_s: float = math.inf,
 ) -> SkyMatch | NotFound:
     """
     Identified stars among sources (n, 2), brightest first, or why there are none.
 
     ``camera`` is the prior: focal length within 25 %, principal point within 5 % of the width,
     distortion within 3 % of the radius.  The catalog is sorted by magnitude.  With
-    ``try_mirrored`` the mirror image is searched too.
+    ``try_mirrored`` the mirror image is searched too.  Of `ROUNDS`, those asked for are searched,
+    until the processor time of the thread reaches ``deadline_s``.
     """
     if len(xy_px) < 5:
         return NotFound(f'{len(xy_px)} star-like sources, at least 5 are needed')
     images = [SourceImage(xy_px, camera)]
     if try_mirrored:
         images.append(SourceImage(mirror(xy_px, camera.width), mirrored_camera(camera)))
-    least, before = 0.0, 0
-    for sources in _ROUNDS:
+    least = 0.0
+    for before, sources in rounds:
+        if len(xy_px) <= before:
+            break
         ways = itertools.product(_focal_scales(images[0].half_diagonal_rad), enumerate(images))
         for focal_scale, (mirrored, image) in ways:
             for scale in scales_for(image.half_diagonal_rad / focal_scale):
@@ -135,10 +145,45 @@ def find_sky(
                     least = min(least, log10_p)
                     if log10_p < max_log10_p_value:
                         return _result(image, catalog, fit, radius_px, log10_p, bool(mirrored))
-        if len(xy_px) <= sources:
-            break
-        before = sources
+                if time.thread_time() > deadline_s:
+                    return NotFound('the time given for the search is over', least)
     return NotFound('no pattern of the sources is one of the catalog beyond chance', least)
+
+
+def confirm_sky(
+    xy_px: Floats,
+    camera: CameraModel,
+    catalog: StarCatalog,
+    camera_from_icrf: Rotation,
+    mirrored: bool = False,
+) -> SkyMatch | NotFound:
+    """The stars that sources are, as `find_sky`, by a rotation known to 10 % of a field."""
+    image = SourceImage(xy_px, camera)
+    if mirrored:
+        image = SourceImage(mirror(xy_px, camera.width), mirrored_camera(camera))
+    stars = _stars_about(image, catalog, camera_from_icrf.as_matrix()[2])
+    start = SkyFit(camera_from_icrf, image.camera, stars)
+    pairs = _shifted_alike(image, catalog, start)
+    fit = refined(image, catalog, start, pairs) if len(pairs) >= 5 else None
+    if fit is None:
+        return NotFound('the stars are not where they were expected')
+    log10_p, radius_px = log10_p_value(image, catalog, fit)
+    if log10_p >= MAX_LOG10_P_VALUE:
+        return NotFound('the stars are not where they were expected', log10_p)
+    return _result(image, catalog, fit, radius_px, log10_p, mirrored)
+
+
+def _shifted_alike(image: SourceImage, catalog: StarCatalog, start: SkyFit) -> Indices:
+    """Pairs (k, 2) of catalog row and source whose shifts are the most alike."""
+    stars, xy_px = predicted(catalog, start, _OF_A_GUESS)
+    shift = (image.xy_px[None, :_OF_A_GUESS] - xy_px[:, None]) / image.half_diagonal_px
+    rank, source = np.nonzero(np.hypot(shift[..., 0], shift[..., 1]) < _GUESSED)
+    if len(rank) == 0:
+        return np.empty((0, 2), np.int64)
+    tree = cKDTree(shift[rank, source])
+    alike = tree.query_ball_point(tree.data, _ALIKE)
+    chosen = np.array(max(alike, key=len))
+    return np.stack([stars[rank[chosen]], source[chosen]], axis=-1)
 
 
 def mirror(xy_px: Floats, width: int) -> Floats:

@@ -184,7 +184,12 @@ def _clipped_mean(ratio: Floats) -> float:
 
 
 def estimate_star_tracker_sigma(
-    eta_rad: Floats, covariance_rad2: Floats, seen: Mask, given_rad: Floats, fitted: int = 1
+    eta_rad: Floats,
+    covariance_rad2: Floats,
+    seen: Mask,
+    given_rad: Floats,
+    fitted: int = 1,
+    is_given: bool = True,
 ) -> tuple[Floats, Mask]:
     """
     1-sigma of the star tracker about its axes, and the attitudes that do not fit.
@@ -197,6 +202,8 @@ def estimate_star_tracker_sigma(
         Assumed 1-sigma; returned unchanged where fewer than three images have enough stars.
     fitted : int
         Numbers fitted to the attitudes of each axis: the mean, and a slope where there is one.
+    is_given : bool
+        False where the assumed sigma is a guess, which the scatter replaces in any case.
 
     Returns
     -------
@@ -228,7 +235,7 @@ def estimate_star_tracker_sigma(
     freedom = count - fitted
     found = eta_rad[good].var(axis=0, ddof=fitted)
     p_value = chdtr(freedom, freedom * found / (given_rad**2 + stars))
-    as_given = (p_value > _GIVEN_P_VALUE / 2) & (p_value < 1 - _GIVEN_P_VALUE / 2)
+    as_given = (p_value > _GIVEN_P_VALUE / 2) & (p_value < 1 - _GIVEN_P_VALUE / 2) & is_given
     hidden = stars * math.sqrt(2.0 / count)
     sigma2 = np.where(found - stars > hidden, found - stars, np.minimum(hidden, given_rad**2))
     return np.sqrt(np.where(as_given, given_rad**2, sigma2)), misfit

@@ -6,10 +6,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 import functools
+import math
 import resource
 import signal
 import sys
 import threading
+import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -23,15 +25,17 @@ from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 
-from starcal_ros.errors import StarcalError
+from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.nodes.inputs import Inputs
 from starcal_ros.nodes.parameters import OptionParameters, unread_sections
+from starcal_ros.options import nearest
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.pipeline.setup import OPTION_CLASSES
+from starcal_ros.pipeline.setup import OPTION_CLASSES, Setup
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Health = tuple[bytes, str, dict[str, object]]
 
+_SILENT_S = 5.0
 # Images, attitudes, services, solve, driver, its answer, two spare: none waits for another.
 _THREADS = 8
 
@@ -43,17 +47,21 @@ class StarcalNode(LifecycleNode):
     Subclasses implement `configure`, `activate`, `deactivate`, `cleanup` and `health`.
     """
 
+    _setup: Setup  # by `configure`
+
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.options = OptionParameters(self, (*OPTION_CLASSES, *NODE_OPTION_CLASSES))
         for unknown in self.options.unknown():
-            self.get_logger().warning(f'{unknown}: not a parameter of starcal')
+            close = nearest(unknown, self.options.names())
+            raise OptionError(f'{unknown}: no such parameter{close}')
         self.failure = ''  # why the last transition failed, one line
         self.inputs = Inputs(self)
         self._incompatible: list[str] = []  # publishers that are not received
         self._errors = 0
         self._taken: Counter[str] = Counter()
         self._level: bytes | None = None
+        self._listening_since_s = math.inf
         self._diagnostics_lock = threading.Lock()
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._diagnostics_timer = self.steady_timer(
@@ -81,6 +89,14 @@ class StarcalNode(LifecycleNode):
     def health(self) -> Health:
         """Return level, message and values of the diagnostics of the active node."""
         raise NotImplementedError
+
+    def silent(self) -> list[str]:
+        """Return the topics that the node cannot do without and that sent nothing yet."""
+        return []
+
+    def taken(self, callback: Callable[[Any], None]) -> int:
+        """Return the number of messages that a callback, wrapped by `taking`, has had."""
+        return self._taken[callback.__name__]
 
     @property
     def is_active(self) -> bool:
@@ -132,6 +148,13 @@ class StarcalNode(LifecycleNode):
         for text in set(incompatible) - set(self._incompatible):
             self.get_logger().warning(f'not received: {text}')
         self._incompatible = incompatible
+        if time.monotonic() > self._listening_since_s + _SILENT_S:
+            self._listening_since_s = math.inf
+            for topic in self.silent():
+                self.get_logger().warning(
+                    f'{topic}: no message in {_SILENT_S:.0f} s, from'
+                    f' {self.count_publishers(topic)} publishers'
+                )
         self.publish_health()
 
     def publish_health(self) -> None:
@@ -180,11 +203,24 @@ class StarcalNode(LifecycleNode):
         self.options.frozen = True
         outcome = self._transition(self.configure, state, super().on_configure)
         if outcome == TransitionCallbackReturn.SUCCESS:
-            camera = self.options.values()['camera_info_url']
-            self.get_logger().info(f'configured, prior camera {camera}')
+            self.get_logger().info(f'configured, {self._prior_in_words()}')
         else:
             self.options.frozen = False
         return outcome
+
+    def _prior_in_words(self) -> str:
+        values, setup = self.options.values(), self._setup
+        camera = setup.prior.camera
+        width_deg = math.degrees(2 * math.atan(camera.width / 2 / float(camera.parameters[0])))
+        alignment = 'not given: found from the images'
+        if setup.is_aligned:
+            alignment = str(
+                [round(float(q), 6) for q in setup.prior.star_tracker_from_camera_xyzw]
+            )
+        return (
+            f'prior camera {values["camera_info_url"]}: {camera.width} x {camera.height},'
+            f' {width_deg:.1f} degrees wide; prior_alignment {alignment}'
+        )
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Activate: publishers first, then subscriptions."""
@@ -194,6 +230,7 @@ class StarcalNode(LifecycleNode):
             self.deactivate()
             super().on_deactivate(state)
         elif outcome == TransitionCallbackReturn.SUCCESS:
+            self._listening_since_s = time.monotonic()
             self.get_logger().info(f'active, listening to {", ".join(self.inputs.names())}')
         return outcome
 

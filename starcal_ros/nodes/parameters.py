@@ -65,6 +65,10 @@ class OptionParameters:
             for name, field in self._fields.items()
         }
 
+    def names(self) -> list[str]:
+        """Names of all options."""
+        return list(self._fields)
+
     def unknown(self) -> list[str]:
         """Names given at start that no option has: ROS itself passes over a misspelt one."""
         given = getattr(self._node, '_parameter_overrides', {})  # rclpy has no other access to it

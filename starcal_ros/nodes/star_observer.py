@@ -13,6 +13,7 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import QuaternionStamped, TwistStamped
+import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Temperature
 from sensor_msgs.msg import Image as ImageMessage
@@ -21,6 +22,8 @@ from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.diagnosis.bags import found_alignment
+from starcal_ros.diagnosis.diagnose import Diagnosis
 from starcal_ros.errors import ImageRefused
 from starcal_ros.messages.calibration import calibration_from_message, camera_info_to_message
 from starcal_ros.messages.fields import nearest_stamp_ns, offset_ns, stamp_ns
@@ -34,10 +37,11 @@ from starcal_ros.messages.telemetry import (
 from starcal_ros.nodes.inputs import with_reliability
 from starcal_ros.nodes.lifecycle import Health, OK, run, StarcalNode, WARN
 from starcal_ros.nodes.message_factory import make_message
+from starcal_ros.nodes.unmatched import Unmatched
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.node_options import ObserverOptions
-from starcal_ros.pipeline.setup import load_setup
+from starcal_ros.pipeline.setup import aligned, load_setup
 from starcal_ros.records import (
     CameraGeometry,
     Image,
@@ -72,6 +76,8 @@ class StarObserver(StarcalNode):
         self._queue: ImageQueue | None = None
         self._counts: Counter[str] = Counter()
         self._last_refusal = ''
+        self._retried = self._retried_used = 0
+        self._unmatched: Unmatched | None = None
         self._camera_info: Any = None  # of the active calibration, header of the last image
         self._camera_infos: Any = None
 
@@ -105,8 +111,9 @@ class StarObserver(StarcalNode):
         self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
         self._temperatures: deque[tuple[int, float]] = deque(maxlen=_SAMPLES.depth)
         self._counts.clear()
-        self._restarts = 0
+        self._restarts = self._retried = self._retried_used = 0
         self._last_refusal = ''
+        self._unmatched = Unmatched(self._setup, self.guarded(self._on_diagnosis))
         self._image_arrivals, self._latency_s, self._attitude_step_s = Recent(), Recent(), Recent()
         self._queue = ImageQueue(
             self._own.image_queue, self._own.attitude_timeout_s, self._attitude_has_come
@@ -144,6 +151,8 @@ class StarObserver(StarcalNode):
             self._queue.close()
             self._worker.join()
         self._worker = None
+        if self._unmatched is not None:
+            self._unmatched.close()
 
     def cleanup(self) -> None:
         """Destroy the publishers."""
@@ -152,6 +161,7 @@ class StarObserver(StarcalNode):
 
     def health(self) -> Health:
         """Diagnostics: counts of used and refused images."""
+        why = None if self._unmatched is None else self._unmatched.diagnosis
         counts = dict(self._counts)  # the worker thread continues counting
         numbers: dict[str, object] = {
             'images': sum(counts.values()),
@@ -164,15 +174,30 @@ class StarObserver(StarcalNode):
             'attitude_rate_hz': _short(self._attitude_step_s.rate_hz()),
             'attitude_gap_s': _short(self._attitude_step_s.largest()),
             'restarts': self._restarts,
+            'retried': self._retried,
+            'retried_used': self._retried_used,
+            'diagnosis': 'none' if why is None else why.cause,
             'calibration': self._calibration_number or 'prior',
             'listeners': self._observations.get_subscription_count(),
             **{f'refused_{reason}': counts.get(reason, 0) for reason in sorted(IMAGE_REFUSALS)},
         }
+        if why is not None:
+            return WARN, f'no image matches: {why.in_a_sentence()}', numbers
         if self._last_refusal:
             return WARN, f'last image refused: {self._last_refusal}', numbers
         if not counts:
             return OK, 'waiting for images', numbers
         return OK, 'observing', numbers
+
+    def silent(self) -> list[str]:
+        """Return the image and attitude topics that sent nothing yet."""
+        image = self._image_input()[1]
+        inputs = ((image, self._on_image), ('attitude', self._on_attitude))
+        return [
+            self.resolve_topic_name(topic)
+            for topic, callback in inputs
+            if not self.taken(callback)
+        ]
 
     def _on_image(self, message: Any) -> None:
         self._image_arrivals.add(0.0)
@@ -197,6 +222,8 @@ class StarObserver(StarcalNode):
     def _on_attitude(self, message: Any) -> None:
         time_ns, quaternion = attitude_from_message(message)
         direction = self._setup.attitude.attitude_direction
+        if self._unmatched is not None:
+            self._unmatched.add_attitude(time_ns, quaternion)
         before_ns = self._attitudes.latest_ns
         self._attitudes.add(time_ns, attitude_sample(time_ns, quaternion, direction))
         # Late samples and steps back of the clock are not gaps.
@@ -230,6 +257,7 @@ class StarObserver(StarcalNode):
         if self._camera_infos is not None:
             self._camera_info = camera_info_to_message(calibration, make_message)
         self.get_logger().info('predicting stars with the active calibration')
+        self._measure_again()
 
     def _attitude_has_come(self, time_ns: int) -> bool:
         """Return True if the attitude samples of an image have arrived or can no longer arrive."""
@@ -273,6 +301,11 @@ class StarObserver(StarcalNode):
         if self._geometry is not self._predicted_from:
             self._predicted_from = self._geometry
             self._track = dataclasses.replace(self._track, geometry=self._geometry)
+        if not self._setup.is_aligned and self._geometry is self._setup.prior:
+            self._keep(image)
+            detail = 'prior_alignment is not given: it is being found from the images'
+            self._publish(self._refused(waiting, 'no_match', detail))
+            return
         before = self._track
         observations, self._track = observe.observe_next(
             image,
@@ -286,8 +319,56 @@ class StarObserver(StarcalNode):
             self._restarts += 1
             self.get_logger().warning('image stamps went back: restarted the sequence')
         self._publish(observations)
+        if observations.refusal == 'no_match':
+            self._keep(image)
+        elif not observations.refusal and self._unmatched is not None:
+            self._unmatched.matched()
         if self._annotated.get_subscription_count():
             self._publish_annotated(image, observations, before.geometry)
+
+    def _keep(self, image: Image) -> None:
+        if self._unmatched is not None:
+            self._unmatched.add(image)
+
+    def _on_diagnosis(self, found: Diagnosis) -> None:
+        """Log why images match nothing; without a prior alignment, take the one found."""
+        if self._setup.is_aligned:
+            self.get_logger().warning(f'no image matches: {found.in_a_sentence()}')
+            self.publish_health()
+            return
+        values, sentence = found_alignment(found)
+        if values is None or self._unmatched is None:
+            self.get_logger().warning(f'prior_alignment is not given, and not found: {sentence}')
+            return
+        is_prior = self._geometry is self._setup.prior
+        self._setup = aligned(self._setup, np.array(values))
+        self._unmatched.aligned(self._setup)
+        self.get_logger().info(sentence)
+        if is_prior:
+            self._geometry = self._setup.prior
+            self._measure_again()
+
+    def _measure_again(self) -> None:
+        """Measure the images that matched nothing, with the calibration or alignment found."""
+        kept = [] if self._unmatched is None else self._unmatched.take()
+        for image in kept:
+            observations, _ = observe.observe_next(
+                image,
+                self._attitudes,
+                self._setup,
+                observe.Track(self._geometry),
+                observe.latest_at(list(self._velocities), image.time_ns, None),
+                observe.latest_at(list(self._temperatures), image.time_ns, math.nan),
+            )
+            self._retried += 1
+            if not observations.refusal:
+                self._retried_used += 1
+                self._counts['no_match'] -= 1
+                self._publish(observations)
+        if kept:
+            self.get_logger().info(
+                f'{len(kept)} images without a match measured again: {self._retried_used} used'
+            )
 
     def _refused(self, waiting: Waiting, reason: str, detail: str) -> StarObservations:
         width, height = (min(side, MAX_SIDE_PX) for side in (waiting.width, waiting.height))

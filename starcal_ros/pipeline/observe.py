@@ -30,6 +30,7 @@ from starcal_ros.records import CameraGeometry, Image, refused_image, StarObserv
 from starcal_ros.sky.attitude import AttitudeHistory
 
 T = TypeVar('T')
+Wanted = Callable[[int], bool]
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
 _SAME_ATTITUDE = 1e-12  # of a component; interpolation between equal samples rounds at 1e-16
@@ -303,12 +304,13 @@ def observe_bag(
     velocity_topic: str = '',
     temperature_topic: str = '',
     on_image: OnImage | None = None,
+    wanted: Wanted | None = None,
 ) -> Iterator[StarObservations]:
     """
     Observations of every image of a bag, in bag order, with one image in memory at a time.
 
     ``on_image`` is called with each decoded image, its observations and the geometry that
-    predicted its stars.
+    predicted its stars.  Images whose stamp is not ``wanted`` are passed over.
 
     Raises
     ------
@@ -327,6 +329,8 @@ def observe_bag(
     size = (setup.prior.camera.width, setup.prior.camera.height)
     offset_s = setup.attitude.stamp_offset_s
     for image in reader.read_images(paths, image_topic, offset_s, size=size):
+        if wanted is not None and not wanted(image.time_ns):
+            continue
         if isinstance(image, StarObservations):
             yield image
             continue

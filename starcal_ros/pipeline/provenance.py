@@ -26,6 +26,7 @@ def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -
     prior = np.r_[setup.prior.camera.parameters, setup.prior.star_tracker_from_camera_xyzw]
     return {
         'software': f'starcal {software_version()}',
+        'camera_name': setup.camera_name,
         'catalog': setup.catalog.digest,
         'options': json.dumps(setup.options(), sort_keys=True),
         'prior': json.dumps(prior.tolist()),

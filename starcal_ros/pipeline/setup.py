@@ -14,8 +14,8 @@ from typing import Any, get_type_hints
 import cv2
 import numpy as np
 
-from starcal_ros.arrays import Pixels
-from starcal_ros.camera import convert
+from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.camera import CameraModel, convert
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions, check_options
 from starcal_ros.gate.options import check_gate_options, GateOptions
@@ -42,7 +42,9 @@ from starcal_ros.options import (
 )
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.products.camera_yaml import (
+    DEFAULT_CAMERA_NAME,
     read_camera_info,
+    read_camera_name,
     resolve_url,
     with_camera_url_from,
 )
@@ -53,6 +55,7 @@ from starcal_ros.sky.catalog import load_catalog, StarCatalog
 from starcal_ros.untrusted import read_bytes, shown
 
 NODES = ('star_observer', 'calibrator')
+_SHORTEST, _LONGEST = 0.15, 500.0  # focal lengths by the width: fields of 147 and 0.1 degrees
 
 
 @dataclass(frozen=True)
@@ -69,10 +72,9 @@ class SetupOptions:
         choices=('prior', 'auto', *COEFFICIENTS),
     )
     prior_alignment: tuple[float, ...] = option(
-        (0.0, 0.0, 0.0, 1.0),
-        'prior orientation of the camera in the star tracker frame, quaternion (x, y, z, w)',
-        low=-1.0,
-        high=1.0,
+        (0.0, 0.0, 0.0, 0.0),
+        'prior orientation of the camera in the star tracker frame, quaternion (x, y, z, w);'
+        ' zeros: found from the first images',
         length=4,
     )
     star_tracker_frame: str = option('star_tracker', 'name of the star tracker frame')
@@ -85,7 +87,11 @@ class SetupOptions:
 
 @dataclass(frozen=True)
 class Setup:
-    """Options of every stage, with prior camera, catalog and dark frame loaded."""
+    """
+    Options of every stage, with prior camera, catalog and dark frame loaded.
+
+    Where no prior alignment ``is_aligned``, that of ``prior`` is the identity, until one is found.
+    """
 
     frames: SetupOptions
     attitude: AttitudeOptions
@@ -101,6 +107,8 @@ class Setup:
     dark: Pixels | None
     dark_pedestal_dn: int = 0
     hot: HotPixels = NO_HOT_PIXELS
+    is_aligned: bool = True
+    camera_name: str = DEFAULT_CAMERA_NAME
 
     @property
     def star_search(self) -> StarSearch:
@@ -182,6 +190,7 @@ def load_setup(
             raise OptionError(f'{said}: no such parameter{nearest(name, known)}')
     groups = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS.items()}
     frames: SetupOptions = groups['frames']
+    is_aligned = prior is not None or any(frames.prior_alignment)
     prior = prior or _prior(frames)
     check_options(groups['calibration'], prior.camera.model)
     check_gate_options(groups['gate'], prior.camera)
@@ -194,7 +203,17 @@ def load_setup(
         dark=dark,
         dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
         hot=hot_in_dark(dark, groups['fixed_pattern']),
+        is_aligned=is_aligned,
+        camera_name=read_camera_name(frames.camera_info_url)
+        if frames.camera_info_url
+        else DEFAULT_CAMERA_NAME,
     )
+
+
+def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
+    """A setup with the prior alignment that was found for it."""
+    prior = CameraGeometry(setup.prior.camera, star_tracker_from_camera_xyzw)
+    return dataclasses.replace(setup, prior=prior, is_aligned=True)
 
 
 def _prior(frames: SetupOptions) -> CameraGeometry:
@@ -208,13 +227,57 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
                 f'lens_model: {frames.lens_model} cannot see all of the field of the prior camera,'
                 f' {frames.camera_info_url}'
             )
+    check_prior_camera(camera, frames.camera_info_url)
+    if not any(frames.prior_alignment):
+        return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
     quaternion = np.array(frames.prior_alignment)
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1.0) > 1e-3:
+        hint = '; angles in degrees are no quaternion' if np.abs(quaternion).max() > 2.0 else ''
         raise OptionError(
-            f'prior_alignment: {list(frames.prior_alignment)} is not a unit quaternion'
+            f'prior_alignment: {list(frames.prior_alignment)} is not a unit quaternion (x, y, z,'
+            f' w): its norm is {norm:.6g}{hint}'
         )
     return CameraGeometry(camera, quaternion / norm)
+
+
+def check_prior_camera(camera: CameraModel, location: str) -> None:
+    """
+    Raise `OptionError` for a camera that no lens makes, with the likely unit.
+
+    Raises
+    ------
+    OptionError
+        Naming the file, the value and the unit that it may have been given in.
+    """
+    width, height = camera.width, camera.height
+    fx, _, fy, cx, cy = (float(value) for value in camera.intrinsics[:5])
+    if min(fx, fy) <= 0:
+        raise OptionError(f'{location}: focal length of {fx:g}, {fy:g} px is not positive')
+    if not 0.5 < fx / fy < 2.0:
+        raise OptionError(f'{location}: fx = {fx:g} and fy = {fy:g} px differ by a factor of two')
+    width_deg = math.degrees(2 * math.atan(width / 2 / fx))
+    if fx < _SHORTEST * width:
+        unit = 'metres' if fx < 1.0 else 'millimetres'
+        raise OptionError(
+            f'{location}: focal length of {fx:g} px makes a field of {width_deg:.0f} degrees:'
+            f' it seems to be in {unit}; divide it by the size of a pixel'
+        )
+    if fx > _LONGEST * width:
+        raise OptionError(
+            f'{location}: focal length of {fx:g} px makes a field of {width_deg:.2g} degrees:'
+            ' it seems to be in micrometres; divide it by the size of a pixel'
+        )
+    if not (-0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
+        raise OptionError(
+            f'{location}: principal point ({cx:g}, {cy:g}) px is far outside the image of {width}'
+            f' x {height}'
+        )
+    if 0 < abs(cx) < 0.05 * width and 0 < abs(cy) < 0.05 * height:
+        raise OptionError(
+            f'{location}: principal point ({cx:g}, {cy:g}) is in the first corner of an image of'
+            f' {width} x {height}: give it in pixels, not in metres or millimetres'
+        )
 
 
 def _read_dark(path: str, width: int, height: int) -> Pixels | None:

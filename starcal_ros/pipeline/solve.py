@@ -29,9 +29,10 @@ from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.lens_choice import estimate_with_smallest_lens
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.gate.judgement import judge, reasons_of
+from starcal_ros.identification.star_finder import realigned
 from starcal_ros.options import check_value
 from starcal_ros.pipeline.provenance import provenance_of
-from starcal_ros.pipeline.setup import Setup
+from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.records import (
     Calibration,
     CameraGeometry,
@@ -44,6 +45,7 @@ from starcal_ros.records import (
 
 _FEWEST_STARS = 3  # two fit their mirror image
 _MOST_OFF = 0.5  # of the RMS size of a constellation; mirrored along an axis it is off by 1.4
+_ALIGNING = 20  # images, of whose alignments the middle one is taken
 
 
 def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:
@@ -80,13 +82,31 @@ def _shows_its_stars(observations: StarObservations, camera: CameraModel) -> boo
     return float(rssd) / math.sqrt(len(seen)) <= _MOST_OFF * spread
 
 
+def aligned_by(ensemble: Ensemble, setup: Setup) -> Setup:
+    """The setup; where it has no prior alignment, with that of the middle one of the images."""
+    if setup.is_aligned or not ensemble.images:
+        return setup
+    shown = Rotation.from_quat(
+        np.array(
+            [
+                realigned(setup.prior, image).star_tracker_from_camera_xyzw
+                for image in ensemble.images[:_ALIGNING]
+            ]
+        )
+    )
+    apart = np.abs(shown.as_quat() @ shown.as_quat().T)  # cosines of half angles
+    return aligned(setup, shown[int(np.median(apart, axis=1).argmax())].as_quat())
+
+
 def within_limit(ensemble: Ensemble, setup: Setup) -> Ensemble:
     """Return the ensemble without its least informative images, down to ``max_images``."""
+    setup = aligned_by(ensemble, setup)
     return keep_most_informative(ensemble, setup.prior, setup.calibration)
 
 
 def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
     """Images and stars collected, and the predicted precision of a calibration from them."""
+    setup = aligned_by(ensemble, setup)
     return _ensemble_status(ensemble, setup.prior, setup.calibration)
 
 
@@ -124,7 +144,7 @@ def solve_with_residuals(
     active: Calibration | None = None,
 ) -> tuple[Calibration, Residuals]:
     """The calibration of `solve`, and its residuals by star and image."""
-    setup = _as_asked_for(setup, method, estimate)
+    setup = aligned_by(ensemble, _as_asked_for(setup, method, estimate))
     result, prior = _estimate(ensemble, setup)
     halves = HalvesComparison(note='min_halves_p_value is 0')
     if setup.gate.min_halves_p_value > 0:

@@ -18,7 +18,7 @@ from starcal_ros.messages.types import (
     VELOCITY_TYPE,
 )
 from starcal_ros.pipeline import observe
-from starcal_ros.pipeline.observe import OnImage
+from starcal_ros.pipeline.observe import OnImage, Wanted
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import StarObservations
 
@@ -79,13 +79,25 @@ def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str
 
 
 def read(
-    paths: Sequence[Path], topics: Topics, setup: Setup, on_image: OnImage | None = None
+    paths: Sequence[Path],
+    topics: Topics,
+    setup: Setup,
+    on_image: OnImage | None = None,
+    wanted: Wanted | None = None,
 ) -> Iterator[StarObservations]:
     """Observations of bags, as recorded or measured in the images (see `observe_bag`)."""
     if topics.observations:
-        return reader.read_observations(paths, topics.observations)
+        recorded = reader.read_observations(paths, topics.observations)
+        return (record for record in recorded if wanted is None or wanted(record.time_ns))
     return observe.observe_bag(
-        paths, topics.image, topics.attitude, setup, topics.velocity, topics.temperature, on_image
+        paths,
+        topics.image,
+        topics.attitude,
+        setup,
+        topics.velocity,
+        topics.temperature,
+        on_image,
+        wanted,
     )
 
 

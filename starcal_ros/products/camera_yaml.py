@@ -26,9 +26,12 @@ from starcal_ros.products.files import read_text, write_atomically
 from starcal_ros.untrusted import PARAMETER_BYTES, yaml_value
 
 CAMERA_INFO_FILE = 'camera_info.yaml'
+DEFAULT_CAMERA_NAME = 'camera'
 
 
-def write_camera_info(camera: CameraModel, path: Path, camera_name: str = 'camera') -> None:
+def write_camera_info(
+    camera: CameraModel, path: Path, camera_name: str = DEFAULT_CAMERA_NAME
+) -> None:
     """
     Write a ROS camera YAML as camera_info_manager reads it: the best camera without skew.
 
@@ -98,6 +101,13 @@ def read_camera_info(location: str | Path) -> CameraModel:
         return camera
     except ValueError as error:
         raise ProductError(f'{path}: {error}') from error
+
+
+def read_camera_name(location: str | Path) -> str:
+    """The ``camera_name`` in a ROS camera YAML that `read_camera_info` accepts."""
+    path = resolve_url(location) if isinstance(location, str) else location
+    name = yaml_value(read_text(path, PARAMETER_BYTES)).get('camera_name')
+    return name if isinstance(name, str) and name else DEFAULT_CAMERA_NAME
 
 
 def resolve_url(url: str) -> Path:

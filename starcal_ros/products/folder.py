@@ -13,8 +13,13 @@ from pathlib import Path
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, write_calibration
-from starcal_ros.products.camera_yaml import CAMERA_INFO_FILE, write_camera_info
+from starcal_ros.products.camera_yaml import (
+    CAMERA_INFO_FILE,
+    DEFAULT_CAMERA_NAME,
+    write_camera_info,
+)
 from starcal_ros.products.files import OBSERVATIONS_FILE, REPORT_FILE
+from starcal_ros.products.not_calibrated import NOT_CALIBRATED_FILE
 from starcal_ros.products.residuals_npz import RESIDUALS_FILE, write_residuals
 from starcal_ros.records import Calibration, StarObservations
 
@@ -41,9 +46,11 @@ def write_products(
         When a file cannot be written.
     """
     write_calibration(calibration, folder / CALIBRATION_FILE)
-    write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE)
+    name = calibration.provenance.get('camera_name', DEFAULT_CAMERA_NAME)
+    write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE, name)
     if residuals is not None:
         write_residuals(residuals, folder / RESIDUALS_FILE)
+    (folder / NOT_CALIBRATED_FILE).unlink(missing_ok=True)
 
 
 def write_observations(

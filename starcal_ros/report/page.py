@@ -31,6 +31,7 @@ from starcal_ros.messages.types import OBSERVATIONS_TYPE
 from starcal_ros.model_errors.temperature import summary as thermal_summary
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, prior_of, read_calibration
 from starcal_ros.products.files import OBSERVATIONS_FILE, REPORT_FILE, write_atomically
+from starcal_ros.products.not_calibrated import read_not_calibrated
 from starcal_ros.products.residuals_npz import read_residuals, RESIDUALS_FILE
 from starcal_ros.records import (
     Calibration,
@@ -41,6 +42,7 @@ from starcal_ros.records import (
 )
 from starcal_ros.report import figures as report_figures
 from starcal_ros.report.charts import charts_of
+from starcal_ros.report.failure_page import write_failure_page
 from starcal_ros.report.thumbnails import read_thumbnails, Thumbnail, THUMBNAILS_FOLDER
 from starcal_ros.untrusted import json_value
 
@@ -77,11 +79,16 @@ def write_report(folder: Path) -> Path:
     """
     Write ``report.html`` from the product files of a folder and return its path.
 
+    Where the last calibration into the folder failed, it is the page of that failure.
+
     Raises
     ------
     ProductError, BagError
         When a file cannot be read or the report cannot be written.
     """
+    failure = read_not_calibrated(folder)
+    if failure is not None:
+        return write_failure_page(failure, folder)
     path = folder / REPORT_FILE
     found = read_folder(folder)
     try:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+import dataclasses
 from dataclasses import dataclass
 import json
 import os
@@ -29,6 +30,7 @@ from starcal_ros.simulation.centroids import (
     cramer_rao_covariance,
 )
 from starcal_ros.simulation.images import images
+from starcal_ros.simulation.mistakes import Mistakes, NO_MISTAKES
 from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenes
 from starcal_ros.untrusted import PRODUCT_BYTES
 
@@ -102,6 +104,7 @@ def write_bag(
     path: Path,
     camera_url: str = '',
     on_image: Callable[[int], None] = lambda index: None,
+    mistakes: Mistakes = NO_MISTAKES,
 ) -> SimulatedBag:
     """
     Render a scenario to a bag, and write its truth and the files to calibrate it.
@@ -115,6 +118,8 @@ def write_bag(
         URL of the prior camera in the parameter file; default: a ``file://`` URL.
     on_image : callable
         Called with the index of each image written.
+    mistakes : Mistakes
+        Made in the bag and in the files to calibrate it; the truth file names them.
 
     Raises
     ------
@@ -128,17 +133,21 @@ def write_bag(
         beside = ('truth.json', 'params.yaml', 'camera.yaml')
     truth, params, camera = (writer.file.with_name(name) for name in beside)
     _check_replaceable(path, writer.file, truth, (params, camera))
+    scenario = dataclasses.replace(scenario, prior=mistakes.prior(scenario.prior))
     content = parameters(scenario, camera_url or f'file://{camera.resolve()}')
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
-    truth_text = json.dumps(truth_content(scenario, writer.file.name), indent=1) + '\n'
+    true = truth_content(scenario, writer.file.name)
+    if mistakes != NO_MISTAKES:
+        true['mistakes'] = dataclasses.asdict(mistakes)
+    truth_text = json.dumps(true, indent=1) + '\n'
     with writer:
         for index, image in enumerate(images(scenario)):
             samples = attitude_samples(scenario, index)
             for sample in (s for s in samples if s.time_ns <= image.time_ns):
-                _write_attitude(writer, sample)
-            writer.write_image(IMAGE_TOPIC, image, 'camera')
+                _write_attitude(writer, sample, mistakes)
+            writer.write_image(IMAGE_TOPIC, mistakes.image(image), 'camera')
             for sample in (s for s in samples if s.time_ns > image.time_ns):
-                _write_attitude(writer, sample)
+                _write_attitude(writer, sample, mistakes)
             on_image(index)
         # Just before the bag replaces an older one, so that they replace theirs together.
         write_atomically(truth, truth_text)
@@ -174,8 +183,8 @@ def _is_truth_of(bag_name: str, truth: Path) -> bool:
         return False
 
 
-def _write_attitude(writer: BagWriter, sample: AttitudeSample) -> None:
-    quaternion = sample.icrf_from_star_tracker_xyzw
+def _write_attitude(writer: BagWriter, sample: AttitudeSample, mistakes: Mistakes) -> None:
+    quaternion = mistakes.attitude(sample.icrf_from_star_tracker_xyzw)
     writer.write_attitude(ATTITUDE_TOPIC, sample.time_ns, quaternion, 'icrf')
 
 

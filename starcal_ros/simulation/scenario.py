@@ -109,6 +109,7 @@ class Scenario:
     cadence_s: float
     image_count: int
     magnitude_limit: float = 9.0
+    stars_per_image: int | None = None  # the brightest on the detector; None: all
 
     def time_ns(self, index: int) -> int:
         """Middle of the exposure of an image."""
@@ -326,6 +327,12 @@ def scene(
     pixels = np.where(folded[:, None], np.nan, project(camera, in_camera))
     size = np.array([camera.width, camera.height])
     near = ((pixels > -margin_px) & (pixels < size - 1 + margin_px)).all(axis=1)
+    if scenario.stars_per_image is not None:
+        inside = near & ((pixels >= 0) & (pixels <= size - 1)).all(axis=1)
+        brightest = np.argsort(np.where(inside, stars.magnitude, np.inf), kind='stable')
+        shown = brightest[: min(scenario.stars_per_image, int(inside.sum()))]
+        near = np.zeros_like(near)
+        near[shown] = True
     magnitude = stars.magnitude[near]
     zero_point = scenario.detector.zero_point_electrons
     return Scene(

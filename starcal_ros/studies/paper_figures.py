@@ -82,7 +82,7 @@ def _residuals(found: PaperStudy) -> Figure:
         )  # fmt: skip
     for k, at in enumerate(found.used):
         images.axvline(at + 1, color='0.85', linewidth=1.5, zorder=0,
-                       label=f'{CALIBRATED_WITH} images used' if k == 0 else None)  # fmt: skip
+                       label=f'{len(found.used)} images used' if k == 0 else None)  # fmt: skip
     x = np.linspace(-1, 1, 201)
     std = float(judged.residual_px[judged.fits].std())
     histogram.plot(x, norm.pdf(x, scale=std), 'k--', linewidth=1, label='normal distribution')

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from starcal_ros.cli import main
-from starcal_ros.pipeline.diagnose import CAUSES
+from starcal_ros.diagnosis.diagnose import CAUSES
 
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 

@@ -35,6 +35,7 @@ MOUNTING = Rotation.from_euler('zyx', [-91.0, -28.0, 3.0], degrees=True)
 PRIOR = CameraGeometry(CAMERA, MOUNTING.as_quat())
 ESTIMATED = ('fx', 'skew', 'fy', 'k1', 'k2', 'k3', 'p1', 'p2')
 SIGHT_ARCSEC = 2.0
+ASSUMED = CalibrationOptions(star_tracker_sigma_arcsec=(10.0, 10.0, 10.0))
 # An alignment known to 1.4 arcsec each axis, and a camera without uncertainty.
 SIGMA = np.r_[np.zeros(10), np.full(3, 1e-6)]
 GOOD: Calibration = dataclasses.replace(
@@ -47,7 +48,7 @@ GOOD: Calibration = dataclasses.replace(
     misfit_images_ns=(5,),
     stars_used=990,
     stars_rejected=10,
-    star_tracker_sigma_arcsec=CalibrationOptions().star_tracker_sigma_arcsec,
+    star_tracker_sigma_arcsec=ASSUMED.star_tracker_sigma_arcsec,
     singular_values=(1.5, 0.02),
     zero_skew_cost_px=0.1,
     termination='converged',
@@ -63,7 +64,7 @@ GOOD: Calibration = dataclasses.replace(
 def judged(
     found: Calibration, options: GateOptions, active: Calibration | None = None
 ) -> tuple[GateCheck, ...]:
-    return judge(found, PRIOR, active, options, CalibrationOptions())
+    return judge(found, PRIOR, active, options, ASSUMED)
 
 
 def reasons(
@@ -167,7 +168,7 @@ def test_a_good_calibration_passes() -> None:
         (
             {
                 'star_tracker_sigma_arcsec': tuple(
-                    3.0 * sigma for sigma in CalibrationOptions().star_tracker_sigma_arcsec
+                    3.0 * sigma for sigma in ASSUMED.star_tracker_sigma_arcsec
                 )
             },
             'max_star_tracker_excess',
@@ -580,3 +581,9 @@ def test_a_camera_that_folds_over_is_refused() -> None:
     folded = dataclasses.replace(GOOD, geometry=turned(0.0, k1=-10.0))
     options = limits_in(reasons(folded, GateOptions(), None))
     assert options == ['max_map_sigma_px', 'max_change_px', 'max_rotation_deg']
+
+
+def test_a_star_tracker_sigma_not_given_has_no_excess() -> None:
+    checks = judge(GOOD, PRIOR, None, GateOptions(), CalibrationOptions())
+    (check,) = (c for c in checks if c.option == 'max_star_tracker_excess')
+    assert (check.passed, check.note) == (None, 'star_tracker_sigma_arcsec is not given')

@@ -13,6 +13,7 @@ from bench.lost_in_space import camera, Frame, frames
 from starcal_ros.camera import line_of_sight
 from starcal_ros.lost_in_space.pattern_index import equivalent, shapes, sphere_points
 from starcal_ros.lost_in_space.search import (
+    confirm_sky,
     find_sky,
     mirror,
     mirrored_camera,
@@ -106,3 +107,18 @@ def test_points_cover_the_sphere() -> None:
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, atol=1e-12)
     # Even to a point: the mean of a thousand random ones would be 0.03 long.
     assert np.linalg.norm(points.mean(axis=0)) < 1e-3
+
+
+@pytest.mark.parametrize('width_deg', [15, 55])
+def test_a_rotation_known_roughly_is_confirmed(catalog: StarCatalog, width_deg: float) -> None:
+    frame = next(
+        frames(catalog, width_deg, 20, 10, 0.0, 1)
+    )  # a confirmation needs the focal length
+    off = Rotation.from_euler('xz', [0.05 * width_deg, 3.0], degrees=True)
+    found = confirm_sky(frame.xy_px, frame.prior, catalog, off * frame.camera_from_icrf)
+    searched = find_sky(frame.xy_px, frame.prior, catalog)
+    assert isinstance(found, SkyMatch) and isinstance(searched, SkyMatch)
+    # Both fit the twenty stars drawn, from other starts; two may stand beside false sources.
+    assert len(set(found.catalog_index) & set(searched.catalog_index)) >= 18
+    elsewhere = Rotation.from_euler('y', 90.0, degrees=True) * frame.camera_from_icrf
+    assert isinstance(confirm_sky(frame.xy_px, frame.prior, catalog, elsewhere), NotFound)

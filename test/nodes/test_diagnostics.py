@@ -186,3 +186,61 @@ def test_a_publisher_that_is_not_received_is_named(
     client.node.create_publisher(Calibration, '/calibration', QoSProfile(depth=1))
     refused = '/calibration: a publisher offers volatile, transient local is asked'
     client.until(lambda: newest(diagnostics, 'star_observer')[1] == f'not received: {refused}')
+
+
+def play(client: Client, bag: Path) -> None:
+    """Publish the attitudes of a bag, then its images."""
+    images = client.publisher(Image, '/opnav/image_raw', 20)
+    attitudes = client.publisher(QuaternionStamped, '/star_tracker/attitude')
+    for sample in reader.read_raw([bag], ['/star_tracker/attitude']):
+        attitudes.publish(sample.data)
+    for image in reader.read_raw([bag], ['/opnav/image_raw']):
+        images.publish(image.data)
+
+
+def test_five_images_without_a_match_are_diagnosed(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    wrong = ('-p', 'attitude_direction:=inertial_to_st')
+    start_node(
+        'star_observer', ros=('--params-file', str(tiny_bag / 'params.yaml'), *wrong, *REMAPS)
+    )
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: newest(diagnostics, 'star_observer')[1] == 'waiting for images')
+    play(client, tiny_bag)
+    client.until(
+        lambda: newest(diagnostics, 'star_observer')[2].get('diagnosis') == 'attitude_direction'
+    )
+    level, text, values = newest(diagnostics, 'star_observer')
+    assert level == b'\x01' and 'Set attitude_direction: st_to_inertial.' in text
+    client.until(lambda: newest(diagnostics, 'star_observer')[2].get('refused_no_match') == '10')
+    assert values['callback_errors'] == '0'
+
+
+def test_an_alignment_not_given_is_found_and_all_images_are_used(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    zeros = ('-p', 'prior_alignment:=[0.0, 0.0, 0.0, 0.0]')
+    node = start_node(
+        'star_observer', ros=('--params-file', str(tiny_bag / 'params.yaml'), *zeros, *REMAPS)
+    )
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: newest(diagnostics, 'star_observer')[1] == 'waiting for images')
+    assert 'prior_alignment not given: found from the images' in node.said()
+    play(client, tiny_bag)
+    # Of the images before the answer the last five are kept, and measured again.
+    client.until(lambda: int(newest(diagnostics, 'star_observer')[2].get('images_used', '0')) >= 5)
+    _, _, values = newest(diagnostics, 'star_observer')
+    assert values['retried'] == values['retried_used'] != '0'
+    assert values['diagnosis'] == 'none'
+    client.until(lambda: 'prior_alignment is not given: found [' in node.said())
+
+
+def test_a_silent_topic_is_warned_of_once(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    node = start_node(
+        'star_observer', ros=('--params-file', str(tiny_bag / 'params.yaml'), *REMAPS)
+    )
+    client.until(lambda: '/star_tracker/attitude: no message in 5 s, from 0 pub' in node.said())
+    assert node.said().count('/opnav/image_raw: no message in 5 s') == 1

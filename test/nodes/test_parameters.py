@@ -54,3 +54,10 @@ def test_sections_of_others_are_no_concern(tmp_path: Path) -> None:
     params.write_text('/**/calibratr:\n  ros__parameters: {}\n')
     (text,) = unread_sections(given, '/calibrator', 'calibrator')
     assert "'/**/calibratr' does not apply" in text and text.endswith('write /**/calibrator')
+
+
+def test_a_misspelt_parameter_stops_a_node(start_node: StartNode, tiny_bag: Path) -> None:
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'magnitude_limt:=6.0')
+    node = start_node('star_observer', ros=ros)
+    assert node.wait() == 2
+    assert 'magnitude_limt: no such parameter (did you mean magnitude_limit?)' in node.said()

@@ -101,7 +101,7 @@ def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> 
             'prior_alignment: .* is not a unit quaternion',
         ),
         (
-            {'prior_alignment': [0.0, 0.0, 0.0, 0.0]},
+            {'prior_alignment': [0.0, 0.0, 0.0, 1e-4]},
             'prior_alignment: .* is not a unit quaternion',
         ),
         ({'prior_alignment': [0.0, 0.0, 1.0]}, 'prior_alignment: .* is not a list of 4'),
@@ -150,3 +150,43 @@ def test_a_dark_frame_that_does_not_fit(
     url = write_png(tmp_path / f'dark.{suffix}', pixels)
     with pytest.raises(OptionError, match='one channel of 640 x 512'):
         load_setup(values(camera_yaml, dark_frame=url))
+
+
+def test_zeros_stand_for_an_alignment_not_given(camera_yaml: Path) -> None:
+    given = values(camera_yaml)
+    assert load_setup(given).is_aligned
+    for missing in (
+        {**given, 'prior_alignment': [0.0] * 4},
+        {'camera_info_url': str(camera_yaml)},
+    ):
+        assert not load_setup(missing).is_aligned
+    assert load_setup({}, prior=SCENARIO.prior).is_aligned
+
+
+def test_a_quaternion_of_another_norm_is_refused_with_it(camera_yaml: Path) -> None:
+    with pytest.raises(OptionError, match=r'prior_alignment: .* its norm is 1\.1$'):
+        load_setup(values(camera_yaml, prior_alignment=[0.0, 0.0, 0.0, 1.1]))
+    with pytest.raises(OptionError, match=r'norm is 90\.559.*angles in degrees are no quat'):
+        load_setup(values(camera_yaml, prior_alignment=[90.0, 0.0, 10.0, 1.0]))
+
+
+@pytest.mark.parametrize(
+    ('changes', 'text'),
+    [
+        (
+            {'fx': 35.0, 'fy': 35.0},
+            'focal length of 35 px makes a field of 16. degrees.*millimetres',
+        ),
+        ({'fx': 0.035, 'fy': 0.035}, 'focal length of 0.035 px .* in metres'),
+        ({'fx': 35e4, 'fy': 35e4}, 'focal length of 350000 px .* in micrometres'),
+        ({'cx': 1.54, 'cy': 1.23}, r'principal point \(1.54, 1.23\) is in the first corner'),
+        ({'cx': 5000.0}, r'principal point \(5000, .*far outside the image of 640 x 512'),
+        ({'fx': 4000.0}, 'fx = 4000 and fy = .* differ by a factor of two'),
+    ],
+)
+def test_a_camera_that_no_lens_makes(tmp_path: Path, changes: dict[str, float], text: str) -> None:
+    path = tmp_path / 'camera.yaml'
+    write_camera_info(SCENARIO.prior.camera.replace(**changes), path)
+    with pytest.raises(OptionError, match=text) as refused:
+        load_setup(values(path))
+    assert str(refused.value).startswith(str(path)) and '\n' not in str(refused.value)

@@ -18,6 +18,7 @@ from starcal_ros.simulation.scenario import (
     Inertial,
     scenario,
     SCENARIOS,
+    scene,
 )
 
 
@@ -81,3 +82,11 @@ def test_star_tracker_errors_have_their_sigma_about_their_axes() -> None:
         assert after.time_ns - before.time_ns == 1_000_000_000
     sigma = np.std(errors, axis=0)
     assert np.allclose(sigma, [5.0, 10.0, 40.0], rtol=5 / math.sqrt(2 * 300))  # 5 standard errors
+
+
+def test_only_the_brightest_stars() -> None:
+    few = dataclasses.replace(scenario('tiny', seed=2), stars_per_image=9)
+    every, nine = scene(scenario('tiny', seed=2), 1), scene(few, 1)
+    size = np.array([few.truth.camera.width, few.truth.camera.height])
+    inside = ((every.pixel_px >= 0) & (every.pixel_px <= size - 1)).all(axis=1)
+    assert sorted(nine.magnitude) == sorted(every.magnitude[inside])[:9]

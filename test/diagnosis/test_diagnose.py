@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from starcal_ros.bag import reader
 from starcal_ros.camera import CameraModel
+from starcal_ros.diagnosis.attitude_reading import SetUp, WireAttitudes
+from starcal_ros.diagnosis.diagnose import CAUSES, diagnose, Diagnosis
 from starcal_ros.messages.telemetry import attitude_from_message
-from starcal_ros.pipeline.attitude_reading import SetUp, WireAttitudes
-from starcal_ros.pipeline.diagnose import CAUSES, diagnose, Diagnosis
 from starcal_ros.records import Image
 from starcal_ros.simulation import images as simulated_images
 from starcal_ros.simulation import scenario as synthetic
@@ -141,6 +141,11 @@ def with_alignment(night: Night, turn: Rotation) -> Night:
     return dataclasses.replace(night, setup=setup)
 
 
+def with_stamps(night: Night, late_s: float) -> Night:
+    images = tuple(Image(i.time_ns + round(late_s * 1e9), i.pixels) for i in night.images)
+    return dataclasses.replace(night, images=images)
+
+
 def with_setup(night: Night, **changes: Any) -> Night:
     return dataclasses.replace(night, setup=dataclasses.replace(night.setup, **changes))
 
@@ -221,37 +226,150 @@ def test_focal_length(night: Night, catalog: StarCatalog, share: float) -> None:
 
 @pytest.mark.parametrize('late_s', [-47.0, -1.5, 3.0, 58.0])
 def test_clock(catalog: StarCatalog, late_s: float) -> None:
-    night = slewing_night()
-    images = tuple(
-        Image(image.time_ns + round(late_s * 1e9), image.pixels) for image in night.images
-    )
-    found = found_in(dataclasses.replace(night, images=images), catalog)
+    night = with_stamps(slewing_night(), late_s)
+    found = found_in(night, catalog)
     assert found.cause == 'clock'
     # A tenth of a second of 2 degrees a second is what the star tracker's mounting would hide.
     assert found.found == pytest.approx(-late_s, abs=0.1)
 
 
-def test_no_stars(catalog: StarCatalog) -> None:
-    night = slewing_night()
+@pytest.mark.parametrize('late_s', [-41.0, 33.0])
+def test_clock_of_a_camera_that_rests(catalog: StarCatalog, late_s: float) -> None:
+    found = found_in(with_stamps(granasat_night(), late_s), catalog)
+    assert found.cause == 'clock'
+    # The attitudes are known for half a second before and after each image, at rest: the middle.
+    assert found.found == pytest.approx(-late_s, abs=0.1)
+
+
+def test_no_stars(night: Night, catalog: StarCatalog) -> None:
     rng = np.random.default_rng(1)
     dark = with_pixels(night, lambda p: rng.poisson(50, p.shape).astype(p.dtype))
     assert found_in(dark, catalog).cause == 'no_stars'
 
 
-def test_smear(catalog: StarCatalog) -> None:
+def test_images_without_stars_before_those_with(night: Night, catalog: StarCatalog) -> None:
+    cap_on = tuple(
+        Image(night.images[0].time_ns - 1000 * (k + 1), np.zeros_like(night.images[0].pixels))
+        for k in range(12)
+    )
+    assert found_in(dataclasses.replace(night, images=cap_on + night.images), catalog).cause == (
+        'none'
+    )
+
+
+@pytest.mark.parametrize('length', [10, 40])
+def test_smear(night: Night, catalog: StarCatalog, length: int) -> None:
     def smeared(pixels: Any) -> Any:
         level = np.median(pixels)
-        light = np.stack([np.roll(pixels, k, axis=1) for k in range(40)]).astype(float) - level
-        return (level + light.sum(axis=0) / 6).clip(0, 4095).astype(pixels.dtype)
+        light = np.stack([np.roll(pixels, k, axis=1) for k in range(length)]).astype(float)
+        streaks = level + (light - level).sum(axis=0) / 6
+        return streaks.clip(0, np.iinfo(pixels.dtype).max if pixels.itemsize == 1 else 4095)
 
-    found = found_in(with_pixels(slewing_night(), smeared), catalog)
+    made = with_pixels(night, lambda p: smeared(p).astype(p.dtype))
+    found = found_in(made, catalog)
     assert found.cause == 'smear'
+    # A streak longer than the window of 13 px is cut: so much is stated as a lower bound.
+    assert found.found == pytest.approx(min(length, 13), abs=2)
+    assert ('at least' in found.sentence) == (length > 13)
 
 
-def test_tone_curve(catalog: StarCatalog) -> None:
+def test_tone_curve(night: Night, catalog: StarCatalog) -> None:
     def curved(pixels: Any) -> Any:
-        light = np.maximum(pixels.astype(float) - np.median(pixels), 0.0)
-        return (100 + 3000 * (light / 4095) ** (1 / 2.2)).astype(pixels.dtype)
+        light = np.maximum(pixels.astype(float) - np.median(pixels), 0.0) / pixels.max()
+        return (10 + 0.8 * pixels.max() * light ** (1 / 2.2)).astype(pixels.dtype)
 
-    found = found_in(with_pixels(slewing_night(), curved), catalog)
+    found = found_in(with_pixels(night, curved), catalog)
     assert found.cause == 'not_linear'
+
+
+@pytest.mark.parametrize(('turns', 'way'), [(1, 'counterclockwise'), (-1, 'clockwise')])
+def test_sides_exchanged(night: Night, catalog: StarCatalog, turns: int, way: str) -> None:
+    found = found_in(with_pixels(night, lambda p: np.rot90(p, turns)), catalog)
+    assert (found.cause, found.found) == ('rotated', 90.0)
+    assert found.sentence.endswith(f'degrees {way}.')
+
+
+def test_another_size_is_no_cause_that_is_known(night: Night, catalog: StarCatalog) -> None:
+    found = found_in(with_pixels(night, lambda p: p[::2, ::2]), catalog)
+    assert found.cause == 'unknown' and 'The images are' in found.sentence
+
+
+def turned(night: Night, degrees: float) -> Night:
+    axis = np.array([0.6, -0.64, 0.48])
+    return with_alignment(night, Rotation.from_rotvec(np.radians(degrees) * axis))
+
+
+def w_first(night: Night) -> Night:
+    return with_quaternions(night, lambda q: q[:, [3, 0, 1, 2]])
+
+
+def conjugated(night: Night) -> Night:
+    return with_quaternions(night, lambda q: q * [-1, -1, -1, 1])
+
+
+def half_turned(night: Night) -> Night:
+    return with_alignment(night, Rotation.from_euler('z', 180.0, degrees=True))
+
+
+def unaligned(night: Night) -> Night:
+    return with_setup(night, star_tracker_from_camera=None)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'causes'),
+    [
+        ((conjugated, lambda n: turned(n, 40)), ['attitude_direction', 'prior_alignment']),
+        ((conjugated, half_turned), ['attitude_direction', 'rotated']),
+        ((conjugated, unaligned), ['attitude_direction', 'prior_alignment']),
+        ((conjugated, w_first), ['quaternion_order', 'attitude_direction']),
+        ((w_first, lambda n: turned(n, 6)), ['quaternion_order', 'prior_alignment']),
+        ((w_first, unaligned), ['quaternion_order', 'prior_alignment']),
+        ((half_turned, lambda n: turned(n, 12)), ['prior_alignment']),
+        ((lambda n: with_stamps(n, 20.0), conjugated), ['attitude_direction', 'clock']),
+        ((lambda n: with_stamps(n, 20.0), unaligned), ['clock', 'prior_alignment']),
+    ],
+)
+def test_two_mistakes(night: Night, catalog: StarCatalog, changes: Any, causes: list[str]) -> None:
+    for change in changes:
+        night = change(night)
+    found = found_in(night, catalog)
+    assert [found.cause, *found.also] == causes
+
+
+def test_two_mistakes_of_which_one_is_in_the_images(night: Night, catalog: StarCatalog) -> None:
+    found = found_in(with_pixels(conjugated(night), lambda p: p[:, ::-1]), catalog)
+    assert [found.cause, *found.also] == ['mirrored', 'attitude_direction']
+
+
+def test_attitudes_of_something_else(night: Night, catalog: StarCatalog) -> None:
+    rng = np.random.default_rng(3)
+    others = with_quaternions(night, lambda q: Rotation.random(len(q), random_state=rng).as_quat())
+    assert found_in(others, catalog).cause == 'unknown'
+
+
+def at_rest(count: int) -> Night:
+    """Images of one attitude, which all ways to read the quaternions fit."""
+    scenario = dataclasses.replace(
+        synthetic.scenario('tiny', seed=3),
+        pointing=synthetic.Inertial(((250.0, 32.0, 10.0),)),
+        image_count=count,
+    )
+    samples = [s for k in range(count) for s in synthetic.attitude_samples(scenario, k)]
+    stamps_ns = np.array([sample.time_ns for sample in samples])
+    sent = np.array([sample.icrf_from_star_tracker_xyzw for sample in samples])
+    prior = scenario.prior
+    return Night(
+        tuple(simulated_images.images(scenario)),
+        WireAttitudes(stamps_ns, sent),
+        set_up(prior.camera, prior.star_tracker_from_camera_xyzw),
+    )
+
+
+@pytest.mark.parametrize('count', [1, 4])
+def test_images_that_do_not_turn(catalog: StarCatalog, count: int) -> None:
+    resting = at_rest(count)
+    assert found_in(resting, catalog).cause == 'none'
+    assert found_in(conjugated(resting), catalog).cause == 'attitude_direction'
+    assert found_in(turned(resting, 10), catalog).cause == 'prior_alignment'
+    # Which of the two is wrong cannot be seen: neither is blamed.
+    assert found_in(turned(conjugated(resting), 30), catalog).cause == 'unknown'

@@ -1,0 +1,198 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""`starcal calibrate`: bags to products, or to a record of why there are none."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+import dataclasses
+from pathlib import Path
+import sys
+
+from starcal_ros.assessment import comparison
+from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.bag import reader
+from starcal_ros.cli import diagnosis, output
+from starcal_ros.cli.arguments import EXIT_ACCEPTED, EXIT_REFUSED
+from starcal_ros.cli.folders import make_folder, missing_extra
+from starcal_ros.cli.output_places import check_folder
+from starcal_ros.cli.selection import selection
+from starcal_ros.cli.terminal import print_text, with_progress
+from starcal_ros.diagnosis.bags import aligned_by_bags
+from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.estimation.options import tracker_sigma_is_given
+from starcal_ros.pipeline import solve
+from starcal_ros.pipeline import topics as bag_topics
+from starcal_ros.pipeline.observe import Wanted
+from starcal_ros.pipeline.provenance import inputs_of, software_version
+from starcal_ros.pipeline.retry import measured_again
+from starcal_ros.pipeline.setup import files_of, read_setup, Setup
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.products.folder import write_observations, write_products
+from starcal_ros.products.not_calibrated import NotCalibrated, write_not_calibrated
+from starcal_ros.records import (
+    Calibration,
+    CameraGeometry,
+    Ensemble,
+    Image,
+    StarObservations,
+)
+from starcal_ros.report import thumbnails
+from starcal_ros.report.expected import ExpectedAlbum
+
+HALVES = ('odd', 'even')
+
+
+def calibrate(args: argparse.Namespace, asked: Topics) -> int:
+    """Calibrate from bags in one process, as the two nodes do on the graph."""
+    setup = read_setup(args.params)
+    wanted = selection(args.from_time, args.to_time, args.first, args.every)
+    if args.output.exists() and not args.output.is_dir():
+        raise OptionError(f'{args.output}: not a folder')
+    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames)))
+    inputs = inputs_of((*reader.mcap_files(args.bags), args.params))
+    try:
+        setup, found = aligned_by_bags(args.bags, asked, setup)
+    except OptionError as error:
+        make_folder(args.output)
+        _write_failure(args.output, NotCalibrated(str(error), tuple(map(str, args.bags)), {}))
+        raise
+    if found:
+        print(found, file=sys.stderr)
+    calibration, observations = calibrate_into(
+        args.output, args.bags, asked, setup, inputs, wanted
+    )
+    report = write_report(args.output)
+    output.print_calibration(calibration, setup.prior)
+    if not tracker_sigma_is_given(setup.calibration):
+        sigma = ', '.join(f'{arcsec:.1f}' for arcsec in calibration.star_tracker_sigma_arcsec)
+        print_text(
+            f'star tracker    {sigma}" (x, y, z) from the scatter: star_tracker_sigma_arcsec'
+            ' is not given'
+        )
+    print_text(f'products written to {args.output}; {report}')
+    if args.split_half:
+        _split(args.output, observations, setup, inputs)
+    return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
+
+
+def calibrate_into(
+    folder: Path,
+    bags: Sequence[Path],
+    asked: Topics,
+    setup: Setup,
+    inputs: Mapping[str, str],
+    wanted: Wanted | None = None,
+) -> tuple[Calibration, list[StarObservations]]:
+    """Calibrate from bags and write the files that a report is made from."""
+    topics = bag_topics.choose_topics(bags, asked, setup)
+    album, expected = thumbnails.Album(), ExpectedAlbum(setup)
+
+    def show(image: Image, observed: StarObservations, geometry: CameraGeometry) -> None:
+        album.show(image, observed, geometry)
+        expected.show(image, observed, geometry)
+
+    records = bag_topics.read(bags, topics, setup, show, wanted)
+    observations = list(with_progress(records, bag_topics.count(bags, topics), 'images'))
+    make_folder(folder)
+    # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
+    write_observations(observations, folder, setup.frames.camera_frame)
+    try:
+        calibration, left = _solve(observations, setup, inputs)
+        if calibration.accepted and topics.image:
+            again = measured_again(bags, topics, setup, calibration.geometry, observations)
+            gained = _used(again) - _used(observations)
+            if gained:
+                print(
+                    f'{gained} images matched nothing at first, and are used with the calibration'
+                    ' of the others',
+                    file=sys.stderr,
+                )
+                observations = again
+                write_observations(observations, folder, setup.frames.camera_frame)
+                calibration, left = _solve(observations, setup, inputs)
+    except TooFewObservations as error:
+        failure = _failure(str(error), bags, asked, setup, observations, bool(topics.image))
+        _write_failure(folder, failure, expected.pictures)
+        raise TooFewObservations(failure.reason) from error
+    write_products(calibration, folder, left)
+    thumbnails.write_thumbnails(album.thumbnails(), folder / thumbnails.THUMBNAILS_FOLDER)
+    return calibration, observations
+
+
+def _solve(
+    observations: Sequence[StarObservations], setup: Setup, inputs: Mapping[str, str]
+) -> tuple[Calibration, Residuals]:
+    ensemble = Ensemble()
+    for record in observations:
+        ensemble = solve.add_to_ensemble(ensemble, record, setup)
+    return solve.solve_with_residuals(ensemble, setup, inputs=inputs)
+
+
+def _used(observations: Sequence[StarObservations]) -> int:
+    return sum(not record.refusal for record in observations)
+
+
+def _split(
+    folder: Path,
+    observations: Sequence[StarObservations],
+    setup: Setup,
+    inputs: Mapping[str, str],
+) -> None:
+    """Calibrate each half of the images into a folder of its own, and print their comparison."""
+    used = [record for record in observations if not record.refusal]
+    made = []
+    for k, name in enumerate(HALVES):
+        half = folder / name
+        make_folder(half)
+        write_observations(used[k::2], half, setup.frames.camera_frame)
+        calibration, left = _solve(used[k::2], setup, inputs)
+        write_products(calibration, half, left)
+        made.append(calibration)
+    print_text(
+        f'\nimages of odd (A) and of even (B) number, in {folder / "odd"} and {folder / "even"}'
+    )
+    output.print_comparison(comparison.compare(*made))
+
+
+def _failure(
+    words: str,
+    bags: Sequence[Path],
+    asked: Topics,
+    setup: Setup,
+    observations: Sequence[StarObservations],
+    has_images: bool,
+) -> NotCalibrated:
+    """The record of a failure, with the diagnosis where no image matches."""
+    refused: dict[str, int] = {}
+    for record in observations:
+        if record.refusal:
+            refused[record.refusal] = refused.get(record.refusal, 0) + 1
+    if refused:
+        words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
+    named = tuple(map(str, bags))
+    if has_images and not _used(observations):
+        found = diagnosis.of_a_failure(bags, asked, setup)
+        if found:
+            words += f'. {found.in_a_sentence()}'
+            return NotCalibrated(words, named, refused, found.cause, found.evidence, found.mend)
+    return NotCalibrated(words, named, refused)
+
+
+def _write_failure(
+    folder: Path, failure: NotCalibrated, pictures: Sequence[thumbnails.Thumbnail] = ()
+) -> None:
+    """Replace what a folder holds of an earlier calibration by the record of a failure."""
+    software = f'starcal {software_version()}'
+    write_not_calibrated(dataclasses.replace(failure, software=software), folder)
+    thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
+    write_report(folder)
+
+
+def write_report(folder: Path) -> str:
+    """Write the report of a folder; returns where it is, or why there is none."""
+    try:
+        from starcal_ros.report import page
+    except ModuleNotFoundError as error:
+        return f'no report: {missing_extra(error, "report")}'
+    return f'look at {page.write_report(folder)}'

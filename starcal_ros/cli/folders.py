@@ -1,0 +1,32 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Folders that the tool writes to, and parts of it that may not be installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from starcal_ros.errors import OptionError
+
+_MODULES_OF_EXTRAS = ('dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')  # setup.cfg
+
+
+def make_folder(path: Path) -> None:
+    """
+    Make a folder and those above it where they are not there.
+
+    Raises
+    ------
+    OptionError
+        When it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OptionError(f'{path}: cannot create the folder: {error.strerror}') from error
+
+
+def missing_extra(error: ModuleNotFoundError, extra: str) -> str:
+    """One line that names the extra to install; raises what is missing for another reason."""
+    if error.name not in _MODULES_OF_EXTRAS:
+        raise error
+    return f"{error.name} is not installed: pip install 'starcal_ros[{extra}]'"

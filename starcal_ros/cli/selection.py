@@ -1,0 +1,112 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Images of a bag that a calibration is restricted to: --from, --to, --first, --every."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+import math
+
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import OptionError
+
+
+@dataclass(frozen=True)
+class Time:
+    """A time of an option: ``seconds`` since 1970 UTC, or since the first image of the bag."""
+
+    seconds: float
+    since_first_image: bool
+
+
+@dataclass
+class Selection:
+    """
+    Which images are taken, asked in the order of the bag.
+
+    Between the times ``start`` and ``end``, both included, every ``every``-th from the first of
+    them on, and ``first`` of those.
+    """
+
+    start: Time | None = None
+    end: Time | None = None
+    first: int | None = None
+    every: int = 1
+    _first_ns: int | None = None
+    _between: int = 0
+    _taken: int = 0
+    _answers: dict[int, bool] = field(default_factory=dict)
+
+    def __call__(self, time_ns: int) -> bool:
+        """Whether the image of a stamp is taken."""
+        if time_ns not in self._answers:  # a stamp asked again has its answer
+            self._answers[time_ns] = self._takes(time_ns)
+        return self._answers[time_ns]
+
+    def _takes(self, time_ns: int) -> bool:
+        if self._first_ns is None:
+            self._first_ns = time_ns
+        if self.start is not None and time_ns < self._ns(self.start):
+            return False
+        if self.end is not None and time_ns > self._ns(self.end):
+            return False
+        self._between += 1
+        if (self._between - 1) % self.every:
+            return False
+        self._taken += 1
+        return self.first is None or self._taken <= self.first
+
+    def _ns(self, time: Time) -> int:
+        origin_ns = (self._first_ns or 0) if time.since_first_image else 0
+        return origin_ns + round(time.seconds * NANOSECONDS_PER_SECOND)
+
+
+def parse_time(text: str, option: str) -> Time:
+    """
+    A time as it is typed: UTC in ISO 8601, seconds since 1970, or +seconds since the first image.
+
+    Raises
+    ------
+    OptionError
+        Naming the option.
+    """
+    try:
+        seconds = float(text)
+    except ValueError:
+        try:
+            read = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
+        except ValueError as error:
+            raise OptionError(
+                f'--{option}: {text!r} is no time: give 2026-05-15T07:20:00, seconds since 1970,'
+                ' or +seconds after the first image'
+            ) from error
+        with_zone = read if read.tzinfo else read.replace(tzinfo=timezone.utc)
+        return Time(with_zone.timestamp(), False)
+    if not math.isfinite(seconds):
+        raise OptionError(f'--{option}: {text!r} is not a finite number of seconds')
+    return Time(seconds, text.strip().startswith('+'))
+
+
+def selection(
+    start: str | None, end: str | None, first: int | None, every: int | None
+) -> Selection | None:
+    """
+    The images that options choose; None: all.
+
+    Raises
+    ------
+    OptionError
+        For a value without a meaning.
+    """
+    if first is not None and first < 1:
+        raise OptionError(f'--first: {first} is not a number of images')
+    if every is not None and every < 1:
+        raise OptionError(f'--every: {every} is not 1 or more')
+    if start is None and end is None and first is None and every is None:
+        return None
+    return Selection(
+        None if start is None else parse_time(start, 'from'),
+        None if end is None else parse_time(end, 'to'),
+        first,
+        every or 1,
+    )

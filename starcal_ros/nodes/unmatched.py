@@ -1,0 +1,110 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Images that match no star, kept by the star observer: diagnosed, and measured again later."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+import threading
+
+from starcal_ros.arrays import Floats
+from starcal_ros.diagnosis.bags import IMAGES_OF_AN_ALIGNMENT, set_up, wire_attitudes
+from starcal_ros.diagnosis.diagnose import Diagnosis
+from starcal_ros.diagnosis.process import DiagnosisProcess, Question
+from starcal_ros.pipeline.setup import Setup
+from starcal_ros.records import Image
+
+KEPT = 5  # images; of 5 megapixels and 16 bit they are 50 MB
+DIAGNOSED = 5  # images in a row without a match
+_ATTITUDES = 20_000  # of the last minutes, for the search of a shift of clocks
+
+
+class Unmatched:
+    """
+    The last images that matched no star, and why they did not.
+
+    After five in a row, then ten, twenty and so on, they are diagnosed in another process; without
+    a prior alignment after each image from the third on.  Safe to use from several threads.
+    """
+
+    def __init__(self, setup: Setup, on_answer: Callable[[Diagnosis], None]) -> None:
+        self._setup = setup
+        self._on_answer = on_answer
+        self._lock = threading.Lock()
+        self._images: deque[Image] = deque(maxlen=KEPT)
+        self._attitudes: deque[tuple[int, Floats]] = deque(maxlen=_ATTITUDES)
+        self._in_a_row = 0
+        self._next = DIAGNOSED if setup.is_aligned else IMAGES_OF_AN_ALIGNMENT
+        self._process = DiagnosisProcess()
+        self._thread: threading.Thread | None = None
+        self._diagnosis: Diagnosis | None = None
+
+    @property
+    def diagnosis(self) -> Diagnosis | None:
+        """Why the last images matched nothing; None: not asked yet, or they match again."""
+        with self._lock:
+            return self._diagnosis
+
+    def add_attitude(self, time_ns: int, quaternion: Floats) -> None:
+        """Keep an attitude as it was sent."""
+        with self._lock:
+            self._attitudes.append((time_ns, quaternion))
+
+    def matched(self) -> None:
+        """Forget the diagnosis: an image matched."""
+        with self._lock:
+            self._in_a_row, self._diagnosis = 0, None
+            self._next = DIAGNOSED
+
+    def add(self, image: Image) -> None:
+        """Keep an image that matched nothing, and have it diagnosed if it is time."""
+        with self._lock:
+            self._images.append(image)
+            self._in_a_row += 1
+            busy = self._thread is not None and self._thread.is_alive()
+            if busy or self._in_a_row < self._next:
+                return
+            self._next = 2 * self._in_a_row if self._setup.is_aligned else self._in_a_row + 1
+            stamps, quaternions = (
+                zip(*self._attitudes, strict=True) if self._attitudes else ((), ())
+            )
+            question = Question(
+                tuple(self._images),
+                wire_attitudes(stamps, quaternions),
+                set_up(self._setup),
+                self._setup.frames.catalog,
+                self._setup.identification.magnitude_limit,
+            )
+            self._thread = threading.Thread(
+                target=self._ask, args=(question,), name='diagnose', daemon=True
+            )
+            self._thread.start()
+
+    def take(self) -> list[Image]:
+        """Take the images kept, which are then measured again."""
+        with self._lock:
+            taken = list(self._images)
+            self._images.clear()
+            return taken
+
+    def aligned(self, setup: Setup) -> None:
+        """Go on with the alignment found."""
+        with self._lock:
+            self._setup = setup
+            self._in_a_row, self._diagnosis, self._next = 0, None, DIAGNOSED
+
+    def close(self) -> None:
+        """End a diagnosis under way."""
+        self._process.stop()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def _ask(self, question: Question) -> None:
+        found = self._process.ask(question)
+        if found is None:
+            return
+        with self._lock:
+            if not self._in_a_row:
+                return  # images match again
+            self._diagnosis = found
+        self._on_answer(found)
