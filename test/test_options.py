@@ -102,6 +102,21 @@ def test_bad_values(values: dict[str, object], text: str) -> None:
     assert str(refused.value) == text
 
 
+def test_long_values_are_refused_in_a_short_line() -> None:
+    for name, value, says in (
+        ('estimate', ['fx', 'fx'], 'estimate: fx stands twice'),
+        ('estimate', ['fx'] * 100_000, 'estimate: 100000 values, at most 100 are read'),
+        ('estimate', ['x' * 10**6], 'estimate: .* is not a text of at most 4096'),
+        ('method', 'm' * 4000, 'method: .* is not one of'),
+        ('min_images', 10**5000, 'min_images: an integer of more than 60 digits is not within 64'),
+        ('catalog', 'a\0b', 'catalog: a text with a NUL character'),
+    ):
+        (kind,) = (kind for kind in OPTION_CLASSES if name in names_of(kind))
+        with pytest.raises(OptionError, match=says) as caught:
+            from_mapping(kind, {name: value})
+        assert len(str(caught.value)) < 300
+
+
 @pytest.mark.parametrize('options_class', OPTION_CLASSES)
 def test_every_default_is_a_value_that_its_own_option_takes(options_class: type) -> None:
     defaults = {f.name: f.default for f in dataclasses.fields(options_class)}

@@ -487,14 +487,15 @@ def test_state_outlasts_a_kill(
 
 
 def test_bad_message_ends_nothing(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
-    """Inconsistent observations are logged and counted; the next ones are used."""
+    """Inconsistent observations are logged and counted as refused; the next ones are used."""
     calibrator = start_node('calibrator', ros=parameters(tiny_bag))
     observations = client.publisher(StarObservations, 'observations')
     observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
     refused = refused_image(5, 8, 8, 'no_stars', '')
     observations.publish(observations_to_message(refused, '', make_message))
     status = client.latched(EnsembleStatus, 'ensemble_status')
-    client.until(lambda: status and [e.reason for e in status[-1].refused] == ['no_stars'])
+    both = ['bad_observations', 'no_stars']
+    client.until(lambda: status and [e.reason for e in status[-1].refused] == both)
     assert 'direction_icrf: 0 numbers, not 2 x 3' in calibrator.said()
     assert 'Traceback' not in calibrator.said()
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -47,6 +48,20 @@ def test_refused_images_are_counted(setup: Setup) -> None:
     assert collected.refused == {'out_of_order': 2}
     status = solve.ensemble_status(collected, setup)
     assert (status.images, status.refused) == (2, {'out_of_order': 2})
+
+
+def test_a_constellation_that_no_camera_shows_is_counted(setup: Setup) -> None:
+    """Negated, mirrored or mixed-up directions have unit length: only their places show them."""
+    sound = ensemble().images[0]
+    mixed = np.random.default_rng(1).permutation(len(sound))
+    for directions in (
+        -sound.direction_icrf,
+        sound.direction_icrf * [1, 1, -1],
+        sound.direction_icrf[mixed],
+    ):
+        wrong = dataclasses.replace(sound, direction_icrf=directions)
+        collected = solve.add_to_ensemble(Ensemble(), wrong, setup)
+        assert (collected.images, collected.refused) == ((), {'bad_observations': 1})
 
 
 def test_at_the_limit_an_image_goes_for_each_that_comes(camera_yaml: Path) -> None:

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 from bench import attack_inputs, fuzz_inputs
+from starcal_ros.cli import main
 
 TEXTS = ('parameters', 'camera', 'metadata', 'calibration', 'state')
 ROOT = Path(__file__).parents[2]
@@ -39,10 +41,24 @@ def test_a_failure_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert len(found.failures) == 3 and 'ZeroDivisionError' in found.failures[0]
 
 
-def test_pipes_and_devices_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
-    row = attack_inputs._pipe(tmp_path)
-    assert row.survived == row.tried == 6
+def test_pipes_and_devices_are_no_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pipe = tmp_path / 'pipe'
+    os.mkfifo(pipe)
+    (tmp_path / 'bag').mkdir()
+    for name in ('metadata.yaml', 'a.mcap'):
+        os.mkfifo(tmp_path / 'bag' / name)
+    for arguments, text in (
+        (['inspect', pipe], 'not a regular file'),
+        (['inspect', '/dev/zero'], 'not a regular file'),
+        (['inspect', tmp_path / 'bag'], 'no .mcap files in the folder'),
+        (['inspect', ROOT / 'bags' / 'tiny', '--params', pipe], 'not a regular file'),
+        (['compare', pipe, '/dev/zero'], 'not a regular file'),
+    ):
+        assert main.main([str(word) for word in arguments]) == 2
+        error = capsys.readouterr().err
+        assert text in error and error.count('\n') == 1
 
 
 @pytest.mark.nodes

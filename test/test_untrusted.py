@@ -1,0 +1,146 @@
+"""The door of untrusted text: plain values, and what is refused with its line."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import pytest
+import yaml
+
+from starcal_ros.untrusted import json_value, read_text, shown, yaml_value
+
+
+@pytest.mark.parametrize(
+    ('text', 'value'),
+    [
+        ('1e-6', 1e-6),
+        ('-2E+3', -2000.0),
+        ('.5', 0.5),
+        ('3.', 3.0),
+        ('0x1F', 31),
+        ('010', 8),
+        ('-0b11', -3),
+        ('08', '08'),
+        ('2026-13-01', '2026-13-01'),
+        ('12:30:45', '12:30:45'),
+        ('yes', True),
+        ('Off', False),
+        ('"yes"', 'yes'),
+        ('! 5', '5'),
+        ('!!str 5', '5'),
+        ('!!float 5', 5),
+        ('~', None),
+        ('-.INF', -math.inf),
+        ('[1, {a: b}]', [1, {'a': 'b'}]),
+        ('{a: &x [1], b: *x}', {'a': [1], 'b': [1]}),
+        ('', None),
+    ],
+)
+def test_values_of_yaml(text: str, value: object) -> None:
+    assert yaml_value(text) == value
+
+
+@pytest.mark.parametrize(
+    ('text', 'says'),
+    [
+        ('a: 1\na: 2', "line 2: key 'a' stands twice"),
+        ('5: 1', 'line 1: key 5 is not a text'),
+        ('no: 1', 'line 1: key False is not a text'),
+        ('a: ' + 5000 * '9', 'line 1: an integer of 5000 digits is beyond 64 bit'),
+        ('a: 9223372036854775808', 'beyond 64 bit'),
+        ('a: 0x' + 99 * 'f', 'beyond 64 bit'),
+        ('a: "\\0"', 'line 1: a text with a NUL character'),
+        ('a: !!python/object/apply:os.system [x]', 'line 1: tag .* is not read'),
+        ('%TAG ! x\n---\na: 1', 'tag directives'),
+        (40 * '[' + 40 * ']', 'line 1: nested deeper than 32'),
+        (100_000 * '[', 'nested deeper'),
+        ('a: &a [*a]', "line 1: alias 'a' of no value before it"),
+        ('--- 1\n--- 2', 'several YAML documents'),
+        ('a: [', 'not YAML: .*line 2, column 1'),
+        ('x\ud800', 'not YAML'),
+    ],
+)
+def test_yaml_that_is_refused(text: str, says: str) -> None:
+    with pytest.raises(ValueError, match=says) as caught:
+        yaml_value(text)
+    assert '\n' not in str(caught.value) and len(str(caught.value)) < 300
+
+
+def test_aliases_do_not_multiply() -> None:
+    """Nine levels of ten aliases each are a gigabyte where they are written out."""
+    lines = ['a0: &a0 [1]']
+    lines += [f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 10)}]' for k in range(1, 10)]
+    with pytest.raises(ValueError, match='line 6: more than 100000 values'):
+        yaml_value('\n'.join(lines))
+
+
+@pytest.mark.parametrize(
+    ('text', 'says'),
+    [
+        ('{"a": 1, "b": {"c": 1, "c": 2}}', "key 'c' stands twice"),
+        ('[NaN]', 'NaN is no number of JSON'),
+        ('5' * 5000, 'a number of more than 400 digits'),
+        ('["\\ud800"]', 'half a surrogate pair'),
+        ('{"\\u0000": 1}', 'NUL'),
+        (40 * '[' + 40 * ']', 'nested deeper than 32'),
+        (100_000 * '[', 'not JSON: nested deeper'),
+        ('[' + 100_001 * '[],' + '1]', 'more than 100000 lists'),
+        ('', 'not JSON: Expecting value'),
+    ],
+)
+def test_json_that_is_refused(text: str, says: str) -> None:
+    with pytest.raises(ValueError, match=says) as caught:
+        json_value(text)
+    assert '\n' not in str(caught.value)
+
+
+letters = st.text(st.characters(exclude_categories=['Cs'], exclude_characters='\0'), max_size=9)
+scalars = (
+    st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1)
+    | st.floats(allow_nan=False) | letters
+)  # fmt: skip
+documents = st.recursive(
+    scalars,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(letters, inner, max_size=4),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(documents)
+def test_what_the_libraries_write_comes_back(value: object) -> None:
+    assert yaml_value(yaml.safe_dump(value)) == value
+    assert json_value(json.dumps(value).replace('Infinity', '1e999')) == value
+
+
+def test_only_regular_files_of_limited_size_are_read(tmp_path: Path) -> None:
+    pipe, file = tmp_path / 'pipe', tmp_path / 'file'
+    os.mkfifo(pipe)
+    file.write_bytes(b'1234')
+    assert read_text(file, 4) == '1234'
+    with pytest.raises(ValueError, match='larger than 0 kB'):
+        read_text(file, 3)
+    for path in (pipe, Path('/dev/zero')):
+        with pytest.raises(ValueError, match='not a regular file'):
+            read_text(path, 4)
+    file.write_bytes(b'\xff')
+    with pytest.raises(ValueError, match='not a text file'):
+        read_text(file, 4)
+    for name in ('a\0b', '\ud800'):
+        with pytest.raises(ValueError, match='not the name of a file'):
+            read_text(tmp_path / name, 4)
+    with pytest.raises(IsADirectoryError):
+        read_text(tmp_path, 4)
+
+
+@pytest.mark.parametrize(
+    'value',
+    [10**6000, ['x'] * 10**6, 'x' * 10**6, {'a': 'x' * 99}],
+    ids=['int', 'list', 'str', 'dict'],
+)
+def test_a_shown_value_is_short(value: object) -> None:
+    assert len(shown(value)) <= 60
