@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import json
 import os
 from pathlib import Path
@@ -33,7 +33,9 @@ def rows(quick: bool) -> list[AttackRow]:
         return [
             places(Path(folder)),
             odd_products(Path(folder), 200 if quick else 10_000),
-            reports(Path(folder), 1 if quick else 60),
+            reports(
+                Path(folder), 0 if quick else 60, _QUICK_PICTURES if quick else tuple(_PICTURES)
+            ),
             streams(),
             interrupted_imports(6 if quick else 100),
         ]
@@ -174,15 +176,15 @@ def odd_products(folder: Path, count: int) -> AttackRow:
     return AttackRow('calibration.json with odd values', tally.tried, tally.survived, 0, 0)
 
 
-def reports(folder: Path, count: int) -> AttackRow:
+def reports(folder: Path, count: int, pictures: Sequence[str]) -> AttackRow:
     """Reports of odd products and of folders with links: one line, and nothing from outside."""
     tally, wrong = sample.Tally('reports'), 0
     secret = folder / 'secret'
     secret.write_bytes(b'\xff\xd8\xff' + _SECRET)
     sound = folder / 'sound'
     write_product_folder(sound)
-    for name, put in _PICTURES.items():
-        here = folder / 'linked'
+    for name in pictures:
+        put, here = _PICTURES[name], folder / 'linked'
         shutil.copytree(sound, here)
         with tally.attempt(name):
             put(here, secret)
@@ -232,6 +234,9 @@ _PICTURES: dict[str, Callable[[Path, Path], object]] = {
     'FIFO as calibration': lambda here, _: fifo_in_place_of(here / CALIBRATION_FILE),
     'FIFO as observations': lambda here, _: fifo_in_place_of(here / 'observations.mcap'),
 }
+
+
+_QUICK_PICTURES = ('link', 'link to a folder', 'FIFO as calibration')
 
 
 def streams() -> AttackRow:

@@ -213,7 +213,7 @@ def test_topics_that_are_not_there(
         ({'camera_info_url': 'package://none/a.yaml'}, ['package none']),
         ({'camera_info_url': 'http://host/a.yaml'}, ['http://host/a.yaml']),
         ({'camera_info_url': str(TINY / 'params.yaml')}, ['params.yaml', 'image_width']),
-        ({'camera_info_url': str(TINY / 'tiny_0.mcap')}, ['tiny_0.mcap', 'not']),
+        ({'camera_info_url': str(TINY / 'tiny_0.mcap')}, ['tiny_0.mcap', 'larger than 256 kB']),
         ({'catalog': 'none.npz'}, ['none.npz']),
         ({'dark_frame': 'none.png'}, ['dark_frame', 'none.png']),
     ],
@@ -477,7 +477,7 @@ def test_play_becomes_the_player(run: Run, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
     run('play', TINY, '--rate', '2', '--remap', 'a:=b', '--remap', 'c:=d')
     (command,) = called
-    start = module_command('starcal_ros.nodes.bag_player')
+    start = [*module_command('starcal_ros.nodes.entry_points'), 'bag_player']
     assert command[: len(start)] == start
     assert f'bag:={TINY.resolve()}' in command and 'rate:=2.0' in command
     assert command[-4:] == ['-r', 'a:=b', '-r', 'c:=d']

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import itertools
 import math
 from pathlib import Path
@@ -13,8 +15,6 @@ import pytest
 
 if TYPE_CHECKING:
     from conftest import Client, StartNode
-
-    from starcal_ros.records import Ensemble
 
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
@@ -27,9 +27,11 @@ from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ros.bag import reader
+from starcal_ros.calibrator.archive import Activation, Archive
 from starcal_ros.messages.observations import observations_to_message
 from starcal_ros.nodes.message_factory import make_message
-from starcal_ros.records import IMAGE_REFUSALS
+from starcal_ros.products.calibration_json import CALIBRATION_FILE, read_calibration
+from starcal_ros.records import Ensemble, IMAGE_REFUSALS
 
 pytestmark = pytest.mark.nodes
 
@@ -131,6 +133,30 @@ def test_calibrator_diagnostics_match_the_document(
     # On this machine's clock, within the time a test may take.
     assert 0 <= float(values['calibration_age_s']) < 600
     assert math.isfinite(float(values['disk_free_mb']))
+
+
+def test_a_stored_calibration_that_the_gate_refuses_is_not_active(
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path, tmp_path: Path
+) -> None:
+    """With a tighter limit at the restart; without it, it is active again."""
+    stored = read_calibration(tiny_products / CALIBRATION_FILE)
+    stored = dataclasses.replace(stored, number=1, active_since_ns=1)
+    with contextlib.closing(Archive(tmp_path / 'state', 'camera')) as archive:
+        archive.keep(Ensemble(), (Activation(1, 0, stored),))
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', f'state_dir:={tmp_path}/state')
+    first = start_node('calibrator', ros=(*ros, '-p', 'max_residual_rms_px:=0.001'))
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: 'images' in newest(diagnostics, 'calibrator')[2])
+    level, text, values = newest(diagnostics, 'calibrator')
+    assert level == b'\x01'
+    assert text.startswith('calibration 1 is not active, the gate refuses it now: residual')
+    assert 'max_residual_rms_px' in text and text in first.said()
+    assert values['in_force'] == 'none' and values['last_gate'] == f'refused: {text}'
+    assert values['state_refused_calibrations'] == '1'
+    first.stop()
+    start_node('calibrator', ros=(*ros, '-r', '__node:=second'))
+    client.until(lambda: newest(diagnostics, 'second')[2].get('in_force') == '1')
+    assert newest(diagnostics, 'second')[2]['state_refused_calibrations'] == '0'
 
 
 def test_nodes_that_are_not_active(client: Client, start_node: StartNode, tiny_bag: Path) -> None:

@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from starcal_ros.camera import CameraModel
+from starcal_ros.errors import ProductError
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
-from starcal_ros.report.thumbnails import Album, read_thumbnails, write_thumbnails
+from starcal_ros.report.thumbnails import Album, read_thumbnails, Thumbnail, write_thumbnails
 
 CAMERA = CameraModel(640, 512, np.array([1800.0, 0, 1800, 319.5, 255.5, 0, 0, 0, 0, 0]))
 GEOMETRY = CameraGeometry(CAMERA, np.array([0.0, 0, 0, 1]))
@@ -83,3 +86,22 @@ def test_a_folder_keeps_what_was_written_and_nothing_older(tmp_path: Path) -> No
     assert set(read_thumbnails(folder)) == set(album.thumbnails())
     assert (folder / 'notes.txt').read_text() == 'mine'
     assert read_thumbnails(tmp_path / 'nowhere') == ()
+
+
+def test_only_pictures_of_the_folder_are_read(tmp_path: Path) -> None:
+    """No link, FIFO, huge file or other content: it would be in the report."""
+    secret, folder = tmp_path / 'secret', tmp_path / 'thumbnails'
+    secret.write_bytes(b'\xff\xd8\xff secret')
+    own = Thumbnail(1, '', 0, b'\xff\xd8\xff')
+    write_thumbnails([own], folder)
+    (folder / 'image_2.jpg').symlink_to(secret)
+    os.mkfifo(folder / 'image_3.jpg')
+    (folder / 'image_4.jpg').write_bytes(b'no picture')
+    (folder / 'image_5.jpg').write_bytes(b'\xff\xd8\xff' + bytes(2 << 20))
+    (folder / 'star_6_blend_0.png').mkdir()
+    assert read_thumbnails(folder) == (own,)
+    (tmp_path / 'link').symlink_to(folder)
+    assert read_thumbnails(tmp_path / 'link') == ()
+    with pytest.raises(ProductError, match='is a link'):
+        write_thumbnails([own], tmp_path / 'link')
+    assert secret.read_bytes() == b'\xff\xd8\xff secret'
