@@ -81,7 +81,7 @@ def in_words(reading: Reading) -> str:
 
 
 def off_by(reading: Reading, setup: SetUp) -> tuple[float, float]:
-    """How far the prior alignment points and rolls away from that found, rad."""
+    """Pointing and roll difference of the prior alignment from the measured one, rad."""
     if setup.star_tracker_from_camera is None:
         return math.pi, math.pi
     turn = setup.star_tracker_from_camera.inv() * reading.star_tracker_from_camera
@@ -91,7 +91,7 @@ def off_by(reading: Reading, setup: SetUp) -> tuple[float, float]:
 
 
 def is_off(reading: Reading, setup: SetUp) -> bool:
-    """Whether the prior alignment is farther off than is searched."""
+    """True if the error of the prior alignment is beyond the range of the search."""
     tilt_rad, roll_rad = off_by(reading, setup)
     return tilt_rad > setup.acquisition_rad or abs(roll_rad) > setup.acquisition_roll_rad
 

@@ -37,12 +37,12 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'overrun': 'images came faster than they could be measured',
     'internal_error': 'the measurement failed unexpectedly; the log of the node has the cause',
 }
-"""Why an image can be refused: stable name -> meaning."""
+"""Reasons to refuse an image: stable name -> meaning."""
 
 
 class StarRefusal(IntEnum):
     """
-    Why a single predicted star is left out; the codes of ``uint8`` arrays.
+    Reasons to leave out a single predicted star, as codes of ``uint8`` arrays.
 
     Messages and files hold the `label`, because codes of another version may differ.
     """
@@ -76,7 +76,7 @@ class StarRefusal(IntEnum):
 STAR_REFUSALS: Mapping[str, str] = {
     refusal.label: refusal.meaning for refusal in StarRefusal if refusal is not StarRefusal.NONE
 }
-"""Why a single predicted star can be left out: stable name -> meaning."""
+"""Reasons to leave out a single predicted star: stable name -> meaning."""
 
 
 @dataclass(frozen=True)
