@@ -102,7 +102,7 @@ def found(catalog: StarCatalog, count: int) -> Table:
 
 
 def random_points(count: int) -> Table:
-    """How many frames of random points are taken for stars."""
+    """Number of frames of random points that are accepted."""
     catalog = load_catalog()
     table = Table(
         'Random points that must not be identified',
@@ -203,7 +203,7 @@ def frames(
 
 
 def _is_right(frame: Frame, sky: SkyMatch, catalog: StarCatalog) -> bool:
-    """Whether most stars are those drawn, or stand within two pixels of them, as in a pair."""
+    """True if most stars are the drawn ones or lie within two pixels of them, as in a pair."""
     drawn = {tuple(xy): star for xy, star in zip(frame.xy_px.tolist(), frame.star, strict=True)}
     rows = np.array([drawn[tuple(xy)] for xy in sky.xy_px.tolist()], np.int64)
     places = catalog.direction_icrs

@@ -286,7 +286,7 @@ def _read_out(world: World, image: Image) -> Image:
 
 
 def _seen_at(world: World, scenario: Scenario, shown: Scene, index: int) -> Floats:
-    """Where (n, 2) the stars of a scene fall on the detector of a world."""
+    """Pixels (n, 2) of the stars of a scene on the detector of a world."""
     camera, pixels = scenario.truth.camera, shown.pixel_px
     if world.name in ('two lenses', 'focal breathing'):
         rng = np.random.default_rng([scenario.seed, 79, index])
@@ -309,7 +309,7 @@ def _seen_at(world: World, scenario: Scenario, shown: Scene, index: int) -> Floa
 
 
 def displacement(world: World, scenario: Scenario) -> Field:
-    """What the world adds to the truth camera of a scenario, px."""
+    """Displacement that the world adds to the true camera of a scenario, px."""
     camera = scenario.truth.camera
     middle = np.array([camera.width - 1, camera.height - 1]) / 2.0
     corner_px = float(np.hypot(*middle))

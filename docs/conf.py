@@ -61,7 +61,7 @@ myst_heading_anchors = 4
 
 
 def copy_of(document: Path) -> Path:
-    """Where the copy of a document outside docs/ goes."""
+    """Path of the copy of a document outside docs/."""
     return GENERATED / '_'.join(document.relative_to(ROOT).parts)
 
 

@@ -82,7 +82,7 @@ class FieldType:
 
     @property
     def is_record(self) -> bool:
-        """Whether the kind is a record."""
+        """True if the kind is a record."""
         return dataclasses.is_dataclass(self.kind)
 
     @property
@@ -93,7 +93,7 @@ class FieldType:
 
     @property
     def is_finite(self) -> bool:
-        """Whether numbers must be finite."""
+        """True if numbers must be finite."""
         return any(isinstance(mark, Finite) for mark in self.marks)
 
 

@@ -127,7 +127,7 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
 
 
 def is_of_ros(name: str) -> bool:
-    """Whether a parameter is one that every ROS node has, as ``ros2 param dump`` writes it."""
+    """True if a parameter of a ``ros2 param dump`` is one that every ROS node has."""
     return name in ('use_sim_time', 'start_type_description_service') or '.' in name
 
 
@@ -242,7 +242,7 @@ def _flat(content: Mapping[str, object], namespace: str) -> dict[str, object]:
 
 
 def section_applies(section: str, node: str) -> bool:
-    """Whether rcl gives a section to a node, ``/namespace/name``: * is one part, ** any number."""
+    """True if rcl gives a section to a node ``/namespace/name``: * is one part, ** any number."""
     return _parts_match(section.lstrip('/').split('/'), node.lstrip('/').split('/'))
 
 

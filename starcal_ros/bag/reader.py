@@ -320,7 +320,7 @@ def _is_inside(name: object) -> bool:
 
 
 def _how_to_convert(path: Path, magic: bytes) -> str:
-    """How to make an MCAP bag of a bag of another kind, as the end of a complaint."""
+    """End of an error message: the command that converts a bag of another kind to MCAP."""
     if magic.startswith(_SQLITE):
         # rosbags converts the folder with its metadata.yaml, not the file in it.
         kind, source = 'an SQLite bag', path.parent if path.suffix == '.db3' else path

@@ -143,7 +143,7 @@ class Archive:
         self._lock = -1
 
     def saved(self, ensemble: Ensemble) -> int:
-        """How many images of an ensemble are on disk."""
+        """Number of images of an ensemble on disk."""
         return sum(map(self._holds, ensemble.images))
 
     def _holds(self, image: StarObservations) -> bool:

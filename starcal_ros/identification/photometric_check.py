@@ -66,8 +66,8 @@ def refuse_by_brightness(
         return refusal
     psf_sigma_px, noise_dn = model.psf_sigma_px or 1.0, model.background.noise_dn
     zero_point = magnitude[good] + 2.5 * np.log10(centroids.flux_dn[good])
-    # Peaks of noise stand near faint catalog stars by chance: by the brightest stars of the
-    # catalog those are too faint to be seen, and what is measured there is not their light.
+    # Peaks of noise lie near faint catalog stars by chance. The zero point of the brightest stars
+    # shows which stars are too faint to be detected: their measurements are noise.
     brightest = np.argsort(magnitude[good], kind='stable')[:_BRIGHTEST]
     highest = median(zero_point[brightest]) + _FAR_MAG
     most_dn = 10.0 ** (0.4 * (highest - magnitude[good].astype(np.float64)))

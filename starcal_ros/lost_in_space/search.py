@@ -91,7 +91,7 @@ class SkyMatch:
 
 @dataclass(frozen=True)
 class NotFound:
-    """Why the stars were not identified, and the log10 p-value of the best fit."""
+    """Reason why no stars were identified, and the log10 p-value of the best fit."""
 
     reason: str
     log10_p_value: float = 0.0

@@ -2,10 +2,9 @@
 """
 Parts that messages of several types share: stamps, headers, quaternions and arrays.
 
-The functions that read take any object with the fields of the message: those that rclpy takes from
-the graph and those that rosbags decodes from a file alike.  The functions that build are given
-``make``, which returns a message of a type from its fields; sequences of numbers are handed to it
-as flat numpy arrays of the field's own type.
+Functions that read take any object with the fields of the message, received by rclpy or decoded by
+rosbags.  Functions that build take ``make``, which returns a message of a type from its fields;
+sequences of numbers are passed to it as flat numpy arrays of the type of the field.
 """
 
 from __future__ import annotations

@@ -40,9 +40,9 @@ class Inputs:
     """
     The subscriptions of a node, each in a callback group of its own unless one is given.
 
-    DDS connects a reliable subscription to no best-effort publisher. One that adapts is made anew
-    as best effort where a publisher offers no more: a reliable publisher then loses nothing but
-    the sending again of what was lost on the way. Safe to use from several threads.
+    DDS does not connect a reliable subscription to a best-effort publisher. An adaptive
+    subscription is created again as best effort if a publisher offers no more; messages of
+    reliable publishers are then not sent again if lost. Safe to use from several threads.
     """
 
     def __init__(self, node: Node) -> None:
@@ -123,10 +123,10 @@ def _lacking(offered: QoSProfile, asked: QoSProfile) -> str:
         ReliabilityPolicy.RELIABLE,
         ReliabilityPolicy.BEST_EFFORT,
     ):
-        lacking.append('best effort, reliable is asked')
+        lacking.append('best effort, reliable is requested')
     if (asked.durability, offered.durability) == (
         DurabilityPolicy.TRANSIENT_LOCAL,
         DurabilityPolicy.VOLATILE,
     ):
-        lacking.append('volatile, transient local is asked')
+        lacking.append('volatile, transient local is requested')
     return ' and '.join(lacking) or str(qos_check_compatible(offered, asked)[1])

@@ -32,8 +32,8 @@ class ObserverOptions:
     )
     image_reliability: str = option(
         'auto',
-        'reliability asked of the image publisher; auto: best_effort from one that offers no more,'
-        ' else reliable (best_effort loses large images)',
+        'reliability of the image subscription; auto: best_effort from a publisher that offers no'
+        ' more, else reliable (best_effort loses large images)',
         choices=('auto', 'reliable', 'best_effort'),
     )
     image_queue: int = option(

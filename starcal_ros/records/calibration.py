@@ -354,7 +354,7 @@ class GateCheck:
 
     @property
     def is_least(self) -> bool:
-        """Whether the limit is a lower limit."""
+        """True if the limit is a lower limit."""
         return self.option.startswith('min_')
 
     @property

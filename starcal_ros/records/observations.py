@@ -43,7 +43,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'internal_error': 'the measurement failed unexpectedly; the log of the node has the cause',
     'other': 'refused by the sender for a reason that this version does not have',
 }
-"""Why an image can be refused: stable name -> meaning."""
+"""Reasons to refuse an image: stable name -> meaning."""
 
 
 def counted_refusal(refusal: str) -> str:
@@ -58,7 +58,7 @@ def counted_refusal(refusal: str) -> str:
 
 class StarRefusal(IntEnum):
     """
-    Why a single predicted star is left out; the codes of ``uint8`` arrays.
+    Reasons to leave out a single predicted star, as codes of ``uint8`` arrays.
 
     Messages and files hold the `label`, because codes of another version may differ.
     """
@@ -92,7 +92,7 @@ class StarRefusal(IntEnum):
 STAR_REFUSALS: Mapping[str, str] = {
     refusal.label: refusal.meaning for refusal in StarRefusal if refusal is not StarRefusal.NONE
 }
-"""Why a single predicted star can be left out: stable name -> meaning."""
+"""Reasons to leave out a single predicted star: stable name -> meaning."""
 
 
 @dataclass(frozen=True)
