@@ -17,22 +17,15 @@ import re
 
 import yaml
 
-from starcal_ros.arrays import Floats
 from starcal_ros.bag.mcap_reader import Damage, MAGIC, RawMessage, read_messages, read_summary
 from starcal_ros.bag.typestore import typestore, typestore_with
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.messages.images import image_from_message, refused_from_message
 from starcal_ros.messages.observations import observations_from_message
-from starcal_ros.messages.telemetry import (
-    attitude_from_message,
-    temperature_from_message,
-    velocity_from_message,
-)
 from starcal_ros.messages.types import (
     Message,
 )
 from starcal_ros.records import Image, refused_image, StarObservations
-from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, AttitudeOptions
 
 _SQLITE, _ROS_1 = b'SQLite format 3', b'#ROSBAG V'  # how bags of other kinds begin
 _MAGIC_BYTES = 16
@@ -90,10 +83,21 @@ def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple
     types: dict[str, str] = {}
     counts: Counter[str] = Counter()
     for file in mcap_files(paths):
-        for topic in _summary(file) or _counted(file, on_damage):
+        status = file.stat()
+        listed, damage = _listed(file, status.st_size, status.st_mtime_ns)
+        for text in damage:
+            on_damage(text)
+        for topic in listed:
             types[topic.name] = topic.type_name
             counts[topic.name] += topic.count
     return tuple(Topic(name, types[name], counts[name]) for name in sorted(counts))
+
+
+@functools.lru_cache(maxsize=64)
+def _listed(file: Path, size: int, modified_ns: int) -> tuple[list[Topic], list[str]]:
+    """Topics of a file and its damage; kept, as a file without summary is read for them."""
+    damage: list[str] = []
+    return _summary(file) or _counted(file, damage.append), damage
 
 
 def _summary(file: Path) -> list[Topic]:
@@ -159,46 +163,19 @@ def read_images(
 ) -> Iterator[Image | StarObservations]:
     """Images of a topic; an image that cannot be decoded becomes refused observations."""
     for raw in read_raw(paths, [topic], on_damage):
-        try:
-            message = decode(raw)
-        except BagError as error:
-            yield refused_image(raw.log_time_ns, 0, 0, 'bad_layout', str(error))
-            continue
-        try:
-            yield image_from_message(message, stamp_offset_s)
-        except ImageRefused as refused:
-            yield refused_from_message(message, stamp_offset_s, refused)
+        yield image_of(raw, stamp_offset_s)
 
 
-def read_attitudes(
-    paths: Iterable[Path | str],
-    topic: str,
-    options: AttitudeOptions | None = None,
-    on_damage: Damage = log_damage,
-) -> AttitudeHistory:
-    """All attitude samples of a topic; those that are not unit quaternions count as invalid."""
-    options = options or AttitudeOptions()
-    history = AttitudeHistory()
-    for message in _decoded(paths, topic, on_damage):
-        time_ns, quaternion = attitude_from_message(message)
-        history.add(time_ns, attitude_sample(time_ns, quaternion, options.attitude_direction))
-    return history
-
-
-def read_velocities(
-    paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
-) -> Iterator[tuple[int, Floats]]:
-    """Stamps and velocities (3,) in m/s of a topic."""
-    for message in _decoded(paths, topic, on_damage):
-        yield velocity_from_message(message)
-
-
-def read_temperatures(
-    paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
-) -> Iterator[tuple[int, float]]:
-    """Stamps and temperatures in degrees Celsius of a topic; NaN if unknown."""
-    for message in _decoded(paths, topic, on_damage):
-        yield temperature_from_message(message)
+def image_of(raw: RawMessage, stamp_offset_s: float = 0.0) -> Image | StarObservations:
+    """Image of a message; refused observations if it cannot be decoded."""
+    try:
+        message = decode(raw)
+    except BagError as error:
+        return refused_image(raw.log_time_ns, 0, 0, 'bad_layout', str(error))
+    try:
+        return image_from_message(message, stamp_offset_s)
+    except ImageRefused as refused:
+        return refused_from_message(message, stamp_offset_s, refused)
 
 
 def read_observations(
@@ -238,15 +215,6 @@ def decode(raw: RawMessage) -> Message:
         raise BagError(
             f'{raw.topic}: cannot decode {len(raw.data)} bytes as {raw.type_name}'
         ) from error
-
-
-def _decoded(paths: Iterable[Path | str], topic: str, on_damage: Damage) -> Iterator[Message]:
-    """Messages of a topic; those that cannot be decoded are reported and skipped."""
-    for raw in read_raw(paths, [topic], on_damage):
-        try:
-            yield decode(raw)
-        except BagError as error:
-            on_damage(str(error))
 
 
 def _files_of_folder(folder: Path) -> list[Path]:

@@ -77,6 +77,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _calibrate(args: argparse.Namespace) -> int:
     """Calibrate from bags in one process, as the two nodes do on the graph."""
+    from concurrent.futures import ThreadPoolExecutor
+
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
     from starcal_ros.pipeline.provenance import inputs_of
@@ -85,8 +87,10 @@ def _calibrate(args: argparse.Namespace) -> int:
     setup = read_setup(args.params)
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
-    inputs = inputs_of((*reader.mcap_files(args.bags), args.params))
-    calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs)
+    files = (*reader.mcap_files(args.bags), args.params)
+    with ThreadPoolExecutor(1, 'digests') as thread:
+        inputs = thread.submit(inputs_of, files)  # of what the images are read from meanwhile
+        calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs.result)
     report = _write_report(args.output)
     output.print_calibration(calibration, setup.prior)
     print(f'products written to {args.output}; {report}')
@@ -94,7 +98,11 @@ def _calibrate(args: argparse.Namespace) -> int:
 
 
 def _calibrate_into(
-    folder: Path, bags: Sequence[Path], asked: Topics, setup: Setup, inputs: Mapping[str, str]
+    folder: Path,
+    bags: Sequence[Path],
+    asked: Topics,
+    setup: Setup,
+    inputs: Callable[[], Mapping[str, str]],
 ) -> Calibration:
     """Calibrate from bags and write the files that a report is made from."""
     from starcal_ros.pipeline import solve
@@ -114,7 +122,7 @@ def _calibrate_into(
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     write_observations(observations, folder, setup.frames.camera_frame)
     try:
-        calibration, left = solve.solve_with_residuals(ensemble, setup, inputs=inputs)
+        calibration, left = solve.solve_with_residuals(ensemble, setup, inputs=inputs())
     except TooFewObservations as error:
         words = f'{error}{_refused_words(ensemble)}'
         if topics.image and not ensemble.images:
@@ -322,7 +330,7 @@ def _demo(args: argparse.Namespace) -> int:
     )
     # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
     setup = load_setup(bag.parameters)
-    again = _calibrate_into(args.output, [bag.bag], Topics(), setup, {})
+    again = _calibrate_into(args.output, [bag.bag], Topics(), setup, dict)
     write_products(calibration, args.output)
     apart_px = float(comparison.compare(calibration, again).before.length_px.max())
     same = apart_px <= _DEMO_SAME_PX

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from starcal_ros.bag import reader
+from starcal_ros.bag.frames import FrameTopics, read_ahead, read_frames
 from starcal_ros.bag.mcap_reader import Damage
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
@@ -200,7 +201,7 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
     stamps: defaultdict[str, list[int]] = defaultdict(list)
     kinds: defaultdict[str, Counter[str]] = defaultdict(Counter)
     bad: Counter[str] = Counter()
-    for raw in reader.read_raw(paths, on_damage=on_damage):
+    for raw in read_ahead(reader.read_raw(paths, on_damage=on_damage)):
         types[raw.topic] = raw.type_name
         stamp_ns = raw.log_time_ns
         if raw.type_name in _STAMPED:
@@ -256,16 +257,16 @@ def _placed(
     paths: Sequence[Path], topics: Topics, options: AttitudeOptions
 ) -> Iterator[StarObservations]:
     """Images without their stars, refused for bad encoding, order or attitude."""
-    attitudes = reader.read_attitudes(paths, topics.attitude, options)
     latest_ns = None
-    for image in reader.read_images(paths, topics.image, options.stamp_offset_s):
-        if isinstance(image, StarObservations):
-            yield image
+    for frame in read_frames(paths, FrameTopics(topics.image, topics.attitude), options):
+        if isinstance(frame, StarObservations):
+            yield frame
             continue
+        image = frame.image
         height, width = image.pixels.shape
         try:
             observe.check_order(image, latest_ns)
-            _, gap_s = attitudes.at(image.time_ns, options.max_attitude_gap_s)
+            _, gap_s = frame.attitudes.at(image.time_ns, options.max_attitude_gap_s)
         except ImageRefused as refused:
             yield refused_image(image.time_ns, width, height, refused.reason, refused.detail)
             continue

@@ -6,16 +6,14 @@ from collections.abc import Callable, Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
 import math
-import operator
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.bag import reader
+from starcal_ros.bag.frames import FrameTopics, read_frames
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned
@@ -27,7 +25,6 @@ from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
 
-T = TypeVar('T')
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
 _IMAGES_OF_A_RESTART = 3  # two images may be swapped in transit, three are not
@@ -225,19 +222,6 @@ def _check_size(image: Image, camera: CameraModel) -> None:
         )
 
 
-def latest_at(samples: Sequence[tuple[int, T]], time_ns: int, without: T) -> T:
-    """
-    Last sample at or before a time, else the first after it; ``without`` if there are none.
-
-    Within a minute, the velocity of a spacecraft changes by under 10 m/s (0.007 arcsec), and the
-    temperature of a camera by less than the resolution of its sensor.
-    """
-    before = [sample for stamp_ns, sample in samples if stamp_ns <= time_ns]
-    if before:
-        return before[-1]
-    return samples[0][1] if samples else without
-
-
 def observe_bag(
     paths: Sequence[Path],
     image_topic: str,
@@ -248,7 +232,7 @@ def observe_bag(
     on_image: OnImage | None = None,
 ) -> Iterator[StarObservations]:
     """
-    Observations of every image of a bag, in bag order, with one image in memory at a time.
+    Observations of every image of a bag, in bag order, with few images in memory at a time.
 
     ``on_image`` is called with each decoded image, its observations and the geometry that
     predicted its stars.
@@ -258,28 +242,21 @@ def observe_bag(
     BagError
         When the bag cannot be read or a topic is not in it.
     """
-    attitudes = reader.read_attitudes(paths, attitude_topic, setup.attitude)
-    by_time = operator.itemgetter(0)
-    velocities: list[tuple[int, Floats]] = []
-    temperatures: list[tuple[int, float]] = []
-    if velocity_topic:
-        velocities = sorted(reader.read_velocities(paths, velocity_topic), key=by_time)
-    if temperature_topic:
-        temperatures = sorted(reader.read_temperatures(paths, temperature_topic), key=by_time)
+    topics = FrameTopics(image_topic, attitude_topic, velocity_topic, temperature_topic)
     track = Track(setup.prior)
-    for image in reader.read_images(paths, image_topic, setup.attitude.stamp_offset_s):
-        if isinstance(image, StarObservations):
-            yield image
+    for frame in read_frames(paths, topics, setup.attitude):
+        if isinstance(frame, StarObservations):
+            yield frame
             continue
         predicted_with = track.geometry
         observations, track = observe_next(
-            image,
-            attitudes,
+            frame.image,
+            frame.attitudes,
             setup,
             track,
-            latest_at(velocities, image.time_ns, None),
-            latest_at(temperatures, image.time_ns, math.nan),
+            frame.velocity_m_s,
+            frame.temperature_degc,
         )
         if on_image is not None:
-            on_image(image, observations, predicted_with)
+            on_image(frame.image, observations, predicted_with)
         yield observations
