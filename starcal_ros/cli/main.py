@@ -222,9 +222,9 @@ def _compare(args: argparse.Namespace) -> int:
 
     found = comparison.compare(*(read_calibration(_file(p)) for p in (args.a, args.b)))
     if args.output:
-        from starcal_ros.report import figures
+        from starcal_ros.report.comparison_figure import write_comparison
 
-        figures.write_comparison(found, args.output)
+        write_comparison(found, args.output)
     if args.json:
         print(json.dumps(comparison.content(found), indent=1, allow_nan=False))
     else:

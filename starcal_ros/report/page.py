@@ -16,7 +16,6 @@ from pathlib import Path
 
 import jinja2
 from markupsafe import Markup
-import matplotlib
 import numpy as np
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
@@ -37,7 +36,6 @@ from starcal_ros.records import (
     STAR_REFUSALS,
     StarObservations,
 )
-from starcal_ros.report import figures as report_figures
 from starcal_ros.report.charts import charts_of
 from starcal_ros.report.thumbnails import read_thumbnails, Thumbnail, THUMBNAILS_FOLDER
 
@@ -117,8 +115,7 @@ def render(found: Found) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    with matplotlib.rc_context(report_figures.STYLE):
-        return environment.get_template('report.html').render(_context(found))
+    return environment.get_template('report.html').render(_context(found))
 
 
 def _context(found: Found) -> Mapping[str, object]:
@@ -132,7 +129,7 @@ def _context(found: Found) -> Mapping[str, object]:
         'alignment': _alignment_rows(calibration, prior),
         'tiles': _tiles(calibration),
         'thermal': thermal_summary(calibration.temperature) if calibration.temperature else '',
-        'charts': charts_of(calibration, residuals),
+        'charts': charts_of(calibration, residuals, found.observations or ()),
         'correlation': calibration.correlation,
         'slider': _slider(calibration, residuals),
         'refused_images': _refused_images(found),

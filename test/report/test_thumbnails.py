@@ -43,18 +43,18 @@ def album_of(count: int, refused_every: int) -> Album:
 
 def test_few_are_kept_of_many_and_evenly() -> None:
     album = album_of(400, refused_every=50)
-    used = [t.time_ns for t in album.used]
+    used = [one.observations.time_ns for one in album.used]
     assert 6 <= len(used) < 12
     steps = np.diff(used)
     # The images between have been refused now and then: a step is longer by those at most.
     assert steps.max() - steps.min() <= 2
     assert used[-1] > 400 - 2 * steps.max()
-    assert [t.time_ns for t in album.refused['no_stars']] == [0, 50]
+    assert [one.observations.time_ns for one in album.refused['no_stars']] == [0, 50]
     assert len(album.stars['saturated']) == 6
 
 
 def test_all_are_kept_of_few() -> None:
-    assert [t.time_ns for t in album_of(5, refused_every=100).used] == [1, 2, 3, 4]
+    assert [one.observations.time_ns for one in album_of(5, refused_every=100).used] == [1, 2, 3, 4]
 
 
 def test_a_star_is_in_the_middle_of_its_picture() -> None:
