@@ -8,6 +8,7 @@ import contourpy
 import cv2
 from markupsafe import Markup
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
@@ -21,7 +22,9 @@ from starcal_ros.report.svg import BAD, GRID, in_digits, INK, MUTED, Panel, Scal
 
 FLAT = 0.02  # relative range below which a map is called flat
 _MOST_HEIGHT = 400.0
-_LEVELS = 6
+_ROUNDING_PX = 1e-9  # displacements below are of the arithmetic
+_LEVELS = 8
+_LABELS_APART = 30.0  # units of the view box
 _FOOTPRINTS = 200  # drawn on the sky
 
 
@@ -124,7 +127,7 @@ def _arrows(camera: CameraModel, places: Floats, shift_px: Floats) -> Markup:
     panel, height = _detector(camera)
     _framed(panel)
     longest_px = float(np.nanmax(np.hypot(*shift_px.T), initial=0.0))
-    if not longest_px > 0:
+    if not longest_px > _ROUNDING_PX:
         panel.note('no displacement')
         return svg.chart([panel], height)
     wide = abs(panel.x.end - panel.x.start)
@@ -147,8 +150,8 @@ def _contours(camera: CameraModel, length_px: Floats) -> Markup:
     u, v = (a.reshape(48, 60) for a in pixel_grid(camera, 60, 48).T)
     length = length_px.reshape(48, 60)
     low, high = float(np.nanmin(length)), float(np.nanmax(length))
-    if not high - low > 1e-9:
-        panel.note(f'{in_digits(high)} px everywhere')
+    if not high - low > _ROUNDING_PX:
+        panel.note(f'{in_digits(round(high, 9))} px everywhere')
         _framed(panel)
         return svg.chart([panel], height)
     levels = [level for level in Scale(low, high, 0, 1).ticks(_LEVELS) if low < level < high]
@@ -158,9 +161,15 @@ def _contours(camera: CameraModel, length_px: Floats) -> Markup:
 
 
 def _draw_contours(
-    panel: Panel, u: Floats, v: Floats, values: Floats, levels: Sequence[float], unit: str
+    panel: Panel,
+    u: Floats,
+    v: Floats,
+    values: Floats,
+    levels: Sequence[float],
+    unit: str,
+    colour: str = SERIES[0],
 ) -> None:
-    """Contours, thicker for higher levels, each with one label away from the others."""
+    """Contours, thicker for higher levels, each with one label if there is room for it."""
     generator = contourpy.contour_generator(u, v, values)
     labels: list[tuple[Floats, str]] = []
     middle = np.array([panel.x.end + panel.x.start, panel.y.end + panel.y.start]) / 2
@@ -168,17 +177,18 @@ def _draw_contours(
         width = 1.0 + 1.4 * k / max(len(levels) - 1, 1)
         drawn = []
         for line in generator.lines(level):
-            panel.line(line[:, 0], line[:, 1], SERIES[0], width)
+            panel.line(line[:, 0], line[:, 1], colour, width)
             drawn.append(np.stack([panel.x(line[:, 0]), panel.y(line[:, 1])], axis=-1))
         places = np.concatenate(drawn or [np.empty((0, 2))])
-        inner = abs(places - middle) < 0.42 * np.abs(
+        inner = abs(places - middle) < 0.46 * np.abs(
             [panel.x.end - panel.x.start, panel.y.end - panel.y.start]
         )
         places = places[inner.all(axis=1)]
         if len(places):
             others = np.array([place for place, _ in labels] or [[-1e4, -1e4]])
             apart = np.linalg.norm(places[:, None] - others, axis=-1).min(axis=1)
-            labels.append((places[int(np.argmax(apart))], f'{in_digits(level)}{unit}'))
+            if apart.max() > _LABELS_APART:
+                labels.append((places[int(np.argmax(apart))], f'{in_digits(level)}{unit}'))
     for (x, y), words in labels:
         panel.parts.append(
             f'<text x="{x:.1f}" y="{y + 4:.1f}" text-anchor="middle" fill="{INK}"'
@@ -194,11 +204,7 @@ def line_of_sight_sigma(sigma_arcsec: Floats, camera: CameraModel) -> Markup:
         panel.note('unknown')
         _framed(panel)
         return svg.chart([panel], height)
-    fine = cv2.resize(
-        (255 * sigma_arcsec / top_arcsec).astype(np.float32), (240, 192),
-        interpolation=cv2.INTER_LINEAR,
-    )  # fmt: skip
-    panel.picture(_coloured(fine))
+    panel.picture(_coloured(cv2.resize(255 * sigma_arcsec / top_arcsec, (240, 192))))
     rows, columns = sigma_arcsec.shape
     u, v = np.meshgrid(
         np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
@@ -206,13 +212,13 @@ def line_of_sight_sigma(sigma_arcsec: Floats, camera: CameraModel) -> Markup:
     low = float(sigma_arcsec.min())
     if top_arcsec - low > FLAT * top_arcsec:
         levels = [x for x in Scale(low, top_arcsec, 0, 1).ticks(4) if low < x < top_arcsec]
-        _draw_contours(panel, u, v, sigma_arcsec, levels, '″')
+        _draw_contours(panel, u, v, sigma_arcsec, levels, '″', svg.PAPER)
     else:
         percent = 100 * (top_arcsec - low) / top_arcsec
         panel.note(f'flat within {in_digits(round(percent, 2))} %')
     _framed(panel)
     bar = Panel(Scale(0, 1, panel.x.end + 12, panel.x.end + 26), _upright(panel, top_arcsec))
-    bar.picture(_coloured(np.repeat(np.linspace(255, 0, 128, dtype=np.float32)[:, None], 2, 1)))
+    bar.picture(_coloured(np.linspace(255, 0, 128)[:, None]))
     for value in bar.y.ticks(5):
         y = float(bar.y(value))
         bar.parts.append(svg.words_at(bar.x.end + 5, y + 4, f'{in_digits(value)}″', 'start'))
@@ -223,9 +229,7 @@ def _upright(panel: Panel, top: float) -> Scale:
     return Scale(0.0, top, panel.y.end, panel.y.start)
 
 
-def _coloured(levels: Floats | np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> np.ndarray[
-    tuple[int, ...], np.dtype[np.uint8]
-]:
+def _coloured(levels: NDArray[np.floating]) -> NDArray[np.uint8]:
     """BGR picture of levels 0 to 255."""
     shades = np.rint(np.clip(levels, 0, 255)).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(shades, cv2.COLORMAP_VIRIDIS), np.uint8)
@@ -240,7 +244,7 @@ def pointings(
     A Hammer projection of the ICRS, right ascension 0 in the middle and increasing to the left.
     Refused images that have an attitude are drawn in the second colour.
     """
-    placed = [o for o in observations if np.isfinite(o.icrf_from_star_tracker_xyzw).all()]
+    placed = [o for o in observations if not o.refusal or np.isfinite(o.attitude_gap_s)]
     left, right, top, high = 8.0, svg.WIDTH - 8.0, 8.0, (svg.WIDTH - 16.0) / 2
     panel = Panel(
         Scale(-2 * np.sqrt(2), 2 * np.sqrt(2), left, right),

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 
 WIDTH = 480.0
-LETTER = 12.0
+LETTER = 12.4  # at least 9 px on a screen of 400 px
 INK, MUTED, GRID, PAPER, BAD = (
     f'var(--{name})' for name in ('ink', 'muted', 'grid', 'paper', 'bad')
 )
@@ -121,9 +121,7 @@ class Panel:
         middle = (top + bottom) / 2
         draw(_text(13, middle, y_label, 'middle', turn_deg=-90))
 
-    def line(
-        self, x: Floats, y: Floats, colour: str, width: float = 1.5, dash: str = ''
-    ) -> None:
+    def line(self, x: Floats, y: Floats, colour: str, width: float = 1.5, dash: str = '') -> None:
         """A line through points (n,); it is broken where a number is not finite."""
         places = np.stack([self.x(x), self.y(y)], axis=-1)
         steps, pen = [], 'M'
@@ -286,8 +284,10 @@ def _line(
 
 def _mark(x: float, y: float, colour: str, shape: str, size: float, title: str) -> str:
     path = _MARKS[shape].replace('{r}', f'{size:g}')
-    style = f'fill="none" stroke="{colour}" stroke-width="1.5"' if shape == 'cross' else (
-        f'fill="{colour}"'
+    style = (
+        f'fill="none" stroke="{colour}" stroke-width="1.5"'
+        if shape == 'cross'
+        else (f'fill="{colour}"')
     )
     inside = f'<title>{html.escape(title)}</title>' if title else ''
     return f'<path transform="translate({x:.1f} {y:.1f})" d="{path}" {style}>{inside}</path>'

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.stats import norm
 
 from starcal_ros.camera import CameraModel, distortion_px, PARAMETER_NAMES, pixel_grid
-from starcal_ros.report.term_removal_figure import curves_of, plot_curves, plot_removed
 from starcal_ros.studies.paper import CALIBRATED_WITH, PaperStudy
+from starcal_ros.studies.term_removal_figure import curves_of, plot_curves, plot_removed
 
 _BLUE, _RED = '#0b62a8', '#c4501b'
 

@@ -166,10 +166,11 @@ def test_late_samples_are_reported(tmp_path: Path) -> None:
     messages.insert(messages.index(('attitude', 31)), late)
     count, differ, said = compared([write(tmp_path / 'bag', messages)])
     assert (count, differ) == (IMAGES, 1)
-    assert said == [
+    (sentence,) = said
+    assert sentence == (
         'telemetry is recorded more than a second out of order; 1 images before it'
         ' were measured without it; sort the messages of the bag by time'
-    ]
+    )
 
 
 def test_a_damaged_chunk_costs_what_is_in_it(tmp_path: Path, chunks: list[int]) -> None:

@@ -1,4 +1,4 @@
-"""Plots of the removal of camera parameters (paper, Fig. 8), for the report and for studies."""
+"""Plots of the removal of camera parameters (paper, Fig. 8) for studies."""
 
 from __future__ import annotations
 
