@@ -123,7 +123,7 @@ class Telemetry:
             if topic and not (samples and samples[0][0] <= time_ns):
                 return False
         try:
-            self.attitudes.at(time_ns, self._options.max_attitude_gap_s)
+            self.attitudes.around(time_ns, self._options.max_attitude_gap_s)
         except ImageRefused:
             return False
         return True
@@ -134,14 +134,18 @@ class Telemetry:
         return velocity_m_s, latest_at(self.temperatures, time_ns, math.nan)
 
     def numbers_at(self, time_ns: int) -> Floats:
-        """All that a measurement takes from the samples, (9,); NaN where there is none."""
+        """All that a measurement takes from the samples, (14,); NaN where there is none."""
         try:
-            xyzw, gap_s = self.attitudes.at(time_ns, self._options.max_attitude_gap_s)
+            samples = self.attitudes.around(time_ns, self._options.max_attitude_gap_s)
+            attitudes = [
+                np.r_[sample.icrf_from_star_tracker_xyzw, sample.time_ns - time_ns]
+                for sample in samples
+            ]
         except ImageRefused:
-            xyzw, gap_s = np.full(4, np.nan), math.nan
+            attitudes = [np.full(10, np.nan)]
         velocity_m_s, temperature_degc = self.at(time_ns)
         velocity_m_s = np.full(3, np.nan) if velocity_m_s is None else velocity_m_s
-        return np.asarray(np.r_[xyzw, gap_s, velocity_m_s, temperature_degc])
+        return np.asarray(np.r_[(*attitudes, velocity_m_s, temperature_degc)])
 
 
 def latest_at(samples: Sequence[tuple[int, T]], time_ns: int, without: T) -> T:
@@ -204,6 +208,20 @@ def read_frames(
             yield _with_telemetry(waiting.popleft(), telemetry)
     while waiting:
         yield _with_telemetry(waiting.popleft(), telemetry)
+
+
+def check_order(image: Image, latest_ns: int | None) -> None:
+    """
+    Check that an image is stamped after the last one used (None: no image used yet).
+
+    Raises
+    ------
+    ImageRefused
+        ``out_of_order``.
+    """
+    if latest_ns is not None and image.time_ns <= latest_ns:
+        late_s = (latest_ns - image.time_ns) * 1e-9
+        raise ImageRefused('out_of_order', f'{late_s:.6f} s before the last image used')
 
 
 def _is_too_much(waiting: Iterable[Image | StarObservations]) -> bool:

@@ -18,7 +18,7 @@ import re
 import yaml
 
 from starcal_ros.bag.mcap_reader import Damage, MAGIC, RawMessage, read_messages, read_summary
-from starcal_ros.bag.typestore import typestore, typestore_with
+from starcal_ros.bag.typestore import typestore_of
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.messages.images import image_from_message, refused_from_message
 from starcal_ros.messages.observations import observations_from_message
@@ -198,17 +198,15 @@ def read_observations(
 
 def decode(raw: RawMessage) -> Message:
     """
-    Decoded message: by the definition of ROS 2, else by the one in the bag.
+    Decoded message: by the definition in the bag, else by the one of ROS 2.
 
     Raises
     ------
     BagError
         If the bytes are not a message of the type.
     """
-    store = typestore()
     try:
-        if raw.type_name not in store.types or raw.type_name.startswith('starcal/'):
-            store = typestore_with(raw.type_name, raw.definition)
+        store = typestore_of(raw.type_name, raw.definition)
         return store.deserialize_cdr(raw.data, raw.type_name)
     # The exceptions of wrong bytes depend on the field and have no common base class.
     except Exception as error:

@@ -50,10 +50,13 @@ def _definitions_folder() -> Path:
     raise BagError(f'the starcal .msg files are not installed in {candidates[-1]}')
 
 
-@functools.lru_cache(maxsize=16)
-def typestore_with(type_name: str, definition: str) -> Typestore:
-    """Types with the bag's own definition of one: another version may have written the bag."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    found = get_types_from_msg(definition, type_name)
-    store.register({name: fields for name, fields in found.items() if name not in store.types})
+@functools.lru_cache(maxsize=64)
+def typestore_of(type_name: str, definition: str) -> Typestore:
+    """Types by the definition in a bag, whose writer may be another version; else `typestore`."""
+    store = get_typestore(Stores.EMPTY)
+    # A definition may be empty, in another language or damaged: no common base class.
+    try:
+        store.register(get_types_from_msg(definition, type_name))
+    except Exception:
+        return typestore()
     return store

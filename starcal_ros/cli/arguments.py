@@ -327,6 +327,10 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
     _params(command, 'ROS parameter file: prior camera, mounting and options', required=True)
     what = 'folder for the products, created if absent; existing products are replaced'
     _output(command, 'DIR', what, required=True)
+    _add(
+        command, '--no-report', action='store_true',
+        help='write no report; starcal report DIR writes it later',
+    )  # fmt: skip
     _topics(command)
 
 

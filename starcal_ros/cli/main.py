@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-import dataclasses
 import json
 import os
 from pathlib import Path
@@ -91,9 +90,9 @@ def _calibrate(args: argparse.Namespace) -> int:
     with ThreadPoolExecutor(1, 'digests') as thread:
         inputs = thread.submit(inputs_of, files)  # of what the images are read from meanwhile
         calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs.result)
-    report = _write_report(args.output)
+    report = '' if args.no_report else f'; {_write_report(args.output)}'
     output.print_calibration(calibration, setup.prior)
-    print(f'products written to {args.output}; {report}')
+    print(f'products written to {args.output}{report}')
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
 
 
@@ -182,14 +181,19 @@ def _inspect(args: argparse.Namespace) -> int:
     from starcal_ros.cli import output
     from starcal_ros.messages.types import COMPRESSED_TYPE, IMAGE_TYPE, OBSERVATIONS_TYPE
     from starcal_ros.pipeline import inspect
-    from starcal_ros.pipeline.setup import read_setup
 
-    setup = read_setup(args.params) if args.params else None
+    setup = None
+    if args.params:
+        from starcal_ros.pipeline.setup import read_setup
+
+        setup = read_setup(args.params)
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:
         found = inspect.inspect(args.bags, _asked(args), setup, on_image=advance)
     if setup and found.images and not found.stars_per_image and found.chosen:
+        import dataclasses
+
         from starcal_ros.cli import diagnosis
 
         why = diagnosis.in_a_sentence(args.bags, _asked(args), setup)
@@ -349,6 +353,7 @@ def _campaign(args: argparse.Namespace) -> int:
     """Run a Monte Carlo study."""
     # Trials run in parallel, one thread each; results must not depend on the number of threads.
     os.environ.update(OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1')
+    import dataclasses
     import time
 
     from starcal_ros.options import nearest

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -82,6 +81,8 @@ def decode_png(data: Any, time_ns: int) -> Image:
     # A JPEG would decode too, but what it does to a star of two pixels is no measurement.
     if bytes(data[: len(_PNG_MAGIC)]) != _PNG_MAGIC:
         raise ImageRefused('bad_encoding', 'the compressed image is not a PNG')
+    import cv2  # slow to import, and few bags have compressed images
+
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ImageRefused('bad_layout', f'{len(data)} bytes of PNG cannot be decoded')

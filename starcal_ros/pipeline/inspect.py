@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_ros.bag import reader
-from starcal_ros.bag.frames import FrameTopics, read_ahead, read_frames
+from starcal_ros.bag.frames import check_order, FrameTopics, read_ahead, read_frames
 from starcal_ros.bag.mcap_reader import Damage
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
@@ -27,9 +28,7 @@ from starcal_ros.messages.types import (
     TEMPERATURE_TYPE,
     VELOCITY_TYPE,
 )
-from starcal_ros.pipeline import observe, solve
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import (
     Ensemble,
@@ -39,6 +38,10 @@ from starcal_ros.records import (
     StarObservations,
 )
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
+
+# What measures and solves takes most of the start: imported only with a setup.
+if TYPE_CHECKING:
+    from starcal_ros.pipeline.setup import Setup
 
 _IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
 _STAMPED = (*_IMAGES, ATTITUDE_TYPE, VELOCITY_TYPE, TEMPERATURE_TYPE, OBSERVATIONS_TYPE)
@@ -161,6 +164,8 @@ def inspect(
     measured = setup is not None or bool(chosen and chosen.observations)
     status = None
     if setup and chosen:
+        from starcal_ros.pipeline import solve
+
         ensemble = Ensemble()
         for observations in seen:
             ensemble = solve.add_to_ensemble(ensemble, observations, setup)
@@ -265,8 +270,9 @@ def _placed(
         image = frame.image
         height, width = image.pixels.shape
         try:
-            observe.check_order(image, latest_ns)
-            _, gap_s = frame.attitudes.at(image.time_ns, options.max_attitude_gap_s)
+            check_order(image, latest_ns)
+            before, after = frame.attitudes.around(image.time_ns, options.max_attitude_gap_s)
+            gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
         except ImageRefused as refused:
             yield refused_image(image.time_ns, width, height, refused.reason, refused.detail)
             continue

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.bag.frames import FrameTopics, read_frames
+from starcal_ros.bag.frames import check_order, FrameTopics, read_frames
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned
@@ -197,20 +197,6 @@ def _with_hot_pixels(
         setup.fixed_pattern,
     )
     return dataclasses.replace(track, hot=hot)
-
-
-def check_order(image: Image, latest_ns: int | None) -> None:
-    """
-    Check that an image is stamped after the last one used (None: no image used yet).
-
-    Raises
-    ------
-    ImageRefused
-        ``out_of_order``.
-    """
-    if latest_ns is not None and image.time_ns <= latest_ns:
-        late_s = (latest_ns - image.time_ns) * 1e-9
-        raise ImageRefused('out_of_order', f'{late_s:.6f} s before the last image used')
 
 
 def _check_size(image: Image, camera: CameraModel) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starcal_ros.bag import reader
 from starcal_ros.errors import BagError
@@ -16,10 +17,12 @@ from starcal_ros.messages.types import (
     TEMPERATURE_TYPE,
     VELOCITY_TYPE,
 )
-from starcal_ros.pipeline import observe
-from starcal_ros.pipeline.observe import OnImage
-from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import StarObservations
+
+# A choice of topics needs no measurement, which is slow to import.
+if TYPE_CHECKING:
+    from starcal_ros.pipeline.observe import OnImage
+    from starcal_ros.pipeline.setup import Setup
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,8 @@ def read(
     """Observations of bags, as recorded or measured in the images (see `observe_bag`)."""
     if topics.observations:
         return reader.read_observations(paths, topics.observations)
+    from starcal_ros.pipeline import observe
+
     return observe.observe_bag(
         paths, topics.image, topics.attitude, setup, topics.velocity, topics.temperature, on_image
     )

@@ -47,8 +47,8 @@ def charts_of(
         charts['lens_field'] = Chart(
             'Residual field beside the lens model',
             detector_figures.field_vectors(camera.field, camera),
-            'Displacement of a star from its place by the lens model, enlarged to the scale of the '
-            'arrow above the figure.',
+            'Displacement of a star from its place by the lens model, enlarged to the scale of '
+            'the arrow above the figure.',
         )
     prior = prior_of(calibration)
     if prior is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import contourpy
 import cv2
@@ -63,7 +64,7 @@ def cell_counts(maps: DetectorMaps, camera: CameraModel) -> Markup:
     edges_u = panel.x(np.linspace(-0.5, camera.width - 0.5, columns + 1))
     edges_v = panel.y(np.linspace(-0.5, camera.height - 0.5, rows + 1))
     share = maps.stars / max(int(maps.stars.max()), 1)
-    size = min(svg.LETTER, 110.0 / columns)
+    size = min(svg.LETTER, 124.0 / columns)
     for (row, column), count in np.ndenumerate(maps.stars):
         x, y = edges_u[column], edges_v[row]
         wide, high = edges_u[column + 1] - x, edges_v[row + 1] - y
@@ -176,7 +177,7 @@ def _draw_contours(
     for k, level in enumerate(levels):
         width = 1.0 + 1.4 * k / max(len(levels) - 1, 1)
         drawn = []
-        for line in generator.lines(level):
+        for line in _lines_at(generator, level):
             panel.line(line[:, 0], line[:, 1], colour, width)
             drawn.append(np.stack([panel.x(line[:, 0]), panel.y(line[:, 1])], axis=-1))
         places = np.concatenate(drawn or [np.empty((0, 2))])
@@ -185,7 +186,7 @@ def _draw_contours(
         )
         places = places[inner.all(axis=1)]
         if len(places):
-            others = np.array([place for place, _ in labels] or [[-1e4, -1e4]])
+            others = np.array([place for place, _ in labels] or [np.full(2, -1e4)])
             apart = np.linalg.norm(places[:, None] - others, axis=-1).min(axis=1)
             if apart.max() > _LABELS_APART:
                 labels.append((places[int(np.argmax(apart))], f'{in_digits(level)}{unit}'))
@@ -194,6 +195,11 @@ def _draw_contours(
             f'<text x="{x:.1f}" y="{y + 4:.1f}" text-anchor="middle" fill="{INK}"'
             f' stroke="{svg.PAPER}" stroke-width="3" paint-order="stroke">{words}</text>'
         )
+
+
+def _lines_at(generator: contourpy.ContourGenerator, level: float) -> list[Floats]:
+    """Lines (n, 2) of a level; contourpy's types allow other forms as well."""
+    return [np.asarray(line, np.float64) for line in generator.lines(level)]
 
 
 def line_of_sight_sigma(sigma_arcsec: Floats, camera: CameraModel) -> Markup:
@@ -229,7 +235,7 @@ def _upright(panel: Panel, top: float) -> Scale:
     return Scale(0.0, top, panel.y.end, panel.y.start)
 
 
-def _coloured(levels: NDArray[np.floating]) -> NDArray[np.uint8]:
+def _coloured(levels: NDArray[Any]) -> NDArray[np.uint8]:
     """BGR picture of levels 0 to 255."""
     shades = np.rint(np.clip(levels, 0, 255)).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(shades, cv2.COLORMAP_VIRIDIS), np.uint8)
@@ -279,7 +285,7 @@ def hammer(directions: Floats) -> tuple[Floats, Floats]:
 
 
 def _draw_graticule(panel: Panel) -> None:
-    along = np.linspace(-np.pi, np.pi, 73)
+    along = np.linspace(-np.pi, np.pi, 73, dtype=np.float64)
     for hours in range(-12, 13, 3):
         longitude, latitude = np.radians(15.0 * hours * 0.99999), along / 2
         panel.line(*_lines(longitude, latitude), GRID, 1.0)
@@ -295,7 +301,5 @@ def _draw_graticule(panel: Panel) -> None:
 
 def _lines(longitude: Floats | float, latitude: Floats | float) -> tuple[Floats, Floats]:
     longitude, latitude = np.broadcast_arrays(longitude, latitude)
-    directions = [
-        np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)
-    ]  # fmt: skip
-    return hammer(np.stack(directions, axis=-1))
+    x, y = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude)
+    return hammer(np.stack([x, y, np.sin(latitude)], axis=-1))

@@ -75,8 +75,8 @@ def numbers_of(frame: Frame) -> Floats:
     seen.attitudes = frame.attitudes
     numbers = seen.numbers_at(frame.image.time_ns)
     velocity_m_s = frame.velocity_m_s
-    numbers[5:8] = np.nan if velocity_m_s is None else velocity_m_s
-    numbers[8] = frame.temperature_degc
+    numbers[10:13] = np.nan if velocity_m_s is None else velocity_m_s
+    numbers[13] = frame.temperature_degc
     return numbers
 
 

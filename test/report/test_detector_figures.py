@@ -55,7 +55,7 @@ def test_a_flat_map_says_so_and_others_start_at_zero() -> None:
     flat = np.full((25, 25), 5.774)
     flat[0, 0] = 5.802
     assert '>flat within 0.48 %<' in str(figures.line_of_sight_sigma(flat, CAMERA))
-    steep = np.linspace(1.0, 8.0, 625).reshape(25, 25)
+    steep = np.linspace(1.0, 8.0, 625, dtype=np.float64).reshape(25, 25)
     drawn = str(figures.line_of_sight_sigma(steep, CAMERA))
     assert 'flat' not in drawn and '>0″<' in drawn and '>8″<' in drawn
     assert '>unknown<' in str(figures.line_of_sight_sigma(np.full((3, 3), np.nan), CAMERA))

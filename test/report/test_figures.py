@@ -57,7 +57,7 @@ def test_a_wave_is_found_at_its_frequency() -> None:
 def test_means_in_bins_and_their_errors() -> None:
     x = np.repeat([0.5, 1.5, 2.5], [100, 9, 25])
     y = np.concatenate([np.tile([1.0, 3.0], 50), np.ones(9), np.full(25, -2.0)])
-    centre, mean, error = figures._in_bins(x, y, np.arange(4.0))
+    centre, mean, error = figures._in_bins(x, y, np.arange(4, dtype=np.float64))
     assert centre.tolist() == [0.5, 2.5]  # nine values are too few
     assert mean.tolist() == [2.0, -2.0]
     assert error.tolist() == pytest.approx([0.1, 0.0])
