@@ -12,5 +12,6 @@ LONG = (
     'faults',
     'soak',
     'transport',
+    'night',
 )
 """Those that take some minutes: run when they are named."""

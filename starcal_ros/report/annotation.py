@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -95,10 +95,10 @@ def _draw_stars(
         return np.asarray((places_px + 0.5) * scale - 0.5, np.float64)
 
     for reason, places in observations.refused_places().items():
-        for uv in reduced(places):
-            _draw_mark(picture, STAR_MARKS.get(reason, _UNKNOWN), _pixel(uv), size)
-    for uv in reduced(predicted_px(observations, geometry)):
-        _draw_mark(picture, Mark(cv2.MARKER_CROSS, _PREDICTED), _pixel(uv), size)
+        for pixel in _pixels(reduced(places)):
+            _draw_mark(picture, STAR_MARKS.get(reason, _UNKNOWN), pixel, size)
+    for pixel in _pixels(reduced(predicted_px(observations, geometry))):
+        _draw_mark(picture, Mark(cv2.MARKER_CROSS, _PREDICTED), pixel, size)
     for uv, snr in zip(reduced(observations.measured_px), observations.snr, strict=True):
         radius = (5 + 2 * np.log10(max(float(snr), 1.0))) * size
         center, radius = _fixed_point(uv), int(radius * (1 << _SHIFT))
@@ -127,7 +127,7 @@ def stretch(pixels: Pixels) -> NDArray[np.uint8]:
     return np.asarray(table[pixels])
 
 
-def _draw_mark(picture: Picture, mark: Mark, place: tuple[int, int], size: float) -> None:
+def _draw_mark(picture: Picture, mark: Mark, place: Sequence[int], size: float) -> None:
     width, length = max(1, round(size)), max(3, round(mark.size * size))
     cv2.drawMarker(picture, place, mark.color, mark.shape, length, width)
 
@@ -202,10 +202,11 @@ def _write(
     )  # fmt: skip
 
 
-def _pixel(uv: NDArray[np.floating]) -> tuple[int, int]:
+def _pixels(places: Floats) -> list[list[int]]:
     # Predictions far outside the image would overflow OpenCV's integers.
-    u, v = np.clip(np.nan_to_num(uv, nan=-1e4), -1e4, 1e5)
-    return round(float(u)), round(float(v))
+    inside = np.clip(np.nan_to_num(places, nan=-1e4), -1e4, 1e5)
+    pixels: list[list[int]] = np.rint(inside).astype(int).tolist()
+    return pixels
 
 
 def _fixed_point(uv: Floats) -> tuple[int, int]:
