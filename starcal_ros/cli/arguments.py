@@ -125,6 +125,20 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   # on another topic
   starcal play bags/tiny --remap /opnav/image_raw:=/camera/image_raw""",
     ),
+    'monitor': (
+        'show running nodes in the terminal',
+        (
+            'Shows images and refusals by reason, coverage, the forecast sigma of each parameter '
+            'beside that of the active calibration, the gate and the health of the nodes.'
+        ),
+        """\
+  # live, until Ctrl-C
+  starcal monitor
+  # nodes in a namespace
+  starcal monitor --remap __ns:=/cam1
+  # one view after five seconds, for a log
+  starcal monitor --once 5""",
+    ),
     'simulate': (
         'render a bag with known truth',
         (
@@ -368,6 +382,13 @@ def _play(command: argparse.ArgumentParser) -> None:
     _add(command, '--remap', action='append', default=[], metavar='A:=B', help=what)
 
 
+def _monitor(command: argparse.ArgumentParser) -> None:
+    what = 'print one view after S seconds and end; needed where the output is not a terminal'
+    _add(command, '--once', type=float, metavar='S', help=what)
+    what = 'read topic A of the nodes from B; may be repeated'
+    _add(command, '--remap', action='append', default=[], metavar='A:=B', help=what)
+
+
 def _seed(command: argparse.ArgumentParser, what: str) -> None:
     _add(command, '--seed', type=int, default=1, metavar='N', help=f'{what} (default: 1)')
 
@@ -412,6 +433,7 @@ _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     'compare': _compare,
     'lookup': _lookup,
     'play': _play,
+    'monitor': _monitor,
     'simulate': _simulate,
     'campaign': _campaign,
 }

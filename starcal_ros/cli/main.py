@@ -280,11 +280,28 @@ def _play(args: argparse.Namespace) -> int:
     reader.mcap_files([args.bag])
     if not 0 <= args.rate <= 1e6:
         raise OptionError(f'--rate: {args.rate} is not within 0 to 1e6')
-    for remap in args.remap:
-        if not all(remap.partition(':=')[::2]):
-            raise OptionError(f'--remap: {remap!r} is not of the form A:=B')
+    _check_remaps(args.remap)
     sys.stdout.flush()
     os.execv(sys.executable, demo.player_command(args.bag, args.rate, args.remap))
+
+
+def _check_remaps(remaps: Sequence[str]) -> None:
+    for remap in remaps:
+        if not all(remap.partition(':=')[::2]):
+            raise OptionError(f'--remap: {remap!r} is not of the form A:=B')
+
+
+def _monitor(args: argparse.Namespace) -> int:
+    """Replace this process by the monitor of running nodes."""
+    from starcal_ros.cli import demo
+
+    _check_remaps(args.remap)
+    if args.once is not None and not 0 <= args.once <= 3600:
+        raise OptionError(f'--once: {args.once:g} s is not within 0 to 3600')
+    if args.once is None and not sys.stdout.isatty():
+        raise OptionError('--once: needed where the output is not a terminal, e.g. --once 5')
+    sys.stdout.flush()
+    os.execv(sys.executable, demo.monitor_command(args.once, args.remap))
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -460,6 +477,7 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     'compare': _compare,
     'lookup': _lookup,
     'play': _play,
+    'monitor': _monitor,
     'simulate': _simulate,
     'campaign': _campaign,
 }

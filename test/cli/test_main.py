@@ -131,6 +131,8 @@ def test_help_is_there_at_once() -> None:
         (['play', str(TINY), '--rate', '-1'], ['--rate', '-1']),
         (['play', str(TINY), '--rate', 'nan'], ['--rate', 'nan']),
         (['play', str(TINY), '--remap', 'image'], ['--remap', "'image'"]),
+        (['monitor'], ['--once', 'not a terminal']),
+        (['monitor', '--once', 'nan'], ['--once', 'nan']),
     ],
 )
 def test_bad_arguments(
@@ -478,6 +480,14 @@ def test_play_becomes_the_player(run: Run, monkeypatch: pytest.MonkeyPatch) -> N
     assert command[:3] == [sys.executable, '-m', 'starcal_ros.nodes.bag_player']
     assert f'bag:={TINY.resolve()}' in command and 'rate:=2.0' in command
     assert command[-4:] == ['-r', 'a:=b', '-r', 'c:=d']
+
+
+def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[list[str]] = []
+    monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
+    run('monitor', '--once', '2.5', '--remap', '__ns:=/cam1')
+    module = [sys.executable, '-m', 'starcal_ros.nodes.monitor']
+    assert called == [[*module, '--once', '2.5', '--ros-args', '-r', '__ns:=/cam1']]
 
 
 def test_parameters_of_the_nodes_are_known_to_the_tool(
