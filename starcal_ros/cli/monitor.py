@@ -86,8 +86,8 @@ def _ensemble(seen: Seen) -> Group | Text:
         head.append(f'{there} of at least {needed} {what}', style).append('   ')
     head.append(f'{status.images_saved} images on disk')
     sigmas = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for name, justify in (('1-sigma of', 'left'), ('if calibrated now', 'right'),
-                          ('active calibration', 'right')):  # fmt: skip
+    for name, justify in (('1-sigma of', 'left'), ('calibrated now', 'right'),
+                          ('active', 'right')):  # fmt: skip
         sigmas.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
     active = _sigmas(seen.active)
     for name, sigma in zip(status.parameter_names, status.predicted_sigma, strict=True):
@@ -106,7 +106,7 @@ def _ensemble(seen: Seen) -> Group | Text:
 def coverage_text(coverage: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Text:
     """The detector as shades, two letters for a cell; empty cells in red."""
     most = max(int(coverage.max(initial=0)), 1)
-    text = Text(f'stars per cell, at most {most}\n')
+    text = Text(f'most in a cell: {most}\n')
     for row in coverage:
         for count in row:
             if count == 0:
@@ -126,7 +126,7 @@ def _sigmas(calibration: Calibration | None) -> dict[str, float]:
 
 def _sigma_text(name: str, sigma: float) -> str:
     if not np.isfinite(sigma):
-        return 'not observable yet'
+        return 'unobservable'
     if name.startswith('alignment'):
         return f'{sigma / ARCSECOND_RAD:.2f} arcsec'
     return f'{sigma:.2g}'

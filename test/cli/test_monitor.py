@@ -55,7 +55,7 @@ def test_forecast_sigmas_stand_beside_the_active_ones() -> None:
     (turn,) = (line for line in lines if ' alignment_x ' in line)
     assert '1.00 arcsec' in turn
     (unknown,) = (line for line in lines if ' k3 ' in line)
-    assert 'not observable yet' in unknown
+    assert 'unobservable' in unknown
 
 
 def test_a_refused_candidate_shows_the_failed_check_first() -> None:
@@ -86,7 +86,7 @@ def test_the_share_of_a_limit(found: float, limit: float, option: str, share: fl
 
 def test_coverage_is_a_picture_of_the_detector() -> None:
     text = coverage_text(np.array([[0, 1], [3, 4]])).plain.splitlines()
-    assert text == ['stars per cell, at most 4', '··░░', '▓▓██']
+    assert text == ['most in a cell: 4', '··░░', '▓▓██']
 
 
 def test_it_fits_a_terminal_of_80_columns() -> None:
