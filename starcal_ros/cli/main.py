@@ -111,9 +111,10 @@ def _calibrate_into(
     from starcal_ros.report import thumbnails
 
     topics = bag_topics.choose_topics(bags, asked, setup)
-    album = thumbnails.Album()
+    count = bag_topics.count(bags, topics)
+    album = thumbnails.Album(count)
     records = bag_topics.read(bags, topics, setup, album.show)
-    observations = list(with_progress(records, bag_topics.count(bags, topics), 'images'))
+    observations = list(with_progress(records, count, 'images'))
     ensemble = Ensemble()
     for record in observations:
         ensemble = solve.add_to_ensemble(ensemble, record, setup)
