@@ -12,6 +12,5 @@ LONG = (
     'faults',
     'soak',
     'transport',
-    'night',
 )
 """Those that take some minutes: run when they are named."""

@@ -58,8 +58,13 @@ class Cost(NamedTuple):
 
 def run(quick: bool) -> list[Table]:
     """Compare with a bare read, then profile."""
-    sizes = (('tiny', 10, None, None),) if quick else SIZES
-    return [table for size in sizes for table in compare(*size, 1 if quick else _ROUNDS)]
+    if quick:
+        return compare('tiny', 10, None, None, 1)
+    return [
+        table
+        for name, images, most_s, most_ratio in SIZES
+        for table in compare(name, images, most_s, most_ratio, _ROUNDS)
+    ]
 
 
 def compare(

@@ -145,7 +145,7 @@ class Telemetry:
             attitudes = [np.full(10, np.nan)]
         velocity_m_s, temperature_degc = self.at(time_ns)
         velocity_m_s = np.full(3, np.nan) if velocity_m_s is None else velocity_m_s
-        return np.asarray(np.r_[(*attitudes, velocity_m_s, temperature_degc)])
+        return np.concatenate([*attitudes, velocity_m_s, [temperature_degc]])
 
 
 def latest_at(samples: Sequence[tuple[int, T]], time_ns: int, without: T) -> T:

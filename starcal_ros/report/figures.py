@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import math
 
 from markupsafe import Markup
@@ -186,7 +186,7 @@ def _in_bins(x: Floats, values: Floats, edges: Floats) -> tuple[Floats, Floats, 
     return 0.5 * (edges[1:] + edges[:-1])[enough], mean, error
 
 
-def _means(x: Sequence[Floats], y: Sequence[Floats], edges: Floats, label: str,
+def _means(x: Iterable[Floats], y: Iterable[Floats], edges: Floats, label: str,
            names: Sequence[str]) -> Markup:  # fmt: skip
     """Means of u and v with their standard errors in bins, about zero."""
     found = [_in_bins(a, b, edges) for a, b in zip(x, y, strict=True)]

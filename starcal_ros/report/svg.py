@@ -16,7 +16,7 @@ import math
 import cv2
 from markupsafe import Markup
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from starcal_ros.arrays import Floats
 
@@ -47,7 +47,7 @@ class Scale:
     end: float
     is_log: bool = False
 
-    def __call__(self, values: Floats | float) -> Floats:
+    def __call__(self, values: ArrayLike) -> Floats:
         """Place of values in the view box."""
         x = np.asarray(values, np.float64)
         low, high = self.low, self.high
@@ -121,7 +121,9 @@ class Panel:
         middle = (top + bottom) / 2
         draw(_text(13, middle, y_label, 'middle', turn_deg=-90))
 
-    def line(self, x: Floats, y: Floats, colour: str, width: float = 1.5, dash: str = '') -> None:
+    def line(
+        self, x: ArrayLike, y: ArrayLike, colour: str, width: float = 1.5, dash: str = ''
+    ) -> None:
         """A line through points (n,); it is broken where a number is not finite."""
         places = np.stack([self.x(x), self.y(y)], axis=-1)
         steps, pen = [], 'M'
@@ -138,8 +140,8 @@ class Panel:
 
     def marks(
         self,
-        x: Floats,
-        y: Floats,
+        x: ArrayLike,
+        y: ArrayLike,
         colour: str,
         shape: str = 'circle',
         size: float = 3.2,
