@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.records import Calibration, Ensemble
 
-_MODULES_OF_EXTRAS = ('dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')  # setup.cfg
+# setup.cfg; contourpy comes with matplotlib
+_MODULES_OF_EXTRAS = ('contourpy', 'dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
 
