@@ -94,7 +94,7 @@ def charts_of(
             'Pointings',
             sky,
             f'Footprints of {placed} images on the whole sky (ICRS, Hammer projection, right '
-            'ascension to the left). Refused images have the second colour.',
+            'ascension to the left).',
         )
     if residuals is not None and residuals.used.any():
         charts.update(_residual_charts(calibration, residuals))

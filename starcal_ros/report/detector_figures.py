@@ -248,7 +248,7 @@ def pointings(
     Footprints of the images on the whole sky, and their number.
 
     A Hammer projection of the ICRS, right ascension 0 in the middle and increasing to the left.
-    Refused images that have an attitude are drawn in the second colour.
+    Refused images that have an attitude are drawn too.
     """
     placed = [o for o in observations if not o.refusal or np.isfinite(o.attitude_gap_s)]
     left, right, top, high = 8.0, svg.WIDTH - 8.0, 8.0, (svg.WIDTH - 16.0) / 2
@@ -273,7 +273,11 @@ def pointings(
         # Across the edge of the map a line would run through all of it.
         x = np.where(np.abs(np.diff(x, prepend=x[:1])) > 2.0, np.nan, x)
         panel.line(x, y, SERIES[1] if one.refusal else SERIES[0], 1.2)
-    return svg.chart([panel], top + high + 8.0), len(placed)
+    below = Panel(panel.x, Scale(0.0, 1.0, top + high + 32.0, top + high + 6.0))
+    below.legend(('used', SERIES[0], 'line'), is_left=True)
+    if any(one.refusal for one in placed):
+        below.legend(('refused', SERIES[1], 'line'))
+    return svg.chart([panel, below], top + high + 32.0), len(placed)
 
 
 def hammer(directions: Floats) -> tuple[Floats, Floats]:

@@ -83,4 +83,5 @@ def test_pointings_count_images_with_an_attitude() -> None:
     ]
     drawn, count = figures.pointings(seen, geometry)
     assert count == 2
-    assert str(drawn).count(svg.SERIES[0]) == 1 and str(drawn).count(svg.SERIES[1]) == 1
+    # A footprint and its line in the legend.
+    assert str(drawn).count(svg.SERIES[0]) == 2 and str(drawn).count(svg.SERIES[1]) == 2
