@@ -78,19 +78,30 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _calibrate(args: argparse.Namespace) -> int:
     """Calibrate from bags in one process, as the two nodes do on the graph."""
     from concurrent.futures import ThreadPoolExecutor
+    import threading
 
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
     from starcal_ros.pipeline.provenance import inputs_of
     from starcal_ros.pipeline.setup import read_setup
+    from starcal_ros.products.files import REPORT_FILE
 
     setup = read_setup(args.params)
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
     files = (*reader.mcap_files(args.bags), args.params)
     with ThreadPoolExecutor(1, 'digests') as thread:
-        inputs = thread.submit(inputs_of, files)  # of what the images are read from meanwhile
-        calibration = _calibrate_into(args.output, args.bags, _asked(args), setup, inputs.result)
+        # Of what the images are read from meanwhile; an error or Ctrl-C ends it at once.
+        stopped = threading.Event()
+        inputs = thread.submit(inputs_of, files, stopped.is_set)
+        try:
+            calibration = _calibrate_into(
+                args.output, args.bags, _asked(args), setup, inputs.result
+            )
+        finally:
+            stopped.set()
+    if args.no_report:
+        (args.output / REPORT_FILE).unlink(missing_ok=True)  # of the products that were replaced
     report = '' if args.no_report else f'; {_write_report(args.output)}'
     output.print_calibration(calibration, setup.prior)
     print(f'products written to {args.output}{report}')

@@ -482,6 +482,17 @@ def test_play_becomes_the_player(run: Run, monkeypatch: pytest.MonkeyPatch) -> N
     assert command[-4:] == ['-r', 'a:=b', '-r', 'c:=d']
 
 
+def test_no_report_is_written_where_none_is_wanted(
+    run: Run, tmp_path: Path, tiny_bag: Path, tiny_products: Path
+) -> None:
+    (tmp_path / 'report.html').write_text('of earlier products')
+    bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
+    status, out, _ = run('calibrate', bag, '--params', params, '-o', tmp_path, '--no-report')
+    assert status == 0 and out.endswith(f'products written to {tmp_path}\n')
+    assert (tmp_path / 'calibration.json').is_file()
+    assert not (tmp_path / 'report.html').exists()
+
+
 def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[list[str]] = []
     monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
