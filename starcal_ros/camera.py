@@ -21,7 +21,6 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from starcal_ros.arrays import Floats
 from starcal_ros.detector_field import DetectorField
@@ -488,6 +487,8 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
         return np.concatenate([J[..., free].reshape(-1, len(free)), held_px])
 
     # MINPACK scales the parameters by their columns and bounds the step.
+    from scipy.optimize import least_squares  # a third of the start of a short command
+
     found = least_squares(
         residual,
         start.parameters[free],

@@ -16,23 +16,16 @@ import logging
 from pathlib import Path
 import re
 
-from starcal_ros.arrays import Floats
 from starcal_ros.bag.mcap_reader import Damage, MAGIC, RawMessage, read_messages, read_summary
-from starcal_ros.bag.typestore import typestore, typestore_with
+from starcal_ros.bag.typestore import typestore_of
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.messages.fields import nearest_stamp_ns
 from starcal_ros.messages.images import image_from_message, refused_from_message
 from starcal_ros.messages.observations import checked_observations
-from starcal_ros.messages.telemetry import (
-    attitude_from_message,
-    temperature_from_message,
-    velocity_from_message,
-)
 from starcal_ros.messages.types import (
     Message,
 )
 from starcal_ros.records import Image, refused_image, StarObservations
-from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, AttitudeOptions
 from starcal_ros.text import printable
 from starcal_ros.untrusted import METADATA_BYTES, read_text, yaml_value
 
@@ -108,10 +101,21 @@ def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple
     types: dict[str, str] = {}
     counts: Counter[str] = Counter()
     for file in mcap_files(paths):
-        for topic in _summary(file) or _counted(file, on_damage):
+        status = file.stat()
+        listed, damage = _listed(file, status.st_size, status.st_mtime_ns)
+        for text in damage:
+            on_damage(text)
+        for topic in listed:
             types[topic.name] = topic.type_name
             counts[topic.name] += topic.count
     return tuple(Topic(name, types[name], counts[name]) for name in sorted(counts))
+
+
+@functools.lru_cache(maxsize=64)
+def _listed(file: Path, size: int, modified_ns: int) -> tuple[list[Topic], list[str]]:
+    """Topics of a file and its damage; kept, as a file without summary is read for them."""
+    damage: list[str] = []
+    return _summary(file) or _counted(file, damage.append), damage
 
 
 def _summary(file: Path) -> list[Topic]:
@@ -184,47 +188,26 @@ def read_images(
     So does a compressed image of another ``size`` (width, height), where one is given.
     """
     for raw in read_raw(paths, [topic], on_damage):
-        try:
-            message = decode(raw)
-        except BagError as error:
-            log_time_ns = nearest_stamp_ns(raw.log_time_ns)
-            yield refused_image(log_time_ns, 0, 0, 'bad_layout', str(error))
-            continue
-        try:
-            yield image_from_message(message, stamp_offset_s, size)
-        except ImageRefused as refused:
-            yield refused_from_message(message, stamp_offset_s, refused)
+        yield image_of(raw, stamp_offset_s, size)
 
 
-def read_attitudes(
-    paths: Iterable[Path | str],
-    topic: str,
-    options: AttitudeOptions | None = None,
-    on_damage: Damage = log_damage,
-) -> AttitudeHistory:
-    """All attitude samples of a topic; those that are not unit quaternions count as invalid."""
-    options = options or AttitudeOptions()
-    history = AttitudeHistory()
-    for message in _decoded(paths, topic, on_damage):
-        time_ns, quaternion = attitude_from_message(message)
-        history.add(time_ns, attitude_sample(time_ns, quaternion, options.attitude_direction))
-    return history
+def image_of(
+    raw: RawMessage, stamp_offset_s: float = 0.0, size: tuple[int, int] | None = None
+) -> Image | StarObservations:
+    """
+    Image of a message; refused observations if it cannot be decoded.
 
-
-def read_velocities(
-    paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
-) -> Iterator[tuple[int, Floats]]:
-    """Stamps and velocities (3,) in m/s of a topic."""
-    for message in _decoded(paths, topic, on_damage):
-        yield velocity_from_message(message)
-
-
-def read_temperatures(
-    paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
-) -> Iterator[tuple[int, float]]:
-    """Stamps and temperatures in degrees Celsius of a topic; NaN if unknown."""
-    for message in _decoded(paths, topic, on_damage):
-        yield temperature_from_message(message)
+    So is a compressed image of another ``size`` (width, height), where one is given.
+    """
+    try:
+        message = decode(raw)
+    except BagError as error:
+        log_time_ns = nearest_stamp_ns(raw.log_time_ns)
+        return refused_image(log_time_ns, 0, 0, 'bad_layout', str(error))
+    try:
+        return image_from_message(message, stamp_offset_s, size)
+    except ImageRefused as refused:
+        return refused_from_message(message, stamp_offset_s, refused)
 
 
 def read_observations(
@@ -248,32 +231,21 @@ def read_observations(
 
 def decode(raw: RawMessage) -> Message:
     """
-    Decoded message: by the definition of ROS 2, else by the one in the bag.
+    Decoded message: by the definition in the bag, else by the one of ROS 2.
 
     Raises
     ------
     BagError
         If the bytes are not a message of the type.
     """
-    store = typestore()
     try:
-        if raw.type_name not in store.types or raw.type_name.startswith('starcal/'):
-            store = typestore_with(raw.type_name, raw.definition)
+        store = typestore_of(raw.type_name, raw.definition)
         return store.deserialize_cdr(raw.data, raw.type_name)
     # The exceptions of wrong bytes depend on the field and have no common base class.
     except Exception as error:
         raise BagError(
             f'{raw.topic}: cannot decode {len(raw.data)} bytes as {raw.type_name}'
         ) from error
-
-
-def _decoded(paths: Iterable[Path | str], topic: str, on_damage: Damage) -> Iterator[Message]:
-    """Messages of a topic; those that cannot be decoded are reported and skipped."""
-    for raw in read_raw(paths, [topic], on_damage):
-        try:
-            yield decode(raw)
-        except BagError as error:
-            on_damage(str(error))
 
 
 def _files_of_folder(folder: Path) -> list[Path]:

@@ -57,6 +57,12 @@ def _definitions_folder() -> Path:
     raise BagError(f'the starcal .msg files are not installed in {candidates[-1]}')
 
 
+def typestore_of(type_name: str, definition: str) -> Typestore:
+    """Types by the definition in a bag, whose writer may be another version; else `typestore`."""
+    found = _store_or_fault(type_name, definition)
+    return typestore() if isinstance(found, str) else found
+
+
 def typestore_with(type_name: str, definition: str) -> Typestore:
     """
     Types with the bag's own definition of one: another version may have written the bag.
@@ -72,7 +78,7 @@ def typestore_with(type_name: str, definition: str) -> Typestore:
     return found
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=64)
 def _store_or_fault(type_name: str, definition: str) -> Typestore | str:
     """The types, or why there are none: a bad definition is not read for each message again."""
     if not _TYPE_NAME.fullmatch(type_name):
@@ -82,14 +88,14 @@ def _store_or_fault(type_name: str, definition: str) -> Typestore | str:
     for count in _COUNT.findall(definition):
         if len(count) > 9 or int(count) > _MOST_ITEMS:
             return f'an array of more than {_MOST_ITEMS} items'
-    store = get_typestore(Stores.ROS2_JAZZY)
+    store = get_typestore(Stores.EMPTY)
     # The exceptions of a text that is no definition have no common base class.
     try:
         found = get_types_from_msg(definition, type_name)
         _count_items(type_name, found, {})
         for name, (_, fields) in found.items():
             _check_fields(name, dict(fields))
-        store.register({name: kind for name, kind in found.items() if name not in store.types})
+        store.register(found)
     except Exception as error:
         return f'{error}'[:100]
     return store

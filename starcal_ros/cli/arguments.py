@@ -133,6 +133,20 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   # on another topic
   starcal play bags/tiny --remap /opnav/image_raw:=/camera/image_raw""",
     ),
+    'monitor': (
+        'show running nodes in the terminal',
+        (
+            'Shows images and refusals by reason, coverage, the forecast sigma of each parameter '
+            'beside that of the active calibration, the gate and the health of the nodes.'
+        ),
+        """\
+  # live, until Ctrl-C
+  starcal monitor
+  # nodes in a namespace
+  starcal monitor --remap __ns:=/cam1
+  # one view after five seconds, for a log
+  starcal monitor --once 5""",
+    ),
     'simulate': (
         'render a bag with known truth',
         (
@@ -342,6 +356,10 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
     _params(command, 'ROS parameter file: prior camera, mounting and options', required=True)
     what = 'folder for the products, created if absent; existing products are replaced'
     _output(command, 'DIR', what, required=True)
+    _add(
+        command, '--no-report', action='store_true',
+        help='write no report; starcal report DIR writes it later',
+    )  # fmt: skip
     _topics(command)
     when = 'UTC in ISO 8601, seconds since 1970, or +seconds after the first image'
     _add(command, '--from', dest='from_time', metavar='T', help=f'use images from T on: {when}')
@@ -383,6 +401,13 @@ def _play(command: argparse.ArgumentParser) -> None:
     what = 'playback speed; 1 is real time, 0 is as fast as stars are observed (default: 1)'
     _add(command, '--rate', type=float, default=1.0, metavar='R', help=what)
     what = 'publish topic A of the bag as B; may be repeated'
+    _add(command, '--remap', action='append', default=[], metavar='A:=B', help=what)
+
+
+def _monitor(command: argparse.ArgumentParser) -> None:
+    what = 'print one view after S seconds and end; needed where the output is not a terminal'
+    _add(command, '--once', type=float, metavar='S', help=what)
+    what = 'read topic A of the nodes from B; may be repeated'
     _add(command, '--remap', action='append', default=[], metavar='A:=B', help=what)
 
 
@@ -468,6 +493,7 @@ _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     'compare': _compare,
     'lookup': _lookup,
     'play': _play,
+    'monitor': _monitor,
     'simulate': _simulate,
     'campaign': _campaign,
 }

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 from pathlib import Path
 import sys
+import threading
 
 from starcal_ros.assessment import comparison
 from starcal_ros.assessment.residuals import Residuals
@@ -28,6 +30,7 @@ from starcal_ros.pipeline.provenance import inputs_of, software_version
 from starcal_ros.pipeline.retry import measured_again
 from starcal_ros.pipeline.setup import files_of, read_setup, Setup
 from starcal_ros.pipeline.topics import Topics
+from starcal_ros.products.files import REPORT_FILE
 from starcal_ros.products.folder import write_observations, write_products
 from starcal_ros.products.not_calibrated import NotCalibrated, write_not_calibrated
 from starcal_ros.records import (
@@ -50,7 +53,7 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
     check_folder(args.output, args.bags, (args.params, *files_of(setup.frames)))
-    inputs = inputs_of((*reader.mcap_files(args.bags), args.params))
+    files = (*reader.mcap_files(args.bags), args.params)
     try:
         setup, found = aligned_by_bags(args.bags, asked, setup)
     except OptionError as error:
@@ -59,10 +62,19 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
         raise
     if found:
         print(found, file=sys.stderr)
-    calibration, observations = calibrate_into(
-        args.output, args.bags, asked, setup, inputs, wanted
-    )
-    report = write_report(args.output)
+    with ThreadPoolExecutor(1, 'digests') as thread:
+        # While the images are read; an error or Ctrl-C ends it at once.
+        stopped = threading.Event()
+        inputs = thread.submit(inputs_of, files, stopped.is_set)
+        try:
+            calibration, observations = calibrate_into(
+                args.output, args.bags, asked, setup, inputs.result, wanted
+            )
+        finally:
+            stopped.set()
+    if args.no_report:
+        (args.output / REPORT_FILE).unlink(missing_ok=True)  # of the products that were replaced
+    report = '' if args.no_report else f'; {write_report(args.output)}'
     output.print_calibration(calibration, setup.prior)
     if not tracker_sigma_is_given(setup.calibration):
         sigma = ', '.join(f'{arcsec:.1f}' for arcsec in calibration.star_tracker_sigma_arcsec)
@@ -70,9 +82,9 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
             f'star tracker    {sigma}" (x, y, z) from the scatter: star_tracker_sigma_arcsec'
             ' is not given'
         )
-    print_text(f'products written to {args.output}; {report}')
+    print_text(f'products written to {args.output}{report}')
     if args.split_half:
-        _split(args.output, observations, setup, inputs)
+        _split(args.output, observations, setup, inputs.result())
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
 
 
@@ -81,24 +93,25 @@ def calibrate_into(
     bags: Sequence[Path],
     asked: Topics,
     setup: Setup,
-    inputs: Mapping[str, str],
+    inputs: Callable[[], Mapping[str, str]],
     wanted: Wanted | None = None,
 ) -> tuple[Calibration, list[StarObservations]]:
     """Calibrate from bags and write the files that a report is made from."""
     topics = bag_topics.choose_topics(bags, asked, setup)
-    album, expected = thumbnails.Album(), ExpectedAlbum(setup)
+    count = bag_topics.count(bags, topics)
+    album, expected = thumbnails.Album(count), ExpectedAlbum(setup)
 
     def show(image: Image, observed: StarObservations, geometry: CameraGeometry) -> None:
         album.show(image, observed, geometry)
         expected.show(image, observed, geometry)
 
     records = bag_topics.read(bags, topics, setup, show, wanted)
-    observations = list(with_progress(records, bag_topics.count(bags, topics), 'images'))
+    observations = list(with_progress(records, count, 'images'))
     make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     write_observations(observations, folder, setup.frames.camera_frame)
     try:
-        calibration, left = _solve(observations, setup, inputs)
+        calibration, left = _solve(observations, setup, inputs())
         if calibration.accepted and topics.image:
             again = measured_again(bags, topics, setup, calibration.geometry, observations)
             gained = _used(again) - _used(observations)
@@ -110,7 +123,7 @@ def calibrate_into(
                 )
                 observations = again
                 write_observations(observations, folder, setup.frames.camera_frame)
-                calibration, left = _solve(observations, setup, inputs)
+                calibration, left = _solve(observations, setup, inputs())
     except TooFewObservations as error:
         failure = _failure(str(error), bags, asked, setup, observations, bool(topics.image))
         _write_failure(folder, failure, expected.pictures)

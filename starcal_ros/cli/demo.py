@@ -140,6 +140,13 @@ def player_command(path: Path, rate: float, remaps: Sequence[str]) -> list[str]:
     return [*_module_command('bag_player'), '--ros-args', *parameters, *renamed]
 
 
+def monitor_command(once_after_s: float | None, remaps: Sequence[str]) -> list[str]:
+    """Command line that shows running nodes in the terminal."""
+    once = [] if once_after_s is None else ['--once', repr(once_after_s)]
+    renamed = [part for remap in remaps for part in ('-r', remap)]
+    return [*_module_command('monitor'), *once, *(['--ros-args', *renamed] if renamed else [])]
+
+
 def _nodes_command(name: str, params: Path) -> list[str]:
     topics = (f'image:={simulated_bag.IMAGE_TOPIC}', f'attitude:={simulated_bag.ATTITUDE_TOPIC}')
     remaps = [part for topic in topics for part in ('-r', topic)]

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.simulation.mistakes import Mistakes
 
+# setup.cfg; contourpy comes with matplotlib
+_MODULES_OF_EXTRAS = ('contourpy', 'dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
 
@@ -127,13 +129,14 @@ def _inspect(args: argparse.Namespace) -> int:
     """List the contents of a bag and the images that a calibration would refuse."""
     from starcal_ros.bag import reader
     from starcal_ros.cli import output
-    from starcal_ros.diagnosis.bags import aligned_by_bags
     from starcal_ros.messages.types import COMPRESSED_TYPE, IMAGE_TYPE, OBSERVATIONS_TYPE
     from starcal_ros.pipeline import inspect
-    from starcal_ros.pipeline.setup import read_setup
 
     setup = None
     if args.params:
+        from starcal_ros.diagnosis.bags import aligned_by_bags
+        from starcal_ros.pipeline.setup import read_setup
+
         setup, aligned = aligned_by_bags(args.bags, _asked(args), read_setup(args.params))
         print(aligned, end='\n' if aligned else '', file=sys.stderr)
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
@@ -141,6 +144,8 @@ def _inspect(args: argparse.Namespace) -> int:
     with progress_bar(total, 'images') as advance:
         found = inspect.inspect(args.bags, _asked(args), setup, on_image=advance)
     if setup and found.images and not found.stars_per_image and found.chosen:
+        import dataclasses
+
         from starcal_ros.cli import diagnosis
 
         why = diagnosis.of_a_failure(args.bags, _asked(args), setup)
@@ -181,10 +186,10 @@ def _compare(args: argparse.Namespace) -> int:
     found = comparison.compare(*map(read_calibration, files))
     if args.output:
         from starcal_ros.cli.output_places import check_no_product
-        from starcal_ros.report import figures
+        from starcal_ros.report.comparison_figure import write_comparison
 
         check_no_product(args.output, files)
-        figures.write_comparison(found, args.output)
+        write_comparison(found, args.output)
     if args.json:
         print_text(json.dumps(comparison.content(found), indent=1, allow_nan=False))
     else:
@@ -251,11 +256,28 @@ def _play(args: argparse.Namespace) -> int:
     reader.mcap_files([args.bag])
     if not 0 <= args.rate <= 1e6:
         raise OptionError(f'--rate: {args.rate} is not within 0 to 1e6')
-    for remap in args.remap:
-        if not all(remap.partition(':=')[::2]):
-            raise OptionError(f'--remap: {remap!r} is not of the form A:=B')
+    _check_remaps(args.remap)
     sys.stdout.flush()
     os.execv(sys.executable, demo.player_command(args.bag, args.rate, args.remap))
+
+
+def _check_remaps(remaps: Sequence[str]) -> None:
+    for remap in remaps:
+        if not all(remap.partition(':=')[::2]):
+            raise OptionError(f'--remap: {remap!r} is not of the form A:=B')
+
+
+def _monitor(args: argparse.Namespace) -> int:
+    """Replace this process by the monitor of running nodes."""
+    from starcal_ros.cli import demo
+
+    _check_remaps(args.remap)
+    if args.once is not None and not 0 <= args.once <= 3600:
+        raise OptionError(f'--once: {args.once:g} s is not within 0 to 3600')
+    if args.once is None and not sys.stdout.isatty():
+        raise OptionError('--once: needed where the output is not a terminal, e.g. --once 5')
+    sys.stdout.flush()
+    os.execv(sys.executable, demo.monitor_command(args.once, args.remap))
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -346,7 +368,7 @@ def _demo(args: argparse.Namespace) -> int:
     )
     # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
     setup = load_setup(bag.parameters)
-    again, _ = calibrate_into(args.output, [bag.bag], Topics(), setup, {})
+    again, _ = calibrate_into(args.output, [bag.bag], Topics(), setup, dict)
     write_products(calibration, args.output)
     apart_px = float(comparison.compare(calibration, again).before.length_px.max())
     same = apart_px <= _DEMO_SAME_PX
@@ -365,6 +387,7 @@ def _campaign(args: argparse.Namespace) -> int:
     """Run a Monte Carlo study."""
     # Trials run in parallel, one thread each; results must not depend on the number of threads.
     os.environ.update(OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1')
+    import dataclasses
     import time
 
     from starcal_ros.options import nearest
@@ -469,6 +492,7 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     'compare': _compare,
     'lookup': _lookup,
     'play': _play,
+    'monitor': _monitor,
     'simulate': _simulate,
     'campaign': _campaign,
 }

@@ -5,20 +5,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.assessment.comparison import Comparison, DifferenceMap
+from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.cli.terminal import print_table, print_text, print_verdict
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
-from starcal_ros.model_errors import temperature
-from starcal_ros.pipeline.inspect import Inspection, TopicContent
-from starcal_ros.records import Calibration, CameraGeometry
+
+if TYPE_CHECKING:
+    from starcal_ros.assessment.comparison import Comparison, DifferenceMap
+    from starcal_ros.pipeline.inspect import Inspection, TopicContent
+    from starcal_ros.records import Calibration, CameraGeometry
 
 
 def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     """Print parameters, statistics and verdict; changes are relative to the prior."""
+    from starcal_ros.model_errors import temperature
+
     camera, sigma = calibration.geometry.camera, calibration.sigma
     rows = []
     for k, name in enumerate(camera.parameter_names):
@@ -28,6 +34,7 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
             (
                 name,
                 f'{value:.8g}',
+                'px' if name in INTRINSIC_NAMES else '',
                 f'{sigma[k]:.2g}' if free else 'held',
                 f'{change:+.4g}',
                 _sigmas(change, sigma[k]) if free else '',
@@ -36,9 +43,12 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     angles = alignment_difference_rad(calibration.geometry, prior) / ARCSECOND_RAD
     for axis, angle, error in zip('xyz', angles, sigma[-3:] / ARCSECOND_RAD, strict=True):
         rows.append(
-            (f'alignment {axis}', '', f'{error:.2f}"', f'{angle:+.2f}"', _sigmas(angle, error))
-        )
-    print_table(('parameter', 'value', '1-sigma', 'from prior', 'in sigmas'), rows)
+            (
+                f'alignment {axis}', '', 'arcsec', f'{error:.2f}', f'{angle:+.2f}',
+                _sigmas(angle, error),
+            )
+        )  # fmt: skip
+    print_table(('parameter', 'value', 'unit', '1-sigma', 'from prior', 'in sigmas'), rows)
     quaternion = calibration.geometry.star_tracker_from_camera_xyzw
     print_text(f'alignment xyzw  {np.array2string(quaternion, precision=9, separator=", ")}')
     print_text(f'images          {calibration.images_used} used, refused: ', end='')

@@ -7,7 +7,6 @@ import math
 import sys
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -108,6 +107,8 @@ def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> 
         raise ImageRefused('bad_layout', 'the PNG claims {} x {} px'.format(*found))
     if has_surplus(bytes(data), header):
         raise ImageRefused('bad_layout', 'the PNG inflates to far more than its pixels')
+    import cv2  # slow to import, and few bags have compressed images
+
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:

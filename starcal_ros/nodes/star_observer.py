@@ -7,6 +7,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 import dataclasses
 import math
+import operator
 import sys
 import threading
 import time
@@ -20,6 +21,7 @@ from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import StarObservations as ObservationsMessage
+from starcal_ros.bag.frames import latest_at
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.diagnosis.bags import found_alignment
@@ -58,6 +60,7 @@ NAME = 'star_observer'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Ten seconds of a fast star tracker; a bag played fast sends bursts.
 _SAMPLES = QoSProfile(depth=2000)
+_STAMP_NS = operator.itemgetter(0)
 _MAX_VELOCITY_M_S = 1e6
 _JUMP_S = 10.0  # smaller steps back are late messages, not a clock change
 
@@ -312,8 +315,8 @@ class StarObserver(StarcalNode):
             self._attitudes,
             self._setup,
             before,
-            observe.latest_at(list(self._velocities), image.time_ns, None),
-            observe.latest_at(list(self._temperatures), image.time_ns, math.nan),
+            latest_at(sorted(self._velocities, key=_STAMP_NS), image.time_ns, None),
+            latest_at(sorted(self._temperatures, key=_STAMP_NS), image.time_ns, math.nan),
         )
         if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
             self._restarts += 1
@@ -357,8 +360,8 @@ class StarObserver(StarcalNode):
                 self._attitudes,
                 self._setup,
                 observe.Track(self._geometry),
-                observe.latest_at(list(self._velocities), image.time_ns, None),
-                observe.latest_at(list(self._temperatures), image.time_ns, math.nan),
+                latest_at(sorted(self._velocities, key=_STAMP_NS), image.time_ns, None),
+                latest_at(sorted(self._temperatures, key=_STAMP_NS), image.time_ns, math.nan),
             )
             self._retried += 1
             if not observations.refusal:

@@ -9,10 +9,12 @@ import dataclasses
 from dataclasses import dataclass
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_ros.bag import reader
+from starcal_ros.bag.frames import check_order, FrameTopics, read_ahead, read_frames
 from starcal_ros.bag.mcap_reader import Damage
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
@@ -28,9 +30,7 @@ from starcal_ros.messages.types import (
     TEMPERATURE_TYPE,
     VELOCITY_TYPE,
 )
-from starcal_ros.pipeline import observe, solve
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import (
     Ensemble,
@@ -40,6 +40,10 @@ from starcal_ros.records import (
     StarObservations,
 )
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
+
+# What measures and solves takes most of the start: imported only with a setup.
+if TYPE_CHECKING:
+    from starcal_ros.pipeline.setup import Setup
 
 _IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
 _STAMPED = (*_IMAGES, ATTITUDE_TYPE, VELOCITY_TYPE, TEMPERATURE_TYPE, OBSERVATIONS_TYPE)
@@ -162,6 +166,8 @@ def inspect(
     measured = setup is not None or bool(chosen and chosen.observations)
     status = None
     if setup and chosen:
+        from starcal_ros.pipeline import solve
+
         ensemble = Ensemble()
         for observations in seen:
             ensemble = solve.add_to_ensemble(ensemble, observations, setup)
@@ -206,7 +212,7 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
     stamps: defaultdict[str, list[int]] = defaultdict(list)
     kinds: defaultdict[str, Counter[str]] = defaultdict(Counter)
     bad: Counter[str] = Counter()
-    for raw in reader.read_raw(paths, on_damage=on_damage):
+    for raw in read_ahead(reader.read_raw(paths, on_damage=on_damage)):
         types[raw.topic] = raw.type_name
         stamp_ns = raw.log_time_ns
         if raw.type_name in _STAMPED:
@@ -262,16 +268,17 @@ def _placed(
     paths: Sequence[Path], topics: Topics, options: AttitudeOptions
 ) -> Iterator[StarObservations]:
     """Images without their stars, refused for bad encoding, order or attitude."""
-    attitudes = reader.read_attitudes(paths, topics.attitude, options)
     latest_ns = None
-    for image in reader.read_images(paths, topics.image, options.stamp_offset_s):
-        if isinstance(image, StarObservations):
-            yield image
+    for frame in read_frames(paths, FrameTopics(topics.image, topics.attitude), options):
+        if isinstance(frame, StarObservations):
+            yield frame
             continue
+        image = frame.image
         height, width = image.pixels.shape
         try:
-            observe.check_order(image, latest_ns)
-            _, gap_s = attitudes.at(image.time_ns, options.max_attitude_gap_s)
+            check_order(image, latest_ns)
+            before, after = frame.attitudes.around(image.time_ns, options.max_attitude_gap_s)
+            gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
         except ImageRefused as refused:
             yield refused_image(image.time_ns, width, height, refused.reason, refused.detail)
             continue

@@ -7,19 +7,18 @@ from collections.abc import Callable, Iterator, Sequence
 import dataclasses
 from dataclasses import dataclass
 import math
-import operator
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.bag import reader
+from starcal_ros.bag.frames import check_order, FrameTopics, read_frames
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
+from starcal_ros.estimation.options import assumed_tracker_sigma_rad
 from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.image.frame_checks import Fingerprint, fingerprint, sample_rows, screen
@@ -29,7 +28,6 @@ from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
 
-T = TypeVar('T')
 Wanted = Callable[[int], bool]
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
@@ -231,7 +229,7 @@ def _held_attitude(
     noise_rad = _TURN_PX / camera.parameters[0]
     direction = line_of_sight(camera, observations.measured_px)
     radius = float(np.sqrt(np.nanmean(direction[:, 0] ** 2 + direction[:, 1] ** 2)))
-    sigma_rad = max(setup.calibration.star_tracker_sigma_arcsec) * ARCSECOND_RAD
+    sigma_rad = float(assumed_tracker_sigma_rad(setup.calibration).max())
     limit_rad = _TURN_SIGMAS * sigma_rad + noise_rad
     limit_around_rad = _TURN_SIGMAS * sigma_rad + noise_rad / max(radius, noise_rad)
     if across_rad > limit_rad or around_rad > limit_around_rad:
@@ -260,20 +258,6 @@ def _with_hot_pixels(
     return dataclasses.replace(track, hot=hot)
 
 
-def check_order(image: Image, latest_ns: int | None) -> None:
-    """
-    Check that an image is stamped after the last one used (None: no image used yet).
-
-    Raises
-    ------
-    ImageRefused
-        ``out_of_order``.
-    """
-    if latest_ns is not None and image.time_ns <= latest_ns:
-        late_s = (latest_ns - image.time_ns) * 1e-9
-        raise ImageRefused('out_of_order', f'{late_s:.6f} s before the last image used')
-
-
 def _check_size(image: Image, camera: CameraModel) -> None:
     height, width = image.pixels.shape
     if (width, height) != (camera.width, camera.height):
@@ -281,19 +265,6 @@ def _check_size(image: Image, camera: CameraModel) -> None:
             'wrong_size',
             f'image of {width} x {height}, prior camera of {camera.width} x {camera.height}',
         )
-
-
-def latest_at(samples: Sequence[tuple[int, T]], time_ns: int, without: T) -> T:
-    """
-    Last sample at or before a time, else the first after it; ``without`` if there are none.
-
-    Within a minute, the velocity of a spacecraft changes by under 10 m/s (0.007 arcsec), and the
-    temperature of a camera by less than the resolution of its sensor.
-    """
-    before = [sample for stamp_ns, sample in samples if stamp_ns <= time_ns]
-    if before:
-        return before[-1]
-    return samples[0][1] if samples else without
 
 
 def observe_bag(
@@ -307,7 +278,7 @@ def observe_bag(
     wanted: Wanted | None = None,
 ) -> Iterator[StarObservations]:
     """
-    Observations of every image of a bag, in bag order, with one image in memory at a time.
+    Observations of every image of a bag, in bag order, with few images in memory at a time.
 
     ``on_image`` is called with each decoded image, its observations and the geometry that
     predicted its stars.  Images whose stamp is not ``wanted`` are passed over.
@@ -317,32 +288,24 @@ def observe_bag(
     BagError
         When the bag cannot be read or a topic is not in it.
     """
-    attitudes = reader.read_attitudes(paths, attitude_topic, setup.attitude)
-    by_time = operator.itemgetter(0)
-    velocities: list[tuple[int, Floats]] = []
-    temperatures: list[tuple[int, float]] = []
-    if velocity_topic:
-        velocities = sorted(reader.read_velocities(paths, velocity_topic), key=by_time)
-    if temperature_topic:
-        temperatures = sorted(reader.read_temperatures(paths, temperature_topic), key=by_time)
+    topics = FrameTopics(image_topic, attitude_topic, velocity_topic, temperature_topic)
     track = Track(setup.prior)
     size = (setup.prior.camera.width, setup.prior.camera.height)
-    offset_s = setup.attitude.stamp_offset_s
-    for image in reader.read_images(paths, image_topic, offset_s, size=size):
-        if wanted is not None and not wanted(image.time_ns):
+    for frame in read_frames(paths, topics, setup.attitude, size=size):
+        if isinstance(frame, StarObservations):
+            yield frame
             continue
-        if isinstance(image, StarObservations):
-            yield image
+        if wanted is not None and not wanted(frame.image.time_ns):
             continue
         predicted_with = track.geometry
         observations, track = observe_next(
-            image,
-            attitudes,
+            frame.image,
+            frame.attitudes,
             setup,
             track,
-            latest_at(velocities, image.time_ns, None),
-            latest_at(temperatures, image.time_ns, math.nan),
+            frame.velocity_m_s,
+            frame.temperature_degc,
         )
         if on_image is not None:
-            on_image(image, observations, predicted_with)
+            on_image(frame.image, observations, predicted_with)
         yield observations

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 import hashlib
 import importlib.metadata
 import json
@@ -35,13 +35,20 @@ def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -
     }
 
 
-def inputs_of(files: Iterable[Path]) -> dict[str, str]:
-    """SHA-256 of the files that a calibration is made from, by their paths."""
+def inputs_of(
+    files: Iterable[Path], is_stopped: Callable[[], bool] = lambda: False
+) -> dict[str, str]:
+    """
+    SHA-256 of the files that a calibration is made from, by their paths.
+
+    ``is_stopped`` is asked between blocks of 1 MB, so that another thread can end it early; the
+    digests are then of no use.
+    """
     digests = {}
     for path in files:
         digest = hashlib.sha256()
         with path.open('rb') as file:
-            while block := file.read(1 << 20):
+            while not is_stopped() and (block := file.read(1 << 20)):
                 digest.update(block)
         # The bytes of a name that is not UTF-8 are written as Python writes them, \\xff.
         name = os.fsencode(path).decode(errors='backslashreplace')

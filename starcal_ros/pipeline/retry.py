@@ -4,15 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import math
-import operator
 from pathlib import Path
 
-from starcal_ros.bag import reader
+from starcal_ros.bag.frames import FrameTopics, read_frames
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.topics import Topics
-from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.records import CameraGeometry, StarObservations
 
 
 def measured_again(
@@ -30,31 +28,22 @@ def measured_again(
     wanted = {record.time_ns for record in observations if record.refusal == 'no_match'}
     if not wanted or not topics.image:
         return list(observations)
-    attitudes = reader.read_attitudes(paths, topics.attitude, setup.attitude)
-    by_time = operator.itemgetter(0)
-    velocities = (
-        sorted(reader.read_velocities(paths, topics.velocity), key=by_time)
-        if topics.velocity
-        else []
-    )
-    temperatures = (
-        sorted(reader.read_temperatures(paths, topics.temperature), key=by_time)
-        if topics.temperature
-        else []
-    )
+    named = FrameTopics(topics.image, topics.attitude, topics.velocity, topics.temperature)
+    camera = setup.prior.camera
     again: dict[int, StarObservations] = {}
-    for image in reader.read_images(paths, topics.image, setup.attitude.stamp_offset_s):
-        if isinstance(image, Image) and image.time_ns in wanted and image.time_ns not in again:
-            record, _ = observe.observe_next(
-                image,
-                attitudes,
-                setup,
-                observe.Track(geometry),
-                observe.latest_at(velocities, image.time_ns, None),
-                observe.latest_at(temperatures, image.time_ns, math.nan),
-            )
-            if not record.refusal:
-                again[image.time_ns] = record
+    for frame in read_frames(paths, named, setup.attitude, size=(camera.width, camera.height)):
+        if isinstance(frame, StarObservations) or frame.image.time_ns not in wanted - again.keys():
+            continue
+        record, _ = observe.observe_next(
+            frame.image,
+            frame.attitudes,
+            setup,
+            observe.Track(geometry),
+            frame.velocity_m_s,
+            frame.temperature_degc,
+        )
+        if not record.refusal:
+            again[frame.image.time_ns] = record
     return [
         again.get(record.time_ns, record) if record.refusal == 'no_match' else record
         for record in observations

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starcal_ros.bag import reader
 from starcal_ros.errors import BagError
@@ -17,10 +18,12 @@ from starcal_ros.messages.types import (
     TEMPERATURE_TYPE,
     VELOCITY_TYPE,
 )
-from starcal_ros.pipeline import observe
-from starcal_ros.pipeline.observe import OnImage, Wanted
-from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import StarObservations
+
+# A choice of topics needs no measurement, which is slow to import.
+if TYPE_CHECKING:
+    from starcal_ros.pipeline.observe import OnImage, Wanted
+    from starcal_ros.pipeline.setup import Setup
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,8 @@ def read(
     if topics.observations:
         recorded = reader.read_observations(paths, topics.observations)
         return (record for record in recorded if wanted is None or wanted(record.time_ns))
+    from starcal_ros.pipeline import observe
+
     return observe.observe_bag(
         paths,
         topics.image,

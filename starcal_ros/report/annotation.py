@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -52,33 +52,58 @@ STAR_MARKS: Mapping[str, Mark] = {
 _UNKNOWN = Mark(cv2.MARKER_STAR, _TEXT)  # a reason from another version
 
 
-def annotate(
-    image: Image, observations: StarObservations, geometry: CameraGeometry, legend: bool = True
-) -> Picture:
+def annotate(image: Image, observations: StarObservations, geometry: CameraGeometry) -> Picture:
     """
     Picture (height, width, 3) BGR of an image with its stars marked.
 
     Crosses mark the predicted and circles the measured positions of the used stars; refused stars
     carry the mark of their reason, which the legend lists with its count.  A banner names the
-    reason of a refused image.  ``geometry`` predicts the stars.  Without ``legend`` only marks are
-    drawn, for pictures that will be reduced.
+    reason of a refused image.  ``geometry`` predicts the stars.
     """
-    picture = np.asarray(cv2.cvtColor(stretch(image.pixels), cv2.COLOR_GRAY2BGR), np.uint8)
-    size = max(max(image.pixels.shape) / 1000.0, 0.6)  # smaller text is illegible
+    picture = _in_grey(image.pixels)
+    size = _mark_size(picture)
+    _draw_stars(picture, observations, geometry, 1.0)
+    top = _draw_banner(picture, observations, size)
+    _draw_legend(picture, observations, size, top)
+    return picture
+
+
+def annotate_reduced(
+    pixels: Pixels, observations: StarObservations, geometry: CameraGeometry
+) -> Picture:
+    """Picture of an image that was reduced to ``pixels``, with its stars marked, no legend."""
+    picture = _in_grey(pixels)
+    _draw_stars(picture, observations, geometry, pixels.shape[1] / observations.width)
+    return picture
+
+
+def _in_grey(pixels: Pixels) -> Picture:
+    return np.asarray(cv2.cvtColor(stretch(pixels), cv2.COLOR_GRAY2BGR), np.uint8)
+
+
+def _mark_size(picture: Picture) -> float:
+    return max(max(picture.shape) / 1000.0, 0.6)  # smaller text is illegible
+
+
+def _draw_stars(
+    picture: Picture, observations: StarObservations, geometry: CameraGeometry, scale: float
+) -> None:
+    """Mark all stars on a picture that is smaller than the image by ``scale``."""
+    size = _mark_size(picture)
     width = max(1, round(size))
+
+    def reduced(places_px: Floats | NDArray[np.float32]) -> Floats:
+        return np.asarray((places_px + 0.5) * scale - 0.5, np.float64)
+
     for reason, places in observations.refused_places().items():
-        for uv in places:
-            _draw_mark(picture, STAR_MARKS.get(reason, _UNKNOWN), _pixel(uv), size)
-    for uv in predicted_px(observations, geometry):
-        _draw_mark(picture, Mark(cv2.MARKER_CROSS, _PREDICTED), _pixel(uv), size)
-    for uv, snr in zip(observations.measured_px, observations.snr, strict=True):
+        for pixel in _pixels(reduced(places)):
+            _draw_mark(picture, STAR_MARKS.get(reason, _UNKNOWN), pixel, size)
+    for pixel in _pixels(reduced(predicted_px(observations, geometry))):
+        _draw_mark(picture, Mark(cv2.MARKER_CROSS, _PREDICTED), pixel, size)
+    for uv, snr in zip(reduced(observations.measured_px), observations.snr, strict=True):
         radius = (5 + 2 * np.log10(max(float(snr), 1.0))) * size
         center, radius = _fixed_point(uv), int(radius * (1 << _SHIFT))
         cv2.circle(picture, center, radius, _MEASURED, width, cv2.LINE_AA, _SHIFT)
-    if legend:
-        top = _draw_banner(picture, observations, size)
-        _draw_legend(picture, observations, size, top)
-    return picture
 
 
 def predicted_px(observations: StarObservations, geometry: CameraGeometry) -> Floats:
@@ -103,7 +128,7 @@ def stretch(pixels: Pixels) -> NDArray[np.uint8]:
     return np.asarray(table[pixels])
 
 
-def _draw_mark(picture: Picture, mark: Mark, place: tuple[int, int], size: float) -> None:
+def _draw_mark(picture: Picture, mark: Mark, place: Sequence[int], size: float) -> None:
     width, length = max(1, round(size)), max(3, round(mark.size * size))
     cv2.drawMarker(picture, place, mark.color, mark.shape, length, width)
 
@@ -178,10 +203,11 @@ def _write(
     )  # fmt: skip
 
 
-def _pixel(uv: NDArray[np.floating]) -> tuple[int, int]:
+def _pixels(places: Floats) -> list[list[int]]:
     # Predictions far outside the image would overflow OpenCV's integers.
-    u, v = np.clip(np.nan_to_num(uv, nan=-1e4), -1e4, 1e5)
-    return round(float(u)), round(float(v))
+    inside = np.clip(np.nan_to_num(places, nan=-1e4), -1e4, 1e5)
+    pixels: list[list[int]] = np.rint(inside).astype(int).tolist()
+    return pixels
 
 
 def _fixed_point(uv: Floats) -> tuple[int, int]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from markupsafe import Markup
@@ -11,8 +11,8 @@ import numpy as np
 
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.products.calibration_json import prior_of
-from starcal_ros.records import Calibration
-from starcal_ros.report import figures
+from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.report import detector_figures, figures
 
 
 @dataclass(frozen=True)
@@ -24,27 +24,38 @@ class Chart:
     text: str
 
 
-def charts_of(calibration: Calibration, residuals: Residuals | None) -> Mapping[str, Chart]:
+def charts_of(
+    calibration: Calibration,
+    residuals: Residuals | None,
+    observations: Sequence[StarObservations],
+) -> Mapping[str, Chart]:
     """Charts by their name in the template; charts without data are left out."""
     camera = calibration.geometry.camera
     charts = {
         'vectors': Chart(
             'Distortion vectors',
-            figures.distortion_vectors(camera),
+            detector_figures.distortion_vectors(camera),
             'Displacement of a star from its position with an ideal lens (dot). Arrows are '
-            'enlarged; the key gives their scale.',
+            'enlarged; the arrow above the figure is their scale.',
         ),
         'contours': Chart(
             'Distortion magnitude',
-            figures.distortion_contours(camera),
-            'Contours of the length of the distortion vectors, in pixels.',
+            detector_figures.distortion_contours(camera),
+            'Contours of the length of the distortion vectors; a longer one has a thicker line.',
         ),
     }
+    if camera.field is not None:
+        charts['lens_field'] = Chart(
+            'Residual field beside the lens model',
+            detector_figures.field_vectors(camera.field, camera),
+            'Displacement of a star from its place by the lens model, enlarged to the scale of '
+            'the arrow above the figure.',
+        )
     prior = prior_of(calibration)
     if prior is not None:
         charts['change'] = Chart(
             'Change relative to the prior',
-            figures.change_contours(prior, calibration.geometry),
+            detector_figures.change_contours(prior, calibration.geometry),
             'Change of the line of sight of each pixel relative to the prior, in pixels, with the '
             'common rotation removed.',
         )
@@ -52,7 +63,7 @@ def charts_of(calibration: Calibration, residuals: Residuals | None) -> Mapping[
         maps = calibration.maps
         charts['cells'] = Chart(
             'Stars per cell',
-            figures.cell_counts(maps, camera),
+            detector_figures.cell_counts(maps, camera),
             f'Used star observations in {maps.stars.size} equal cells: '
             f'{int(maps.stars.min())} to {int(maps.stars.max())} per cell, '
             f'{int((maps.stars == 0).sum())} cells empty.',
@@ -65,10 +76,9 @@ def charts_of(calibration: Calibration, residuals: Residuals | None) -> Mapping[
         ):  # fmt: skip
             charts[name] = Chart(
                 title,
-                figures.line_of_sight_sigma(sigma, camera, name),
+                detector_figures.line_of_sight_sigma(sigma, camera),
                 f'1-sigma of the line of sight of each pixel, {text}: '
-                f'{sigma.min():.3g}″ to {sigma.max():.3g}″. Each colour covers one eighth of the '
-                'detector.',
+                f'{sigma.min():.4g}″ to {sigma.max():.4g}″. The colours start at zero.',
             )
     if len(calibration.removals) > 1:
         insignificant = [r.removed for r in calibration.removals[1:] if r.negligible]
@@ -79,8 +89,25 @@ def charts_of(calibration: Calibration, residuals: Residuals | None) -> Mapping[
             'estimated again. Not significant (shaded): '
             f'{", ".join(insignificant) or "none"}.',
         )
+    sky, placed = detector_figures.pointings(observations, calibration.geometry)
+    if placed:
+        charts['sky'] = Chart(
+            'Pointings',
+            sky,
+            f'Footprints of {placed} images on the whole sky (ICRS, Hammer projection, right '
+            'ascension to the left).',
+        )
     if residuals is not None and residuals.used.any():
         charts.update(_residual_charts(calibration, residuals))
+        if prior is not None:
+            before = figures.before_and_after(residuals, observations, prior)
+            if before:
+                charts['before'] = Chart(
+                    'Residuals before and after',
+                    before,
+                    'Distance of the stars from their prediction: by the attitude that the star '
+                    'tracker reported and the prior, and after the calibration.',
+                )
     return charts
 
 
@@ -90,7 +117,7 @@ def _residual_charts(calibration: Calibration, residuals: Residuals) -> dict[str
     charts = {
         'coverage': Chart(
             'Star positions',
-            figures.star_coverage(residuals, camera),
+            detector_figures.star_coverage(residuals, camera),
             f'All {int(residuals.used.sum()):,} used star observations of all images.',
         ),
         'images': Chart(
@@ -101,9 +128,16 @@ def _residual_charts(calibration: Calibration, residuals: Residuals) -> dict[str
         ),
         'field': Chart(
             'Mean residuals over the detector',
-            figures.residual_field(residuals, camera),
-            'Mean residual of the stars in each cell, enlarged. A regular pattern indicates '
+            detector_figures.mean_residuals(residuals, camera),
+            'Mean residual of the stars in each cell, enlarged to the scale of the arrow above. A '
+            'regular pattern indicates '
             'distortion that the lens model does not describe; noise has no pattern.',
+        ),
+        'spectrum': Chart(
+            'Spectrum of the residuals',
+            figures.spectrum(residuals, camera),
+            'Waves that are left in the residuals over the detector. Amplitudes over the line of '
+            'independent noise indicate a pattern that neither lens model nor field describes.',
         ),
         'histogram': Chart(
             'Normalised residuals',
@@ -117,6 +151,8 @@ def _residual_charts(calibration: Calibration, residuals: Residuals) -> dict[str
             'Dots: single stars. Measured and expected noise agree where the two lines coincide.',
         ),
     }
+    if not charts['magnitude'].svg:
+        del charts['magnitude']  # no star has a magnitude
     colour = figures.residuals_against_colour(residuals)
     if colour:
         charts['colour'] = Chart(

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import jinja2
 from markupsafe import Markup
-import matplotlib
 import numpy as np
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
@@ -30,6 +29,7 @@ from starcal_ros.errors import ProductError
 from starcal_ros.messages.types import OBSERVATIONS_TYPE
 from starcal_ros.model_errors.temperature import summary as thermal_summary
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, prior_of, read_calibration
+from starcal_ros.products.camera_yaml import CAMERA_INFO_FILE
 from starcal_ros.products.files import OBSERVATIONS_FILE, REPORT_FILE, write_atomically
 from starcal_ros.products.not_calibrated import read_not_calibrated
 from starcal_ros.products.residuals_npz import read_residuals, RESIDUALS_FILE
@@ -40,24 +40,36 @@ from starcal_ros.records import (
     STAR_REFUSALS,
     StarObservations,
 )
-from starcal_ros.report import figures as report_figures
+from starcal_ros.report.annotation import STAR_MARKS
 from starcal_ros.report.charts import charts_of
 from starcal_ros.report.failure_page import write_failure_page
-from starcal_ros.report.thumbnails import read_thumbnails, Thumbnail, THUMBNAILS_FOLDER
+from starcal_ros.report.model_rows import model_rows
+from starcal_ros.report.thumbnails import (
+    read_thumbnails,
+    star_of,
+    Thumbnail,
+    THUMBNAILS_FOLDER,
+)
 from starcal_ros.untrusted import json_value
 
 _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200
+_PRODUCTS = (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, OBSERVATIONS_FILE)
 
 
 @dataclass(frozen=True)
 class Found:
-    """Contents of a folder; ``residuals`` and ``observations`` are None without a file."""
+    """
+    Contents of a folder; ``residuals`` and ``observations`` are None without a file.
+
+    ``files`` are the names of the products beside the report.
+    """
 
     calibration: Calibration
     residuals: Residuals | None
     observations: tuple[StarObservations, ...] | None
     thumbnails: tuple[Thumbnail, ...]
+    files: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -122,6 +134,7 @@ def read_folder(folder: Path) -> Found:
         read_residuals(residuals) if residuals.is_file() else None,
         recorded,
         read_thumbnails(folder / THUMBNAILS_FOLDER),
+        tuple(name for name in _PRODUCTS if (folder / name).is_file()),
     )
 
 
@@ -134,8 +147,7 @@ def render(found: Found) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    with matplotlib.rc_context(report_figures.STYLE):
-        return environment.get_template('report.html').render(_context(found))
+    return environment.get_template('report.html').render(_context(found))
 
 
 def _context(found: Found) -> Mapping[str, object]:
@@ -149,11 +161,14 @@ def _context(found: Found) -> Mapping[str, object]:
         'alignment': _alignment_rows(calibration, prior),
         'tiles': _tiles(calibration),
         'thermal': thermal_summary(calibration.temperature) if calibration.temperature else '',
-        'charts': charts_of(calibration, residuals),
+        'charts': charts_of(calibration, residuals, found.observations or ()),
         'correlation': calibration.correlation,
         'slider': _slider(calibration, residuals),
         'refused_images': _refused_images(found),
         'refused_stars': _refused_stars(found),
+        'model_rows': model_rows(calibration),
+        'star_marks': _star_marks(found),
+        'files': found.files,
         'has_images': any(not thumbnail.reason for thumbnail in found.thumbnails),
         'used_images': _used_images(found),
         'provenance': _provenance(calibration),
@@ -327,21 +342,45 @@ def _refused_images(found: Found) -> list[Mapping[str, object]]:
     return groups
 
 
-def _refused_stars(found: Found) -> list[Mapping[str, object]]:
+def _counts(found: Found) -> Mapping[str, int]:
+    """Refused stars of all images by reason."""
     counts: dict[str, int] = {}
     for observed in found.observations or ():
         for reason, count in observed.refused_stars.items():
             counts[reason] = counts.get(reason, 0) + count
+    return counts
+
+
+def _star_marks(found: Found) -> list[tuple[str, str]]:
+    """Colour and reason of the marks of refused stars in the pictures."""
+    return [
+        ('#{:02x}{:02x}{:02x}'.format(*reversed(STAR_MARKS[reason].color)), reason)
+        for reason, count in _counts(found).items()
+        if count and reason in STAR_MARKS
+    ]
+
+
+def _cut_outs(found: Found, reason: str) -> list[tuple[Markup, str, str]]:
+    """Pictures of stars refused for a reason, with the stamp and the catalog number of each."""
+    by_time = {o.time_ns: o for o in found.observations or ()}
+    cut_outs = []
+    for one in found.thumbnails:
+        if one.reason == reason:
+            number = star_of(one, by_time[one.time_ns]) if one.time_ns in by_time else None
+            label = '' if number is None else str(number)
+            cut_outs.append((_picture(one), utc_text(one.time_ns), label))
+    return cut_outs
+
+
+def _refused_stars(found: Found) -> list[Mapping[str, object]]:
     return [
         {
             'reason': reason,
             'meaning': STAR_REFUSALS.get(reason, ''),
             'count': count,
-            'pictures': [
-                (_picture(t), utc_text(t.time_ns)) for t in found.thumbnails if t.reason == reason
-            ],
+            'pictures': _cut_outs(found, reason),
         }
-        for reason, count in sorted(counts.items(), key=lambda item: -item[1])
+        for reason, count in sorted(_counts(found).items(), key=lambda item: -item[1])
         if count
     ]
 

@@ -17,7 +17,7 @@ from starcal_ros.arrays import Pixels
 from starcal_ros.errors import ProductError
 from starcal_ros.products.files import write_atomically
 from starcal_ros.records import CameraGeometry, Image, StarObservations
-from starcal_ros.report.annotation import annotate, stretch
+from starcal_ros.report.annotation import annotate_reduced, stretch
 from starcal_ros.untrusted import read_bytes
 
 THUMBNAILS_FOLDER = 'thumbnails'
@@ -52,29 +52,50 @@ class Thumbnail:
         return f'image_{self.time_ns}.jpg'
 
 
+@dataclass(frozen=True)
+class _Reduced:
+    """An image reduced to the width of a thumbnail, to be drawn if it is shown in the end."""
+
+    pixels: Pixels
+    observations: StarObservations
+    geometry: CameraGeometry
+
+    def drawn(self) -> Thumbnail:
+        """Thumbnail with the stars marked."""
+        picture = annotate_reduced(self.pixels, self.observations, self.geometry)
+        _, encoded = cv2.imencode('.jpg', picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
+        return Thumbnail(self.observations.time_ns, '', 0, encoded.tobytes())
+
+
 @dataclass
 class Album:
     """
-    Selects thumbnails from a stream of images of unknown length.
+    Selects thumbnails from a stream of images.
 
     Keeps some used images, evenly spread, and the first images and stars of each refusal reason.
+    ``expected`` images, if known, are spread from the start; more or fewer may come.
     """
 
-    used: list[Thumbnail] = field(default_factory=list)
-    refused: dict[str, list[Thumbnail]] = field(default_factory=dict)
+    expected: int = 0
+    used: list[_Reduced] = field(default_factory=list)
+    refused: dict[str, list[_Reduced]] = field(default_factory=dict)
     stars: dict[str, list[Thumbnail]] = field(default_factory=dict)
     _stride: int = 1
     _seen: int = 0
+
+    def __post_init__(self) -> None:
+        """Reduce no image that is not likely to be kept."""
+        self._stride = max(1, -(-self.expected // (2 * _USED - 1)))
 
     def show(self, image: Image, observations: StarObservations, geometry: CameraGeometry) -> None:
         """Add an image, its observations and the geometry that predicted its stars."""
         if observations.refusal:
             of_reason = self.refused.setdefault(observations.refusal, [])
             if len(of_reason) < _REFUSED_OF_A_REASON:
-                of_reason.append(_whole(image, observations, geometry))
+                of_reason.append(_Reduced(_reduced(image.pixels), observations, geometry))
         else:
             if self._seen % self._stride == 0:
-                self.used.append(_whole(image, observations, geometry))
+                self.used.append(_Reduced(_reduced(image.pixels), observations, geometry))
                 if len(self.used) == 2 * _USED:
                     self.used, self._stride = self.used[::2], 2 * self._stride
             self._seen += 1
@@ -91,8 +112,17 @@ class Album:
 
     def thumbnails(self) -> tuple[Thumbnail, ...]:
         """All selected thumbnails."""
-        groups = [self.used, *self.refused.values(), *self.stars.values()]
-        return tuple(thumbnail for group in groups for thumbnail in group)
+        whole = [*self.used, *(one for group in self.refused.values() for one in group)]
+        stars = [one for group in self.stars.values() for one in group]
+        return (*(one.drawn() for one in whole), *stars)
+
+
+def star_of(thumbnail: Thumbnail, observations: StarObservations) -> int | None:
+    """Catalog number of the refused star of a thumbnail; None if the image has none such."""
+    codes = {name: code for code, name in enumerate(observations.refused_stars)}
+    of_reason = observations.refused_reason == codes.get(thumbnail.reason, -1)
+    numbers = observations.refused_catalog_id[of_reason]
+    return int(numbers[thumbnail.number % len(numbers)]) if len(numbers) else None
 
 
 def write_thumbnails(thumbnails: Iterable[Thumbnail], folder: Path) -> None:
@@ -141,14 +171,15 @@ def read_thumbnails(folder: Path) -> tuple[Thumbnail, ...]:
     return tuple(sorted(found, key=lambda t: (t.time_ns, t.reason, t.number)))
 
 
-def _whole(image: Image, observations: StarObservations, geometry: CameraGeometry) -> Thumbnail:
-    picture = annotate(image, observations, geometry, legend=False)
-    height, width = picture.shape[:2]
-    if width > _WIDTH_PX:
-        size = (_WIDTH_PX, max(1, round(height * _WIDTH_PX / width)))
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-    _, encoded = cv2.imencode('.jpg', picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
-    return Thumbnail(image.time_ns, '', 0, encoded.tobytes())
+def _reduced(pixels: Pixels) -> Pixels:
+    """Pixels at the width of a thumbnail, or all of a smaller image."""
+    height, width = pixels.shape
+    if width <= _WIDTH_PX:
+        return pixels.copy()
+    size = (_WIDTH_PX, max(1, round(height * _WIDTH_PX / width)))
+    # OpenCV's type stubs lack integer images.
+    reduced = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    return reduced  # type: ignore[return-value]
 
 
 def _cut_out(pixels: Pixels, place_px: NDArray[np.float32]) -> bytes:

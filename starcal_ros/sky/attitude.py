@@ -10,7 +10,6 @@ import math
 import threading
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
@@ -144,11 +143,26 @@ class AttitudeHistory:
         ImageRefused
             ``no_attitude``, ``bad_attitude`` or ``attitude_gap``.
         """
+        before, after = self.around(time_ns, max_gap_s)
+        if before is after:
+            return before.icrf_from_star_tracker_xyzw, 0.0
+        gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
+        return _between(before, after, time_ns), gap_s
+
+    def around(self, time_ns: int, max_gap_s: float) -> tuple[AttitudeSample, AttitudeSample]:
+        """
+        The samples that `at` interpolates between; twice the same one if it has this stamp.
+
+        Raises
+        ------
+        ImageRefused
+            ``no_attitude``, ``bad_attitude`` or ``attitude_gap``.
+        """
         refusals = []
         with self._lock:
             for run in reversed(self._runs):
                 try:
-                    return run.at(time_ns, max_gap_s)
+                    return run.around(time_ns, max_gap_s)
                 except ImageRefused as refused:
                     refusals.append(refused)
         if not refusals:
@@ -209,12 +223,13 @@ class _Run:
         """Mask of the valid samples in a range of indices."""
         return np.asarray(np.isfinite(self._xyzw[4 * low : 4 * high : 4]))
 
-    def at(self, time_ns: int, max_gap_s: float) -> tuple[Floats, float]:
-        """See `AttitudeHistory.at`."""
+    def around(self, time_ns: int, max_gap_s: float) -> tuple[AttitudeSample, AttitudeSample]:
+        """See `AttitudeHistory.around`."""
         k, end = self._index(time_ns), len(self._times_ns)
         if k < end and self._times_ns[k] == time_ns:
             if self._valid(k, k + 1).all():
-                return np.array(self._xyzw[4 * k : 4 * k + 4]), 0.0
+                sample = self._sample(k)
+                return sample, sample
             raise ImageRefused('bad_attitude', 'the sample at the image is no unit quaternion')
         reach_ns = _nanoseconds(max_gap_s)
         low, high = self._index(time_ns - reach_ns), self._index(time_ns + reach_ns + 1)
@@ -223,7 +238,7 @@ class _Run:
             i, j = low + int(before[-1]), k + int(after[0])
             gap_s = (self._times_ns[j] - self._times_ns[i]) / NANOSECONDS_PER_SECOND
             if gap_s <= max_gap_s:
-                return self._between(i, j, time_ns), gap_s
+                return self._sample(i), self._sample(j)
         about = self._valid(max(k - 1, self._start), min(k + 1, end))
         if len(about) and not about.all():
             raise ImageRefused('bad_attitude', 'the samples next to the image are invalid')
@@ -233,10 +248,16 @@ class _Run:
         gap_s = (self._times_ns[k] - self._times_ns[k - 1]) / NANOSECONDS_PER_SECOND
         raise ImageRefused('attitude_gap', f'{gap_s:.3f} s between samples, over {max_gap_s:g} s')
 
-    def _between(self, i: int, j: int, time_ns: int) -> Floats:
-        """Attitude (4,) at a time between two samples."""
-        ends = np.array([self._xyzw[4 * i : 4 * i + 4], self._xyzw[4 * j : 4 * j + 4]])
-        # Relative times: seconds since 1970 have a resolution of 0.1 us in double precision.
-        gap_s = (self._times_ns[j] - self._times_ns[i]) / NANOSECONDS_PER_SECOND
-        since_s = (time_ns - self._times_ns[i]) / NANOSECONDS_PER_SECOND
-        return np.asarray(Slerp([0.0, gap_s], Rotation.from_quat(ends))(since_s).as_quat())
+    def _sample(self, k: int) -> AttitudeSample:
+        return AttitudeSample(self._times_ns[k], np.array(self._xyzw[4 * k : 4 * k + 4]))
+
+
+def _between(before: AttitudeSample, after: AttitudeSample, time_ns: int) -> Floats:
+    """Attitude (4,) at a time between two samples."""
+    from scipy.spatial.transform import Rotation, Slerp  # half of the start of a short command
+
+    ends = np.array([before.icrf_from_star_tracker_xyzw, after.icrf_from_star_tracker_xyzw])
+    # Relative times: seconds since 1970 have a resolution of 0.1 us in double precision.
+    gap_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
+    since_s = (time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
+    return np.asarray(Slerp([0.0, gap_s], Rotation.from_quat(ends))(since_s).as_quat())

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from starcal_ros.camera import PARAMETER_NAMES
-from starcal_ros.report.term_removal_figure import plot_curves, plot_removed
 from starcal_ros.studies.monte_carlo import ENOUGH, Row, SAME_SIGMAS, UNUSED_IMAGES
 from starcal_ros.studies.summary import column, StudyResult
+from starcal_ros.studies.term_removal_figure import plot_curves, plot_removed
 from starcal_ros.studies.trials import ESTIMATED
 
 # Colour-blind-safe colours (Okabe and Ito), marker, and width that keeps coinciding lines visible.

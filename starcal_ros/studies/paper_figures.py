@@ -12,8 +12,8 @@ import numpy as np
 from scipy.stats import norm
 
 from starcal_ros.camera import CameraModel, distortion_px, PARAMETER_NAMES, pixel_grid
-from starcal_ros.report.term_removal_figure import curves_of, plot_curves, plot_removed
 from starcal_ros.studies.paper import CALIBRATED_WITH, PaperStudy
+from starcal_ros.studies.term_removal_figure import curves_of, plot_curves, plot_removed
 
 _BLUE, _RED = '#0b62a8', '#c4501b'
 
@@ -56,12 +56,18 @@ def _distortion(found: PaperStudy) -> Figure:
     left, right = figure.subplots(1, 2)
     camera = found.camera
     coarse = pixel_grid(camera, 20, 16)
-    left.quiver(*coarse.T, *distortion_px(camera, coarse).T, angles='xy', color=_BLUE, width=0.003)
-    left.set_title('distortion vectors, not to scale')
+    vectors_px = distortion_px(camera, coarse)
+    arrows = left.quiver(*coarse.T, *vectors_px.T, angles='xy', color=_BLUE, width=0.003)
+    scale_px = float(f'{np.hypot(*vectors_px.T).max() / 2:.0e}')
+    left.quiverkey(
+        arrows, 0.93, 1.04, scale_px, f'{scale_px:g} px', labelpos='W', color=_RED, labelcolor='k'
+    )
+    left.set_title('distortion vectors, enlarged', loc='left')
     grid = pixel_grid(camera, 60, 48)
     u, v, length = (a.reshape(48, 60) for a in (*grid.T, np.hypot(*distortion_px(camera, grid).T)))
     lines = right.contour(u, v, length, levels=8, cmap='viridis')
-    right.clabel(lines, fmt='%g')
+    for label in right.clabel(lines, fmt='%g'):
+        label.set(clip_on=False, bbox={'color': 'w', 'pad': 0.5})
     right.set_title('distortion magnitude (px)')
     for axes in (left, right):
         _detector(axes, camera)
@@ -88,8 +94,10 @@ def _residuals(found: PaperStudy) -> Figure:
     histogram.plot(x, norm.pdf(x, scale=std), 'k--', linewidth=1, label='normal distribution')
     images.set(xlabel='image', ylabel='standard deviation (px)', ylim=(0, 1.3 * spread.max()))
     histogram.set(xlabel='residual (px)', ylabel='density', xlim=(-1, 1))
-    field.hist2d(*judged.residual_px[judged.fits].T, bins=np.linspace(-0.6, 0.6, 81).tolist(),
-                 cmap='Blues')  # fmt: skip
+    field.hist2d(
+        *judged.residual_px[judged.fits].T, bins=np.linspace(-3.5 * std, 3.5 * std, 71).tolist(),
+        cmap='Blues',
+    )  # fmt: skip
     field.set(xlabel='residual of u (px)', ylabel='residual of v (px)', aspect='equal')
     number = [float(row['images']) for row in found.counts]
     for name, colour, words in (

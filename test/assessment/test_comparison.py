@@ -20,7 +20,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.products.calibration_json import read_calibration, write_calibration
 from starcal_ros.records import Calibration
-from starcal_ros.report import figures
+from starcal_ros.report.comparison_figure import write_comparison
 
 
 @pytest.fixture(scope='module')
@@ -165,17 +165,17 @@ def test_cameras_of_other_sizes_are_refused(tiny: Calibration) -> None:
 
 
 def test_the_figure_is_drawn(tiny: Calibration, tmp_path: Path) -> None:
-    figures.write_comparison(compare(tiny, tiny), tmp_path / 'same.png')  # and no warning
+    write_comparison(compare(tiny, tiny), tmp_path / 'same.png')  # and no warning
     found = compare(tiny, moved(tiny, fx=1.0))
-    figures.write_comparison(found, tmp_path / 'a.png')
+    write_comparison(found, tmp_path / 'a.png')
     picture = cv2.imread(str(tmp_path / 'a.png'))
     assert picture is not None and np.ptp(picture) > 200
-    figures.write_comparison(found, tmp_path / 'a.svg')
+    write_comparison(found, tmp_path / 'a.svg')
     assert '<svg' in (tmp_path / 'a.svg').read_text()
     with pytest.raises(OptionError, match='a.jpg'):
-        figures.write_comparison(found, tmp_path / 'a.jpg')
+        write_comparison(found, tmp_path / 'a.jpg')
     with pytest.raises(ProductError, match='cannot be written'):
-        figures.write_comparison(found, tmp_path / 'none' / 'a.png')
+        write_comparison(found, tmp_path / 'none' / 'a.png')
 
 
 def test_the_tool_compares(

@@ -22,6 +22,8 @@ import yaml
 
 from starcal_ros.bag import reader as bag_reader
 from starcal_ros.bag import writer as writer_module
+from starcal_ros.bag.frames import FrameTopics, read_telemetry
+from starcal_ros.bag.mcap_reader import Damage
 from starcal_ros.bag.typestore import make_message, typestore
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.errors import BagError, ImageRefused
@@ -29,7 +31,7 @@ from starcal_ros.messages.fields import stamp_ns
 from starcal_ros.messages.images import color_image_to_message, image_to_message
 from starcal_ros.messages.types import ATTITUDE_TYPE, CALIBRATION_TYPE, IMAGE_TYPE
 from starcal_ros.records import Image, refused_image, StarObservations
-from starcal_ros.sky.attitude import AttitudeOptions
+from starcal_ros.sky.attitude import AttitudeHistory
 
 SHARED = Path(__file__).parents[3] / 'shared'  # inputs from elsewhere, not part of the tree
 START_NS = 1_700_000_000_000_000_000
@@ -65,6 +67,11 @@ def images_of(path: Path, **options: Any) -> list[Image | StarObservations]:
     return list(bag_reader.read_images([path], '/image', **options))
 
 
+def attitudes_of(path: Path, on_damage: Damage, topic: str = '/attitude') -> AttitudeHistory:
+    """All attitudes of a bag."""
+    return read_telemetry([path], FrameTopics('', topic), on_damage=on_damage).attitudes
+
+
 @pytest.mark.parametrize('compression', ['zstd', 'lz4', ''])
 @pytest.mark.parametrize('name', ['b', 'b.mcap'])
 def test_round_trip(tmp_path: Path, compression: str, name: str) -> None:
@@ -78,17 +85,18 @@ def test_round_trip(tmp_path: Path, compression: str, name: str) -> None:
         assert isinstance(image, Image)
         assert image.time_ns == START_NS + k * SECOND_NS
         np.testing.assert_array_equal(image.pixels, random.integers(0, 4096, (600, 602)))
-    attitudes = bag_reader.read_attitudes([path], '/attitude')
+    telemetry = read_telemetry([path], FrameTopics('', '/attitude', '/velocity', '/temperature'))
+    attitudes = telemetry.attitudes
     assert len(attitudes) == 12
     xyzw, gap_s = attitudes.at(START_NS + SECOND_NS, max_gap_s=1.0)
     np.testing.assert_allclose(xyzw, [0, np.sin(1 / 9), 0, np.cos(1 / 9)], atol=1e-15)
     assert gap_s == pytest.approx(2e-7)
     details = [record.detail for record in bag_reader.read_observations([path], '/observations')]
     assert details == list('012345')
-    velocities = list(bag_reader.read_velocities([path], '/velocity'))
+    velocities = telemetry.velocities
     assert velocities[5][0] == START_NS + 5 * SECOND_NS
     np.testing.assert_array_equal(velocities[5][1], [5.0, 2.0, 3e4])
-    temperatures = list(bag_reader.read_temperatures([path], '/temperature'))
+    temperatures = telemetry.temperatures
     assert temperatures[5] == (START_NS + 5 * SECOND_NS, 15.0)
 
 
@@ -226,7 +234,7 @@ def test_invalid_attitude_sample(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'b') as writer:
         for k, w in enumerate([1.0, np.nan, 1.0]):
             writer.write_attitude('/attitude', k, np.array([0, 0, 0, w]), 'icrf')
-    history = bag_reader.read_attitudes([tmp_path / 'b'], '/attitude', AttitudeOptions())
+    history = attitudes_of(tmp_path / 'b', print)
     with pytest.raises(ImageRefused, match='bad_attitude'):
         history.at(1, max_gap_s=1.0)
 
@@ -302,7 +310,7 @@ def test_a_flipped_bit_loses_one_chunk_only(tmp_path: Path, small_chunks: Path) 
         damaged[first.chunk_start_offset + offset] ^= 4
         file.write_bytes(damaged)
         said: list[str] = []
-        assert len(bag_reader.read_attitudes([file], '/attitude', on_damage=said.append)) == 15
+        assert len(attitudes_of(file, said.append)) == 15
         assert said[-1].endswith('lost 1 of 16 on /attitude')
         assert len(images_of(file, on_damage=said.append)) == 8
         assert bag_reader.choose_topic([file], ATTITUDE_TYPE) == '/attitude'
@@ -428,7 +436,5 @@ def test_bags_of_others(name: str, images: int, shape: tuple[int, int], dtype: A
         assert isinstance(image, Image)
         assert (image.pixels.shape, image.pixels.dtype) == (shape, dtype)
     attitude_topic = bag_reader.choose_topic([path], ATTITUDE_TYPE)
-    assert (
-        len(bag_reader.read_attitudes([path], attitude_topic, on_damage=said.append)) == 2 * images
-    )
+    assert len(attitudes_of(path, said.append, attitude_topic)) == 2 * images
     assert not said

@@ -1,3 +1,4 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Definitions of messages in bags: bounded before code is made from them."""
 
 from __future__ import annotations

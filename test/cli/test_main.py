@@ -133,6 +133,8 @@ def test_help_is_there_at_once() -> None:
         (['play', str(TINY), '--rate', '-1'], ['--rate', '-1']),
         (['play', str(TINY), '--rate', 'nan'], ['--rate', 'nan']),
         (['play', str(TINY), '--remap', 'image'], ['--remap', "'image'"]),
+        (['monitor'], ['--once', 'not a terminal']),
+        (['monitor', '--once', 'nan'], ['--once', 'nan']),
     ],
 )
 def test_bad_arguments(
@@ -481,6 +483,25 @@ def test_play_becomes_the_player(run: Run, monkeypatch: pytest.MonkeyPatch) -> N
     assert command[: len(start)] == start
     assert f'bag:={TINY.resolve()}' in command and 'rate:=2.0' in command
     assert command[-4:] == ['-r', 'a:=b', '-r', 'c:=d']
+
+
+def test_no_report_is_written_where_none_is_wanted(
+    run: Run, tmp_path: Path, tiny_bag: Path, tiny_products: Path
+) -> None:
+    (tmp_path / 'report.html').write_text('of earlier products')
+    bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
+    status, out, _ = run('calibrate', bag, '--params', params, '-o', tmp_path, '--no-report')
+    assert status == 0 and out.endswith(f'products written to {tmp_path}\n')
+    assert (tmp_path / 'calibration.json').is_file()
+    assert not (tmp_path / 'report.html').exists()
+
+
+def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[list[str]] = []
+    monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
+    run('monitor', '--once', '2.5', '--remap', '__ns:=/cam1')
+    module = [sys.executable, '-m', 'starcal_ros.nodes.monitor']
+    assert called == [[*module, '--once', '2.5', '--ros-args', '-r', '__ns:=/cam1']]
 
 
 def test_parameters_of_the_nodes_are_known_to_the_tool(

@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
+import numpy as np
 import pytest
 from sample_records import plain, status, TIME_NS  # type: ignore[import-not-found]
 
 from starcal_ros.bag.typestore import make_message
 from starcal_ros.messages.fields import stamp_ns
-from starcal_ros.messages.status import status_to_message
+from starcal_ros.messages.status import status_from_message, status_to_message
+from starcal_ros.records import EnsembleStatus
 
 
 @pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
@@ -25,3 +28,11 @@ def test_a_status_has_every_number(make: Any) -> None:
     assert message.coverage.tolist() == record.coverage.ravel().tolist()
     assert tuple(message.parameter_names) == record.parameter_names
     assert message.predicted_sigma.tolist() == record.predicted_sigma.tolist()
+
+
+@pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
+def test_a_status_comes_back(make: Any) -> None:
+    record = status()
+    back = status_from_message(status_to_message(record, 'cam', make))
+    for field in dataclasses.fields(EnsembleStatus):
+        np.testing.assert_array_equal(getattr(back, field.name), getattr(record, field.name))

@@ -13,17 +13,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_campaign import attitudes, image, SCENARIO, TRUTH, values, write_png  # type: ignore[import-not-found]
 
+from starcal_ros.bag.frames import FrameTopics, read_telemetry
+from starcal_ros.bag.reader import read_images
 from starcal_ros.camera import project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, Image
+from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, Image, StarObservations
+from starcal_ros.simulation.bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.simulation.images import render, star_electrons
 from starcal_ros.simulation.scenario import attitude_samples, Inertial, scene
 from starcal_ros.sky.astrometry import through_the_air
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
 
 S = 1_000_000_000
+TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 
 
 @pytest.fixture(scope='module')
@@ -222,11 +226,23 @@ def test_a_star_tracker_that_jumped_and_came_back(setup: Setup, jump_deg: float)
     assert left.magnitude() < 200 * ARCSECOND_RAD
 
 
-def test_the_last_sample_at_or_before_an_image_counts() -> None:
-    samples = [(10, 'a'), (20, 'b'), (30, 'c')]
-    for time_ns, sample in ((5, 'a'), (10, 'a'), (29, 'b'), (30, 'c'), (99, 'c')):
-        assert observe.latest_at(samples, time_ns, 'none') == sample
-    assert observe.latest_at([], 5, 'none') == 'none'
+def test_a_bag_read_once_gives_what_two_passes_give(camera_yaml: Path) -> None:
+    """The tiny bag, all telemetry read before the first image, to the last bit."""
+    setup = load_setup(values(camera_yaml))
+    found = list(observe.observe_bag([TINY], IMAGE_TOPIC, ATTITUDE_TOPIC, setup))
+    held = read_telemetry([TINY], FrameTopics('', ATTITUDE_TOPIC), setup.attitude).attitudes
+    track, expected = observe.Track(setup.prior), []
+    for one in read_images([TINY], IMAGE_TOPIC):
+        assert isinstance(one, Image)
+        observations, track = observe.observe_next(one, held, setup, track)
+        expected.append(observations)
+    assert len(found) == 10
+    for one_pass, two_passes in zip(found, expected, strict=True):
+        assert not one_pass.refusal
+        for field in dataclasses.fields(StarObservations):
+            np.testing.assert_array_equal(
+                getattr(one_pass, field.name), getattr(two_passes, field.name), field.name
+            )
 
 
 def test_a_dark_frame_takes_a_pattern_away(camera_yaml: Path, tmp_path: Path) -> None:

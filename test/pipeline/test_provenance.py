@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from tiny_campaign import ensemble, values  # type: ignore[import-not-found]
 from starcal_ros.messages.observations import observations_from_message, observations_to_message
 from starcal_ros.options import names_of
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.provenance import provenance_of
+from starcal_ros.pipeline.provenance import inputs_of, provenance_of
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, Setup
 from starcal_ros.records import Ensemble, StarObservations
 
@@ -73,3 +74,13 @@ def test_recorded_observations_have_the_digest_of_the_images(setup: Setup) -> No
         observations_from_message(observations_to_message(one, 'camera', plain)) for one in images
     ]
     assert digest_of(sent, setup) == digest_of(images, setup)
+
+
+def test_digests_can_be_stopped(tmp_path: Path) -> None:
+    """A file of three blocks, stopped after the first."""
+    file = tmp_path / 'bag'
+    file.write_bytes(bytes(3 << 20))
+    asked = iter([False, True])
+    stopped = inputs_of([file], lambda: next(asked))
+    assert stopped[str(file)] == f'sha256:{hashlib.sha256(bytes(1 << 20)).hexdigest()}'
+    assert inputs_of([file])[str(file)] == f'sha256:{hashlib.sha256(bytes(3 << 20)).hexdigest()}'

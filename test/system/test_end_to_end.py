@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 import yaml
 
 from starcal_ros.assessment import agreement
-from starcal_ros.bag.reader import read_attitudes, read_images
+from starcal_ros.bag.frames import FrameTopics, read_telemetry
+from starcal_ros.bag.reader import read_images
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project
 from starcal_ros.cli import demo, main
 from starcal_ros.constants import ARCSECOND_RAD
@@ -178,7 +179,7 @@ def test_bright_stars_of_the_bag_stand_where_truth_and_attitude_say() -> None:
     fx, skew, fy, cx, cy = truth['k_true']
     k1, k2, k3, p1, p2 = truth['d_true']
     made = synthetic.scenario('tiny', truth['seed'])
-    attitudes = read_attitudes([TINY], simulated_bag.ATTITUDE_TOPIC)
+    attitudes = read_telemetry([TINY], FrameTopics('', simulated_bag.ATTITUDE_TOPIC)).attitudes
     for index, image in enumerate(read_images([TINY], simulated_bag.IMAGE_TOPIC)):
         assert isinstance(image, Image)
         shown = synthetic.scene(made, index)

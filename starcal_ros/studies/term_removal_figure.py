@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Plots of the removal of camera parameters (paper, Fig. 8), for the report and for studies."""
+"""Plots of the removal of camera parameters (paper, Fig. 8) for studies."""
 
 from __future__ import annotations
 

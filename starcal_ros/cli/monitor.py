@@ -1,0 +1,203 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""View of running nodes for a terminal: images, refusals, forecast sigmas, gate, health."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+import dataclasses
+from dataclasses import dataclass, field
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Group
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from starcal_ros.arrays import Floats
+from starcal_ros.constants import ARCSECOND_RAD, utc_text
+from starcal_ros.records import Calibration, EnsembleStatus, GateCheck, StarObservations
+
+_HEALTH = {0: ('ok', 'green'), 1: ('warning', 'yellow'), 2: ('error', 'bold red')}
+_STALE = ('stale', 'yellow')
+_SHADES = ' ░▒▓█'
+_TIGHTEST = 6  # gate checks shown of a calibration that passed
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What has been received; None or empty where nothing has been."""
+
+    images: int = 0
+    refused: Mapping[str, int] = field(default_factory=dict)
+    last: StarObservations | None = None
+    status: EnsembleStatus | None = None
+    active: Calibration | None = None
+    candidate: Calibration | None = None
+    health: Mapping[str, tuple[int, str]] = field(default_factory=dict)
+
+    def with_image(self, observations: StarObservations) -> Seen:
+        """The same with one more image."""
+        refused = Counter(self.refused)
+        if observations.refusal:
+            refused[observations.refusal] += 1
+        return dataclasses.replace(
+            self, images=self.images + 1, refused=dict(refused), last=observations
+        )
+
+
+def view(seen: Seen) -> Group:
+    """All panels below each other; they fit in 80 columns."""
+    return Group(
+        Panel(_images(seen), title='images', title_align='left'),
+        Panel(_ensemble(seen), title='ensemble', title_align='left'),
+        Panel(_calibration(seen), title='calibration', title_align='left'),
+        Panel(_health(seen.health), title='nodes', title_align='left'),
+    )
+
+
+def _images(seen: Seen) -> Text:
+    text = Text()
+    if seen.last is None:
+        return text.append('no image since the start of this view', 'dim')
+    refused = sum(seen.refused.values())
+    text.append(f'{seen.images} since the start of this view, {seen.images - refused} used\n')
+    for reason, count in sorted(seen.refused.items(), key=lambda item: -item[1]):
+        text.append(f'  {count} refused: {reason.replace("_", " ")}\n', 'yellow')
+    last = seen.last
+    text.append(f'last {utc_text(last.time_ns)}: ')
+    if last.refusal:
+        text.append(f'refused, {last.refusal.replace("_", " ")}: {last.detail}', 'yellow')
+    else:
+        text.append(f'{len(last)} stars', 'green')
+    return text
+
+
+def _ensemble(seen: Seen) -> Group | Text:
+    status = seen.status
+    if status is None:
+        return Text('no status received from a calibrator', 'dim')
+    head = Text()
+    for there, needed, what in (
+        (status.images, status.min_images, 'images'),
+        (status.stars, status.min_stars, 'stars'),
+    ):
+        style = 'green' if there >= needed else 'yellow'
+        head.append(f'{there} of at least {needed} {what}', style).append('   ')
+    head.append(f'{status.images_saved} images on disk')
+    sigmas = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for name, justify in (('1-sigma of', 'left'), ('calibrated now', 'right'),
+                          ('active', 'right')):  # fmt: skip
+        sigmas.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    active = _sigmas(seen.active)
+    for name, sigma in zip(status.parameter_names, status.predicted_sigma, strict=True):
+        before = active.get(name)
+        style = 'green' if before is not None and sigma < before else ''
+        sigmas.add_row(
+            Text(name),
+            Text(_sigma_text(name, float(sigma)), style),
+            Text('' if before is None else _sigma_text(name, before)),
+        )
+    grid = Table.grid(padding=(0, 3))
+    grid.add_row(sigmas, coverage_text(status.coverage))
+    return Group(head, grid)
+
+
+def coverage_text(coverage: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Text:
+    """The detector as shades, two letters for a cell; empty cells in red."""
+    most = max(int(coverage.max(initial=0)), 1)
+    text = Text(f'most in a cell: {most}\n')
+    for row in coverage:
+        for count in row:
+            if count == 0:
+                text.append('··', 'red')
+            else:
+                text.append(2 * _SHADES[1 + int(3 * count // most)], 'cyan')
+        text.append('\n')
+    return text
+
+
+def _sigmas(calibration: Calibration | None) -> dict[str, float]:
+    if calibration is None:
+        return {}
+    sigma: Floats = calibration.sigma
+    return dict(zip(calibration.parameter_names, sigma.tolist(), strict=True))
+
+
+def _sigma_text(name: str, sigma: float) -> str:
+    if not np.isfinite(sigma):
+        return 'unobservable'
+    if name.startswith('alignment'):
+        return f'{sigma / ARCSECOND_RAD:.2f} arcsec'
+    return f'{sigma:.2g}'
+
+
+def _calibration(seen: Seen) -> Group | Text:
+    parts: list[Text | Table] = []
+    if seen.active is None:
+        parts.append(Text('none active: the prior is in use', 'dim'))
+    else:
+        active = seen.active
+        style = 'green' if active.accepted else 'bold red'
+        words = 'accepted by the gate' if active.accepted else 'activated against the gate'
+        parts.append(
+            Text(
+                f'active: number {active.number}, {words}, since'
+                f' {utc_text(active.active_since_ns)}, {active.images_used} images,'
+                f' residual {active.residual_rms_px:.3f} px',
+                style,
+            )
+        )
+    last = seen.candidate or seen.active
+    if seen.candidate is not None:
+        reasons = '; '.join(seen.candidate.reasons)
+        parts.append(Text(f'last candidate refused: {reasons}', 'bold red'))
+    if last is not None:
+        parts.append(_gate(last))
+    return Group(*parts)
+
+
+def _gate(calibration: Calibration) -> Table:
+    """Failed checks, then those nearest to their limit."""
+    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column('gate check')
+    table.add_column('value', justify='right')
+    table.add_column('limit', justify='right')
+    table.add_column('of the limit')
+    failed = [check for check in calibration.gate if check.passed is False]
+    passed = sorted(
+        (check for check in calibration.gate if check.passed and share_of_limit(check) > 0),
+        key=share_of_limit,
+        reverse=True,
+    )
+    for check in [*failed, *passed[:_TIGHTEST]]:
+        share = min(share_of_limit(check), 1.0)
+        style = 'bold red' if check.passed is False else ''
+        table.add_row(
+            Text(check.name, style),
+            Text(check.found_text, style),
+            Text(check.limit_text),
+            Text('█' * round(10 * share) + '·' * (10 - round(10 * share)), style or 'cyan'),
+        )
+    return table
+
+
+def share_of_limit(check: GateCheck) -> float:
+    """How near a check is to its limit: 1 at the limit; 0 without a number or a limit."""
+    if not (np.isfinite(check.found) and np.isfinite(check.limit) and check.limit > 0):
+        return 0.0
+    if check.is_least:
+        return check.limit / check.found if check.found > 0 else 1.0
+    return abs(check.found) / check.limit
+
+
+def _health(health: Mapping[str, tuple[int, str]]) -> Text:
+    lines = list(_health_lines(health))
+    return Text('\n').join(lines) if lines else Text('no diagnostics received', 'dim')
+
+
+def _health_lines(health: Mapping[str, tuple[int, str]]) -> Iterator[Text]:
+    for name, (level, message) in sorted(health.items()):
+        words, style = _HEALTH.get(level, _STALE)
+        yield Text(f'{name}: ').append(words, style).append(f' {message}')

@@ -1,0 +1,88 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Figures over the detector and the sky: scales inside the canvas, flat maps, the projection."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from starcal_ros.camera import CameraModel
+from starcal_ros.detector_field import DetectorField
+from starcal_ros.records import CameraGeometry, refused_image
+from starcal_ros.report import detector_figures as figures
+from starcal_ros.report import svg
+
+CAMERA = CameraModel(640, 512, np.array([1800.0, 0, 1800, 319.5, 255.5, -0.05, 0, 0, 0, 0]))
+
+
+@pytest.mark.parametrize(('width', 'height'), [(640, 512), (2592, 2048), (400, 1600), (2000, 200)])
+def test_arrows_have_a_scale_inside_the_canvas(width: int, height: int) -> None:
+    camera = CameraModel(
+        width, height, np.array([1800.0, 0, 1800, width / 2, height / 2, -0.05, 0, 0, 0, 0])
+    )
+    drawn = str(figures.distortion_vectors(camera))
+    assert re.search(r'>scale: [\d.]+ px<', drawn)
+    wide, high = map(float, re.findall(r'viewBox="0 0 (\d+) ([\d.]+)"', drawn)[0])
+    tips = re.findall(rf'd="M([\d.]+),([\d.]+)L[^"]*Z" fill="{re.escape(svg.SERIES[1])}"', drawn)
+    assert len(tips) == 1
+    assert 0 < float(tips[0][0]) <= wide and 0 < float(tips[0][1]) < high
+
+
+def test_the_scale_is_that_of_the_arrows() -> None:
+    """Arrows of a field that is 0.3 px along u have 1.5 times the length of 0.2 px."""
+    field = DetectorField(640, 512, 0, np.array([[0.3], [0.0]]))
+    drawn = str(figures.field_vectors(field, CAMERA))
+    assert '>scale: 0.2 px<' in drawn
+    arrow = (
+        r'd="M([\d.]+),[\d.]+L[\d.]+,[\d.]+" stroke="{}" stroke-width="1.3"/><path d="M([\d.]+),'
+    )
+    lengths = {}
+    for colour in svg.SERIES[:2]:
+        first = re.findall(arrow.format(re.escape(colour)), drawn)[0]
+        lengths[colour] = float(first[1]) - float(first[0])
+    # The view box has one decimal.
+    assert lengths[svg.SERIES[0]] == pytest.approx(1.5 * lengths[svg.SERIES[1]], abs=0.2)
+
+
+def test_no_displacement_is_said() -> None:
+    ideal = CAMERA.replace(k1=0.0)
+    assert '>no displacement<' in str(figures.distortion_vectors(ideal))
+    assert '>0 px everywhere<' in str(figures.distortion_contours(ideal))
+
+
+def test_a_flat_map_says_so_and_others_start_at_zero() -> None:
+    flat = np.full((25, 25), 5.774)
+    flat[0, 0] = 5.802
+    assert '>flat within 0.48 %<' in str(figures.line_of_sight_sigma(flat, CAMERA))
+    steep = np.linspace(1.0, 8.0, 625, dtype=np.float64).reshape(25, 25)
+    drawn = str(figures.line_of_sight_sigma(steep, CAMERA))
+    assert 'flat' not in drawn and '>0″<' in drawn and '>8″<' in drawn
+    assert '>unknown<' in str(figures.line_of_sight_sigma(np.full((3, 3), np.nan), CAMERA))
+
+
+def test_the_projection_of_the_sky() -> None:
+    """Hammer: x = -2 sqrt(2) cos(d) sin(a/2) / sqrt(1 + cos(d) cos(a/2)), of unit area scale."""
+    root2 = np.sqrt(2.0)
+    directions = np.array([[1.0, 0, 0], [0, 0, 1], [0, 0, -1], [0, 1, 0], [-1, 1e-12, 0]])
+    x, y = figures.hammer(directions)
+    quarter = -2 * root2 * np.sin(np.pi / 4) / np.sqrt(1 + np.cos(np.pi / 4))
+    np.testing.assert_allclose(x, [0, 0, 0, quarter, -2 * root2], atol=1e-9)
+    np.testing.assert_allclose(y, [0, root2, -root2, 0, 0], atol=1e-9)
+
+
+def test_pointings_count_images_with_an_attitude() -> None:
+    geometry = CameraGeometry(CAMERA, np.array([0.0, 0, 0, 1]))
+    turned = np.array([0.0, np.sin(0.3), 0.0, np.cos(0.3)])
+    seen = [
+        refused_image(1, 640, 512, '', '', icrf_from_star_tracker_xyzw=turned),
+        refused_image(
+            2, 640, 512, 'no_match', '', icrf_from_star_tracker_xyzw=turned, attitude_gap_s=0.5
+        ),
+        refused_image(3, 640, 512, 'no_attitude', ''),
+    ]
+    drawn, count = figures.pointings(seen, geometry)
+    assert count == 2
+    # A footprint and its line in the legend.
+    assert str(drawn).count(svg.SERIES[0]) == 2 and str(drawn).count(svg.SERIES[1]) == 2
