@@ -260,7 +260,8 @@ def _estimate(
     angles = slice(p + len(state.focal), p + len(state.focal) + 3)
     A = alignment.as_matrix()
     full[angles, angles] += A @ np.diag(correlated.added_variance_rad2) @ A.T
-    full[:p, :p] += verdict.variation.common_covariance(p)
+    free = np.ix_(problem.free, problem.free)
+    full[free] += verdict.variation.common_covariance(p)[free]
     information = reduced_information(problem, state, blocks, terms)
     in_modes = len(state.modes)
     shared = np.concatenate([problem.free, np.arange(p, len(information) - in_modes)])

@@ -164,7 +164,7 @@ def _with_field(
     if not options.residual_field or best.p_value > options.max_field_p_value:
         return plain
     degree = degree_for(best)
-    best = _field_prior(found, table, camera, degree, waves=None)
+    best = _field_prior(found, table, camera, degree, looks_for_waves=True)
     for k in range(_FIELD_ROUNDS):
         if best is None:
             return plain
@@ -172,8 +172,7 @@ def _with_field(
         # A smoother kernel of a larger amplitude needs the same degree.
         degree = max(degree, degree_for(best))
         # The first search was among residuals whose variance held the field.
-        waves = best.waves if k else None
-        again = _field_prior(found, table, camera, degree, waves)
+        again = _field_prior(found, table, camera, degree, best.waves, looks_for_waves=k == 0)
         if again is not None and k and again.is_close_to(best):
             break
         best = again
@@ -201,7 +200,8 @@ def _field_prior(
     table: StarTable,
     camera: CameraModel,
     degree: int,
-    waves: Waves | None = NO_WAVES,
+    waves: Waves = NO_WAVES,
+    looks_for_waves: bool = False,
 ) -> FieldPrior | None:
     """
     The prior of a field that the residuals at a minimum ask for, in polynomials of a degree.
@@ -225,7 +225,7 @@ def _field_prior(
         coefficients = in_degree(now, degree)
         gradient = shown.gradient + shown.information @ coefficients
         shown = Score(gradient, shown.information)
-    return best_prior(shown, camera, problem.free, degree, waves)
+    return best_prior(shown, camera, problem.free, degree, waves, looks_for_waves)
 
 
 def _robust_search(problem: Problem, start: State, measurements: Measurements) -> Solution[State]:

@@ -21,6 +21,7 @@ eigenvalues L_i of ``W^(1/2) F W^(1/2)``; z_i is the gradient along them in sigm
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 import functools
 
@@ -53,7 +54,7 @@ _SHARE_OF_WAVE = 0.98  # of the variance of a component that has a wave
 _LEAST_GAIN = 20.0  # of twice the log likelihood, for four more numbers that were looked for
 _FASTEST = 16.0  # rad per half length: 2.5 waves across the longer side
 _WAVE_STEP = 0.8  # rad per half length, at first: half the width of a line over the detector
-_REFINEMENTS = 5
+_REFINEMENTS = 3
 _BEYOND_WAVE = 9.0  # degrees beyond the wave number that hold all but 1e-4 of a wave
 _AMPLITUDES_PX = np.geomspace(1e-3, 10.0, 41)
 _GRID = 41  # pixels a side at which the lens model's own displacements are taken
@@ -240,7 +241,8 @@ def best_prior(
     camera: CameraModel,
     free: NDArray[np.int64],
     degree: int,
-    waves: Waves | None = NO_WAVES,
+    waves: Waves = NO_WAVES,
+    looks_for_waves: bool = False,
 ) -> FieldPrior:
     """
     Return the prior of the largest marginal likelihood.
@@ -251,9 +253,11 @@ def best_prior(
         Of the terms of `polynomials` of that degree, at a field of zero.
     free : (f,) int
         Camera parameters that are estimated.
-    waves : Waves or None
-        Dominant waves; None: they are looked for.  None are in the test of no field, whose p-value
-        is of smooth kernels.
+    waves : Waves
+        Dominant waves.
+    looks_for_waves : bool
+        Whether better ones are looked for, from those given or from the spectrum; never in the
+        test of no field, whose p-value is of smooth kernels.
     """
     span = spanned_by_lens(camera, free, degree)
     shown = _Likelihood(
@@ -264,16 +268,16 @@ def best_prior(
         score.gradient - span @ (span.T @ score.gradient),
         _patterns(camera.width, camera.height, degree, span),
     )
-    known = NO_WAVES if waves is None else waves
+    known = waves
     found = [(*shown.best_amplitude(length, known), length) for length in _LENGTHS]
     ratio, amplitude_px, length = max(found)
-    if waves is None:
+    if looks_for_waves:
         mean = shown.posterior_mean(length, known, amplitude_px)
-        for component in (0, 1):
-            more = _best_wave(shown, length, known, component, mean)
-            again = shown.best_amplitude(length, more)
-            if again[0] > ratio + _LEAST_GAIN:
-                known, (ratio, amplitude_px) = more, again
+        for candidate in _candidates(shown, length, known, mean):
+            again = shown.best_amplitude(length, candidate)
+            more = known.count(None) - candidate.count(None)
+            if again[0] > ratio + _LEAST_GAIN * max(more, 0):
+                known, (ratio, amplitude_px) = candidate, again
     root = shown.root(length, known)
     modes = amplitude_px * (root - span @ (span.T @ root))
     return FieldPrior(
@@ -281,36 +285,50 @@ def best_prior(
     )
 
 
-def _best_wave(
-    shown: _Likelihood, length: float, waves: Waves, component: int, mean: Floats
-) -> Waves:
-    """Waves with the most likely one in a component, from the spectrum of the mean field."""
+def _candidates(
+    shown: _Likelihood, length: float, known: Waves, mean: Floats
+) -> tuple[Waves, ...]:
+    """Waves of one component or of both, near known ones or by the mean field (2 t,)."""
+    # The amplitude is that of both components: each wave is looked for beside one of the other.
+    u, v = (
+        wave or Wave(*_dominant_wave(shown.camera, shown.degree, component), _ENVELOPES[1])
+        for wave, component in zip(known, np.split(mean, 2), strict=True)
+    )
+    u, _ = _refined(shown, length, (u, v), 0)
+    u, v = _refined(shown, length, (u, v), 1)
+    return (u, None), (None, v), (u, v)
 
-    def with_wave(wave: Wave) -> Waves:
+
+def _refined(
+    shown: _Likelihood, length: float, waves: tuple[Wave, Wave], component: int
+) -> tuple[Wave, Wave]:
+    """Waves with the most likely one in a component, near the one that it has."""
+
+    def with_wave(wave: Wave) -> tuple[Wave, Wave]:
         return (wave, waves[1]) if component == 0 else (waves[0], wave)
 
     def likelihood(wave: Wave) -> float:
         return shown.best_amplitude(length, with_wave(wave))[0]
 
-    start = _dominant_wave(shown.camera, shown.degree, np.split(mean, 2)[component])
-    best = max(
-        ((likelihood(wave), n, wave) for n, wave in enumerate(_of_envelopes(start))),
-    )
-    step = _WAVE_STEP
-    for _ in range(_REFINEMENTS):
-        value, _, wave = best
-        around = [
-            Wave(abs(wave.along_u + i * step), abs(wave.along_v + j * step), wave.envelope)
-            for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1))
-        ]
-        best = max(best, max((likelihood(one), n, one) for n, one in enumerate(around)))
-        if best[0] == value:
-            step *= 0.5
-    return with_wave(best[2])
-
-
-def _of_envelopes(wave: tuple[float, float]) -> list[Wave]:
-    return [Wave(*wave, envelope) for envelope in _ENVELOPES]
+    wave = waves[component]
+    found = []
+    # A long envelope has a narrow line: it is looked for where a shorter one has found it.
+    for envelope in _ENVELOPES:
+        wave = dataclasses.replace(wave, envelope=envelope)
+        value, step = likelihood(wave), _WAVE_STEP / envelope
+        for _ in range(_REFINEMENTS):
+            around = [
+                Wave(abs(wave.along_u + i * step), abs(wave.along_v + j * step), envelope)
+                for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1))
+            ]
+            values = [likelihood(one) for one in around]
+            k = int(np.argmax(values))
+            if values[k] > value:
+                value, wave = values[k], around[k]
+            else:
+                step *= 0.5
+        found.append((value, envelope, wave))
+    return with_wave(max(found)[2])
 
 
 def _dominant_wave(camera: CameraModel, degree: int, coefficients: Floats) -> tuple[float, float]:

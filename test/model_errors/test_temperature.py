@@ -277,7 +277,10 @@ def test_a_changing_camera_fits_only_where_it_is_asked_for() -> None:
     without = estimate_calibration(noisy, PRIOR, plain)
     rms, more = (np.sqrt(np.mean(e.residual_px[e.kept] ** 2)) for e in (estimate, without))
     assert estimate.variance_factor == pytest.approx(1.0, abs=0.1)
-    assert more > 1.1 * rms
+    # Without the terms the images have shapes of their own, and the camera is known less well.
+    assert without.variation.p_value < 1e-6 and estimate.variation.p_value > 1e-3
+    assert more == pytest.approx(rms, rel=0.02)
+    assert without.covariance[0, 0] > 4 * estimate.covariance[0, 0]
 
 
 @pytest.mark.parametrize('method', METHODS)
