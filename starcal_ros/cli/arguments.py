@@ -12,6 +12,7 @@ import re
 import sys
 from typing import Any, NoReturn
 
+from starcal_ros.cli import mission_arguments
 from starcal_ros.text import printable
 
 EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_INTERRUPTED = 0, 2, 3, 130
@@ -178,6 +179,7 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   # twelve frames of it, in a minute
   starcal campaign paper -o paper --images 12 --trials 20""",
     ),
+    **mission_arguments.HELP,
 }
 
 _INTRODUCTION = 'In-flight star calibration of spacecraft cameras.'
@@ -496,4 +498,5 @@ _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     'monitor': _monitor,
     'simulate': _simulate,
     'campaign': _campaign,
+    **mission_arguments.ARGUMENTS,
 }

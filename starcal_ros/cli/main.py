@@ -16,10 +16,10 @@ import dataclasses
 import io
 import json
 import os
-from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
+from starcal_ros.cli import mission
 from starcal_ros.cli.arguments import (
     complain,
     EXIT_ACCEPTED,
@@ -179,8 +179,9 @@ def _compare(args: argparse.Namespace) -> int:
     from starcal_ros.cli import output
     from starcal_ros.cli.truth import is_truth
     from starcal_ros.products.calibration_json import read_calibration
+    from starcal_ros.products.folder import calibration_file
 
-    files = [_file(path) for path in (args.a, args.b)]
+    files = [calibration_file(path) for path in (args.a, args.b)]
     if files[1].suffix == '.json' and is_truth(files[1]):
         return _compare_with_truth(args)
     found = comparison.compare(*map(read_calibration, files))
@@ -203,10 +204,11 @@ def _compare_with_truth(args: argparse.Namespace) -> int:
     """Compare a calibration with the truth of a simulated bag."""
     from starcal_ros.cli import truth
     from starcal_ros.products.calibration_json import read_calibration
+    from starcal_ros.products.folder import calibration_file
 
     if args.output:
         raise OptionError('--output: a plot needs two calibrations')
-    found = truth.compare_with(read_calibration(_file(args.a)), args.b)
+    found = truth.compare_with(read_calibration(calibration_file(args.a)), args.b)
     print(json.dumps(truth.content(found), indent=1) if args.json else '\n'.join(found.lines))
     return EXIT_ACCEPTED
 
@@ -217,9 +219,10 @@ def _lookup(args: argparse.Namespace) -> int:
     from starcal_ros.camera import pixel_grid
     from starcal_ros.cli.output_places import check_no_product
     from starcal_ros.products.calibration_json import read_calibration
+    from starcal_ros.products.folder import calibration_file
     from starcal_ros.products.lookup_table import write_lookup_table
 
-    file = _file(args.calibration)
+    file = calibration_file(args.calibration)
     check_no_product(args.output, [file])
     calibration = read_calibration(file)
     camera = calibration.geometry.camera
@@ -235,17 +238,6 @@ def _lookup(args: argparse.Namespace) -> int:
     write_lookup_table(table, args.output)
     print_text(f'{len(pixels)} lines of sight written to {args.output}')
     return EXIT_ACCEPTED
-
-
-def _file(path: Path) -> Path:
-    """Path of the calibration in a folder, or of the file itself."""
-    from starcal_ros.products.calibration_json import CALIBRATION_FILE
-
-    if not path.is_dir():
-        return path
-    if not (path / CALIBRATION_FILE).exists():
-        raise OptionError(f'{path}: the folder holds no {CALIBRATION_FILE}')
-    return path / CALIBRATION_FILE
 
 
 def _play(args: argparse.Namespace) -> int:
@@ -495,6 +487,7 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     'monitor': _monitor,
     'simulate': _simulate,
     'campaign': _campaign,
+    **mission.COMMANDS,
 }
 
 
