@@ -500,7 +500,7 @@ def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     called: list[list[str]] = []
     monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))
     run('monitor', '--once', '2.5', '--remap', '__ns:=/cam1')
-    module = [sys.executable, '-m', 'starcal_ros.nodes.monitor']
+    module = module_command('starcal_ros.nodes.monitor')
     assert called == [[*module, '--once', '2.5', '--ros-args', '-r', '__ns:=/cam1']]
 
 
