@@ -3,7 +3,7 @@
 Entry points of the console scripts, with the default action for SIGINT during imports.
 
 The imports take over a second; Python would answer Ctrl-C then with a traceback, the default
-action of the system ends the process without one.  ``-m starcal_ros.nodes.entry_points NAME``
+action of the system ends the process without one.  ``-m starcal_ros.entry_points NAME``
 runs a node in the same way.
 """
 

@@ -16,9 +16,10 @@ _RUN = (
 
 
 def module_command(
-    name: str, version: tuple[int, ...] = sys.version_info[:2], interpreter: str = sys.executable
+    name: str, version: tuple[int, ...] = sys.version_info[:2], interpreter: str = ''
 ) -> list[str]:
     """Start of a command line that runs a module as ``python -m`` does, by a safe path."""
+    interpreter = interpreter or sys.executable
     if version >= (3, 11):
         return [interpreter, '-P', '-m', name]
     return [interpreter, '-c', _RUN, name]

@@ -165,7 +165,7 @@ def _client_command(bag: DemoBag, result: Path) -> list[str]:
 
 
 def _module_command(name: str) -> list[str]:
-    return [*module_command('starcal_ros.nodes.entry_points'), name]
+    return [*module_command('starcal_ros.entry_points'), name]
 
 
 def _lines(client: Process, nodes: dict[str, Process]) -> Iterator[str]:

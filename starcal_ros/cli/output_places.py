@@ -12,6 +12,7 @@ from starcal_ros.files import same_as_one_of
 from starcal_ros.products.calibration_json import CALIBRATION_FILE
 from starcal_ros.products.files import check_not_inputs
 from starcal_ros.products.folder import PRODUCT_FILES
+from starcal_ros.products.not_calibrated import NOT_CALIBRATED_FILE
 from starcal_ros.report.thumbnails import THUMBNAILS_FOLDER
 
 
@@ -29,7 +30,8 @@ def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> N
         raise OptionError(f'{folder}: holds the bag that is read; choose another folder (-o)')
     check_not_inputs([folder / name for name in PRODUCT_FILES], (*bag_files, *files))
     pictures = folder / THUMBNAILS_FOLDER
-    is_old = (folder / CALIBRATION_FILE).exists() and not pictures.is_symlink()
+    records = (CALIBRATION_FILE, NOT_CALIBRATED_FILE)
+    is_old = any((folder / name).exists() for name in records) and not pictures.is_symlink()
     if pictures.is_dir() and any(pictures.iterdir()) and not is_old:
         raise OptionError(f'{pictures}: is not of a calibration; choose another folder (-o)')
 

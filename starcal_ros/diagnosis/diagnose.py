@@ -76,7 +76,7 @@ class Diagnosis:
     def in_a_sentence(self) -> str:
         """Cause and remedy, as the end of a complaint."""
         lines = '; '.join(line for line in self.mend if not line.startswith('#'))
-        return f'{self.sentence}{f" Set {lines}." if lines else ""} (starcal diagnose says more)'
+        return f'{self.sentence}{f" Set {lines}." if lines else ""} (details: starcal diagnose)'
 
 
 def diagnose(

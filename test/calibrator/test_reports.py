@@ -79,7 +79,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 @pytest.fixture
 def stand_in(tmp_path_factory: pytest.TempPathFactory, monkeypatch: Any) -> StandIn:
-    """Have a shell script, the folder is its $4, where the interpreter is called."""
+    """Have a shell script, the folder is its $5, where the interpreter is called."""
 
     def put(script: str) -> None:
         interpreter = tmp_path_factory.mktemp('bin') / 'python'
@@ -124,7 +124,7 @@ def test_the_newest_wins(
     subject: Subject, reports: CalibratorReports, told: Told, tmp_path: Path, stand_in: StandIn
 ) -> None:
     stand_in(
-        'test -e "$4/../go" || { touch "$4/../busy"; exec sleep 600; }; touch "$4/report.html"'
+        'test -e "$5/../go" || { touch "$5/../busy"; exec sleep 600; }; touch "$5/report.html"'
     )
     reports.show(ACTIVE, subject)
     until((tmp_path / 'busy').exists)
@@ -142,7 +142,7 @@ def test_the_newest_wins(
 def test_closing_ends_the_process_and_keeps_the_products(
     subject: Subject, reports: CalibratorReports, told: Told, tmp_path: Path, stand_in: StandIn
 ) -> None:
-    stand_in('touch "$4/../busy"; exec sleep 600')
+    stand_in('touch "$5/../busy"; exec sleep 600')
     before = children()
     reports.show(ACTIVE, subject)
     until((tmp_path / 'busy').exists)
@@ -155,7 +155,7 @@ def test_closing_ends_the_process_and_keeps_the_products(
     assert told.empty()
     reports.show(ACTIVE, subject)
     assert children() == before
-    stand_in('touch "$4/report.html"')
+    stand_in('touch "$5/report.html"')
     reports.open(str(tmp_path), 'camera')
     reports.show(ACTIVE, subject)
     assert told.get(timeout=PAGE_S) == (tmp_path / 'report' / 'report.html', '')
@@ -164,7 +164,7 @@ def test_closing_ends_the_process_and_keeps_the_products(
 def test_a_full_disk_leaves_the_report_before(
     subject: Subject, reports: CalibratorReports, told: Told, tmp_path: Path, stand_in: StandIn
 ) -> None:
-    stand_in('touch "$4/report.html"')
+    stand_in('touch "$5/report.html"')
     reports.show(ACTIVE, subject)
     page = told.get(timeout=PAGE_S)[0]
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)

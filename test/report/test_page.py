@@ -174,7 +174,7 @@ def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:
         maps=None,
         correlation=None,
         removals=(),
-        time_ns=-(2**63),
+        time_ns=0,
     )
     write_calibration(calibration, tmp_path / CALIBRATION_FILE)
     left = residuals_npz.read_residuals(folder / residuals_npz.RESIDUALS_FILE)

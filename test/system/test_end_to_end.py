@@ -134,12 +134,15 @@ def test_recorded_observations_give_the_same_calibration(
     assert first == second
 
 
-def test_observations_can_be_calibrated_in_place(tiny_products: Path, tmp_path: Path) -> None:
+def test_observations_are_not_calibrated_in_place(tiny_products: Path, tmp_path: Path) -> None:
     bag = tmp_path / 'observations.mcap'
-    bag.write_bytes((tiny_products / 'observations.mcap').read_bytes())
-    for _ in range(2):
-        done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
-        assert done.returncode == 0, done.stderr
+    content = (tiny_products / 'observations.mcap').read_bytes()
+    bag.write_bytes(content)
+    done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
+    assert done.returncode == 2 and 'holds the bag that is read' in done.stderr, done.stderr
+    assert bag.read_bytes() == content
+    done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_gate_refuses_with_status_3_and_writes_the_products(tmp_path: Path) -> None:
