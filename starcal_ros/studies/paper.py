@@ -202,7 +202,7 @@ def study(observations: Sequence[StarObservations], table1: StudyResult, seed: i
             'sigma_fx_px': float(np.sqrt(estimate.covariance[0, 0])),
         }
 
-    used = spread(min(CALIBRATED_WITH, count // 2), count)  # others judge the result
+    used = spread(min(CALIBRATED_WITH, count - 1), count)  # the others judge the result
     estimates = {method: solve(used, method=method) for method in METHODS}
     camera = estimates['per_image'].geometry.camera
     others = sorted(set(range(count)) - set(used))
