@@ -29,6 +29,7 @@ from starcal_ros.records import ALIGNMENT_NAMES, Calibration, CameraGeometry, ch
 from starcal_ros.untrusted import json_value, PRODUCT_BYTES, shown
 
 SCHEMA = 1
+_LONGEST_REASON = 500  # characters: a text of the file may be in it
 CALIBRATION_FILE = 'calibration.json'
 
 _UNIT_TOLERANCE = 1e-6  # of the length of a quaternion: rounding to a text leaves less
@@ -167,7 +168,8 @@ def calibration_from_content(path: Path, content: Mapping[str, Any]) -> Calibrat
         check_calibration(calibration)
         return calibration
     except ValueError as error:
-        raise ProductError(f'{path}: {" ".join(str(error).split())}') from error
+        reason = ' '.join(str(error).split())
+        raise ProductError(f'{path}: {reason[:_LONGEST_REASON]}') from error
 
 
 def _with_new_names(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -151,11 +151,11 @@ def test_a_stored_calibration_that_the_gate_refuses_is_not_active(
     assert level == b'\x01'
     assert text.startswith('calibration 1 is not active, the gate refuses it now: residual')
     assert 'max_residual_rms_px' in text and text in first.said()
-    assert values['in_force'] == 'none' and values['last_gate'] == f'refused: {text}'
+    assert values['active'] == 'none' and values['last_gate'] == f'refused: {text}'
     assert values['state_refused_calibrations'] == '1'
     first.stop()
     start_node('calibrator', ros=(*ros, '-r', '__node:=second'))
-    client.until(lambda: newest(diagnostics, 'second')[2].get('in_force') == '1')
+    client.until(lambda: newest(diagnostics, 'second')[2].get('active') == '1')
     assert newest(diagnostics, 'second')[2]['state_refused_calibrations'] == '0'
 
 
