@@ -125,8 +125,8 @@ def wave_amplitudes(residuals: Residuals, camera: CameraModel) -> tuple[Floats, 
     """
     Spectrum of the residuals: waves over the longer side, RMS amplitude (px), and that of noise.
 
-    The mean over directions and both axes of |2/n sum r exp(-i k x)|^2, x in cells of 1/64 of the
-    longer side; for independent residuals of variance s^2 its expectation is 4 s^2 / n.
+    The mean over directions and both axes of ``|2/n sum r exp(-i k x)|^2``, x in cells of 1/64 of
+    the longer side; for independent residuals of variance s^2 its expectation is 4 s^2 / n.
     """
     side, cells = float(max(camera.width, camera.height)), 64
     used = residuals.used
