@@ -58,9 +58,20 @@ def _definitions_folder() -> Path:
 
 
 def typestore_of(type_name: str, definition: str) -> Typestore:
-    """Types by the definition in a bag, whose writer may be another version; else `typestore`."""
-    found = _store_or_fault(type_name, definition)
-    return typestore() if isinstance(found, str) else found
+    """
+    Types by the definition in a bag, whose writer may be another version; else `typestore`.
+
+    Raises
+    ------
+    BagError
+        When the definition is none and the type is not one of `typestore`.
+    """
+    try:
+        return typestore_with(type_name, definition)
+    except BagError:
+        if type_name not in typestore().types:
+            raise
+        return typestore()
 
 
 def typestore_with(type_name: str, definition: str) -> Typestore:

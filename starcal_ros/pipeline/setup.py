@@ -55,7 +55,7 @@ from starcal_ros.sky.catalog import load_catalog, StarCatalog
 from starcal_ros.untrusted import read_bytes, shown
 
 NODES = ('star_observer', 'calibrator')
-_SHORTEST, _LONGEST = 0.15, 500.0  # focal lengths by the width: fields of 147 and 0.1 degrees
+_LONGEST = 500.0  # focal length by the width: a field of 0.1 degrees
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
 
 def check_prior_camera(camera: CameraModel, location: str) -> None:
     """
-    Raise `OptionError` for a camera that no lens makes, with the likely unit.
+    Raise `OptionError` for a camera that no lens makes, beyond `camera.check_plausible`.
 
     Raises
     ------
@@ -252,17 +252,9 @@ def check_prior_camera(camera: CameraModel, location: str) -> None:
     """
     width, height = camera.width, camera.height
     fx, _, fy, cx, cy = (float(value) for value in camera.intrinsics[:5])
-    if min(fx, fy) <= 0:
-        raise OptionError(f'{location}: focal length of {fx:g}, {fy:g} px is not positive')
     if not 0.5 < fx / fy < 2.0:
         raise OptionError(f'{location}: fx = {fx:g} and fy = {fy:g} px differ by a factor of two')
     width_deg = math.degrees(2 * math.atan(width / 2 / fx))
-    if fx < _SHORTEST * width:
-        unit = 'metres' if fx < 1.0 else 'millimetres'
-        raise OptionError(
-            f'{location}: focal length of {fx:g} px makes a field of {width_deg:.0f} degrees:'
-            f' it seems to be in {unit}; divide it by the size of a pixel'
-        )
     if fx > _LONGEST * width:
         raise OptionError(
             f'{location}: focal length of {fx:g} px makes a field of {width_deg:.2g} degrees:'
