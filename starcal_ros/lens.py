@@ -53,6 +53,7 @@ COEFFICIENTS: Mapping[str, tuple[str, ...]] = {
 _EQUIDISTANT = 'equidistant'
 # Below it the difference 1 - t / tan(t) loses digits; the series ends beyond 1e-14 there.
 _SERIES_RAD = 0.2
+_NO_ROOT = 1e-100  # reciprocal of a squared radius: no detector reaches so far
 
 
 def ideal_points(model: str, directions_camera: Floats) -> Floats:
@@ -277,7 +278,10 @@ def fold_radius2(model: str, coefficients: Floats) -> float:
 
 
 def _least_positive_root(polynomial: object) -> float:
-    roots = np.roots(np.asarray(polynomial, np.float64))
+    """Least positive root of a polynomial with the constant 1, highest power first."""
+    # By the reciprocals of the roots: a first coefficient of 1e-313 would overflow as a divisor.
+    reciprocals = np.roots(np.asarray(polynomial, np.float64)[::-1])
+    roots = 1.0 / reciprocals[np.abs(reciprocals) > _NO_ROOT]
     real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
     return float(real.min(initial=np.inf))
 

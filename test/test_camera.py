@@ -460,3 +460,8 @@ def test_the_matrix_is_the_pinhole_part() -> None:
     homogeneous = e @ camera.matrix.T
     expected = homogeneous[:, :2] / homogeneous[:, 2:]
     np.testing.assert_allclose(project(camera, e), expected, rtol=0, atol=1e-12)
+
+
+def test_a_coefficient_next_to_zero_folds_nothing() -> None:
+    """As a first coefficient of the polynomial it would overflow as a divisor."""
+    assert fold_radius2('plumb_bob', np.array([0.0, 0.0, 2.2e-313, 0.0, 0.0])) == np.inf

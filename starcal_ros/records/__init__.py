@@ -15,16 +15,13 @@ from starcal_ros.records.calibration import (
     check_calibration,
     Correlation,
     DetectorMaps,
-    DetectorStep,
     GateCheck,
     HalvesComparison,
-    HeldTerm,
-    ModelChecks,
-    ResidualBin,
     ResidualField,
     TemperatureTerms,
     TermRemoval,
 )
+from starcal_ros.records.model_checks import DetectorStep, HeldTerm, ModelChecks, ResidualBin
 from starcal_ros.records.observations import (
     AttitudeSample,
     counted_refusal,

@@ -75,7 +75,10 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
 @settings(
-    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=50,
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(
     fx=st.floats(1e3, 1e7),
