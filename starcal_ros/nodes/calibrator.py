@@ -184,8 +184,9 @@ class Calibrator(StarcalNode):
             return WARN, '; '.join(state.withheld), numbers
         if active is not None and active.forced:
             return WARN, f'active despite the gate: {"; ".join(active.reasons)}', numbers
-        if self.count_publishers(self._calibration.topic_name) > 1:
-            return WARN, f'another node publishes {self._calibration.topic_name}', numbers
+        topic = self.resolve_topic_name('calibration')
+        if self.count_publishers(topic) > 1:
+            return WARN, f'another node publishes {topic}', numbers
         if state.damage:
             return WARN, f'set aside as damaged: {"; ".join(state.damage)}', numbers
         if driver is not None and driver.has_failed:
@@ -307,6 +308,9 @@ class Calibrator(StarcalNode):
     def _answered(self, answer: Any) -> Any:
         """Return the service callback wrapped so that errors are answered, logged and counted."""
 
+        # The diagnostics may fail while the node is being deactivated; the answer must not.
+        tell_health = self.guarded(self.publish_health_change)
+
         def run_and_tell(request: Any, response: Any) -> Any:
             if not self.is_active:
                 state = self._state_machine.current_state[1]
@@ -320,7 +324,7 @@ class Calibrator(StarcalNode):
                 response.message = f'internal error: {type(error).__name__}: {error}'
                 self._last_answer = Answer(False, response.message)
             self.get_logger().info(response.message)
-            self.publish_health_change()
+            tell_health()
             return response
 
         return run_and_tell
