@@ -307,7 +307,6 @@ class Calibrator(StarcalNode):
 
     def _answered(self, answer: Any) -> Any:
         """Return the service callback wrapped so that errors are answered, logged and counted."""
-
         # The diagnostics may fail while the node is being deactivated; the answer must not.
         tell_health = self.guarded(self.publish_health_change)
 
