@@ -39,6 +39,17 @@ class LineOfSightTable:
     shape_sigma_arcsec: Floats
     sigma_arcsec: Floats
 
+    def columns(self) -> dict[str, Floats]:
+        """Columns (n,) by name, as in files and messages."""
+        values = (*self.pixels.T, *self.direction_camera.T)
+        return dict(
+            zip(COLUMNS, (*values, self.shape_sigma_arcsec, self.sigma_arcsec), strict=True)
+        )
+
+
+COLUMNS = ('u_px', 'v_px', 'x', 'y', 'z', 'shape_sigma_arcsec', 'sigma_arcsec')
+"""Pixel, unit vector in the camera frame, and 1-sigma of the direction: see `LineOfSightTable`."""
+
 
 def line_of_sight_table(
     camera: CameraModel, covariance: Floats, pixels: Floats

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import array
 from collections.abc import Sequence
 from pathlib import Path
 import sys
@@ -18,15 +19,18 @@ from std_srvs.srv import Trigger
 from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import EnsembleStatus as StatusMessage
 from starcal.msg import StarObservations as ObservationsMessage
-from starcal.srv import Calibrate
+from starcal.srv import Calibrate, LineOfSightTable
+from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.calibrator.reports import ACTIVE, CalibratorReports, CANDIDATE, Subject
 from starcal_ros.calibrator.state import Answer, CalibratorState
+from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.messages.calibration import (
     alignment_to_message,
     calibration_to_message,
     camera_info_to_message,
 )
+from starcal_ros.messages.fields import make_header
 from starcal_ros.messages.observations import checked_observations
 from starcal_ros.messages.status import status_to_message
 from starcal_ros.nodes.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
@@ -43,6 +47,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Deep enough to lose no image at one a second during a solve of minutes.
 _OBSERVATIONS = QoSProfile(depth=1000)
 _RETRY_S = 1.0  # after a failed write
+_TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB
 
 
 class Calibrator(StarcalNode):
@@ -70,6 +75,7 @@ class Calibrator(StarcalNode):
             (Calibrate, '~/solve', self._on_solve, solving),
             (Trigger, '~/reset', self._on_reset, deciding),
             (Trigger, '~/rollback', self._on_rollback, deciding),
+            (LineOfSightTable, '~/lookup', self._on_lookup, sending),
             (Trigger, '~/send_camera_info', self._on_send_camera_info, sending),
         ):
             self.create_service(kind, name, self._answered(answer), callback_group=group)
@@ -246,6 +252,25 @@ class Calibrator(StarcalNode):
 
     def _on_rollback(self, _request: Any, response: Any) -> Any:
         return self._told(self._state.rollback(self._now_ns()), response)
+
+    def _on_lookup(self, request: Any, response: Any) -> Any:
+        active = self._state.active
+        points = request.points or _TABLE_POINTS
+        response.success = False
+        if not 2 <= points <= _MAX_TABLE_POINTS:
+            response.message = f'points: {points} is not in the range 2 to {_MAX_TABLE_POINTS}'
+        elif active is None:
+            response.message = 'no calibration is active'
+        else:
+            camera = active.geometry.camera
+            pixels = pixel_grid(camera, points, points)
+            table = line_of_sight_table(camera, active.joint_covariance, pixels)
+            response.header = make_header(active.active_since_ns, active.child_frame, make_message)
+            for name, column in table.columns().items():
+                setattr(response, name, array.array('d', column.tobytes()))
+            response.success = True
+            response.message = f'{len(pixels)} lines of sight of calibration {active.number}'
+        return response
 
     def _on_send_camera_info(self, _request: Any, response: Any) -> Any:
         driver = self._driver

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,9 +13,6 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import LineOfSightTable
 from starcal_ros.errors import ProductError
 from starcal_ros.products.files import write_atomically
-
-COLUMNS = ('u_px', 'v_px', 'x', 'y', 'z', 'shape_sigma_arcsec', 'sigma_arcsec')
-"""Pixel, unit vector in the camera frame, and 1-sigma of the direction: see `LineOfSightTable`."""
 
 
 def write_lookup_table(table: LineOfSightTable, path: Path) -> None:
@@ -26,23 +24,24 @@ def write_lookup_table(table: LineOfSightTable, path: Path) -> None:
     ProductError
         For another ending, a file that cannot be written, or .fits without astropy.
     """
-    values = np.column_stack(
-        [table.pixels, table.direction_camera, table.shape_sigma_arcsec, table.sigma_arcsec]
-    )
+    columns: dict[str, Any] = table.columns()  # the stub of savez_compressed wants no others
     if path.suffix == '.csv':
-        rows = (','.join(repr(float(value)) for value in row) for row in values)
-        write_atomically(path, '\n'.join([','.join(COLUMNS), *rows]) + '\n')
+        rows = (
+            ','.join(repr(float(value)) for value in row)
+            for row in zip(*columns.values(), strict=True)
+        )
+        write_atomically(path, '\n'.join([','.join(columns), *rows]) + '\n')
     elif path.suffix == '.npz':
         memory = io.BytesIO()
-        np.savez_compressed(memory, **dict(zip(COLUMNS, values.T, strict=True)))
+        np.savez_compressed(memory, **columns)
         write_atomically(path, memory.getvalue())
     elif path.suffix == '.fits':
-        write_atomically(path, _fits(values))
+        write_atomically(path, _fits(columns))
     else:
         raise ProductError(f'{path}: ends neither in .csv nor in .npz nor in .fits')
 
 
-def _fits(values: Floats) -> bytes:
+def _fits(values: dict[str, Floats]) -> bytes:
     try:
         from astropy.io import fits
     except ImportError as error:
@@ -50,7 +49,7 @@ def _fits(values: Floats) -> bytes:
     units = {'px': 'pix', 'arcsec': 'arcsec'}
     columns = [
         fits.Column(name=name, format='D', array=column, unit=units.get(name.rsplit('_', 1)[-1]))
-        for name, column in zip(COLUMNS, values.T, strict=True)
+        for name, column in values.items()
     ]
     memory = io.BytesIO()
     fits.BinTableHDU.from_columns(columns, name='LINES_OF_SIGHT').writeto(memory)

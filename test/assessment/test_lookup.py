@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment.lookup import (
+    COLUMNS,
     line_of_sight_jacobian,
     line_of_sight_table,
     LineOfSightTable,
@@ -19,7 +20,7 @@ from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.detector_field import degrees, DetectorField
 from starcal_ros.errors import ProductError
-from starcal_ros.products.lookup_table import COLUMNS, write_lookup_table
+from starcal_ros.products.lookup_table import write_lookup_table
 
 LENS = CameraModel(640, 512, np.array([1800, 0.2, 1801, 320, 255, -0.045, 0.08, 0.1, 4e-4, -3e-4]))
 DEGREE = 3

@@ -39,9 +39,11 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Temperature
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
-from starcal.srv import Calibrate
+from starcal.srv import Calibrate, LineOfSightTable
+from starcal_ros.assessment.lookup import COLUMNS
 from starcal_ros.bag import reader
 from starcal_ros.bag.writer import BagWriter
+from starcal_ros.cli.main import main
 from starcal_ros.messages import fields as message_fields
 from starcal_ros.messages.calibration import (
     calibration_from_message,
@@ -55,7 +57,11 @@ from starcal_ros.messages.telemetry import attitude_to_message, temperature_to_m
 from starcal_ros.nodes.message_factory import make_message
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import load_setup
-from starcal_ros.products.calibration_json import CALIBRATION_FILE, read_calibration
+from starcal_ros.products.calibration_json import (
+    CALIBRATION_FILE,
+    read_calibration,
+    write_calibration,
+)
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.records import refused_image
 
@@ -161,6 +167,25 @@ def test_dry_run_and_bad_requests_activate_nothing(client: Client, calibrated: l
     bad = client.call(Calibrate, '/calibrator/solve', method='magic')
     assert not bad.success and 'magic' in bad.message
     assert len(calibrated) == 1
+
+
+def test_the_table_of_lines_of_sight_is_that_of_the_tool(
+    client: Client, calibrated: list[Any], tmp_path: Path
+) -> None:
+    answer = client.call(LineOfSightTable, '/calibrator/lookup', points=7)
+    assert answer.success and '49 lines of sight' in answer.message
+    write_calibration(calibration_from_message(calibrated[0]), tmp_path / 'calibration.json')
+    table = tmp_path / 'table.csv'
+    assert main(['lookup', str(tmp_path), '-o', str(table), '--points', '7']) == 0
+    columns = np.genfromtxt(table, delimiter=',', names=True)
+    assert len(columns) == 49
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(answer, name), columns[name])
+    default = client.call(LineOfSightTable, '/calibrator/lookup')
+    assert len(default.u_px) == 25**2
+    for points in (1, 201, 2**32 - 1):
+        refused = client.call(LineOfSightTable, '/calibrator/lookup', points=points)
+        assert not refused.success and f'points: {points}' in refused.message
 
 
 def test_reset_empties_the_ensemble(client: Client, calibrated: list[Any]) -> None:
