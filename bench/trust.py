@@ -48,6 +48,8 @@ _GRID = 25
 _SPEED_OF_LIGHT_M_S = 299792458.0
 _AU_PER_DAY_M_S = 149597870700.0 / 86400.0
 _WANDER_IMAGES = 10.0  # correlation length of the star tracker that wanders
+_ABBBA = (0, 1, 1, 1, 0)  # too few images for halves
+_LENSES = {'two lenses': (0, 1), 'two lenses as ABBBA': _ABBBA}  # the truth is lens 0
 _HONEST = (0.7, 1.5)
 _NEVER = 2.0
 
@@ -73,6 +75,7 @@ WORLDS = (
     *(World('columns lost', size, 'px', ('step',)) for size in (1.0, 3.0)),
     World('odd rows shifted', 1.0, 'px', ('rows', 'step')),
     World('two lenses', 1.0, 'px', ('image to image',)),
+    *(World('two lenses as ABBBA', size, 'px', ('image to image',)) for size in (0.3, 1.0)),
     World('one image', COPIES, 'times', ('pointing',)),
     *(World('focal breathing', size, 'px', ('image to image',)) for size in (0.5, 2.0, 4.0)),
     World('aberration reversed', 0.5, 'year', ('velocity', 'aberration')),
@@ -200,6 +203,8 @@ def scenario_of(world: World, seed: int) -> Scenario:
     count = IMAGES
     if world.name == 'one image':
         count = COPIES
+    if world.name == 'two lenses as ABBBA':
+        count = len(_ABBBA)
     if world.name == 'tracker wanders':
         count = 2 * IMAGES
     fields = np.stack(
@@ -288,12 +293,13 @@ def _read_out(world: World, image: Image) -> Image:
 def _seen_at(world: World, scenario: Scenario, shown: Scene, index: int) -> Floats:
     """Pixels (n, 2) of the stars of a scene on the detector of a world."""
     camera, pixels = scenario.truth.camera, shown.pixel_px
-    if world.name in ('two lenses', 'focal breathing'):
+    if world.name in _LENSES or world.name == 'focal breathing':
         rng = np.random.default_rng([scenario.seed, 79, index])
-        part = index % 2 if world.name == 'two lenses' else rng.uniform(-1.0, 1.0)
+        lenses = _LENSES.get(world.name)
+        part = lenses[index % len(lenses)] if lenses else rng.uniform(-1.0, 1.0)
         # The size is a change of focal length; of two lenses, the shift at a corner.
         reach = 1.0
-        if world.name == 'two lenses':
+        if lenses:
             reach = camera.parameters[0] / math.hypot(camera.width / 2, camera.height / 2)
         fx, _, fy = camera.intrinsics[:3]
         change = part * world.size * reach
