@@ -29,6 +29,7 @@ _TIMES = 12  # from half the median interval to four times the span
 # and in 1 of 100 of 200, by draws with a coarser grid of scales.  Averaging without need makes the
 # sigma 2 times as large.
 _DETECTION = 3.0
+_COARSE = 2.0  # a quarter of the grid missed at most 1.5 of it in 6,338 drawn ensembles
 
 
 @dataclass(frozen=True)
@@ -81,17 +82,20 @@ def attitude_correlation(
     error, noise = error_rad[order], variance_rad2[order]
     scatter = np.sqrt(np.maximum(error.var(axis=0, ddof=1), 1e-300))
     times_s = np.geomspace(0.5 * np.median(steps_s[steps_s > 0]), 4.0 * steps_s.sum(), _TIMES)
-    share, scale, tau = (
-        axis.ravel() for axis in np.meshgrid(_SHARES, _SCALES, times_s, indexing='ij')
-    )
-    total = (scale[:, None] * scatter) ** 2  # (g, 3)
-    process, white = share[:, None] * total, (1.0 - share)[:, None] * total
-    log_likelihood, variance = _filter(error, noise, steps_s, process, white, tau)
-    # One share and one correlation time for all axes; each axis has its own scale.
-    by_process = log_likelihood.reshape(len(_SHARES), len(_SCALES), _TIMES, 3)
-    most = by_process.max(axis=1).sum(axis=2)  # (shares, times)
-    if not suspect and 2.0 * (most.max() - most[0].max()) < _DETECTION:
-        return none
+    # Most ensembles show no correlation on a quarter of the grid, far from the limit.
+    for every, least in ((2, _DETECTION - _COARSE), (1, _DETECTION)):
+        scales, times = _SCALES[::every], times_s[::every]
+        share, scale, tau = (
+            axis.ravel() for axis in np.meshgrid(_SHARES, scales, times, indexing='ij')
+        )
+        total = (scale[:, None] * scatter) ** 2  # (g, 3)
+        process, white = share[:, None] * total, (1.0 - share)[:, None] * total
+        log_likelihood, variance = _filter(error, noise, steps_s, process, white, tau)
+        # One share and one correlation time for all axes; each axis has its own scale.
+        by_process = log_likelihood.reshape(len(_SHARES), len(scales), len(times), 3)
+        most = by_process.max(axis=1).sum(axis=2)  # (shares, times)
+        if not suspect and 2.0 * (most.max() - most[0].max()) < least:
+            return none
     prior = most - most.max()
     conditional = by_process - by_process.max(axis=1, keepdims=True)
     weight = np.exp(conditional + prior[:, None, :, None])

@@ -367,6 +367,13 @@ def _patterns(width: int, height: int, degree: int, span: Floats) -> Floats:
 
     Radial of 8th order, thin prism of 2nd and 4th order, tilt; each with a mean square of 1.
     """
+    patterns = _projected(_pattern_coefficients(width, height, degree), span)
+    return np.asarray(patterns / np.linalg.norm(patterns, axis=0))
+
+
+@functools.lru_cache(maxsize=8)
+def _pattern_coefficients(width: int, height: int, degree: int) -> Floats:
+    """Coefficients (2 t, 7) of the patterns as they are."""
     u, v = np.meshgrid(np.linspace(0, width - 1, _GRID), np.linspace(0, height - 1, _GRID))
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1)
     half = np.array([width - 1, height - 1]) / 2.0
@@ -382,6 +389,8 @@ def _patterns(width: int, height: int, degree: int, span: Floats) -> Floats:
         (x * y, y * y),
     ]
     phi = basis(pixels, width, height, degree)
-    found = [np.linalg.lstsq(phi, np.stack(pair, -1), rcond=None)[0].T.ravel() for pair in moved]
-    patterns = _projected(np.stack(found, axis=-1), span)
-    return np.asarray(patterns / np.linalg.norm(patterns, axis=0))
+    both = np.concatenate([np.stack(axis, axis=-1) for axis in zip(*moved, strict=True)], axis=1)
+    along_u, along_v = np.split(np.linalg.lstsq(phi, both, rcond=None)[0], 2, axis=1)
+    coefficients = np.concatenate([along_u, along_v])
+    coefficients.setflags(write=False)
+    return np.asarray(coefficients)

@@ -171,9 +171,12 @@ def _inside(ratio: Floats) -> Floats:
     # Two axes: the squared length is exponential, of median ln 2 per unit of mean.
     mean = float(np.median(ratio)) / math.log(2.0)
     inside = ratio
+    count = -1
     for _ in range(6):
         inside = ratio[ratio <= 0.5 * _CLIP_SIGMA**2 * mean]
-        mean = float(inside.mean()) if len(inside) else mean
+        if len(inside) == count or not len(inside):
+            break
+        count, mean = len(inside), float(inside.mean())
     return inside
 
 
