@@ -399,6 +399,34 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
     return _fit(started, list(range(len(names))), camera)
 
 
+def nearest_camera(
+    camera: CameraModel, model: str, zero: tuple[str, ...]
+) -> tuple[CameraModel, float]:
+    """
+    Best camera of a lens model with some parameters held at zero, without field, and its cost.
+
+    For formats that lack these parameters.  Least squares as of `convert`.
+
+    Returns
+    -------
+    camera : CameraModel
+    worst_px : float
+        Largest pixel error over the grid; infinite where the model cannot see all of it.
+
+    Raises
+    ------
+    ValueError
+        For an unknown model, or a name that is no parameter of it.
+    """
+    start = camera if model == camera.model else convert(camera, model)[0]
+    start = dataclasses.replace(start.replace(**dict.fromkeys(zero, 0.0)), field=None)
+    unchanged = camera.field is None and model == camera.model
+    if unchanged and np.array_equal(start.parameters, camera.parameters):
+        return start, 0.0
+    free = [k for k, name in enumerate(start.parameter_names) if name not in zero]
+    return _fit(start, free, camera)
+
+
 def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[CameraModel, float]:
     """Camera fitted to the pixels of the lines of sight of another, and its worst error, px."""
     target = pixel_grid(camera, 25, 25)

@@ -10,6 +10,8 @@ import re
 import sys
 from typing import Any, NoReturn
 
+from starcal_ros.cli import mission_arguments
+
 EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_INTERRUPTED = 0, 2, 3, 130
 
 _EXIT_STATUS = """\
@@ -150,6 +152,7 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   # the whole night of the paper from pixels, with its figures, in some minutes
   starcal campaign paper -o paper""",
     ),
+    **mission_arguments.HELP,
 }
 
 _INTRODUCTION = 'In-flight star calibration of spacecraft cameras.'
@@ -410,4 +413,5 @@ _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     'play': _play,
     'simulate': _simulate,
     'campaign': _campaign,
+    **mission_arguments.ARGUMENTS,
 }

@@ -18,6 +18,7 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
+from starcal_ros.cli import mission
 from starcal_ros.cli.arguments import (
     complain,
     EXIT_ACCEPTED,
@@ -211,8 +212,9 @@ def _compare(args: argparse.Namespace) -> int:
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import output
     from starcal_ros.products.calibration_json import read_calibration
+    from starcal_ros.products.folder import calibration_file
 
-    found = comparison.compare(*(read_calibration(_file(p)) for p in (args.a, args.b)))
+    found = comparison.compare(*(read_calibration(calibration_file(p)) for p in (args.a, args.b)))
     if args.output:
         from starcal_ros.report import figures
 
@@ -231,9 +233,10 @@ def _lookup(args: argparse.Namespace) -> int:
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
     from starcal_ros.products.calibration_json import read_calibration
+    from starcal_ros.products.folder import calibration_file
     from starcal_ros.products.lookup_table import write_lookup_table
 
-    calibration = read_calibration(_file(args.calibration))
+    calibration = read_calibration(calibration_file(args.calibration))
     camera = calibration.geometry.camera
     if args.step is not None:
         if not 0 < args.step <= max(camera.width, camera.height):
@@ -247,17 +250,6 @@ def _lookup(args: argparse.Namespace) -> int:
     write_lookup_table(table, args.output)
     print(f'{len(pixels)} lines of sight written to {args.output}')
     return EXIT_ACCEPTED
-
-
-def _file(path: Path) -> Path:
-    """Path of the calibration in a folder, or of the file itself."""
-    from starcal_ros.products.calibration_json import CALIBRATION_FILE
-
-    if not path.is_dir():
-        return path
-    if not (path / CALIBRATION_FILE).exists():
-        raise OptionError(f'{path}: the folder holds no {CALIBRATION_FILE}')
-    return path / CALIBRATION_FILE
 
 
 def _play(args: argparse.Namespace) -> int:
@@ -449,6 +441,7 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     'play': _play,
     'simulate': _simulate,
     'campaign': _campaign,
+    **mission.COMMANDS,
 }
 
 

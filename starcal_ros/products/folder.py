@@ -11,6 +11,7 @@ from pathlib import Path
 
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.bag.writer import BagWriter
+from starcal_ros.errors import ProductError
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, write_calibration
 from starcal_ros.products.camera_yaml import CAMERA_INFO_FILE, write_camera_info
 from starcal_ros.products.files import OBSERVATIONS_FILE
@@ -51,3 +52,19 @@ def write_observations(
     with BagWriter(folder / OBSERVATIONS_FILE) as writer:
         for record in observations:
             writer.write_observations(OBSERVATIONS_TOPIC, record, frame_id)
+
+
+def calibration_file(path: Path) -> Path:
+    """
+    Path of the calibration in a folder, or of the file itself.
+
+    Raises
+    ------
+    ProductError
+        When the folder holds none.
+    """
+    if not path.is_dir():
+        return path
+    if not (path / CALIBRATION_FILE).exists():
+        raise ProductError(f'{path}: the folder holds no {CALIBRATION_FILE}')
+    return path / CALIBRATION_FILE

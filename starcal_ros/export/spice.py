@@ -1,0 +1,279 @@
+"""
+SPICE kernels of a calibration: a frame kernel (FK) and an instrument kernel (IK).
+
+The FK has the camera as a fixed frame (TKFRAME) in the star tracker frame.  The IK has the field
+of view, and the whole camera: lens model, skew and field; nothing is approximated.  Sources:
+NAIF's Frames Required Reading (TK frames), Kernel Required Reading (text kernels) and the
+specification of GETFOV.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError
+from starcal_ros.export.kernel_text import assignment, frame_name, kernel, Value
+from starcal_ros.export.losses import Loss, temperature_losses
+from starcal_ros.export.provenance import origin, PIXEL_CONVENTION
+from starcal_ros.records import Calibration
+
+_INSTRUMENTS_PER_SPACECRAFT = 1000  # NAIF: instrument ID = 1000 * spacecraft ID - number
+_SIDE_POINTS = 4  # vertices of the field of view on each side of the detector
+_WIDEST_RAD = np.radians(89.0)  # SPICE sees no polygon wider than a half space
+_UM_PER_MM = 1000.0
+
+_MODEL_IN_WORDS = {
+    'plumb_bob': (
+        'g  = 1 + k1 r2 + k2 r2^2 + k3 r2^3',
+        "x' = g x + 2 p1 x y + p2 (r2 + 2 x^2)",
+        "y' = g y + p1 (r2 + 2 y^2) + 2 p2 x y",
+    ),
+    'equidistant': (
+        'x = theta cos(phi), y = theta sin(phi) in place of X/Z, Y/Z, with theta the',
+        'angle from +Z in radians and phi the azimuth from +X;',
+        "(x', y') = (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) (x, y)",
+    ),
+}
+_OPENCV_IN_WORDS = (
+    'g  = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)',
+    "x' = g x + 2 p1 x y + p2 (r2 + 2 x^2) + s1 r2 + s2 r2^2",
+    "y' = g y + p1 (r2 + 2 y^2) + 2 p2 x y + s3 r2 + s4 r2^2",
+    'then, with tau_x and tau_y, the tilted detector of OpenCV; absent coefficients are 0',
+)
+
+
+@dataclass(frozen=True)
+class SpiceNames:
+    """
+    NAIF identifiers and frame names of a mission.
+
+    ``instrument_id`` 0: ``1000 * spacecraft_id - 1``.  ``star_tracker_id`` 0: another frame kernel
+    defines the star tracker frame; else the FK defines it as a CK frame of this number.  Empty
+    frame names: those of the calibration.  ``pixel_size_um`` 0: not known.
+    """
+
+    spacecraft_id: int
+    instrument_id: int = 0
+    star_tracker_id: int = 0
+    camera_frame: str = ''
+    star_tracker_frame: str = ''
+    pixel_size_um: float = 0.0
+
+    @property
+    def camera_id(self) -> int:
+        """Identifier of the instrument and of its frame."""
+        return self.instrument_id or _INSTRUMENTS_PER_SPACECRAFT * self.spacecraft_id - 1
+
+
+def spice_kernels(
+    calibration: Calibration, names: SpiceNames
+) -> tuple[str, str, tuple[Loss, ...]]:
+    """
+    Texts of the FK and of the IK of a calibration, and what they cannot hold.
+
+    Raises
+    ------
+    OptionError
+        For identifiers or frame names that SPICE does not allow.
+    """
+    _check(names)
+    camera_frame = frame_name(names.camera_frame or calibration.child_frame, '--camera-frame')
+    tracker_frame = frame_name(
+        names.star_tracker_frame or calibration.parent_frame, '--star-tracker-frame'
+    )
+    if camera_frame == tracker_frame:
+        raise OptionError(f'--camera-frame: {camera_frame} is the star tracker frame too')
+    losses = temperature_losses(calibration)
+    boresight, corners = field_of_view(calibration.geometry.camera)
+    if corners is None:
+        losses = (*losses, Loss('field of view: as wide as a half space or folded', 0.0))
+    missing = [f'Not in this kernel: {loss.part}, {loss.cost_px:.3g} px.' for loss in losses]
+    about = [*origin(calibration), '', *missing]
+    fk = _frame_kernel(calibration, names, camera_frame, tracker_frame, about)
+    ik = _instrument_kernel(calibration, names, camera_frame, boresight, corners, about)
+    return fk, ik, losses
+
+
+def field_of_view(camera: CameraModel) -> tuple[Floats, Floats | None]:
+    """
+    Boresight (3,), the line of sight of the middle of the detector, and corners (n, 3).
+
+    The corners follow the outer edge of the detector, so that a curved edge is kept; None where a
+    point of the edge has no line of sight or SPICE could not take the polygon.
+    """
+    w, h = camera.width, camera.height
+    share = np.arange(_SIDE_POINTS) / _SIDE_POINTS
+    u, v = share * w - 0.5, share * h - 0.5
+    left, right, top, bottom = (np.full(_SIDE_POINTS, x) for x in (-0.5, w - 0.5, -0.5, h - 0.5))
+    edge = np.concatenate(
+        [
+            np.c_[u, top],
+            np.c_[right, v],
+            np.c_[w - 1.0 - u, bottom],
+            np.c_[left, h - 1.0 - v],
+        ]
+    )
+    boresight = line_of_sight(camera, np.array([(w - 1) / 2, (h - 1) / 2]))
+    corners = line_of_sight(camera, edge)
+    if not (corners @ boresight > np.cos(_WIDEST_RAD)).all():  # NaN is not either
+        return boresight, None
+    return boresight, corners
+
+
+def _check(names: SpiceNames) -> None:
+    if names.spacecraft_id >= 0:
+        raise OptionError(f'--spacecraft-id: {names.spacecraft_id} is not a negative NAIF ID')
+    if names.instrument_id > 0:
+        raise OptionError(f'--instrument-id: {names.instrument_id} is not a negative NAIF ID')
+    if names.camera_id == names.star_tracker_id:
+        raise OptionError(f'--star-tracker-id: {names.star_tracker_id} is that of the camera')
+    if not 0 <= names.pixel_size_um < 1e4:
+        raise OptionError(f'--pixel-size-um: {names.pixel_size_um:g} is not within 0 to 10000')
+
+
+def _frame_kernel(
+    calibration: Calibration,
+    names: SpiceNames,
+    camera_frame: str,
+    tracker_frame: str,
+    about: list[str],
+) -> str:
+    number = names.camera_id
+    sigma = calibration.sigma[-3:] / ARCSECOND_RAD
+    comments = [
+        f'{camera_frame} is fixed in {tracker_frame}. TKFRAME_{number}_Q takes vectors of the',
+        'camera frame to the star tracker frame (SPICE quaternion, scalar first).',
+        '',
+        *PIXEL_CONVENTION,
+        '',
+        f'1-sigma of the alignment about the camera axes, arcsec: {_three(sigma)}.',
+        f'Names of the calibration: {calibration.child_frame} in {calibration.parent_frame}.',
+        '',
+        *about,
+    ]
+    data: list[str] = []
+    tracker_id = names.star_tracker_id
+    if tracker_id:
+        comments += ['', f'{tracker_frame} is a CK frame: its attitude is in a C kernel.']
+        data += _frame(tracker_frame, tracker_id, 3, names.spacecraft_id)
+        data += assignment(f'CK_{tracker_id}_SCLK', names.spacecraft_id)
+        data += [*assignment(f'CK_{tracker_id}_SPK', names.spacecraft_id), '']
+    else:
+        comments += ['', f'{tracker_frame} must be defined by the frame kernel of the mission.']
+    x, y, z, w = calibration.geometry.star_tracker_from_camera_xyzw
+    data += _frame(camera_frame, number, 4, names.spacecraft_id)
+    data += assignment(f'TKFRAME_{number}_RELATIVE', tracker_frame)
+    data += assignment(f'TKFRAME_{number}_SPEC', 'QUATERNION')
+    data += assignment(f'TKFRAME_{number}_Q', [w, x, y, z])
+    data += ['', f"   NAIF_BODY_NAME += '{camera_frame}'", f'   NAIF_BODY_CODE += {number}']
+    return kernel('FK', f'Frame of the camera {camera_frame}', comments, data)
+
+
+def _three(values: Floats) -> str:
+    return ', '.join(f'{value:.3f}' for value in values)
+
+
+def _frame(name: str, number: int, kind: int, center: int) -> list[str]:
+    return [
+        *assignment(f'FRAME_{name}', number),
+        *assignment(f'FRAME_{number}_NAME', name),
+        *assignment(f'FRAME_{number}_CLASS', kind),
+        *assignment(f'FRAME_{number}_CLASS_ID', number),
+        *assignment(f'FRAME_{number}_CENTER', center),
+    ]
+
+
+def _instrument_kernel(
+    calibration: Calibration,
+    names: SpiceNames,
+    camera_frame: str,
+    boresight: Floats,
+    corners: Floats | None,
+    about: list[str],
+) -> str:
+    camera = calibration.geometry.camera
+    prefix = f'INS{names.camera_id}_'
+    values: dict[str, Value] = {}
+    if corners is not None:
+        values |= {
+            'FOV_FRAME': camera_frame,
+            'FOV_SHAPE': 'POLYGON',
+            'FOV_CLASS_SPEC': 'CORNERS',
+            'BORESIGHT': boresight.tolist(),
+            'FOV_BOUNDARY_CORNERS': corners.ravel().tolist(),
+        }
+    values |= _lens_values(camera)
+    if names.pixel_size_um:
+        mm = np.sqrt(camera.intrinsics[0] * camera.intrinsics[2]) * names.pixel_size_um
+        values |= {'FOCAL_LENGTH': [mm / _UM_PER_MM], 'PIXEL_SIZE': [names.pixel_size_um] * 2}
+    terms = calibration.temperature
+    if terms is not None:
+        values['REFERENCE_DEGC'] = [terms.reference_degc]
+        values |= {'FOCAL_PER_DEGC': terms.focal_per_degc} if terms.focal_per_degc else {}
+        rate = terms.alignment_rate_rad_per_degc
+        values |= {'ALIGNMENT_PER_DEGC': rate} if rate else {}
+    values['PARAMETERS'] = calibration.parameter_names
+    values['PARAMETER_SIGMAS'] = calibration.sigma.tolist()
+    data = [line for key, value in values.items() for line in assignment(prefix + key, value)]
+    comments = [*_lens_comments(camera, names), '', *about]
+    return kernel('IK', f'Camera {camera_frame}', comments, data)
+
+
+def _lens_values(camera: CameraModel) -> dict[str, Value]:
+    fx, skew, fy, cx, cy = camera.intrinsics.tolist()
+    names = camera.parameter_names[len(camera.intrinsics) :]
+    values: dict[str, Value] = {
+        'PIXEL_SAMPLES': camera.width,
+        'PIXEL_LINES': camera.height,
+        'IFOV': [1.0 / fx, 1.0 / fy],
+        'FOCAL_LENGTH_PX': [fx, fy],
+        'SKEW_PX': [skew],
+        'CCD_CENTER': [cx, cy],
+        'LENS_MODEL': camera.model,
+        'LENS_COEFFICIENTS': camera.distortion.tolist(),
+        'LENS_TERMS': names,
+    }
+    if camera.field is not None:
+        values |= {
+            'FIELD_DEGREE': camera.field.degree,
+            'FIELD_U_PX': camera.field.coefficients[0].tolist(),
+            'FIELD_V_PX': camera.field.coefficients[1].tolist(),
+        }
+    return values
+
+
+def _lens_comments(camera: CameraModel, names: SpiceNames) -> list[str]:
+    lines = [
+        *PIXEL_CONVENTION,
+        '',
+        'A direction (X, Y, Z) of the camera frame is seen at pixel (u, v), with',
+        'x = X/Z, y = Y/Z, r2 = x^2 + y^2, and LENS_COEFFICIENTS named by LENS_TERMS:',
+        '',
+        *(f'   {line}' for line in _MODEL_IN_WORDS.get(camera.model, _OPENCV_IN_WORDS)),
+        "   u = FOCAL_LENGTH_PX(1) x' + SKEW_PX y' + CCD_CENTER(1)",
+        "   v = FOCAL_LENGTH_PX(2) y' + CCD_CENTER(2)",
+    ]
+    if camera.field is not None:
+        lines += [
+            '',
+            'A star that these equations place at (u, v) is measured at (U, V) with',
+            '   U = u + f_u(U, V), V = v + f_v(U, V)',
+            'where f is the sum over all total degrees d = 0 .. FIELD_DEGREE, and in each over',
+            'j = 0 .. d, of coefficients FIELD_U_PX (FIELD_V_PX) in this order times',
+            '   sqrt(2 (d-j) + 1) P(d-j; a) sqrt(2 j + 1) P(j; b)',
+            'with P(n; x) the Legendre polynomials, a = (2 U + 1) / PIXEL_SAMPLES - 1 and',
+            'b = (2 V + 1) / PIXEL_LINES - 1; beyond the detector f is that at its edge.',
+        ]
+    if names.pixel_size_um:
+        lines += ['', 'FOCAL_LENGTH is in mm, PIXEL_SIZE in micrometres (as given on export).']
+    return [
+        *lines,
+        '',
+        'BORESIGHT is the line of sight of the middle of the detector.',
+        'PARAMETER_SIGMAS are the 1-sigma of PARAMETERS: px, for alignment angles rad.',
+    ]

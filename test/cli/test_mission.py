@@ -1,0 +1,58 @@
+"""The commands for missions, as a person types them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from export_calibrations import calibration  # type: ignore[import-not-found]
+import pytest
+import spiceypy
+
+from starcal_ros.cli.main import main
+from starcal_ros.products.calibration_json import write_calibration
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / 'out').mkdir()
+    write_calibration(calibration(), tmp_path / 'out/calibration.json')
+    return tmp_path / 'out'
+
+
+def test_export_writes_kernels_that_load(folder: Path, tmp_path: Path, capsys) -> None:
+    kernels = tmp_path / 'deep/kernels'
+    line = (
+        f'export {folder} --to spice -o {kernels} --spacecraft-id -999 --star-tracker-id -999100'
+    )
+    assert main(line.split()) == 0
+    assert 'largest error of a pixel against the calibration: 0 px' in capsys.readouterr().out
+    spiceypy.kclear()
+    for path in kernels.iterdir():
+        spiceypy.furnsh(str(path))
+    assert spiceypy.pxform('CAMERA_OPTICAL_FRAME', 'STAR_TRACKER', 0.0).shape == (3, 3)
+    spiceypy.kclear()
+
+
+def test_export_states_the_cost_of_each_part(folder: Path, tmp_path: Path, capsys) -> None:
+    assert main(f'export {folder} --to kalibr -o {tmp_path}'.split()) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].startswith('largest error') and lines[2].startswith('left out: skew, 0.')
+
+
+@pytest.mark.parametrize(
+    ('line', 'words'),
+    [
+        ('--to spice', '--spacecraft-id'),
+        ('--to matlab', "'matlab' is not one of spice, opencv"),
+        ('--to spice --spacecraft-id 5', 'not a negative NAIF ID'),
+    ],
+)
+def test_export_refuses_in_one_line(folder, tmp_path, capsys, line: str, words: str) -> None:
+    assert main(f'export {folder} -o {tmp_path} {line}'.split()) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count('\n') == 1
+
+
+def test_export_needs_a_calibration(tmp_path: Path, capsys) -> None:
+    assert main(f'export {tmp_path} --to csv -o {tmp_path}'.split()) == 2
+    assert 'holds no calibration.json' in capsys.readouterr().err
