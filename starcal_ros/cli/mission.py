@@ -1,12 +1,15 @@
-"""Commands for missions: export."""
+"""Commands for missions: export and import."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+import glob
 import math
 from pathlib import Path
 
+from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT
+from starcal_ros.cli.terminal import progress_bar
 from starcal_ros.errors import OptionError
 
 
@@ -37,7 +40,7 @@ def _export(args: argparse.Namespace) -> int:
         print(f'largest error of a pixel against the calibration: {done.worst_px:.3g} px')
     for loss in done.losses:
         print(f'left out: {loss.part}, {loss.cost_px:.3g} px alone')
-    return 0
+    return EXIT_ACCEPTED
 
 
 def _make_folder(path: Path) -> None:
@@ -47,4 +50,54 @@ def _make_folder(path: Path) -> None:
         raise OptionError(f'{path}: cannot create the folder: {error.strerror}') from error
 
 
-COMMANDS: Mapping[str, Callable[[argparse.Namespace], int]] = {'export': _export}
+def _import(args: argparse.Namespace) -> int:
+    """Make a bag from the files of a mission."""
+    from starcal_ros.ingest import recording, sources, tables
+    from starcal_ros.ingest.images import ImageOptions
+
+    options = ImageOptions(
+        time_key=args.time_key,
+        times=None if args.times is None else tables.read_times(args.times),
+        hdu=args.hdu,
+        channel=args.channel,
+        bayer=args.bayer,
+        value_range=None if args.value_range is None else tuple(args.value_range),
+        temperature_key=args.temperature_key,
+    )
+    paths = _expanded(args.images)
+    with progress_bar(2 * len(paths), 'images') as advance:
+        files, problems = recording.look_at_all(paths, options, advance)
+        for problem in problems:
+            complain(problem)
+        if problems:
+            return EXIT_BAD_INPUT
+        stamps = [file.time_ns for file in files]
+        attitudes = sources.attitudes(args.attitude, args.star_tracker, stamps)
+        velocities = args.velocity and sources.velocities(args.velocity, args.spacecraft, stamps)
+        prior = args.camera and recording.Prior(args.camera, tuple(args.alignment))
+        made = recording.write_bag(
+            args.output, files, options, attitudes, velocities, prior, advance
+        )
+    print(f'bag {made.bag}: {len(files)} images')
+    for note in made.notes:
+        print(f'note: {note}')
+    if made.params:
+        print(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
+    return EXIT_ACCEPTED
+
+
+def _expanded(patterns: Sequence[str]) -> list[Path]:
+    """Files of patterns, each once, in order of their names."""
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        names = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
+        if not names:
+            raise OptionError(f'--images: no file matches {pattern}')
+        found |= dict.fromkeys(map(Path, names))
+    return list(found)
+
+
+COMMANDS: Mapping[str, Callable[[argparse.Namespace], int]] = {
+    'export': _export,
+    'import': _import,
+}

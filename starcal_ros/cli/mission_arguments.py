@@ -22,6 +22,22 @@ HELP: dict[str, tuple[str, str, str]] = {
   # for cv2.projectPoints
   starcal export out --to opencv -o opencv""",
     ),
+    'import': (
+        'make a bag from images and attitudes in the formats of a mission',
+        (
+            'Images are FITS (tiled, scaled and floating point too), TIFF or PNG; attitudes CCSDS '
+            'AEM, CSV or SPICE CK with SCLK and LSK; velocities CCSDS OEM, CSV or SPK. Times of '
+            'UTC, TAI, TT, TDB and GPS become UTC. With --camera a parameter file to calibrate '
+            'the bag is written beside it.'
+        ),
+        """\
+  # FITS and an attitude ephemeris
+  starcal import --images 'night/*.fits' --attitude attitude.aem -o bag --camera prior.yaml
+  # SPICE kernels for attitude and velocity
+  starcal import --images 'night/*.fits' --attitude ck.bc clk.tsc lsk.tls --star-tracker ST1 -o bag
+  # PNG with a table of times and one of attitudes
+  starcal import --images 'night/*.png' --times times.csv --attitude attitude.csv -o bag""",
+    ),
 }
 
 
@@ -51,4 +67,47 @@ def _export(command: argparse.ArgumentParser) -> None:
     command.add_argument('--image-topic', default='', metavar='T', help=what)
 
 
-ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {'export': _export}
+def _import(command: argparse.ArgumentParser) -> None:
+    what = 'image files; a pattern in quotes is expanded here'
+    command.add_argument('--images', nargs='+', required=True, metavar='FILE', help=what)
+    what = 'AEM, CSV, or SPICE kernels (CK, SCLK, LSK and, for a frame by name, FK)'
+    command.add_argument(
+        '--attitude', nargs='+', type=Path, required=True, metavar='FILE', help=what
+    )
+    what = 'OEM, CSV, or SPICE kernels (SPK with the Earth or the Sun, LSK); default: the Earth'
+    command.add_argument('--velocity', nargs='+', type=Path, metavar='FILE', help=what)
+    what = 'bag folder or .mcap file to write; an existing one is replaced'
+    command.add_argument('-o', '--output', type=Path, required=True, metavar='BAG', help=what)
+    what = 'star tracker frame: a body frame of the AEM, or a frame name or number of the CK'
+    command.add_argument('--star-tracker', default='', metavar='FRAME', help=what)
+    what = 'name or NAIF ID of the spacecraft in the SPK'
+    command.add_argument('--spacecraft', default='', metavar='BODY', help=what)
+    what = 'FITS keyword of the middle of the exposure (default: DATE-AVG, else from DATE-BEG)'
+    command.add_argument('--time-key', default='', metavar='KEY', help=what)
+    what = 'CSV with columns file and time_utc (or time_tai, time_tdb, time_gps, time_ns)'
+    command.add_argument('--times', type=Path, metavar='FILE', help=what)
+    what = 'FITS keyword of the camera temperature, degC, e.g. CCD-TEMP'
+    command.add_argument('--temperature-key', default='', metavar='KEY', help=what)
+    what = 'FITS extension by number or name (default: the first image)'
+    command.add_argument('--hdu', default='', metavar='N', help=what)
+    what = 'colour to take from an RGB image or a mosaic'
+    command.add_argument('--channel', default='', choices=('red', 'green', 'blue'), help=what)
+    what = 'Bayer pattern of a mosaic; the image then has half the width and height'
+    command.add_argument(
+        '--bayer', default='', choices=('rggb', 'bggr', 'gbrg', 'grbg'), help=what
+    )
+    what = 'range of pixel values that is mapped to 16 bit (default: that of all images)'
+    command.add_argument('--value-range', nargs=2, type=float, metavar=('LOW', 'HIGH'), help=what)
+    what = 'ROS camera YAML of the prior camera; params.yaml is written then'
+    command.add_argument('--camera', type=Path, metavar='FILE', help=what)
+    what = 'prior orientation of the camera in the star tracker frame (default: 0 0 0 1)'
+    command.add_argument(
+        '--alignment', nargs=4, type=float, default=(0.0, 0.0, 0.0, 1.0), help=what,
+        metavar=('X', 'Y', 'Z', 'W'),
+    )  # fmt: skip
+
+
+ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
+    'export': _export,
+    'import': _import,
+}

@@ -1,0 +1,1 @@
+"""Images, attitudes and velocities in the formats of missions, to bags."""
