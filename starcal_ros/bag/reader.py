@@ -156,8 +156,13 @@ def read_images(
     topic: str,
     stamp_offset_s: float = 0.0,
     on_damage: Damage = log_damage,
+    channel: str = '',
 ) -> Iterator[Image | StarObservations]:
-    """Images of a topic; an image that cannot be decoded becomes refused observations."""
+    """
+    Images of a topic; an image that cannot be decoded becomes refused observations.
+
+    ``channel`` is the colour that is taken of colour images (`image_from_message`).
+    """
     for raw in read_raw(paths, [topic], on_damage):
         try:
             message = decode(raw)
@@ -165,7 +170,7 @@ def read_images(
             yield refused_image(raw.log_time_ns, 0, 0, 'bad_layout', str(error))
             continue
         try:
-            yield image_from_message(message, stamp_offset_s)
+            yield image_from_message(message, stamp_offset_s, channel)
         except ImageRefused as refused:
             yield refused_from_message(message, stamp_offset_s, refused)
 

@@ -70,7 +70,8 @@ def in_a_sentence(paths: Sequence[Path], asked: Topics, setup: Setup) -> str:
 
 
 def _images(paths: Sequence[Path], topic: str, setup: Setup) -> Iterator[Image]:
-    for image in reader.read_images(paths, topic, setup.attitude.stamp_offset_s):
+    offset_s, channel = setup.attitude.stamp_offset_s, setup.frames.image_channel
+    for image in reader.read_images(paths, topic, offset_s, channel=channel):
         if isinstance(image, Image):
             yield image
 

@@ -11,9 +11,9 @@ import threading
 import time
 from typing import Any
 
-from geometry_msgs.msg import QuaternionStamped, TwistStamped
+from geometry_msgs.msg import PoseStamped, QuaternionStamped, TransformStamped, TwistStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Temperature
+from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, Temperature
 from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
@@ -51,6 +51,13 @@ from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
 NAME = 'star_observer'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Ten seconds of a fast star tracker; a bag played fast sends bursts.
+# Values of the option `attitude_message`.
+_ATTITUDE_MESSAGES = {
+    'quaternion': QuaternionStamped,
+    'pose': PoseStamped,
+    'transform': TransformStamped,
+    'imu': Imu,
+}
 _SAMPLES = QoSProfile(depth=2000)
 _MAX_VELOCITY_M_S = 1e6
 _JUMP_S = 10.0  # smaller steps back are late messages, not a clock change
@@ -112,6 +119,7 @@ class StarObserver(StarcalNode):
         self._worker = threading.Thread(target=self._measure_all, name='measure')
         self._worker.start()
         asked = self._own.image_reliability
+        attitude_message = _ATTITUDE_MESSAGES[self._setup.attitude.attitude_message]
         images = with_reliability(
             QoSProfile(depth=self._own.image_queue),
             ReliabilityPolicy.BEST_EFFORT
@@ -122,7 +130,7 @@ class StarObserver(StarcalNode):
             (CalibrationMessage, 'calibration', self._on_calibration, LATCHED, False),
             (TwistStamped, 'velocity', self._on_velocity, _SAMPLES, True),
             (Temperature, 'temperature', self._on_temperature, _SAMPLES, True),
-            (QuaternionStamped, 'attitude', self._on_attitude, _SAMPLES, True),
+            (attitude_message, 'attitude', self._on_attitude, _SAMPLES, True),
             (*self._image_input(), self._on_image, images, asked == 'auto'),
         ):
             self.inputs.add(kind, topic, self.taking(callback), qos, adapts=adapts)
@@ -263,7 +271,11 @@ class StarObserver(StarcalNode):
             self._publish(self._refused(waiting, 'overrun', detail))
             return
         try:
-            image = image_from_message(waiting.message, self._setup.attitude.stamp_offset_s)
+            image = image_from_message(
+                waiting.message,
+                self._setup.attitude.stamp_offset_s,
+                self._setup.frames.image_channel,
+            )
         except ImageRefused as refused:
             self._publish(self._refused(waiting, refused.reason, refused.detail))
             return

@@ -267,7 +267,8 @@ def observe_bag(
     if temperature_topic:
         temperatures = sorted(reader.read_temperatures(paths, temperature_topic), key=by_time)
     track = Track(setup.prior)
-    for image in reader.read_images(paths, image_topic, setup.attitude.stamp_offset_s):
+    offset_s, channel = setup.attitude.stamp_offset_s, setup.frames.image_channel
+    for image in reader.read_images(paths, image_topic, offset_s, channel=channel):
         if isinstance(image, StarObservations):
             yield image
             continue

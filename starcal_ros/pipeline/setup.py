@@ -27,6 +27,7 @@ from starcal_ros.image.hot_pixels import (
     NO_HOT_PIXELS,
 )
 from starcal_ros.lens import COEFFICIENTS
+from starcal_ros.messages.colour import CHANNELS
 from starcal_ros.options import (
     from_mapping,
     holds_options,
@@ -69,6 +70,12 @@ class SetupOptions:
     )
     star_tracker_frame: str = option('star_tracker', 'name of the star tracker frame')
     camera_frame: str = option('camera_optical_frame', 'name of the camera optical frame')
+    image_channel: str = option(
+        '',
+        'colour that is taken of rgb, bgr and bayer images; of bayer ones the camera has half the'
+        ' width and height; empty: colour images are refused',
+        choices=('', *CHANNELS),
+    )
     catalog: str = option('', 'star catalog file; empty: the bundled one')
     dark_frame: str = option(
         '', 'dark frame to subtract, a PNG or TIFF of image size and depth; empty: none'
