@@ -37,7 +37,14 @@ if TYPE_CHECKING:
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.records import Calibration, Ensemble
 
-_MODULES_OF_EXTRAS = ('dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')  # setup.cfg
+_MODULES_OF_EXTRAS = (
+    'dask',
+    'distributed',
+    'jinja2',
+    'markupsafe',
+    'matplotlib',
+    'pyarrow',
+)  # setup.cfg
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
 
@@ -69,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         return complain(f'{error.filename or "input/output"}: {error.strerror or error}')
     except ModuleNotFoundError as error:
-        extra = 'studies' if args.command == 'campaign' else 'report'
+        extra = {'campaign': 'studies', 'trend': 'mission'}.get(args.command, 'report')
         return complain(_missing_extra(error, extra))
     except KeyboardInterrupt:
         complain('interrupted')

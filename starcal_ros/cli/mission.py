@@ -1,4 +1,4 @@
-"""Commands for missions: export and import."""
+"""Commands for missions: export, import and trend."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import glob
 import math
 from pathlib import Path
 
-from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT
+from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED
 from starcal_ros.cli.terminal import progress_bar
 from starcal_ros.errors import OptionError
+
+_FAILURES_SHOWN = 5
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -97,7 +99,37 @@ def _expanded(patterns: Sequence[str]) -> list[Path]:
     return list(found)
 
 
+def _trend(args: argparse.Namespace) -> int:
+    """Follow calibrations over years."""
+    from starcal_ros.trend import fleet, page, tasks
+    from starcal_ros.trend.table import Table
+
+    if not args.root.is_dir():
+        raise OptionError(f'{args.root}: no such folder')
+    if not 0 <= args.workers <= 1024:
+        raise OptionError(f'--workers: {args.workers} is not within 0 to 1024')
+    _make_folder(args.output)
+    table = Table(args.output)
+    if args.retry:
+        table.forget_failed()
+    found = list(tasks.find(args.root, args.params))
+    if not found:
+        raise OptionError(
+            f'{args.root}: no calibration.json below it, and no bag to calibrate with --params'
+        )
+    with progress_bar(len(found), 'calibrations') as advance:
+        done = fleet.update(table, found, args.workers, args.scheduler, advance)
+    rows = table.rows()
+    path = page.write_page(rows, args.output, str(args.root))
+    print(f'{done.computed} new, {done.known} known before, {done.failed} failed')
+    for row in [row for row in rows if row.error][:_FAILURES_SHOWN]:
+        print(f'failed: {row.path}: {row.error}')
+    print(f'{page.span_years(rows):.2f} years; look at {path}')
+    return EXIT_ACCEPTED if any(not row.error for row in rows) else EXIT_REFUSED
+
+
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], int]] = {
     'export': _export,
     'import': _import,
+    'trend': _trend,
 }

@@ -38,6 +38,22 @@ HELP: dict[str, tuple[str, str, str]] = {
   # PNG with a table of times and one of attitudes
   starcal import --images 'night/*.png' --times times.csv --attitude attitude.csv -o bag""",
     ),
+    'trend': (
+        'follow calibrations over years',
+        (
+            'Reads every calibration.json and state folder under ROOT, calibrates bags with '
+            '--params, and observations of older versions again, into a Parquet table that grows; '
+            'writes trend.html: each parameter, boresight and alignment over time, steps and '
+            'drifts with p-values, and what a recalibration would have changed.'
+        ),
+        """\
+  # all calibrations of a mission; run again, only what is new is computed
+  starcal trend mission -o trend
+  # a thousand bags on two processes
+  starcal trend fleet -o trend --params camera.yaml --workers 2
+  # on a Dask cluster that sees the same files
+  starcal trend /data/fleet -o trend --params camera.yaml --scheduler tcp://host:8786""",
+    ),
 }
 
 
@@ -107,7 +123,24 @@ def _import(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def _trend(command: argparse.ArgumentParser) -> None:
+    what = 'folder tree with calibrations and bags'
+    command.add_argument('root', type=Path, metavar='ROOT', help=what)
+    what = 'folder for trend.html and the table trend.parquet, created if absent'
+    command.add_argument('-o', '--output', type=Path, required=True, metavar='DIR', help=what)
+    what = 'ROS parameter file for bags without a calibration beside them'
+    command.add_argument('--params', type=Path, metavar='FILE', help=what)
+    what = 'try what failed before again'
+    command.add_argument('--retry', action='store_true', help=what)
+    where = command.add_mutually_exclusive_group()
+    what = 'worker processes (default: 0, in-process)'
+    where.add_argument('--workers', type=int, default=0, metavar='N', help=what)
+    what = 'address of a Dask scheduler, e.g. tcp://host:8786'
+    where.add_argument('--scheduler', default='', metavar='ADDRESS', help=what)
+
+
 ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     'export': _export,
     'import': _import,
+    'trend': _trend,
 }

@@ -103,6 +103,9 @@ def _svg(figure: Figure, name: str, titles: Sequence[str] = ()) -> Markup:
     return Markup(text)
 
 
+inline_svg = _svg  # for pages of other rooms
+
+
 def _with_titles(text: str, titles: Sequence[str]) -> str:
     """Add titles to the points of the group, which a browser shows on hover."""
     first = text.index(f'id="{_TITLED}"')

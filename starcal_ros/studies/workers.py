@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import functools
 import itertools
@@ -17,11 +17,12 @@ from types import FrameType
 from typing import TypeVar
 
 import dask
-from distributed import Client, Future, LocalCluster
+from distributed import Client, Future, KilledWorker, LocalCluster
 
 from starcal_ros.errors import OptionError
 from starcal_ros.studies.monte_carlo import Design, Row, run_trial
 
+Item = TypeVar('Item')
 Result = TypeVar('Result')
 
 LOOPBACK = '127.0.0.1'
@@ -80,12 +81,36 @@ def run_each(
     OptionError
         When no scheduler answers at the address.
     """
+    results = []
+    for number, result in stream_each(function, range(count), workers, scheduler):
+        if isinstance(result, Exception):
+            raise result
+        results.append((number, result))
+        on_each()
+    return results
+
+
+def stream_each(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    workers: int = 0,
+    scheduler: str = '',
+) -> Iterator[tuple[int, Result | Exception]]:
+    """
+    Pairs (index, result) of a function called with each item, in any order, as they come.
+
+    The result of an item whose function raises, or whose worker process dies again and again, is
+    the exception.  ``workers`` and ``scheduler`` as for `run_each`.
+    """
+    if not items:
+        return
     if not scheduler and workers == 0:
-        results = []
-        for number in range(count):
-            results.append((number, function(number)))
-            on_each()
-        return results
+        for number, item in enumerate(items):
+            try:
+                yield number, function(item)
+            except Exception as error:
+                yield number, error
+        return
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(_interrupts_wait())
         stack.enter_context(dask.config.set(_SETTINGS))
@@ -93,27 +118,34 @@ def run_each(
         if scheduler:
             client = stack.enter_context(_client(scheduler))
         else:
-            cluster = stack.enter_context(_local_cluster(min(workers, count)))
+            cluster = stack.enter_context(_local_cluster(min(workers, len(items))))
             client = stack.enter_context(_client(cluster))
-        return _gather(client, function, count, on_each, stop)
+        killed = []
+        for number, result in _gather(client, function, dict(enumerate(items)), stop):
+            if isinstance(result, KilledWorker):
+                killed.append(number)
+            else:
+                yield number, result
+        # A task that only waited on a worker that another one killed is blamed too: alone, each
+        # shows whether it was the one.
+        for number in killed:
+            yield from _gather(client, function, {number: items[number]}, stop)
 
 
 def _gather(
     client: Client,
-    function: Callable[[int], Result],
-    count: int,
-    on_each: Callable[[], None],
+    function: Callable[[Item], Result],
+    items: Mapping[int, Item],
     stop: threading.Event,
-) -> list[tuple[int, Result]]:
-    """All results; submits few tasks ahead, since cancelling 100,000 of them is slow."""
-    results: list[tuple[int, Result]] = []
+) -> Iterator[tuple[int, Result | Exception]]:
+    """Results as they come; submits few tasks ahead, since cancelling 100,000 of them is slow."""
     finished: queue.SimpleQueue[Future[Result]] = queue.SimpleQueue()
     submitted: dict[Future[Result], int] = {}
-    numbers = iter(range(count))
+    waiting = iter(items.items())
 
     def submit(most: int) -> None:
-        for number in itertools.islice(numbers, most):
-            future = client.submit(function, number, pure=False, retries=2)
+        for number, item in itertools.islice(waiting, most):
+            future = client.submit(function, item, pure=False, retries=2)
             submitted[future] = number
             future.add_done_callback(finished.put)  # type: ignore[no-untyped-call]
 
@@ -124,10 +156,13 @@ def _gather(
             raise KeyboardInterrupt
         with contextlib.suppress(queue.Empty):
             future = finished.get(timeout=_POLL_S)
-            results.append((submitted.pop(future), future.result()))
-            on_each()
+            number = submitted.pop(future)
+            try:
+                result: Result | Exception = future.result()
+            except Exception as error:
+                result = error
             submit(1)
-    return results
+            yield number, result
 
 
 @contextlib.contextmanager

@@ -264,6 +264,7 @@ def test_attitudes_of_an_imu_are_taken_by_parameter(
             setattr(sample.orientation, axis, getattr(decoded.quaternion, axis))
         attitudes.publish(sample)
     first = next(iter(reader.read_images([tiny_bag], '/opnav/image_raw')))
+    assert isinstance(first, ImageRecord)
     images.publish(image_to_message(first, 'camera', make_message))
     client.until(lambda: bool(answers))
     assert answers[0].refusal == '' and len(answers[0].catalog_id) > 50

@@ -1,0 +1,1 @@
+"""Calibrations of a camera, or of a fleet, over years."""
