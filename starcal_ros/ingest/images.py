@@ -241,6 +241,18 @@ def _truncation_is_an_error() -> Iterator[None]:
         yield
 
 
+def read_values(path: Path) -> NDArray[Any]:
+    """
+    Values (height, width) of an image file of one channel, FITS by its ending, as they are.
+
+    Raises
+    ------
+    IngestError
+        When the file cannot be read or has more channels.
+    """
+    return _read(path, ImageOptions())[0]
+
+
 def _read_picture(path: Path) -> NDArray[Any]:
     values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if values is None:

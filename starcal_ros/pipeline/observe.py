@@ -23,6 +23,7 @@ from starcal_ros.identification.tracking import start_tracking, track_stars, Tra
 from starcal_ros.image.centroiding import saturation_level
 from starcal_ros.image.frame_checks import Fingerprint, fingerprint, sample_rows, screen
 from starcal_ros.image.hot_pixels import HotPixels, learn_hot_pixels
+from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
@@ -90,7 +91,7 @@ def observe_next(
         screen(sample, seen, track.seen, saturation_dn, setup.dark, setup.screening)
         hot = (track.hot or setup.hot).index
         exposure = Exposure(
-            _without_dark(image, setup),
+            flattened(_without_dark(image, setup), setup.flat, setup.dark_pedestal_dn),
             quaternion,
             gap_s,
             velocity_m_s,

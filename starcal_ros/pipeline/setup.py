@@ -12,7 +12,7 @@ from typing import Any, get_type_hints
 import cv2
 import numpy as np
 
-from starcal_ros.arrays import Pixels
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.assessment.gate import check_gate_options, GateOptions
 from starcal_ros.camera import convert
 from starcal_ros.errors import OptionError
@@ -38,6 +38,7 @@ from starcal_ros.options import (
     OptionValue,
     read_parameter_file,
 )
+from starcal_ros.pipeline.detector_frames import read_bad_pixels, read_flat, with_bad_pixels
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.products.camera_yaml import read_camera_info, with_camera_url_from
 from starcal_ros.records import CameraGeometry
@@ -80,11 +81,21 @@ class SetupOptions:
     dark_frame: str = option(
         '', 'dark frame to subtract, a PNG or TIFF of image size and depth; empty: none'
     )
+    flat_field: str = option(
+        '',
+        'flat field to divide by, a FITS, TIFF or PNG of image size; its median counts as 1;'
+        ' empty: none',
+    )
+    bad_pixel_map: str = option(
+        '',
+        'map of bad pixels, a FITS, TIFF or PNG of image size: those that are not 0 are left out'
+        ' of stars like hot pixels; empty: none',
+    )
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Options of every stage, with prior camera, catalog and dark frame loaded."""
+    """Options of every stage, with prior camera, catalog and detector frames loaded."""
 
     frames: SetupOptions
     attitude: AttitudeOptions
@@ -100,6 +111,7 @@ class Setup:
     dark: Pixels | None
     dark_pedestal_dn: int = 0
     hot: HotPixels = NO_HOT_PIXELS
+    flat: Floats | None = None
 
     def options(self) -> dict[str, OptionValue]:
         """Every option of every stage, by name."""
@@ -163,13 +175,19 @@ def load_setup(
     check_gate_options(groups['gate'], prior.camera)
     path = Path(frames.catalog) if frames.catalog else None
     dark = _read_dark(frames.dark_frame, prior.camera.width, prior.camera.height)
+    flat = read_flat(frames.flat_field, prior.camera.width, prior.camera.height)
     return Setup(
         **groups,
         prior=prior,
         catalog=load_catalog(path, groups['identification'].magnitude_limit),
         dark=dark,
         dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
-        hot=hot_in_dark(dark, groups['fixed_pattern']),
+        hot=with_bad_pixels(
+            hot_in_dark(dark, groups['fixed_pattern']),
+            read_bad_pixels(frames.bad_pixel_map, prior.camera.width, prior.camera.height),
+            flat,
+        ),
+        flat=flat,
     )
 
 

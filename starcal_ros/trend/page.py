@@ -222,7 +222,7 @@ def _change_chart(
 def _date_axis(axes: matplotlib.axes.Axes, at: Floats) -> None:
     # A span of seconds would be labelled by fractions of them.
     axes.set_xlim(at.min() - _MARGIN_DAYS, at.max() + _MARGIN_DAYS)
-    locator = AutoDateLocator(maxticks=9)
+    locator = AutoDateLocator()
     axes.xaxis_date()
     axes.xaxis.set_major_locator(locator)
     axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))

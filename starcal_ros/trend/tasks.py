@@ -108,7 +108,8 @@ def _setup_beside(bag: Path) -> Setup:
         raise ProductError(f'{path}: has no options to calibrate with: give --params') from error
     if prior is None:
         raise ProductError(f'{path}: has no prior to calibrate with: give --params')
-    files = {'dark_frame': '', 'catalog': ''}  # may be gone; observations need no dark frame
+    # Files that may be gone, and that observations do not need.
+    files = dict.fromkeys(('dark_frame', 'flat_field', 'bad_pixel_map', 'catalog'), '')
     return load_setup({**options, **files}, prior=prior)
 
 
