@@ -31,6 +31,8 @@ _POLL_S = 0.2  # interval of checks for an interrupt
 _AHEAD = 8  # trials submitted ahead for each worker thread
 _SETTINGS = {
     'logging': {'distributed': 'critical'},
+    # A task is tried on a second worker process and, if that dies too, once more alone.
+    'distributed.scheduler.allowed-failures': 1,
     'distributed.worker.daemon': True,  # a worker ends with its parent
     'distributed.nanny.pre-spawn-environ': {
         'OMP_NUM_THREADS': 1,
