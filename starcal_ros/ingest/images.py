@@ -271,7 +271,7 @@ def _time_ns(path: Path, header: Mapping[str, Any], options: ImageOptions) -> in
         raise IngestError(f'{path}: has no time: give --times FILE with columns file, time_utc')
     try:
         return _time_of_header(header, options.time_key)
-    except (TimeError, KeyError, ValueError) as error:
+    except (TimeError, KeyError, ValueError, OverflowError) as error:
         words = error.args[0] if error.args else error
         raise IngestError(f'{path}: {words}') from error
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from starcal_ros.ingest.records import Attitudes, in_order, IngestError, Velocities
-from starcal_ros.ingest.time_systems import from_text, SYSTEMS, TimeError
+from starcal_ros.ingest.time_systems import from_text, SYSTEMS, TimeError, to_utc_ns
 
 _QUATERNION = ('qx', 'qy', 'qz', 'qw')
 _VELOCITY = ('vx_m_s', 'vy_m_s', 'vz_m_s')
@@ -49,7 +49,7 @@ def read_velocities(path: Path) -> Velocities:
 def read_times(path: Path) -> dict[str, int]:
     """Stamps by the names of images, without folders; raises as `read_attitudes`."""
     rows = _rows(path, ('file',))
-    return {Path(row['file']).name: _stamp(row, f'{path} line {number}') for number, row in rows}
+    return {Path(row['file'] or '').name: _stamp(row, f'{path} line {number}') for number, row in rows}
 
 
 def _rows(path: Path, needed: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
@@ -79,7 +79,7 @@ def _stamp(row: dict[str, str], where: str) -> int:
     system = name.partition('_')[2]
     try:
         if system == 'ns':
-            return int(row[name])
+            return to_utc_ns(int(row[name] or ''), 'UTC')
         return from_text(row[name] or '', system)
     except (TimeError, ValueError) as error:
         raise IngestError(f'{where}: {error}') from error

@@ -22,6 +22,7 @@ _UNIX_EPOCH_MJD = 40587
 _UNIX_EPOCH_JD = 2440587.5
 _TT_MINUS_TAI_NS = 32_184_000_000  # IAU 1991 Resolution A4, recommendation IV
 _TAI_MINUS_GPS_NS = 19 * NANOSECONDS_PER_SECOND  # IS-GPS-200, since 1980-01-06
+_LAST_STAMP_NS = ((1 << 31) - 60) * NANOSECONDS_PER_SECOND  # no system is 60 s off UTC
 _OTHER_NAMES = {'ET': 'TDB', 'TDT': 'TT', 'GPST': 'GPS', 'IAT': 'TAI', 'UT': 'UTC', '': 'UTC'}
 SYSTEMS = ('UTC', 'TAI', 'TT', 'TDB', 'GPS')
 
@@ -104,9 +105,11 @@ def to_utc_ns(count_ns: int, system: str) -> int:
     Raises
     ------
     TimeError
-        For another system than `SYSTEMS`, or a time before 1972.
+        For another system than `SYSTEMS`, or a time before 1972 or after 2038.
     """
     system = system_of(system)
+    if count_ns >= _LAST_STAMP_NS:
+        raise TimeError('a time after 2038-01-19, where stamps of ROS end (32 bit)')
     if system == 'UTC':
         if count_ns < _leap_seconds()[0][0]:
             raise TimeError(f'{count_ns / 1e9:.3f} s since 1970 is before 1972, where UTC begins')

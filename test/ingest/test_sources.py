@@ -154,7 +154,7 @@ def test_tables_are_read(tmp_path: Path) -> None:
     path = tmp_path / 'a.csv'
     path.write_text('\n'.join(lines) + '\n')
     assert worst_rad(sources.attitudes([path], '', AT_NS), attitudes()) < 1.3e-15
-    path.write_text('time_ns,vx_m_s,vy_m_s,vz_m_s\n7,1,2,3\n')
+    path.write_text(f'time_ns,vx_m_s,vy_m_s,vz_m_s\n{AT_NS[0]},1,2,3\n')
     assert sources.velocities([path], '', AT_NS).velocity_m_s.tolist() == [[1.0, 2.0, 3.0]]
 
 
@@ -192,6 +192,8 @@ def test_a_bad_aem_is_one_line(tmp_path: Path, old: str, new: str, words: str) -
         ('time_utc,qx,qy,qz,qw\n2026-05-15,0,0,,1\n', 'line 2'),
         ('time_utc,qx,qy,qz,qw\n2026-05-15,0,0,nan,1\n', 'not all finite'),
         ('time_utc,qx,qy,qz,qw\nnoon,0,0,0,1\n', "line 2: 'noon'"),
+        ('qx,qy,qz,qw,time_ns\n0,0,0,1\n', 'line 2'),
+        ('time_ns,qx,qy,qz,qw\n-5,0,0,0,1\n', 'before 1972'),
     ],
 )
 def test_a_bad_table_is_one_line(tmp_path: Path, text: str, words: str) -> None:
