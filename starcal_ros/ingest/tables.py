@@ -49,7 +49,9 @@ def read_velocities(path: Path) -> Velocities:
 def read_times(path: Path) -> dict[str, int]:
     """Stamps by the names of images, without folders; raises as `read_attitudes`."""
     rows = _rows(path, ('file',))
-    return {Path(row['file'] or '').name: _stamp(row, f'{path} line {number}') for number, row in rows}
+    return {
+        Path(row['file'] or '').name: _stamp(row, f'{path} line {number}') for number, row in rows
+    }
 
 
 def _rows(path: Path, needed: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
