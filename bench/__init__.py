@@ -14,5 +14,6 @@ LONG = (
     'soak',
     'transport',
     'attack',
+    'fleet',
 )
 """Those that take some minutes: run when they are named."""

@@ -41,7 +41,7 @@ def main() -> None:
     )
     args = parser.parse_args()
     venv = args.venv.absolute()
-    packages = ('oldest',) if args.versions == 'oldest' else ('runtime', 'dev')
+    packages = ('oldest',) if args.versions == 'oldest' else ('runtime', 'mission', 'dev')
     names = (*packages, 'colcon', args.ros)
     requirements = [ROOT / 'requirements' / f'{name}.txt' for name in names]
     check_request(args.ros, requirements[-1])

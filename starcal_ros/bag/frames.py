@@ -181,12 +181,14 @@ def read_frames(
     options: AttitudeOptions | None = None,
     on_damage: Damage = log_damage,
     size: tuple[int, int] | None = None,
+    channel: str = '',
 ) -> Iterator[Frame | StarObservations]:
     """
     Images of bags with their telemetry, in bag order.
 
     An image that cannot be decoded, or a compressed one of another ``size`` (width, height),
-    becomes refused observations.  The first sample out of order starts the second pass; images
+    becomes refused observations; ``channel`` is the colour that is taken of colour images
+    (`image_from_message`).  The first sample out of order starts the second pass; images
     yielded before it whose telemetry that pass changes are reported to ``on_damage``.
     """
     options = options or AttitudeOptions()
@@ -198,7 +200,7 @@ def read_frames(
     for raw in read_ahead(messages):
         in_order = True
         if raw.topic == topics.image:
-            waiting.append(image_of(raw, options.stamp_offset_s, size))
+            waiting.append(image_of(raw, options.stamp_offset_s, size, channel))
         elif not is_complete:
             in_order = telemetry.add(raw)
         if not is_complete and (not in_order or _is_too_much(waiting)):

@@ -181,23 +181,29 @@ def read_images(
     stamp_offset_s: float = 0.0,
     on_damage: Damage = log_damage,
     size: tuple[int, int] | None = None,
+    channel: str = '',
 ) -> Iterator[Image | StarObservations]:
     """
     Images of a topic; an image that cannot be decoded becomes refused observations.
 
     So does a compressed image of another ``size`` (width, height), where one is given.
+    ``channel`` is the colour that is taken of colour images (`image_from_message`).
     """
     for raw in read_raw(paths, [topic], on_damage):
-        yield image_of(raw, stamp_offset_s, size)
+        yield image_of(raw, stamp_offset_s, size, channel)
 
 
 def image_of(
-    raw: RawMessage, stamp_offset_s: float = 0.0, size: tuple[int, int] | None = None
+    raw: RawMessage,
+    stamp_offset_s: float = 0.0,
+    size: tuple[int, int] | None = None,
+    channel: str = '',
 ) -> Image | StarObservations:
     """
     Image of a message; refused observations if it cannot be decoded.
 
     So is a compressed image of another ``size`` (width, height), where one is given.
+    ``channel`` is the colour that is taken of colour images (`image_from_message`).
     """
     try:
         message = decode(raw)
@@ -205,7 +211,7 @@ def image_of(
         log_time_ns = nearest_stamp_ns(raw.log_time_ns)
         return refused_image(log_time_ns, 0, 0, 'bad_layout', str(error))
     try:
-        return image_from_message(message, stamp_offset_s, size)
+        return image_from_message(message, stamp_offset_s, size, channel)
     except ImageRefused as refused:
         return refused_from_message(message, stamp_offset_s, refused)
 

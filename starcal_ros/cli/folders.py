@@ -7,7 +7,16 @@ from pathlib import Path
 
 from starcal_ros.errors import OptionError
 
-_MODULES_OF_EXTRAS = ('dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')  # setup.cfg
+# setup.cfg; contourpy comes with matplotlib
+_MODULES_OF_EXTRAS = (
+    'contourpy',
+    'dask',
+    'distributed',
+    'jinja2',
+    'markupsafe',
+    'matplotlib',
+    'pyarrow',
+)
 
 
 def make_folder(path: Path) -> None:

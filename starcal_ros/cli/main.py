@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.simulation.mistakes import Mistakes
 
-# setup.cfg; contourpy comes with matplotlib
-_MODULES_OF_EXTRAS = ('contourpy', 'dask', 'distributed', 'jinja2', 'markupsafe', 'matplotlib')
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
 
@@ -80,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         discard('stdout')
         return complain(f'{error.filename or "input/output"}: {error.strerror or error}')
     except ModuleNotFoundError as error:
-        extra = 'studies' if command == 'campaign' else 'report'
+        extra = {'campaign': 'studies', 'trend': 'mission'}.get(command, 'report')
         return complain(missing_extra(error, extra))
     except KeyboardInterrupt:
         complain('interrupted')

@@ -1,14 +1,20 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Commands for missions: export."""
+"""Commands for missions: export, import and trend."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+import glob
 import math
+from pathlib import Path
 
+from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED
 from starcal_ros.cli.folders import make_folder
-from starcal_ros.cli.terminal import print_text
+from starcal_ros.cli.terminal import print_text, progress_bar
+from starcal_ros.errors import OptionError
+
+_FAILURES_SHOWN = 5
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -38,7 +44,89 @@ def _export(args: argparse.Namespace) -> int:
         print_text(f'largest error of a pixel against the calibration: {done.worst_px:.3g} px')
     for loss in done.losses:
         print_text(f'left out: {loss.part}, {loss.cost_px:.3g} px alone')
-    return 0
+    return EXIT_ACCEPTED
 
 
-COMMANDS: Mapping[str, Callable[[argparse.Namespace], int]] = {'export': _export}
+def _import(args: argparse.Namespace) -> int:
+    """Make a bag from the files of a mission."""
+    from starcal_ros.ingest import recording, sources, tables
+    from starcal_ros.ingest.images import ImageOptions
+
+    options = ImageOptions(
+        time_key=args.time_key,
+        times=None if args.times is None else tables.read_times(args.times),
+        hdu=args.hdu,
+        channel=args.channel,
+        bayer=args.bayer,
+        value_range=None if args.value_range is None else tuple(args.value_range),
+        temperature_key=args.temperature_key,
+    )
+    paths = _expanded(args.images)
+    inputs = [args.times, args.camera, *args.attitude, *(args.velocity or ())]
+    recording.check_place(args.output, [*paths, *filter(None, inputs)])
+    with progress_bar(2 * len(paths), 'images') as advance:
+        files, problems = recording.look_at_all(paths, options, advance)
+        for problem in problems:
+            complain(problem)
+        if problems:
+            return EXIT_BAD_INPUT
+        stamps = [file.time_ns for file in files]
+        attitudes = sources.attitudes(args.attitude, args.star_tracker, stamps)
+        velocities = args.velocity and sources.velocities(args.velocity, args.spacecraft, stamps)
+        prior = args.camera and recording.Prior(args.camera, tuple(args.alignment))
+        made = recording.write_bag(
+            args.output, files, options, attitudes, velocities, prior, advance
+        )
+    print_text(f'bag {made.bag}: {len(files)} images')
+    for note in made.notes:
+        print_text(f'note: {note}')
+    if made.params:
+        print_text(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
+    return EXIT_ACCEPTED
+
+
+def _expanded(patterns: Sequence[str]) -> list[Path]:
+    """Files of patterns, each once, in order of their names."""
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        names = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
+        if not names:
+            raise OptionError(f'--images: no file matches {pattern}')
+        found |= dict.fromkeys(map(Path, names))
+    return list(found)
+
+
+def _trend(args: argparse.Namespace) -> int:
+    """Follow calibrations over years."""
+    from starcal_ros.trend import fleet, page, tasks
+    from starcal_ros.trend.table import Table
+
+    if not args.root.is_dir():
+        raise OptionError(f'{args.root}: no such folder')
+    if not 0 <= args.workers <= 1024:
+        raise OptionError(f'--workers: {args.workers} is not within 0 to 1024')
+    make_folder(args.output)
+    table = Table(args.output)
+    if args.retry:
+        table.forget_failed()
+    found = list(tasks.find(args.root, args.params))
+    if not found:
+        raise OptionError(
+            f'{args.root}: no calibration.json below it, and no bag to calibrate with --params'
+        )
+    with progress_bar(len(found), 'calibrations') as advance:
+        done = fleet.update(table, found, args.workers, args.scheduler, advance)
+    rows = table.rows()
+    path = page.write_page(rows, args.output, str(args.root))
+    print_text(f'{done.computed} new, {done.known} known before, {done.failed} failed')
+    for row in [row for row in rows if row.error][:_FAILURES_SHOWN]:
+        print_text(f'failed: {row.path}: {row.error}')
+    print_text(f'{page.span_years(rows):.2f} years; look at {path}')
+    return EXIT_ACCEPTED if any(not row.error for row in rows) else EXIT_REFUSED
+
+
+COMMANDS: Mapping[str, Callable[[argparse.Namespace], int]] = {
+    'export': _export,
+    'import': _import,
+    'trend': _trend,
+}

@@ -75,7 +75,8 @@ def found_alignment(found: Diagnosis) -> tuple[list[float] | None, str]:
 
 
 def _images(paths: Sequence[Path], topic: str, setup: Setup) -> Iterator[Image]:
-    for image in reader.read_images(paths, topic, setup.attitude.stamp_offset_s):
+    offset_s, channel = setup.attitude.stamp_offset_s, setup.frames.image_channel
+    for image in reader.read_images(paths, topic, offset_s, channel=channel):
         if isinstance(image, Image):
             yield image
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
 from starcal_ros.image.file_header import has_surplus, png_header, PNG_HEADER_BYTES
+from starcal_ros.messages.colour import BAYER_ENCODINGS, of_mosaic, plane, RGB_ENCODINGS
 from starcal_ros.messages.fields import (
     is_stamp,
     make_header,
@@ -35,11 +36,13 @@ def decode_image(
     is_bigendian: bool,
     data: Any,
     time_ns: int,
+    channel: str = '',
 ) -> Image:
     """
     Pixels of an image message in native byte order, without its row padding.
 
-    No copy where the message holds them so already.
+    No copy where the message holds them so already.  Of a mosaic, the image of a colour has half
+    the width and height (`colour.of_mosaic`).
 
     Parameters
     ----------
@@ -47,20 +50,28 @@ def decode_image(
         As in sensor_msgs/Image; ``data`` is anything with a buffer of bytes.
     time_ns : int
         Middle of the exposure.
+    channel : str
+        Colour that is taken of a colour image: red, green or blue; empty: none are taken.
 
     Raises
     ------
     ImageRefused
         ``bad_encoding`` or ``bad_layout``.
     """
-    pixel_bytes = _PIXEL_BYTES.get(encoding)
-    if pixel_bytes is None:
+    is_colour = encoding in RGB_ENCODINGS or encoding in BAYER_ENCODINGS
+    if is_colour and not channel:
+        raise ImageRefused('bad_encoding', f'{encoding} is a colour image: set image_channel')
+    letters, pixel_bytes = RGB_ENCODINGS.get(encoding, ('', 0))
+    if not letters:
+        pixel_bytes = _PIXEL_BYTES.get(encoding) or BAYER_ENCODINGS.get(encoding, ('', 0))[1]
+    if not pixel_bytes:
         raise ImageRefused(
             'bad_encoding', f'{encoding[:40]!r} is not one of {", ".join(_PIXEL_BYTES)}'
         )
+    channels = max(len(letters), 1)
     # An empty buffer has no shape that frombuffer would take.
     flat = np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
-    row_bytes = width * pixel_bytes
+    row_bytes = width * pixel_bytes * channels
     if width < 1 or height < 1:
         raise ImageRefused('bad_layout', f'{width} x {height} is not an image')
     if step < row_bytes:
@@ -72,8 +83,14 @@ def decode_image(
     dtype = np.dtype(np.uint8 if pixel_bytes == 1 else '>u2' if is_bigendian else '<u2')
     # Strides rather than a slice: a step need not be a whole number of 16-bit pixels.
     rows: NDArray[Any] = np.ndarray(
-        (height, width), dtype, buffer=flat, strides=(step, pixel_bytes)
+        (height, width, channels),
+        dtype,
+        buffer=flat,
+        strides=(step, pixel_bytes * channels, pixel_bytes),
     )
+    rows = plane(rows, letters, channel) if letters else rows[:, :, 0]
+    if encoding in BAYER_ENCODINGS:
+        rows = of_mosaic(rows, BAYER_ENCODINGS[encoding][0], channel)
     pixels: NDArray[Any] = np.ascontiguousarray(rows, dtype.newbyteorder('='))
     pixels.setflags(write=False)
     return Image(time_ns, pixels)
@@ -124,13 +141,16 @@ def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> 
 
 
 def image_from_message(
-    message: Message, stamp_offset_s: float = 0.0, size: tuple[int, int] | None = None
+    message: Message,
+    stamp_offset_s: float = 0.0,
+    size: tuple[int, int] | None = None,
+    channel: str = '',
 ) -> Image:
     """
     Image of a sensor_msgs/Image or CompressedImage, its time shifted to the middle of exposure.
 
     ``size`` (width, height), where known, is that of the prior camera: a compressed image of
-    another is not decoded.
+    another is not decoded.  ``channel`` as for `decode_image`.
 
     Raises
     ------
@@ -150,6 +170,7 @@ def image_from_message(
         bool(message.is_bigendian),
         message.data,
         time_ns,
+        channel,
     )
 
 

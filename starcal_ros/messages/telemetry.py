@@ -25,8 +25,23 @@ from starcal_ros.messages.types import (
 
 
 def attitude_from_message(message: Message) -> tuple[int, Floats]:
-    """Stamp and (4,) xyzw of a geometry_msgs/QuaternionStamped, as on the wire and unchecked."""
-    return stamp_ns(message.header.stamp), quaternion_from_message(message.quaternion)
+    """
+    Stamp and (4,) xyzw of an attitude, as on the wire and unchecked.
+
+    Of a geometry_msgs/QuaternionStamped, PoseStamped or TransformStamped, or a sensor_msgs/Imu;
+    NaN for an Imu that marks its orientation as not known (first covariance -1).
+    """
+    if hasattr(message, 'quaternion'):
+        quaternion = message.quaternion
+    elif hasattr(message, 'pose'):
+        quaternion = message.pose.orientation
+    elif hasattr(message, 'transform'):
+        quaternion = message.transform.rotation
+    else:
+        quaternion = message.orientation
+        if message.orientation_covariance[0] == -1.0:
+            return stamp_ns(message.header.stamp), np.full(4, math.nan)
+    return stamp_ns(message.header.stamp), quaternion_from_message(quaternion)
 
 
 def attitude_to_message(

@@ -12,9 +12,19 @@ VELOCITY_TYPE = 'geometry_msgs/msg/TwistStamped'
 TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 ALIGNMENT_TYPE = 'geometry_msgs/msg/TransformStamped'
+POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
+IMU_TYPE = 'sensor_msgs/msg/Imu'
 OBSERVATIONS_TYPE = 'starcal/msg/StarObservations'
 CALIBRATION_TYPE = 'starcal/msg/Calibration'
 STATUS_TYPE = 'starcal/msg/EnsembleStatus'
+
+ATTITUDE_TYPES = {
+    'quaternion': ATTITUDE_TYPE,
+    'pose': POSE_TYPE,
+    'transform': ALIGNMENT_TYPE,
+    'imu': IMU_TYPE,
+}
+"""Values of the option `attitude_message`, and the type of message of each."""
 
 Message = Any  # a message class of rclpy or of rosbags: they share field names and nothing else
 

@@ -13,10 +13,10 @@ import threading
 import time
 from typing import Any
 
-from geometry_msgs.msg import QuaternionStamped, TwistStamped
+from geometry_msgs.msg import PoseStamped, QuaternionStamped, TransformStamped, TwistStamped
 import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Temperature
+from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, Temperature
 from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
@@ -58,6 +58,13 @@ from starcal_ros.star_observer.sliding_window import Recent
 
 NAME = 'star_observer'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# Values of the option `attitude_message`.
+_ATTITUDE_MESSAGES = {
+    'quaternion': QuaternionStamped,
+    'pose': PoseStamped,
+    'transform': TransformStamped,
+    'imu': Imu,
+}
 # Ten seconds of a fast star tracker; a bag played fast sends bursts.
 _SAMPLES = QoSProfile(depth=2000)
 _STAMP_NS = operator.itemgetter(0)
@@ -124,6 +131,7 @@ class StarObserver(StarcalNode):
         self._worker = threading.Thread(target=self._measure_all, name='measure')
         self._worker.start()
         asked = self._own.image_reliability
+        attitude_message = _ATTITUDE_MESSAGES[self._setup.attitude.attitude_message]
         images = with_reliability(
             QoSProfile(depth=self._own.image_queue),
             ReliabilityPolicy.BEST_EFFORT
@@ -134,7 +142,7 @@ class StarObserver(StarcalNode):
             (CalibrationMessage, 'calibration', self._on_calibration, LATCHED, False),
             (TwistStamped, 'velocity', self._on_velocity, _SAMPLES, True),
             (Temperature, 'temperature', self._on_temperature, _SAMPLES, True),
-            (QuaternionStamped, 'attitude', self._on_attitude, _SAMPLES, True),
+            (attitude_message, 'attitude', self._on_attitude, _SAMPLES, True),
             (*self._image_input(), self._on_image, images, asked == 'auto'),
         ):
             self.inputs.add(kind, topic, self.taking(callback), qos, adapts=adapts)
@@ -297,7 +305,12 @@ class StarObserver(StarcalNode):
             return
         offset_s, camera = self._setup.attitude.stamp_offset_s, self._setup.prior.camera
         try:
-            image = image_from_message(waiting.message, offset_s, (camera.width, camera.height))
+            image = image_from_message(
+                waiting.message,
+                offset_s,
+                (camera.width, camera.height),
+                self._setup.frames.image_channel,
+            )
         except ImageRefused as refused:
             self._publish(self._refused(waiting, refused.reason, refused.detail))
             return

@@ -24,6 +24,7 @@ from starcal_ros.identification.tracking import start_tracking, track_stars, Tra
 from starcal_ros.image.frame_checks import Fingerprint, fingerprint, sample_rows, screen
 from starcal_ros.image.hot_pixels import HotPixels, learn_hot_pixels
 from starcal_ros.image.image_model import saturation_level
+from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
@@ -108,7 +109,7 @@ def observe_next(
         screen(sample, seen, track.seen, saturation_dn, setup.dark, setup.screening)
         hot = (track.hot or setup.hot).index
         exposure = Exposure(
-            _without_dark(image, setup),
+            flattened(_without_dark(image, setup), setup.flat, setup.dark_pedestal_dn),
             quaternion,
             gap_s,
             velocity_m_s,
@@ -291,7 +292,8 @@ def observe_bag(
     topics = FrameTopics(image_topic, attitude_topic, velocity_topic, temperature_topic)
     track = Track(setup.prior)
     size = (setup.prior.camera.width, setup.prior.camera.height)
-    for frame in read_frames(paths, topics, setup.attitude, size=size):
+    channel = setup.frames.image_channel
+    for frame in read_frames(paths, topics, setup.attitude, size=size, channel=channel):
         if isinstance(frame, StarObservations):
             yield frame
             continue

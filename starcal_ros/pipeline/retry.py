@@ -31,7 +31,8 @@ def measured_again(
     named = FrameTopics(topics.image, topics.attitude, topics.velocity, topics.temperature)
     camera = setup.prior.camera
     again: dict[int, StarObservations] = {}
-    for frame in read_frames(paths, named, setup.attitude, size=(camera.width, camera.height)):
+    size, channel = (camera.width, camera.height), setup.frames.image_channel
+    for frame in read_frames(paths, named, setup.attitude, size=size, channel=channel):
         if isinstance(frame, StarObservations) or frame.image.time_ns not in wanted - again.keys():
             continue
         record, _ = observe.observe_next(

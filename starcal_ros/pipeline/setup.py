@@ -30,6 +30,7 @@ from starcal_ros.image.hot_pixels import (
 )
 from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.lens import COEFFICIENTS
+from starcal_ros.messages.colour import CHANNELS
 from starcal_ros.options import (
     from_mapping,
     holds_options,
@@ -40,6 +41,7 @@ from starcal_ros.options import (
     OptionValue,
     read_parameter_file,
 )
+from starcal_ros.pipeline.detector_frames import read_bad_pixels, read_flat, with_bad_pixels
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.products.camera_yaml import (
     DEFAULT_CAMERA_NAME,
@@ -60,7 +62,7 @@ _LONGEST = 500.0  # focal length by the width: a field of 0.1 degrees
 
 @dataclass(frozen=True)
 class SetupOptions:
-    """Prior camera and alignment, frames, catalog and dark frame."""
+    """Prior camera and alignment, frames, catalog and detector frames."""
 
     camera_info_url: str = option(
         '', 'ROS camera YAML of the prior camera: file:// or package:// URL, or a path'
@@ -79,16 +81,32 @@ class SetupOptions:
     )
     star_tracker_frame: str = option('star_tracker', 'name of the star tracker frame')
     camera_frame: str = option('camera_optical_frame', 'name of the camera optical frame')
+    image_channel: str = option(
+        '',
+        'colour that is taken of rgb, bgr and bayer images; of bayer ones the camera has half the'
+        ' width and height; empty: colour images are refused',
+        choices=('', *CHANNELS),
+    )
     catalog: str = option('', 'star catalog file; empty: the bundled one')
     dark_frame: str = option(
         '', 'dark frame to subtract, a PNG or TIFF of image size and depth; empty: none'
+    )
+    flat_field: str = option(
+        '',
+        'flat field to divide by, a FITS, TIFF or PNG of image size; its median counts as 1;'
+        ' empty: none',
+    )
+    bad_pixel_map: str = option(
+        '',
+        'map of bad pixels, a FITS, TIFF or PNG of image size: those that are not 0 are left out'
+        ' of stars like hot pixels; empty: none',
     )
 
 
 @dataclass(frozen=True)
 class Setup:
     """
-    Options of every stage, with prior camera, catalog and dark frame loaded.
+    Options of every stage, with prior camera, catalog and detector frames loaded.
 
     Where no prior alignment ``is_aligned``, that of ``prior`` is the identity, until one is found.
     """
@@ -109,6 +127,7 @@ class Setup:
     hot: HotPixels = NO_HOT_PIXELS
     is_aligned: bool = True
     camera_name: str = DEFAULT_CAMERA_NAME
+    flat: Floats | None = None
 
     @property
     def star_search(self) -> StarSearch:
@@ -150,7 +169,7 @@ def read_setup(params: Path) -> Setup:
 
 def files_of(frames: SetupOptions) -> tuple[Path, ...]:
     """
-    The files that options name: prior camera, catalog and dark frame.
+    The files that options name: prior camera, catalog and detector frames.
 
     Raises
     ------
@@ -160,8 +179,8 @@ def files_of(frames: SetupOptions) -> tuple[Path, ...]:
     files = [resolve_url(frames.camera_info_url)] if frames.camera_info_url else []
     if frames.catalog:
         files.append(Path(frames.catalog))
-    if frames.dark_frame:
-        files.append(Path(frames.dark_frame.removeprefix('file://')))
+    for path in filter(None, (frames.dark_frame, frames.flat_field, frames.bad_pixel_map)):
+        files.append(Path(path.removeprefix('file://')))
     return tuple(files)
 
 
@@ -196,17 +215,23 @@ def load_setup(
     check_gate_options(groups['gate'], prior.camera)
     path = Path(frames.catalog) if frames.catalog else None
     dark = _read_dark(frames.dark_frame, prior.camera.width, prior.camera.height)
+    flat = read_flat(frames.flat_field, prior.camera.width, prior.camera.height)
     return Setup(
         **groups,
         prior=prior,
         catalog=load_catalog(path, groups['identification'].magnitude_limit),
         dark=dark,
         dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
-        hot=hot_in_dark(dark, groups['fixed_pattern']),
+        hot=with_bad_pixels(
+            hot_in_dark(dark, groups['fixed_pattern']),
+            read_bad_pixels(frames.bad_pixel_map, prior.camera.width, prior.camera.height),
+            flat,
+        ),
         is_aligned=is_aligned,
         camera_name=read_camera_name(frames.camera_info_url)
         if frames.camera_info_url
         else DEFAULT_CAMERA_NAME,
+        flat=flat,
     )
 
 

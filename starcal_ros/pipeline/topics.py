@@ -12,6 +12,7 @@ from starcal_ros.bag import reader
 from starcal_ros.errors import BagError
 from starcal_ros.messages.types import (
     ATTITUDE_TYPE,
+    ATTITUDE_TYPES,
     COMPRESSED_TYPE,
     IMAGE_TYPE,
     OBSERVATIONS_TYPE,
@@ -61,7 +62,8 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
         if any(t.type_name == kind and t.name == f'/{asked.image.lstrip("/")}' for t in there):
             image_type = kind
     image = _choose(paths, image_type, asked.image, 'image')
-    attitude = _choose(paths, ATTITUDE_TYPE, asked.attitude, 'attitude')
+    attitude_type = ATTITUDE_TYPES[setup.attitude.attitude_message] if setup else ATTITUDE_TYPE
+    attitude = _choose(paths, attitude_type, asked.attitude, 'attitude')
     velocity, temperature = asked.velocity, asked.temperature
     if velocity or VELOCITY_TYPE in types:
         velocity = _choose(paths, VELOCITY_TYPE, velocity, 'velocity')

@@ -96,15 +96,28 @@ class Panel:
         self._left, self._right = sorted((x.start, x.end))
         self._top, self._bottom = sorted((y.start, y.end))
 
-    def axes(self, x_label: str, y_label: str, is_framed: bool = False, most: int = 6) -> None:
-        """Lines, ticks and labels of the axes; a grid unless framed.  Without a label no axis."""
+    def axes(
+        self,
+        x_label: str,
+        y_label: str,
+        is_framed: bool = False,
+        most: int = 6,
+        x_ticks: Sequence[tuple[float, str]] | None = None,
+    ) -> None:
+        """
+        Lines, ticks and labels of the axes; a grid unless framed.  Without a label no axis.
+
+        ``x_ticks`` are values and their names; None: round numbers.
+        """
         draw = self.parts.append
         left, right, top, bottom = self._left, self._right, self._top, self._bottom
-        x_ticks = self.x.ticks(6) if x_label else []
-        for value, x in zip(x_ticks, self.x(np.array(x_ticks)), strict=True):
+        if x_ticks is None:
+            x_ticks = [(value, in_digits(value)) for value in self.x.ticks(6) if x_label]
+        for value, name in x_ticks:
+            x = float(self.x(value))
             if not is_framed:
                 draw(_line(x, top, x, bottom, GRID, 0.7))
-            draw(_text(x, bottom + 15, in_digits(value), 'middle'))
+            draw(_text(x, bottom + 15, name, 'middle'))
         y_ticks = self.y.ticks(most) if y_label else []
         for value, y in zip(y_ticks, self.y(np.array(y_ticks)), strict=True):
             if not is_framed:

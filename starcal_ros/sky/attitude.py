@@ -41,6 +41,13 @@ class AttitudeOptions:
         'direction of the rotation in the attitude message (ROS does not define it)',
         choices=('st_to_inertial', 'inertial_to_st'),
     )
+    attitude_message: str = option(
+        'quaternion',
+        'message type of the attitudes; quaternion: geometry_msgs/QuaternionStamped, pose:'
+        ' geometry_msgs/PoseStamped, transform: geometry_msgs/TransformStamped, imu:'
+        ' sensor_msgs/Imu (its orientation)',
+        choices=('quaternion', 'pose', 'transform', 'imu'),
+    )
 
 
 def attitude_sample(

@@ -1,9 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Process that calls a function for the numbers that its parent sends: ``python -m`` of this module.
+Process that calls a function with the items that its parent sends: ``python -m`` of this module.
 
 It reads pickles from its standard input, a pipe that only the parent holds: the path of imports,
-the function, then numbers.  It writes one pickle for each number, the result or the exception.
+the function, then items.  It writes one pickle for each item, the result or the exception.
 There is no socket, so no other user can send it code.
 """
 
@@ -25,9 +25,9 @@ def main() -> None:
         sys.path[:] = pickle.load(sys.stdin.buffer)
         function = pickle.load(sys.stdin.buffer)
         while True:
-            number = pickle.load(sys.stdin.buffer)
+            item = pickle.load(sys.stdin.buffer)
             try:
-                answer = (True, function(number))
+                answer = (True, function(item))
             except Exception as error:
                 answer = (False, error)
             pickle.dump(answer, answers)

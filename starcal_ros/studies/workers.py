@@ -1,9 +1,10 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Parallel trials, in processes of this machine or on a running Dask cluster."""
+"""Parallel trials and tasks, in processes of this machine or on a running Dask cluster."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 import contextlib
 import functools
 import itertools
@@ -12,12 +13,13 @@ import os
 import pickle
 import queue
 import re
+import selectors
 import signal
 import subprocess
 import sys
 import threading
 from types import FrameType
-from typing import Any, TYPE_CHECKING, TypeVar
+from typing import Any, IO, TYPE_CHECKING, TypeVar
 
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.safe_path import module_command
@@ -26,11 +28,13 @@ from starcal_ros.studies.monte_carlo import Design, Row, run_trial
 if TYPE_CHECKING:
     from distributed import Client, Future
 
+Item = TypeVar('Item')
 Result = TypeVar('Result')
 Process = subprocess.Popen[bytes]
 
 _CONNECT_S = 10.0
 _POLL_S = 0.2  # interval of checks for an interrupt
+_TRIES = 3  # of an item whose process ends, the last of them alone
 _AHEAD = 8  # trials submitted ahead for each worker thread of a cluster
 _ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
 _ADDRESS = re.compile(r'(tcp|tls)://[^/\s]+:\d{1,5}')
@@ -77,120 +81,228 @@ def run_each(
     OptionError
         When no scheduler answers at the address.
     StarcalError
-        When a process ends early.
+        When the processes of a call end early, each time that it is tried.
     """
-    if not scheduler and workers == 0:
-        results = []
-        for number in range(count):
-            results.append((number, function(number)))
+    results = []
+    with contextlib.closing(stream_each(function, range(count), workers, scheduler)) as found:
+        for number, result in found:
+            if isinstance(result, Exception):
+                raise result
+            results.append((number, result))
             on_each()
-        return results
+    return results
+
+
+def stream_each(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    workers: int = 0,
+    scheduler: str = '',
+) -> Generator[tuple[int, Result | Exception], None, None]:
+    """
+    Pairs (index, result) of a function called with each item, in any order, as they come.
+
+    The result of an item whose function raises, or whose process ends early each time that it is
+    tried, is the exception.  ``workers`` and ``scheduler`` as for `run_each`.
+
+    Raises
+    ------
+    OptionError
+        When no scheduler answers at the address.
+    """
+    if not items:
+        return
+    if not scheduler and workers == 0:
+        for number, item in enumerate(items):
+            try:
+                yield number, function(item)
+            except Exception as error:
+                yield number, error
+        return
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(_interrupts_wait())
-        if not scheduler:
-            return _in_processes(function, count, min(workers, count), on_each, stop)
-        import dask
+        if scheduler:
+            import dask
 
-        settings = {'logging': {'distributed': 'critical'}}
-        stack.enter_context(dask.config.set(settings))
-        stack.enter_context(_quiet())
-        client = stack.enter_context(_client(scheduler))
-        return _gather(client, function, count, on_each, stop)
+            settings = {'logging': {'distributed': 'critical'}}
+            stack.enter_context(dask.config.set(settings))
+            stack.enter_context(_quiet())
+            client = stack.enter_context(_client(scheduler))
+            yield from _on_cluster(client, function, items, stop)
+        else:
+            start = pickle.dumps(sys.path) + pickle.dumps(function)
+            processes = stack.enter_context(contextlib.closing(_Processes(start)))
+            yield from _in_processes(processes, items, min(workers, len(items)), stop)
 
 
-def _in_processes(
-    function: Callable[[int], Result],
-    count: int,
-    workers: int,
-    on_each: Callable[[], None],
-    stop: threading.Event,
-) -> list[tuple[int, Result]]:
+class _Processes:
     """
-    All results, from processes that are reached through their own pipes only.
+    Worker processes that are reached through their own pipes only; closing ends them.
 
     No process starts from a copy of this one, whose threads may hold locks, nor listens on a
     socket, where another user could send it code.
     """
-    start = pickle.dumps(sys.path) + pickle.dumps(function)
-    numbers = iter(range(count))
-    taking = threading.Lock()
-    answers: queue.SimpleQueue[tuple[int, bool, Any]] = queue.SimpleQueue()
 
-    def converse(process: Process) -> None:
-        assert process.stdin is not None and process.stdout is not None  # both are pipes
-        number = -1
-        try:
-            process.stdin.write(start)
-            while True:
-                with taking:
-                    number = next(numbers, -1)
-                if number < 0:
-                    return
-                pickle.dump(number, process.stdin)
-                process.stdin.flush()
-                answers.put((number, *pickle.load(process.stdout)))
-        except (OSError, EOFError, ValueError, pickle.UnpicklingError):
-            status = process.wait()
-            error = StarcalError(f'a worker process ended with status {status}: out of memory?')
-            answers.put((number, False, error))
+    def __init__(self, start: bytes) -> None:
+        self._start = start
+        self._idle: list[Process] = []
+        self._busy = selectors.DefaultSelector()
 
-    results: list[tuple[int, Result]] = []
-    with _processes(workers) as processes:
-        for process in processes:
-            threading.Thread(target=converse, args=(process,), daemon=True).start()
-        while len(results) < count:
-            if stop.is_set():
-                raise KeyboardInterrupt
-            with contextlib.suppress(queue.Empty):
-                number, success, found = answers.get(timeout=_POLL_S)
-                if not success:
-                    raise found
-                results.append((number, found))
-                on_each()
-    return results
+    @property
+    def busy(self) -> int:
+        """Number of processes that have an item."""
+        return len(self._busy.get_map())
 
+    def send(self, number: int, item: object) -> None:
+        """Give an item and its number to an idle process, or to a new one."""
+        process = self._idle.pop() if self._idle else self._started()
+        self._busy.register(_pipe(process.stdout), selectors.EVENT_READ, (process, number))
+        # Of a process that has ended, `answers` reports the end.
+        with contextlib.suppress(BrokenPipeError):
+            pickle.dump(item, _pipe(process.stdin))
+            _pipe(process.stdin).flush()
 
-@contextlib.contextmanager
-def _processes(count: int) -> Iterator[list[Process]]:
-    """Worker processes, which end here at the latest."""
-    started: list[Process] = []
-    try:
-        for _ in range(count):
-            started.append(
-                subprocess.Popen(
-                    module_command('starcal_ros.studies.worker'),
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    env={**os.environ, **_ONE_THREAD},
-                )
-            )
-        yield started
-    finally:
-        for process in started:
+    def end_idle(self) -> None:
+        """End the processes that have no item."""
+        while self._idle:
+            _end(self._idle.pop())
+
+    def answers(self, timeout_s: float) -> list[tuple[int, bool, Any]]:
+        """
+        Triples (number, success, result or exception) that came within a time.
+
+        Of a process that ended, success is False and the exception a `_Death`.
+        """
+        found: list[tuple[int, bool, Any]] = []
+        for key, _ in self._busy.select(timeout_s):
+            process, number = key.data
+            self._busy.unregister(key.fileobj)
+            try:
+                found.append((number, *pickle.load(_pipe(process.stdout))))
+                self._idle.append(process)
+            except (OSError, EOFError, ValueError, pickle.UnpicklingError):
+                _end(process)
+                found.append((number, False, _Death(process.returncode)))
+        return found
+
+    def close(self) -> None:
+        """End all processes."""
+        busy = [key.data[0] for key in self._busy.get_map().values()]
+        for process in (*self._idle, *busy):
             process.kill()
-        for process in started:
-            process.wait()
-            for pipe in (process.stdin, process.stdout):
-                with contextlib.suppress(OSError):  # what was left to write finds no reader
-                    pipe.close()  # type: ignore[union-attr]
+        for process in (*self._idle, *busy):
+            _end(process)
+        self._busy.close()
+
+    def _started(self) -> Process:
+        process = subprocess.Popen(
+            module_command('starcal_ros.studies.worker'),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, **_ONE_THREAD},
+        )
+        with contextlib.suppress(BrokenPipeError):
+            _pipe(process.stdin).write(self._start)
+        return process
+
+
+class _Death(Exception):
+    """A process ended with an exit status and did not answer."""
+
+
+def _pipe(pipe: IO[bytes] | None) -> IO[bytes]:
+    assert pipe is not None  # all are pipes, see `_Processes._started`
+    return pipe
+
+
+def _end(process: Process) -> None:
+    """End a process that does not answer, and close its pipes."""
+    process.kill()
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        with contextlib.suppress(OSError):  # what was left to write finds no reader
+            _pipe(pipe).close()
+
+
+def _in_processes(
+    processes: _Processes, items: Sequence[Item], workers: int, stop: threading.Event
+) -> Iterator[tuple[int, Any]]:
+    """
+    Results as they come, from so many processes at a time.
+
+    An item whose process ends is tried again in another and, if that ends too, at the end, in a
+    new process while there is no other: where memory is short, the system may end the wrong one.
+    """
+    waiting, last = deque(range(len(items))), deque[int]()
+    deaths: Counter[int] = Counter()
+    while waiting or last or processes.busy:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        while waiting and processes.busy < workers:
+            number = waiting.popleft()
+            processes.send(number, items[number])
+        if last and not processes.busy:
+            processes.end_idle()
+            number = last.popleft()
+            processes.send(number, items[number])
+        for number, success, result in processes.answers(_POLL_S):
+            if success or not isinstance(result, _Death):
+                yield number, result
+                continue
+            deaths[number] += 1
+            if deaths[number] == _TRIES:
+                status = result.args[0]
+                yield (
+                    number,
+                    StarcalError(
+                        f'a worker process ended with status {status}, the last of {_TRIES} times:'
+                        ' out of memory?'
+                    ),
+                )
+            elif deaths[number] == _TRIES - 1:
+                last.append(number)
+            else:
+                waiting.append(number)
+
+
+def _on_cluster(
+    client: Client,
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    stop: threading.Event,
+) -> Iterator[tuple[int, Result | Exception]]:
+    """Results as they come, from the workers of a cluster."""
+    from distributed import KilledWorker
+
+    killed = []
+    for number, result in _gather(client, function, dict(enumerate(items)), stop):
+        if isinstance(result, KilledWorker):
+            killed.append(number)
+        else:
+            yield number, result
+    # An item that only waited on a worker that another one ended is blamed too: alone, each shows
+    # whether it was the one.
+    for number in killed:
+        for _, result in _gather(client, function, {number: items[number]}, stop):
+            if isinstance(result, KilledWorker):
+                result = StarcalError('the workers of the cluster ended with it: out of memory?')
+            yield number, result
 
 
 def _gather(
     client: Client,
-    function: Callable[[int], Result],
-    count: int,
-    on_each: Callable[[], None],
+    function: Callable[[Item], Result],
+    items: Mapping[int, Item],
     stop: threading.Event,
-) -> list[tuple[int, Result]]:
-    """All results; submits few tasks ahead, since cancelling 100,000 of them is slow."""
-    results: list[tuple[int, Result]] = []
+) -> Iterator[tuple[int, Result | Exception]]:
+    """Results as they come; submits few tasks ahead, since cancelling 100,000 of them is slow."""
     finished: queue.SimpleQueue[Future[Result]] = queue.SimpleQueue()
     submitted: dict[Future[Result], int] = {}
-    numbers = iter(range(count))
+    waiting = iter(items.items())
 
     def submit(most: int) -> None:
-        for number in itertools.islice(numbers, most):
-            future = client.submit(function, number, pure=False, retries=2)
+        for number, item in itertools.islice(waiting, most):
+            future = client.submit(function, item, pure=False, retries=2)
             submitted[future] = number
             future.add_done_callback(finished.put)  # type: ignore[no-untyped-call]
 
@@ -201,10 +313,13 @@ def _gather(
             raise KeyboardInterrupt
         with contextlib.suppress(queue.Empty):
             future = finished.get(timeout=_POLL_S)
-            results.append((submitted.pop(future), future.result()))
-            on_each()
+            number = submitted.pop(future)
+            try:
+                result: Result | Exception = future.result()
+            except Exception as error:
+                result = error
             submit(1)
-    return results
+            yield number, result
 
 
 @contextlib.contextmanager

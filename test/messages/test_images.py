@@ -68,7 +68,8 @@ def test_native_images_are_not_copied() -> None:
 @pytest.mark.parametrize(
     ('change', 'reason', 'detail'),
     [
-        ({'encoding': 'rgb8'}, 'bad_encoding', "'rgb8' is not one of mono8"),
+        ({'encoding': 'yuv422'}, 'bad_encoding', "'yuv422' is not one of mono8"),
+        ({'encoding': 'rgb8'}, 'bad_encoding', 'rgb8 is a colour image: set image_channel'),
         ({'encoding': ''}, 'bad_encoding', "'' is not"),
         ({'encoding': 'x' * 9999}, 'bad_encoding', 'xxx'),
         ({'width': 0}, 'bad_layout', '0 x 3'),

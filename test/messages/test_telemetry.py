@@ -10,6 +10,7 @@ import pytest
 from sample_records import plain  # type: ignore[import-not-found]
 
 from starcal_ros.bag.typestore import make_message
+from starcal_ros.messages.fields import make_header, quaternion_to_message, vector_to_message
 from starcal_ros.messages.telemetry import (
     attitude_from_message,
     attitude_to_message,
@@ -18,6 +19,7 @@ from starcal_ros.messages.telemetry import (
     velocity_from_message,
     velocity_to_message,
 )
+from starcal_ros.messages.types import ATTITUDE_TYPES
 
 
 def test_attitude_and_velocity_round_trip() -> None:
@@ -40,3 +42,44 @@ def test_temperature_round_trip(make: Any) -> None:
     # A sensor that has failed says inf or NaN: not known.
     message = temperature_to_message(7, np.inf, 'camera', make)
     assert np.isnan(temperature_from_message(message)[1])
+
+
+@pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
+@pytest.mark.parametrize('kind', list(ATTITUDE_TYPES))
+def test_attitudes_of_each_type_are_read(make: Any, kind: str) -> None:
+    message = attitude_message(kind, make)
+    time_ns, xyzw = attitude_from_message(message)
+    assert time_ns == 5
+    np.testing.assert_array_equal(xyzw, XYZW)
+    if kind == 'imu':
+        message.orientation_covariance[0] = -1.0  # sensor_msgs/Imu: orientation not known
+        assert np.isnan(attitude_from_message(message)[1]).all()
+
+
+XYZW = np.array([0.1, 0.7, -0.1, 0.7])
+
+
+def attitude_message(kind: str, make: Any) -> Any:
+    """A message of a type with the attitude `XYZW` at 5 ns."""
+    rotation = quaternion_to_message(XYZW, make)
+    zero = vector_to_message(np.zeros(3), make)
+    fields: dict[str, Any] = {'header': make_header(5, 'icrf', make)}
+    if kind == 'quaternion':
+        fields['quaternion'] = rotation
+    elif kind == 'pose':
+        point = make('geometry_msgs/msg/Point', x=1.0, y=2.0, z=3.0)
+        pose = make('geometry_msgs/msg/Pose', position=point, orientation=rotation)
+        fields['pose'] = pose
+    elif kind == 'transform':
+        transform = make('geometry_msgs/msg/Transform', translation=zero, rotation=rotation)
+        fields |= {'child_frame_id': 'st', 'transform': transform}
+    else:
+        fields |= {
+            'orientation': rotation,
+            'orientation_covariance': np.zeros(9),
+            'angular_velocity': zero,
+            'angular_velocity_covariance': np.zeros(9),
+            'linear_acceleration': zero,
+            'linear_acceleration_covariance': np.zeros(9),
+        }
+    return make(ATTITUDE_TYPES[kind], **fields)

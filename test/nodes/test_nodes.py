@@ -35,7 +35,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Temperature
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, Temperature
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
@@ -270,6 +270,30 @@ def test_every_image_gets_one_answer(
     values = {v.key: v.value for v in diagnostics[0].status[0].values}
     assert (values['images'], values['refused_bad_layout']) == ('6', '2')
     assert diagnostics[0].status[0].level == b'\x01'
+
+
+def test_attitudes_of_an_imu_are_taken_by_parameter(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """The orientations of an Imu serve as the quaternions do."""
+    start_node('star_observer', ros=parameters(tiny_bag, 'attitude_message:=imu'))
+    answers: list[Any] = client.collect(StarObservations, 'observations')
+    images = client.publisher(Image, 'image', 50)
+    attitudes = client.publisher(Imu, 'attitude', 200)
+    client.until_listened()
+    for raw in reader.read_raw([tiny_bag], ['/star_tracker/attitude']):
+        decoded = reader.decode(raw)
+        sample = Imu()
+        sample.header.stamp.sec = decoded.header.stamp.sec
+        sample.header.stamp.nanosec = decoded.header.stamp.nanosec
+        for axis in 'xyzw':
+            setattr(sample.orientation, axis, getattr(decoded.quaternion, axis))
+        attitudes.publish(sample)
+    first = next(iter(reader.read_images([tiny_bag], '/opnav/image_raw')))
+    assert isinstance(first, ImageRecord)
+    images.publish(image_to_message(first, 'camera', make_message))
+    client.until(lambda: bool(answers))
+    assert answers[0].refusal == '' and len(answers[0].catalog_id) > 50
 
 
 def test_image_waits_for_its_attitude(

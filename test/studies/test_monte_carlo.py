@@ -122,8 +122,27 @@ def test_workers_are_reached_through_no_socket() -> None:
 def test_an_error_and_the_end_of_a_worker_reach_the_caller() -> None:
     with pytest.raises(ValueError, match='invalid literal'):
         workers.run_each(functools.partial(int, 'x'), 3, workers=1)  # int('x', 0)
-    with pytest.raises(StarcalError, match='a worker process ended with status 0'):
-        workers.run_each(os._exit, 3, workers=1)  # os._exit(0), then none for 1 and 2
+    with pytest.raises(StarcalError, match='a worker process ended with status 0, the last of 3'):
+        workers.run_each(os._exit, 1, workers=1)  # os._exit(0)
+
+
+@pytest.mark.parametrize('count', [1, 2])
+def test_each_result_comes_once_whatever_workers_are_killed(count: int) -> None:
+    """Idle or at work; an exception and a process that ends each time cost themselves only."""
+    us = psutil.Process()
+    earlier = {child.pid for child in us.children()}  # of other tests
+    items, found = [*'1234', 'x', *'5678'], {}
+    for number, result in workers.stream_each(int, items, workers=count):
+        assert number not in found
+        found[number] = result
+        if len(found) < 6:
+            for child in us.children():
+                if child.pid not in earlier:
+                    child.kill()
+    assert isinstance(found.pop(4), ValueError)
+    assert found == {k: int(item) for k, item in enumerate(items) if item != 'x'}
+    ended = dict(workers.stream_each(os._exit, [3, 4, 5], workers=count))
+    assert all('ended with status' in str(error) for error in ended.values()) and len(ended) == 3
 
 
 def test_interrupted_leaves_in_one_line(tmp_path: Path) -> None:

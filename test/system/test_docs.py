@@ -164,7 +164,7 @@ def test_every_parameter_is_in_the_interface_document_and_none_else() -> None:
     assert sorted(rows) == sorted(f.name for cls in OPTIONS for f in dataclasses.fields(cls))
 
 
-FILE_ENDINGS = ('html', 'json', 'mcap', 'md', 'npz', 'py', 'yaml')
+FILE_ENDINGS = ('html', 'json', 'mcap', 'md', 'npz', 'py', 'tf', 'ti', 'yaml')
 
 
 @pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

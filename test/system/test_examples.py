@@ -64,3 +64,13 @@ def test_the_notebook_is_kept_without_outputs() -> None:
     cells = json.loads((EXAMPLES / 'calibrate.ipynb').read_text())['cells']
     for cell in cells:
         assert not cell.get('outputs') and cell.get('execution_count') is None
+
+
+def test_mission(tmp_path: Path) -> None:
+    """FITS and AEM to kernels that spiceypy loads, with the boresight of the calibration."""
+    params = TINY / 'params.yaml'
+    done = run(tmp_path, EXAMPLES / 'mission.py', TINY, params, tmp_path / 'mission')
+    assert (done.returncode, done.stderr) == (0, '')
+    difference = done.stdout.splitlines()[-1].removeprefix('difference from the calibration: ')
+    assert float(difference.split()[0]) < 1e-9
+    assert (tmp_path / 'mission/camera.ti').read_text().startswith('KPL/IK')

@@ -18,7 +18,16 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE', 'msg')
-OF_EXTRAS = ('dask', 'distributed', 'jinja2', 'matplotlib', 'sphinx', 'spiceypy')
+OF_EXTRAS = (
+    'ccsds_ndm',
+    'dask',
+    'distributed',
+    'jinja2',
+    'matplotlib',
+    'pyarrow',
+    'sphinx',
+    'spiceypy',
+)
 
 
 def run(*command: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:

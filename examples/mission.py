@@ -1,0 +1,105 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+From FITS images and a CCSDS attitude file to SPICE kernels, and a check of these with spiceypy.
+
+Run: python mission.py BAG PARAMS DIR, for example with bags/tiny.  BAG stands for a mission here:
+its images become FITS files and its attitudes an AEM.  Needs pip install 'starcal_ros[mission]'.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+from pathlib import Path
+import sys
+
+from astropy.io import fits
+import numpy as np
+import spiceypy
+import yaml
+
+import starcal_ros
+from starcal_ros.bag import reader
+from starcal_ros.cli.main import main as starcal
+from starcal_ros.records import Image
+
+
+def utc(time_ns: int) -> str:
+    """Date and time to the nanosecond."""
+    seconds, rest_ns = divmod(time_ns, 10**9)
+    return f'{datetime.fromtimestamp(seconds, timezone.utc):%Y-%m-%dT%H:%M:%S}.{rest_ns:09d}'
+
+
+def write_mission_files(bag: Path, folder: Path) -> None:
+    """Write the images of a bag as FITS files and its attitudes as an AEM."""
+    for number, image in enumerate(reader.read_images([bag], '/opnav/image_raw')):
+        assert isinstance(image, Image)
+        hdu = fits.PrimaryHDU(image.pixels)
+        hdu.header['DATE-AVG'] = utc(image.time_ns)
+        hdu.writeto(folder / f'{number:03d}.fits', overwrite=True)
+    samples = []
+    for raw in reader.read_raw([bag], ['/star_tracker/attitude']):
+        message = reader.decode(raw)
+        stamp, q = message.header.stamp, message.quaternion
+        date = utc(stamp.sec * 10**9 + stamp.nanosec)
+        samples.append((date, f'{date} {q.x!r} {q.y!r} {q.z!r} {q.w!r}'))
+    header = f"""CCSDS_AEM_VERS = 1.0
+CREATION_DATE = {samples[0][0]}
+ORIGINATOR = EXAMPLE
+META_START
+OBJECT_NAME = EXAMPLE
+OBJECT_ID = 2026-001A
+CENTER_NAME = EARTH
+REF_FRAME_A = ICRF
+REF_FRAME_B = STARTRACKER_1
+ATTITUDE_DIR = A2B
+TIME_SYSTEM = UTC
+START_TIME = {samples[0][0]}
+STOP_TIME = {samples[-1][0]}
+ATTITUDE_TYPE = QUATERNION
+QUATERNION_TYPE = LAST
+META_STOP
+DATA_START
+"""
+    text = header + '\n'.join(line for _, line in samples) + '\nDATA_STOP\n'
+    (folder / 'attitude.aem').write_text(text)
+
+
+def run(*words: object) -> None:
+    """One command of the tool; ends the script if it fails."""
+    if starcal([str(word) for word in words]):
+        sys.exit(1)
+
+
+def main() -> int:
+    """Import, calibrate, export, and read the kernels."""
+    bag, params, folder = map(Path, sys.argv[1:4])
+    folder.mkdir(parents=True, exist_ok=True)
+    write_mission_files(bag, folder)
+    values = yaml.safe_load(params.read_text())['/**']['ros__parameters']
+    run(
+        'import', '--images', folder / '*.fits', '--attitude', folder / 'attitude.aem',
+        '-o', folder / 'bag', '--camera', params.parent / values['camera_info_url'],
+        '--alignment', *values['prior_alignment'],
+    )  # fmt: skip
+    run('calibrate', folder / 'bag', '--params', folder / 'bag/params.yaml', '-o', folder / 'out')
+    run(
+        'export', folder / 'out', '--to', 'spice', '-o', folder,
+        '--spacecraft-id', -999, '--star-tracker-id', -999100,
+    )  # fmt: skip
+
+    for kernel in ('camera.tf', 'camera.ti'):
+        spiceypy.furnsh(str(folder / kernel))
+    _, frame, boresight, _, _ = spiceypy.getfov(-999001, 100)
+    in_tracker = spiceypy.pxform(frame, 'STAR_TRACKER', 0.0) @ boresight
+
+    calibration = starcal_ros.read_calibration(folder / 'out')
+    camera = calibration.geometry.camera
+    middle = ((camera.width - 1) / 2, (camera.height - 1) / 2)
+    expected = starcal_ros.lines_of_sight(calibration, middle, frame='star_tracker')
+    print('boresight in the star tracker frame, by SPICE:', *np.round(in_tracker, 9))
+    print(f'difference from the calibration: {np.linalg.norm(in_tracker - expected):.1e} rad')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,277 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""A bag of images and telemetry of a mission, and a parameter file to calibrate it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+import heapq
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from starcal_ros.arrays import Floats
+from starcal_ros.bag.writer import BagWriter
+from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
+from starcal_ros.files import same_as_one_of
+from starcal_ros.ingest.images import (
+    check_alike,
+    common_scale,
+    ImageFile,
+    ImageOptions,
+    look,
+    pixels_of,
+    Scale,
+)
+from starcal_ros.ingest.records import Attitudes, IngestError, Velocities
+from starcal_ros.products.camera_yaml import read_camera_info
+from starcal_ros.products.files import check_not_inputs, read_text, write_atomically
+from starcal_ros.records import Image
+from starcal_ros.sky.attitude import AttitudeOptions
+from starcal_ros.untrusted import PARAMETER_BYTES
+
+IMAGE_TOPIC = '/camera/image_raw'
+ATTITUDE_TOPIC = '/star_tracker/attitude'
+VELOCITY_TOPIC = '/spacecraft/velocity'
+TEMPERATURE_TOPIC = '/camera/temperature'
+_MARGIN_NS = 60 * NANOSECONDS_PER_SECOND  # for an offset of the stamps of the camera
+_COARSE = 1 / 3  # step of the pixel values over their noise from which centroids lose accuracy
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The camera file and alignment of a calibration of the bag."""
+
+    camera: Path
+    star_tracker_from_camera_xyzw: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Paths of a bag that was written, and notes: one line for each thing to know of it."""
+
+    bag: Path
+    params: Path | None
+    notes: tuple[str, ...] = field(default=())
+
+
+def look_at_all(
+    paths: Sequence[Path], options: ImageOptions, on_image: Callable[[], None] = lambda: None
+) -> tuple[list[ImageFile], list[str]]:
+    """
+    The image files in order of time, and one line for each file that cannot be taken.
+
+    Raises
+    ------
+    IngestError
+        When the images have different sizes, or two have one time.
+    """
+    files, problems = [], []
+    for path in paths:
+        try:
+            files.append(look(path, options))
+        except IngestError as error:
+            problems.append(str(error))
+        on_image()
+    if files:
+        check_alike(files)
+    return sorted(files, key=lambda file: file.time_ns), problems
+
+
+def check_place(bag: Path, inputs: Sequence[Path]) -> None:
+    """
+    Check that a bag and the files beside it replace no input.
+
+    Raises
+    ------
+    ProductError
+        Naming the file.
+    """
+    file = BagWriter(bag).file
+    names = (file.name, f'{_beside(bag)}import.json', f'{_beside(bag)}params.yaml')
+    check_not_inputs([file.with_name(name) for name in names], inputs)
+
+
+def _beside(bag: Path) -> str:
+    """Start of the names of the files beside a bag."""
+    return f'{bag.stem}_' if bag.suffix == '.mcap' else ''
+
+
+def write_bag(
+    bag: Path,
+    files: Sequence[ImageFile],
+    options: ImageOptions,
+    attitudes: Attitudes,
+    velocities: Velocities | None = None,
+    prior: Prior | None = None,
+    on_image: Callable[[], None] = lambda: None,
+) -> Recorded:
+    """
+    Write a bag in order of time, ``import.json`` and, with a prior, ``params.yaml`` beside it.
+
+    Raises
+    ------
+    IngestError
+        When no image has attitudes about it.
+    BagError, ProductError
+        When a file cannot be written or the prior camera cannot be read.
+    """
+    covered = [_gap_s(attitudes, file.time_ns) for file in files]
+    notes = [*attitudes.notes, *(velocities.notes if velocities else ())]
+    notes += _coverage_notes(files, covered)
+    scale = common_scale(files, options)
+    notes += _scale_notes(files, scale)
+    writer = BagWriter(bag)
+    with writer:
+        for _, _, write in heapq.merge(
+            _image_messages(files, options, scale, on_image),
+            _attitude_messages(_near(attitudes, files)),
+            _velocity_messages(velocities),
+            key=lambda message: message[:2],
+        ):
+            write(writer)
+    beside = _beside(bag)
+    record = {
+        'images': [file.path.name for file in files],
+        'scale': {'offset': scale.offset, 'step': scale.step, 'dtype': scale.dtype.__name__},
+        'channel': options.channel,
+        'bayer': options.bayer,
+        'notes': list(dict.fromkeys(notes)),
+    }
+    path = writer.file.with_name(f'{beside}import.json')
+    write_atomically(path, json.dumps(record, indent=1) + '\n')
+    params = None
+    if prior is not None:
+        params = writer.file.with_name(f'{beside}params.yaml')
+        _write_params(params, prior, files, scale, beside)
+    return Recorded(bag, params, tuple(dict.fromkeys(notes)))
+
+
+def _near(attitudes: Attitudes, files: Sequence[ImageFile]) -> Attitudes:
+    """Attitudes from a minute before the first image to a minute after the last."""
+    stamps = attitudes.time_ns
+    first_ns, last_ns = files[0].time_ns - _MARGIN_NS, files[-1].time_ns + _MARGIN_NS
+    keep = (stamps >= first_ns) & (stamps <= last_ns)
+    return Attitudes(stamps[keep], attitudes.icrf_from_star_tracker_xyzw[keep])
+
+
+def _gap_s(attitudes: Attitudes, time_ns: int) -> float:
+    """Time between the attitudes before and after a stamp; infinite where one is missing."""
+    stamps = attitudes.time_ns
+    k = int(np.searchsorted(stamps, time_ns))
+    if k < len(stamps) and stamps[k] == time_ns:
+        return 0.0
+    if k in (0, len(stamps)):
+        return math.inf
+    return float(stamps[k] - stamps[k - 1]) / NANOSECONDS_PER_SECOND
+
+
+def _coverage_notes(files: Sequence[ImageFile], gaps_s: Sequence[float]) -> list[str]:
+    longest_s = AttitudeOptions().max_attitude_gap_s
+    outside = [file for file, gap_s in zip(files, gaps_s, strict=True) if math.isinf(gap_s)]
+    if len(outside) == len(files):
+        raise IngestError(
+            f'no attitude before and after any image, {utc_text(files[0].time_ns)} to '
+            f'{utc_text(files[-1].time_ns)}: the attitudes are of another time'
+        )
+    notes = []
+    if outside:
+        notes.append(
+            f'{len(outside)} of {len(files)} images have no attitude about them, the first is '
+            f'{outside[0].path.name} at {utc_text(outside[0].time_ns)}'
+        )
+    wide = [gap_s for gap_s in gaps_s if longest_s < gap_s < math.inf]
+    if wide:
+        notes.append(
+            f'{len(wide)} of {len(files)} images are in gaps of up to {max(wide):.3g} s between '
+            f'attitudes: refused, unless max_attitude_gap_s is over {longest_s:g}'
+        )
+    return notes
+
+
+def _scale_notes(files: Sequence[ImageFile], scale: Scale) -> list[str]:
+    if scale.is_none:
+        return []
+    notes = [f'pixel values are {scale.offset:.9g} + {scale.step:.9g} DN']
+    noise = float(np.median([file.noise for file in files]))
+    if noise > 0 and scale.step > _COARSE * noise:
+        notes.append(
+            f'a step of 16 bit is {scale.step / noise:.2g} of the noise: give --value-range with '
+            'the range of the stars'
+        )
+    return notes
+
+
+_Message = tuple[int, int, Callable[[BagWriter], None]]
+
+
+def _image_messages(
+    files: Sequence[ImageFile],
+    options: ImageOptions,
+    scale: Scale,
+    on_image: Callable[[], None],
+) -> Iterator[_Message]:
+    for file in files:
+
+        def write(writer: BagWriter, file: ImageFile = file) -> None:
+            if not math.isnan(file.temperature_degc):
+                writer.write_temperature(
+                    TEMPERATURE_TOPIC, file.time_ns, file.temperature_degc, 'camera'
+                )
+            image = Image(file.time_ns, pixels_of(file.path, options, scale))
+            writer.write_image(IMAGE_TOPIC, image, 'camera')
+            on_image()
+
+        yield file.time_ns, 2, write
+
+
+def _attitude_messages(attitudes: Attitudes) -> Iterator[_Message]:
+    for time_ns, xyzw in zip(
+        attitudes.time_ns.tolist(), attitudes.icrf_from_star_tracker_xyzw, strict=True
+    ):
+
+        def write(writer: BagWriter, time_ns: int = time_ns, xyzw: Floats = xyzw) -> None:
+            writer.write_attitude(ATTITUDE_TOPIC, time_ns, xyzw, 'icrf')
+
+        yield time_ns, 0, write
+
+
+def _velocity_messages(velocities: Velocities | None) -> Iterator[_Message]:
+    if velocities is None:
+        return
+    for time_ns, velocity in zip(
+        velocities.time_ns.tolist(), velocities.velocity_m_s, strict=True
+    ):
+
+        def write(writer: BagWriter, time_ns: int = time_ns, velocity: Floats = velocity) -> None:
+            writer.write_velocity(VELOCITY_TOPIC, time_ns, velocity, 'icrf')
+
+        yield time_ns, 1, write
+
+
+def _write_params(
+    path: Path, prior: Prior, files: Sequence[ImageFile], scale: Scale, beside: str
+) -> None:
+    camera = read_camera_info(prior.camera)
+    if (camera.width, camera.height) != (files[0].width, files[0].height):
+        raise IngestError(
+            f'{prior.camera}: a camera of {camera.width} x {camera.height}, the images have '
+            f'{files[0].width} x {files[0].height}'
+        )
+    copied = path.with_name(f'{beside}camera.yaml')
+    if not same_as_one_of(copied, [prior.camera]):
+        write_atomically(copied, read_text(prior.camera, PARAMETER_BYTES))
+    values: dict[str, object] = {
+        'camera_info_url': copied.name,
+        'prior_alignment': list(prior.star_tracker_from_camera_xyzw),
+        'star_tracker_frame': 'star_tracker',
+        'camera_frame': 'camera',
+    }
+    saturation = [file.saturation for file in files if not math.isnan(file.saturation)]
+    if saturation:
+        values['saturation_dn'] = (min(saturation) - scale.offset) / scale.step
+    content = {'/**': {'ros__parameters': values}}
+    write_atomically(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None))

@@ -1,0 +1,96 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+CSV tables of attitudes, velocities and times, with a header of named columns.
+
+A column of times is ``time_utc``, ``time_tai``, ``time_tt``, ``time_tdb`` or ``time_gps`` (dates)
+or ``time_ns`` (UTC stamps).  Attitudes are ``qx, qy, qz, qw``, the orientation of the star tracker
+in the ICRF; velocities ``vx_m_s, vy_m_s, vz_m_s``, barycentric along ICRF axes; ``file`` names an
+image.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+
+from starcal_ros.ingest.records import Attitudes, in_order, IngestError, text_of, Velocities
+from starcal_ros.ingest.time_systems import from_text, SYSTEMS, TimeError, to_utc_ns
+
+_QUATERNION = ('qx', 'qy', 'qz', 'qw')
+_VELOCITY = ('vx_m_s', 'vy_m_s', 'vz_m_s')
+
+
+def read_attitudes(path: Path) -> Attitudes:
+    """
+    Attitudes of a CSV file.
+
+    Raises
+    ------
+    IngestError
+        Naming the line that is wrong.
+    """
+    rows = _rows(path, _QUATERNION)
+    stamps = [_stamp(row, f'{path} line {number}') for number, row in rows]
+    numbers = [_numbers(row, _QUATERNION, f'{path} line {number}') for number, row in rows]
+    return in_order(stamps, [np.array(q) for q in numbers], str(path), ())
+
+
+def read_velocities(path: Path) -> Velocities:
+    """Velocities of a CSV file, in order of time; raises as `read_attitudes`."""
+    rows = _rows(path, _VELOCITY)
+    stamps = np.array([_stamp(row, f'{path} line {n}') for n, row in rows], np.int64)
+    values = np.array([_numbers(row, _VELOCITY, f'{path} line {n}') for n, row in rows])
+    order = np.argsort(stamps, kind='stable')
+    return Velocities(stamps[order], values[order].reshape(-1, 3))
+
+
+def read_times(path: Path) -> dict[str, int]:
+    """Stamps by the names of images, without folders; raises as `read_attitudes`."""
+    rows = _rows(path, ('file',))
+    return {
+        Path(row['file'] or '').name: _stamp(row, f'{path} line {number}') for number, row in rows
+    }
+
+
+def _rows(path: Path, needed: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
+    lines = text_of(path).splitlines()
+    table = csv.DictReader(line for line in lines if not line.startswith('#'))
+    try:
+        names = [name.strip() for name in table.fieldnames or ()]
+        missing = [name for name in needed if name not in names]
+        if missing or not any(_is_time(name) for name in names):
+            wanted = ', '.join((*missing, 'time_utc'))
+            raise IngestError(f'{path}: a table without the columns {wanted}')
+        table.fieldnames = names
+        return [(number, row) for number, row in enumerate(table, start=2)]
+    except csv.Error as error:
+        raise IngestError(f'{path}: not a table of text: {error}') from error
+
+
+def _is_time(name: str) -> bool:
+    kind, _, system = name.partition('_')
+    return kind == 'time' and (system == 'ns' or system.upper() in SYSTEMS)
+
+
+def _stamp(row: dict[str, str], where: str) -> int:
+    name = next(name for name in row if name and _is_time(name))
+    system = name.partition('_')[2]
+    try:
+        if system == 'ns':
+            return to_utc_ns(int(row[name] or ''), 'UTC')
+        return from_text(row[name] or '', system)
+    except (TimeError, ValueError) as error:
+        raise IngestError(f'{where}: {error}') from error
+
+
+def _numbers(row: dict[str, str], names: tuple[str, ...], where: str) -> list[float]:
+    try:
+        values = [float(row[name]) for name in names]
+    except (TypeError, ValueError) as error:
+        raise IngestError(f'{where}: {", ".join(names)}: {error}') from error
+    if not all(map(math.isfinite, values)):
+        raise IngestError(f'{where}: {", ".join(names)} are not all finite')
+    return values

@@ -1,0 +1,86 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Flat field and bad pixels of a detector, beside its dark frame."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.errors import OptionError
+from starcal_ros.image.hot_pixels import HotPixels
+from starcal_ros.ingest.images import read_values
+from starcal_ros.ingest.records import IngestError
+from starcal_ros.records import Image
+
+_LEAST = 0.1  # response over the median below which a pixel is bad: its noise is ten times larger
+
+
+def read_flat(path: str, width: int, height: int) -> Floats | None:
+    """
+    Response (height, width) of the pixels, median 1; NaN where it is under a tenth of that.
+
+    None without a path.
+
+    Raises
+    ------
+    OptionError
+        When the file is missing, damaged or of another size, or holds no positive number.
+    """
+    if not path:
+        return None
+    values = _read('flat_field', path, width, height).astype(np.float64)
+    with np.errstate(all='ignore'):
+        middle = float(np.nanmedian(values))
+        response = values / middle
+    if not middle > 0:
+        raise OptionError(f'flat_field: {path}: the median is {middle:g}, not positive')
+    response[~(response >= _LEAST)] = np.nan
+    return np.asarray(response)
+
+
+def read_bad_pixels(path: str, width: int, height: int) -> Indices:
+    """Flat indices (k,) of the pixels of a map that are not 0; raises as `read_flat`."""
+    if not path:
+        return np.empty(0, np.int64)
+    return np.flatnonzero(_read('bad_pixel_map', path, width, height))
+
+
+def with_bad_pixels(hot: HotPixels, bad: Indices, flat: Floats | None) -> HotPixels:
+    """Hot pixels, bad pixels and those without response in the flat field, together."""
+    blind = np.empty(0, np.int64) if flat is None else np.flatnonzero(np.isnan(flat))
+    index = np.union1d(np.union1d(hot.index, bad), blind)
+    return dataclasses.replace(hot, index=index) if len(index) else hot
+
+
+def flattened(image: Image, flat: Floats | None, pedestal_dn: int) -> Image:
+    """
+    Image divided by the flat field above a pedestal; of blind pixels as it is.
+
+    The brightest pixels stay at the peak of the image, so that saturated ones are still found.
+    """
+    if flat is None:
+        return image
+    pixels = image.pixels
+    peak = int(pixels.max())
+    signal = (pixels.astype(np.float32) - pedestal_dn) / np.nan_to_num(flat, nan=1.0)
+    level = np.clip(np.rint(signal + pedestal_dn), 0, peak)
+    level[pixels == peak] = peak
+    cast = level.astype(np.uint8) if pixels.dtype == np.uint8 else level.astype(np.uint16)
+    return Image(image.time_ns, cast)
+
+
+def _read(name: str, path: str, width: int, height: int) -> NDArray[Any]:
+    try:
+        values = read_values(Path(path.removeprefix('file://')))
+    except IngestError as error:
+        raise OptionError(f'{name}: {error}') from error
+    if values.shape != (height, width):
+        raise OptionError(
+            f'{name}: {path} is of shape {values.shape}, expected {width} x {height} pixels'
+        )
+    return values

@@ -1,0 +1,154 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""From FITS and an attitude ephemeris to the calibration of the original bag."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from mission_files import (  # type: ignore[import-not-found]
+    attitudes,
+    FRAME_ID,
+    images,
+    TINY,
+    write_aem,
+    write_ck,
+    write_fits,
+)
+import numpy as np
+import pytest
+import yaml
+
+import starcal_ros
+from starcal_ros.bag import reader
+from starcal_ros.bag.frames import FrameTopics, read_telemetry
+from starcal_ros.cli.main import main
+from starcal_ros.records import Image
+
+ALIGNMENT = yaml.safe_load((TINY / 'params.yaml').read_text())['/**']['ros__parameters'][
+    'prior_alignment'
+]
+
+
+@pytest.fixture(scope='module')
+def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The images of the small bag as FITS, in names whose order is not that of time."""
+    folder = tmp_path_factory.mktemp('night')
+    for number, image in enumerate(images()):
+        write_fits(folder / f'{9 - number}.fits', image, 'tiled')
+    return folder
+
+
+def words(text: str, **values: object) -> list[str]:
+    return [word.format(**values) for word in text.split()]
+
+
+def test_the_imported_bag_gives_the_calibration_of_the_original(
+    night: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    aem, bag = write_aem(tmp_path / 'a.aem'), tmp_path / 'bag'
+    line = words(
+        'import --images {night}/*.fits --attitude {aem} -o {bag} --camera {camera}',
+        night=night, aem=aem, bag=bag, camera=TINY / 'camera.yaml',
+    )  # fmt: skip
+    assert main([*line, '--alignment', *map(repr, ALIGNMENT)]) == 0
+    out = capsys.readouterr().out
+    assert '10 images' in out and 'params.yaml -o DIR' in out
+    found = list(reader.read_images([bag], '/camera/image_raw'))
+    for a, b in zip(found, images(), strict=True):
+        assert isinstance(a, Image) and a.time_ns == b.time_ns and (a.pixels == b.pixels).all()
+    # The file of the original: it has the sigma of the star tracker too.
+    imported = starcal_ros.calibrate_bag(bag, TINY / 'params.yaml')
+    original = starcal_ros.calibrate_bag(TINY, TINY / 'params.yaml')
+    # Quaternions are scaled to unit length on the way: a rounding of 1e-16.
+    change = np.abs(imported.geometry.camera.parameters - original.geometry.camera.parameters)
+    assert (change <= 1e-6 * original.sigma[:-3]).all()
+    assert starcal_ros.calibrate_bag(bag, bag / 'params.yaml').accepted
+    record = json.loads((bag / 'import.json').read_text())
+    assert record['scale'] == {'offset': 0.0, 'step': 1.0, 'dtype': images()[0].pixels.dtype.name}
+
+
+def test_a_ck_has_an_attitude_at_each_image(night: Path, tmp_path: Path, capsys) -> None:
+    kernels = write_ck(tmp_path)
+    bag = tmp_path / 'bag.mcap'
+    line = words('import --images {night}/*.fits -o {bag} --attitude', night=night, bag=bag)
+    assert main([*line, *map(str, kernels), '--star-tracker', str(FRAME_ID)]) == 0
+    topics = FrameTopics('/camera/image_raw', '/star_tracker/attitude')
+    held = read_telemetry([bag], topics).attitudes
+    for image in images()[1:-1]:
+        assert held.at(image.time_ns, 0.1)[1] == 0.0
+    assert (tmp_path / 'bag_import.json').exists()
+
+
+def test_images_without_attitudes_are_named(night: Path, tmp_path: Path, capsys) -> None:
+    aem = write_aem(tmp_path / 'a.aem')
+    lines = aem.read_text().splitlines()
+    start = lines.index('DATA_START') + 1
+    count = len(attitudes())
+    # The middle third is missing: a gap, and what is after the end.
+    kept = lines[: start + count // 3] + lines[start + 2 * count // 3 : -4] + ['DATA_STOP']
+    aem.write_text('\n'.join(kept) + '\n')
+    line = words('import --images {n}/*.fits --attitude {a} -o {b}', n=night, a=aem,
+                 b=tmp_path / 'bag')  # fmt: skip
+    assert main(line) == 0
+    out = capsys.readouterr().out
+    assert 'images are in gaps of up to' in out and 'have no attitude about them' in out
+
+
+def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, capsys) -> None:
+    aem = write_aem(tmp_path / 'a.aem')
+    aem.write_text(aem.read_text().replace('2026-05-15T07:', '2027-05-15T07:'))
+    line = words('import --images {n}/*.fits --attitude {a} -o {b}', n=night, a=aem,
+                 b=tmp_path / 'bag')  # fmt: skip
+    assert main(line) == 2
+    error = capsys.readouterr().err
+    assert 'the attitudes are of another time' in error and error.count('\n') == 1
+
+
+def test_each_bad_file_is_one_line(night: Path, tmp_path: Path, capsys) -> None:
+    for name in ('a.fits', 'b.fits'):
+        (tmp_path / name).write_bytes(b'nothing')
+    aem = write_aem(tmp_path / 'a.aem')
+    line = words('import --images {n}/*.fits {t}/*.fits --attitude {a} -o {b}', n=night,
+                 t=tmp_path, a=aem, b=tmp_path / 'bag')  # fmt: skip
+    assert main(line) == 2
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) == 2 and 'a.fits' in error[0] and 'b.fits' in error[1]
+    assert not (tmp_path / 'bag').exists()
+
+
+@pytest.mark.parametrize(
+    ('line', 'found'),
+    [
+        ('--images {night}/*.nothing --attitude {aem}', 'no file matches'),
+        ('--images {night}/0.fits --attitude {night}/none.aem', 'cannot be read'),
+        ('--images {night}/0.fits --attitude {aem} {aem}', 'one file, unless all are SPICE'),
+        ('--images {night}/0.fits --attitude {aem} --camera {aem}', 'a.aem'),
+        ('--images {night}/0.fits --attitude {aem} --star-tracker ST7', 'choose one with'),
+        ('--images {night}/0.fits --attitude {aem} --value-range 5 1', 'is empty'),
+    ],
+)
+def test_bad_input_is_one_line(night: Path, tmp_path: Path, capsys, line: str, found: str) -> None:
+    aem = write_aem(tmp_path / 'a.aem')
+    assert main(['import', *words(line, night=night, aem=aem), '-o', str(tmp_path / 'bag')]) == 2
+    error = capsys.readouterr().err
+    assert found in error and error.count('\n') == 1
+
+
+def test_no_input_is_replaced(night: Path, tmp_path: Path, capsys) -> None:
+    aem = write_aem(tmp_path / 'import.json')
+    before = aem.read_bytes()
+    line = words('import --images {n}/0.fits --attitude {a} -o {b}', n=night, a=aem,
+                 b=tmp_path)  # fmt: skip
+    assert main(line) == 2
+    assert 'would be replaced' in capsys.readouterr().err and aem.read_bytes() == before
+
+
+def test_a_coarse_scale_is_named(tmp_path: Path, capsys) -> None:
+    for number, image in enumerate(images()[:3]):
+        write_fits(tmp_path / f'{number}.fits', image, 'float32')
+    aem = write_aem(tmp_path / 'a.aem')
+    line = 'import --images {t}/*.fits --attitude {a} -o {t}/bag --value-range 0 2e6'
+    assert main(words(line, t=tmp_path, a=aem)) == 0
+    out = capsys.readouterr().out
+    assert 'a step of 16 bit is' in out and 'pixel values are 0 + 30.7692308 DN' in out
