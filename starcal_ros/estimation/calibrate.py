@@ -252,30 +252,29 @@ def _estimate(
     attitude_error_rad, attitude_covariance_rad2, attitude_seen = attitudes_of_stars_alone(
         problem, dataclasses.replace(state, camera_from_star_tracker=alignment), blocks
     )
-    p = problem.camera_count
-    focal_px = float(state.parameters[0])
     correlated = _correlation(
         found, time_ns, attitude_error_rad, attitude_covariance_rad2, attitude_seen, options
     )
-    angles = slice(p + len(state.focal), p + len(state.focal) + 3)
+    p = problem.camera_count
+    k = p + len(state.focal)
     A = alignment.as_matrix()
-    full[angles, angles] += A @ np.diag(correlated.added_variance_rad2) @ A.T
+    full[k : k + 3, k : k + 3] += A @ np.diag(correlated.added_variance_rad2) @ A.T
     free = np.ix_(problem.free, problem.free)
     full[free] += verdict.variation.common_covariance(p)[free]
-    information = reduced_information(problem, state, blocks, terms)
-    in_modes = len(state.modes)
-    shared = np.concatenate([problem.free, np.arange(p, len(information) - in_modes)])
-    k = p + len(state.focal)
     at_reference = np.r_[0:p, k : k + 3]
-    of_modes = np.arange(len(full) - in_modes, len(full))
-    full, joint = full[: of_modes[0], : of_modes[0]] if in_modes else full, full
+    without_modes = len(full) - len(state.modes)
+    with_modes = np.r_[at_reference, without_modes : len(full)]
+    joint = _in_coefficients(problem, full, with_modes)
+    full = full[:without_modes, :without_modes]
+    names = shared_names(problem.model, len(state.focal), len(state.rate) > 0)
+    information = reduced_information(problem, state, blocks, terms)
+    shared = np.r_[problem.free, p : len(information) - len(state.modes)]
     thermal = _thermal(state, full, options)
     weakest = weakest_term(thermal, full[k + 3 :, k + 3 :]) if thermal else ''
-    names = shared_names(problem.model, len(state.focal), len(state.rate) > 0)
     estimate = Estimate(
         geometry=geometry,
         covariance=full[np.ix_(at_reference, at_reference)],
-        joint_covariance=_in_coefficients(problem, joint, np.r_[at_reference, of_modes]),
+        joint_covariance=joint,
         information=information[np.ix_(shared, shared)],
         information_names=tuple(names[i] for i in shared),
         shared_covariance=full,
@@ -299,7 +298,9 @@ def _estimate(
         thermal=thermal,
         field_test=found.field_test,
         repetition=verdict.repetition,
-        pointings=len(np.unique(pointing_groups(state.camera_from_icrf, focal_px))),
+        pointings=len(
+            np.unique(pointing_groups(state.camera_from_icrf, float(state.parameters[0])))
+        ),
         variation=verdict.variation,
         correlation=correlated,
     )
