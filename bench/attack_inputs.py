@@ -292,7 +292,7 @@ def _bombs(campaign: Campaign) -> AttackRow:
 
     from starcal.msg import StarObservations
     from starcal_ros.messages.fields import make_header
-    from starcal_ros.nodes.message_factory import make_message
+    from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 
     answers: list[Any] = []
     bombs = [_png(40_000, 40_000, 2**30), _png(2**31 - 1, 2**31 - 1, 2**20), _png(640, 512, 2**30)]

@@ -21,7 +21,7 @@ from bench.attack_state import fifo_in_place_of
 from starcal_ros.errors import ProductError
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, read_calibration
 from starcal_ros.products.folder import write_observations, write_products
-from starcal_ros.report.thumbnails import Thumbnail, THUMBNAILS_FOLDER, write_thumbnails
+from starcal_ros.report.pictures.thumbnails import Thumbnail, THUMBNAILS_FOLDER, write_thumbnails
 
 _BAD = 2
 _SECRET = b'a file outside of the folder'

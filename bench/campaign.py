@@ -38,7 +38,7 @@ class Campaign:
 
     def message(self, record: StarObservations, time_ns: int | None = None) -> Any:
         """Observations as a message, optionally with another stamp."""
-        from starcal_ros.nodes.message_factory import make_message
+        from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 
         message = observations_to_message(record, 'camera', make_message)
         if time_ns is not None:

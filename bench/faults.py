@@ -111,7 +111,7 @@ def _hostile_to_observer(campaign: Campaign, times: int) -> Iterator[tuple[Any, 
     from sensor_msgs.msg import CompressedImage, Image, Temperature
 
     from starcal.msg import Calibration
-    from starcal_ros.nodes.message_factory import make_message
+    from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 
     image, samples = campaign.frames[0]
     small = image_to_message(image, 'camera', make_message)
@@ -188,7 +188,7 @@ def _measures_a_sound_image(
     from sensor_msgs.msg import CompressedImage, Image
 
     from starcal.msg import Calibration
-    from starcal_ros.nodes.message_factory import make_message
+    from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 
     client.publisher(Calibration, 'calibration', latched=True).publish(_calibration(campaign))
     attitudes = client.publisher(QuaternionStamped, 'attitude')
@@ -404,7 +404,7 @@ def _ask(
 
 
 def _calibration(campaign: Campaign) -> Any:
-    from starcal_ros.nodes.message_factory import make_message
+    from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 
     return calibration_to_message(campaign.calibration, make_message)
 

@@ -34,7 +34,8 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.bag import reader
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.calibrator.archive import Activation, Archive
-from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project, ros_fit
+from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
+from starcal_ros.camera_conversion import ros_fit
 from starcal_ros.errors import StarcalError
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import solve
@@ -311,7 +312,7 @@ def _observations(sound: Ensemble, setup: Setup) -> _Kind:
     """Mutants of a message: refused, or saved and read again, and counted by an ensemble."""
     from bench.hostile import mutants
     from starcal_ros.messages.observations import checked_observations, observations_to_message
-    from starcal_ros.nodes.message_factory import make_message
+    from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 
     brightest = sound.images[0].select(np.argsort(np.argsort(-sound.images[0].flux_dn)) < 20)
     template = observations_to_message(brightest, 'camera', make_message)

@@ -148,7 +148,7 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
 
     from starcal_ros.messages.images import image_to_message
     from starcal_ros.messages.telemetry import attitude_to_message
-    from starcal_ros.nodes.message_factory import make_message
+    from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 
     sent_s: dict[int, float] = {}
     # Serialised once, to leave the processor to the node.

@@ -52,7 +52,7 @@ def _soak(folder: Path, count: int) -> Table:
     from std_srvs.srv import Trigger
 
     from starcal.msg import EnsembleStatus, StarObservations
-    from starcal_ros.nodes.message_factory import make_message
+    from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 
     scenario = synthetic.scenario('tiny')
     params = write_set_up(scenario, folder)

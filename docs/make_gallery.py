@@ -21,7 +21,7 @@ from docs.make_images import FOLDER, setup_of
 from starcal_ros.arrays import Floats, Picture
 from starcal_ros.pipeline import observe
 from starcal_ros.records import Image, StarObservations
-from starcal_ros.report.annotation import annotate
+from starcal_ros.report.pictures.annotation import annotate
 from starcal_ros.simulation import images as simulated_images
 from starcal_ros.simulation import scenario
 from starcal_ros.sky.attitude import AttitudeHistory

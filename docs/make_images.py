@@ -31,7 +31,7 @@ from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.products.camera_yaml import write_camera_info
 from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
-from starcal_ros.report.annotation import annotate_reduced
+from starcal_ros.report.pictures.annotation import annotate_reduced
 from starcal_ros.simulation import bag as simulated_bag
 from starcal_ros.simulation import images as simulated_images
 from starcal_ros.simulation import scenario as synthetic

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.camera import (
     ALL_PARAMETER_NAMES,
     CameraModel,
-    convert,
     field_radius_rad,
     line_of_sight,
     model_of,
@@ -20,8 +19,8 @@ from starcal_ros.camera import (
     project,
     project_jacobians,
     project_parameters,
-    ros_fit,
 )
+from starcal_ros.camera_conversion import convert, ros_fit
 from starcal_ros.lens import (
     coefficient_jacobian,
     COEFFICIENTS,

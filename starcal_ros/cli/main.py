@@ -19,7 +19,6 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from starcal_ros.cli import mission
 from starcal_ros.cli.arguments import (
     complain,
     EXIT_ACCEPTED,
@@ -28,6 +27,7 @@ from starcal_ros.cli.arguments import (
     EXIT_REFUSED,
     parser,
 )
+from starcal_ros.cli.commands import mission
 from starcal_ros.cli.folders import make_folder, missing_extra
 from starcal_ros.cli.terminal import (
     discard,
@@ -98,7 +98,7 @@ def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:
 
 def _calibrate(args: argparse.Namespace) -> int:
     """Calibrate from bags."""
-    from starcal_ros.cli.calibrate import calibrate
+    from starcal_ros.cli.commands.calibrate import calibrate
 
     return calibrate(args, _asked(args))
 
@@ -144,7 +144,7 @@ def _inspect(args: argparse.Namespace) -> int:
     if setup and found.images and not found.stars_per_image and found.chosen:
         import dataclasses
 
-        from starcal_ros.cli import diagnosis
+        from starcal_ros.cli.commands import diagnosis
 
         why = diagnosis.of_a_failure(args.bags, _asked(args), setup)
         if why:
@@ -159,7 +159,7 @@ def _inspect(args: argparse.Namespace) -> int:
 
 def _diagnose(args: argparse.Namespace) -> int:
     """Print the reason why the images of a bag match no stars."""
-    from starcal_ros.cli import diagnosis
+    from starcal_ros.cli.commands import diagnosis
     from starcal_ros.diagnosis.bags import diagnose_bags
     from starcal_ros.pipeline.setup import read_setup
 
@@ -175,7 +175,7 @@ def _compare(args: argparse.Namespace) -> int:
     """Compare two calibrations."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import output
-    from starcal_ros.cli.truth import is_truth
+    from starcal_ros.cli.commands.truth import is_truth
     from starcal_ros.products.calibration_json import read_calibration
     from starcal_ros.products.folder import calibration_file
 
@@ -200,7 +200,7 @@ def _compare(args: argparse.Namespace) -> int:
 
 def _compare_with_truth(args: argparse.Namespace) -> int:
     """Compare a calibration with the truth of a simulated bag."""
-    from starcal_ros.cli import truth
+    from starcal_ros.cli.commands import truth
     from starcal_ros.products.calibration_json import read_calibration
     from starcal_ros.products.folder import calibration_file
 
@@ -241,7 +241,7 @@ def _lookup(args: argparse.Namespace) -> int:
 def _play(args: argparse.Namespace) -> int:
     """Replace this process by the bag player."""
     from starcal_ros.bag import reader
-    from starcal_ros.cli import demo
+    from starcal_ros.cli.commands import demo
 
     reader.mcap_files([args.bag])
     if not 0 <= args.rate <= 1e6:
@@ -259,7 +259,7 @@ def _check_remaps(remaps: Sequence[str]) -> None:
 
 def _monitor(args: argparse.Namespace) -> int:
     """Replace this process by the monitor of running nodes."""
-    from starcal_ros.cli import demo
+    from starcal_ros.cli.commands import demo
 
     _check_remaps(args.remap)
     if args.once is not None and not 0 <= args.once <= 3600:
@@ -331,8 +331,8 @@ def _mistakes(args: argparse.Namespace) -> Mistakes:
 def _demo(args: argparse.Namespace) -> int:
     """Calibrate the small bag with the real nodes and compare the result with the truth."""
     from starcal_ros.assessment import comparison
-    from starcal_ros.cli import demo
-    from starcal_ros.cli.calibrate import calibrate_into
+    from starcal_ros.cli.commands import demo
+    from starcal_ros.cli.commands.calibrate import calibrate_into
     from starcal_ros.cli.output_places import check_folder
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics

@@ -13,7 +13,7 @@ from starcal_ros.products.calibration_json import CALIBRATION_FILE
 from starcal_ros.products.files import check_not_inputs
 from starcal_ros.products.folder import PRODUCT_FILES
 from starcal_ros.products.not_calibrated import NOT_CALIBRATED_FILE
-from starcal_ros.report.thumbnails import THUMBNAILS_FOLDER
+from starcal_ros.report.pictures.thumbnails import THUMBNAILS_FOLDER
 
 
 def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from starcal_ros.camera import convert
+from starcal_ros.camera_conversion import convert
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starcal_ros.camera import CameraModel, line_of_sight, nearest_camera, pixel_grid, project
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
+from starcal_ros.camera_conversion import nearest_camera
 from starcal_ros.records import Calibration
 
 _GRID = 25  # pixels a side, as in the fits of `camera`

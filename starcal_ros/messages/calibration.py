@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from starcal_ros.camera import CameraModel, ros_fit
+from starcal_ros.camera import CameraModel
+from starcal_ros.camera_conversion import ros_fit
 from starcal_ros.lens import ros_distortion
 from starcal_ros.messages.codec import message_fields, record_fields
 from starcal_ros.messages.fields import (

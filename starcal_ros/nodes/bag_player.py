@@ -29,9 +29,9 @@ from starcal_ros.messages.types import (
     OBSERVATIONS_TYPE,
     STATUS_TYPE,
 )
-from starcal_ros.nodes.lifecycle import end_quietly, until_told_to_end
-from starcal_ros.nodes.message_factory import message_class
-from starcal_ros.nodes.parameters import OptionParameters
+from starcal_ros.nodes.lifecycle_node.lifecycle import end_quietly, until_told_to_end
+from starcal_ros.nodes.lifecycle_node.message_factory import message_class
+from starcal_ros.nodes.lifecycle_node.parameters import OptionParameters
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import PlayerOptions
 

@@ -33,8 +33,8 @@ from starcal_ros.messages.calibration import (
 from starcal_ros.messages.fields import make_header
 from starcal_ros.messages.observations import checked_observations
 from starcal_ros.messages.status import status_to_message
-from starcal_ros.nodes.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
-from starcal_ros.nodes.message_factory import make_message, message_class
+from starcal_ros.nodes.lifecycle_node.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
+from starcal_ros.nodes.lifecycle_node.message_factory import make_message, message_class
 from starcal_ros.nodes.set_camera_info_client import CameraDriver
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import CalibratorOptions

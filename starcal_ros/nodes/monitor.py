@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.live import Live
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
-from starcal_ros.cli.monitor import Seen, view
+from starcal_ros.cli.commands.monitor import Seen, view
 from starcal_ros.messages.calibration import calibration_from_message
 from starcal_ros.messages.observations import observations_from_message
 from starcal_ros.messages.status import status_from_message

@@ -10,7 +10,7 @@ from typing import Any
 from rclpy.callback_groups import ReentrantCallbackGroup
 from sensor_msgs.srv import SetCameraInfo
 
-from starcal_ros.nodes.lifecycle import StarcalNode
+from starcal_ros.nodes.lifecycle_node.lifecycle import StarcalNode
 
 _LOOK_S = 0.5  # period of checks for the service and the timeout
 ACCEPTED = 'accepted'

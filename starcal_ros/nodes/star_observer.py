@@ -36,9 +36,9 @@ from starcal_ros.messages.telemetry import (
     temperature_from_message,
     velocity_from_message,
 )
-from starcal_ros.nodes.inputs import with_reliability
-from starcal_ros.nodes.lifecycle import Health, OK, run, StarcalNode, WARN
-from starcal_ros.nodes.message_factory import make_message
+from starcal_ros.nodes.lifecycle_node.inputs import with_reliability
+from starcal_ros.nodes.lifecycle_node.lifecycle import Health, OK, run, StarcalNode, WARN
+from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 from starcal_ros.nodes.unmatched import Unmatched
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import observe
@@ -51,7 +51,7 @@ from starcal_ros.records import (
     refused_image,
     StarObservations,
 )
-from starcal_ros.report.annotation import annotate
+from starcal_ros.report.pictures.annotation import annotate
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
 from starcal_ros.star_observer.image_queue import ImageQueue, Waiting
 from starcal_ros.star_observer.sliding_window import Recent

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.camera import CameraModel, convert
+from starcal_ros.camera import CameraModel
+from starcal_ros.camera_conversion import convert
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions, check_options
 from starcal_ros.gate.options import check_gate_options, GateOptions

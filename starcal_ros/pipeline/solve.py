@@ -22,7 +22,8 @@ from starcal_ros.assessment.observability import (
 from starcal_ros.assessment.observability import ensemble_status as _ensemble_status
 from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.assessment.term_removal import removal_study
-from starcal_ros.camera import CameraModel, line_of_sight, ros_fit
+from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.camera_conversion import ros_fit
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.detector_field import DetectorField
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration

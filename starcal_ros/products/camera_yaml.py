@@ -12,7 +12,8 @@ from urllib.parse import unquote
 import numpy as np
 import yaml
 
-from starcal_ros.camera import CameraModel, check_plausible, ros_fit
+from starcal_ros.camera import CameraModel, check_plausible
+from starcal_ros.camera_conversion import ros_fit
 from starcal_ros.errors import ProductError
 from starcal_ros.lens import from_ros_distortion, ros_distortion
 from starcal_ros.products.fields import (

@@ -13,8 +13,8 @@ from starcal_ros.constants import utc_text
 from starcal_ros.products.files import REPORT_FILE, write_atomically
 from starcal_ros.products.not_calibrated import NotCalibrated
 from starcal_ros.records import IMAGE_REFUSALS
-from starcal_ros.report.expected import EXPECTED
-from starcal_ros.report.thumbnails import read_thumbnails, THUMBNAILS_FOLDER
+from starcal_ros.report.pictures.expected import EXPECTED
+from starcal_ros.report.pictures.thumbnails import read_thumbnails, THUMBNAILS_FOLDER
 
 
 def write_failure_page(record: NotCalibrated, folder: Path) -> Path:

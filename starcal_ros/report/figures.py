@@ -16,7 +16,7 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.least_squares.normal_equations import whitening
 from starcal_ros.records import CameraGeometry, StarObservations, TermRemoval
 from starcal_ros.report import svg
-from starcal_ros.report.annotation import predicted_px
+from starcal_ros.report.pictures.annotation import predicted_px
 from starcal_ros.report.svg import INK, MUTED, Panel, Scale, SERIES
 
 _LEFT, _RIGHT, _TOP, _BELOW = 62.0, 468.0, 10.0, 42.0

@@ -40,11 +40,11 @@ from starcal_ros.records import (
     STAR_REFUSALS,
     StarObservations,
 )
-from starcal_ros.report.annotation import STAR_MARKS
 from starcal_ros.report.charts import charts_of
 from starcal_ros.report.failure_page import write_failure_page
 from starcal_ros.report.model_rows import model_rows
-from starcal_ros.report.thumbnails import (
+from starcal_ros.report.pictures.annotation import STAR_MARKS
+from starcal_ros.report.pictures.thumbnails import (
     read_thumbnails,
     star_of,
     Thumbnail,

@@ -21,8 +21,9 @@ import pytest
 import yaml
 
 from starcal_ros.bag.writer import BagWriter
-from starcal_ros.cli import demo, main
+from starcal_ros.cli import main
 from starcal_ros.cli.arguments import parser
+from starcal_ros.cli.commands import demo
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.records import Image
 from starcal_ros.safe_path import module_command

@@ -10,7 +10,7 @@ import pytest
 from random_pointings import honesty, of_random_pointings  # type: ignore[import-not-found]
 
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import convert
+from starcal_ros.camera_conversion import convert
 from starcal_ros.estimation.lens_choice import estimate_with_smallest_lens
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.simulation.centroids import true_observations

@@ -15,7 +15,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 import yaml
 
-from starcal_ros.camera import line_of_sight, nearest_camera, pixel_grid, project
+from starcal_ros.camera import line_of_sight, pixel_grid, project
+from starcal_ros.camera_conversion import nearest_camera
 from starcal_ros.errors import OptionError
 from starcal_ros.export.formats import export, Exported, FORMATS
 from starcal_ros.products.camera_yaml import read_camera_info

@@ -29,7 +29,7 @@ from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ros.bag import reader
 from starcal_ros.calibrator.archive import Activation, Archive
 from starcal_ros.messages.observations import observations_to_message
-from starcal_ros.nodes.message_factory import make_message
+from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Ensemble, IMAGE_REFUSALS
 

@@ -21,7 +21,7 @@ from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ros.messages.calibration import calibration_to_message
 from starcal_ros.messages.observations import observations_to_message
 from starcal_ros.messages.status import status_to_message
-from starcal_ros.nodes.message_factory import make_message
+from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 from starcal_ros.nodes.monitor import Monitor
 
 pytestmark = pytest.mark.nodes

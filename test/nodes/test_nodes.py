@@ -54,7 +54,7 @@ from starcal_ros.messages.fields import make_header
 from starcal_ros.messages.images import image_from_message, image_to_message
 from starcal_ros.messages.observations import observations_from_message, observations_to_message
 from starcal_ros.messages.telemetry import attitude_to_message, temperature_to_message
-from starcal_ros.nodes.message_factory import make_message
+from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.products.calibration_json import (

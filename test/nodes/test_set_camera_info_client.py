@@ -28,7 +28,7 @@ from std_srvs.srv import Trigger
 
 from starcal.msg import EnsembleStatus, StarObservations
 from starcal_ros.messages.observations import observations_to_message
-from starcal_ros.nodes.message_factory import make_message
+from starcal_ros.nodes.lifecycle_node.message_factory import make_message
 
 pytestmark = pytest.mark.nodes
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, ros_fit
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
+from starcal_ros.camera_conversion import ros_fit
 from starcal_ros.errors import ProductError
 from starcal_ros.products.camera_yaml import read_camera_info, resolve_url, write_camera_info
 

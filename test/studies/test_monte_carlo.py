@@ -102,18 +102,20 @@ def test_a_cluster_that_is_there_gives_the_same_rows(scheduler: str) -> None:
 
 def test_workers_are_reached_through_no_socket() -> None:
     """A socket without authentication would let another user run code as this one."""
+    # Renamed in psutil 6.
+    sockets = getattr(psutil.Process, 'net_connections', None) or psutil.Process.connections
     us = psutil.Process()
-    before = set(us.net_connections('all'))
+    before = set(sockets(us, 'all'))
     earlier = {child.pid for child in us.children(recursive=True)}  # of other tests
     opened, seen = set(), 0
 
     def look() -> None:
         nonlocal seen
-        opened.update(set(us.net_connections('all')) - before)
+        opened.update(set(sockets(us, 'all')) - before)
         for child in us.children(recursive=True):
             if child.pid not in earlier:
                 seen += 1
-                opened.update(child.net_connections('all'))
+                opened.update(sockets(child, 'all'))
 
     workers.run_trials(small('coverage'), workers=1, on_trial=look)
     assert seen and not opened

@@ -21,7 +21,8 @@ from starcal_ros.assessment import agreement
 from starcal_ros.bag.frames import FrameTopics, read_telemetry
 from starcal_ros.bag.reader import read_images
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project
-from starcal_ros.cli import demo, main
+from starcal_ros.cli import main
+from starcal_ros.cli.commands import demo
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.products.calibration_json import read_calibration
 from starcal_ros.products.camera_yaml import read_camera_info

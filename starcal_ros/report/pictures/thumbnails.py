@@ -17,7 +17,7 @@ from starcal_ros.arrays import Pixels
 from starcal_ros.errors import ProductError
 from starcal_ros.products.files import write_atomically
 from starcal_ros.records import CameraGeometry, Image, StarObservations
-from starcal_ros.report.annotation import annotate_reduced, stretch
+from starcal_ros.report.pictures.annotation import annotate_reduced, stretch
 from starcal_ros.untrusted import read_bytes
 
 THUMBNAILS_FOLDER = 'thumbnails'

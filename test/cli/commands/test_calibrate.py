@@ -14,7 +14,7 @@ import yaml
 from starcal_ros.cli import main
 from starcal_ros.products.not_calibrated import NOT_CALIBRATED_FILE
 
-TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
+TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 
 
 def params_with(folder: Path, **changes: Any) -> str:

@@ -26,8 +26,8 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 
 from starcal_ros.errors import OptionError, StarcalError
-from starcal_ros.nodes.inputs import Inputs
-from starcal_ros.nodes.parameters import OptionParameters, unread_sections
+from starcal_ros.nodes.lifecycle_node.inputs import Inputs
+from starcal_ros.nodes.lifecycle_node.parameters import OptionParameters, unread_sections
 from starcal_ros.options import nearest
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import OPTION_CLASSES, Setup

@@ -62,7 +62,7 @@ class TruthTable:
 def tiny_bag(spare: Path) -> DemoBag:
     """The small bag of the source tree or the installed package, or one rendered under `spare`."""
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
-    places = [Path(__file__).parents[2], *(Path(p, 'share/starcal') for p in prefixes if p)]
+    places = [Path(__file__).parents[3], *(Path(p, 'share/starcal') for p in prefixes if p)]
     folders = (place / 'bags' / 'tiny' for place in places)
     folder = next((f for f in folders if (f / 'truth.json').is_file()), None)
     if folder is None:

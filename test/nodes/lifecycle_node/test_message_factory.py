@@ -25,7 +25,7 @@ from starcal_ros.messages.calibration import (
 from starcal_ros.messages.images import image_from_message, image_to_message
 from starcal_ros.messages.observations import observations_from_message, observations_to_message
 from starcal_ros.messages.status import status_to_message
-from starcal_ros.nodes.message_factory import make_message, message_class
+from starcal_ros.nodes.lifecycle_node.message_factory import make_message, message_class
 from starcal_ros.records import Image
 
 pytestmark = pytest.mark.nodes

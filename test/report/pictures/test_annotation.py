@@ -17,7 +17,7 @@ from starcal_ros.records import (
     STAR_REFUSALS,
     StarObservations,
 )
-from starcal_ros.report.annotation import annotate, predicted_px, STAR_MARKS, stretch
+from starcal_ros.report.pictures.annotation import annotate, predicted_px, STAR_MARKS, stretch
 
 PIXELS = np.array([[30.0, 40.0], [150.25, 99.5]])
 GEOMETRY = CameraGeometry(

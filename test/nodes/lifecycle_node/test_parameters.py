@@ -16,7 +16,7 @@ pytest.importorskip('starcal.msg')
 
 from rcl_interfaces.srv import GetParameters
 
-from starcal_ros.nodes.parameters import unread_sections
+from starcal_ros.nodes.lifecycle_node.parameters import unread_sections
 
 pytestmark = pytest.mark.nodes
 

@@ -12,7 +12,7 @@ import yaml
 from starcal_ros.cli import main
 from starcal_ros.diagnosis.diagnose import CAUSES
 
-TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
+TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 
 
 @pytest.fixture

@@ -14,11 +14,12 @@ import threading
 from starcal_ros.assessment import comparison
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.bag import reader
-from starcal_ros.cli import diagnosis, output
+from starcal_ros.cli import output
 from starcal_ros.cli.arguments import EXIT_ACCEPTED, EXIT_REFUSED
+from starcal_ros.cli.commands import diagnosis
+from starcal_ros.cli.commands.selection import selection
 from starcal_ros.cli.folders import make_folder, missing_extra
 from starcal_ros.cli.output_places import check_folder
-from starcal_ros.cli.selection import selection
 from starcal_ros.cli.terminal import print_text, with_progress
 from starcal_ros.diagnosis.bags import aligned_by_bags
 from starcal_ros.errors import OptionError, TooFewObservations
@@ -40,8 +41,8 @@ from starcal_ros.records import (
     Image,
     StarObservations,
 )
-from starcal_ros.report import thumbnails
-from starcal_ros.report.expected import ExpectedAlbum
+from starcal_ros.report.pictures import thumbnails
+from starcal_ros.report.pictures.expected import ExpectedAlbum
 
 HALVES = ('odd', 'even')
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starcal_ros.cli.demo import compare, TruthTable
+from starcal_ros.cli.commands.demo import compare, TruthTable
 from starcal_ros.errors import ProductError
 from starcal_ros.products.calibration_json import prior_of
 from starcal_ros.products.files import read_text

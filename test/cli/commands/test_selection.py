@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from starcal_ros.cli.selection import selection
+from starcal_ros.cli.commands.selection import selection
 from starcal_ros.errors import OptionError
 
 STAMPS_NS = [(1_778_829_600 + 10 * k) * 1_000_000_000 for k in range(12)]

@@ -12,8 +12,8 @@ from starcal_ros.identification.prediction import in_image, predict
 from starcal_ros.lost_in_space.bright_sources import bright_sources
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
-from starcal_ros.report.annotation import stretch
-from starcal_ros.report.thumbnails import Thumbnail
+from starcal_ros.report.pictures.annotation import stretch
+from starcal_ros.report.pictures.thumbnails import Thumbnail
 
 EXPECTED = 'no_match_expected'  # in the names of these pictures
 _PICTURES = 3

@@ -14,7 +14,7 @@ import pytest
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.errors import ProductError
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
-from starcal_ros.report.thumbnails import (
+from starcal_ros.report.pictures.thumbnails import (
     Album,
     read_thumbnails,
     star_of,

@@ -117,7 +117,7 @@ def test_every_transition_in_every_state(
 SIGNALLED = """
 import os, signal, sys, time
 import rclpy
-from starcal_ros.nodes.lifecycle import end_quietly, until_told_to_end
+from starcal_ros.nodes.lifecycle_node.lifecycle import end_quietly, until_told_to_end
 
 def work():
     if 'told' in sys.argv:
@@ -142,7 +142,7 @@ def test_what_fails_after_a_signal_is_no_error(argument: str, status: int, said:
 
 SIGNALLED_AGAIN = """
 import os, signal, sys, time
-from starcal_ros.nodes.lifecycle import end_quietly, until_told_to_end
+from starcal_ros.nodes.lifecycle_node.lifecycle import end_quietly, until_told_to_end
 
 def tell():
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):

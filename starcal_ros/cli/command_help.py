@@ -1,0 +1,167 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Summary, description and examples of each command of the `starcal` tool."""
+
+from __future__ import annotations
+
+from starcal_ros.cli import mission_arguments
+
+# Command -> summary, description, and examples: a comment, then the line to type.
+HELP: dict[str, tuple[str, str, str]] = {
+    'demo': (
+        'calibrate a small bag with the real ROS nodes',
+        (
+            'Starts the nodes, plays ten simulated images to them, requests a calibration through '
+            'the service and prints the result beside the truth.'
+        ),
+        """\
+  # write to the folder starcal_demo
+  starcal demo
+  # write to another folder
+  starcal demo -o /tmp/first_look""",
+    ),
+    'inspect': (
+        'list the contents of a bag and the images a calibration would refuse',
+        (
+            'Lists topics, rates, stamps, encodings and gaps, and checks each image against the '
+            'attitudes as a calibration does. With --params the stars are measured as well.'
+        ),
+        """\
+  # check stamps and attitudes
+  starcal inspect bags/tiny
+  # also measure the stars, as "starcal calibrate" does
+  starcal inspect bags/tiny --params bags/tiny/params.yaml
+  # machine-readable output
+  starcal inspect bags/tiny --json
+
+exit status: 0 the bag can be calibrated; 3 it cannot, and the reasons are listed; 2 bad input.""",
+    ),
+    'diagnose': (
+        'find out why the images of a bag match no star',
+        (
+            'Identifies some of the first images without attitude or alignment, compares the '
+            'attitudes, alignment and camera with them, and prints the error, the evidence for it '
+            'and the lines of the parameter file that correct it.'
+        ),
+        """\
+  # no image matches: why?
+  starcal diagnose bags/tiny --params bags/tiny/params.yaml
+  # for a program
+  starcal diagnose bags/tiny --params bags/tiny/params.yaml --json
+
+exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad input.""",
+    ),
+    'calibrate': (
+        'calibrate from bags, without a ROS graph',
+        (
+            'Measures the stars of all images, estimates camera and alignment, checks the result '
+            'against the limits of the gate and writes report.html, calibration.json, '
+            'camera_info.yaml and observations.mcap to DIR.'
+        ),
+        """\
+  # the bag in the repository
+  starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out
+  # the images of the first 30 s, and a comparison of its two halves
+  starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out --to +30 --split-half
+  # two bags together, with several cameras in them
+  starcal calibrate night1 night2.mcap --params camera1.yaml -o out --image-topic /camera1/image
+  # repeat from the recorded observations, with other options and without images
+  starcal calibrate out/observations.mcap --params bags/tiny/params.yaml -o again""",
+    ),
+    'compare': (
+        'compare two calibrations in pixels and sigmas',
+        (
+            'A and B are each a calibration.json or a folder that holds one. Lines of sight are '
+            'compared in the star tracker frame, before and after removing their common rotation. '
+            'Differences are B minus A; their sigmas assume that A and B are independent.'
+        ),
+        """\
+  # two runs
+  starcal compare out again
+  # with the truth of a simulated bag
+  starcal compare out sim/truth.json
+  # with a map of the difference over the detector
+  starcal compare out again -o difference.png
+  # machine-readable output
+  starcal compare out/calibration.json again/calibration.json --json""",
+    ),
+    'report': (
+        'rewrite report.html of a calibration',
+        (
+            'Makes one page from the files of a folder: gate verdict, parameters, residuals, '
+            'uncertainties, refused images and stars. The page needs no network.'
+        ),
+        """\
+  # from the files of an earlier calibration
+  starcal report out""",
+    ),
+    'lookup': (
+        'write a table of lines of sight and their sigma by pixel',
+        (
+            'Writes u_px, v_px, the unit vector x, y, z in the camera frame, shape_sigma_arcsec '
+            '(1-sigma of the direction, common rotation removed) and sigma_arcsec (in the star '
+            'tracker frame), with the field beside the lens model if there is one.'
+        ),
+        """\
+  # 25 x 25 pixels over the detector
+  starcal lookup out -o lines_of_sight.csv
+  # every 16 pixels, for interpolation
+  starcal lookup out -o lines_of_sight.npz --step 16""",
+    ),
+    'play': (
+        'play a bag on the ROS graph',
+        'Publishes the messages of a bag with their own stamps, for the nodes to calibrate from.',
+        """\
+  # in real time
+  starcal play bags/tiny
+  # as fast as the stars are observed
+  starcal play bags/tiny --rate 0
+  # on another topic
+  starcal play bags/tiny --remap /opnav/image_raw:=/camera/image_raw""",
+    ),
+    'monitor': (
+        'show running nodes in the terminal',
+        (
+            'Shows images and refusals by reason, coverage, the forecast sigma of each parameter '
+            'beside that of the active calibration, the gate and the health of the nodes.'
+        ),
+        """\
+  # live, until Ctrl-C
+  starcal monitor
+  # nodes in a namespace
+  starcal monitor --remap __ns:=/cam1
+  # one view after five seconds, for a log
+  starcal monitor --once 5""",
+    ),
+    'simulate': (
+        'render a bag with known truth',
+        (
+            'Renders images of real stars with a simulated camera and writes the truth, a prior '
+            'camera and a parameter file beside the bag.'
+        ),
+        """\
+  # 24 images of 1296 x 1024, in a few seconds
+  starcal simulate -o sim --scenario small
+  # calibrate them
+  starcal calibrate sim --params sim/params.yaml -o out
+  # another draw of the camera and the noise
+  starcal simulate -o sim2 --scenario small --seed 2
+  # the camera of sim with other noise, twelve stars in each image
+  starcal simulate -o sim3 --scenario small --seed 3 --camera-seed 1 --stars-per-image 12
+  # a mistake to rehearse
+  starcal simulate -o mirrored --scenario tiny --flip""",
+    ),
+    'campaign': (
+        'run a Monte Carlo study of the calibration',
+        'Calibrates many simulated campaigns and compares the estimates with the truth.',
+        """\
+  # method against star tracker noise, as in Table 1 of the paper
+  starcal campaign table1 -o studies
+  # a shorter run: two noise levels, twenty trials
+  starcal campaign table1 -o studies --trials 20 --tracker 0 20
+  # the whole night of the paper from pixels, with its figures, in some minutes
+  starcal campaign paper -o paper
+  # twelve frames of it, in a minute
+  starcal campaign paper -o paper --images 12 --trials 20""",
+    ),
+    **mission_arguments.HELP,
+}
