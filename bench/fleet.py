@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 import itertools
+import os
 from pathlib import Path
 import shutil
 import statistics
@@ -53,22 +54,27 @@ def run(quick: bool) -> list[Table]:
         folder = Path(name)
         copy_bags(folder / 'fleet', count)
         found = list(tasks.find(folder / 'fleet', _PARAMS))
-        before_s = one_bag_s(found[:alone], folder / 'before')
+        before = one_bag_s(found[:alone], folder / 'before')
         watch = Watch(kill_at=count // 2)
-        start_s = time.perf_counter()
+        start_s, start_processor_s = time.perf_counter(), processor_s()
         with Rows(folder / 'out') as table:
             fleet.update(table, found, _WORKERS, on_row=watch.on_row)
         wall_s = time.perf_counter() - start_s
-        after_s = one_bag_s(found[-alone:], folder / 'after')
+        used_s = (processor_s() - start_processor_s) / count
+        after = one_bag_s(found[-alone:], folder / 'after')
         rows = Rows(folder / 'out').rows()
-    one_s = (before_s + after_s) / 2
+    one_s = (before[0] + after[0]) / 2
+    one_used_s = (before[1] + after[1]) / 2
     efficiency = count * one_s / (_WORKERS * wall_s)
     keys = Counter(row.key for row in rows)
     made = Table(f'starcal trend over {count} bags on {_WORKERS} workers', ('quantity', 'value'))
-    made.add('one bag alone, before, s', before_s)
-    made.add('one bag alone, after, s', after_s)
+    made.add('one bag alone, before, s', before[0])
+    made.add('one bag alone, after, s', after[0])
     made.add(f'{count} bags, s', wall_s)
-    made.add('efficiency', efficiency)
+    made.add('efficiency, wall time', efficiency)
+    made.add('processor time of a bag alone, s', one_used_s)
+    made.add(f'processor time of a bag of {count}, s', used_s)
+    made.add('efficiency, processor time', one_used_s / used_s)
     made.add('workers killed with SIGKILL', watch.killed)
     made.add('bags lost', sum(task.key not in keys for task in found))
     made.add('bags counted twice', sum(n > 1 for n in keys.values()))
@@ -93,9 +99,21 @@ def copy_bags(folder: Path, count: int) -> None:
         (bag / 'tiny_0.mcap').write_bytes(content.replace(_LIBRARY, f'{k:07d}'.encode(), 1))
 
 
-def one_bag_s(found: list[Task], folder: Path) -> float:
-    """Median time of a bag on one worker, its start and its first bag left out."""
+def one_bag_s(found: list[Task], folder: Path) -> tuple[float, float]:
+    """
+    Wall and processor time of a bag on one worker.
+
+    The wall time is the median without the first bag, before which the worker starts.
+    """
     ends_s: list[float] = []
+    start_s = processor_s()
     with Rows(folder) as table:
         fleet.update(table, found, 1, on_row=lambda: ends_s.append(time.perf_counter()))
-    return statistics.median(b - a for a, b in itertools.pairwise(ends_s))
+    wall_s = statistics.median(b - a for a, b in itertools.pairwise(ends_s))
+    return wall_s, (processor_s() - start_s) / len(found)
+
+
+def processor_s() -> float:
+    """Processor time of this process and of its children that have ended."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system

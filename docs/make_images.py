@@ -160,24 +160,29 @@ def focal_plane(ensemble: Ensemble, setup: Setup, file: Path) -> None:
 
 def report_page(file: Path) -> None:
     """Top of the small bag's report in a browser."""
+    with tempfile.TemporaryDirectory() as folder:
+        arguments = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', folder]
+        assert cli.main(arguments) == 0
+        draw_page(Path(folder) / 'report.html', file, REPORT_SIZE)
+
+
+def draw_page(page: Path, file: Path, size: tuple[int, int]) -> None:
+    """Draw the top of a page as a browser shows it, if chromium is installed."""
     browser = next(filter(None, map(shutil.which, ('chromium', 'google-chrome'))), None)
     if browser is None:
         print(f'{file.name}: not drawn, chromium is not installed')
         return
-    with tempfile.TemporaryDirectory() as folder:
-        arguments = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', folder]
-        assert cli.main(arguments) == 0
-        look = [
-            '--headless',
-            '--no-sandbox',
-            '--disable-gpu',
-            '--disable-background-networking',
-            '--hide-scrollbars',
-            f'--window-size={",".join(map(str, REPORT_SIZE))}',
-            f'--screenshot={file.resolve()}',
-            (Path(folder) / 'report.html').as_uri(),
-        ]
-        subprocess.run([browser, *look], check=True, capture_output=True)
+    look = [
+        '--headless',
+        '--no-sandbox',
+        '--disable-gpu',
+        '--disable-background-networking',
+        '--hide-scrollbars',
+        f'--window-size={",".join(map(str, size))}',
+        f'--screenshot={file.resolve()}',
+        page.resolve().as_uri(),
+    ]
+    subprocess.run([browser, *look], check=True, capture_output=True)
 
 
 def main() -> None:

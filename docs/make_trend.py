@@ -12,12 +12,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 import dataclasses
 import math
+import os
 from pathlib import Path
 import sys
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from docs.make_images import draw_page, FOLDER
 from starcal_ros.cli.main import main as starcal
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.pipeline import solve
@@ -28,6 +30,7 @@ from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import Inertial, Scenario, scenario
 
 MONTHS = 60
+SIZE = (1184, 1688)  # of the picture, px
 SHOCK, NEW_TRACKER = 20, 41  # the first months after them
 FOCAL_PER_DEGC = 4e-5
 SHOCK_FOCAL_PX, SHOCK_CX_PX = 0.35, -0.6
@@ -112,10 +115,13 @@ def write_mission(folder: Path, months: int = MONTHS) -> Path:
 
 
 def main() -> int:
-    """Write mission and page into the folder of the first argument."""
-    folder = Path(sys.argv[1])
+    """Write mission and page into the folder of the first argument, and draw the page."""
+    folder, picture = Path(sys.argv[1]).resolve(), FOLDER.resolve() / 'trend.png'
     write_mission(folder / 'mission')
-    return starcal(['trend', str(folder / 'mission'), '-o', str(folder)])
+    os.chdir(folder)  # the page names the mission as it is given
+    status = starcal(['trend', 'mission', '-o', '.'])
+    draw_page(folder / 'trend.html', picture, SIZE)
+    return status
 
 
 if __name__ == '__main__':

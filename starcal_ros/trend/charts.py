@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import datetime, timezone
-import math
 
 from markupsafe import Markup
 import numpy as np
@@ -19,6 +18,7 @@ from starcal_ros.trend.series import Change, Series
 
 _LEFT, _RIGHT, _TOP, _BELOW, _HEIGHT = 84.0, 468.0, 10.0, 42.0, 270.0
 _MARGIN_NS = 30 * 86400 * NANOSECONDS_PER_SECOND  # one calibration alone has dates about it
+_LOG_ROOM = 1.5  # factor above and below the numbers of a logarithmic axis
 _HEADROOM = 0.22  # of the height, for the legend
 _TICKS = 6
 _DIGITS = 1e4  # a number with more of them than a label holds is drawn as a difference
@@ -71,11 +71,8 @@ def change_figure(new: Sequence[Change], rows: Sequence[Row], limit_px: float) -
     ]
     finite = np.concatenate(sizes)
     finite = finite[np.isfinite(finite)]
-    lowest = min(limit_px, float(finite.min(initial=limit_px)))
-    highest = max(limit_px, float(finite.max(initial=limit_px)))
-    high = 10.0 ** math.ceil(math.log10(highest) + 1e-9)
-    low = 10.0 ** math.floor(math.log10(lowest) - 1e-9)
-    # The legend stands above the highest power of ten.
+    low = float(finite.min(initial=limit_px)) / _LOG_ROOM
+    high = float(finite.max(initial=limit_px)) * _LOG_ROOM
     high *= (high / low) ** _HEADROOM
     panel = Panel(_dates(at), Scale(low, high, _HEIGHT - _BELOW, _TOP, is_log=True))
     panel.axes('date', 'change against the active one (px)', x_ticks=_date_ticks(panel.x))

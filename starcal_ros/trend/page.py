@@ -134,7 +134,7 @@ def _active(one: Active, rows: Sequence[Row], new: Sequence[Change]) -> tuple[st
     row = rows[one.row]
     missed = [c.line_of_sight_px for c in new if c.against == one.row]
     until = utc_text(one.until_ns)[:16] if one.until_ns else 'now'
-    name = f'calibration {row.number}' if row.number else Path(row.path).parent.name
+    name = f'{row.number}' if row.number else Path(row.path).parent.name
     worst = f'{max(missed):.3f}' if missed else 'none made'
     return utc_text(one.since_ns)[:16], until, name, worst
 
@@ -149,10 +149,11 @@ def _chart(series: Series, rows: Sequence[Row]) -> Chart:
 
 def _words(term: Term, series: Series) -> str:
     unit = series.unit and f' {series.unit}'
+    size = f'{term.size:.3g}'.replace('-', '\N{MINUS SIGN}')
     if term.kind == 'step':
-        return f'step of {term.size:.3g}{unit}'
+        return f'step of {size}{unit}'
     per = 'year' if term.kind == 'drift' else 'degC'
-    return f'{term.kind} of {term.size:.3g}{unit} per {per}'
+    return f'{term.kind} of {size}{unit} per {per}'
 
 
 def _change_chart(rows: Sequence[Row], new: Sequence[Change]) -> Chart:

@@ -42,6 +42,18 @@ def test_solver_bench(tmp_path: Path) -> None:
     assert [row['m'] for row in grown['rows']] == [6, 30]
 
 
+def test_fleet_bench(tmp_path: Path) -> None:
+    """A worker is killed in the run, and each bag is in the table once, without a failure."""
+    found = tmp_path / 'found.json'
+    command = [sys.executable, '-m', 'bench', 'fleet', '--quick', '--json', str(found)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    (table,) = json.loads(found.read_text())['fleet']
+    rows = {row['quantity']: row['value'] for row in table['rows']}
+    assert rows['workers killed with SIGKILL'] == 1
+    assert [rows[f'bags {what}'] for what in ('lost', 'counted twice', 'failed')] == [0, 0, 0]
+
+
 def test_ensemble_bench(tmp_path: Path) -> None:
     """Images kept from a stream are within 5 % in sigma of the best choice of that size."""
     found = tmp_path / 'found.json'

@@ -106,7 +106,7 @@ def test_observations_of_another_version_are_calibrated_again(tmp_path: Path, ca
     page = (tmp_path / 'out/trend.html').read_text()
     assert 'The same observations with this version' in page
     # The same code again, from the observations and the options beside them.
-    assert '<td>starcal 0.0.1</td>' in page and '<td>0.000</td>' in page
+    assert '<td class="text">starcal 0.0.1</td>' in page and '<td>0.000</td>' in page
 
 
 @pytest.mark.parametrize(
