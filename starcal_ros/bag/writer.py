@@ -14,6 +14,7 @@ from mcap.writer import CompressionType, Writer
 import yaml
 
 from starcal_ros.arrays import Floats
+from starcal_ros.bag.metadata import FileSpan, metadata_text, qos_profile, TopicSummary
 from starcal_ros.bag.typestore import described, make_message, typestore
 from starcal_ros.errors import BagError
 from starcal_ros.files import replacing
@@ -117,7 +118,7 @@ class BagWriter:
                 self._writer.finish()
             if self._metadata_file is not None:
                 with replacing(self._metadata_file) as file:
-                    file.write(yaml.safe_dump(self._metadata(), sort_keys=True).encode())
+                    file.write(self._metadata().encode())
         except OSError as failure:
             raise BagError(f'{self.file}: cannot be written: {failure.strerror}') from failure
 
@@ -182,68 +183,20 @@ class BagWriter:
         definition, type_hash = described(type_name)
         schema_id = self._writer.register_schema(type_name, 'ros2msg', definition.encode())
         metadata = {
-            'offered_qos_profiles': yaml.safe_dump([_qos_profile(latched)], sort_keys=False),
+            'offered_qos_profiles': yaml.safe_dump([qos_profile(latched)], sort_keys=False),
             'topic_type_hash': type_hash,
         }
         number = self._writer.register_channel(topic, 'cdr', schema_id, metadata)
         self._channels[topic] = _Channel(number, type_name, latched)
         return self._channels[topic]
 
-    def _metadata(self) -> dict[str, object]:
-        """Content of rosbag2's metadata.yaml, version 9."""
-        first_ns = self._first_ns or 0
-
-        def span() -> dict[str, object]:
-            # A new dict for each call: YAML would write a reference to a shared one.
-            return {
-                'starting_time': {'nanoseconds_since_epoch': first_ns},
-                'duration': {'nanoseconds': max(self._last_ns - first_ns, 0)},
-                'message_count': sum(self._counts.values()),
-            }
-
-        topic_list = [
-            {
-                'topic_metadata': {
-                    'name': topic,
-                    'type': channel.type_name,
-                    'serialization_format': 'cdr',
-                    'offered_qos_profiles': [_qos_profile(channel.latched)],
-                    'type_description_hash': typestore().hash_rihs01(channel.type_name),
-                },
-                'message_count': self._counts[topic],
-            }
-            for topic, channel in self._channels.items()
-        ]
-        return {
-            'rosbag2_bagfile_information': {
-                'version': 9,
-                'storage_identifier': 'mcap',
-                'relative_file_paths': [self.file.name],
-                **span(),
-                'topics_with_message_count': topic_list,
-                'compression_format': '',
-                'compression_mode': '',
-                'files': [{'path': self.file.name, **span()}],
-                'custom_data': None,
-                'ros_distro': 'jazzy',
-            }
-        }
-
-
-def _qos_profile(latched: bool) -> dict[str, object]:
-    """Offered QoS in the notation of rosbag2: reliable, and transient local if latched."""
-
-    def forever() -> dict[str, int]:
-        return {'sec': 9223372036, 'nsec': 854775807}
-
-    return {
-        'history': 'keep_last',
-        'depth': 1 if latched else 10,
-        'reliability': 'reliable',
-        'durability': 'transient_local' if latched else 'volatile',
-        'deadline': forever(),
-        'lifespan': forever(),
-        'liveliness': 'automatic',
-        'liveliness_lease_duration': forever(),
-        'avoid_ros_namespace_conventions': False,
-    }
+    def _metadata(self) -> str:
+        messages = sum(self._counts.values())
+        file = FileSpan(self.file.name, self._first_ns or 0, self._last_ns, messages)
+        return metadata_text(
+            [file],
+            [
+                TopicSummary(topic, channel.type_name, channel.latched, self._counts[topic])
+                for topic, channel in self._channels.items()
+            ],
+        )

@@ -3,7 +3,8 @@
 State on disk: the ensemble, and the activated calibrations, safe from a crash.
 
 ``ensemble/00000012.mcap`` is one image, numbered in order of arrival: a whole bag that any reader
-of MCAP opens.  ``ensemble/refused.json`` counts the refused images.
+of MCAP opens.  ``ensemble/refused.json`` counts the refused images.  ``ensemble/metadata.yaml``
+lists the images for rosbag2 while no calibrator uses the folder, unless the last one was killed.
 ``calibrations/00000007_calibration_00000003.json`` records that event 7 activated calibration 3
 (here by a roll-back): a ``calibration.json`` with two more keys.
 
@@ -31,12 +32,14 @@ import stat
 from typing import Any
 
 from starcal_ros.arrays import Count
+from starcal_ros.bag.metadata import FileSpan, metadata_text, TopicSummary
 from starcal_ros.bag.reader import read_observations
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.calibrator.seal import CHECKSUMS, Seal
 from starcal_ros.calibrator.stored import check_publishable
 from starcal_ros.errors import ArchiveError, BagError, ProductError
 from starcal_ros.files import PART, sync_folder
+from starcal_ros.messages.types import OBSERVATIONS_TYPE
 from starcal_ros.products.calibration_json import (
     calibration_content,
     calibration_from_content,
@@ -51,7 +54,7 @@ ARCHIVE_SCHEMA = 1
 TOPIC = '/observations'
 
 _ENSEMBLE, _CALIBRATIONS, _EMPTIED = 'ensemble', 'calibrations', 'ensemble.emptied'
-_REFUSED = 'refused.json'
+_REFUSED, _METADATA = 'refused.json', 'metadata.yaml'
 _EVENT_NAME = re.compile(r'(\d{8,9})_calibration_(\d{8,9})\.json')
 _IMAGE_NAME = re.compile(r'(\d{8,9})(?:_([0-9a-f]{64}))?\.mcap')
 # Numbers in the names of files that are not read count as given up to this one: a calibrator does
@@ -132,15 +135,26 @@ class Archive:
         self._events: dict[int, Path] = {}  # those on disk
         self._lock = _locked(folder)
         self._finish_emptying()
-        for part in folder.glob(f'*/.*{PART}'):
+        # After a kill the metadata would lack the last images, and readers would skip them.
+        for stale in (*folder.glob(f'*/.*{PART}'), folder / _ENSEMBLE / _METADATA):
             with contextlib.suppress(OSError):
-                part.unlink()
+                stale.unlink()
 
     def close(self) -> None:
-        """Unlock the folder; safe to call twice."""
+        """Describe the ensemble for rosbag2 and unlock the folder; safe to call twice."""
         if self._lock >= 0:
+            self._describe()
             os.close(self._lock)
         self._lock = -1
+
+    def _describe(self) -> None:
+        kept = sorted(self._images.items(), key=lambda item: item[1].path.name)
+        if not kept:
+            return
+        files = [FileSpan(one.path.name, stamp, stamp, 1) for stamp, one in kept]
+        topic = TopicSummary(TOPIC, OBSERVATIONS_TYPE, False, len(files))
+        with contextlib.suppress(OSError, ProductError):  # nothing here reads it
+            self._write(_ENSEMBLE, _METADATA, metadata_text(files, [topic]))
 
     def saved(self, ensemble: Ensemble) -> int:
         """Number of images of an ensemble on disk."""

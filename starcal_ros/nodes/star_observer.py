@@ -69,6 +69,7 @@ _ATTITUDE_MESSAGES = {
 _SAMPLES = QoSProfile(depth=2000)
 _STAMP_NS = operator.itemgetter(0)
 _MAX_VELOCITY_M_S = 1e6
+_DISCOVERY_S = 1.5  # 15 of the 20 images that wait, at 10 Hz
 _JUMP_S = 10.0  # smaller steps back are late messages, not a clock change
 
 
@@ -286,7 +287,13 @@ class StarObserver(StarcalNode):
 
     def _measure_all(self) -> None:
         assert self._queue is not None  # created before the thread
+        heard_by_s = math.inf
         while (waiting := self._queue.take()) is not None:
+            # Where all nodes start at once, the first image may be faster than the discovery of
+            # the calibrator, and its observations would reach nobody.
+            heard_by_s = min(heard_by_s, time.monotonic() + _DISCOVERY_S)
+            while not self._is_heard() and time.monotonic() < heard_by_s:
+                time.sleep(0.02)  # rclpy cannot wait for a match
             try:
                 self._measure(waiting)
             except Exception as error:
@@ -297,6 +304,9 @@ class StarObserver(StarcalNode):
                 self._publish(self._refused(waiting, 'internal_error', detail))
             self._latency_s.add(time.monotonic() - waiting.arrived_s)
             self.guarded(self.publish_health_change)()
+
+    def _is_heard(self) -> bool:
+        return bool(self._observations.get_subscription_count()) or not self.is_active
 
     def _measure(self, waiting: Waiting) -> None:
         if waiting.message is None:
