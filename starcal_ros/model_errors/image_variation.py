@@ -8,9 +8,10 @@ image gets three unknowns of its own (scale, stretch and shear: changes of fx, s
 Gaussian prior about the camera that all images share.  The variances of the prior are found by the
 method of moments (DerSimonian & Laird 1986).
 
-A lens that breathes does so about its mean.  Stretch and shear that vary come from outside the
-lens, as refraction does, which flattens every image and some more than others: the mean of the
-images is then off by as much as they scatter, and the covariance of the camera carries that.
+The covariance of the camera carries the whole variance, not that of the mean of the images: a
+calibration is used for one image, and the camera of one image differs from the mean by as much as
+they scatter.  So does the mean itself from the true camera where all images err to one side, as by
+refraction, which flattens every image and some more than others.
 """
 
 from __future__ import annotations
@@ -55,12 +56,12 @@ class ImageVariation:
         return float(np.linalg.norm(self.amplitude_sigma_px)) * radius_px / focal_px
 
     def common_covariance(self, parameter_count: int) -> Floats:
-        """Covariance (p, p) of what all images may have in common, on the camera parameters."""
+        """Covariance (p, p) of the camera of one image about the mean, on the parameters."""
         if not self.amplitude_sigma_px:
             return np.zeros((parameter_count, parameter_count))
         _, stretch_px, shear_px = self.amplitude_sigma_px
         # Air changes the scale by as much as it stretches.
-        common = np.square([max(stretch_px, shear_px), stretch_px, shear_px])
+        common = np.square([max(self.amplitude_sigma_px), stretch_px, shear_px])
         modes = shape_modes(parameter_count)
         return np.asarray((modes * common) @ modes.T)
 
@@ -102,8 +103,7 @@ def image_variation(blocks: Floats, shapes: Floats) -> ImageVariation:
     s = (a - np.einsum('mip,mi->mp', back, c)) @ D
     if shapes.size:
         s = s + np.einsum('mij,mj->mi', h, shapes[seen])
-    weight = np.einsum('mii->mi', h)
-    if not (weight > 0).all():
+    if not (np.einsum('mii->mi', h) > 0).all():
         return ImageVariation()
     mean = np.linalg.solve(h.sum(axis=0), s.sum(axis=0))
     off = s - h @ mean
@@ -111,7 +111,10 @@ def image_variation(blocks: Floats, shapes: Floats) -> ImageVariation:
     freedom = 3 * (len(h) - 1)
     if chdtrc(freedom, chi2) > _P_VALUE:
         return ImageVariation(chi2, freedom)
-    each = off / weight
+    # Each image by itself: in an image of few stars a change of scale looks like one of stretch.
+    back = inverse(h)
+    each = np.einsum('mij,mj->mi', back, off)
+    weight = 1.0 / np.einsum('mii->mi', back)
     centre = (weight * each).sum(axis=0) / weight.sum(axis=0)
     excess = (weight * (each - centre) ** 2).sum(axis=0) - (len(h) - 1)
     spread = weight.sum(axis=0) - (weight**2).sum(axis=0) / weight.sum(axis=0)
