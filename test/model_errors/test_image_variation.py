@@ -49,7 +49,12 @@ def test_a_focal_length_that_breathes_is_estimated_image_by_image() -> None:
     # The shapes are those that were made, but for what the mean of twelve takes.
     shown = found.state.shapes[:, 0] / focal_px
     np.testing.assert_allclose(shown - shown.mean(), scales - scales.mean(), atol=3e-5)
-    assert found.covariance[0, 0] > 10 * still.covariance[0, 0]
+    # Of the three shapes only the scale varies, and stars at one side do not mix them: their own
+    # noise leaves a few percent of it.
+    scale_px, stretch_px, shear_px = found.variation.amplitude_sigma_px
+    assert max(stretch_px, shear_px) < 0.1 * scale_px
+    # The camera of one image scatters by that about the mean, which adds 1 in 12 of the variance.
+    assert 1.0 < found.covariance[0, 0] / scale_px**2 < 1.2
     # What is left of the stars is their noise again.
     np.testing.assert_allclose(
         found.residual_px[found.kept].std(), still.residual_px[still.kept].std(), rtol=0.02
