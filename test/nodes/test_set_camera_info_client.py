@@ -54,7 +54,8 @@ rclpy.init()
 node = rclpy.create_node('camera_driver')
 node.create_service(SetCameraInfo, sys.argv[2], keep)
 try:
-    rclpy.spin(node)
+    while rclpy.ok():  # rmw_fastrtps may lose the wake-up by a signal: wait for half a second
+        rclpy.spin_once(node, timeout_sec=0.5)
 except ExternalShutdownException:
     pass
 node.destroy_node()
