@@ -153,7 +153,7 @@ class Archive:
             return
         files = [FileSpan(one.path.name, stamp, stamp, 1) for stamp, one in kept]
         topic = TopicSummary(TOPIC, OBSERVATIONS_TYPE, False, len(files))
-        with contextlib.suppress(OSError, ProductError):  # nothing here reads it
+        with contextlib.suppress(OSError, ProductError):  # the images are whole without it
             self._write(_ENSEMBLE, _METADATA, metadata_text(files, [topic]))
 
     def saved(self, ensemble: Ensemble) -> int:

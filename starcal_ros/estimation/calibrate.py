@@ -260,7 +260,7 @@ def _estimate(
     A = alignment.as_matrix()
     full[k : k + 3, k : k + 3] += A @ np.diag(correlated.added_variance_rad2) @ A.T
     free = np.ix_(problem.free, problem.free)
-    full[free] += verdict.variation.common_covariance(p)[free]
+    full[free] += verdict.variation.covariance_of_one_image(p)[free]
     at_reference = np.r_[0:p, k : k + 3]
     without_modes = len(full) - len(state.modes)
     with_modes = np.r_[at_reference, without_modes : len(full)]

@@ -21,6 +21,28 @@ def model_gate(
     """Contradictions between the stars and the assumed model, each with the remedy."""
     if found is None:
         return
+    yield from _lens(found, options, estimation)
+    yield from _read_out_and_light(found, options)
+    yield from _cross_validated(found.cross_validation, options)
+    check = limit_check(
+        options,
+        'min_independent_images',
+        'images with independent star-tracker errors',
+        found.independent_images,
+    )
+    note = ''
+    if found.correlation_time_s > 0:
+        note = (
+            f'the errors are correlated over {found.correlation_time_s:.3g} s: collect images '
+            'over a longer time'
+        )
+    yield dataclasses.replace(check, note=note)
+
+
+def _lens(
+    found: ModelChecks, options: GateOptions, estimation: CalibrationOptions
+) -> Iterator[GateCheck]:
+    """Pointings that show the lens, what its model leaves, and terms that are held."""
     check = limit_check(
         estimation,
         'min_images',
@@ -52,6 +74,10 @@ def model_gate(
         if not check.passed:
             note += f': estimate {term.name}, or widen its prior (estimate, prior_sigma)'
         yield dataclasses.replace(check, note=note)
+
+
+def _read_out_and_light(found: ModelChecks, options: GateOptions) -> Iterator[GateCheck]:
+    """Steps of the detector, aberration, and change from image to image."""
     step = found.step
     yield _significant(
         options,
@@ -87,20 +113,6 @@ def model_gate(
         'focal length or lens changes between images: estimate with temperature, or calibrate '
         'each state apart',
     )
-    yield from _cross_validated(found.cross_validation, options)
-    check = limit_check(
-        options,
-        'min_independent_images',
-        'images with independent star-tracker errors',
-        found.independent_images,
-    )
-    note = ''
-    if found.correlation_time_s > 0:
-        note = (
-            f'the errors are correlated over {found.correlation_time_s:.3g} s: collect images '
-            'over a longer time'
-        )
-    yield dataclasses.replace(check, note=note)
 
 
 def _cross_validated(bins: tuple[ResidualBin, ...], options: GateOptions) -> Iterator[GateCheck]:

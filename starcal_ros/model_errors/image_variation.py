@@ -55,15 +55,15 @@ class ImageVariation:
         """1-sigma displacement of a star in a corner ``radius_px`` from the middle."""
         return float(np.linalg.norm(self.amplitude_sigma_px)) * radius_px / focal_px
 
-    def common_covariance(self, parameter_count: int) -> Floats:
+    def covariance_of_one_image(self, parameter_count: int) -> Floats:
         """Covariance (p, p) of the camera of one image about the mean, on the parameters."""
         if not self.amplitude_sigma_px:
             return np.zeros((parameter_count, parameter_count))
         _, stretch_px, shear_px = self.amplitude_sigma_px
         # Air changes the scale by as much as it stretches.
-        common = np.square([max(self.amplitude_sigma_px), stretch_px, shear_px])
+        variance = np.square([max(self.amplitude_sigma_px), stretch_px, shear_px])
         modes = shape_modes(parameter_count)
-        return np.asarray((modes * common) @ modes.T)
+        return np.asarray((modes * variance) @ modes.T)
 
     def is_close_to(self, other: ImageVariation) -> bool:
         """Whether the sigmas agree to 5 %, or to 1e-3 px: no estimate moves with that."""
