@@ -49,6 +49,8 @@ def generate_launch_description() -> LaunchDescription:
                 'rate': ParameterValue(LaunchConfiguration('rate'), value_type=float),
                 'loop': ParameterValue(LaunchConfiguration('loop'), value_type=bool),
                 'clock': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool),
+                # The calibrator may start last; the first observations would be lost.
+                'wait_for_topic': 'observations',
             }
         ],
         ros_arguments=['--log-level', LaunchConfiguration('log_level')],

@@ -127,15 +127,24 @@ class BagPlayer(Node):
                 raise ExternalShutdownException
 
     def _wait_for_subscribers(self) -> None:
-        """Wait until all image and attitude topics have subscribers, or until the timeout."""
+        """Wait until the topics that matter have subscribers, or until the timeout."""
         inputs = (IMAGE_TYPE, ATTITUDE_TYPE)
         needed = [t.name for t in self._topics if t.type_name in inputs] or list(self._players)
+        other = self.own.wait_for_topic
         deadline_s = time.monotonic() + self.own.wait_for_subscribers_s
-        while missing := [n for n in needed if not self._players[n].get_subscription_count()]:
+        while missing := [
+            *(name for name in needed if not self._players[name].get_subscription_count()),
+            *([other] if other and not self._other_subscribers(other) else []),
+        ]:
             if time.monotonic() > deadline_s:
                 self.get_logger().warning(f'no subscriber on {", ".join(missing)}: playing anyway')
                 return
             _sleep_until(time.monotonic() + 0.02)  # rclpy cannot wait for a match
+
+    def _other_subscribers(self, topic: str) -> int:
+        name = self.resolve_topic_name(topic)
+        is_own = self._paced and name == self._observations.topic_name
+        return int(self.count_subscribers(name)) - is_own
 
     def _wait_for_observations(self, sent: int) -> None:
         """Wait while a star observer has too many images in its queue."""

@@ -306,7 +306,11 @@ class StarObserver(StarcalNode):
             self.guarded(self.publish_health_change)()
 
     def _is_heard(self) -> bool:
-        return bool(self._observations.get_subscription_count()) or not self.is_active
+        """Return True if each subscriber that the graph shows is matched, and there is one."""
+        if not self.is_active:
+            return True
+        known = self.count_subscribers(self._observations.topic_name)
+        return bool(known) and self._observations.get_subscription_count() >= known
 
     def _measure(self, waiting: Waiting) -> None:
         if waiting.message is None:

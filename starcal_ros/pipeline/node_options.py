@@ -101,6 +101,9 @@ class PlayerOptions:
     wait_for_subscribers_s: float = option(
         10.0, 'timeout of the wait for subscribers of images and attitudes, s', low=0.0
     )
+    wait_for_topic: str = option(
+        '', 'another topic that needs a subscriber before the playback starts'
+    )
     images_in_flight: int = option(
         4, 'images sent ahead of their observations if a star observer is running', low=1
     )

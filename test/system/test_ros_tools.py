@@ -65,6 +65,11 @@ def row(rmw: str, tool: str, command: str, outcome: str) -> None:
     print(f'\n| {tool}, {"Fast" if rmw == FAST else "Cyclone"} DDS | `{command}` | {outcome} |')
 
 
+def has_rosbag2(ros2: RosTools) -> bool:
+    """Return True if the libraries of rosbag2 load; its commands are missing otherwise."""
+    return ' record ' in ros2.run('bag', '--help').stdout
+
+
 def middleware(ros2: RosTools) -> str:
     return str(ros2.environment['RMW_IMPLEMENTATION'])
 
@@ -73,7 +78,7 @@ def test_launch_replay_calibrate_and_record(
     ros2: RosTools, tiny_bag: Path, tmp_path: Path
 ) -> None:
     """The sequence of the README with every launch argument, ended as a terminal ends it."""
-    if 'record' not in ros2.run('bag', '--help').stdout:
+    if not has_rosbag2(ros2):
         pytest.skip('ros2 bag record does not load here')
     recorded = tmp_path / 'recorded'
     launch = ros2.start(
@@ -113,9 +118,10 @@ def test_launch_arguments_are_shown(make: Make) -> None:
     row(FAST, 'launch', 'ros2 launch starcal replay.launch.py --show-args', 'every argument')
 
 
-def test_replay_launch(make: Make, tiny_bag: Path) -> None:
+def test_replay_launch(make: Make, tiny_bag: Path, tmp_path: Path) -> None:
     ros2 = make(FAST)
     values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())
+    values['/**']['ros__parameters']['state_dir'] = str(tmp_path / 'state')
     remapped = tiny_bag / 'images.yaml'
     remapped.write_text(yaml.safe_dump(values))
     launch = ros2.start(
@@ -127,6 +133,12 @@ def test_replay_launch(make: Make, tiny_bag: Path) -> None:
     launch.interrupt()
     assert 'process has died' not in launch.said(), launch.said()
     row(FAST, 'launch', 'ros2 launch starcal replay.launch.py', '10 images')
+    if not has_rosbag2(ros2):
+        return
+    info = ros2.run('bag', 'info', tmp_path / 'state' / 'ensemble')
+    words = info.stdout.split()
+    assert words[words.index('Messages:') + 1] == '10', info.stdout + info.stderr
+    row(FAST, 'rosbag2', 'ros2 bag info STATE_DIR/ensemble', '10 messages')
 
 
 def test_lifecycle_and_parameters(ros2: RosTools, tiny_bag: Path, tmp_path: Path) -> None:
