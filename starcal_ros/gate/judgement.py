@@ -238,7 +238,7 @@ def _changes(
     yield limit_check(
         options,
         'max_zero_skew_cost_px',
-        'largest error of camera_info, which has no skew',
+        'largest error of camera_info, which carries neither skew nor field,',
         calibration.zero_skew_cost_px,
         'px',
     )

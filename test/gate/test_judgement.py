@@ -219,8 +219,8 @@ def test_a_good_calibration_passes() -> None:
             0.7,
             0.6,
             (
-                'largest error of camera_info, which has no skew is 0.7 px, over the limit of '
-                '0.6 px (max_zero_skew_cost_px)'
+                'largest error of camera_info, which carries neither skew nor field, is 0.7 px, '
+                'over the limit of 0.6 px (max_zero_skew_cost_px)'
             ),
         ),
         (
