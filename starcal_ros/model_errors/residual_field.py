@@ -136,12 +136,12 @@ class FieldPrior:
         """
         Probability of as large a ratio, or as large a radial term, without a field.
 
-        The variance stands at its bound under the null hypothesis, which alone halves the tail of
-        chi^2 with one degree of freedom (Self & Liang 1987); the choice among lengths doubles it
-        again.  The radial term is Gaussian.  The smaller of the two counts twice (Bonferroni).
-        Held against draws in the tests.
+        The variance stands at its bound under the null hypothesis, which halves the tail of chi^2
+        with one degree of freedom (Self & Liang 1987).  The radial term is Gaussian.  The smaller
+        of the two counts twice (Bonferroni).  Of 20,000 draws without a field, for 14 images
+        and for 4, 1.0 and 0.8 % have a p-value under 1 %.
         """
-        smooth = chdtrc(1.0, max(self.log_likelihood_ratio, 0.0))
+        smooth = 0.5 * chdtrc(1.0, max(self.log_likelihood_ratio, 0.0))
         return float(min(1.0, 2.0 * min(smooth, chdtrc(1.0, self.radial_score**2))))
 
 
