@@ -27,6 +27,7 @@ from starcal_ros.methods.attitude_errors import attitude_errors
 from starcal_ros.methods.minimise import minimise
 from starcal_ros.methods.problem import (
     field_terms,
+    image_alignment,
     image_blocks,
     image_field,
     Problem,
@@ -239,10 +240,29 @@ def _robust_search(problem: Problem, start: State, measurements: Measurements) -
         try:
             free = dataclasses.replace(problem, method='per_image')
             solution = minimise(free, start, measurements, _ROBUST_SCALE)
-            return dataclasses.replace(solution, state=_with_slope(problem, solution.state))
+            state = _with_slope(problem, _with_mountings(problem, solution.state))
+            return dataclasses.replace(solution, state=state)
         except NotObservable:
             pass  # so few stars that they need the star tracker
     return minimise(problem, start, measurements, _ROBUST_SCALE)
+
+
+def _with_mountings(problem: Problem, state: State) -> State:
+    """
+    The state with the errors of the mountings that its rotations show.
+
+    Differences of medians to the first star tracker, or to the next one that has images.
+    """
+    if len(state.mountings) == 0:
+        return state
+    eta_rad = attitude_errors(problem, state, state.camera_from_icrf)
+    turned = image_alignment(problem, state).apply(eta_rad)
+    there = np.unique(problem.star_tracker)
+    medians = {k: np.median(turned[problem.star_tracker == k], axis=0) for k in there}
+    mountings = state.mountings.reshape(-1, 3).copy()
+    for k in there[1:]:
+        mountings[k - 1] += medians[k] - medians[there[0]]
+    return dataclasses.replace(state, mountings=mountings.ravel())
 
 
 def _with_slope(problem: Problem, state: State) -> State:
