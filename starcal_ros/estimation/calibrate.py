@@ -369,14 +369,17 @@ def _correlation(
     """Correlation in time of the errors of a star tracker, in the images that fit."""
     good = errors.seen & here
     assumed_rad = assumed_tracker_sigma_rad(options)
-    excess = tracker_sigma_is_given(options) and bool(
+    is_given = tracker_sigma_is_given(options)
+    excess = is_given and bool(
         (found.verdict.tracker_sigma_rad > _TRACKER_EXCESS * assumed_rad).any()
     )
+    largest_rad = assumed_rad if is_given and not excess else np.full(3, np.inf)
     return attitude_correlation(
         errors.time_ns[good],
         errors.error_rad[good],
         errors.variance_rad2[good],
         excess,
+        largest_rad,
     )
 
 
@@ -429,9 +432,6 @@ def _result(
         if good.any():
             scatter_arcsec = float(np.sqrt(eta_rad[good].var(axis=0).mean())) / ARCSECOND_RAD
     alignment, full = shared_covariance(problem, state, blocks, good, tracker_sigma_rad, terms)
-    focal_px = state.parameters[[0, 2]]
-    if not (focal_px > 0).all():
-        raise NotObservable(f'fx, fy of {focal_px.round(1).tolist()} px are of a mirrored image')
     camera = dataclasses.replace(prior.camera, field=image_field(problem, state)).replace(
         **{problem.parameter_names[i]: float(state.parameters[i]) for i in problem.free}
     )

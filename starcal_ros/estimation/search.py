@@ -17,6 +17,7 @@ import numpy as np
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.detector_field import in_degree
+from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.options import assumed_tracker_sigma_rad, CalibrationOptions
 from starcal_ros.estimation.verdict import arranged, judge_residuals, Verdict
 from starcal_ros.least_squares.levenberg_marquardt import NotObservable, Solution
@@ -69,6 +70,8 @@ def search(
     ------
     NotObservable
         When the stars do not determine all unknowns.
+    TooFewObservations
+        When the images are mirrored.
     """
     everything = np.ones(len(table), bool)
     given_rad = problem.star_tracker_sigma_rad[0]
@@ -108,7 +111,16 @@ class Found:
 def _settle(
     found: Found, measurements: Measurements, table: StarTable, options: CalibrationOptions
 ) -> Found:
-    """Least squares and judgement of its residuals in turns, until the judgement stands."""
+    """
+    Least squares and judgement of its residuals in turns, until the judgement stands.
+
+    Raises
+    ------
+    NotObservable
+        When the stars do not determine all unknowns.
+    TooFewObservations
+        For a focal length below zero, which no camera has.
+    """
     problem, solution = found.problem, found.solution
     given_rad = assumed_tracker_sigma_rad(options)
     iterations, after = found.iterations, found.verdict
@@ -131,6 +143,13 @@ def _settle(
         del blocks
         if after.agrees_with(verdict):
             break
+    focal_px = solution.state.parameters[[0, 2]]
+    if not (focal_px > 0).all():
+        raise TooFewObservations(
+            'the stars are those of a mirrored image: fx and fy would be '
+            f'{focal_px.round(1).tolist()} px; flip the images along one axis, or set up the '
+            'driver of the camera not to'
+        )
     return dataclasses.replace(
         found, problem=problem, solution=solution, verdict=verdict, iterations=iterations
     )

@@ -148,3 +148,21 @@ def _drift(errors: AttitudeErrors, here: Mask) -> tuple[Floats, float, float]:
     p_value = min(1.0, 3.0 * 2.0 * float(stdtr(freedom, -np.abs(t)).min()))  # of three axes
     rate = slope / ARCSECOND_RAD
     return rate, float(np.linalg.norm(rate) * np.ptp(hours)), p_value
+
+
+def summary(one: StarTrackerAlignment) -> str:
+    """One line of text: images, 1-sigma of alignment and mounting, drift."""
+    aligned, mounted = (
+        np.sqrt(np.diag(covariance)) / ARCSECOND_RAD
+        for covariance in (one.alignment_covariance_rad2, one.mounting_covariance_rad2)
+    )
+    text = f'{one.frame}: {one.images} images, alignment within {_three(aligned)} arcsec'
+    if mounted.any():
+        text += f', mounting within {_three(mounted)}'
+    if np.isfinite(one.drift_p_value):
+        text += f'; drift {one.drift_arcsec:.1f} arcsec (p-value {one.drift_p_value:.1g})'
+    return text
+
+
+def _three(values: Floats) -> str:
+    return ', '.join(f'{value:.1f}' for value in values)

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
-from starcal_ros.records import Ensemble, StarTrackerAlignment
+from starcal_ros.records import Ensemble, StarObservations, StarTrackerAlignment
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import Scenario, scene
 
@@ -96,7 +96,7 @@ def test_each_alignment_is_found(method: str) -> None:
         assert (first * (mounting * own).inv()).magnitude() < 1e-12
 
 
-def _without_noise(given: Scenario, index: int, image):  # type: ignore[no-untyped-def]
+def _without_noise(given: Scenario, index: int, image: StarObservations) -> StarObservations:
     head = 0 if not image.star_tracker else int(image.star_tracker[-1])
     first_from_camera = Rotation.from_quat(given.truth.star_tracker_from_camera_xyzw)
     camera_from_icrf = Rotation.from_matrix(scene(given, index).camera_from_icrf)
