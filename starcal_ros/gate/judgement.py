@@ -177,7 +177,7 @@ def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateC
         options,
         'min_coverage',
         'fraction of the detector with stars that fit',
-        float((maps.stars > 0).mean()),
+        float((maps.stars > 0).mean()) if maps.stars.size else 0.0,
     )
     yield limit_check(
         options,
