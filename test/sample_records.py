@@ -25,6 +25,7 @@ from starcal_ros.records import (
     ResidualBin,
     ResidualField,
     StarObservations,
+    StarTrackerAlignment,
     TemperatureTerms,
     TermRemoval,
 )
@@ -105,6 +106,19 @@ def calibration() -> Calibration:
             TermRemoval('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
             TermRemoval('k3', -0.3, 0.5, 1 / 7, False, 0.3, (0.25, 0.35), 1e-9),
         ),
+        star_trackers=(
+            StarTrackerAlignment(
+                'head',
+                7,
+                np.array([0.5, -0.5, 0.5, 0.5]),
+                np.asarray(np.arange(9.0).reshape(3, 3) / 7e12, np.float64),
+                np.array([0.6, 0.0, 0.0, 0.8]),
+                np.asarray(np.arange(9.0).reshape(3, 3) / 3e12, np.float64),
+                (0.1, -0.2, 1 / 3),
+                0.7,
+                0.25,
+            ),
+        ),
         model_checks=model_checks(),
         field=ResidualField(
             1,
@@ -153,8 +167,8 @@ def without_field() -> Calibration:
 
 
 def calibration_of_0_1() -> Calibration:
-    """What a file of version 0.1 holds of it: that version had no field and no model checks."""
-    return dataclasses.replace(without_field(), model_checks=None)
+    """What a file of version 0.1 holds of it: no field, no checks of the model, one alignment."""
+    return dataclasses.replace(without_field(), model_checks=None, star_trackers=())
 
 
 def plain_calibration() -> Calibration:
@@ -166,6 +180,7 @@ def plain_calibration() -> Calibration:
         correlation=None,
         removals=(),
         halves=None,
+        star_trackers=(),
         model_checks=None,
         gate=(),
     )
@@ -198,6 +213,10 @@ def assert_same(a: Any, b: Any) -> None:
         x, y = getattr(a, field.name), getattr(b, field.name)
         if dataclasses.is_dataclass(x):
             assert_same(x, y)
+        elif isinstance(x, tuple) and any(map(dataclasses.is_dataclass, x)):
+            assert len(x) == len(y), field.name
+            for one, other in zip(x, y, strict=True):
+                assert_same(one, other)
         elif isinstance(x, float) and np.isnan(x):
             assert np.isnan(y), field.name
         elif isinstance(x, np.ndarray):

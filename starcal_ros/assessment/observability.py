@@ -149,7 +149,7 @@ def _sigma_with(
         )
     except (NotObservable, np.linalg.LinAlgError):
         return {}
-    names = shared_names(problem.model, order, with_rate)
+    names = shared_names(problem.model, order, with_rate, len(state.mountings) // 3)
     return dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
 
 

@@ -46,17 +46,23 @@ _stamp_ns = operator.itemgetter(0)
 
 @dataclass(frozen=True)
 class FrameTopics:
-    """Topics of images and of their telemetry; velocity and temperature may be empty."""
+    """
+    Topics of images and of their telemetry; velocity and temperature may be empty.
+
+    ``more_attitudes`` are those of further star trackers.
+    """
 
     image: str
     attitude: str
     velocity: str = ''
     temperature: str = ''
+    more_attitudes: tuple[str, ...] = ()
 
     @property
     def telemetry(self) -> tuple[str, ...]:
         """Topics that are not images."""
-        return tuple(filter(None, (self.attitude, self.velocity, self.temperature)))
+        single = (self.attitude, self.velocity, self.temperature)
+        return tuple(filter(None, (*single, *self.more_attitudes)))
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,7 @@ class Frame:
     attitudes: AttitudeHistory
     velocity_m_s: Floats | None
     temperature_degc: float
+    more_attitudes: tuple[AttitudeHistory, ...] = ()
 
 
 class Telemetry:
@@ -80,6 +87,7 @@ class Telemetry:
         self, topics: FrameTopics, options: AttitudeOptions, on_damage: Damage = log_damage
     ) -> None:
         self.attitudes = AttitudeHistory()
+        self.more_attitudes = tuple(AttitudeHistory() for _ in topics.more_attitudes)
         self.velocities: list[tuple[int, Floats]] = []
         self.temperatures: list[tuple[int, float]] = []
         self._topics = topics
@@ -98,10 +106,14 @@ class Telemetry:
         except BagError as error:
             self._on_damage(str(error))
             return True
-        if raw.topic == self._topics.attitude:
+        by_topic = {
+            self._topics.attitude: self.attitudes,
+            **dict(zip(self._topics.more_attitudes, self.more_attitudes, strict=True)),
+        }
+        if raw.topic in by_topic:
             time_ns, quaternion = attitude_from_message(message)
             sample = attitude_sample(time_ns, quaternion, self._options.attitude_direction)
-            self.attitudes.add(time_ns, sample)
+            by_topic[raw.topic].add(time_ns, sample)
         elif raw.topic == self._topics.velocity:
             time_ns, velocity_m_s = velocity_from_message(message)
             bisect.insort(self.velocities, (time_ns, velocity_m_s), key=_stamp_ns)
@@ -192,10 +204,15 @@ def read_frames(
     yielded before it whose telemetry that pass changes are reported to ``on_damage``.
     """
     options = options or AttitudeOptions()
-    telemetry = Telemetry(topics, options, on_damage)
+    # Which of several star trackers an image takes depends on all that are there.
+    is_complete = bool(topics.more_attitudes)
+    telemetry = (
+        read_telemetry(paths, topics, options, on_damage)
+        if is_complete
+        else Telemetry(topics, options, on_damage)
+    )
     waiting: deque[Image | StarObservations] = deque()
     taken: list[tuple[int, Floats]] = []
-    is_complete = False
     messages = read_raw(paths, [topics.image, *topics.telemetry], on_damage)
     for raw in read_ahead(messages):
         in_order = True
@@ -242,7 +259,7 @@ def _with_telemetry(
 ) -> Frame | StarObservations:
     if isinstance(item, StarObservations):
         return item
-    return Frame(item, telemetry.attitudes, *telemetry.at(item.time_ns))
+    return Frame(item, telemetry.attitudes, *telemetry.at(item.time_ns), telemetry.more_attitudes)
 
 
 def _report_changed(

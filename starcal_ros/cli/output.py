@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     """Print parameters, statistics and verdict; changes are relative to the prior."""
+    from starcal_ros.estimation import star_trackers
     from starcal_ros.model_errors import temperature
 
     camera, sigma = calibration.geometry.camera, calibration.sigma
@@ -61,6 +62,8 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     print_text(f'solver          {calibration.iterations} iterations, {calibration.termination}')
     if calibration.temperature is not None:
         print_text(f'temperature     {temperature.summary(calibration.temperature)}')
+    for one in calibration.star_trackers:
+        print_text(f'star tracker    {star_trackers.summary(one)}')
     if calibration.accepted:
         print_verdict(True, 'verdict         accepted')
     else:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import TooFewObservations
+from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.options import (
     assumed_tracker_sigma_rad,
     CalibrationOptions,
@@ -23,6 +23,11 @@ from starcal_ros.estimation.options import (
     tracker_sigma_is_given,
 )
 from starcal_ros.estimation.search import Found, search
+from starcal_ros.estimation.star_trackers import (
+    AttitudeErrors,
+    star_tracker_alignments,
+    star_tracker_names,
+)
 from starcal_ros.estimation.verdict import all_residuals_px, arranged, dropped_stars, free_share
 from starcal_ros.least_squares.levenberg_marquardt import NotObservable
 from starcal_ros.least_squares.linear_terms import LinearTerms
@@ -37,7 +42,12 @@ from starcal_ros.model_errors.repeated_pointings import pointing_groups
 from starcal_ros.model_errors.residual_field import FieldPrior
 from starcal_ros.model_errors.temperature import weakest_term, why_unsupported
 from starcal_ros.model_errors.variance_components import CentroidVariance
-from starcal_ros.records import CameraGeometry, Ensemble, TemperatureTerms
+from starcal_ros.records import (
+    CameraGeometry,
+    Ensemble,
+    StarTrackerAlignment,
+    TemperatureTerms,
+)
 
 _TRACKER_EXCESS = 1.3  # found over assumed sigma from which the scatter is suspect
 
@@ -96,7 +106,9 @@ class Estimate:
     variation : ImageVariation
         Of the camera from image to image; where there is one, each image has a shape of its own.
     correlation : AttitudeCorrelation
-        Of the star-tracker errors in time; carried in the covariances.
+        Of the star-tracker errors in time, of the first one; carried in the covariances.
+    star_trackers : tuple of StarTrackerAlignment
+        Empty where there is one only.
     """
 
     geometry: CameraGeometry
@@ -128,6 +140,7 @@ class Estimate:
     pointings: int
     variation: ImageVariation
     correlation: AttitudeCorrelation
+    star_trackers: tuple[StarTrackerAlignment, ...]
 
 
 def estimate_calibration(
@@ -151,6 +164,7 @@ def estimate_calibration(
     table = star_table(ensemble.images)
     time_ns = np.array([image.time_ns for image in ensemble.images], np.int64)
     problem = problem_of(ensemble, prior, options)
+    names = star_tracker_names(ensemble)
     order, with_rate = options.focal_temperature_order, options.alignment_temperature
     left_out = []
     unsupported = (order or with_rate) and why_unsupported(
@@ -163,13 +177,13 @@ def estimate_calibration(
         start = start_of(problem, prior, order, with_rate)
         try:
             found = search(problem, start, table, prior.camera, options)
-            estimate, weakest = _estimate(found, table, time_ns, prior, options)
+            estimate, weakest = _estimate(found, table, time_ns, names, prior, options)
             why = 'within chance'
         except (NotObservable, np.linalg.LinAlgError) as error:
             if not (order or with_rate):
-                names = ', '.join(estimated_parameters(options, problem.model))
+                asked = ', '.join(estimated_parameters(options, problem.model))
                 raise TooFewObservations(
-                    f'the stars do not determine all of {names} and the alignment: {error}; '
+                    f'the stars do not determine all of {asked} and the alignment: {error}; '
                     'more images, or stars over more of the detector, or fewer parameters are '
                     'needed'
                 ) from error
@@ -197,20 +211,35 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
     for k in free & {names.index('cx'), names.index('cy')}:
         if prior_sigma[k] == 0:
             prior_sigma[k] = weak_px
+    attitudes = Rotation.from_quat(
+        np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
+    )
+    names = star_tracker_names(ensemble)
+    mountings = None
+    if len(names) > 1:
+        if options.method == 'per_image':
+            raise OptionError(
+                'method: per_image has no common alignment, which several star trackers need'
+            )
+        mountings = Rotation.from_quat(
+            np.array([image.star_tracker_from_head_xyzw for image in ensemble.images])
+        )
+        attitudes = attitudes * mountings
     return Problem(
         method=options.method,
         model=model,
         free=np.array(sorted(free), np.int64),
         prior_parameters=prior.camera.parameters,
         prior_sigma=np.where(prior_sigma > 0, prior_sigma, np.inf),
-        star_tracker_from_icrf=Rotation.from_quat(
-            np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
-        ).inv(),
+        star_tracker_from_icrf=attitudes.inv(),
         star_tracker_sigma_rad=np.tile(
             assumed_tracker_sigma_rad(options), (len(ensemble.images), 1)
         ),
         above_reference_k=np.array([image.temperature_degc for image in ensemble.images])
         - options.reference_temperature_degc,
+        star_tracker=np.array([names.index(image.star_tracker) for image in ensemble.images]),
+        first_from_star_tracker=mountings,
+        mounting_sigma_rad=options.star_tracker_mounting_sigma_arcsec * ARCSECOND_RAD,
     )
 
 
@@ -220,9 +249,12 @@ def start_of(problem: Problem, prior: CameraGeometry, order: int, with_rate: boo
     return State(
         prior.camera.parameters.copy(),
         alignment,
-        alignment * problem.star_tracker_from_icrf,
+        alignment * problem.star_tracker_from_icrf
+        if problem.first_from_star_tracker is None
+        else alignment * problem.first_from_star_tracker * problem.star_tracker_from_icrf,
         np.zeros(order),
         np.zeros(3 if with_rate else 0),
+        mountings=np.zeros(3 * int(problem.star_tracker.max(initial=0))),
     )
 
 
@@ -230,6 +262,7 @@ def _estimate(
     found: Found,
     table: StarTable,
     time_ns: NDArray[np.int64],
+    star_trackers: tuple[str, ...],
     prior: CameraGeometry,
     options: CalibrationOptions,
 ) -> tuple[Estimate, str]:
@@ -252,11 +285,23 @@ def _estimate(
     attitude_error_rad, attitude_covariance_rad2, attitude_seen = attitudes_of_stars_alone(
         problem, dataclasses.replace(state, camera_from_star_tracker=alignment), blocks
     )
-    correlated = _correlation(
-        found, time_ns, attitude_error_rad, attitude_covariance_rad2, attitude_seen, options
+    errors = AttitudeErrors(
+        time_ns,
+        attitude_error_rad,
+        np.einsum('mii->mi', attitude_covariance_rad2),
+        verdict.tracker_sigma_rad,
+        attitude_seen & ~verdict.misfit,
     )
+    # The errors of one star tracker say nothing of those of another.
+    correlations = tuple(
+        _correlation(found, errors, problem.star_tracker == k, options)
+        for k in range(len(star_trackers))
+    )
+    correlated = correlations[0]
     p = problem.camera_count
     k = p + len(state.focal)
+    aligned = k + np.r_[0:3, 3 + len(state.rate) : state.alignment_count]
+    of_star_trackers = full[np.ix_(aligned, aligned)]
     A = alignment.as_matrix()
     full[k : k + 3, k : k + 3] += A @ np.diag(correlated.added_variance_rad2) @ A.T
     free = np.ix_(problem.free, problem.free)
@@ -266,11 +311,14 @@ def _estimate(
     with_modes = np.r_[at_reference, without_modes : len(full)]
     joint = _in_coefficients(problem, full, with_modes)
     full = full[:without_modes, :without_modes]
-    names = shared_names(problem.model, len(state.focal), len(state.rate) > 0)
+    names = shared_names(
+        problem.model, len(state.focal), len(state.rate) > 0, len(state.mountings) // 3
+    )
     information = reduced_information(problem, state, blocks, terms)
     shared = np.r_[problem.free, p : len(information) - len(state.modes)]
     thermal = _thermal(state, full, options)
-    weakest = weakest_term(thermal, full[k + 3 :, k + 3 :]) if thermal else ''
+    rate = slice(k + 3, k + 3 + len(state.rate))
+    weakest = weakest_term(thermal, full[rate, rate]) if thermal else ''
     estimate = Estimate(
         geometry=geometry,
         covariance=full[np.ix_(at_reference, at_reference)],
@@ -303,26 +351,35 @@ def _estimate(
         ),
         variation=verdict.variation,
         correlation=correlated,
+        star_trackers=star_tracker_alignments(
+            star_trackers,
+            problem,
+            state,
+            of_star_trackers,
+            errors,
+            tuple(one.added_variance_rad2 for one in correlations),
+        ),
     )
     return estimate, weakest
 
 
 def _correlation(
-    found: Found,
-    time_ns: NDArray[np.int64],
-    error_rad: Floats,
-    covariance_rad2: Floats,
-    seen: Mask,
-    options: CalibrationOptions,
+    found: Found, errors: AttitudeErrors, here: Mask, options: CalibrationOptions
 ) -> AttitudeCorrelation:
-    """Correlation in time of the star-tracker errors of the images that fit."""
-    good = seen & ~found.verdict.misfit
+    """Correlation in time of the errors of a star tracker, in the images that fit."""
+    good = errors.seen & here
     assumed_rad = assumed_tracker_sigma_rad(options)
-    excess = tracker_sigma_is_given(options) and bool(
+    is_given = tracker_sigma_is_given(options)
+    excess = is_given and bool(
         (found.verdict.tracker_sigma_rad > _TRACKER_EXCESS * assumed_rad).any()
     )
+    largest_rad = assumed_rad if is_given and not excess else np.full(3, np.inf)
     return attitude_correlation(
-        time_ns[good], error_rad[good], np.einsum('mii->mi', covariance_rad2[good]), excess
+        errors.time_ns[good],
+        errors.error_rad[good],
+        errors.variance_rad2[good],
+        excess,
+        largest_rad,
     )
 
 
@@ -338,7 +395,7 @@ def _thermal(state: State, full: Floats, options: CalibrationOptions) -> Tempera
         focal_per_degc=tuple(state.focal.tolist()),
         focal_per_degc_sigma=tuple(sigma[p:k].tolist()),
         alignment_rate_rad_per_degc=tuple(state.rate.tolist()),
-        alignment_rate_rad_per_degc_sigma=tuple(sigma[k + 3 :].tolist()),
+        alignment_rate_rad_per_degc_sigma=tuple(sigma[k + 3 : k + 3 + len(state.rate)].tolist()),
     )
 
 
@@ -375,9 +432,6 @@ def _result(
         if good.any():
             scatter_arcsec = float(np.sqrt(eta_rad[good].var(axis=0).mean())) / ARCSECOND_RAD
     alignment, full = shared_covariance(problem, state, blocks, good, tracker_sigma_rad, terms)
-    focal_px = state.parameters[[0, 2]]
-    if not (focal_px > 0).all():
-        raise NotObservable(f'fx, fy of {focal_px.round(1).tolist()} px are of a mirrored image')
     camera = dataclasses.replace(prior.camera, field=image_field(problem, state)).replace(
         **{problem.parameter_names[i]: float(state.parameters[i]) for i in problem.free}
     )

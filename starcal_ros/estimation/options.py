@@ -62,6 +62,13 @@ class CalibrationOptions:
         ' is held, it is taken as exact',
         low=0.0,
     )
+    star_tracker_mounting_sigma_arcsec: float = option(
+        300.0,
+        '1-sigma of each angle of the mountings of several star trackers among each other, as'
+        ' more_alignments and prior_alignment have them, arcsec',
+        low=1e-3,
+        high=648000.0,
+    )
     principal_point_prior: float = option(
         0.03,
         '1-sigma of the prior of cx and cy where prior_sigma gives none, as a fraction of the'

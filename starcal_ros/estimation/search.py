@@ -17,6 +17,7 @@ import numpy as np
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.detector_field import in_degree
+from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.options import assumed_tracker_sigma_rad, CalibrationOptions
 from starcal_ros.estimation.verdict import arranged, judge_residuals, Verdict
 from starcal_ros.least_squares.levenberg_marquardt import NotObservable, Solution
@@ -27,6 +28,7 @@ from starcal_ros.methods.attitude_errors import attitude_errors
 from starcal_ros.methods.minimise import minimise
 from starcal_ros.methods.problem import (
     field_terms,
+    image_alignment,
     image_blocks,
     image_field,
     Problem,
@@ -68,6 +70,8 @@ def search(
     ------
     NotObservable
         When the stars do not determine all unknowns.
+    TooFewObservations
+        When the images are mirrored.
     """
     everything = np.ones(len(table), bool)
     given_rad = problem.star_tracker_sigma_rad[0]
@@ -107,7 +111,16 @@ class Found:
 def _settle(
     found: Found, measurements: Measurements, table: StarTable, options: CalibrationOptions
 ) -> Found:
-    """Least squares and judgement of its residuals in turns, until the judgement stands."""
+    """
+    Least squares and judgement of its residuals in turns, until the judgement stands.
+
+    Raises
+    ------
+    NotObservable
+        When the stars do not determine all unknowns.
+    TooFewObservations
+        For a focal length below zero, which no camera has.
+    """
     problem, solution = found.problem, found.solution
     given_rad = assumed_tracker_sigma_rad(options)
     iterations, after = found.iterations, found.verdict
@@ -130,6 +143,13 @@ def _settle(
         del blocks
         if after.agrees_with(verdict):
             break
+    focal_px = solution.state.parameters[[0, 2]]
+    if not (focal_px > 0).all():
+        raise TooFewObservations(
+            'the stars are those of a mirrored image: fx and fy would be '
+            f'{focal_px.round(1).tolist()} px; flip the images along one axis, or set up the '
+            'driver of the camera not to'
+        )
     return dataclasses.replace(
         found, problem=problem, solution=solution, verdict=verdict, iterations=iterations
     )
@@ -239,10 +259,29 @@ def _robust_search(problem: Problem, start: State, measurements: Measurements) -
         try:
             free = dataclasses.replace(problem, method='per_image')
             solution = minimise(free, start, measurements, _ROBUST_SCALE)
-            return dataclasses.replace(solution, state=_with_slope(problem, solution.state))
+            state = _with_slope(problem, _with_mountings(problem, solution.state))
+            return dataclasses.replace(solution, state=state)
         except NotObservable:
             pass  # so few stars that they need the star tracker
     return minimise(problem, start, measurements, _ROBUST_SCALE)
+
+
+def _with_mountings(problem: Problem, state: State) -> State:
+    """
+    The state with the errors of the mountings that its rotations show.
+
+    Differences of medians to the first star tracker, or to the next one that has images.
+    """
+    if len(state.mountings) == 0:
+        return state
+    eta_rad = attitude_errors(problem, state, state.camera_from_icrf)
+    turned = image_alignment(problem, state).apply(eta_rad)
+    there = np.unique(problem.star_tracker)
+    medians = {k: np.median(turned[problem.star_tracker == k], axis=0) for k in there}
+    mountings = state.mountings.reshape(-1, 3).copy()
+    for k in there[1:]:
+        mountings[k - 1] += medians[k] - medians[there[0]]
+    return dataclasses.replace(state, mountings=mountings.ravel())
 
 
 def _with_slope(problem: Problem, state: State) -> State:

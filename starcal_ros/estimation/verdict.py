@@ -110,9 +110,15 @@ def judge_residuals(
         # By the stars that fit: one that does not turns an image of few by more than the tracker.
         _, blocks = image_blocks(problem, state, measurements)
         eta_rad, covariance_rad2, seen = attitudes_of_stars_alone(problem, state, blocks)
-        fitted = 2 if len(state.rate) else 1  # mean of the attitudes, and slope
+        fitted = state.alignment_count // 3  # means of the attitudes, and slope
         found_rad, misfit = estimate_star_tracker_sigma(
-            eta_rad, covariance_rad2, seen, given_rad, fitted, tracker_sigma_is_given(options)
+            eta_rad,
+            covariance_rad2,
+            seen,
+            given_rad,
+            fitted,
+            tracker_sigma_is_given(options),
+            problem.star_tracker if len(state.mountings) else None,
         )
         if options.variance_components:
             tracker_sigma_rad = found_rad
@@ -176,7 +182,7 @@ def free_share(
     stars and T the star tracker's, trace(T (T + P)^-1).  So does a mode of the field that its
     prior holds: one less its posterior variance; and the shape of an image.
     """
-    unknowns = float(len(problem.free) + len(state.focal) + len(state.rate))
+    unknowns = float(len(problem.free) + len(state.focal) + len(state.rate) + len(state.mountings))
     unknowns += shape_unknowns(problem, state, blocks)
     if terms is not None:
         without = dataclasses.replace(problem, field_prior=None)

@@ -13,7 +13,7 @@ from starcal_ros.assessment.agreement import Difference, difference, movement
 from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.gate.model import model_gate
+from starcal_ros.gate.model import model_gate, star_tracker_gate
 from starcal_ros.gate.options import GateOptions, limit_check
 from starcal_ros.records import Calibration, CameraGeometry, GateCheck, HalvesComparison
 
@@ -57,6 +57,7 @@ def judge(
         *_fit(calibration, options, estimation),
         *_halves(calibration.halves, options),
         *model_gate(calibration.model_checks, options, estimation),
+        *star_tracker_gate(calibration.star_trackers, options),
         *_precision(calibration, options),
         *_changes(calibration, prior, active, options),
     )
@@ -176,7 +177,7 @@ def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateC
         options,
         'min_coverage',
         'fraction of the detector with stars that fit',
-        float((maps.stars > 0).mean()),
+        float((maps.stars > 0).mean()) if maps.stars.size else 0.0,
     )
     yield limit_check(
         options,

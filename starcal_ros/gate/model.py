@@ -9,10 +9,30 @@ import math
 
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.gate.options import GateOptions, limit_check
-from starcal_ros.records import GateCheck, ModelChecks, ResidualBin
+from starcal_ros.records import GateCheck, ModelChecks, ResidualBin, StarTrackerAlignment
 
+_DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
 _PART_TOLERANCE = 0.05  # of a normalised residual, within which a part of the data is as predicted
 _PART_SIGMAS = 3.5  # one of twelve parts exceeds it by noise in 1 of 200 calibrations
+
+
+def star_tracker_gate(
+    found: tuple[StarTrackerAlignment, ...], options: GateOptions
+) -> Iterator[GateCheck]:
+    """The drift of each of several star trackers."""
+    for one in found:
+        if math.isfinite(one.drift_p_value):
+            yield _significant(
+                options,
+                'max_star_tracker_drift_arcsec',
+                f'drift of the attitude of {one.frame} against the stars',
+                one.drift_arcsec,
+                'arcsec',
+                one.drift_p_value,
+                'that star tracker or its mounting moves: leave it out of more_star_trackers, or'
+                ' collect images over a shorter time',
+                _DRIFT_P_VALUE,
+            )
 
 
 def model_gate(
@@ -87,6 +107,7 @@ def _read_out_and_light(found: ModelChecks, options: GateOptions) -> Iterator[Ga
         'px',
         step.p_value,
         'columns or rows are lost or shifted there: check the read-out',
+        options.min_model_p_value,
     )
     name = 'velocity of the observer that the aberration misses'
     if found.velocity_sigma_km_s > options.max_velocity_error_km_s:
@@ -102,6 +123,7 @@ def _read_out_and_light(found: ModelChecks, options: GateOptions) -> Iterator[Ga
             found.velocity_p_value,
             'the velocity or the clock is wrong, or air bends the light: check the velocity'
             ' topic, the stamps and the site',
+            options.min_model_p_value,
         )
     yield _significant(
         options,
@@ -112,6 +134,7 @@ def _read_out_and_light(found: ModelChecks, options: GateOptions) -> Iterator[Ga
         found.image_variation_p_value,
         'focal length or lens changes between images: estimate with temperature, or calibrate '
         'each state apart',
+        options.min_model_p_value,
     )
 
 
@@ -151,10 +174,11 @@ def _significant(
     unit: str,
     p_value: float,
     remedy: str,
+    least_p_value: float,
 ) -> GateCheck:
     """A check that fails where the value exceeds its limit and noise does not explain it."""
     check = limit_check(options, option, name, found, unit)
-    likely = not p_value < options.min_model_p_value
+    likely = not p_value < least_p_value
     note = f'the p-value is {p_value:.1g}'
     if not check.passed and not likely:
         note += f'; {remedy}'

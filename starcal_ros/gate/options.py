@@ -143,6 +143,13 @@ class GateOptions:
         low=0.0,
         high=1e5,
     )
+    max_star_tracker_drift_arcsec: float = option(
+        30.0,
+        'largest drift of one of several star trackers against the stars over the images that it'
+        ' gave the attitude of, arcsec',
+        low=0.0,
+        high=648000.0,
+    )
     min_model_p_value: float = option(
         1e-6,
         'p-value below which a step, a missed velocity or a change from image to image is real',

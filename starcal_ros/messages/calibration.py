@@ -110,6 +110,23 @@ def camera_info_to_message(calibration: Calibration, make: Make) -> Message:
     )
 
 
+def mountings_to_messages(calibration: Calibration, make: Make) -> list[Message]:
+    """geometry_msgs/TransformStamped of each further star tracker in the frame of the first."""
+    return [
+        make(
+            ALIGNMENT_TYPE,
+            header=make_header(calibration.time_ns, calibration.parent_frame, make),
+            child_frame_id=one.frame,
+            transform=make(
+                'geometry_msgs/msg/Transform',
+                translation=vector_to_message(np.zeros(3), make),
+                rotation=quaternion_to_message(one.first_from_star_tracker_xyzw, make),
+            ),
+        )
+        for one in calibration.star_trackers[1:]
+    ]
+
+
 def alignment_to_message(calibration: Calibration, make: Make) -> Message:
     """Return a geometry_msgs/TransformStamped: the camera frame in the star tracker frame."""
     return make(

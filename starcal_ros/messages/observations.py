@@ -22,6 +22,7 @@ from starcal_ros.records import IMAGE_REFUSALS, refused_image, StarObservations
 # Fields of the record whose names in the message are another.
 _NAMES = {
     'icrf_from_star_tracker_xyzw': 'attitude',
+    'star_tracker_from_head_xyzw': 'star_tracker_from_head',
     'refused_catalog_id': 'refused_star_id',
     'refused_px': 'refused_star_px',
     'refused_reason': 'refused_star_reason',
@@ -99,19 +100,23 @@ def _check_image(record: StarObservations) -> None:
         raise ValueError(f'refusal: {record.refusal[:_LONGEST_NAME]!r} is no known reason')
     if max(record.width, record.height) > MAX_SIDE_PX:
         raise ValueError(f'width, height: {record.width} x {record.height} px is no image')
-    with np.errstate(over='ignore'):
-        norm = float(np.linalg.norm(record.icrf_from_star_tracker_xyzw))
-    if not abs(norm - 1.0) <= _UNIT_TOLERANCE:
-        raise ValueError(f'attitude: a quaternion of length {norm:.6g}')
+    for field, quaternion in (
+        ('attitude', record.icrf_from_star_tracker_xyzw),
+        ('star_tracker_from_head', record.star_tracker_from_head_xyzw),
+    ):
+        with np.errstate(over='ignore'):
+            norm = float(np.linalg.norm(quaternion))
+        if not abs(norm - 1.0) <= _UNIT_TOLERANCE:
+            raise ValueError(f'{field}: a quaternion of length {norm:.6g}')
     low, high = _DEGC
     if not (math.isnan(record.temperature_degc) or low <= record.temperature_degc <= high):
         raise ValueError(f'temperature_degc: {record.temperature_degc:.6g} is no temperature')
     for name in ('attitude_gap_s', 'background_dn', 'noise_dn', 'psf_sigma_px'):
         if math.isinf(getattr(record, name)):
             raise ValueError(f'{name}: not finite')
-    names = [record.catalog_digest, *record.refused_stars]
+    names = [record.catalog_digest, record.star_tracker, *record.refused_stars]
     if len(names) > _MOST_REASONS or max(map(len, names)) > _LONGEST_NAME:
-        raise ValueError('refused_star_reasons, catalog_digest: longer than any')
+        raise ValueError('refused_star_reasons, catalog_digest, star_tracker: longer than any')
     reasons = len(record.refused_stars)
     if (record.refused_reason >= reasons).any():
         raise ValueError(

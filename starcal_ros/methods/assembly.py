@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.least_squares.levenberg_marquardt import inverse, NormalEquations
 from starcal_ros.least_squares.linear_terms import Border, bordered, LinearTerms, Score, score
-from starcal_ros.methods.attitude_errors import whitened_attitude_errors
-from starcal_ros.methods.problem import Problem, State
+from starcal_ros.methods.attitude_errors import cross_matrix, whitened_attitude_errors
+from starcal_ros.methods.problem import by_image, mounting_turns, Problem, State
 from starcal_ros.model_errors.temperature import parameters_chain, turns_chain
 
 
@@ -109,7 +109,7 @@ def border_of(
         aligned = np.einsum('mqi,mij->qj', own, _turn_chain(problem, state))
         blocks: Floats = np.zeros((0, 3, q))
     else:
-        count = 0 if problem.method == 'per_image' else 3 + len(state.rate)
+        count = 0 if problem.method == 'per_image' else state.alignment_count
         aligned = np.zeros((q, count))
         blocks = own.transpose(0, 2, 1)
     if not every_parameter:
@@ -153,7 +153,7 @@ def _with_all_parameters(
     """Normal equations as if all camera parameters were free; priors on those that are."""
     has_alignment = problem.method != 'per_image'
     k = problem.camera_count + len(state.focal)
-    p = k + (3 + len(state.rate) if has_alignment else 0)
+    p = k + (state.alignment_count if has_alignment else 0)
     A, a = np.zeros((p, p)), np.zeros(p)
     B: Floats = np.zeros((0, 3, p))
     C: Floats = np.zeros((0, 3, 3))
@@ -198,6 +198,12 @@ def _with_all_parameters(
     cost += 0.5 * float(off @ off)
     A[of_camera, of_camera] += weight
     a[of_camera] += off / problem.prior_sigma
+    if has_alignment and len(state.mountings):
+        of_mounting = state.mountings / problem.mounting_sigma_rad
+        cost += 0.5 * float(of_mounting @ of_mounting)
+        of_mountings = np.arange(p - len(of_mounting), p)
+        A[of_mountings, of_mountings] += 1.0 / problem.mounting_sigma_rad**2
+        a[of_mountings] -= of_mounting / problem.mounting_sigma_rad
     return NormalEquations(cost, A, a, B, C, c)
 
 
@@ -216,18 +222,29 @@ def pulled(C: Floats) -> Floats:
 
 
 def _turn_chain(problem: Problem, state: State) -> Floats:
-    """How alignment angles and rate turn the camera of each image: (m, 3, 3) or (m, 3, 6)."""
+    """How alignment angles, rate and mountings turn the camera of each image: (m, 3, a)."""
+    m = len(state.camera_from_icrf)
+    chain: Floats = np.tile(np.eye(3), (m, 1, 1))
     if len(state.rate):
-        return turns_chain(state.rate, problem.above_reference_k)
-    return np.tile(np.eye(3), (len(state.camera_from_icrf), 1, 1))
+        chain = turns_chain(state.rate, problem.above_reference_k)
+    if problem.first_from_star_tracker is None:
+        return chain
+    # d exp(-[h x]) to first order in h, as `turns_chain`.
+    own = np.eye(3) - 0.5 * cross_matrix(by_image(problem, state))
+    of_mountings = np.zeros((m, 3, len(state.mountings)))
+    for k in range(len(state.mountings) // 3):
+        here = problem.star_tracker == k + 1
+        of_mountings[here, :, 3 * k : 3 * k + 3] = own[here]
+    turned = mounting_turns(problem, state).as_matrix() @ chain
+    return np.concatenate([turned, of_mountings], axis=-1)
 
 
 def _by_alignment(problem: Problem, state: State, blocks: Floats) -> Floats:
-    """Matrices of `by_shared` with alignment angles and rate in place of the image's rotation."""
-    if len(state.rate) == 0:
+    """Matrices of `by_shared` with what turns all images in place of the image's rotation."""
+    if state.alignment_count == 3:
         return blocks
     k = problem.camera_count + len(state.focal)
-    E = np.zeros((len(blocks), k + 4, k + 7))
+    E = np.zeros((len(blocks), k + 4, k + 1 + state.alignment_count))
     E[:, :k, :k], E[:, -1, -1] = np.eye(k), 1.0
     E[:, k:-1, k:-1] = _turn_chain(problem, state)
     return np.asarray(E.transpose(0, 2, 1) @ blocks @ E)
@@ -247,6 +264,9 @@ def reduced_information(
     of_prior[problem.free] = 1.0 / problem.prior_sigma[problem.free] ** 2
     total = information_of_images(problem, state, blocks).sum(axis=0)
     total[camera, camera] += of_prior
+    if problem.method != 'per_image' and len(state.mountings):
+        mountings = np.arange(len(total) - len(state.mountings), len(total))
+        total[mountings, mountings] += 1.0 / problem.mounting_sigma_rad**2
     if terms is None:
         return np.asarray(total)
     border = _with_mode_prior(border_of(problem, state, terms, every_parameter=True), state)
@@ -265,7 +285,7 @@ def information_of_images(problem: Problem, state: State, blocks: Floats) -> Flo
     k = problem.camera_count + len(state.focal)
     blocks = by_shared(problem, state, blocks)
     if problem.method == 'single':
-        p = k + 3 + len(state.rate)
+        p = k + state.alignment_count
         return _by_alignment(problem, state, blocks)[:, :p, :p]
     camera, own = slice(0, k), slice(k, -1)
     A, B, C = blocks[:, camera, camera], blocks[:, own, camera], blocks[:, own, own]

@@ -18,7 +18,7 @@ def whitened_attitude_errors(problem: Problem, state: State) -> tuple[Floats, Fl
     """
     eta = attitude_errors(problem, state, state.camera_from_icrf)
     # d Log: the inverse Jacobian of SO(3) to first order, exact to eta^2 / 12 (1e-9 at 20 arcsec).
-    half = 0.5 * _cross_matrix(eta)
+    half = 0.5 * cross_matrix(eta)
     J = (np.eye(3) + half) @ image_alignment(problem, state).inv().as_matrix()
     sigma = problem.star_tracker_sigma_rad
     return eta / sigma, J / sigma[:, :, None]
@@ -35,8 +35,8 @@ def attitude_errors(problem: Problem, state: State, camera_from_icrf: Rotation) 
     )
 
 
-def _cross_matrix(v: Floats) -> Floats:
-    """Matrices (m, 3, 3) with ``_cross_matrix(v) @ w = v x w``."""
+def cross_matrix(v: Floats) -> Floats:
+    """Matrices (m, 3, 3) with ``cross_matrix(v) @ w = v x w``."""
     x, y, z = v.T
     zero = np.zeros_like(x)
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]

@@ -25,13 +25,16 @@ from starcal_ros.methods.problem import Problem, State
 from starcal_ros.records import ALIGNMENT_NAMES
 
 
-def shared_names(model: str, focal_terms: int, with_rate: bool) -> tuple[str, ...]:
-    """Names of camera parameters, focal terms, alignment angles and their rate."""
+def shared_names(
+    model: str, focal_terms: int, with_rate: bool, mountings: int = 0
+) -> tuple[str, ...]:
+    """Names of camera parameters, focal terms, alignment angles, their rate and mountings."""
     return (
         *parameter_names(model),
         *(f'focal_temperature_{i}' for i in range(1, focal_terms + 1)),
         *ALIGNMENT_NAMES,
         *(f'{name}_temperature' for name in ALIGNMENT_NAMES if with_rate),
+        *(f'star_tracker_{k}_{axis}' for k in range(2, mountings + 2) for axis in ('x', 'y', 'z')),
     )
 
 

@@ -68,13 +68,16 @@ def _move(problem: Problem, state: State, shared: Floats, blocks: Floats) -> Sta
     shapes = state.shapes + blocks[:, 3:] if state.shapes.size else state.shapes
     if problem.method == 'per_image':
         rotations = Rotation.from_rotvec(-blocks[:, :3]) * rotations
-        return State(parameters, alignment, rotations, focal, state.rate, modes, shapes)
+        return State(
+            parameters, alignment, rotations, focal, state.rate, modes, shapes, state.mountings
+        )
     turn = Rotation.from_rotvec(-turned[:3])
-    rate = state.rate + turned[3:]
-    moved = State(parameters, turn * alignment, rotations, focal, rate, modes, shapes)
+    s = 3 + len(state.rate)
+    rate, mountings = state.rate + turned[3:s], state.mountings + turned[s:]
+    moved = State(parameters, turn * alignment, rotations, focal, rate, modes, shapes, mountings)
     if problem.method == 'hierarchical':
         rotations = Rotation.from_rotvec(-blocks[:, :3]) * rotations
-    elif len(rate):
+    elif state.alignment_count > 3:
         rotations = image_alignment(problem, moved) * problem.star_tracker_from_icrf
     else:
         rotations = turn * rotations

@@ -12,9 +12,14 @@ With R_k = camera_from_icrf of image k, the attitude error of the star tracker i
 camera_from_star_tracker and T_k = star_tracker_from_icrf as measured.
 
 Where terms of temperature are estimated (`thermal`), parameters and A are those of the image, and
-the derivatives by what is shared follow by the chain rule, one small matrix for each image.  Where
-the shape of the images varies (`image_variation`), each image has changes of fx, skew and fy of
-its own beside its rotation, with a Gaussian prior.
+the derivatives by what is shared follow by the chain rule, one small matrix for each image.
+
+Of several star trackers, each has axes of its own: T_k is that of the one that gave the attitude,
+and A that of the first, turned by its mounting M (first from this one) and by the small rotation h
+of the camera frame by which the mounting is wrong: ``exp(-[h x]) A M``.
+
+Where the shape of the images varies (`image_variation`), each image has changes of fx, skew and fy
+of its own beside its rotation, with a Gaussian prior.
 """
 
 from __future__ import annotations
@@ -48,6 +53,13 @@ class State:
     modes: Floats = field(default_factory=lambda: np.empty(0))  # (r,) amplitudes of the field
     # (m, h) amplitudes of the shapes of the images, px of focal length
     shapes: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    # (3 s,) h of the further star trackers, rad
+    mountings: Floats = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def alignment_count(self) -> int:
+        """Number of angles of the alignment, of its rate and of the mountings."""
+        return 3 + len(self.rate) + len(self.mountings)
 
 
 @dataclass(frozen=True)
@@ -76,6 +88,12 @@ class Problem:
         Changes of the camera parameters by which the images differ; h is 0 where they do not.
     shape_sigma_px : (h,)
         1-sigma of their amplitudes.
+    star_tracker : (m,) int
+        Which star tracker gave the attitude of each image: 0 is the first.
+    first_from_star_tracker : Rotation (m,) or None
+        Its mounting as assumed; None where there is one star tracker only.
+    mounting_sigma_rad : float
+        1-sigma of each angle of the mountings as assumed.
     """
 
     method: str
@@ -89,6 +107,9 @@ class Problem:
     field_prior: FieldPrior | None = None
     shape_modes: Floats = field(default_factory=lambda: np.empty((0, 0)))
     shape_sigma_px: Floats = field(default_factory=lambda: np.empty(0))
+    star_tracker: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    first_from_star_tracker: Rotation | None = None
+    mounting_sigma_rad: float = np.inf
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -111,10 +132,25 @@ def image_parameters(problem: Problem, state: State) -> Floats:
 
 
 def image_alignment(problem: Problem, state: State) -> Rotation:
-    """camera_from_star_tracker: of all images, or (m,) where temperature turns it."""
-    if len(state.rate) == 0:
-        return state.camera_from_star_tracker
-    return turns(state.rate, problem.above_reference_k) * state.camera_from_star_tracker
+    """camera_from_star_tracker: of all images, or (m,) where they differ."""
+    alignment = state.camera_from_star_tracker
+    if len(state.rate):
+        alignment = turns(state.rate, problem.above_reference_k) * alignment
+    if problem.first_from_star_tracker is None:
+        return alignment
+    mounted: Rotation = mounting_turns(problem, state) * alignment
+    return mounted * problem.first_from_star_tracker
+
+
+def mounting_turns(problem: Problem, state: State) -> Rotation:
+    """Rotations (m,) of the camera frame by which the mountings of the images are wrong."""
+    return Rotation.from_rotvec(-by_image(problem, state))
+
+
+def by_image(problem: Problem, state: State) -> Floats:
+    """Errors (m, 3) of the mounting of the star tracker of each image, rad; 0 of the first."""
+    errors = np.concatenate([np.zeros((1, 3)), state.mountings.reshape(-1, 3)])
+    return np.asarray(errors[problem.star_tracker])
 
 
 def image_blocks(

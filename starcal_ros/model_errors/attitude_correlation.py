@@ -29,6 +29,7 @@ _TIMES = 12  # from half the median interval to four times the span
 # and in 1 of 100 of 200, by draws with a coarser grid of scales.  Averaging without need makes the
 # sigma 2 times as large.
 _DETECTION = 3.0
+_UNLIMITED = np.full(3, np.inf)
 _COARSE = 2.0  # a quarter of the grid missed at most 1.5 of it in 6,338 drawn ensembles
 
 
@@ -56,7 +57,11 @@ class AttitudeCorrelation:
 
 
 def attitude_correlation(
-    time_ns: NDArray[np.int64], error_rad: Floats, variance_rad2: Floats, suspect: bool
+    time_ns: NDArray[np.int64],
+    error_rad: Floats,
+    variance_rad2: Floats,
+    suspect: bool,
+    largest_rad: Floats = _UNLIMITED,
 ) -> AttitudeCorrelation:
     """
     Return the correlation of star-tracker errors in time.
@@ -72,6 +77,8 @@ def attitude_correlation(
     suspect : bool
         Whether the scatter of the images exceeds the assumed sigma of the star tracker: then the
         correlation is averaged over without a test, since a short ensemble cannot reject it.
+    largest_rad : (3,)
+        Largest sigma of a correlated process: an assumed one that the scatter does not exceed.
     """
     m = len(time_ns)
     none = AttitudeCorrelation(False, 0.0, np.full(3, float(m)), np.zeros(3))
@@ -92,6 +99,8 @@ def attitude_correlation(
         process, white = share[:, None] * total, (1.0 - share)[:, None] * total
         log_likelihood, variance = _filter(error, noise, steps_s, process, white, tau)
         # One share and one correlation time for all axes; each axis has its own scale.
+        too_large = (share > 0.0)[:, None] & (np.sqrt(total) > largest_rad)
+        log_likelihood = np.where(too_large, -np.inf, log_likelihood)
         by_process = log_likelihood.reshape(len(_SHARES), len(scales), len(times), 3)
         most = by_process.max(axis=1).sum(axis=2)  # (shares, times)
         if not suspect and 2.0 * (most.max() - most[0].max()) < least:

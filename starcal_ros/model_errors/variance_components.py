@@ -193,6 +193,7 @@ def estimate_star_tracker_sigma(
     given_rad: Floats,
     fitted: int = 1,
     is_given: bool = True,
+    star_tracker: NDArray[np.int64] | None = None,
 ) -> tuple[Floats, Mask]:
     """
     1-sigma of the star tracker about its axes, and the attitudes that do not fit.
@@ -207,6 +208,8 @@ def estimate_star_tracker_sigma(
         Numbers fitted to the attitudes of each axis: the mean, and a slope where there is one.
     is_given : bool
         False where the assumed sigma is a guess, which the scatter replaces in any case.
+    star_tracker : (m,) int or None
+        Which of several gave each attitude: each has a mean of its own, all one sigma.
 
     Returns
     -------
@@ -224,7 +227,11 @@ def estimate_star_tracker_sigma(
     own = np.einsum('mii->mi', covariance_rad2)
     if np.count_nonzero(seen) < _FEWEST_IMAGES + fitted - 1:
         return given_rad, np.zeros_like(seen)
-    centred = eta_rad - np.median(eta_rad[seen], axis=0)
+    own_mean = np.zeros(len(eta_rad), np.int64) if star_tracker is None else star_tracker
+    centred = eta_rad.copy()
+    for k in np.unique(own_mean[seen]):
+        here = own_mean == k
+        centred[here] -= np.median(eta_rad[seen & here], axis=0)
     spread2 = np.median(centred[seen] ** 2, axis=0) / _MEDIAN_OF_SQUARE
     # The spread of a dozen images may be small by half: the assumed sigma bounds it too.
     usual = np.maximum(np.maximum(spread2, given_rad**2), own)
@@ -236,7 +243,11 @@ def estimate_star_tracker_sigma(
     count = int(np.count_nonzero(good))
     stars = own[good].mean(axis=0)
     freedom = count - fitted
-    found = eta_rad[good].var(axis=0, ddof=fitted)
+    summed = np.zeros(3)
+    for k in np.unique(own_mean[good]):
+        of_one = eta_rad[good & (own_mean == k)]
+        summed += ((of_one - of_one.mean(axis=0)) ** 2).sum(axis=0)
+    found = summed / freedom
     p_value = chdtr(freedom, freedom * found / (given_rad**2 + stars))
     as_given = (p_value > _GIVEN_P_VALUE / 2) & (p_value < 1 - _GIVEN_P_VALUE / 2) & is_given
     hidden = stars * math.sqrt(2.0 / count)

@@ -29,6 +29,7 @@ from starcal_ros.messages.calibration import (
     alignment_to_message,
     calibration_to_message,
     camera_info_to_message,
+    mountings_to_messages,
 )
 from starcal_ros.messages.fields import make_header
 from starcal_ros.messages.observations import checked_observations
@@ -326,7 +327,8 @@ class Calibrator(StarcalNode):
         self._alignment.publish(alignment)
         self._calibration.publish(calibration_to_message(calibration, make_message))
         if self._tf_static is not None:
-            self._tf_static.publish(make_message('tf2_msgs/msg/TFMessage', transforms=[alignment]))
+            transforms = [alignment, *mountings_to_messages(calibration, make_message)]
+            self._tf_static.publish(make_message('tf2_msgs/msg/TFMessage', transforms=transforms))
         if self._driver is not None:
             self._driver.hand_over(camera_info)
 

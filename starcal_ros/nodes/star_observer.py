@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import dataclasses
 import math
 import operator
@@ -117,6 +117,9 @@ class StarObserver(StarcalNode):
         """Subscribe to images and attitudes, start the worker thread."""
         jump_s = max(_JUMP_S, self._setup.attitude.max_attitude_gap_s)
         self._attitudes = AttitudeHistory(self._own.attitude_history_s, jump_s)
+        self._more_attitudes = tuple(
+            AttitudeHistory(self._own.attitude_history_s, jump_s) for _ in self._setup.mountings
+        )
         self._track = observe.Track(self._geometry)
         self._predicted_from = self._geometry
         self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
@@ -147,6 +150,14 @@ class StarObserver(StarcalNode):
             (*self._image_input(), self._on_image, images, asked == 'auto'),
         ):
             self.inputs.add(kind, topic, self.taking(callback), qos, adapts=adapts)
+        for mounting, history in zip(self._setup.mountings, self._more_attitudes, strict=True):
+            self.inputs.add(
+                attitude_message,
+                f'{mounting.frame}/attitude',
+                self.taking(self._adding_to(history)),
+                _SAMPLES,
+                adapts=True,
+            )
 
     def _image_input(self) -> tuple[Any, str]:
         if self._own.image_transport == 'raw':
@@ -209,6 +220,10 @@ class StarObserver(StarcalNode):
             self.resolve_topic_name(topic)
             for topic, callback in inputs
             if not self.taken(callback)
+        ] + [
+            self.resolve_topic_name(f'{mounting.frame}/attitude')
+            for mounting, history in zip(self._setup.mountings, self._more_attitudes, strict=True)
+            if not len(history)
         ]
 
     def _on_image(self, message: Any) -> None:
@@ -233,15 +248,25 @@ class StarObserver(StarcalNode):
 
     def _on_attitude(self, message: Any) -> None:
         time_ns, quaternion = attitude_from_message(message)
-        direction = self._setup.attitude.attitude_direction
         if self._unmatched is not None:
             self._unmatched.add_attitude(time_ns, quaternion)
         before_ns = self._attitudes.latest_ns
-        self._attitudes.add(time_ns, attitude_sample(time_ns, quaternion, direction))
+        self._add_attitude(self._attitudes, message)
         # Late samples and steps back of the clock are not gaps.
         latest_ns = self._attitudes.latest_ns or 0
         step_ns = 0 if before_ns is None else max(0, latest_ns - before_ns)
         self._attitude_step_s.add(step_ns / NANOSECONDS_PER_SECOND)
+
+    def _adding_to(self, history: AttitudeHistory) -> Callable[[Any], None]:
+        def on_more_attitudes(message: Any) -> None:
+            self._add_attitude(history, message)
+
+        return on_more_attitudes
+
+    def _add_attitude(self, history: AttitudeHistory, message: Any) -> None:
+        time_ns, quaternion = attitude_from_message(message)
+        direction = self._setup.attitude.attitude_direction
+        history.add(time_ns, attitude_sample(time_ns, quaternion, direction))
         if self._queue is not None:
             self._queue.wake()
 
@@ -273,17 +298,11 @@ class StarObserver(StarcalNode):
 
     def _attitude_has_come(self, time_ns: int) -> bool:
         """Return True if the attitude samples of an image have arrived or can no longer arrive."""
-        latest_ns = self._attitudes.latest_ns
-        if latest_ns is None or latest_ns < time_ns:
-            return False
         gap_s = self._setup.attitude.max_attitude_gap_s
-        if latest_ns > time_ns + offset_ns(gap_s):
-            return True
-        try:
-            self._attitudes.at(time_ns, gap_s)
-        except ImageRefused:
-            return False
-        return True
+        return any(
+            _covers(history, time_ns, gap_s)
+            for history in (self._attitudes, *self._more_attitudes)
+        )
 
     def _measure_all(self) -> None:
         assert self._queue is not None  # created before the thread
@@ -344,6 +363,7 @@ class StarObserver(StarcalNode):
             before,
             latest_at(sorted(self._velocities, key=_STAMP_NS), image.time_ns, None),
             latest_at(sorted(self._temperatures, key=_STAMP_NS), image.time_ns, math.nan),
+            self._more_attitudes,
         )
         if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
             self._restarts += 1
@@ -389,6 +409,7 @@ class StarObserver(StarcalNode):
                 observe.Track(self._geometry),
                 latest_at(sorted(self._velocities, key=_STAMP_NS), image.time_ns, None),
                 latest_at(sorted(self._temperatures, key=_STAMP_NS), image.time_ns, math.nan),
+                self._more_attitudes,
             )
             self._retried += 1
             if not observations.refusal:
@@ -425,6 +446,19 @@ class StarObserver(StarcalNode):
         self._annotated.publish(
             color_image_to_message(image.time_ns, picture, frame_id, make_message)
         )
+
+
+def _covers(history: AttitudeHistory, time_ns: int, gap_s: float) -> bool:
+    latest_ns = history.latest_ns
+    if latest_ns is None or latest_ns < time_ns:
+        return False
+    if latest_ns > time_ns + offset_ns(gap_s):
+        return True
+    try:
+        history.at(time_ns, gap_s)
+    except ImageRefused:
+        return False
+    return True
 
 
 def _short(number: float | None) -> str:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import math
@@ -28,6 +28,7 @@ from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
+from starcal_ros.sky.star_trackers import Attitude, attitudes_at
 
 Wanted = Callable[[int], bool]
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
@@ -60,7 +61,8 @@ class Track:
     ``behind`` images in a row, the last of them at ``behind_ns``, were stamped before the last one
     used.  ``seen`` is the last frame of all, used or not,
     which a stuck camera shows again; ``hot`` the hot pixels found so far.  ``held`` is the first
-    image used at the attitude of the last one.
+    image used at the attitude of the last one.  ``taken`` counts the images by star tracker, and
+    ``others`` have the state of the sequence by the further ones, whose mountings are not exact.
     """
 
     geometry: CameraGeometry
@@ -71,6 +73,8 @@ class Track:
     seen: Fingerprint | None = None
     hot: HotPixels | None = None
     held: HeldAttitude | None = None
+    taken: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    others: Mapping[str, Track] = dataclasses.field(default_factory=dict)
 
 
 def observe_next(
@@ -80,9 +84,13 @@ def observe_next(
     track: Track,
     velocity_m_s: Floats | None = None,
     temperature_degc: float = math.nan,
+    more_attitudes: Sequence[AttitudeHistory] = (),
 ) -> tuple[StarObservations, Track]:
     """
     Observations of the next image of a sequence, and the state of the sequence after it.
+
+    ``more_attitudes`` are those of the further star trackers of the setup.  The one that has given
+    the fewest images is taken; where its attitude leads to a refusal, the next one.
 
     A sequence starts with the prior or the active calibration.  An image stamped at or before the
     last one used is refused and does not change the state, so that one wrong stamp costs one
@@ -99,35 +107,105 @@ def observe_next(
         sample = sample_rows(image.pixels)
         seen = fingerprint(image, sample)
         remembered = dataclasses.replace(track, seen=seen)
-        quaternion, gap_s = attitudes.at(image.time_ns, setup.attitude.max_attitude_gap_s)
-        known |= {
-            'icrf_from_star_tracker_xyzw': quaternion,
-            'attitude_gap_s': gap_s,
-            'catalog_digest': setup.catalog.digest,
-        }
+        found = attitudes_at(
+            image.time_ns,
+            attitudes,
+            more_attitudes,
+            setup.mountings[: len(more_attitudes)],
+            setup.attitude.max_attitude_gap_s,
+            track.taken,
+        )
+        known |= _known_of(found[0]) | {'catalog_digest': setup.catalog.digest}
         saturation_dn = setup.centroid.saturation_dn
         screen(sample, seen, track.seen, saturation_dn, setup.dark, setup.screening)
         hot = (track.hot or setup.hot).index
         exposure = Exposure(
             flattened(_without_dark(image, setup), setup.flat, setup.dark_pedestal_dn),
-            quaternion,
-            gap_s,
+            found[0].icrf_from_star_tracker_xyzw,
+            found[0].gap_s,
             velocity_m_s,
             setup.site,
             hot,
             temperature_degc,
         )
-        observations, after = _stars(exposure, setup, remembered)
-        if not observations.refusal:
-            held = _held_attitude(observations, track.held, setup)
-            after = dataclasses.replace(after, held=held)
-        return observations, after
+        return _with_any(found, exposure, setup, remembered)
     except ImageRefused as refused:
         height, width = image.pixels.shape
         observations = refused_image(
             image.time_ns, width, height, refused.reason, refused.detail, **known
         )
         return observations, remembered
+
+
+def _known_of(attitude: Attitude) -> dict[str, object]:
+    """Fields of observations that an attitude gives."""
+    return {
+        'icrf_from_star_tracker_xyzw': attitude.icrf_from_star_tracker_xyzw,
+        'attitude_gap_s': attitude.gap_s,
+        'star_tracker': attitude.star_tracker,
+        'star_tracker_from_head_xyzw': attitude.mounting_xyzw,
+    }
+
+
+def _with_any(
+    attitudes: Sequence[Attitude], exposure: Exposure, setup: Setup, track: Track
+) -> tuple[StarObservations, Track]:
+    """Observations with the first attitude that leads to no refusal, else the first refusal."""
+    outcomes: list[tuple[StarObservations, Track]] = []
+    errors: list[ImageRefused] = []
+    for attitude in attitudes:
+        try:
+            observations, after = _with_one(attitude, exposure, setup, track)
+        except ImageRefused as refused:
+            errors.append(refused)
+            continue
+        if not observations.refusal:
+            return observations, after
+        outcomes.append((observations, after))
+    if errors and len(errors) == len(attitudes):
+        raise errors[0]
+    return outcomes[0]
+
+
+def _with_one(
+    attitude: Attitude, exposure: Exposure, setup: Setup, track: Track
+) -> tuple[StarObservations, Track]:
+    """Observations with an attitude; the state keeps what is known of each star tracker apart."""
+    name = attitude.star_tracker
+    own = track.others.get(name) if name else track
+    before = track
+    if name:
+        # The mounting is wrong by more than the images before leave open.
+        before = dataclasses.replace(
+            track,
+            geometry=own.geometry if own else track.geometry,
+            tracked_camera=own.tracked_camera if own else None,
+            held=own.held if own else None,
+        )
+    exposure = dataclasses.replace(
+        exposure,
+        icrf_from_star_tracker_xyzw=attitude.icrf_from_star_tracker_xyzw,
+        attitude_gap_s=attitude.gap_s,
+    )
+    observations, after = _stars(exposure, setup, before)
+    observations = dataclasses.replace(
+        observations,
+        star_tracker=name,
+        star_tracker_from_head_xyzw=attitude.mounting_xyzw,
+    )
+    if observations.refusal:
+        return observations, track
+    after = dataclasses.replace(after, held=_held_attitude(observations, before.held, setup))
+    taken = {**track.taken, name: track.taken.get(name, 0) + 1}
+    if not name:
+        return observations, dataclasses.replace(after, taken=taken)
+    return observations, dataclasses.replace(
+        track,
+        latest_ns=after.latest_ns,
+        hot=after.hot,
+        taken=taken,
+        others={**track.others, name: dataclasses.replace(after, others={})},
+    )
 
 
 def observe(
@@ -277,6 +355,7 @@ def observe_bag(
     temperature_topic: str = '',
     on_image: OnImage | None = None,
     wanted: Wanted | None = None,
+    more_attitude_topics: tuple[str, ...] = (),
 ) -> Iterator[StarObservations]:
     """
     Observations of every image of a bag, in bag order, with few images in memory at a time.
@@ -289,7 +368,9 @@ def observe_bag(
     BagError
         When the bag cannot be read or a topic is not in it.
     """
-    topics = FrameTopics(image_topic, attitude_topic, velocity_topic, temperature_topic)
+    topics = FrameTopics(
+        image_topic, attitude_topic, velocity_topic, temperature_topic, more_attitude_topics
+    )
     track = Track(setup.prior)
     size = (setup.prior.camera.width, setup.prior.camera.height)
     channel = setup.frames.image_channel
@@ -307,6 +388,7 @@ def observe_bag(
             track,
             frame.velocity_m_s,
             frame.temperature_degc,
+            frame.more_attitudes,
         )
         if on_image is not None:
             on_image(frame.image, observations, predicted_with)

@@ -28,7 +28,13 @@ def measured_again(
     wanted = {record.time_ns for record in observations if record.refusal == 'no_match'}
     if not wanted or not topics.image:
         return list(observations)
-    named = FrameTopics(topics.image, topics.attitude, topics.velocity, topics.temperature)
+    named = FrameTopics(
+        topics.image,
+        topics.attitude,
+        topics.velocity,
+        topics.temperature,
+        topics.more_attitudes,
+    )
     camera = setup.prior.camera
     again: dict[int, StarObservations] = {}
     size, channel = (camera.width, camera.height), setup.frames.image_channel
@@ -42,6 +48,7 @@ def measured_again(
             observe.Track(geometry),
             frame.velocity_m_s,
             frame.temperature_degc,
+            frame.more_attitudes,
         )
         if not record.refusal:
             again[frame.image.time_ns] = record

@@ -9,10 +9,12 @@ import dataclasses
 from dataclasses import dataclass
 import math
 from pathlib import Path
+import re
 from typing import Any, get_type_hints
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
@@ -55,6 +57,7 @@ from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
+from starcal_ros.sky.star_trackers import Mounting
 from starcal_ros.untrusted import read_bytes, shown
 
 NODES = ('star_observer', 'calibrator')
@@ -129,6 +132,7 @@ class Setup:
     is_aligned: bool = True
     camera_name: str = DEFAULT_CAMERA_NAME
     flat: Floats | None = None
+    mountings: tuple[Mounting, ...] = ()
 
     @property
     def star_search(self) -> StarSearch:
@@ -233,6 +237,7 @@ def load_setup(
         if frames.camera_info_url
         else DEFAULT_CAMERA_NAME,
         flat=flat,
+        mountings=_mountings(groups['attitude'], prior, is_aligned),
     )
 
 
@@ -240,6 +245,43 @@ def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
     """A setup with the prior alignment that was found for it."""
     prior = CameraGeometry(setup.prior.camera, star_tracker_from_camera_xyzw)
     return dataclasses.replace(setup, prior=prior, is_aligned=True)
+
+
+def _mountings(
+    options: AttitudeOptions, prior: CameraGeometry, is_aligned: bool
+) -> tuple[Mounting, ...]:
+    """The further star trackers, each in the frame of the first by the prior alignments."""
+    frames = [frame for frame in options.more_star_trackers if frame]
+    if not frames:
+        return ()
+    if len(set(frames)) < len(frames):
+        raise OptionError(f'more_star_trackers: {", ".join(frames)}: a name comes twice')
+    for frame in frames:
+        if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', frame):
+            raise OptionError(f'more_star_trackers: {shown(frame)} is no name of a frame')
+    if not is_aligned:
+        raise OptionError(
+            'more_star_trackers: prior_alignment is needed beside more_alignments: one of them'
+            ' cannot be found from the images'
+        )
+    if len(options.more_alignments) != 4 * len(frames):
+        raise OptionError(
+            f'more_alignments: {len(options.more_alignments)} numbers, but {len(frames)} further'
+            f' star trackers need {4 * len(frames)}'
+        )
+    quaternions = np.array(options.more_alignments).reshape(-1, 4)
+    for frame, quaternion in zip(frames, quaternions, strict=True):
+        norm = float(np.linalg.norm(quaternion))
+        if abs(norm - 1.0) > 1e-3:
+            raise OptionError(
+                f'more_alignments: {quaternion.tolist()} of {frame} is not a unit quaternion'
+                f' (x, y, z, w): its norm is {norm:.6g}'
+            )
+    first = Rotation.from_quat(prior.star_tracker_from_camera_xyzw)
+    return tuple(
+        Mounting(frame, (first * Rotation.from_quat(quaternion).inv()).as_quat())
+        for frame, quaternion in zip(frames, quaternions, strict=True)
+    )
 
 
 def _prior(frames: SetupOptions) -> CameraGeometry:

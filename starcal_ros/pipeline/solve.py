@@ -42,6 +42,7 @@ from starcal_ros.records import (
     HalvesComparison,
     ResidualField,
     StarObservations,
+    StarTrackerAlignment,
 )
 
 _FEWEST_STARS = 3  # two fit their mirror image
@@ -184,6 +185,13 @@ def _without_field(ensemble: Ensemble, field: DetectorField | None) -> Ensemble:
     return dataclasses.replace(ensemble, images=images)
 
 
+def _named(
+    found: tuple[StarTrackerAlignment, ...], first_frame: str
+) -> tuple[StarTrackerAlignment, ...]:
+    """The star trackers, the first one with the name of its frame."""
+    return tuple(dataclasses.replace(one, frame=one.frame or first_frame) for one in found)
+
+
 def _field_record(result: Estimate) -> ResidualField | None:
     """The field of an estimate with its covariance; None where there is none."""
     field, prior = result.geometry.camera.field, result.problem.field_prior
@@ -259,6 +267,7 @@ def _not_judged(
         correlation=correlation(result.shared_covariance, result.shared_names),
         removals=removal_study(result),
         halves=halves,
+        star_trackers=_named(result.star_trackers, setup.frames.star_tracker_frame),
         model_checks=model_checks(result),
         field=_field_record(result),
     )

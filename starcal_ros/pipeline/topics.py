@@ -29,13 +29,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Topics:
-    """Topic of each kind of message; empty: not requested, or not in the bag."""
+    """
+    Topic of each kind of message; empty: not requested, or not in the bag.
+
+    ``more_attitudes`` are those of the further star trackers, in the order of the setup.
+    """
 
     image: str = ''
     attitude: str = ''
     velocity: str = ''
     temperature: str = ''
     observations: str = ''
+    more_attitudes: tuple[str, ...] = ()
 
 
 def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = None) -> Topics:
@@ -63,7 +68,17 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
             image_type = kind
     image = _choose(paths, image_type, asked.image, 'image')
     attitude_type = ATTITUDE_TYPES[setup.attitude.attitude_message] if setup else ATTITUDE_TYPE
-    attitude = _choose(paths, attitude_type, asked.attitude, 'attitude')
+    more = more_attitude_topics(setup)
+    types_of = {topic.name: topic.type_name for topic in there}
+    missing = [name for name in more if types_of.get(name, '') != attitude_type]
+    if missing:
+        raise BagError(
+            f'{", ".join(missing)}: no such topic of type {attitude_type}, but more_star_trackers'
+            ' names its star tracker'
+        )
+    first = [n for n, kind in types_of.items() if kind == attitude_type and n not in more]
+    only = first[0] if more and len(first) == 1 else ''
+    attitude = _choose(paths, attitude_type, asked.attitude or only, 'attitude')
     velocity, temperature = asked.velocity, asked.temperature
     if velocity or VELOCITY_TYPE in types:
         velocity = _choose(paths, VELOCITY_TYPE, velocity, 'velocity')
@@ -73,7 +88,12 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
     # A spacecraft has many: the topic must be unique only if the calibration uses it.
     if temperature or thermometers == 1 or (thermometers and used):
         temperature = _choose(paths, TEMPERATURE_TYPE, temperature, 'temperature')
-    return Topics(image, attitude, velocity, temperature)
+    return Topics(image, attitude, velocity, temperature, more_attitudes=more)
+
+
+def more_attitude_topics(setup: Setup | None) -> tuple[str, ...]:
+    """Topics in bags of the attitudes of the further star trackers."""
+    return tuple(f'/{one.frame.lstrip("/")}/attitude' for one in setup.mountings) if setup else ()
 
 
 def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str:
@@ -105,6 +125,7 @@ def read(
         topics.temperature,
         on_image,
         wanted,
+        topics.more_attitudes,
     )
 
 

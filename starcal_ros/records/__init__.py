@@ -18,6 +18,7 @@ from starcal_ros.records.calibration import (
     GateCheck,
     HalvesComparison,
     ResidualField,
+    StarTrackerAlignment,
     TemperatureTerms,
     TermRemoval,
 )
@@ -58,6 +59,7 @@ __all__ = [
     'ResidualField',
     'StarObservations',
     'StarRefusal',
+    'StarTrackerAlignment',
     'TemperatureTerms',
     'TermRemoval',
     'calibration_parameter_names',

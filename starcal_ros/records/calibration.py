@@ -78,6 +78,43 @@ class TemperatureTerms:
 
 
 @dataclass(frozen=True)
+class StarTrackerAlignment:
+    """
+    Alignment of the camera to one of several star trackers.
+
+    Attributes
+    ----------
+    frame : str
+        Name of the frame of the star tracker.
+    images : int
+        Number of images whose attitude it gave; with 0 its mounting is as assumed.
+    star_tracker_from_camera_xyzw : (4,)
+        Orientation of the camera in its frame.
+    alignment_covariance_rad2 : (3, 3)
+        Of that: passive small rotation, camera frame.
+    first_from_star_tracker_xyzw : (4,)
+        Its orientation in the frame of the first star tracker.
+    mounting_covariance_rad2 : (3, 3)
+        Of that: small rotation about the axes of the camera; zero for the first.
+    drift_arcsec_per_hour : tuple of 3 float
+        Of its attitude against the stars, about its own axes.
+    drift_arcsec, drift_p_value : float
+        Length of that over the time of its images, and the p-value of none; NaN for fewer than
+        four images.
+    """
+
+    frame: str
+    images: Count
+    star_tracker_from_camera_xyzw: Annotated[Floats, Finite(), Shape((4,))]
+    alignment_covariance_rad2: Annotated[Floats, Finite(), Shape((3, 3))]
+    first_from_star_tracker_xyzw: Annotated[Floats, Finite(), Shape((4,))]
+    mounting_covariance_rad2: Annotated[Floats, Finite(), Shape((3, 3))]
+    drift_arcsec_per_hour: Annotated[tuple[float, ...], Shape((3,))]
+    drift_arcsec: float
+    drift_p_value: float
+
+
+@dataclass(frozen=True)
 class DetectorMaps:
     """
     Precision of a calibration over the detector; the first row is that of the smallest v.
@@ -328,6 +365,8 @@ class Calibration:
         Activated by request despite the gate.
     halves : HalvesComparison or None
         None where not recorded.
+    star_trackers : tuple of StarTrackerAlignment
+        The first one, that of ``geometry``, and the others; empty where there is one only.
     gate : tuple of GateCheck
         The checks of the gate; empty where not recorded.
 
@@ -373,6 +412,7 @@ class Calibration:
     active_since_ns: int = 0
     forced: bool = False
     halves: HalvesComparison | None = None
+    star_trackers: tuple[StarTrackerAlignment, ...] = ()
     model_checks: ModelChecks | None = None
     field: ResidualField | None = None
     gate: tuple[GateCheck, ...] = ()

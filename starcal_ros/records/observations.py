@@ -131,6 +131,11 @@ class StarObservations:
         Empty, or a name of `IMAGE_REFUSALS` and the finding in words.
     icrf_from_star_tracker_xyzw : (4,)
         Star tracker attitude at ``time_ns``; identity where there is none.
+    star_tracker : str
+        Frame of the star tracker that gave the attitude; empty: the first, or the only one.
+    star_tracker_from_head_xyzw : (4,)
+        Orientation of that star tracker in the frame of the first, as assumed; the identity for
+        the first.  ``icrf_from_star_tracker`` times it is the attitude that the star tracker gave.
     attitude_gap_s : float
         Time between the two samples around the image; NaN without a sample on both sides.
     catalog_id : (n,) int64
@@ -180,6 +185,10 @@ class StarObservations:
     psf_sigma_px: float
     catalog_digest: str
     temperature_degc: float = math.nan
+    star_tracker: str = ''
+    star_tracker_from_head_xyzw: Annotated[Floats, Finite(), Shape((4,))] = dataclasses.field(
+        default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0])
+    )
     refused_catalog_id: Annotated[NDArray[np.int64], Shape(('m',))] = dataclasses.field(
         default_factory=lambda: np.empty(0, np.int64)
     )

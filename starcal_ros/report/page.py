@@ -26,6 +26,7 @@ from starcal_ros.bag import reader
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import ProductError
+from starcal_ros.estimation.star_trackers import summary as tracker_summary
 from starcal_ros.messages.types import OBSERVATIONS_TYPE
 from starcal_ros.model_errors.temperature import summary as thermal_summary
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, prior_of, read_calibration
@@ -160,6 +161,7 @@ def _context(found: Found) -> Mapping[str, object]:
         'parameters': _parameter_rows(calibration, prior),
         'alignment': _alignment_rows(calibration, prior),
         'tiles': _tiles(calibration),
+        'star_trackers': [tracker_summary(one) for one in calibration.star_trackers],
         'thermal': thermal_summary(calibration.temperature) if calibration.temperature else '',
         'charts': charts_of(calibration, residuals, found.observations or ()),
         'correlation': calibration.correlation,

@@ -41,6 +41,16 @@ class AttitudeOptions:
         'direction of the rotation in the attitude message (ROS does not define it)',
         choices=('st_to_inertial', 'inertial_to_st'),
     )
+    more_star_trackers: tuple[str, ...] = option(
+        ('',),
+        'frames of further star trackers; the attitudes of each are on the topic <frame>/attitude;'
+        ' empty: there is one star tracker',
+    )
+    more_alignments: tuple[float, ...] = option(
+        (0.0,),
+        'prior orientation of the camera in the frame of each of more_star_trackers, quaternions'
+        ' (x, y, z, w), four numbers each',
+    )
     attitude_message: str = option(
         'quaternion',
         'message type of the attitudes; quaternion: geometry_msgs/QuaternionStamped, pose:'

@@ -7,11 +7,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+from random_pointings import (  # type: ignore[import-not-found]
+    displaced,
+    estimated,
+    of_random_pointings,
+    WIDTH,
+)
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import line_of_sight_sigma_arcsec, map_error_px
 from starcal_ros.camera import CameraModel, project_jacobians
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.least_squares.normal_equations import arrange, normal_blocks, star_table
@@ -174,3 +181,13 @@ def test_a_prior_sigma_of_every_parameter() -> None:
     found = estimate_of(made, 'equidistant', true_observations(made), prior_sigma=tight)
     sigma = np.sqrt(np.diag(found.covariance))[[0, 1, 2, 5, 6, 7, 8]]
     assert (sigma <= np.array(tight)[[0, 1, 2, 5, 6, 7, 8]]).all()
+
+
+def test_mirrored_images_are_named() -> None:
+    given = of_random_pointings(3, images=6)
+
+    def mirrored(pixels: Floats) -> Floats:
+        return np.stack([WIDTH - 1 - 2.0 * pixels[:, 0], 0.0 * pixels[:, 1]], axis=-1)
+
+    with pytest.raises(TooFewObservations, match='^the stars are those of a mirrored image'):
+        estimated(given, displaced(true_observations(given), mirrored))

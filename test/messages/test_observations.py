@@ -59,7 +59,11 @@ def test_bad_observations_are_refused(field: str, value: Any, text: str) -> None
         ('background_dn', np.inf, 'background_dn: not finite'),
         ('width', 2**32 - 1, 'width, height: 4294967295 x 1024 px is no image'),
         ('refusal', 'x' * 10**6, "refusal: 'x{100}' is no known reason"),
-        ('catalog_digest', 'x' * 10**6, 'refused_star_reasons, catalog_digest: longer'),
+        (
+            'catalog_digest',
+            'x' * 10**6,
+            'refused_star_reasons, catalog_digest, .*: longer',
+        ),
     ],
 )
 def test_a_value_that_no_image_has_is_refused(place: str, value: Any, text: str) -> None:

@@ -61,6 +61,19 @@ def test_a_short_ensemble_that_scatters_too_much_is_not_trusted() -> None:
     ).all()
 
 
+def test_a_known_sigma_bounds_what_the_mean_can_be_off() -> None:
+    """A mean is off by no more than a star tracker is, however slowly it wanders."""
+    rng = np.random.default_rng(4)
+    time_ns, noise = np.arange(14) * MINUTE_NS, np.full((14, 3), 1e-12)
+    error = white(rng, 14)
+    free, bounded = (
+        attitude_correlation(time_ns, error, noise, True, largest_rad)
+        for largest_rad in (np.full(3, np.inf), np.full(3, SIGMA_RAD))
+    )
+    assert (free.added_variance_rad2 > bounded.added_variance_rad2).all()
+    assert (np.sqrt(bounded.added_variance_rad2) < SIGMA_RAD).all()
+
+
 def test_few_images_show_nothing() -> None:
     found = attitude_correlation(
         np.arange(5) * MINUTE_NS, np.zeros((5, 3)), np.full((5, 3), 1e-12), suspect=True

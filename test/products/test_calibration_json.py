@@ -170,7 +170,13 @@ def test_an_older_file_is_read(tmp_path: Path) -> None:
     write_calibration(calibration(), path)
     content = json.loads(path.read_text())
     del content['temperature'], content['maps'], content['correlation'], content['removals']
-    del content['halves'], content['gate'], content['model_checks'], content['field']
+    del (
+        content['halves'],
+        content['gate'],
+        content['star_trackers'],
+        content['model_checks'],
+        content['field'],
+    )
     path.write_text(json.dumps(content))
     assert_same(plain_calibration(), read_calibration(path))
 

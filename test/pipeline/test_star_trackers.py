@@ -1,0 +1,119 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""A bag with the attitudes of two star trackers, from images to alignments."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+from mission_files import attitudes, images, TINY  # type: ignore[import-not-found]
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.bag.writer import BagWriter
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import BagError, OptionError
+from starcal_ros.options import read_parameter_file
+from starcal_ros.pipeline import solve, topics
+from starcal_ros.pipeline.setup import load_setup, NODES, Setup
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.records import Ensemble, StarObservations
+
+FIRST_FROM_OTHER = Rotation.from_euler('xyz', [100.0, -20.0, 35.0], degrees=True)
+# Two pixels of this camera: the mounting as assumed is wrong by more than a star is wide.
+WRONG = Rotation.from_rotvec(np.array([150.0, -100.0, 180.0]) * ARCSECOND_RAD)
+VALUES = read_parameter_file(TINY / 'params.yaml', NODES)
+
+
+def other_alignment() -> list[float]:
+    """The alignment of the camera to the other star tracker as a user would give it."""
+    first_from_camera = Rotation.from_quat(VALUES['prior_alignment'])
+    return [float(x) for x in ((FIRST_FROM_OTHER * WRONG).inv() * first_from_camera).as_quat()]
+
+
+def setup_with(**others: object) -> Setup:
+    two = {'more_star_trackers': ['other'], 'more_alignments': other_alignment()}
+    return load_setup({**VALUES, 'camera_info_url': str(TINY / 'camera.yaml'), **two, **others})
+
+
+def bag_of(path: Path, first_until: float = 1.0, other_until: float = 1.0) -> Path:
+    """The small bag with a second star tracker; each repeats itself after a part of the time."""
+    samples = attitudes()
+    with BagWriter(path) as writer:
+        for topic, mounted, until in (
+            ('/star_tracker/attitude', Rotation.identity(), first_until),
+            ('/other/attitude', FIRST_FROM_OTHER, other_until),
+        ):
+            last = int(until * (len(samples) - 1))
+            for k, (time_ns, xyzw) in enumerate(samples):
+                if until < 0.0 and k >= len(samples) // 2:
+                    break  # silent, not stuck
+                shown = samples[min(k, last)][1] if until >= 0.0 else xyzw
+                quaternion = (Rotation.from_quat(shown) * mounted).as_quat()
+                writer.write_attitude(topic, time_ns, quaternion, 'icrf')
+        for image in images():
+            writer.write_image('/image', image, 'camera')
+    return path
+
+
+def observed(bag: Path, setup: Setup) -> list[StarObservations]:
+    return list(topics.read([bag], topics.choose_topics([bag], Topics(), setup), setup))
+
+
+def used(records: list[StarObservations]) -> Counter[str]:
+    return Counter(record.star_tracker for record in records if not record.refusal)
+
+
+def test_both_star_trackers_are_used_and_aligned(tmp_path: Path) -> None:
+    setup = setup_with()
+    records = observed(bag_of(tmp_path / 'two'), setup)
+    assert used(records) == {'': 5, 'other': 5}
+    calibration = solve.solve(Ensemble(tuple(records)), setup)
+    first, other = calibration.star_trackers
+    assert (first.frame, other.frame) == ('star_tracker', 'other')
+    assert (first.images, other.images) == (5, 5)
+    off = Rotation.from_quat(other.first_from_star_tracker_xyzw) * FIRST_FROM_OTHER.inv()
+    # Both have the attitudes of the one in the bag, so the noise of 10, 10 and 40 arcsec is
+    # common; five images each leave 18 arcsec, and 250 arcsec are assumed wrongly.
+    assert off.magnitude() < 80 * ARCSECOND_RAD
+    np.testing.assert_allclose(
+        first.star_tracker_from_camera_xyzw,
+        calibration.geometry.star_tracker_from_camera_xyzw,
+        atol=1e-15,
+    )
+
+
+@pytest.mark.parametrize('until', [-1.0, 0.0])
+@pytest.mark.parametrize('which', ['first', 'other'])
+def test_one_that_falls_silent_or_repeats_itself_costs_no_image(
+    tmp_path: Path, which: str, until: float
+) -> None:
+    bag = bag_of(tmp_path / 'two', **{f'{which}_until': until})
+    records = observed(bag, setup_with())
+    assert [record.refusal for record in records] == [''] * 10
+    lost, kept = ('', 'other') if which == 'first' else ('other', '')
+    assert used(records)[lost] < 5 < used(records)[kept]
+
+
+def test_a_topic_that_is_not_there_is_named() -> None:
+    with pytest.raises(BagError, match='^/other/attitude: no such topic of type geometry_msgs'):
+        topics.choose_topics([TINY], Topics(), setup_with())
+
+
+@pytest.mark.parametrize(
+    ('others', 'says'),
+    [
+        ({'more_alignments': [0.0]}, 'more_alignments: 1 numbers, but 1 further .* need 4'),
+        ({'more_alignments': [1.0, 1.0, 0.0, 0.0]}, 'more_alignments: .* other is not a unit'),
+        ({'more_star_trackers': ['a b']}, "more_star_trackers: 'a b' is no name of a frame"),
+        (
+            {'more_star_trackers': ['a', 'a'], 'more_alignments': 8 * [0.0]},
+            'more_star_trackers: a, a: a name comes twice',
+        ),
+        ({'prior_alignment': 4 * [0.0]}, 'more_star_trackers: prior_alignment is needed'),
+    ],
+)
+def test_options_that_do_not_go_together(others: dict[str, object], says: str) -> None:
+    with pytest.raises(OptionError, match=says):
+        setup_with(**others)
