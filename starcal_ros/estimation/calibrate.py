@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +24,7 @@ from starcal_ros.estimation.options import (
 from starcal_ros.estimation.search import Found, search
 from starcal_ros.estimation.star_trackers import (
     AttitudeErrors,
+    canonical_xyzw,
     star_tracker_alignments,
     star_tracker_names,
 )
@@ -435,7 +435,4 @@ def _result(
     camera = dataclasses.replace(prior.camera, field=image_field(problem, state)).replace(
         **{problem.parameter_names[i]: float(state.parameters[i]) for i in problem.free}
     )
-    quaternion = alignment.inv().as_quat()
-    # One of the two quaternions of a rotation, so that equal calibrations are equal numbers.
-    quaternion = quaternion * math.copysign(1.0, quaternion[3])
-    return CameraGeometry(camera, quaternion), full, scatter_arcsec
+    return CameraGeometry(camera, canonical_xyzw(alignment.inv())), full, scatter_arcsec

@@ -101,9 +101,9 @@ def star_tracker_alignments(
             StarTrackerAlignment(
                 frame=name,
                 images=int(here.sum()),
-                star_tracker_from_camera_xyzw=_canonical(alignment.inv()),
+                star_tracker_from_camera_xyzw=canonical_xyzw(alignment.inv()),
                 alignment_covariance_rad2=to_angles @ covariance @ to_angles.T + correlated[k],
-                first_from_star_tracker_xyzw=_canonical(A.inv() * alignment),
+                first_from_star_tracker_xyzw=canonical_xyzw(A.inv() * alignment),
                 mounting_covariance_rad2=of_mounting + correlated[0] + correlated[k]
                 if k
                 else of_mounting,
@@ -115,8 +115,8 @@ def star_tracker_alignments(
     return tuple(found)
 
 
-def _canonical(rotation: Rotation) -> Floats:
-    """One of the two quaternions of a rotation, so that equal calibrations are equal numbers."""
+def canonical_xyzw(rotation: Rotation) -> Floats:
+    """Return one of the two quaternions (4,), so that equal rotations are equal numbers."""
     quaternion = rotation.as_quat()
     return np.asarray(quaternion * np.copysign(1.0, quaternion[3]))
 
