@@ -463,6 +463,25 @@ def test_a_velocity_that_the_stars_do_not_determine_is_not_judged() -> None:
     assert check.passed is None and check.note == 'the stars determine it to 40 km/s only'
 
 
+@pytest.mark.parametrize(
+    ('drift_arcsec', 'p_value', 'passes'),
+    [(80.0, 1e-6, False), (80.0, 1e-3, True), (20.0, 1e-6, True)],
+)
+def test_a_star_tracker_that_drifts_is_named(
+    drift_arcsec: float, p_value: float, passes: bool
+) -> None:
+    """Where the drift is significant, and more than the limit."""
+    tracker = dataclasses.replace(
+        GOOD.star_trackers[0], frame='head_2', drift_arcsec=drift_arcsec, drift_p_value=p_value
+    )
+    found = dataclasses.replace(GOOD, star_trackers=(*GOOD.star_trackers, tracker))
+    said = reasons(found, GateOptions())
+    assert (said == ()) is passes
+    if not passes:
+        assert said[0].startswith('drift of the attitude of head_2 against the stars is 80 arcsec')
+        assert 'leave it out of more_star_trackers' in said[0]
+
+
 def test_a_calibration_of_an_older_file_has_no_checks_of_the_model() -> None:
     found = checks(dataclasses.replace(GOOD, model_checks=None), GateOptions())
     assert 'max_detector_step_px' not in found and 'max_field_px' not in found
