@@ -43,6 +43,18 @@ def complain(text: str) -> int:
     return EXIT_BAD_INPUT
 
 
+def is_interrupt(error: BaseException) -> bool:
+    """
+    Return True for a Ctrl-C, and for an error that one became.
+
+    A module in C that is interrupted while it is loaded raises ImportError or SystemError.
+    """
+    seen: BaseException | None = error
+    while seen is not None and not isinstance(seen, KeyboardInterrupt):
+        seen = seen.__cause__ or seen.__context__
+    return seen is not None
+
+
 def _path(text: str) -> Path:
     if not text:
         raise argparse.ArgumentTypeError('empty path')  # Path('') means the current folder

@@ -25,6 +25,7 @@ from starcal_ros.cli.arguments import (
     EXIT_BAD_INPUT,
     EXIT_INTERRUPTED,
     EXIT_REFUSED,
+    is_interrupt,
     parser,
 )
 from starcal_ros.cli.commands import mission
@@ -80,7 +81,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         extra = {'campaign': 'studies', 'trend': 'mission'}.get(command, 'report')
         return complain(missing_extra(error, extra))
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ImportError, SystemError) as error:
+        if not is_interrupt(error):
+            raise
         complain('interrupted')
         return EXIT_INTERRUPTED
 

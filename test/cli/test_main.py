@@ -22,7 +22,7 @@ import yaml
 
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.cli import main
-from starcal_ros.cli.arguments import parser
+from starcal_ros.cli.arguments import EXIT_INTERRUPTED, parser
 from starcal_ros.cli.commands import demo
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.records import Image
@@ -543,3 +543,29 @@ def test_demo_says_which_node_failed(
         demo, '_module_command', lambda name: failing if name == 'calibrator' else waiting
     )
     assert_refused(run('demo', '-o', tmp_path), 'calibrator', 'no such thing')
+
+
+@pytest.mark.parametrize('kind', [ImportError, SystemError])
+def test_a_ctrl_c_that_became_another_error_is_one(
+    kind: type[Exception], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As matplotlib's module in C raises it, interrupted while it is loaded."""
+
+    def interrupted(_args: object) -> int:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise kind('initialization failed') from error
+
+    monkeypatch.setitem(main._COMMANDS, 'compare', interrupted)
+    assert main.main(['compare', 'a', 'b']) == EXIT_INTERRUPTED
+    assert capsys.readouterr().err == 'starcal: interrupted\n'
+
+
+def test_another_error_of_an_import_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(_args: object) -> int:
+        raise ImportError('libfreetype is not there')
+
+    monkeypatch.setitem(main._COMMANDS, 'compare', broken)
+    with pytest.raises(ImportError, match='libfreetype'):
+        main.main(['compare', 'a', 'b'])
