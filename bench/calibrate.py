@@ -39,11 +39,11 @@ _STAGES = (
     ('images and stars', 'pipeline/observe', 'observe_bag'),
     ('  wait for the reading thread', 'bag/frames', 'read_ahead'),
     ('  measure and identify stars', 'pipeline/observe', 'observe_next'),
-    ('  select pictures', 'pictures/thumbnails', 'show'),
+    ('  select pictures', 'report/pictures/thumbnails', 'show'),
     ('write the observations', 'products/folder', 'write_observations'),
     ('solve and judge', 'pipeline/solve', 'solve_with_residuals'),
     ('  estimates', 'estimation/calibrate', 'estimate_calibration'),
-    ('draw and write pictures', 'pictures/thumbnails', 'thumbnails'),
+    ('draw and write pictures', 'report/pictures/thumbnails', 'thumbnails'),
     ('report', 'report/page', 'write_report'),
     ('  figures', 'report/charts', 'charts_of'),
 )
