@@ -42,6 +42,17 @@ def test_solver_bench(tmp_path: Path) -> None:
     assert [row['m'] for row in grown['rows']] == [6, 30]
 
 
+def test_calibrate_bench(tmp_path: Path) -> None:
+    """Every stage of the profile is still called where the bench looks for it."""
+    found = tmp_path / 'found.json'
+    command = [sys.executable, '-m', 'bench', 'calibrate', '--quick', '--json', str(found)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    _, stages = json.loads(found.read_text())['calibrate']
+    calls = {row['stage'].strip(): row['calls'] for row in stages['rows']}
+    assert calls['measure and identify stars'] == calls['select pictures'] == 10
+
+
 def test_fleet_bench(tmp_path: Path) -> None:
     """A worker is killed in the run, and each bag is in the table once, without a failure."""
     found = tmp_path / 'found.json'
