@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -222,7 +223,7 @@ def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOp
                 'method: per_image has no common alignment, which several star trackers need'
             )
         mountings = Rotation.from_quat(
-            np.array([image.star_tracker_from_head_xyzw for image in ensemble.images])
+            np.array([image.first_from_star_tracker_xyzw for image in ensemble.images])
         )
         attitudes = attitudes * mountings
     return Problem(
@@ -293,39 +294,27 @@ def _estimate(
         attitude_seen & ~verdict.misfit,
     )
     # The errors of one star tracker say nothing of those of another.
-    correlations = tuple(
+    correlations = [
         _correlation(found, errors, problem.star_tracker == k, options)
         for k in range(len(star_trackers))
-    )
-    correlated = correlations[0]
-    p = problem.camera_count
-    k = p + len(state.focal)
-    aligned = k + np.r_[0:3, 3 + len(state.rate) : state.alignment_count]
-    of_star_trackers = full[np.ix_(aligned, aligned)]
-    A = alignment.as_matrix()
-    full[k : k + 3, k : k + 3] += A @ np.diag(correlated.added_variance_rad2) @ A.T
-    free = np.ix_(problem.free, problem.free)
-    full[free] += verdict.variation.covariance_of_one_image(p)[free]
-    at_reference = np.r_[0:p, k : k + 3]
-    without_modes = len(full) - len(state.modes)
-    with_modes = np.r_[at_reference, without_modes : len(full)]
-    joint = _in_coefficients(problem, full, with_modes)
-    full = full[:without_modes, :without_modes]
+    ]
+    covariances = _covariances(found, full, alignment, correlations[0])
     names = shared_names(
         problem.model, len(state.focal), len(state.rate) > 0, len(state.mountings) // 3
     )
     information = reduced_information(problem, state, blocks, terms)
-    shared = np.r_[problem.free, p : len(information) - len(state.modes)]
-    thermal = _thermal(state, full, options)
-    rate = slice(k + 3, k + 3 + len(state.rate))
-    weakest = weakest_term(thermal, full[rate, rate]) if thermal else ''
+    shared = np.r_[problem.free, problem.camera_count : len(information) - len(state.modes)]
+    thermal = _thermal(state, covariances.shared, options)
+    k = problem.camera_count + len(state.focal) + 3
+    rate = slice(k, k + len(state.rate))
+    weakest = weakest_term(thermal, covariances.shared[rate, rate]) if thermal else ''
     estimate = Estimate(
         geometry=geometry,
-        covariance=full[np.ix_(at_reference, at_reference)],
-        joint_covariance=joint,
+        covariance=covariances.at_reference,
+        joint_covariance=covariances.joint,
         information=information[np.ix_(shared, shared)],
         information_names=tuple(names[i] for i in shared),
-        shared_covariance=full,
+        shared_covariance=covariances.shared,
         shared_names=names,
         problem=problem,
         state=state,
@@ -350,17 +339,55 @@ def _estimate(
             np.unique(pointing_groups(state.camera_from_icrf, float(state.parameters[0])))
         ),
         variation=verdict.variation,
-        correlation=correlated,
+        correlation=correlations[0],
         star_trackers=star_tracker_alignments(
             star_trackers,
             problem,
             state,
-            of_star_trackers,
+            covariances.star_trackers,
             errors,
-            tuple(one.added_variance_rad2 for one in correlations),
+            [one.added_variance_rad2 for one in correlations],
         ),
     )
     return estimate, weakest
+
+
+class _Covariances(NamedTuple):
+    """Parts of the covariance of a solution, with what its images do not show each by itself."""
+
+    at_reference: Floats  # of camera parameters and alignment
+    joint: Floats  # of these, then of the coefficients of the field
+    shared: Floats  # of all that is shared but the field
+    star_trackers: Floats  # of alignment and mountings, errors independent in time
+
+
+def _covariances(
+    found: Found, of_noise: Floats, alignment: Rotation, correlated: AttitudeCorrelation
+) -> _Covariances:
+    """
+    Covariances of a solution from that of its noise.
+
+    Added are the correlation in time of the errors of the first star tracker, and the difference
+    of the camera of one image from the mean.
+    """
+    problem, state = found.problem, found.solution.state
+    full = of_noise.copy()
+    p = problem.camera_count
+    k = p + len(state.focal)
+    A = alignment.as_matrix()
+    full[k : k + 3, k : k + 3] += A @ np.diag(correlated.added_variance_rad2) @ A.T
+    free = np.ix_(problem.free, problem.free)
+    full[free] += found.verdict.variation.covariance_of_one_image(p)[free]
+    at_reference = np.r_[0:p, k : k + 3]
+    without_modes = len(full) - len(state.modes)
+    with_modes = np.r_[at_reference, without_modes : len(full)]
+    aligned = k + np.r_[0:3, 3 + len(state.rate) : state.alignment_count]
+    return _Covariances(
+        full[np.ix_(at_reference, at_reference)],
+        _in_coefficients(problem, full, with_modes),
+        full[:without_modes, :without_modes],
+        of_noise[np.ix_(aligned, aligned)],
+    )
 
 
 def _correlation(

@@ -9,7 +9,9 @@ is ``exp(-[h x]) A M``.  Of small rotations a of A, that alignment turns by ``a 
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,7 @@ _FEWEST_IMAGES = 4  # for a mean, a slope and a scatter about them
 _HOUR_S = 3600.0
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class AttitudeErrors:
     """
     Star-tracker errors of m images as their stars show them.
@@ -61,7 +63,7 @@ def star_tracker_alignments(
     state: State,
     covariance: Floats,
     errors: AttitudeErrors,
-    correlated_rad2: tuple[Floats, ...],
+    correlated_rad2: Sequence[Floats],
 ) -> tuple[StarTrackerAlignment, ...]:
     """
     Return the alignments to the star trackers of an ensemble; none where there is one only.
@@ -74,7 +76,7 @@ def star_tracker_alignments(
         Of alignment and mountings of the s further ones, errors independent in time.
     errors : AttitudeErrors
         Each about the axes of its own star tracker.
-    correlated_rad2 : tuple of (3,)
+    correlated_rad2 : sequence of (3,)
         What the correlation of the errors of each in time adds to the variance of its mean.
     """
     if problem.first_from_star_tracker is None:
@@ -127,7 +129,7 @@ def _drift(errors: AttitudeErrors, here: Mask) -> tuple[Floats, float, float]:
 
     By the scatter about the slope: a drift raises the sigma of the star tracker that is estimated.
     """
-    unknown = np.full(3, np.nan), float('nan'), float('nan')
+    unknown = np.full(3, np.nan), math.nan, math.nan
     used = here & errors.seen
     if np.count_nonzero(used) < _FEWEST_IMAGES:
         return unknown

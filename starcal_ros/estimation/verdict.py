@@ -116,9 +116,9 @@ def judge_residuals(
             covariance_rad2,
             seen,
             given_rad,
+            problem.star_tracker,
             fitted,
             tracker_sigma_is_given(options),
-            problem.star_tracker if len(state.mountings) else None,
         )
         if options.variance_components:
             tracker_sigma_rad = found_rad

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera_conversion import ros_fit
 from starcal_ros.lens import ros_distortion
@@ -113,31 +114,28 @@ def camera_info_to_message(calibration: Calibration, make: Make) -> Message:
 def mountings_to_messages(calibration: Calibration, make: Make) -> list[Message]:
     """geometry_msgs/TransformStamped of each further star tracker in the frame of the first."""
     return [
-        make(
-            ALIGNMENT_TYPE,
-            header=make_header(calibration.time_ns, calibration.parent_frame, make),
-            child_frame_id=one.frame,
-            transform=make(
-                'geometry_msgs/msg/Transform',
-                translation=vector_to_message(np.zeros(3), make),
-                rotation=quaternion_to_message(one.first_from_star_tracker_xyzw, make),
-            ),
-        )
+        _in_star_tracker(calibration, one.frame, one.first_from_star_tracker_xyzw, make)
         for one in calibration.star_trackers[1:]
     ]
 
 
 def alignment_to_message(calibration: Calibration, make: Make) -> Message:
     """Return a geometry_msgs/TransformStamped: the camera frame in the star tracker frame."""
+    rotation_xyzw = calibration.geometry.star_tracker_from_camera_xyzw
+    return _in_star_tracker(calibration, calibration.child_frame, rotation_xyzw, make)
+
+
+def _in_star_tracker(
+    calibration: Calibration, frame: str, rotation_xyzw: Floats, make: Make
+) -> Message:
+    """A frame of that orientation in the frame of the (first) star tracker."""
     return make(
         ALIGNMENT_TYPE,
         header=make_header(calibration.time_ns, calibration.parent_frame, make),
-        child_frame_id=calibration.child_frame,
+        child_frame_id=frame,
         transform=make(
             'geometry_msgs/msg/Transform',
             translation=vector_to_message(np.zeros(3), make),
-            rotation=quaternion_to_message(
-                calibration.geometry.star_tracker_from_camera_xyzw, make
-            ),
+            rotation=quaternion_to_message(rotation_xyzw, make),
         ),
     )

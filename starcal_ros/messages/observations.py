@@ -22,7 +22,7 @@ from starcal_ros.records import IMAGE_REFUSALS, refused_image, StarObservations
 # Fields of the record whose names in the message are another.
 _NAMES = {
     'icrf_from_star_tracker_xyzw': 'attitude',
-    'star_tracker_from_head_xyzw': 'star_tracker_from_head',
+    'first_from_star_tracker_xyzw': 'first_from_star_tracker',
     'refused_catalog_id': 'refused_star_id',
     'refused_px': 'refused_star_px',
     'refused_reason': 'refused_star_reason',
@@ -102,7 +102,7 @@ def _check_image(record: StarObservations) -> None:
         raise ValueError(f'width, height: {record.width} x {record.height} px is no image')
     for field, quaternion in (
         ('attitude', record.icrf_from_star_tracker_xyzw),
-        ('star_tracker_from_head', record.star_tracker_from_head_xyzw),
+        ('first_from_star_tracker', record.first_from_star_tracker_xyzw),
     ):
         with np.errstate(over='ignore'):
             norm = float(np.linalg.norm(quaternion))

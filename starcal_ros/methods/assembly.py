@@ -12,7 +12,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.least_squares.levenberg_marquardt import inverse, NormalEquations
 from starcal_ros.least_squares.linear_terms import Border, bordered, LinearTerms, Score, score
 from starcal_ros.methods.attitude_errors import cross_matrix, whitened_attitude_errors
-from starcal_ros.methods.problem import by_image, mounting_turns, Problem, State
+from starcal_ros.methods.problem import mounting_errors_rad, mounting_turns, Problem, State
 from starcal_ros.model_errors.temperature import parameters_chain, turns_chain
 
 
@@ -230,7 +230,7 @@ def _turn_chain(problem: Problem, state: State) -> Floats:
     if problem.first_from_star_tracker is None:
         return chain
     # d exp(-[h x]) to first order in h, as `turns_chain`.
-    own = np.eye(3) - 0.5 * cross_matrix(by_image(problem, state))
+    own = np.eye(3) - 0.5 * cross_matrix(mounting_errors_rad(problem, state))
     of_mountings = np.zeros((m, 3, len(state.mountings)))
     for k in range(len(state.mountings) // 3):
         here = problem.star_tracker == k + 1

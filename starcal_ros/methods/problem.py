@@ -144,10 +144,10 @@ def image_alignment(problem: Problem, state: State) -> Rotation:
 
 def mounting_turns(problem: Problem, state: State) -> Rotation:
     """Rotations (m,) of the camera frame by which the mountings of the images are wrong."""
-    return Rotation.from_rotvec(-by_image(problem, state))
+    return Rotation.from_rotvec(-mounting_errors_rad(problem, state))
 
 
-def by_image(problem: Problem, state: State) -> Floats:
+def mounting_errors_rad(problem: Problem, state: State) -> Floats:
     """Errors (m, 3) of the mounting of the star tracker of each image, rad; 0 of the first."""
     errors = np.concatenate([np.zeros((1, 3)), state.mountings.reshape(-1, 3)])
     return np.asarray(errors[problem.star_tracker])

@@ -191,9 +191,9 @@ def estimate_star_tracker_sigma(
     covariance_rad2: Floats,
     seen: Mask,
     given_rad: Floats,
-    fitted: int = 1,
-    is_given: bool = True,
-    star_tracker: NDArray[np.int64] | None = None,
+    star_tracker: NDArray[np.int64],
+    fitted: int,
+    is_given: bool,
 ) -> tuple[Floats, Mask]:
     """
     1-sigma of the star tracker about its axes, and the attitudes that do not fit.
@@ -204,12 +204,12 @@ def estimate_star_tracker_sigma(
         Attitude errors from the stars alone (`image_unknowns.attitudes_of_stars_alone`).
     given_rad : (3,)
         Assumed 1-sigma; returned unchanged where fewer than three images have enough stars.
+    star_tracker : (m,) int
+        Which one gave each attitude: each has a mean of its own, all one sigma.
     fitted : int
         Numbers fitted to the attitudes of each axis: the mean, and a slope where there is one.
     is_given : bool
         False where the assumed sigma is a guess, which the scatter replaces in any case.
-    star_tracker : (m,) int or None
-        Which of several gave each attitude: each has a mean of its own, all one sigma.
 
     Returns
     -------
@@ -227,10 +227,9 @@ def estimate_star_tracker_sigma(
     own = np.einsum('mii->mi', covariance_rad2)
     if np.count_nonzero(seen) < _FEWEST_IMAGES + fitted - 1:
         return given_rad, np.zeros_like(seen)
-    own_mean = np.zeros(len(eta_rad), np.int64) if star_tracker is None else star_tracker
     centred = eta_rad.copy()
-    for k in np.unique(own_mean[seen]):
-        here = own_mean == k
+    for k in np.unique(star_tracker[seen]):
+        here = star_tracker == k
         centred[here] -= np.median(eta_rad[seen & here], axis=0)
     spread2 = np.median(centred[seen] ** 2, axis=0) / _MEDIAN_OF_SQUARE
     # The spread of a dozen images may be small by half: the assumed sigma bounds it too.
@@ -244,8 +243,8 @@ def estimate_star_tracker_sigma(
     stars = own[good].mean(axis=0)
     freedom = count - fitted
     summed = np.zeros(3)
-    for k in np.unique(own_mean[good]):
-        of_one = eta_rad[good & (own_mean == k)]
+    for k in np.unique(star_tracker[good]):
+        of_one = eta_rad[good & (star_tracker == k)]
         summed += ((of_one - of_one.mean(axis=0)) ** 2).sum(axis=0)
     found = summed / freedom
     p_value = chdtr(freedom, freedom * found / (given_rad**2 + stars))

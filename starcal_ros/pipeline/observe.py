@@ -143,7 +143,7 @@ def _known_of(attitude: Attitude) -> dict[str, object]:
         'icrf_from_star_tracker_xyzw': attitude.icrf_from_star_tracker_xyzw,
         'attitude_gap_s': attitude.gap_s,
         'star_tracker': attitude.star_tracker,
-        'star_tracker_from_head_xyzw': attitude.mounting_xyzw,
+        'first_from_star_tracker_xyzw': attitude.first_from_star_tracker_xyzw,
     }
 
 
@@ -191,7 +191,7 @@ def _with_one(
     observations = dataclasses.replace(
         observations,
         star_tracker=name,
-        star_tracker_from_head_xyzw=attitude.mounting_xyzw,
+        first_from_star_tracker_xyzw=attitude.first_from_star_tracker_xyzw,
     )
     if observations.refusal:
         return observations, track

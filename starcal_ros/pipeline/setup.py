@@ -269,19 +269,27 @@ def _mountings(
             f'more_alignments: {len(options.more_alignments)} numbers, but {len(frames)} further'
             f' star trackers need {4 * len(frames)}'
         )
-    quaternions = np.array(options.more_alignments).reshape(-1, 4)
-    for frame, quaternion in zip(frames, quaternions, strict=True):
-        norm = float(np.linalg.norm(quaternion))
-        if abs(norm - 1.0) > 1e-3:
-            raise OptionError(
-                f'more_alignments: {quaternion.tolist()} of {frame} is not a unit quaternion'
-                f' (x, y, z, w): its norm is {norm:.6g}'
-            )
+    alignments = [
+        Rotation.from_quat(_unit_quaternion('more_alignments', row.tolist()))
+        for row in np.array(options.more_alignments).reshape(-1, 4)
+    ]
     first = Rotation.from_quat(prior.star_tracker_from_camera_xyzw)
     return tuple(
-        Mounting(frame, (first * Rotation.from_quat(quaternion).inv()).as_quat())
-        for frame, quaternion in zip(frames, quaternions, strict=True)
+        Mounting(frame, (first * alignment.inv()).as_quat())
+        for frame, alignment in zip(frames, alignments, strict=True)
     )
+
+
+def _unit_quaternion(option: str, values: Sequence[float]) -> Floats:
+    quaternion = np.array(values)
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1.0) > 1e-3:
+        hint = '; angles in degrees are no quaternion' if np.abs(quaternion).max() > 2.0 else ''
+        raise OptionError(
+            f'{option}: {list(values)} is not a unit quaternion (x, y, z, w): its norm is'
+            f' {norm:.6g}{hint}'
+        )
+    return np.asarray(quaternion / norm)
 
 
 def _prior(frames: SetupOptions) -> CameraGeometry:
@@ -298,15 +306,7 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
     check_prior_camera(camera, frames.camera_info_url)
     if not any(frames.prior_alignment):
         return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
-    quaternion = np.array(frames.prior_alignment)
-    norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1.0) > 1e-3:
-        hint = '; angles in degrees are no quaternion' if np.abs(quaternion).max() > 2.0 else ''
-        raise OptionError(
-            f'prior_alignment: {list(frames.prior_alignment)} is not a unit quaternion (x, y, z,'
-            f' w): its norm is {norm:.6g}{hint}'
-        )
-    return CameraGeometry(camera, quaternion / norm)
+    return CameraGeometry(camera, _unit_quaternion('prior_alignment', frames.prior_alignment))
 
 
 def check_prior_camera(camera: CameraModel, location: str) -> None:

@@ -18,7 +18,6 @@ from starcal_ros.records.calibration import (
     GateCheck,
     HalvesComparison,
     ResidualField,
-    StarTrackerAlignment,
     TemperatureTerms,
     TermRemoval,
 )
@@ -36,6 +35,7 @@ from starcal_ros.records.observations import (
     StarObservations,
     StarRefusal,
 )
+from starcal_ros.records.star_trackers import StarTrackerAlignment
 
 __all__ = [
     'ALIGNMENT_NAMES',

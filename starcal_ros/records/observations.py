@@ -133,7 +133,7 @@ class StarObservations:
         Star tracker attitude at ``time_ns``; identity where there is none.
     star_tracker : str
         Frame of the star tracker that gave the attitude; empty: the first, or the only one.
-    star_tracker_from_head_xyzw : (4,)
+    first_from_star_tracker_xyzw : (4,)
         Orientation of that star tracker in the frame of the first, as assumed; the identity for
         the first.  ``icrf_from_star_tracker`` times it is the attitude that the star tracker gave.
     attitude_gap_s : float
@@ -186,7 +186,7 @@ class StarObservations:
     catalog_digest: str
     temperature_degc: float = math.nan
     star_tracker: str = ''
-    star_tracker_from_head_xyzw: Annotated[Floats, Finite(), Shape((4,))] = dataclasses.field(
+    first_from_star_tracker_xyzw: Annotated[Floats, Finite(), Shape((4,))] = dataclasses.field(
         default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0])
     )
     refused_catalog_id: Annotated[NDArray[np.int64], Shape(('m',))] = dataclasses.field(

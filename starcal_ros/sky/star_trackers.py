@@ -41,14 +41,14 @@ class Attitude:
         Between the two samples about the image.
     star_tracker : str
         Frame of the star tracker that gave it; empty: the first.
-    mounting_xyzw : (4,)
+    first_from_star_tracker_xyzw : (4,)
         Its orientation in the frame of the first.
     """
 
     icrf_from_star_tracker_xyzw: Floats
     gap_s: float
     star_tracker: str = ''
-    mounting_xyzw: Floats = field(default_factory=lambda: IDENTITY_XYZW)
+    first_from_star_tracker_xyzw: Floats = field(default_factory=lambda: IDENTITY_XYZW)
 
 
 def attitudes_at(

@@ -55,7 +55,7 @@ def campaign(
                 image,
                 icrf_from_star_tracker_xyzw=(measured * ASSUMED[head].inv()).as_quat(),
                 star_tracker='' if head == 0 else f'head_{head}',
-                star_tracker_from_head_xyzw=ASSUMED[head].as_quat(),
+                first_from_star_tracker_xyzw=ASSUMED[head].as_quat(),
             )
         )
     return given, Ensemble(tuple(images))

@@ -105,7 +105,7 @@ def test_a_topic_that_is_not_there_is_named() -> None:
     ('others', 'says'),
     [
         ({'more_alignments': [0.0]}, 'more_alignments: 1 numbers, but 1 further .* need 4'),
-        ({'more_alignments': [1.0, 1.0, 0.0, 0.0]}, 'more_alignments: .* other is not a unit'),
+        ({'more_alignments': [1.0, 1.0, 0.0, 0.0]}, 'more_alignments: .* is not a unit'),
         ({'more_star_trackers': ['a b']}, "more_star_trackers: 'a b' is no name of a frame"),
         (
             {'more_star_trackers': ['a', 'a'], 'more_alignments': 8 * [0.0]},

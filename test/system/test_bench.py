@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,16 +27,21 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 
 
+def found_by(name: str, tmp_path: Path) -> tuple[Any, str]:
+    """Tables of a bench in its short form, and what it prints."""
+    found = tmp_path / 'found.json'
+    command = [sys.executable, '-m', 'bench', name, '--quick', '--json', str(found)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    return json.loads(found.read_text())[name], done.stdout
+
+
 def test_solver_bench(tmp_path: Path) -> None:
     """A row for each solver; SciPy and starcal agree to a hundredth of a sigma."""
-    found = tmp_path / 'found.json'
-    command = [sys.executable, '-m', 'bench', 'solver', '--quick', '--json', str(found)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
-    assert done.returncode == 0, done.stderr
-    compared, grown = json.loads(found.read_text())['solver']
+    (compared, grown), said = found_by('solver', tmp_path)
     rows = {row['solver']: row for row in compared['rows']}
     for name in ('starcal, search alone', 'starcal, whole estimate', 'OpenCV calibrateCamera'):
-        assert rows[name]['ms'] > 0 and name in done.stdout
+        assert rows[name]['ms'] > 0 and name in said
     scipy = rows['SciPy trf, sparse Jacobian']
     # Costs of one minimum differ by their rounding and by the inner tolerance of SciPy, 1e-9.
     assert scipy['sigma off'] < 0.01 and abs(scipy['cost off']) < 1e-8
@@ -44,22 +50,14 @@ def test_solver_bench(tmp_path: Path) -> None:
 
 def test_calibrate_bench(tmp_path: Path) -> None:
     """Every stage of the profile is still called where the bench looks for it."""
-    found = tmp_path / 'found.json'
-    command = [sys.executable, '-m', 'bench', 'calibrate', '--quick', '--json', str(found)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
-    assert done.returncode == 0, done.stderr
-    _, stages = json.loads(found.read_text())['calibrate']
+    (_, stages), _ = found_by('calibrate', tmp_path)
     calls = {row['stage'].strip(): row['calls'] for row in stages['rows']}
     assert calls['measure and identify stars'] == calls['select pictures'] == 10
 
 
 def test_fleet_bench(tmp_path: Path) -> None:
     """A worker is killed in the run, and each bag is in the table once, without a failure."""
-    found = tmp_path / 'found.json'
-    command = [sys.executable, '-m', 'bench', 'fleet', '--quick', '--json', str(found)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
-    assert done.returncode == 0, done.stderr
-    (table,) = json.loads(found.read_text())['fleet']
+    (table,), _ = found_by('fleet', tmp_path)
     rows = {row['quantity']: row['value'] for row in table['rows']}
     assert rows['workers killed with SIGKILL'] == 1
     assert [rows[f'bags {what}'] for what in ('lost', 'counted twice', 'failed')] == [0, 0, 0]
@@ -67,11 +65,8 @@ def test_fleet_bench(tmp_path: Path) -> None:
 
 def test_ensemble_bench(tmp_path: Path) -> None:
     """Images kept from a stream are within 5 % in sigma of the best choice of that size."""
-    found = tmp_path / 'found.json'
-    command = [sys.executable, '-m', 'bench', 'ensemble', '--quick', '--json', str(found)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
-    assert done.returncode == 0, done.stderr
-    for table in json.loads(found.read_text())['ensemble']:
+    tables, _ = found_by('ensemble', tmp_path)
+    for table in tables:
         rows = {row['choice']: row for row in table['rows']}
         streamed = rows.pop('streamed, one by one')
         # The 5 % are what is promised; 1 % more may be the gap of the bound itself.
