@@ -33,11 +33,10 @@ def bag_player() -> int:
 def _run(name: str) -> int:
     # Read when NumPy is loaded: on matrices of this size two threads of BLAS wait for each other.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:  # unless nohup or a shell ignores it
+    # Unless nohup or a shell ignores it; `main` sets the handler of the node.
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     module = importlib.import_module(f'starcal_ros.nodes.{name}')
-    signal.signal(signal.SIGINT, before)
     return int(module.main())
 
 

@@ -42,6 +42,7 @@ _IMAGE_DEPTH, _OTHER_DEPTH = 10, 20_000
 _UNACKED = {True: _IMAGE_DEPTH // 2, False: _OTHER_DEPTH // 2}
 _SMALL_PER_S = 2000.0  # rate that a Python reader sustains beside its other work
 _ACK_S = 30.0
+_POLL_S = 0.1  # longest time without a look at whether a signal has shut ROS down
 _CLOCK_S = 0.01  # wall-clock period of /clock
 _LATCHED_TYPES = (CALIBRATION_TYPE, STATUS_TYPE, CAMERA_INFO_TYPE)
 
@@ -108,7 +109,7 @@ class BagPlayer(Node):
                 first_ns = raw.log_time_ns
             if self.own.rate:
                 since_s = (raw.log_time_ns - first_ns) / NANOSECONDS_PER_SECOND
-                _sleep_until(start_s + since_s / self.own.rate)
+                self._sleep_until(start_s + since_s / self.own.rate)
             self._tell_time(raw.log_time_ns)
             is_image = raw.topic in self._images
             if is_image:
@@ -116,15 +117,14 @@ class BagPlayer(Node):
                 sent_images += 1
             else:
                 small_s = max(small_s + 1.0 / _SMALL_PER_S, time.monotonic() - 0.05)
-                _sleep_until(small_s)
+                self._sleep_until(small_s)
             player = self._players[raw.topic]
             player.publish(raw.data)
             self._unacked[raw.topic] += 1
             if self._unacked[raw.topic] >= _UNACKED[is_image]:
                 player.wait_for_all_acked(_timeout())
                 self._unacked[raw.topic] = 0
-            if not self.context.ok():
-                raise ExternalShutdownException
+            self._check_shutdown()
 
     def _wait_for_subscribers(self) -> None:
         """Wait until the topics that matter have subscribers, or until the timeout."""
@@ -139,7 +139,7 @@ class BagPlayer(Node):
             if time.monotonic() > deadline_s:
                 self.get_logger().warning(f'no subscriber on {", ".join(missing)}: playing anyway')
                 return
-            _sleep_until(time.monotonic() + 0.02)  # rclpy cannot wait for a match
+            self._sleep_until(time.monotonic() + 0.02)  # rclpy cannot wait for a match
 
     def _other_subscribers(self, topic: str) -> int:
         name = self.resolve_topic_name(topic)
@@ -151,14 +151,30 @@ class BagPlayer(Node):
         if not self._paced or not self.count_publishers(self._observations.topic_name):
             return
         with self._observed:
+            before, since_s = self._observed_count, time.monotonic()
             while sent - self._observed_count >= self.own.images_in_flight:
-                before = self._observed_count
-                if not self._observed.wait(_ACK_S) and self._observed_count == before:
+                self._observed.wait(_POLL_S)
+                self._check_shutdown()
+                if self._observed_count != before:
+                    before, since_s = self._observed_count, time.monotonic()
+                elif time.monotonic() > since_s + _ACK_S:
                     self.get_logger().warning(
                         'no observations received: images are no longer paced'
                     )
                     self._paced = False
                     return
+
+    def _sleep_until(self, moment_s: float) -> None:
+        while True:
+            self._check_shutdown()
+            left_s = moment_s - time.monotonic()
+            if left_s <= 0:
+                return
+            time.sleep(min(left_s, _POLL_S))
+
+    def _check_shutdown(self) -> None:
+        if not self.context.ok():
+            raise ExternalShutdownException
 
     def _tell_time(self, time_ns: int) -> None:
         if self._clock_publisher is None or time.monotonic() < self._clock_due_s:
@@ -192,12 +208,6 @@ def _listen(player: BagPlayer) -> None:
 
 def _timeout() -> Duration:
     return Duration(seconds=_ACK_S)
-
-
-def _sleep_until(moment_s: float) -> None:
-    left_s = moment_s - time.monotonic()
-    if left_s > 0:
-        time.sleep(left_s)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -7,7 +7,6 @@ import array
 from collections.abc import Sequence
 from pathlib import Path
 import sys
-import threading
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped
@@ -23,6 +22,7 @@ from starcal.srv import Calibrate, LineOfSightTable
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.calibrator.reports import ACTIVE, CalibratorReports, CANDIDATE, Subject
 from starcal_ros.calibrator.state import Answer, CalibratorState
+from starcal_ros.calibrator.status_thread import StatusThread
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.messages.calibration import (
@@ -66,8 +66,7 @@ class Calibrator(StarcalNode):
         self._last_answer = Answer(True, '')
         self._last_gate = 'none'
         self._driver: CameraDriver | None = None
-        self._status_due = threading.Event()
-        self._status_thread: threading.Thread | None = None
+        self._status_thread: StatusThread | None = None
         solving, deciding = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
         sending = MutuallyExclusiveCallbackGroup()
         # There in every state: a caller of a service that is not there waits for ever.
@@ -128,9 +127,7 @@ class Calibrator(StarcalNode):
         )
         retry = self.steady_timer(_RETRY_S, self.guarded(self._save_again), collecting)
         self._listeners.append((self.destroy_timer, retry))
-        self._status_due.set()
-        self._status_thread = threading.Thread(target=self._tell_status, name='status')
-        self._status_thread.start()
+        self._status_thread = StatusThread(self.guarded(self._publish_status))
         active = self._state.active
         if active is not None:
             self._publish_calibration(active)
@@ -147,8 +144,7 @@ class Calibrator(StarcalNode):
             destroy(entity)
         thread, self._status_thread = self._status_thread, None
         if thread is not None:
-            self._status_due.set()
-            thread.join()
+            thread.close()
 
     def cleanup(self) -> None:
         """Destroy the publishers and close the state folder; the state stays in memory."""
@@ -209,20 +205,17 @@ class Calibrator(StarcalNode):
         if observations.refusal == 'bad_observations':
             self.get_logger().warning(f'observations refused: {observations.detail}')
         self._state.add(observations)
-        self._status_due.set()
+        self._on_change()
 
     def _save_again(self) -> None:
         if self._state.trouble:
             self._state.save()
-            self._status_due.set()
+            self._on_change()
 
-    def _tell_status(self) -> None:
-        # One status per burst.  A guard condition would not do: before ros2/rmw_fastrtps#895 a
-        # trigger during the executor's wait is lost, and with it the status of the last image.
-        tell = self.guarded(self._publish_status)
-        while self._status_due.wait() and self._status_thread is not None:
-            self._status_due.clear()
-            tell()
+    def _on_change(self) -> None:
+        thread = self._status_thread
+        if thread is not None:
+            thread.changed()
 
     def _publish_status(self) -> None:
         frame_id = self._setup.frames.camera_frame
@@ -248,7 +241,7 @@ class Calibrator(StarcalNode):
 
     def _on_reset(self, _request: Any, response: Any) -> Any:
         answer = self._state.reset()
-        self._status_due.set()
+        self._on_change()
         return self._told(answer, response)
 
     def _on_rollback(self, _request: Any, response: Any) -> Any:

@@ -348,12 +348,13 @@ def until_told_to_end(
     error.
     """
     is_up = False
-    interrupt = _Interrupt()
+    told = _record_signals()
     try:
         rclpy.init(args=None if args is None else [name, *args])
         is_up = True
-        return work()
-    except (KeyboardInterrupt, ExternalShutdownException, ROSInterruptException):
+        # Before `rclpy.init` no handler of ROS was there to shut the context down.
+        return 0 if told else work()
+    except (ExternalShutdownException, ROSInterruptException):
         return 0
     except Exception as error:
         # A signal shuts ROS down at once; an object under construction then fails.
@@ -362,29 +363,23 @@ def until_told_to_end(
         print(f'{name}: {one_line(error)}', file=sys.stderr)
         return 2
     finally:
-        interrupt.is_over = True
         end()
 
 
-class _Interrupt:
+def _record_signals() -> list[int]:
     """
-    The first SIGINT or SIGTERM raises KeyboardInterrupt in the main thread; later ones do nothing.
+    Handle SIGINT and SIGTERM by adding them to the list returned, and by nothing else.
 
-    A second one is common: `ros2 launch` sends SIGINT to a node that has already received one with
-    its process group. It must not interrupt the shutdown of the node.
+    The handler of rclpy calls this one and shuts the context down, which ends every loop.  A
+    KeyboardInterrupt in its place may hit the entry of a `threading.Condition` of the executor;
+    its lock is then never released, and the threads that wait for it never end
+    (python/cpython#74174).
     """
-
-    def __init__(self) -> None:
-        self.is_over = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            # rclpy's handler shuts ROS down and calls the one before it: this.
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                signal.signal(number, self._on_signal)
-
-    def _on_signal(self, _number: int, _frame: object) -> None:
-        if not self.is_over:
-            self.is_over = True
-            raise KeyboardInterrupt
+    told: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda number, _frame: told.append(number))
+    return told
 
 
 def end_quietly(node: Node | None) -> None:
@@ -412,7 +407,7 @@ def _spin(node: StarcalNode, executor: MultiThreadedExecutor) -> None:
     while node.context.ok():
         try:
             executor.spin_once(timeout_sec=1.0)
-        except (KeyboardInterrupt, ExternalShutdownException):
+        except ExternalShutdownException:
             return
         except Exception as error:
             node.count_error(error)

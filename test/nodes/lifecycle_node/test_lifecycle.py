@@ -142,6 +142,7 @@ def test_what_fails_after_a_signal_is_no_error(argument: str, status: int, said:
 
 SIGNALLED_AGAIN = """
 import os, signal, sys, time
+import rclpy
 from starcal_ros.nodes.lifecycle_node.lifecycle import end_quietly, until_told_to_end
 
 def tell():
@@ -151,8 +152,8 @@ def tell():
 
 def work():
     tell()
-    while True:
-        time.sleep(1.0)
+    while rclpy.ok():
+        time.sleep(0.01)
 
 def end():
     tell()
@@ -168,6 +169,40 @@ def test_signals_do_not_cut_the_end_short() -> None:
     command = [sys.executable, '-c', SIGNALLED_AGAIN]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, 'ended\n', '')
+
+
+SIGNALLED_AT_AN_ENTRY = """
+import os, signal, sys, time
+import rclpy
+from starcal_ros.nodes.lifecycle_node.lifecycle import end_quietly, until_told_to_end
+
+class Lock:
+    def __enter__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0)  # where Python runs the handlers
+    def __exit__(self, *_):
+        print('released')
+
+def work():
+    with Lock():
+        pass
+    while rclpy.ok():
+        time.sleep(0.01)
+    return 0
+
+if 'early' in sys.argv:
+    init = rclpy.init
+    rclpy.init = lambda args: (os.kill(os.getpid(), signal.SIGTERM), init(args=args))
+sys.exit(until_told_to_end('maker', [], work, lambda: end_quietly(None)))
+"""
+
+
+@pytest.mark.parametrize(('argument', 'said'), [('', 'released\n'), ('early', '')])
+def test_a_signal_leaves_no_lock_taken(argument: str, said: str) -> None:
+    """A KeyboardInterrupt at the entry of a lock would, and the threads that need it never end."""
+    command = [sys.executable, '-c', SIGNALLED_AT_AN_ENTRY, argument]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, said, '')
 
 
 @pytest.mark.parametrize('seed', range(4))
