@@ -211,6 +211,10 @@ def install_package(venv: Path) -> None:
     underlay = "import os, sys; os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)\n"
     (packages_of(venv) / 'starcal_underlay.pth').write_text(underlay)
     pip(venv, 'install', '--no-deps', '--no-build-isolation', '--editable', ROOT)
+    # As pip does for a package that it copies.  Where Python may write no bytecode, every process
+    # would compile all sources again, 0.7 s.
+    sources = (ROOT / 'starcal_ros', packages_of(venv) / 'starcal')
+    run([venv / 'bin/python', '-m', 'compileall', '-q', *sources])
 
 
 def packages_of(venv: Path) -> Path:
