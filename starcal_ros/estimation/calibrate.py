@@ -29,14 +29,14 @@ from starcal_ros.estimation.star_trackers import (
     star_tracker_alignments,
     star_tracker_names,
 )
-from starcal_ros.estimation.verdict import all_residuals_px, arranged, dropped_stars, free_share
+from starcal_ros.estimation.verdict import all_residuals_px, dropped_stars, free_share
 from starcal_ros.least_squares.levenberg_marquardt import NotObservable
 from starcal_ros.least_squares.linear_terms import LinearTerms
 from starcal_ros.least_squares.normal_equations import squared_sigmas, star_table, StarTable
 from starcal_ros.methods.assembly import reduced_information
 from starcal_ros.methods.covariance import shared_covariance, shared_names
 from starcal_ros.methods.image_unknowns import attitudes_of_stars_alone
-from starcal_ros.methods.problem import field_terms, image_blocks, image_field, Problem, State
+from starcal_ros.methods.problem import image_field, Problem, State
 from starcal_ros.model_errors.attitude_correlation import attitude_correlation, AttitudeCorrelation
 from starcal_ros.model_errors.image_variation import ImageVariation
 from starcal_ros.model_errors.repeated_pointings import pointing_groups
@@ -270,10 +270,7 @@ def _estimate(
     """What a search has found, and the term of temperature to leave out, if any."""
     problem, solution, verdict = found.problem, found.solution, found.verdict
     state = solution.state
-    measurements = arranged(table, verdict)
-    _, blocks = image_blocks(problem, state, measurements)
-    terms = field_terms(problem, state, measurements)
-    del measurements
+    blocks, terms = solution.normal.blocks, solution.normal.terms
     residual_px = all_residuals_px(problem, state, table)
     kept = verdict.kept
     freedom = free_share(problem, state, blocks, terms, kept, verdict.tracker_sigma_rad)

@@ -19,15 +19,14 @@ from starcal_ros.camera import CameraModel
 from starcal_ros.detector_field import in_degree
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.options import assumed_tracker_sigma_rad, CalibrationOptions
-from starcal_ros.estimation.verdict import arranged, judge_residuals, Verdict
-from starcal_ros.least_squares.levenberg_marquardt import NotObservable, Solution
+from starcal_ros.estimation.verdict import arranged, judge_residuals, Verdict, Weighted
+from starcal_ros.least_squares.levenberg_marquardt import NotObservable
 from starcal_ros.least_squares.linear_terms import Score
 from starcal_ros.least_squares.normal_equations import Measurements, StarTable
 from starcal_ros.methods.assembly import score_of
 from starcal_ros.methods.attitude_errors import attitude_errors
-from starcal_ros.methods.minimise import minimise
+from starcal_ros.methods.minimise import minimise, Minimum
 from starcal_ros.methods.problem import (
-    field_terms,
     image_alignment,
     image_blocks,
     image_field,
@@ -49,6 +48,7 @@ from starcal_ros.model_errors.residual_field import (
 from starcal_ros.model_errors.variance_components import CentroidVariance
 
 _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
+_ROBUST_GAIN = 1e-3  # a step of 0.04 sigma: least squares goes on from there
 _START_FLOOR_PX = 0.05  # until the residuals tell: of the order of what is left in good images
 _FIELD_ROUNDS = 6  # its prior and the variances settle in two or three
 _ROUNDS = 10  # the set of rejected stars settles in two or three
@@ -87,13 +87,13 @@ def search(
     solution = _robust_search(problem, start, measurements)
     _, blocks = image_blocks(problem, solution.state, measurements)
     del measurements  # before the next: they are as large as the table
-    verdict, measurements = judge_residuals(
+    verdict, weighted = judge_residuals(
         problem, solution.state, blocks, None, table, verdict, given_rad, options
     )
     found = _settle(
-        Found(problem, solution, verdict, solution.iterations), measurements, table, options
+        Found(problem, solution, verdict, solution.iterations), weighted, table, options
     )
-    del measurements
+    del weighted
     return _with_field(found, table, camera, options)
 
 
@@ -102,14 +102,14 @@ class Found:
     """Where a search stands: its problem, its minimum, and the verdict that it was made with."""
 
     problem: Problem
-    solution: Solution[State]
+    solution: Minimum
     verdict: Verdict
     iterations: int
     field_test: FieldPrior | None = None
 
 
 def _settle(
-    found: Found, measurements: Measurements, table: StarTable, options: CalibrationOptions
+    found: Found, weighted: Weighted, table: StarTable, options: CalibrationOptions
 ) -> Found:
     """
     Least squares and judgement of its residuals in turns, until the judgement stands.
@@ -133,14 +133,12 @@ def _settle(
                 verdict.misfit[:, None], np.inf, verdict.tracker_sigma_rad
             ),
         )
-        solution = minimise(problem, state, measurements)
+        solution = minimise(problem, state, weighted.measurements, at_start=weighted.at(state))
         iterations += solution.iterations
-        _, blocks = image_blocks(problem, solution.state, measurements)
-        terms = field_terms(problem, solution.state, measurements)
-        after, measurements = judge_residuals(
+        blocks, terms = solution.normal.blocks, solution.normal.terms
+        after, weighted = judge_residuals(
             problem, solution.state, blocks, terms, table, verdict, given_rad, options
         )
-        del blocks
         if after.agrees_with(verdict):
             break
     focal_px = solution.state.parameters[[0, 2]]
@@ -159,6 +157,8 @@ def _with_shapes(
     problem: Problem, state: State, variation: ImageVariation
 ) -> tuple[Problem, State]:
     """Problem and state with a shape of each image where the images differ, without elsewhere."""
+    if not variation.amplitude_sigma_px and not state.shapes.size:
+        return problem, state
     sigma_px = np.array(variation.amplitude_sigma_px)
     modes: Floats = np.empty((0, 0))
     shapes: Floats = np.empty((0, 0))
@@ -188,7 +188,9 @@ def _with_field(
     for k in range(_FIELD_ROUNDS):
         if best is None:
             return plain
-        found = _settle(_started(found, best), arranged(table, found.verdict), table, options)
+        weighted = Weighted(arranged(table, found.verdict))
+        found = _settle(_started(found, best), weighted, table, options)
+        del weighted
         # A smoother kernel of a larger amplitude needs the same degree.
         degree = max(degree, degree_for(best))
         # The first search was among residuals whose variance held the field.
@@ -233,13 +235,12 @@ def _field_prior(
     if not sees_detector(camera):
         return None
     measurements = arranged(table, found.verdict)
-    _, blocks = image_blocks(problem, state, measurements)
     terms = scalar_terms_at(
         problem, state, measurements, polynomials(camera.width, camera.height, degree)
     )
     # The field that there is, if any, is part of what the residuals are asked for.
     without = dataclasses.replace(problem, field_prior=None)
-    shown = score_of(without, state, blocks, None, terms)
+    shown = score_of(without, state, found.solution.normal.blocks, None, terms)
     now = image_field(problem, state)
     if now is not None:
         coefficients = in_degree(now, degree)
@@ -248,7 +249,7 @@ def _field_prior(
     return best_prior(shown, camera, problem.free, degree, waves, looks_for_waves)
 
 
-def _robust_search(problem: Problem, start: State, measurements: Measurements) -> Solution[State]:
+def _robust_search(problem: Problem, start: State, measurements: Measurements) -> Minimum:
     """
     Search with the robust loss, every image free of the star tracker.
 
@@ -258,12 +259,12 @@ def _robust_search(problem: Problem, start: State, measurements: Measurements) -
     if problem.method == 'hierarchical':
         try:
             free = dataclasses.replace(problem, method='per_image')
-            solution = minimise(free, start, measurements, _ROBUST_SCALE)
+            solution = minimise(free, start, measurements, _ROBUST_SCALE, least_gain=_ROBUST_GAIN)
             state = _with_slope(problem, _with_mountings(problem, solution.state))
             return dataclasses.replace(solution, state=state)
         except NotObservable:
             pass  # so few stars that they need the star tracker
-    return minimise(problem, start, measurements, _ROBUST_SCALE)
+    return minimise(problem, start, measurements, _ROBUST_SCALE, least_gain=_ROBUST_GAIN)
 
 
 def _with_mountings(problem: Problem, state: State) -> State:

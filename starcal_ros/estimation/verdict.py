@@ -70,6 +70,19 @@ class Verdict:
         )
 
 
+@dataclass(frozen=True)
+class Weighted:
+    """The stars as a verdict weights them, and their `image_blocks` at one state, if known."""
+
+    measurements: Measurements
+    state: State | None = None
+    image_blocks: tuple[float, Floats] | None = None
+
+    def at(self, state: State) -> tuple[float, Floats] | None:
+        """Return the `image_blocks` at a state, if known."""
+        return self.image_blocks if state is self.state else None
+
+
 def arranged(table: StarTable, verdict: Verdict) -> Measurements:
     """Lay out the stars that a verdict keeps, with its covariances."""
     return arrange(table, verdict.kept, verdict.covariance_px2(table))
@@ -84,11 +97,11 @@ def judge_residuals(
     before: Verdict,
     given_rad: Floats,
     options: CalibrationOptions,
-) -> tuple[Verdict, Measurements]:
+) -> tuple[Verdict, Weighted]:
     """
     Variances and misfits from the residuals at a state that the verdict before has led to.
 
-    With the measurements as the verdict has them, which a search with it needs.
+    With the stars as the verdict weights them, which a search with it needs.
     """
     residual_px = all_residuals_px(problem, state, table)
     variance, tracker_sigma_rad = CentroidVariance(1.0, 0.0), given_rad
@@ -102,13 +115,13 @@ def judge_residuals(
     repeated = repetition(table, kept, residual_px, groups)
     del residual_px
     misfit: Mask = np.zeros(table.image_count, bool)
-    weighted = variance.of(table.covariance_px2, table.magnitude) * repeated[:, None]
-    measurements = arrange(table, kept, weighted)
+    covariance_px2 = variance.of(table.covariance_px2, table.magnitude) * repeated[:, None]
+    measurements = arrange(table, kept, covariance_px2)
     variation = ImageVariation()
+    # By the stars that fit: one that does not turns an image of few by more than the tracker.
+    cost, blocks = image_blocks(problem, state, measurements)
     # One rotation for all has no attitude of an image to judge.
     if problem.method != 'single':
-        # By the stars that fit: one that does not turns an image of few by more than the tracker.
-        _, blocks = image_blocks(problem, state, measurements)
         eta_rad, covariance_rad2, seen = attitudes_of_stars_alone(problem, state, blocks)
         fitted = state.alignment_count // 3  # means of the attitudes, and slope
         found_rad, misfit = estimate_star_tracker_sigma(
@@ -124,7 +137,7 @@ def judge_residuals(
             tracker_sigma_rad = found_rad
             variation = image_variation(blocks, state.shapes)
     verdict = Verdict(variance, tracker_sigma_rad, misfit, kept, repeated, variation)
-    return verdict, measurements
+    return verdict, Weighted(measurements, state, (cost, blocks))
 
 
 def _fitting(

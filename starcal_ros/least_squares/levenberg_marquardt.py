@@ -53,17 +53,20 @@ class NormalEquations:
     c: Floats
 
 
+NormalT = TypeVar('NormalT', bound=NormalEquations)
+
+
 @dataclass(frozen=True)
-class Solution(Generic[StateT]):
+class Solution(Generic[StateT, NormalT]):
     """
-    Final state of the search and the reason of its termination.
+    Final state of the search, its normal equations, and the reason of its termination.
 
     ``termination`` is ``converged``, ``no_descent`` (no lower cost up to the largest damping) or
     ``iteration_limit``; only the first is success.
     """
 
     state: StateT
-    normal: NormalEquations
+    normal: NormalT
     iterations: int
     termination: str
 
@@ -173,9 +176,10 @@ def covariance(normal: NormalEquations) -> tuple[Floats, Floats, Floats]:
 
 def levenberg_marquardt(
     state: StateT,
-    evaluate: Callable[[StateT], NormalEquations],
+    evaluate: Callable[[StateT], NormalT],
     move: Callable[[StateT, Floats, Floats], StateT],
-) -> Solution[StateT]:
+    least_gain: float = 0.0,
+) -> Solution[StateT, NormalT]:
     """
     Minimum of the cost from a start.
 
@@ -187,13 +191,15 @@ def levenberg_marquardt(
         Cost and normal equations at a state; a state with a non-finite cost is rejected.
     move
         New state from a state, a shared step (p,) and block steps (m, q).
+    least_gain : float
+        A step that would lower the cost by less is not taken: half of its square in 1-sigma.
 
     Notes
     -----
     Marquardt's damping in the paper's form (Eq. 25), scaled by the diagonal.  A step is judged by
     the actual over the predicted reduction of the cost (Nielsen's rule for the damping).
     The search has converged when the undamped step is below ``1e-9`` of the 1-sigma scale in every
-    unknown, or no step lowers the cost by more than its rounding.
+    unknown, or lowers the cost by less than ``least_gain`` or its rounding.
 
     Raises
     ------
@@ -217,7 +223,8 @@ def levenberg_marquardt(
         )
         # The criteria apply to the undamped step.
         reach = 1.0 + damping
-        if scaled * reach < _STEP_TOLERANCE or predicted * reach < _COST_TOLERANCE * normal.cost:
+        least = max(least_gain, _COST_TOLERANCE * normal.cost)
+        if scaled * reach < _STEP_TOLERANCE or predicted * reach < least:
             return Solution(state, normal, iteration, 'converged')
         candidate = move(state, shared, blocks)
         candidate_normal = evaluate(candidate)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,6 +14,7 @@ from starcal_ros.least_squares.levenberg_marquardt import (
     NormalEquations,
     Solution,
 )
+from starcal_ros.least_squares.linear_terms import LinearTerms
 from starcal_ros.least_squares.normal_equations import Measurements
 from starcal_ros.methods.assembly import assemble
 from starcal_ros.methods.problem import (
@@ -25,13 +26,31 @@ from starcal_ros.methods.problem import (
 )
 
 
+@dataclass(frozen=True)
+class ImageEquations(NormalEquations):
+    """Normal equations and what they are made of: `image_blocks` and `field_terms`."""
+
+    blocks: Floats
+    terms: LinearTerms | None
+
+
+Minimum = Solution[State, ImageEquations]
+
+
 def minimise(
-    problem: Problem, start: State, measurements: Measurements, loss_scale: float = np.inf
-) -> Solution[State]:
+    problem: Problem,
+    start: State,
+    measurements: Measurements,
+    loss_scale: float = np.inf,
+    at_start: tuple[float, Floats] | None = None,
+    least_gain: float = 0.0,
+) -> Minimum:
     """
     The state of least cost, by Levenberg-Marquardt.
 
-    ``loss_scale`` is that of `normal_equations.normal_blocks`: infinite is least squares.
+    ``loss_scale`` is that of `normal_equations.normal_blocks`: infinite is least squares;
+    ``at_start`` are the `image_blocks` at the start, where they are known; ``least_gain`` is that
+    of `levenberg_marquardt`.
 
     Raises
     ------
@@ -40,19 +59,24 @@ def minimise(
     """
     information: Floats | None = None  # of the modes of the field: the same at every state
 
-    def evaluate(state: State) -> NormalEquations:
+    def evaluate(state: State) -> ImageEquations:
         nonlocal information
-        cost, blocks = image_blocks(problem, state, measurements, loss_scale)
+        if at_start is not None and state is start:
+            cost, blocks = at_start
+        else:
+            cost, blocks = image_blocks(problem, state, measurements, loss_scale)
         if not np.isfinite(cost):
-            return NormalEquations(cost, *(np.empty(0) for _ in range(5)))
+            none: Floats = np.empty(0)
+            return ImageEquations(cost, none, none, none, none, none, none, None)
         terms = field_terms(problem, state, measurements, information)
         information = terms.information if terms else None
-        return assemble(problem, state, cost, blocks, terms)
+        normal = assemble(problem, state, cost, blocks, terms)
+        return ImageEquations(**vars(normal), blocks=blocks, terms=terms)
 
     def move(state: State, shared: Floats, blocks: Floats) -> State:
         return _move(problem, state, shared, blocks)
 
-    return levenberg_marquardt(start, evaluate, move)
+    return levenberg_marquardt(start, evaluate, move, least_gain)
 
 
 def _move(problem: Problem, state: State, shared: Floats, blocks: Floats) -> State:

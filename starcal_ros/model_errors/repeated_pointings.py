@@ -11,6 +11,7 @@ images is multiplied by ``1 + (c - 1) share``: then c of them weigh as the mean 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Mask
@@ -22,14 +23,16 @@ _SAME_PX = 1.0  # movement of a star from image to image below which a pointing 
 def pointing_groups(camera_from_icrf: Rotation, focal_px: float) -> Indices:
     """Return the number (m,) of the pointing of each image, from 0."""
     quaternions = np.atleast_2d(camera_from_icrf.as_quat())
-    group = np.full(len(quaternions), -1)
-    least = np.cos(0.5 * _SAME_PX / focal_px)
+    m = len(quaternions)
+    # A quaternion and its negative are one rotation.
+    tree = cKDTree(np.concatenate([quaternions, -quaternions]))
+    chord = 2.0 * np.sin(0.25 * _SAME_PX / focal_px)
+    group = np.full(m, -1)
     count = 0
-    for k, quaternion in enumerate(quaternions):
+    for k, near in enumerate(tree.query_ball_point(quaternions, chord)):
         if group[k] < 0:
-            alike = (np.abs(quaternions @ quaternion) >= least) & (group < 0)
-            alike[k] = True
-            group[alike] = count
+            alike = np.array([k, *near]) % m
+            group[alike[group[alike] < 0]] = count
             count += 1
     return group
 

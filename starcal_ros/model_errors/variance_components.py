@@ -106,12 +106,13 @@ def estimate_variance(
 def _line(own: Floats, squared: Floats, parts: list[NDArray[np.intp]]) -> tuple[float, float]:
     """Scale and floor of the variances: groups of stars (n,) of like variance ``own``."""
     mean_own = np.array([own[part].mean() for part in parts])
+    where = _rows(parts)
 
     def found(scale: float, floor_px2: float) -> Floats:
         # Within a group variances differ: the ratio to their model is what has one mean.
         model = np.maximum(scale * own + floor_px2, 1e-12)
-        ratio = squared / model
-        return np.array([_clipped_mean(ratio[part]) * model[part].mean() for part in parts])
+        mean_model = np.maximum(scale * mean_own + floor_px2, 1e-12)
+        return np.asarray(_clipped(_in_rows(squared / model, where))[0] * mean_model)
 
     if len(parts) < 3 or mean_own[-1] < 2.0 * mean_own[0]:
         # Scale and floor cannot be separated: a floor when there is an excess, else a scale.
@@ -138,21 +139,22 @@ def _class_factors(
     ``ratio`` (n,) are the squared residuals per axis over their expected variance.
     """
     parts = _magnitude_classes(magnitude)
-    if len(parts) < 2 or _clipped_mean(ratio) < _FACTOR_LIMITS[0]:
+    if len(parts) < 2 or _clipped(ratio[None])[0] < _FACTOR_LIMITS[0]:
         return (), ()  # few stars, or residuals without noise whose scale is at its limit
     nodes = np.array([magnitude[part].mean() for part in parts])
     if not (np.diff(nodes) > 0.0).all():
         return (), ()  # too many stars of one magnitude
-    mean = np.array([_clipped_mean(ratio[part]) for part in parts])
+    where = _rows(parts)
+    mean, scatter = _clipped(_in_rows(ratio, where))
     # Normal noise has a variance of 1 for the mean square of two axes; tails have more.
-    variance = np.array([max(1.0, _inside(ratio[part]).var()) / len(part) for part in parts])
+    variance = np.maximum(1.0, scatter) / [len(part) for part in parts]
     if ((mean - 1.0) ** 2 / variance).sum() < chdtri(len(parts), _CLASS_P_VALUE):
         return (), ()
     factors = np.clip(mean, *_FACTOR_LIMITS)
     # Linear between the nodes, the mean of a class is not its node: repeated until it is.
     for _ in range(8):
         left = ratio / np.interp(magnitude, nodes, factors)
-        factors = np.clip(factors * [_clipped_mean(left[part]) for part in parts], *_FACTOR_LIMITS)
+        factors = np.clip(factors * _clipped(_in_rows(left, where))[0], *_FACTOR_LIMITS)
     return tuple(nodes.tolist()), tuple(factors.tolist())
 
 
@@ -166,24 +168,42 @@ def _magnitude_classes(magnitude: NDArray[np.floating]) -> list[NDArray[np.intp]
     return [order]
 
 
-def _inside(ratio: Floats) -> Floats:
-    """Squared residuals over variance without those beyond the clip, which starts at a median."""
+def _rows(parts: list[NDArray[np.intp]]) -> NDArray[np.intp]:
+    """Indices of the stars of each group as a row (groups, largest), -1 beyond its end."""
+    rows = np.full((len(parts), max(map(len, parts))), -1)
+    for row, part in zip(rows, parts, strict=True):
+        row[: len(part)] = part
+    return rows
+
+
+def _in_rows(ratio: Floats, where: NDArray[np.intp]) -> Floats:
+    """Values (n,) of the stars of each row, infinite beyond its end."""
+    return np.asarray(np.where(where < 0, np.inf, ratio[where]))
+
+
+def _clipped(ratio: Floats) -> tuple[Floats, Floats]:
+    """
+    Mean and variance (groups,) of rows of squared residuals over variance, within a clip.
+
+    The clip starts at the median; the rows (groups, largest) may end with infinities.
+    """
+    ordered = np.sort(ratio, axis=1)
+    size = np.isfinite(ordered).sum(axis=1)
+    group = np.arange(len(ordered))
+    finite = np.where(np.isfinite(ordered), ordered, 0.0)
+    sums, squares = np.cumsum(finite, axis=1), np.cumsum(finite**2, axis=1)
+    median = 0.5 * (ordered[group, (size - 1) // 2] + ordered[group, size // 2])
     # Two axes: the squared length is exponential, of median ln 2 per unit of mean.
-    mean = float(np.median(ratio)) / math.log(2.0)
-    inside = ratio
-    count = -1
+    mean = median / math.log(2.0)
+    count = np.full(len(ordered), -1)
     for _ in range(6):
-        inside = ratio[ratio <= 0.5 * _CLIP_SIGMA**2 * mean]
-        if len(inside) == count or not len(inside):
+        inside = (ordered <= (0.5 * _CLIP_SIGMA**2 * mean)[:, None]).sum(axis=1)
+        if (inside == count).all():
             break
-        count, mean = len(inside), float(inside.mean())
-    return inside
-
-
-def _clipped_mean(ratio: Floats) -> float:
-    """Mean of the ratios (n,) within the clip."""
-    inside = _inside(ratio)
-    return float(inside.mean()) if len(inside) else 0.0
+        # Not empty: the limit is fourteen times the median, or ten times a mean.
+        count = inside
+        mean = sums[group, count - 1] / count
+    return mean, np.maximum(squares[group, count - 1] / count - mean**2, 0.0)
 
 
 def estimate_star_tracker_sigma(
