@@ -55,7 +55,9 @@ def estimate_with_smallest_lens(
                 raise
             continue  # the stars do not determine a model that large
         test = estimate.field_test
-        if test is not None and test.p_value >= options.max_field_p_value:
+        # A limit of 0 asks for no test: no field has a p-value below it.
+        p_value = 1.0 if options.max_field_p_value == 0.0 else test.p_value if test else math.nan
+        if p_value >= options.max_field_p_value:
             return estimate, started
         ratio = math.inf if test is None else test.log_likelihood_ratio
         if ratio < least:

@@ -85,7 +85,7 @@ class CalibrationOptions:
     )
     max_field_p_value: float = option(
         0.01,
-        'p-value of no field below which one is estimated',
+        'p-value of no field below which one is estimated; 0: no test',
         low=0.0,
         high=1.0,
     )

@@ -177,6 +177,8 @@ def _with_field(
 ) -> Found:
     """The search with a field beside the lens model, where the stars show one."""
     plain = found
+    if options.max_field_p_value == 0.0:
+        return plain
     best = _field_prior(found, table, camera, TEST_DEGREE)
     if best is None:
         return plain

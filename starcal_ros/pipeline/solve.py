@@ -151,7 +151,9 @@ def solve_with_residuals(
     halves = HalvesComparison(note='min_halves_p_value is 0')
     if setup.gate.min_halves_p_value > 0:
         # A field is common to both halves: each would show less of it, at twice the time.
-        options = dataclasses.replace(setup.calibration, residual_field=False)
+        options = dataclasses.replace(
+            setup.calibration, residual_field=False, max_field_p_value=0.0
+        )
         bare = _without_field(ensemble, result.geometry.camera.field)
         halves = compare_halves(bare, prior, options)
     provenance = provenance_of(setup, ensemble, inputs or {})
