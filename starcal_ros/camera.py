@@ -131,6 +131,11 @@ class CameraModel:
         return self.parameters[5:]
 
     @property
+    def has_field(self) -> bool:
+        """True where a field moves pixels; one of zeros is there for its covariance."""
+        return self.field is not None and bool(self.field.coefficients.any())
+
+    @property
     def matrix(self) -> Floats:
         """The (3, 3) camera matrix K with skew (Eq. 7)."""
         fx, skew, fy, cx, cy = self.intrinsics
@@ -234,7 +239,7 @@ def project(camera: CameraModel, directions_camera: Floats) -> Floats:
     """
     directions = np.asarray(directions_camera, np.float64)
     ideal = project_parameters(camera.model, camera.parameters, directions)
-    if camera.field is None:
+    if camera.field is None or not camera.has_field:
         return ideal
     pixels = ideal
     for _ in range(_FIELD_STEPS):
@@ -324,7 +329,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     model, distortion = camera.model, camera.distortion
     fold2 = fold_radius2(model, distortion)
     pixels = np.asarray(pixels, np.float64)
-    if camera.field is not None:
+    if camera.field is not None and camera.has_field:
         pixels = pixels - camera.field.displacement_px(pixels)
     fx, skew, fy, cx, cy = camera.intrinsics
     yd = (pixels[..., 1] - cy) / fy

@@ -36,8 +36,8 @@ def ros_fit(camera: CameraModel) -> tuple[CameraModel, float]:
     worst_px : float
         Largest pixel error over the grid.
     """
-    if camera.intrinsics[1] == 0.0 and camera.field is None:
-        return camera, 0.0
+    if camera.intrinsics[1] == 0.0 and not camera.has_field:
+        return dataclasses.replace(camera, field=None), 0.0
     free = [k for k, name in enumerate(camera.parameter_names) if name != 'skew']
     return _fit(dataclasses.replace(camera.replace(skew=0.0), field=None), free, camera)
 
@@ -59,8 +59,8 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
     ValueError
         For an unknown model.
     """
-    if model == camera.model and camera.field is None:
-        return camera, 0.0
+    if model == camera.model and not camera.has_field:
+        return dataclasses.replace(camera, field=None), 0.0
     if model not in COEFFICIENTS:
         raise ValueError(f'lens model: {model!r} is not one of {", ".join(COEFFICIENTS)}')
     names = parameter_names(model)
@@ -70,7 +70,7 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
     if not same_plane:
         start[5:] = 0.0
     started = CameraModel(camera.width, camera.height, start, model)
-    if same_plane and known.keys() <= set(names) and camera.field is None:
+    if same_plane and known.keys() <= set(names) and not camera.has_field:
         return started, 0.0  # a special case of the larger model
     return _fit(started, list(range(len(names))), camera)
 
@@ -96,7 +96,7 @@ def nearest_camera(
     """
     start = camera if model == camera.model else convert(camera, model)[0]
     start = dataclasses.replace(start.replace(**dict.fromkeys(zero, 0.0)), field=None)
-    unchanged = camera.field is None and model == camera.model
+    unchanged = not camera.has_field and model == camera.model
     if unchanged and np.array_equal(start.parameters, camera.parameters):
         return start, 0.0
     free = [k for k, name in enumerate(start.parameter_names) if name not in zero]

@@ -81,7 +81,8 @@ class CalibrationOptions:
     )
     residual_field: bool = option(
         True,
-        'estimate a smooth field over the detector beside the lens model where stars show one',
+        'estimate a smooth field over the detector beside the lens model where stars show one;'
+        ' where they do not, what they do not exclude is in the sigmas',
     )
     max_field_p_value: float = option(
         0.01,

@@ -21,11 +21,11 @@ from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.options import assumed_tracker_sigma_rad, CalibrationOptions
 from starcal_ros.estimation.verdict import arranged, judge_residuals, Verdict, Weighted
 from starcal_ros.least_squares.levenberg_marquardt import NotObservable
-from starcal_ros.least_squares.linear_terms import Score
+from starcal_ros.least_squares.linear_terms import LinearTerms, Score
 from starcal_ros.least_squares.normal_equations import Measurements, StarTable
 from starcal_ros.methods.assembly import score_of
 from starcal_ros.methods.attitude_errors import attitude_errors
-from starcal_ros.methods.minimise import minimise, Minimum
+from starcal_ros.methods.minimise import image_equations, minimise, Minimum
 from starcal_ros.methods.problem import (
     image_alignment,
     image_blocks,
@@ -43,6 +43,7 @@ from starcal_ros.model_errors.residual_field import (
     polynomials,
     sees_detector,
     TEST_DEGREE,
+    unseen_prior,
     Waves,
 )
 from starcal_ros.model_errors.variance_components import CentroidVariance
@@ -179,13 +180,16 @@ def _with_field(
     plain = found
     if options.max_field_p_value == 0.0:
         return plain
-    best = _field_prior(found, table, camera, TEST_DEGREE)
-    if best is None:
+    shown = _shown(found, table, camera, TEST_DEGREE)
+    if shown is None:
         return plain
-    found = plain = dataclasses.replace(found, field_test=best)
-    if not options.residual_field or best.p_value > options.max_field_p_value:
+    test = best_prior(shown.score, shown.camera, found.problem.free, TEST_DEGREE)
+    found = plain = dataclasses.replace(found, field_test=test)
+    if not options.residual_field:
         return plain
-    degree = degree_for(best)
+    if test.p_value > options.max_field_p_value:
+        return _considering(plain, shown, test)
+    degree = degree_for(test)
     best = _field_prior(found, table, camera, degree, looks_for_waves=True)
     for k in range(_FIELD_ROUNDS):
         if best is None:
@@ -201,6 +205,26 @@ def _with_field(
             break
         best = again
     return found if best is not None else plain
+
+
+def _considering(found: Found, shown: _Shown, test: FieldPrior) -> Found:
+    """
+    The search with a field of zero whose prior is what the stars do not exclude.
+
+    So its modes are in the covariance, and no line of sight moves by what no star shows.
+    """
+    prior = unseen_prior(shown.score, shown.camera, found.problem.free, test)
+    problem = dataclasses.replace(found.problem, field_prior=prior)
+    state = dataclasses.replace(found.solution.state, modes=np.zeros(prior.modes.shape[1]))
+    normal = image_equations(
+        problem,
+        state,
+        found.solution.normal.cost,
+        found.solution.normal.blocks,
+        shown.terms.in_modes(prior.modes),
+    )
+    solution = dataclasses.replace(found.solution, state=state, normal=normal)
+    return dataclasses.replace(found, field_test=test, problem=problem, solution=solution)
 
 
 def _started(found: Found, prior: FieldPrior) -> Found:
@@ -232,6 +256,24 @@ def _field_prior(
 
     None where the lens model has lines of sight for a small part of the detector only.
     """
+    shown = _shown(found, table, camera, degree)
+    if shown is None:
+        return None
+    free = found.problem.free
+    return best_prior(shown.score, shown.camera, free, degree, waves, looks_for_waves)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What the residuals at a minimum show of the polynomials of a degree, all else free."""
+
+    camera: CameraModel
+    terms: LinearTerms
+    score: Score
+
+
+def _shown(found: Found, table: StarTable, camera: CameraModel, degree: int) -> _Shown | None:
+    """None where the lens model has lines of sight for a small part of the detector only."""
     problem, state = found.problem, found.solution.state
     camera = dataclasses.replace(camera, parameters=state.parameters, field=None)
     if not sees_detector(camera):
@@ -248,7 +290,7 @@ def _field_prior(
         coefficients = in_degree(now, degree)
         gradient = shown.gradient + shown.information @ coefficients
         shown = Score(gradient, shown.information)
-    return best_prior(shown, camera, problem.free, degree, waves, looks_for_waves)
+    return _Shown(camera, terms, shown)
 
 
 def _robust_search(problem: Problem, start: State, measurements: Measurements) -> Minimum:

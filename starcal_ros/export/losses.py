@@ -47,7 +47,7 @@ def fitted(calibration: Calibration, model: str, zero: tuple[str, ...]) -> Fitte
     found, worst_px = nearest_camera(camera, model, zero)
     losses = []
     lens = dataclasses.replace(camera, field=None)
-    if camera.field is not None:
+    if camera.has_field:
         losses.append(Loss('field beside the lens model', _alone(camera, camera.model, ())))
     if model != camera.model:
         cost_px = _alone(lens, model, ())

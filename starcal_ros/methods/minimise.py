@@ -37,6 +37,14 @@ class ImageEquations(NormalEquations):
 Minimum = Solution[State, ImageEquations]
 
 
+def image_equations(
+    problem: Problem, state: State, cost: float, blocks: Floats, terms: LinearTerms | None
+) -> ImageEquations:
+    """Normal equations of `assemble` with its arguments."""
+    normal = assemble(problem, state, cost, blocks, terms)
+    return ImageEquations(**vars(normal), blocks=blocks, terms=terms)
+
+
 def minimise(
     problem: Problem,
     start: State,
@@ -70,8 +78,7 @@ def minimise(
             return ImageEquations(cost, none, none, none, none, none, none, None)
         terms = field_terms(problem, state, measurements, information)
         information = terms.information if terms else None
-        normal = assemble(problem, state, cost, blocks, terms)
-        return ImageEquations(**vars(normal), blocks=blocks, terms=terms)
+        return image_equations(problem, state, cost, blocks, terms)
 
     def move(state: State, shared: Floats, blocks: Floats) -> State:
         return _move(problem, state, shared, blocks)

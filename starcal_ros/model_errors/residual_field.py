@@ -60,6 +60,7 @@ _WAVE_STEP = 0.8  # rad per half length, at first: half the width of a line over
 _REFINEMENTS = 3
 _BEYOND_WAVE = 9.0  # degrees beyond the wave number that hold all but 1e-4 of a wave
 _AMPLITUDES_PX = np.geomspace(1e-3, 10.0, 41)
+_UNSEEN_PX = np.geomspace(1e-5, 10.0, 61)  # from what no stars show to what all show
 _GRID = 41  # pixels a side at which the lens model's own displacements are taken
 # Of the detector, with a line of sight: a circular image fills 0.4 of a wide one; a lens model
 # that stars in one spot determine folds back around them.
@@ -227,15 +228,18 @@ class _Likelihood:
 
     def best_amplitude(self, length: float, waves: Waves) -> tuple[float, float]:
         """Twice the log of the largest likelihood ratio, and the amplitude in px."""
-        root = self.root(length, waves)
+        ratio = self.ratios(self.root(length, waves), _AMPLITUDES_PX)
+        k = int(ratio.argmax())
+        return float(ratio[k]), float(_AMPLITUDES_PX[k])
+
+    def ratios(self, root: Floats, amplitudes_px: NDArray[np.floating]) -> Floats:
+        """Twice the log of the likelihood ratios (k,) of amplitudes, to no field."""
         eigenvalues, vectors = np.linalg.eigh(root.T @ self.information @ root)
         eigenvalues = np.maximum(eigenvalues, 0.0)
         along = vectors.T @ (root.T @ self.gradient)
-        s2 = _AMPLITUDES_PX[:, None] ** 2
+        s2 = amplitudes_px[:, None] ** 2
         shrunk = 1.0 + s2 * eigenvalues
-        ratio = (along**2 * s2 / shrunk - np.log(shrunk)).sum(axis=1)
-        k = int(ratio.argmax())
-        return float(ratio[k]), float(_AMPLITUDES_PX[k])
+        return np.asarray((along**2 * s2 / shrunk - np.log(shrunk)).sum(axis=1))
 
     def radial_score(self) -> float:
         """Gradient along the radial pattern, in sigma; 0 where the stars say nothing about it."""
@@ -273,15 +277,8 @@ def best_prior(
         Whether better ones are looked for, from those given or from the spectrum; never in the
         test of no field, whose p-value is of smooth kernels.
     """
-    span = spanned_by_lens(camera, free, degree)
-    shown = _Likelihood(
-        camera,
-        degree,
-        span,
-        _projected(_projected(score.information, span).T, span),
-        score.gradient - span @ (span.T @ score.gradient),
-        _patterns(camera.width, camera.height, degree, span),
-    )
+    shown = _likelihood(score, camera, free, degree)
+    span = shown.span
     known = waves
     found = [(*shown.best_amplitude(length, known), length) for length in _LENGTHS]
     ratio, amplitude_px, length = max(found)
@@ -304,6 +301,46 @@ def best_prior(
         ratio,
         shown.radial_score(),
         known,
+    )
+
+
+def unseen_prior(
+    score: Score, camera: CameraModel, free: NDArray[np.int64], tested: FieldPrior
+) -> FieldPrior:
+    """
+    Return the prior of what may be there where the test shows no field.
+
+    A camera that is exactly its lens model does not exist, and stars that do not show a term do
+    not exclude it.  The field has the patterns that lens models have next, all of one amplitude s,
+    and before the stars are asked every factor of ten of s from 1e-5 to 10 px is as likely.  The
+    amplitude of the prior is the root of the mean of s^2 that the stars leave.
+
+    Parameters
+    ----------
+    score, camera, free
+        Those of `best_prior`.
+    tested : FieldPrior
+        Its answer, without waves.
+    """
+    shown = _likelihood(score, camera, free, tested.degree)
+    log_ratio = 0.5 * shown.ratios(shown.patterns, _UNSEEN_PX)
+    weight = np.exp(log_ratio - log_ratio.max())
+    amplitude_px = float(np.sqrt(weight @ _UNSEEN_PX**2 / weight.sum()))
+    modes = amplitude_px * shown.patterns
+    return dataclasses.replace(tested, modes=modes, amplitude_px=amplitude_px)
+
+
+def _likelihood(
+    score: Score, camera: CameraModel, free: NDArray[np.int64], degree: int
+) -> _Likelihood:
+    span = spanned_by_lens(camera, free, degree)
+    return _Likelihood(
+        camera,
+        degree,
+        span,
+        _projected(_projected(score.information, span).T, span),
+        score.gradient - span @ (span.T @ score.gradient),
+        _patterns(camera.width, camera.height, degree, span),
     )
 
 

@@ -175,7 +175,9 @@ class HalvesComparison:
 @dataclass(frozen=True)
 class ResidualField:
     """
-    Field over the detector that was estimated beside the lens model.
+    Field over the detector beside the lens model.
+
+    With coefficients of zero none was found; its covariance is that of what no star excludes.
 
     Attributes
     ----------

@@ -44,7 +44,7 @@ def charts_of(
             'Contours of the length of the distortion vectors; a longer one has a thicker line.',
         ),
     }
-    if camera.field is not None:
+    if camera.field is not None and camera.has_field:
         charts['lens_field'] = Chart(
             'Residual field beside the lens model',
             detector_figures.field_vectors(camera.field, camera),

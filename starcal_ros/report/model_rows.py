@@ -33,6 +33,10 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
         if found.field_rms_px > 0
         else 'no field needed'
     )
+    if calibration.field is not None and found.field_rms_px == 0.0:
+        field += (
+            f'; one of {_px(calibration.field.amplitude_px)} is not excluded and is in the sigmas'
+        )
     return [
         ModelRow(
             'The lens model describes the lens',

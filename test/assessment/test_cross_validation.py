@@ -51,7 +51,9 @@ def without_image(given: Scenario, ensemble: Ensemble, k: int) -> Floats:
 def test_the_linear_step_is_the_calibration_without_the_image() -> None:
     given = of_random_pointings(12, images=5)
     ensemble = true_observations(given)
-    found = estimated(given, ensemble, variance_components=False, outlier_sigma=20.0)
+    found = estimated(
+        given, ensemble, variance_components=False, outlier_sigma=20.0, residual_field=False
+    )
     measurements = arrange(found.table, found.kept, found.table.covariance_px2)
     _, blocks = image_blocks(found.problem, found.state, measurements)
     squared, expected = predicted_residuals(found, measurements, blocks, None)

@@ -136,7 +136,7 @@ def test_without_noise_the_truth_comes_back(method: str, with_principal_point: b
     prior = CameraGeometry(prior_camera, mounting.as_quat())
     chosen = options(method, estimate=estimate, residual_field=True)
     found = estimate_calibration(clean(), prior, chosen)
-    assert found.geometry.camera.field is None
+    assert not found.geometry.camera.has_field
     assert found.termination == 'converged' and found.kept.all()
     error = error_of(found, list(range(13)))
     # 1e-9 of each term at the edge of the field (r = 0.23, f = 1800 px) and of a radian.

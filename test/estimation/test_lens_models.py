@@ -118,7 +118,8 @@ def test_errors_are_those_of_the_reported_covariance(model: str) -> None:
             np.linalg.cholesky(covariance / np.outer(sigma, sigma)), error / sigma
         )
         squares, count = squares + float(whitened @ whitened), count + len(free)
-        assert (line_of_sight_sigma_arcsec(found.geometry.camera, found.covariance) > 0).all()
+        camera = found.geometry.camera
+        assert (line_of_sight_sigma_arcsec(camera, found.joint_covariance) > 0).all()
     # Chi^2 with `count` degrees of freedom, 5 sigma on either side.
     assert abs(squares / count - 1.0) < 5 * np.sqrt(2 / count)
 
