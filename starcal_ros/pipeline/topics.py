@@ -78,7 +78,12 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
         )
     first = [n for n, kind in types_of.items() if kind == attitude_type and n not in more]
     only = first[0] if more and len(first) == 1 else ''
-    attitude = _choose(paths, attitude_type, asked.attitude or only, 'attitude')
+    try:
+        attitude = _choose(paths, attitude_type, asked.attitude or only, 'attitude')
+    except BagError as error:
+        if first:
+            raise
+        raise BagError(f'{error}{_other_attitudes(there, asked.attitude)}') from error
     velocity, temperature = asked.velocity, asked.temperature
     if velocity or VELOCITY_TYPE in types:
         velocity = _choose(paths, VELOCITY_TYPE, velocity, 'velocity')
@@ -89,6 +94,17 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
     if temperature or thermometers == 1 or (thermometers and used):
         temperature = _choose(paths, TEMPERATURE_TYPE, temperature, 'temperature')
     return Topics(image, attitude, velocity, temperature, more_attitudes=more)
+
+
+def _other_attitudes(there: Sequence[reader.Topic], asked: str) -> str:
+    """Return which topics may hold the attitudes in messages of another type."""
+    names = {kind: name for name, kind in ATTITUDE_TYPES.items()}
+    return ''.join(
+        f'; {topic.name} is a {topic.type_name.rpartition("/")[2]}: if it holds the attitudes, set'
+        f' attitude_message: {names[topic.type_name]}'
+        for topic in there
+        if topic.type_name in names and topic.name.lstrip('/') == (asked or topic.name).lstrip('/')
+    )
 
 
 def more_attitude_topics(setup: Setup | None) -> tuple[str, ...]:

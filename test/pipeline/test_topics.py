@@ -72,9 +72,14 @@ def test_stars_are_found_in_the_channel_and_with_the_transforms(bag: Path) -> No
     assert min(len(record) for record in records) > 10
 
 
-def test_a_bag_of_transforms_has_no_attitudes_by_default(bag: Path) -> None:
-    with pytest.raises(BagError, match='no topic of type geometry_msgs/msg/QuaternionStamped'):
-        topics.choose_topics([bag], Topics(), setup_with())
+@pytest.mark.parametrize('asked', ['', 'attitude'])
+def test_a_bag_of_transforms_has_no_attitudes_by_default(bag: Path, asked: str) -> None:
+    """Without a setup too, as for `starcal inspect`."""
+    for setup in (setup_with(), None):
+        with pytest.raises(BagError, match='no topic.*QuaternionStamped') as caught:
+            topics.choose_topics([bag], Topics(attitude=asked), setup)
+        remedy = '/attitude is a TransformStamped: if it holds the attitudes, set attitude_message'
+        assert f'{remedy}: transform' in str(caught.value)
 
 
 def test_without_a_channel_the_refusal_names_the_option(bag: Path) -> None:
