@@ -33,7 +33,10 @@ def estimate_with_smallest_lens(
     OptionError
         For options that do not go together.
     """
-    bare = dataclasses.replace(options, residual_field=False)
+    # Every p-value is above it: a model gets no field, but what its stars do not exclude.
+    bare = options
+    if options.max_field_p_value > 0.0:
+        bare = dataclasses.replace(options, max_field_p_value=math.ulp(0.0))
     least, best = math.inf, prior
     own = len(COEFFICIENTS[prior.camera.model])
     for model in sorted(
