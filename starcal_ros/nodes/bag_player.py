@@ -23,8 +23,10 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError
 from starcal_ros.messages.types import (
     ATTITUDE_TYPE,
+    ATTITUDE_TYPES,
     CALIBRATION_TYPE,
     CAMERA_INFO_TYPE,
+    COMPRESSED_TYPE,
     IMAGE_TYPE,
     OBSERVATIONS_TYPE,
     STATUS_TYPE,
@@ -56,6 +58,8 @@ class BagPlayer(Node):
         if not self.own.bag:
             raise BagError('bag: path of the bag to play is missing')
         self._topics = reader.topics([self.own.bag])
+        # A star observer reads the raw images or the compressed ones.
+        self._images = set(self._of(IMAGE_TYPE) or self._of(COMPRESSED_TYPE))
         self._players = {}
         for topic in self._topics:
             if self.own.clock and topic.name == '/clock':
@@ -66,10 +70,10 @@ class BagPlayer(Node):
                 text = f'{topic.name}: {topic.type_name} is not installed here: skipped'
                 self.get_logger().warning(text)
                 continue
-            self._players[topic.name] = self.create_publisher(kind, topic.name, _offer(topic))
+            offer = _offer(topic, topic.name in self._images)
+            self._players[topic.name] = self.create_publisher(kind, topic.name, offer)
         if not self._players:
             raise BagError(f'{self.own.bag}: no topic has an installed message type')
-        self._images = {t.name for t in self._topics if t.type_name == IMAGE_TYPE}
         self._clock_publisher = (
             self.create_publisher(Clock, '/clock', QoSProfile(depth=10))
             if self.own.clock
@@ -128,18 +132,29 @@ class BagPlayer(Node):
 
     def _wait_for_subscribers(self) -> None:
         """Wait until the topics that matter have subscribers, or until the timeout."""
-        inputs = (IMAGE_TYPE, ATTITUDE_TYPE)
-        needed = [t.name for t in self._topics if t.type_name in inputs] or list(self._players)
+        attitudes = self._of(ATTITUDE_TYPE)
+        # Of other types, one holds the attitudes, and the others may be there for anything.
+        others = [] if attitudes else self._of(*ATTITUDE_TYPES.values())
+        needed = [*self._images, *attitudes] or list(self._players)
         other = self.own.wait_for_topic
         deadline_s = time.monotonic() + self.own.wait_for_subscribers_s
+
+        def is_read(name: str) -> bool:
+            return bool(self._players[name].get_subscription_count())
+
         while missing := [
-            *(name for name in needed if not self._players[name].get_subscription_count()),
+            *(name for name in needed if not is_read(name)),
+            *([] if not others or any(map(is_read, others)) else [' or '.join(others)]),
             *([other] if other and not self._other_subscribers(other) else []),
         ]:
             if time.monotonic() > deadline_s:
                 self.get_logger().warning(f'no subscriber on {", ".join(missing)}: playing anyway')
                 return
             self._sleep_until(time.monotonic() + 0.02)  # rclpy cannot wait for a match
+
+    def _of(self, *types: str) -> list[str]:
+        """Topics of the bag of some types."""
+        return [topic.name for topic in self._topics if topic.type_name in types]
 
     def _other_subscribers(self, topic: str) -> int:
         name = self.resolve_topic_name(topic)
@@ -193,10 +208,10 @@ class BagPlayer(Node):
         self.get_logger().warning(text)
 
 
-def _offer(topic: reader.Topic) -> QoSProfile:
+def _offer(topic: reader.Topic, is_image: bool) -> QoSProfile:
     if topic.type_name in _LATCHED_TYPES:
         return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    return QoSProfile(depth=_IMAGE_DEPTH if topic.type_name == IMAGE_TYPE else _OTHER_DEPTH)
+    return QoSProfile(depth=_IMAGE_DEPTH if is_image else _OTHER_DEPTH)
 
 
 def _listen(player: BagPlayer) -> None:
