@@ -37,7 +37,7 @@ def ros_fit(camera: CameraModel) -> tuple[CameraModel, float]:
         Largest pixel error over the grid.
     """
     if camera.intrinsics[1] == 0.0 and not camera.has_field:
-        return dataclasses.replace(camera, field=None), 0.0
+        return _bare(camera), 0.0
     free = [k for k, name in enumerate(camera.parameter_names) if name != 'skew']
     return _fit(dataclasses.replace(camera.replace(skew=0.0), field=None), free, camera)
 
@@ -60,7 +60,7 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
         For an unknown model.
     """
     if model == camera.model and not camera.has_field:
-        return dataclasses.replace(camera, field=None), 0.0
+        return _bare(camera), 0.0
     if model not in COEFFICIENTS:
         raise ValueError(f'lens model: {model!r} is not one of {", ".join(COEFFICIENTS)}')
     names = parameter_names(model)
@@ -101,6 +101,10 @@ def nearest_camera(
         return start, 0.0
     free = [k for k, name in enumerate(start.parameter_names) if name not in zero]
     return _fit(start, free, camera)
+
+
+def _bare(camera: CameraModel) -> CameraModel:
+    return camera if camera.field is None else dataclasses.replace(camera, field=None)
 
 
 def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[CameraModel, float]:
