@@ -34,8 +34,9 @@ def estimate_with_smallest_lens(
         For options that do not go together.
     """
     # Every p-value is above it: a model gets no field, but what its stars do not exclude.
+    is_tested = options.max_field_p_value > 0.0
     bare = options
-    if options.max_field_p_value > 0.0:
+    if is_tested:
         bare = dataclasses.replace(options, max_field_p_value=math.ulp(0.0))
     least, best = math.inf, prior
     own = len(COEFFICIENTS[prior.camera.model])
@@ -58,9 +59,8 @@ def estimate_with_smallest_lens(
                 raise
             continue  # the stars do not determine a model that large
         test = estimate.field_test
-        # A limit of 0 asks for no test: no field has a p-value below it.
-        p_value = 1.0 if options.max_field_p_value == 0.0 else test.p_value if test else math.nan
-        if p_value >= options.max_field_p_value:
+        passes = test is not None and test.p_value >= options.max_field_p_value
+        if passes or not is_tested:
             return estimate, started
         ratio = math.inf if test is None else test.log_likelihood_ratio
         if ratio < least:
