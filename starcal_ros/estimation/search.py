@@ -38,6 +38,8 @@ from starcal_ros.model_errors.image_variation import ImageVariation, shape_modes
 from starcal_ros.model_errors.residual_field import (
     best_prior,
     degree_for,
+    field_likelihood,
+    FieldLikelihood,
     FieldPrior,
     NO_WAVES,
     polynomials,
@@ -183,7 +185,7 @@ def _with_field(
     shown = _shown(found, table, camera, TEST_DEGREE)
     if shown is None:
         return plain
-    test = best_prior(shown.score, shown.camera, found.problem.free, TEST_DEGREE)
+    test = best_prior(shown.likelihood)
     found = plain = dataclasses.replace(found, field_test=test)
     if not options.residual_field:
         return plain
@@ -213,7 +215,7 @@ def _considering(found: Found, shown: _Shown, test: FieldPrior) -> Found:
 
     So its modes are in the covariance, and no line of sight moves by what no star shows.
     """
-    prior = unseen_prior(shown.score, shown.camera, found.problem.free, test)
+    prior = unseen_prior(shown.likelihood, test)
     problem = dataclasses.replace(found.problem, field_prior=prior)
     state = dataclasses.replace(found.solution.state, modes=np.zeros(prior.modes.shape[1]))
     normal = image_equations(
@@ -257,19 +259,15 @@ def _field_prior(
     None where the lens model has lines of sight for a small part of the detector only.
     """
     shown = _shown(found, table, camera, degree)
-    if shown is None:
-        return None
-    free = found.problem.free
-    return best_prior(shown.score, shown.camera, free, degree, waves, looks_for_waves)
+    return best_prior(shown.likelihood, waves, looks_for_waves) if shown else None
 
 
 @dataclass(frozen=True)
 class _Shown:
     """What the residuals at a minimum show of the polynomials of a degree, all else free."""
 
-    camera: CameraModel
     terms: LinearTerms
-    score: Score
+    likelihood: FieldLikelihood
 
 
 def _shown(found: Found, table: StarTable, camera: CameraModel, degree: int) -> _Shown | None:
@@ -290,7 +288,7 @@ def _shown(found: Found, table: StarTable, camera: CameraModel, degree: int) -> 
         coefficients = in_degree(now, degree)
         gradient = shown.gradient + shown.information @ coefficients
         shown = Score(gradient, shown.information)
-    return _Shown(camera, terms, shown)
+    return _Shown(terms, field_likelihood(shown, camera, problem.free, degree))
 
 
 def _robust_search(problem: Problem, start: State, measurements: Measurements) -> Minimum:

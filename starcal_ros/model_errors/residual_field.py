@@ -209,8 +209,8 @@ def _kernel_root(
 
 
 @dataclass(frozen=True)
-class _Likelihood:
-    """Score of the polynomials of a detector without what the lens model explains."""
+class FieldLikelihood:
+    """Score of the polynomials of a detector, less what the lens model explains."""
 
     camera: CameraModel
     degree: int
@@ -255,30 +255,22 @@ class _Likelihood:
 
 
 def best_prior(
-    score: Score,
-    camera: CameraModel,
-    free: NDArray[np.int64],
-    degree: int,
-    waves: Waves = NO_WAVES,
-    looks_for_waves: bool = False,
+    shown: FieldLikelihood, waves: Waves = NO_WAVES, looks_for_waves: bool = False
 ) -> FieldPrior:
     """
     Return the prior of the largest marginal likelihood.
 
     Parameters
     ----------
-    score : Score
-        Of the terms of `polynomials` of that degree, at a field of zero.
-    free : (f,) int
-        Camera parameters that are estimated.
+    shown : FieldLikelihood
+        At a field of zero.
     waves : Waves
         Dominant waves.
     looks_for_waves : bool
         Whether better ones are looked for, from those given or from the spectrum; never in the
         test of no field, whose p-value is of smooth kernels.
     """
-    shown = _likelihood(score, camera, free, degree)
-    span = shown.span
+    camera, span = shown.camera, shown.span
     known = waves
     found = [(*shown.best_amplitude(length, known), length) for length in _LENGTHS]
     ratio, amplitude_px, length = max(found)
@@ -294,7 +286,7 @@ def best_prior(
     return FieldPrior(
         camera.width,
         camera.height,
-        degree,
+        shown.degree,
         modes,
         amplitude_px,
         length,
@@ -304,9 +296,7 @@ def best_prior(
     )
 
 
-def unseen_prior(
-    score: Score, camera: CameraModel, free: NDArray[np.int64], tested: FieldPrior
-) -> FieldPrior:
+def unseen_prior(shown: FieldLikelihood, tested: FieldPrior) -> FieldPrior:
     """
     Return the prior of what may be there where the test shows no field.
 
@@ -315,14 +305,8 @@ def unseen_prior(
     and before the stars are asked every factor of ten of s from 1e-5 to 10 px is as likely.  The
     amplitude of the prior is the root of the mean of s^2 that the stars leave.
 
-    Parameters
-    ----------
-    score, camera, free
-        Those of `best_prior`.
-    tested : FieldPrior
-        Its answer, without waves.
+    ``tested`` is the answer of `best_prior`, without waves.
     """
-    shown = _likelihood(score, camera, free, tested.degree)
     log_ratio = 0.5 * shown.ratios(shown.patterns, _UNSEEN_PX)
     weight = np.exp(log_ratio - log_ratio.max())
     amplitude_px = float(np.sqrt(weight @ _UNSEEN_PX**2 / weight.sum()))
@@ -330,11 +314,23 @@ def unseen_prior(
     return dataclasses.replace(tested, modes=modes, amplitude_px=amplitude_px)
 
 
-def _likelihood(
+def field_likelihood(
     score: Score, camera: CameraModel, free: NDArray[np.int64], degree: int
-) -> _Likelihood:
+) -> FieldLikelihood:
+    """
+    Return the likelihood of fields beside a lens model.
+
+    Parameters
+    ----------
+    score : Score
+        Of the terms of `polynomials` of that degree, at a field of zero.
+    camera : CameraModel
+    free : (f,) int
+        Camera parameters that are estimated.
+    degree : int
+    """
     span = spanned_by_lens(camera, free, degree)
-    return _Likelihood(
+    return FieldLikelihood(
         camera,
         degree,
         span,
@@ -345,7 +341,7 @@ def _likelihood(
 
 
 def _candidates(
-    shown: _Likelihood, length: float, known: Waves, mean: Floats
+    shown: FieldLikelihood, length: float, known: Waves, mean: Floats
 ) -> tuple[Waves, ...]:
     """Waves of one component or of both, near known ones or by the mean field (2 t,)."""
     # The amplitude is that of both components: each wave is looked for beside one of the other.
@@ -359,7 +355,7 @@ def _candidates(
 
 
 def _refined(
-    shown: _Likelihood, length: float, waves: tuple[Wave, Wave], component: int
+    shown: FieldLikelihood, length: float, waves: tuple[Wave, Wave], component: int
 ) -> tuple[Wave, Wave]:
     """Waves with the most likely one in a component, near the one that it has."""
 
