@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 import contextlib
 import fcntl
-import glob
 import os
 from pathlib import Path
 import secrets
@@ -54,7 +53,11 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
 def _remove_abandoned(path: Path) -> None:
     """Remove unfinished files for a place whose writers have ended."""
-    for part in path.parent.glob(f'.{glob.escape(path.name)}.*{PART}'):
+    parts = []
+    with contextlib.suppress(OSError), os.scandir(path.parent) as entries:
+        beside = [entry.name for entry in entries if entry.name.startswith(f'.{path.name}.')]
+        parts = [path.with_name(name) for name in beside if name.endswith(PART)]
+    for part in parts:
         with contextlib.suppress(OSError):
             number = os.open(part, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
             try:

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.estimation.calibrate import Estimate
@@ -171,9 +171,10 @@ def _predicted(
     except np.linalg.LinAlgError:
         return None
     Gr = Gr + GJ @ cho_solve(without, GJ.T @ r)
-    # Diagonals of G and of G J (N - M)^-1 J' G.
-    variance = 1.0 - (solve_triangular(factor[0], K.T, lower=True) ** 2).sum(axis=0)
-    variance += np.einsum('ij,ji->i', GJ, cho_solve(without, GJ.T))
+    # Diagonals of G and of G J (N - M)^-1 J' G.  The inverse of the small matrix is formed, as its
+    # product with many rows takes a tenth of the time of their solution.
+    variance = 1.0 - ((K @ cho_solve(factor, np.eye(K.shape[1]))) * K).sum(axis=1)
+    variance += ((GJ @ cho_solve(without, np.eye(d))) * GJ).sum(axis=1)
     return (Gr**2).reshape(2, n).sum(axis=0), variance.reshape(2, n).sum(axis=0)
 
 

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Message types for bags: those of ROS 2 Jazzy and of starcal, as rosbags types."""
+"""Message types for bags: those of ROS 2 that starcal uses, and its own, as rosbags types."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
+from starcal_ros.bag.ros_types import DEFINITIONS, ROOT
 from starcal_ros.errors import BagError
 from starcal_ros.messages.types import Message
 
@@ -31,8 +32,9 @@ def make_message(type_name: str, /, **fields: Any) -> Message:
 
 @functools.lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """Types of ROS 2 Jazzy and of starcal."""
-    store = get_typestore(Stores.ROS2_JAZZY)
+    """Types of ROS 2 that starcal uses, and its own."""
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(DEFINITIONS, ROOT))
     folder = _definitions_folder()
     for path in sorted(folder.glob('*.msg')):
         store.register(get_types_from_msg(path.read_text(), f'starcal/msg/{path.stem}'))

@@ -14,9 +14,9 @@ import threading
 from starcal_ros.diagnosis.attitude_reading import SetUp, WireAttitudes
 from starcal_ros.diagnosis.diagnose import diagnose, Diagnosis
 from starcal_ros.records import Image
+from starcal_ros.safe_path import module_command
 from starcal_ros.sky.catalog import load_catalog
 
-_COMMAND = 'from starcal_ros.diagnosis.process import answer; answer()'
 _LOWEST_PRIORITY = 19
 
 
@@ -52,7 +52,7 @@ class DiagnosisProcess:
             if self._stopped:
                 return None
             process = self._process = subprocess.Popen(
-                [sys.executable, '-c', _COMMAND],
+                module_command('starcal_ros.diagnosis.process'),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 env=environment,
@@ -80,3 +80,7 @@ def answer() -> None:
     catalog = load_catalog(path, question.magnitude_limit)
     found = diagnose(question.images, question.attitudes, question.setup, catalog)
     sys.stdout.buffer.write(pickle.dumps(found))
+
+
+if __name__ == '__main__':
+    answer()

@@ -15,7 +15,6 @@ import dataclasses
 from dataclasses import dataclass
 import json
 from pathlib import Path
-import re
 from typing import Annotated, Any
 
 import numpy as np
@@ -118,10 +117,18 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
     ProductError
         When the file cannot be written.
     """
-    text = json.dumps(calibration_content(calibration), indent=1, allow_nan=False)
-    # A row of a grid on one line; JSON text has no line break inside a string.
-    text = re.sub(r'\[\n([^][{}"]+)\n *\]', lambda row: f'[{" ".join(row[1].split())}]', text)
-    write_atomically(path, text + '\n')
+    write_atomically(path, f'{_text(calibration_content(calibration))}\n')
+
+
+def _text(value: object, margin: str = '\n') -> str:
+    """JSON text: a key or an item on a line, a list of numbers, as a row of a grid, on one."""
+    inner = f'{margin} '
+    if isinstance(value, dict) and value:
+        rows = [f'{json.dumps(key)}: {_text(item, inner)}' for key, item in value.items()]
+        return f'{{{inner}{f",{inner}".join(rows)}{margin}}}'
+    if isinstance(value, list) and {dict, list, str} & set(map(type, value)):
+        return f'[{inner}{f",{inner}".join(_text(item, inner) for item in value)}{margin}]'
+    return json.dumps(value, allow_nan=False)
 
 
 def read_calibration(path: Path) -> Calibration:

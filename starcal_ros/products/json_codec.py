@@ -81,7 +81,8 @@ def _written(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(name): _written(item) for name, item in value.items()}
     if isinstance(value, np.ndarray):
-        return _written(value.tolist())
+        finite = value.dtype.kind != 'f' or np.isfinite(value).all()
+        return value.tolist() if finite else _written(value.tolist())
     if isinstance(value, (list, tuple)):
         return [_written(item) for item in value]
     if isinstance(value, np.generic):
@@ -138,6 +139,16 @@ def _number(value: object, key: str, null: bool) -> float:
     return number
 
 
+def _are_numbers(value: object) -> bool:
+    """Whether a value is a list of finite numbers: tested at once, as grids have thousands."""
+    if not isinstance(value, list) or not set(map(type, value)) <= {float, int}:
+        return False
+    try:
+        return all(map(math.isfinite, value))
+    except OverflowError:  # an integer that no float holds
+        return False
+
+
 def _items(value: object, key: str) -> list[Any]:
     if not isinstance(value, list):
         raise _error(key, value, 'a list')
@@ -159,6 +170,8 @@ def _array(kind: FieldType, value: object, key: str, sizes: dict[str, int]) -> N
     def rows(value: object, key: str, depth: int) -> Any:
         if depth == 0:
             return _scalar(wanted, kind, value, key)
+        if depth == 1 and wanted is float and _are_numbers(value):
+            return value
         found = [rows(item, f'{key}[{k}]', depth - 1) for k, item in enumerate(_items(value, key))]
         if depth > 1 and len({len(row) for row in found}) > 1:
             raise ValueError(f'{key}: rows of different length')

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import pytest
+from rosbags.typesys import get_typestore, Stores
 
-from starcal_ros.bag.typestore import described, typestore_with
+from starcal_ros.bag.typestore import described, typestore, typestore_with
 from starcal_ros.errors import BagError
 from starcal_ros.messages.types import CALIBRATION_TYPE, OBSERVATIONS_TYPE
 
@@ -45,3 +46,13 @@ def test_others_are_refused(definition: str, why: str) -> None:
 def test_a_name_is_no_code() -> None:
     with pytest.raises(BagError, match='not a type name'):
         typestore_with("starcal/msg/X'); import os; ('", 'int8 x\n')
+
+
+@pytest.mark.parametrize('release', [Stores.ROS2_JAZZY, Stores.ROS2_KILTED])
+def test_the_types_are_those_of_the_ros_releases(release: Stores) -> None:
+    theirs = get_typestore(release)
+    shared = [name for name in typestore().types if not name.startswith('starcal/')]
+    assert 'sensor_msgs/msg/CameraInfo' in shared
+    for name in shared:
+        assert typestore().hash_rihs01(name) == theirs.hash_rihs01(name)
+        assert described(name)[0] == theirs.generate_msgdef(name, ros_version=2)[0]

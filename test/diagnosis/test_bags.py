@@ -62,7 +62,12 @@ def test_attitudes_that_are_no_rotation_are_left_out() -> None:
     assert len(wire_attitudes([], []).quaternion) == 0
 
 
-def test_a_process_of_its_own(unaligned: Setup) -> None:
+def test_a_process_of_its_own(
+    unaligned: Setup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # In the folder of an untrusted bag: nothing that lies there is imported.
+    (tmp_path / 'cv2.py').write_text('raise SystemExit(9)')
+    monkeypatch.chdir(tmp_path)
     images = reader.read_images([TINY], '/opnav/image_raw', 0.0)
     three = tuple(i for _, i in zip(range(3), images, strict=False) if isinstance(i, Image))
     setup = dataclasses.replace(set_up(unaligned), attitude_direction='inertial_to_st')

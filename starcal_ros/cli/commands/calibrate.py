@@ -111,31 +111,52 @@ def calibrate_into(
     make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     write_observations(observations, folder, setup.frames.camera_frame)
-    try:
-        calibration, left = _solve(observations, setup, inputs())
-        if calibration.accepted and topics.image:
-            again = measured_again(bags, topics, setup, calibration.geometry, observations)
-            gained = _used(again) - _used(observations)
-            if gained:
-                print(
-                    f'{gained} images matched nothing at first, and are used with the calibration'
-                    ' of the others',
-                    file=sys.stderr,
-                )
-                observations = again
-                write_observations(observations, folder, setup.frames.camera_frame)
-                calibration, left = _solve(observations, setup, inputs())
-    except TooFewObservations as error:
-        failure = _failure(str(error), bags, asked, setup, observations, bool(topics.image))
-        _write_failure(folder, failure, expected.pictures)
-        raise TooFewObservations(failure.reason) from error
-    write_products(calibration, folder, left)
-    thumbnails.write_thumbnails(album.thumbnails(), folder / thumbnails.THUMBNAILS_FOLDER)
+    with ThreadPoolExecutor(1, 'pictures') as thread:
+        drawn = thread.submit(album.thumbnails)
+        try:
+            calibration, left, observations = _solve_twice(
+                folder, bags, topics, setup, inputs(), observations
+            )
+        except TooFewObservations as error:
+            failure = _failure(str(error), bags, asked, setup, observations, bool(topics.image))
+            _write_failure(folder, failure, expected.pictures)
+            raise TooFewObservations(failure.reason) from error
+        pictures = folder / thumbnails.THUMBNAILS_FOLDER
+        written = thread.submit(thumbnails.write_thumbnails, drawn.result(), pictures)
+        write_products(calibration, folder, left)
+        written.result()
     return calibration, observations
 
 
+def _solve_twice(
+    folder: Path,
+    bags: Sequence[Path],
+    topics: Topics,
+    setup: Setup,
+    inputs: Mapping[str, str],
+    observations: list[StarObservations],
+) -> tuple[Calibration, Residuals, list[StarObservations]]:
+    """Solve, and once more if that calibration identifies stars in images that matched nothing."""
+    calibration, left = _solve(observations, setup, inputs)
+    if not (calibration.accepted and topics.image):
+        return calibration, left, observations
+    again = measured_again(bags, topics, setup, calibration.geometry, observations)
+    gained = _used(again) - _used(observations)
+    if not gained:
+        return calibration, left, observations
+    print(
+        f'{gained} images matched nothing at first, and are used with the calibration of the'
+        ' others',
+        file=sys.stderr,
+    )
+    write_observations(again, folder, setup.frames.camera_frame)
+    return *_solve(again, setup, inputs), again
+
+
 def _solve(
-    observations: Sequence[StarObservations], setup: Setup, inputs: Mapping[str, str]
+    observations: Sequence[StarObservations],
+    setup: Setup,
+    inputs: Mapping[str, str],
 ) -> tuple[Calibration, Residuals]:
     ensemble = Ensemble()
     for record in observations:

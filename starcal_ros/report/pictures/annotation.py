@@ -122,10 +122,12 @@ def stretch(pixels: Pixels) -> NDArray[np.uint8]:
     dark, sky, bright = np.percentile(sample, [1.0, 50.0, 99.9])
     noise = max(float(sky - dark) / 2.3, 0.5)
     top = max(float(bright - sky), 30.0 * noise)
-    levels = np.arange(int(np.iinfo(pixels.dtype).max) + 1, dtype=np.float32)
-    curve = np.arcsinh((levels - (sky - noise)) / (2.0 * noise)) / np.arcsinh(top / (2.0 * noise))
-    table = np.asarray(np.clip(20.0 + 220.0 * curve, 0.0, 255.0), np.uint8)
-    return np.asarray(table[pixels])
+    by_table = pixels.size > np.iinfo(pixels.dtype).max
+    levels = np.arange(int(np.iinfo(pixels.dtype).max) + 1) if by_table else pixels
+    signal = (levels.astype(np.float32) - (sky - noise)) / (2.0 * noise)
+    curve = np.arcsinh(signal) / np.arcsinh(top / (2.0 * noise))
+    shown = np.asarray(np.clip(20.0 + 220.0 * curve, 0.0, 255.0), np.uint8)
+    return np.asarray(shown[pixels]) if by_table else shown
 
 
 def _draw_mark(picture: Picture, mark: Mark, place: Sequence[int], size: float) -> None:
