@@ -8,11 +8,12 @@ VENV := .venv$(filter-out -jazzy,-$(ROS_DISTRO))$(filter-out -newest,-$(VERSIONS
 # An environment keeps the interpreter it was made with unless another is asked for.
 PYTHON ?= $(or $(wildcard $(VENV)/bin/python),python3)
 RUN := $(VENV)/bin
+MAKE_VENV = $(PYTHON) tools/make_venv.py $(VENV) --ros $(ROS_DISTRO) --versions $(VERSIONS)
 
 .PHONY: setup demo test bench lint docs help
 
 setup:
-	@$(PYTHON) tools/make_venv.py $(VENV) --ros $(ROS_DISTRO) --versions $(VERSIONS)
+	@$(MAKE_VENV)
 
 demo: setup
 	$(RUN)/starcal demo
@@ -29,8 +30,8 @@ else
 	exit $$failed
 endif
 
-bench: setup
-	@$(RUN)/python -m pip install --quiet --requirement requirements/bench.txt
+bench:
+	@$(MAKE_VENV) --also bench
 	$(RUN)/python -m bench
 
 lint: setup
@@ -39,8 +40,8 @@ lint: setup
 	$(RUN)/mypy
 	$(RUN)/lint-imports --no-logo
 
-docs: setup
-	@$(RUN)/python -m pip install --quiet --requirement requirements/docs.txt
+docs:
+	@$(MAKE_VENV) --also docs
 	$(RUN)/python -m sphinx -W --keep-going --quiet --jobs auto docs docs/_build/html
 	@echo the site: docs/_build/html/index.html
 

@@ -24,6 +24,7 @@ import sysconfig
 
 ROOT = Path(__file__).resolve().parent.parent
 OLDEST_PYTHON, NEWEST_PYTHON = (3, 10), (3, 13)
+HASHES = ROOT / 'requirements/hashes.txt'
 WHEELS_STAMP, PACKAGE_STAMP = '.starcal-wheels', '.starcal-package'
 SOURCED = ('AMENT_', 'CMAKE_PREFIX_PATH', 'COLCON_', 'PYTHONHOME', 'PYTHONPATH', 'ROS_')
 
@@ -39,15 +40,28 @@ def main() -> None:
         default='newest',
         help='of Python packages: requirements/oldest.txt has those of Ubuntu 24.04',
     )
+    parser.add_argument(
+        '--also',
+        action='append',
+        default=[],
+        choices=('docs', 'bench'),
+        help='install these requirements too',
+    )
     args = parser.parse_args()
     venv = args.venv.absolute()
     packages = ('oldest',) if args.versions == 'oldest' else ('runtime', 'mission', 'dev')
     names = (*packages, 'colcon', args.ros)
     requirements = [ROOT / 'requirements' / f'{name}.txt' for name in names]
     check_request(args.ros, requirements[-1])
+    bring_up_to_date(venv, args.ros, requirements)
+    for name in args.also:
+        pip_install(venv, [ROOT / 'requirements' / f'{name}.txt'])
 
+
+def bring_up_to_date(venv: Path, ros: str, requirements: list[Path]) -> None:
+    """Make the steps whose inputs have changed."""
     # The interfaces are generated and compiled by the wheels: new wheels, new interfaces.
-    wheels = digest([Path(__file__), *requirements], f'{args.ros} {python_name()}')
+    wheels = digest([Path(__file__), HASHES, *requirements], f'{ros} {python_name()}')
     package = digest(package_inputs(), wheels)
     if is_stamped(venv, WHEELS_STAMP, wheels) and is_stamped(venv, PACKAGE_STAMP, package):
         return
@@ -62,7 +76,7 @@ def main() -> None:
     if not is_stamped(venv, PACKAGE_STAMP, package):
         install_package(venv)
         write_stamp(venv, PACKAGE_STAMP, package)
-    print(f'{shown(venv)}: ROS 2 {args.ros.capitalize()}, {python_name()}: ready', flush=True)
+    print(f'{shown(venv)}: ROS 2 {ros.capitalize()}, {python_name()}: ready', flush=True)
 
 
 def check_request(distro: str, distro_requirements: Path) -> None:
@@ -156,13 +170,36 @@ def install_wheels(venv: Path, requirements: list[Path]) -> None:
         run([sys.executable, '-m', 'venv', '--clear', str(venv)])
 
     say('installing wheels from PyPI (about a minute)')
-    runtime = requirements[0]
-    pip(venv, 'install', '--only-binary', ':all:', '--requirement', runtime)
+    pip_install(venv, requirements[:1])
     # empy alone has no wheel; it is built with the pinned setuptools that has just come.
-    everything = [word for path in requirements for word in ('--requirement', path)]
-    no_wheel = ('--no-binary', 'empy', '--no-build-isolation', '--use-pep517')
-    pip(venv, 'install', '--only-binary', ':all:', *no_wheel, *everything)
+    pip_install(venv, requirements, '--no-binary', 'empy', '--no-build-isolation', '--use-pep517')
     point_cmake_files_here(venv)
+
+
+def pip_install(venv: Path, requirements: list[Path], *options: str) -> None:
+    """Install pinned versions, and of these only files whose digests are in hashes.txt."""
+    together = venv / 'requirements.txt'
+    together.write_text('\n'.join(line for path in requirements for line in hashed_lines(path)))
+    pip(venv, 'install', '--only-binary', ':all:', *options, '--require-hashes', '-r', together)
+
+
+def hashed_lines(path: Path) -> list[str]:
+    """Return the requirements of a file, each with the digests of its files."""
+    digests: dict[str, list[str]] = {}
+    for line in HASHES.read_text().splitlines():
+        if not line.startswith('#'):
+            pin, value, _ = line.split()
+            digests.setdefault(pin, []).append(f'--hash={value}')
+    lines = []
+    for line in path.read_text().splitlines():
+        text = line.partition('#')[0].strip()
+        if text:
+            name, _, version = text.partition(';')[0].strip().partition('==')
+            pin = f'{re.sub("[-_.]+", "-", name.partition("[")[0]).lower()}=={version}'
+            if pin not in digests:
+                sys.exit(f'{pin} is not in {shown(HASHES)}: python -m tools.write_hashes')
+            lines.append(' '.join([text, *digests[pin]]))
+    return lines
 
 
 def point_cmake_files_here(venv: Path) -> None:
