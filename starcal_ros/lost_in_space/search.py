@@ -91,10 +91,10 @@ class SkyMatch:
 
 @dataclass(frozen=True)
 class NotFound:
-    """Reason why no stars were identified, and the log10 p-value of the best fit."""
+    """Reason why no stars were identified, and the log10 p-value of the best fit, if any."""
 
     reason: str
-    log10_p_value: float = 0.0
+    log10_p_value: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def find_sky(
     images = [SourceImage(xy_px, camera)]
     if try_mirrored:
         images.append(SourceImage(mirror(xy_px, camera.width), mirrored_camera(camera)))
-    least = 0.0
+    least = math.inf
     for before, sources in rounds:
         if len(xy_px) <= before:
             break

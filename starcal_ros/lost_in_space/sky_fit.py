@@ -205,9 +205,13 @@ def _step(
 
 
 def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tuple[float, float]:
-    """Decadic logarithm of the expected number of false matches this good, and its radius, px."""
+    """
+    Decadic logarithm of the expected number of false matches this good, and its radius, px.
+
+    Infinite with fewer than five stars near their predictions.
+    """
     _, xy_px = predicted(catalog, fit, _MOST_STARS)
-    best, best_radius_px = 0.0, _JUDGED_PX[-1]
+    best, best_radius_px = math.inf, _JUDGED_PX[-1]
     depths = [n for n in _DEPTHS if n < len(xy_px)] + [len(xy_px)]
     for n in depths:
         if n < 5:
