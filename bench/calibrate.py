@@ -43,7 +43,6 @@ _STAGES = (
     ('write the observations', 'products/folder', 'write_observations'),
     ('solve and judge', 'pipeline/solve', 'solve_with_residuals'),
     ('  estimates', 'estimation/calibrate', 'estimate_calibration'),
-    ('draw and write pictures', 'report/pictures/thumbnails', 'thumbnails'),
     ('report', 'report/page', 'write_report'),
     ('  figures', 'report/charts', 'charts_of'),
 )

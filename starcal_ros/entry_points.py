@@ -36,6 +36,8 @@ def _run(name: str) -> int:
     # Unless nohup or a shell ignores it; `main` sets the handler of the node.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # `starcal play` and `starcal monitor` block it until here.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     module = importlib.import_module(f'starcal_ros.nodes.{name}')
     return int(module.main())
 

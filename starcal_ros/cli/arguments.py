@@ -10,6 +10,7 @@ import difflib
 from pathlib import Path
 import re
 import sys
+from types import FrameType
 from typing import Any, NoReturn
 
 from starcal_ros.cli import mission_arguments
@@ -43,12 +44,24 @@ def complain(text: str) -> int:
     return EXIT_BAD_INPUT
 
 
+_interrupts: list[int] = []  # the signals that came
+
+
+def on_interrupt(number: int, _frame: FrameType | None) -> NoReturn:
+    """Handle SIGINT as Python does, and remember it for `is_interrupt`."""
+    _interrupts.append(number)
+    raise KeyboardInterrupt
+
+
 def is_interrupt(error: BaseException) -> bool:
     """
     Return True for a Ctrl-C, and for an error that one became.
 
-    A module in C that is interrupted while it is loaded raises ImportError or SystemError.
+    A module in C that is interrupted while it is loaded raises ImportError or SystemError, not
+    always with the KeyboardInterrupt as its cause.
     """
+    if _interrupts:
+        return True
     seen: BaseException | None = error
     while seen is not None and not isinstance(seen, KeyboardInterrupt):
         seen = seen.__cause__ or seen.__context__

@@ -20,11 +20,12 @@ def main() -> int:
     if is_default:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from starcal_ros.cli import main as tool
+    from starcal_ros.cli.arguments import on_interrupt
 
-    signal.signal(signal.SIGINT, before)
     if is_default:
         sys.unraisablehook = _interrupt_again
-        signal.signal(signal.SIGALRM, signal.default_int_handler)
+        signal.signal(signal.SIGALRM, on_interrupt)
+        signal.signal(signal.SIGINT, on_interrupt)
     try:
         return tool.main()
     finally:

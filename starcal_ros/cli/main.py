@@ -78,14 +78,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         discard('stdout')
         return complain(f'{error.filename or "input/output"}: {error.strerror or error}')
-    except ModuleNotFoundError as error:
+    except (KeyboardInterrupt, ImportError, SystemError) as error:
+        if is_interrupt(error):
+            complain('interrupted')
+            return EXIT_INTERRUPTED
+        if not isinstance(error, ModuleNotFoundError):
+            raise
         extra = {'campaign': 'studies', 'trend': 'mission'}.get(command, 'report')
         return complain(missing_extra(error, extra))
-    except (KeyboardInterrupt, ImportError, SystemError) as error:
-        if not is_interrupt(error):
-            raise
-        complain('interrupted')
-        return EXIT_INTERRUPTED
 
 
 def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:
@@ -250,8 +250,7 @@ def _play(args: argparse.Namespace) -> int:
     if not 0 <= args.rate <= 1e6:
         raise OptionError(f'--rate: {args.rate} is not within 0 to 1e6')
     _check_remaps(args.remap)
-    sys.stdout.flush()
-    os.execv(sys.executable, demo.player_command(args.bag, args.rate, args.remap))
+    return demo.become(demo.player_command(args.bag, args.rate, args.remap))
 
 
 def _check_remaps(remaps: Sequence[str]) -> None:
@@ -269,8 +268,7 @@ def _monitor(args: argparse.Namespace) -> int:
         raise OptionError(f'--once: {args.once:g} s is not within 0 to 3600')
     if args.once is None and not sys.stdout.isatty():
         raise OptionError('--once: needed where the output is not a terminal, e.g. --once 5')
-    sys.stdout.flush()
-    os.execv(sys.executable, demo.monitor_command(args.once, args.remap))
+    return demo.become(demo.monitor_command(args.once, args.remap))
 
 
 def _simulate(args: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ from pathlib import Path
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -569,3 +570,39 @@ def test_another_error_of_an_import_stays(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setitem(main._COMMANDS, 'compare', broken)
     with pytest.raises(ImportError, match='libfreetype'):
         main.main(['compare', 'a', 'b'])
+
+
+def test_a_ctrl_c_whose_error_has_lost_its_cause_is_one() -> None:
+    """As NumPy raises it, whose import of its own modules catches ImportError."""
+    code = """
+import os, signal, sys, time
+from starcal_ros.cli import entry_point, main
+
+def interrupted(_args):
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(60)
+    except KeyboardInterrupt:
+        pass
+    raise ModuleNotFoundError('Error importing numpy')
+
+main._COMMANDS['inspect'] = interrupted
+sys.argv = ['starcal', 'inspect', 'x']
+sys.exit(entry_point.main())
+"""
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, 'starcal: interrupted\n')
+
+
+def test_a_ctrl_c_while_the_player_starts_is_silent() -> None:
+    code = """
+import os, signal
+from pathlib import Path
+from starcal_ros.cli.commands import demo
+
+become = os.execv
+os.execv = lambda *command: (os.kill(os.getpid(), signal.SIGINT), become(*command))
+demo.become(demo.player_command(Path('none'), 1.0, []))
+"""
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, '')

@@ -13,7 +13,9 @@ import select
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
+from typing import NoReturn
 
 import numpy as np
 import yaml
@@ -131,6 +133,16 @@ def run(
         dead = next((name for name, node in nodes.items() if node.poll()), 'demo_client')
         last = (folder / f'{dead}.log').read_text(errors='replace').strip().rpartition('\n')[2]
         raise NodeError(f'{dead} ended before the calibration: {last}')
+
+
+def become(command: list[str]) -> NoReturn:
+    """Replace this process; a Ctrl-C waits until the new one answers it without a traceback."""
+    sys.stdout.flush()
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        os.execv(sys.executable, command)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def player_command(path: Path, rate: float, remaps: Sequence[str]) -> list[str]:
