@@ -14,11 +14,12 @@ from starcal_ros.trend.tasks import compute, failed, Task
 
 @dataclass(frozen=True)
 class Done:
-    """How many tasks were computed, failed, or were in the table before."""
+    """How many tasks were computed, failed, were in the table before, or repeat another one."""
 
     computed: int
     failed: int
     known: int
+    repeated: int
 
 
 def update(
@@ -47,7 +48,10 @@ def update(
     OptionError
         When no scheduler answers at the address.
     """
-    new = [task for task in tasks if task.key not in table]
+    different: dict[str, Task] = {}
+    for task in tasks:
+        different.setdefault(task.key, task)
+    new = [task for task in different.values() if task.key not in table]
     count = failures = 0
     with table, contextlib.closing(stream_each(compute, new, workers, scheduler)) as found:
         for number, result in found:
@@ -59,4 +63,4 @@ def update(
             count += not row.error
             failures += bool(row.error)
             on_row()
-    return Done(count, failures, len(tasks) - len(new))
+    return Done(count, failures, len(different) - len(new), len(tasks) - len(different))

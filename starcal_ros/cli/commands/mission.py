@@ -118,7 +118,8 @@ def _trend(args: argparse.Namespace) -> int:
         done = fleet.update(table, found, args.workers, args.scheduler, advance)
     rows = table.rows()
     path = page.write_page(rows, args.output, str(args.root))
-    print_text(f'{done.computed} new, {done.known} known before, {done.failed} failed')
+    copies = f', {done.repeated} the same as another' if done.repeated else ''
+    print_text(f'{done.computed} new, {done.known} known before, {done.failed} failed{copies}')
     for row in [row for row in rows if row.error][:_FAILURES_SHOWN]:
         print_text(f'failed: {row.path}: {row.error}')
     print_text(f'{page.span_years(rows):.2f} years; look at {path}')
