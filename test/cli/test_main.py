@@ -578,6 +578,8 @@ def test_a_ctrl_c_whose_error_has_lost_its_cause_is_one() -> None:
 import os, signal, sys, time
 from starcal_ros.cli import entry_point, main
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+
 def interrupted(_args):
     try:
         os.kill(os.getpid(), signal.SIGINT)
@@ -600,6 +602,7 @@ import os, signal
 from pathlib import Path
 from starcal_ros.cli.commands import demo
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 become = os.execv
 os.execv = lambda *command: (os.kill(os.getpid(), signal.SIGINT), become(*command))
 demo.become(demo.player_command(Path('none'), 1.0, []))
