@@ -131,8 +131,13 @@ class CameraModel:
         return self.parameters[5:]
 
     @property
+    def moving_field(self) -> DetectorField | None:
+        """The field where it moves pixels; one of zeros is there for its covariance."""
+        return self.field if self.has_field else None
+
+    @property
     def has_field(self) -> bool:
-        """True where a field moves pixels; one of zeros is there for its covariance."""
+        """True where a field moves pixels."""
         return self.field is not None and bool(self.field.coefficients.any())
 
     @property
@@ -239,11 +244,12 @@ def project(camera: CameraModel, directions_camera: Floats) -> Floats:
     """
     directions = np.asarray(directions_camera, np.float64)
     ideal = project_parameters(camera.model, camera.parameters, directions)
-    if camera.field is None or not camera.has_field:
+    field = camera.moving_field
+    if field is None:
         return ideal
     pixels = ideal
     for _ in range(_FIELD_STEPS):
-        pixels = ideal + camera.field.displacement_px(pixels)
+        pixels = ideal + field.displacement_px(pixels)
     return pixels
 
 
@@ -329,8 +335,8 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     model, distortion = camera.model, camera.distortion
     fold2 = fold_radius2(model, distortion)
     pixels = np.asarray(pixels, np.float64)
-    if camera.field is not None and camera.has_field:
-        pixels = pixels - camera.field.displacement_px(pixels)
+    if (field := camera.moving_field) is not None:
+        pixels = pixels - field.displacement_px(pixels)
     fx, skew, fy, cx, cy = camera.intrinsics
     yd = (pixels[..., 1] - cy) / fy
     xd = (pixels[..., 0] - cx - skew * yd) / fx

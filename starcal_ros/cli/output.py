@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_ros.assessment.agreement import alignment_difference_rad
-from starcal_ros.assessment.comparison import Comparison, DifferenceMap
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.cli.terminal import print_table, print_text, print_verdict
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
@@ -23,6 +21,7 @@ if TYPE_CHECKING:
 
 def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     """Print parameters, statistics and verdict; changes are relative to the prior."""
+    from starcal_ros.assessment.agreement import alignment_difference_rad
     from starcal_ros.estimation import star_trackers
     from starcal_ros.model_errors import temperature
 

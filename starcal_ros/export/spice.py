@@ -239,11 +239,11 @@ def _lens_values(camera: CameraModel) -> dict[str, Value]:
         'LENS_COEFFICIENTS': camera.distortion.tolist(),
         'LENS_TERMS': names,
     }
-    if camera.field is not None and camera.has_field:
+    if (field := camera.moving_field) is not None:
         values |= {
-            'FIELD_DEGREE': camera.field.degree,
-            'FIELD_U_PX': camera.field.coefficients[0].tolist(),
-            'FIELD_V_PX': camera.field.coefficients[1].tolist(),
+            'FIELD_DEGREE': field.degree,
+            'FIELD_U_PX': field.coefficients[0].tolist(),
+            'FIELD_V_PX': field.coefficients[1].tolist(),
         }
     return values
 
@@ -259,7 +259,7 @@ def _lens_comments(camera: CameraModel, names: SpiceNames) -> list[str]:
         "   u = FOCAL_LENGTH_PX(1) x' + SKEW_PX y' + CCD_CENTER(1)",
         "   v = FOCAL_LENGTH_PX(2) y' + CCD_CENTER(2)",
     ]
-    if camera.field is not None and camera.has_field:
+    if camera.has_field:
         lines += [
             '',
             'A star that these equations place at (u, v) is measured at (U, V) with',

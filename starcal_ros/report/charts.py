@@ -44,10 +44,10 @@ def charts_of(
             'Contours of the length of the distortion vectors; a longer one has a thicker line.',
         ),
     }
-    if camera.field is not None and camera.has_field:
+    if (field := camera.moving_field) is not None:
         charts['lens_field'] = Chart(
             'Residual field beside the lens model',
-            detector_figures.field_vectors(camera.field, camera),
+            detector_figures.field_vectors(field, camera),
             'Displacement of a star from its place by the lens model, enlarged to the scale of '
             'the arrow above the figure.',
         )
