@@ -15,6 +15,7 @@ import contextlib
 from dataclasses import dataclass, field
 import hashlib
 import io
+import itertools
 import json
 import math
 import os
@@ -35,6 +36,7 @@ from starcal_ros.bag import reader
 from starcal_ros.cli import entry_point, main
 from starcal_ros.errors import StarcalError
 from starcal_ros.products.calibration_json import read_calibration
+from starcal_ros.records import Image
 
 BAG = Path(__file__).parents[1] / 'bags' / 'tiny'
 _SLOWEST_S = 300.0
@@ -67,6 +69,15 @@ COMMANDS = (
         'campaign',
         ('table1', '--trials', '2', '--tracker', '10', '--workers', '0', '-o', 'out'),
     ),
+    Command('export', ('in/a', '--to', 'spice', '--spacecraft-id=-999', '-o', 'out')),
+    Command(
+        'import',
+        (
+            *('--images', 'in/frames/*.png', '--times', 'in/frames/times.csv'),
+            *('--attitude', 'in/frames/attitude.csv', '-o', 'out/sim'),
+        ),
+    ),
+    Command('trend', ('in', '-o', 'out'), is_repeatable=False),
     Command('inspect', ('in/bag', '--params', 'in/bag/params.yaml')),
     Command('diagnose', ('in/bag', '--params', 'in/bag/params.yaml')),
     Command('play', ('in/bag', '--rate', '5'), starts_nodes=True),
@@ -102,14 +113,29 @@ def rows(quick: bool) -> list[AttackRow]:
 
 
 def make_inputs(folder: Path) -> None:
-    """Write the inputs of the commands into ``in/``: a bag, and two calibrations of it."""
+    """Write the inputs of the commands into ``in/``: a bag, its images, two calibrations of it."""
     shutil.copytree(BAG, folder / 'in/bag')
+    _make_frames(folder / 'in/frames')
     for name in ('a', 'b'):
         files = ['--params', str(folder / 'in/bag/params.yaml'), '-o', str(folder / 'in' / name)]
         with contextlib.redirect_stdout(io.StringIO()):  # in this process: it loads the modules
             status = main.main(['calibrate', str(folder / 'in/bag'), *files])
         if status != 0:
             raise RuntimeError(f'calibrate ended with {status}')
+
+
+def _make_frames(folder: Path) -> None:
+    """Write three images as PNG, their times, and attitudes about them."""
+    folder.mkdir()
+    images = itertools.islice(reader.read_images([BAG], '/opnav/image_raw', 0.0), 3)
+    times, attitudes = ['file,time_ns'], ['time_ns,qx,qy,qz,qw']
+    for k, image in enumerate(images):
+        assert isinstance(image, Image)  # of a sound bag
+        cv2.imwrite(str(folder / f'{k}.png'), image.pixels)
+        times.append(f'{k}.png,{image.time_ns}')
+        attitudes += [f'{image.time_ns + after_ns},0,0,0,1' for after_ns in (-(10**8), 10**8)]
+    (folder / 'times.csv').write_text('\n'.join(times) + '\n')
+    (folder / 'attitude.csv').write_text('\n'.join(attitudes) + '\n')
 
 
 def _arguments(command: Command, folder: Path) -> list[str]:
