@@ -58,7 +58,7 @@ def is_interrupt(error: BaseException) -> bool:
     Return True for a Ctrl-C, and for an error that one became.
 
     A module in C that is interrupted while it is loaded raises ImportError or SystemError, not
-    always with the KeyboardInterrupt as its cause.
+    always with the KeyboardInterrupt as its cause; a dataclass RuntimeError, up to Python 3.11.
     """
     if _interrupts:
         return True

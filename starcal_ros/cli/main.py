@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         discard('stdout')
         return complain(f'{error.filename or "input/output"}: {error.strerror or error}')
-    except (KeyboardInterrupt, ImportError, SystemError) as error:
+    except (KeyboardInterrupt, Exception) as error:
         if is_interrupt(error):
             complain('interrupted')
             return EXIT_INTERRUPTED

@@ -546,7 +546,7 @@ def test_demo_says_which_node_failed(
     assert_refused(run('demo', '-o', tmp_path), 'calibrator', 'no such thing')
 
 
-@pytest.mark.parametrize('kind', [ImportError, SystemError])
+@pytest.mark.parametrize('kind', [ImportError, SystemError, RuntimeError])
 def test_a_ctrl_c_that_became_another_error_is_one(
     kind: type[Exception], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
