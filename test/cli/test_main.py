@@ -609,3 +609,17 @@ demo.become(demo.player_command(Path('none'), 1.0, []))
 """
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
+
+
+def test_an_interrupt_while_a_node_starts_waits_until_it_is_known() -> None:
+    seen: list[str] = []
+
+    def start() -> None:
+        with demo._ended_like_interrupted(), demo._interrupts_wait():
+            os.kill(os.getpid(), signal.SIGTERM)
+            seen.append('the rest of the block')
+
+    with pytest.raises(KeyboardInterrupt):
+        start()
+    assert seen
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL

@@ -105,15 +105,17 @@ def run(
 
         def start(name: str, command: list[str], output: int | None = None) -> Process:
             log = stack.enter_context((folder / f'{name}.log').open('wb'))
-            process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log if output is None else output,
-                stderr=log,
-                env=environment,
-                bufsize=0,  # select() does not see bytes that readline() has buffered
-            )
-            stack.callback(_stop, process)
+            # Interrupted in here, the process would run on with nobody to end it.
+            with _interrupts_wait():
+                process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log if output is None else output,
+                    stderr=log,
+                    env=environment,
+                    bufsize=0,  # select() does not see bytes that readline() has buffered
+                )
+                stack.callback(_stop, process)
             return process
 
         for name in _NODES:
@@ -201,6 +203,25 @@ def _ended_like_interrupted() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Raise the KeyboardInterrupt of a signal that comes in the block at its end."""
+    came: list[int] = []
+    numbers = [
+        number
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if callable(signal.getsignal(number))  # not ignored
+    ]
+    before = [signal.signal(number, lambda got, _: came.append(got)) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+    if came:
+        raise KeyboardInterrupt
 
 
 def _stop(process: Process) -> None:
