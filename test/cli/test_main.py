@@ -613,6 +613,7 @@ demo.become(demo.player_command(Path('none'), 1.0, []))
 
 def test_an_interrupt_while_a_node_starts_waits_until_it_is_known() -> None:
     seen: list[str] = []
+    before = signal.getsignal(signal.SIGTERM)
 
     def start() -> None:
         with demo._ended_like_interrupted(), demo._interrupts_wait():
@@ -622,4 +623,4 @@ def test_an_interrupt_while_a_node_starts_waits_until_it_is_known() -> None:
     with pytest.raises(KeyboardInterrupt):
         start()
     assert seen
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) is before

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 from pathlib import Path
 
 import pytest
+from tool_modules import tool  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ros.options import check_value, read_parameter_file
@@ -21,12 +21,7 @@ CONFIG = ROOT / 'config'
 
 def test_parameter_file_is_up_to_date() -> None:
     """The file equals the output of tools/write_parameters.py."""
-    path = ROOT / 'tools' / 'write_parameters.py'
-    spec = importlib.util.spec_from_file_location('write_parameters', path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    assert (CONFIG / 'starcal.yaml').read_text() == module.parameter_file()
+    assert (CONFIG / 'starcal.yaml').read_text() == tool('write_parameters').parameter_file()
 
 
 def test_every_parameter_stands_with_its_default() -> None:

@@ -3,23 +3,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 import re
-from typing import Any
 
 import pytest
+from tool_modules import tool  # type: ignore[import-not-found]
 
 ROOT = Path(__file__).parents[2]
-
-
-def tool(name: str) -> Any:
-    """A module of the folder tools."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / 'tools' / f'{name}.py')
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_every_pin_has_its_digests() -> None:

@@ -154,9 +154,7 @@ def _solve_twice(
 
 
 def _solve(
-    observations: Sequence[StarObservations],
-    setup: Setup,
-    inputs: Mapping[str, str],
+    observations: Sequence[StarObservations], setup: Setup, inputs: Mapping[str, str]
 ) -> tuple[Calibration, Residuals]:
     ensemble = Ensemble()
     for record in observations:
