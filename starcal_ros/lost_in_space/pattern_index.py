@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices
+from starcal_ros.lost_in_space.shape_grid import shape_grid, ShapeGrid
 from starcal_ros.sky.catalog import StarCatalog
 
 _SMALLEST_DEG = 1.6
@@ -39,13 +40,13 @@ class PatternIndex:
     """
     Patterns within discs of one size all over the sky.
 
-    ``quads`` (q, 4) rows of the catalog in the order A, B, C, D; ``shape`` (q, 5) their shapes
-    (`shapes`); ``radius_rad`` radius of the discs.
+    ``quads`` (q, 4) rows of the catalog in the order A, B, C, D, sorted as ``grid`` has their
+    shapes (`shapes`); ``radius_rad`` radius of the discs.
     """
 
     radius_rad: float
     quads: Indices
-    shape: NDArray[np.float32]
+    grid: ShapeGrid
 
 
 def scales_for(half_diagonal_rad: float) -> list[int]:
@@ -77,9 +78,8 @@ def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
     key = np.unique(((quads[:, 0] << 16 | quads[:, 1]) << 16 | quads[:, 2]) << 16 | quads[:, 3])
     quads = np.stack([key >> 48, key >> 32 & 0xFFFF, key >> 16 & 0xFFFF, key & 0xFFFF], axis=-1)
     order, shape = shapes(stars[quads])
-    return PatternIndex(
-        radius_rad, np.take_along_axis(quads, order, axis=1), shape.astype(np.float32)
-    )
+    rows, grid = shape_grid(shape)
+    return PatternIndex(radius_rad, np.take_along_axis(quads, order, axis=1)[rows], grid)
 
 
 def shapes(directions: Floats) -> tuple[Indices, Floats]:
@@ -112,19 +112,23 @@ def shapes(directions: Floats) -> tuple[Indices, Floats]:
     return order, np.stack([c.real, c.imag, d.real, d.imag, size], axis=-1)
 
 
-def equivalent(order: Indices, shape: Floats) -> tuple[Indices, Floats]:
+def equivalent(order: Indices, shape: Floats, tolerance: float) -> tuple[Indices, Floats]:
     """
-    Each pattern (n, 4), (n, 5) in its four possible orders: (4 n, 4), (4 n, 5).
+    The patterns (n, 4), (n, 5) in each order in which the catalog may have them: (m, 4), (m, 5).
 
-    Noise may move a pattern across the border between two orders.
+    An error of a place up to the tolerance may move a pattern across the border between two of
+    the four orders.
     """
     c = shape[:, 0] + 1j * shape[:, 1]
     d = shape[:, 2] + 1j * shape[:, 3]
     places = ((c, d), (d, c), (1.0 - c, 1.0 - d), (1.0 - d, 1.0 - c))
-    all_shapes = [
-        np.stack([p.real, p.imag, q.real, q.imag, shape[:, 4]], axis=-1) for p, q in places
-    ]
-    return np.concatenate([order[:, k] for k in _ORDERS]), np.concatenate(all_shapes)
+    all_orders = np.concatenate([order[:, k] for k in _ORDERS])
+    found = np.concatenate(
+        [np.stack([p.real, p.imag, q.real, q.imag, shape[:, 4]], axis=-1) for p, q in places]
+    )
+    c_real, d_real = found[:, 0], found[:, 2]
+    near = (c_real <= d_real + 2 * tolerance) & (c_real + d_real <= 1.0 + 2 * tolerance)
+    return all_orders[near], found[near]
 
 
 def _tangent_points(directions: Floats) -> NDArray[np.complex128]:

@@ -30,6 +30,7 @@ from starcal_ros.lost_in_space.pattern_index import (
     shapes,
     sphere_points,
 )
+from starcal_ros.lost_in_space.shape_grid import equal_shapes
 from starcal_ros.lost_in_space.sky_fit import (
     FOCAL_RANGE,
     log10_p_value,
@@ -44,7 +45,7 @@ from starcal_ros.sky.catalog import StarCatalog
 MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of false matches
 ROUNDS = ((0, 12), (12, 18), (18, 24))
 """Brightest sources of which patterns are formed, with one of each range, round by round."""
-_REFINED = 16  # number of best candidates of a lookup that are refined
+_REFINED = 32  # number of best candidates of a lookup that are refined
 _GUESSED = 0.2  # largest shift of a guess, half diagonals
 _ALIKE = 0.03  # largest shift of one star to the next, half diagonals
 _OF_A_GUESS = 40  # brightest stars and sources
@@ -212,14 +213,6 @@ def _tolerances(half_diagonal_rad: float) -> tuple[float, float]:
     return 0.012 + 0.04 * half_diagonal_rad, size
 
 
-@functools.lru_cache(maxsize=8)
-def _shape_tree(catalog: StarCatalog, scale: int, size_weight: float) -> cKDTree:
-    """Search tree of the shapes of an index, the size weighted."""
-    shape = pattern_index(catalog, scale).shape.astype(np.float64)
-    shape[:, 4] *= size_weight
-    return cKDTree(shape, balanced_tree=False, compact_nodes=False)
-
-
 def _fits(
     image: SourceImage,
     catalog: StarCatalog,
@@ -265,17 +258,12 @@ def _look_up(
     order, shape = shapes(directions[chosen])
     sources = np.take_along_axis(chosen, order, axis=1)
     fits = shape[:, 4] < math.log(2 * index.radius_rad) + size_tolerance
-    sources, shape = equivalent(sources[fits], shape[fits])
-    weight = np.array([1.0, 1.0, 1.0, 1.0, place_tolerance / size_tolerance])
-    tree = _shape_tree(catalog, scale, float(weight[4]))
-    found = tree.query_ball_point(shape * weight, place_tolerance, p=np.inf)
-    counts = np.array([len(rows) for rows in found], np.int64)
-    quad = np.fromiter(itertools.chain.from_iterable(found), np.int64, int(counts.sum()))
-    query = np.repeat(np.arange(len(found)), counts)
+    sources, shape = equivalent(sources[fits], shape[fits], place_tolerance)
+    query, quad = equal_shapes(index.grid, shape, place_tolerance, size_tolerance)
     if len(quad) > _CANDIDATES:
         few = np.random.default_rng(0).choice(len(quad), _CANDIDATES, replace=False)
         quad, query = quad[few], query[few]
-    growth = np.exp(shape[query, 4] - index.shape[quad, 4])
+    growth = np.exp(shape[query, 4] - index.grid.shape[quad, 4])
     return _Candidates(index.quads[quad], sources[query], growth)
 
 
@@ -286,7 +274,7 @@ def _rotations(catalog: StarCatalog, candidates: _Candidates, plane: Floats) -> 
     seen[..., 2] = 1.0
     seen /= np.linalg.norm(seen, axis=2, keepdims=True)
     stars = catalog.direction_icrs[candidates.stars]
-    return np.asarray(np.einsum('nki,nkj->nij', _triads(seen), _triads(stars)))
+    return np.asarray(np.matmul(_triads(seen).transpose(0, 2, 1), _triads(stars)))
 
 
 def _triads(directions: Floats) -> Floats:
@@ -315,18 +303,19 @@ def _gains(
     half = image.half_diagonal_px / float(image.camera.parameters[0])
     finite = plane[np.isfinite(plane[:, 0])]
     gain_map, low, cell = _gain_map(finite, half)
+    (rows, columns), flat = gain_map.shape, gain_map.ravel()
     gains = np.empty(len(rotation))
     for first in range(0, len(rotation), _CHUNK):
         part = slice(first, first + _CHUNK)
         stars = _bright_about(catalog, rotation[part, 2], 1.1 * math.atan(half), 3 * _TESTED)
-        place = np.einsum('nij,nkj->nki', rotation[part], catalog.direction_icrs[stars])
+        place = np.matmul(catalog.direction_icrs[stars], rotation[part].transpose(0, 2, 1))
         ahead = (stars >= 0) & (place[..., 2] > 0.1)
-        z = np.where(ahead, place[..., 2], 1.0)
-        xy = place[..., :2] / z[..., None] * candidates.growth[part, None, None]
-        at = np.floor((xy - low) / cell).astype(np.int64)
-        inside = ahead & ((at >= 0) & (at < gain_map.shape[::-1])).all(axis=2)
-        inside &= np.cumsum(inside, axis=1) <= _TESTED
-        value = gain_map[np.where(inside, at[..., 1], 0), np.where(inside, at[..., 0], 0)]
+        scale = candidates.growth[part, None] / np.where(ahead, place[..., 2], 1.0) / cell
+        column, row = (np.floor(place[..., k] * scale - low[k] / cell) for k in (0, 1))
+        inside = ahead & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        at = np.where(inside, row * columns + column, 0.0).astype(np.int64)
+        inside &= np.cumsum(inside, axis=1, dtype=np.int32) <= _TESTED
+        value = flat[at]
         # An image of few stars shows only the brightest: take the best depth.
         gains[part] = np.cumsum(value * inside, axis=1).max(axis=1)
     return gains, 4.0 * float(gain_map.max())
@@ -353,7 +342,8 @@ def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTr
     """Search trees of points all over the sky and of the stars that discs of a radius need."""
     radius_rad = math.radians(radius_deg)
     points = sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
-    enough = int(9 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
+    # Where the sky is emptiest a disc has half of the mean: still most of the stars looked at.
+    enough = int(5 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
     return cKDTree(points), cKDTree(catalog.direction_icrs[:enough])
 
 

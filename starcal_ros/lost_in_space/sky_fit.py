@@ -38,10 +38,12 @@ _CLOSING_IN = (
     0.005,
 )  # radii of matching, in half diagonals
 _CROWDED = 0.15  # largest probability that a source lies by chance within the radius of matching
+_TELLING = 0.08  # largest such probability at which a candidate is judged by its matches
 _MOST_STARS = 200
 _JUDGED_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5)  # radii of matching for the p-value
 _DEPTHS = (6, 8, 11, 15, 20, 30, 50, 80, 130, 200)  # numbers of brightest predictions for it
 _LOOKS = 10.0  # independent tests among them: most of their stars are common
+_ORDERED = 30  # brightest matches whose order is judged: more would not change a verdict
 _ALONE = 10.0  # radius about a star for the local density of sources, in radii of matching
 
 
@@ -86,7 +88,7 @@ def refined(
     image: SourceImage, catalog: StarCatalog, start: SkyFit, pairs: Indices
 ) -> SkyFit | None:
     """
-    Fit from a start with decreasing radius of matching; None if it loses the stars.
+    Fit from a start with decreasing radius of matching; None once it looks like chance.
 
     ``pairs`` (k, 2), rows of the catalog and of the sources, belong to the start.
     """
@@ -96,9 +98,11 @@ def refined(
     for part in _CLOSING_IN:
         radius_px = max(part * half_px, 2.0)
         sources = int(_CROWDED * image.area_px2 / (math.pi * radius_px**2)) + 6
-        pairs = match(image, catalog, fit, radius_px, 2 * sources, sources)
-        if len(pairs) < 5:
+        stars, xy_px = predicted(catalog, fit, 2 * sources)
+        rank, source, _ = _mutual(image, xy_px, radius_px, sources)
+        if _like_chance(image, rank, radius_px, sources):
             return None
+        pairs = np.stack([stars[rank], source], axis=-1)
         fit = _step(image, catalog, fit, pairs, radius_px / 3)
         fx = float(fit.camera.parameters[0])
         if abs(math.log(fx / float(prior.parameters[0]))) > 1.3 * FOCAL_RANGE:
@@ -109,6 +113,30 @@ def refined(
             return None
         fit = _step(image, catalog, fit, pairs, 1.0)
     return fit
+
+
+def _like_chance(image: SourceImage, rank: Indices, radius_px: float, sources: int) -> bool:
+    """
+    Whether chance puts so many sources near predictions, of which ``rank`` (k,) have one.
+
+    Told only at radii at which few places are near a source: at larger ones sources without a
+    star, such as the structure of a corona, hide those that have one.  From there on, the fits
+    accepted of six stars among twelve false sources were below the limit by a factor of two.
+    """
+    if len(rank) < 5:
+        return True
+    one = _evenly(image, radius_px, sources)
+    if one > _TELLING:
+        return False
+    hits, depth = np.arange(5, len(rank) + 1), rank[4:] + 1
+    tail = betainc(hits, depth - hits + 1, one)
+    limit = betainc(5, 12 - 5 + 1, _evenly(image, radius_px, 18))  # P(Binomial(12, q) >= 5)
+    return float(tail.min()) > float(limit)
+
+
+def _evenly(image: SourceImage, radius_px: float, sources: int) -> float:
+    """Probability that one of so many sources, spread evenly, lies within a radius."""
+    return min(1.0, min(sources, len(image.xy_px)) * math.pi * radius_px**2 / image.area_px2)
 
 
 def match(
@@ -217,14 +245,16 @@ def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tupl
         if n < 5:
             continue
         sources = min(len(image.xy_px), 4 * n)
-        _, _, apart_px = _mutual(image, xy_px[:n], _JUDGED_PX[-1], sources)
+        _, source, apart_px = _mutual(image, xy_px[:n], _JUDGED_PX[-1], sources)
         for radius_px in _JUDGED_PX:
-            hits = int(np.count_nonzero(apart_px < radius_px))
+            near = apart_px < radius_px
+            hits = int(np.count_nonzero(near))
             if hits < 5:
                 continue
             q = _chance_of_one(image, xy_px[:n], radius_px, sources)
             tail = float(betainc(hits, n - hits + 1, q))  # P(Binomial(n, q) >= hits)
-            log10_p = math.log10(max(_LOOKS * tail, 1e-300)) + _log10_positions(image, radius_px)
+            chance = max(_LOOKS * tail * _chance_of_order(source[near]), 1e-300)
+            log10_p = math.log10(chance) + _log10_positions(image, radius_px)
             if log10_p < best:
                 best, best_radius_px = log10_p, radius_px
     return best, best_radius_px
@@ -236,10 +266,32 @@ def _chance_of_one(image: SourceImage, xy_px: Floats, radius_px: float, sources:
 
     Mean over the stars; a star among many sources, as in glare, has their local density.
     """
-    everywhere = min(1.0, sources * math.pi * radius_px**2 / image.area_px2)
+    everywhere = _evenly(image, radius_px, sources)
     near = image.tree.query_ball_point(xy_px, _ALONE * radius_px, return_length=True)
     crowded = np.minimum((np.maximum(near, 1) - 1) / _ALONE**2, 1.0)
     return float(np.maximum(crowded, everywhere).mean())
+
+
+def _chance_of_order(source: Indices) -> float:
+    """
+    Probability that chance sorts sources by brightness as well as those (k,) of stars so sorted.
+
+    Sources are numbered by brightness.  The measure is the number of pairs in the wrong order, of
+    which each permutation is equally likely (Kendall 1938, Biometrika 30, 81).
+    """
+    brightest = source[:_ORDERED]
+    wrong = np.triu(brightest[:, None] > brightest[None], 1)
+    return float(_orderings(len(brightest))[np.count_nonzero(wrong)])
+
+
+@functools.lru_cache(maxsize=_ORDERED)
+def _orderings(count: int) -> Floats:
+    """Probability that a permutation of ``count`` has at most 0, 1, ... pairs in wrong order."""
+    share: Floats = np.ones(1)
+    for k in range(2, count + 1):
+        # The last of k is in the wrong order to none, one, ... or all of the others.
+        share = np.convolve(share, np.full(k, 1.0 / k))
+    return np.minimum(np.cumsum(share), 1.0)
 
 
 def _log10_positions(image: SourceImage, radius_px: float) -> float:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.lost_in_space import camera, Frame, frames
+from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera import line_of_sight
 from starcal_ros.lost_in_space.pattern_index import equivalent, shapes, sphere_points
 from starcal_ros.lost_in_space.search import (
@@ -20,6 +22,8 @@ from starcal_ros.lost_in_space.search import (
     NotFound,
     SkyMatch,
 )
+from starcal_ros.lost_in_space.shape_grid import equal_shapes, shape_grid
+from starcal_ros.lost_in_space.sky_fit import _chance_of_order
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 
@@ -93,13 +97,59 @@ def test_a_shape_hangs_on_no_rotation_or_order() -> None:
     np.testing.assert_array_equal(np.array([2, 0, 3, 1])[order_again], order)
 
 
-def test_equivalent_orders_have_the_shape_of_their_stars() -> None:
-    rng = np.random.default_rng(4)
-    directions = rng.normal([0, 0, 5], 0.3, (1, 4, 3))
+def random_shapes(seed: int, count: int) -> tuple[Indices, Floats]:
+    directions = np.random.default_rng(seed).normal([0, 0, 5], 0.3, (count, 4, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
-    orders, found = equivalent(*shapes(directions))
+    return shapes(directions)
+
+
+def test_equivalent_orders_have_the_shape_of_their_stars() -> None:
+    # With a tolerance beyond every shape, all four orders are near a border.
+    orders, found = equivalent(*random_shapes(4, 1), 2.0)
     assert len({tuple(order) for order in orders.tolist()}) == 4
     np.testing.assert_allclose(found[2][:2], 1.0 - found[0][:2] * [1, 1] - [0, 1], atol=1e-12)
+
+
+def test_the_grid_finds_what_the_definition_does() -> None:
+    """Every shape within the tolerances of any order, and no other."""
+    order, shape = random_shapes(5, 3000)
+    rows, grid = shape_grid(shape)
+    rng = np.random.default_rng(6)
+    for tolerance, size_tolerance in ((0.014, 0.3), (0.04, 0.13), (0.1, 0.2)):
+        seen = shape[:40] + 1.4 * tolerance * rng.uniform(-1, 1, (40, 5))
+        _, four = equivalent(order[:40], seen, 2.0)
+        off = np.abs(four[:, None] - shape[None])
+        close = (off[..., :4] <= tolerance).all(axis=2) & (off[..., 4] <= size_tolerance)
+        expected = {(*four[k].round(9), n) for k, n in zip(*np.nonzero(close), strict=True)}
+        assert len(expected) > 5
+        _, near = equivalent(order[:40], seen, tolerance)
+        query, found = equal_shapes(grid, near, tolerance, size_tolerance)
+        # The grid keeps shapes as float32: no pair of these lies within 1e-7 of a tolerance.
+        got = {(*near[k].round(9), rows[n]) for k, n in zip(query, found, strict=True)}
+        assert got == expected and len(query) == len(got)
+
+
+def test_shapes_outside_the_grid_equal_none() -> None:
+    _, grid = shape_grid(random_shapes(7, 100)[1])
+    query, found = equal_shapes(grid, np.full((3, 5), 9.0), 0.02, 0.2)
+    assert len(query) == len(found) == 0
+    query, found = equal_shapes(grid, np.empty((0, 5)), 0.02, 0.2)
+    assert len(query) == len(found) == 0
+
+
+def test_the_chance_of_an_order_is_that_among_all_permutations() -> None:
+    """Kendall's distribution of pairs in the wrong order, by counting."""
+    pairs = tuple(itertools.combinations(range(6), 2))
+    every = itertools.permutations(range(6))
+    wrong = np.array([sum(order[i] > order[j] for i, j in pairs) for order in every])
+    for source, found in (
+        ((0, 1, 2, 3, 4, 5), 0),
+        ((3, 1, 7, 9, 20, 8), 3),
+        ((9, 8, 7, 3, 2, 1), 15),
+    ):
+        # Rounding of five convolutions.
+        expected = pytest.approx(np.mean(wrong <= found), abs=1e-14)
+        assert _chance_of_order(np.array(source)) == expected
 
 
 def test_points_cover_the_sphere() -> None:
@@ -122,3 +172,18 @@ def test_a_rotation_known_roughly_is_confirmed(catalog: StarCatalog, width_deg: 
     assert len(set(found.catalog_index) & set(searched.catalog_index)) >= 18
     elsewhere = Rotation.from_euler('y', 90.0, degrees=True) * frame.camera_from_icrf
     assert isinstance(confirm_sky(frame.xy_px, frame.prior, catalog, elsewhere), NotFound)
+
+
+def test_bright_false_sources_do_not_hide_the_stars(catalog: StarCatalog) -> None:
+    """As in a corona: at large radii of matching, most stars are near a source by chance."""
+    confirmed = 0
+    for frame in frames(catalog, 55, 60, 100, 0.0, 10):
+        brightest = np.flatnonzero(frame.star < 0)[-30:]
+        order = np.concatenate([brightest, np.setdiff1d(np.arange(len(frame.star)), brightest)])
+        off = Rotation.from_euler('xz', [1.6, 2.0], degrees=True)
+        guess = off * frame.camera_from_icrf
+        found = confirm_sky(frame.xy_px[order], frame.prior, catalog, guess)
+        confirmed += isinstance(found, SkyMatch)
+    # Six of ten; ten of the forty brightest sources are stars, and their shift must be found.
+    # Judged by chance from the first radius on, four.
+    assert confirmed >= 6
