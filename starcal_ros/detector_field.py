@@ -24,11 +24,17 @@ def degrees(total: int) -> NDArray[np.int64]:
 
 def basis(pixels: Floats, width: int, height: int, total_degree: int) -> Floats:
     """Return the products (n, t) of `degrees` at pixels (n, 2)."""
-    pixels = np.asarray(pixels, np.float64)
-    along_u = legendre((2.0 * pixels[:, 0] + 1.0) / width - 1.0, total_degree)
-    along_v = legendre((2.0 * pixels[:, 1] + 1.0) / height - 1.0, total_degree)
+    along_u, along_v = _along_axes(np.asarray(pixels, np.float64), width, height, total_degree)
     of_u, of_v = degrees(total_degree).T
     return np.asarray((along_u[of_u] * along_v[of_v]).T)
+
+
+def _along_axes(pixels: Floats, width: int, height: int, degree: int) -> tuple[Floats, Floats]:
+    """Return the polynomials (degree + 1, n) of u and of v at pixels (n, 2)."""
+    return (
+        legendre((2.0 * pixels[:, 0] + 1.0) / width - 1.0, degree),
+        legendre((2.0 * pixels[:, 1] + 1.0) / height - 1.0, degree),
+    )
 
 
 def legendre(x: Floats, degree: int) -> Floats:
@@ -61,8 +67,13 @@ class DetectorField:
         pixels = np.asarray(pixels, np.float64)
         # Beyond the detector polynomials grow without limit; the field at its border stands there.
         inside = np.clip(pixels.reshape(-1, 2), -0.5, [self.width - 0.5, self.height - 0.5])
-        flat = basis(inside, self.width, self.height, self.degree)
-        return np.asarray((flat @ self.coefficients.T).reshape(pixels.shape))
+        along_u, along_v = _along_axes(inside, self.width, self.height, self.degree)
+        of_u, of_v = degrees(self.degree).T
+        # Summed over v first: the products of both, six times as many numbers, are never formed.
+        table = np.zeros((2, self.degree + 1, self.degree + 1))
+        table[:, of_u, of_v] = self.coefficients
+        sums = [((of_axis @ along_v) * along_u).sum(axis=0) for of_axis in table]
+        return np.stack(sums, axis=-1).reshape(pixels.shape)
 
 
 def in_degree(field: DetectorField, degree: int) -> Floats:
