@@ -135,10 +135,13 @@ def _inspect(args: argparse.Namespace) -> int:
 
     setup = None
     if args.params:
-        from starcal_ros.diagnosis.bags import aligned_by_bags
         from starcal_ros.pipeline.setup import read_setup
 
-        setup, aligned = aligned_by_bags(args.bags, _asked(args), read_setup(args.params))
+        setup = read_setup(args.params)
+    if setup and not setup.is_aligned:
+        from starcal_ros.diagnosis.bags import aligned_by_bags
+
+        setup, aligned = aligned_by_bags(args.bags, _asked(args), setup)
         print(aligned, end='\n' if aligned else '', file=sys.stderr)
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)

@@ -16,12 +16,10 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.bag import reader
 from starcal_ros.cli import output
 from starcal_ros.cli.arguments import EXIT_ACCEPTED, EXIT_REFUSED
-from starcal_ros.cli.commands import diagnosis
 from starcal_ros.cli.commands.selection import selection
 from starcal_ros.cli.folders import make_folder, missing_extra
 from starcal_ros.cli.output_places import check_folder
 from starcal_ros.cli.terminal import print_text, with_progress
-from starcal_ros.diagnosis.bags import aligned_by_bags
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.pipeline import solve
@@ -55,8 +53,12 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
         raise OptionError(f'{args.output}: not a folder')
     check_folder(args.output, args.bags, (args.params, *files_of(setup.frames)))
     files = (*reader.mcap_files(args.bags), args.params)
+    found = ''
     try:
-        setup, found = aligned_by_bags(args.bags, asked, setup)
+        if not setup.is_aligned:
+            from starcal_ros.diagnosis.bags import aligned_by_bags  # seldom needed, slow to load
+
+            setup, found = aligned_by_bags(args.bags, asked, setup)
     except OptionError as error:
         make_folder(args.output)
         _write_failure(args.output, NotCalibrated(str(error), tuple(map(str, args.bags)), {}))
@@ -205,6 +207,8 @@ def _failure(
         words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
     named = tuple(map(str, bags))
     if has_images and not _used(observations):
+        from starcal_ros.cli.commands import diagnosis  # seldom needed, slow to load
+
         found = diagnosis.of_a_failure(bags, asked, setup)
         if found:
             words += f'. {found.in_a_sentence()}'
