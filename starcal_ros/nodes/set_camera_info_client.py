@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from typing import Any
@@ -13,6 +14,7 @@ from sensor_msgs.srv import SetCameraInfo
 from starcal_ros.nodes.lifecycle_node.lifecycle import StarcalNode
 
 _LOOK_S = 0.5  # period of checks for the service and the timeout
+_LONGEST_PAUSE_S = 300.0  # between two attempts at a driver that does not answer
 ACCEPTED = 'accepted'
 
 
@@ -20,9 +22,11 @@ class CameraDriver:
     """
     Client of set_camera_info that reports the outcome of each call.
 
-    A calibration is sent as soon as the service is available.  After a refusal or a timeout it is
-    sent again only by `hand_over_again` or when the service reappears, because a driver that
-    refuses would refuse every second.  Safe to use from several threads.
+    A calibration is sent as soon as the service is available, and again to each server of it that
+    appears: a driver that restarts has lost its camera.  Without an answer it is sent again after
+    a pause that doubles, since the request or its answer may have been lost before the two had
+    discovered each other.  After a refusal it is sent again only by `hand_over_again` or to a new
+    server.  Safe to use from several threads.
 
     Parameters
     ----------
@@ -41,12 +45,16 @@ class CameraDriver:
         self._camera_info: Any = None
         self._is_due = False  # to be sent once the service is available
         self._is_there = False
+        self._servers: frozenset[bytes] = frozenset()
         self._call: Any = None
         self._since_s = 0.0
+        self._pause_s = timeout_s  # before it is sent again without an answer
+        self._again_s = math.inf  # time of that, of the monotonic clock
         self._closed = False
         self._changed = threading.Condition(threading.RLock())
         group = ReentrantCallbackGroup()
         self._client = node.create_client(SetCameraInfo, service, callback_group=group)
+        self._answers = f'rr{node.resolve_service_name(service)}Reply'  # its DDS topic
         self._timer = node.steady_timer(_LOOK_S, node.guarded(self._look), group)
 
     def close(self) -> None:
@@ -78,6 +86,7 @@ class CameraDriver:
     def _begin(self) -> None:
         self._drop_call()
         self._is_due, self._since_s = True, time.monotonic()
+        self._pause_s, self._again_s = self._timeout_s, math.inf
         self.outcome, self.has_failed = 'waiting for the service', False
         self._look()
 
@@ -85,21 +94,38 @@ class CameraDriver:
         with self._changed:
             if self._closed:
                 return
-            was_there, self._is_there = self._is_there, self._client.service_is_ready()
-            overdue = time.monotonic() - self._since_s > self._timeout_s
-            if self._is_there and (
-                self._is_due or (self._camera_info is not None and not was_there)
-            ):
+            now_s = time.monotonic()
+            overdue = now_s - self._since_s > self._timeout_s
+            appeared = self._has_appeared() and self._camera_info is not None
+            if appeared:
+                self._pause_s = self._timeout_s
+            if self._is_there and (self._is_due or appeared or now_s > self._again_s):
                 self._send()
             elif self._is_due and overdue:
                 self._end('service not available; will be sent when it is', False)
             elif self._call is not None and overdue:
                 self._drop_call()
                 self._end(f'no answer within {self._timeout_s:g} s', False)
+                self._again_s = now_s + self._pause_s
+                self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
+
+    def _has_appeared(self) -> bool:
+        """
+        Return True if the service is there and was not, or has a server that it did not have.
+
+        A driver restarts in less time than passes between two looks, and one that was killed
+        counts as there until its lease ends, 20 s with Fast DDS.  Servers are known by the DDS
+        topic of their answers; a middleware without DDS names leaves that empty.
+        """
+        was_there, self._is_there = self._is_there, self._client.service_is_ready()
+        had = self._servers
+        found = self._node.get_publishers_info_by_topic(self._answers, no_mangle=True)
+        self._servers = frozenset(bytes(server.endpoint_gid) for server in found)
+        return self._is_there and (not was_there or not self._servers <= had)
 
     def _send(self) -> None:
         self._drop_call()
-        self._is_due, self._since_s = False, time.monotonic()
+        self._is_due, self._since_s, self._again_s = False, time.monotonic(), math.inf
         self.outcome = 'waiting for its answer'
         self._call = self._client.call_async(SetCameraInfo.Request(camera_info=self._camera_info))
         self._call.add_done_callback(self._node.guarded(self._answered))
