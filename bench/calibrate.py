@@ -32,6 +32,9 @@ with open(sys.argv[1], 'rb') as stream:
     print(sum(len(message.data) for _, _, message in make_reader(stream).iter_messages()))
 """
 
+# As the console script does.
+_TOOL = 'import sys; from starcal_ros.cli.entry_point import main; sys.exit(main())'
+
 # Cumulative times in the main thread; indented stages are parts of the one above.
 _STAGES = (
     ('import of Python modules', 'importlib._bootstrap', '_find_and_load'),
@@ -43,7 +46,7 @@ _STAGES = (
     ('write the observations', 'products/folder', 'write_observations'),
     ('solve and judge', 'pipeline/solve', 'solve_with_residuals'),
     ('  estimates', 'estimation/calibrate', 'estimate_calibration'),
-    ('report', 'report/page', 'write_report'),
+    ('report', 'report/page', 'render'),
     ('  figures', 'report/charts', 'charts_of'),
 )
 
@@ -76,14 +79,15 @@ def compare(
         scenario = dataclasses.replace(synthetic.scenario(name), image_count=images)
         made = simulated_bag.write_bag(scenario, Path(folder, 'bag'))
         (file,) = made.bag.glob('*.mcap')
-        calibrate = ['starcal_ros.cli.main', 'calibrate', str(made.bag), '--params']
+        calibrate = ['calibrate', str(made.bag), '--params']
         calibrate += [str(made.params), '-o', str(Path(folder, 'out'))]
         costs: dict[str, list[Cost]] = {'bare read with mcap': [], 'starcal calibrate': []}
         for _ in range(rounds):
             costs['bare read with mcap'].append(cost(['-c', _BARE, str(file)]))
-            costs['starcal calibrate'].append(cost(['-m', *calibrate]))
+            costs['starcal calibrate'].append(cost(['-c', _TOOL, *calibrate]))
         profile = Path(folder, 'profile')
-        cost(['-m', 'cProfile', '-o', str(profile), '-m', *calibrate])
+        profiled = ['-m', 'cProfile', '-o', str(profile), '-m', 'starcal_ros.cli.main']
+        cost([*profiled, *calibrate])
         stages = _stages(profile)
     height, width = scenario.truth.camera.height, scenario.truth.camera.width
     table = _compared(f'{images} images of {width} x {height}', costs, most_s, most_ratio)

@@ -362,7 +362,7 @@ def _demo(args: argparse.Namespace) -> int:
     )
     # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
     setup = load_setup(bag.parameters)
-    again, _ = calibrate_into(args.output, [bag.bag], Topics(), setup, dict)
+    again, *_ = calibrate_into(args.output, [bag.bag], Topics(), setup, dict)
     write_products(calibration, args.output)
     apart_px = float(comparison.compare(calibration, again).before.length_px.max())
     same = apart_px <= _DEMO_SAME_PX

@@ -11,6 +11,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping
 from dataclasses import dataclass
+import functools
 import json
 import math
 from pathlib import Path
@@ -55,7 +56,7 @@ from starcal_ros.untrusted import json_value
 
 _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200
-_PRODUCTS = (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, OBSERVATIONS_FILE)
+PRODUCTS = (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, OBSERVATIONS_FILE)
 
 
 @dataclass(frozen=True)
@@ -63,14 +64,15 @@ class Found:
     """
     Contents of a folder; ``residuals`` and ``observations`` are None without a file.
 
-    ``files`` are the names of the products beside the report.
+    ``thumbnails`` are in the order of `ordered`, ``files`` the names of the products beside the
+    report.
     """
 
     calibration: Calibration
     residuals: Residuals | None
     observations: tuple[StarObservations, ...] | None
     thumbnails: tuple[Thumbnail, ...]
-    files: tuple[str, ...] = ()
+    files: tuple[str, ...] = PRODUCTS
 
 
 @dataclass(frozen=True)
@@ -103,14 +105,7 @@ def write_report(folder: Path) -> Path:
     if failure is not None:
         return write_failure_page(failure, folder)
     path = folder / REPORT_FILE
-    found = read_folder(folder)
-    try:
-        text = render(found)
-    # A file can hold numbers that no calibration has; the errors of drawing have no common base.
-    except Exception as error:
-        why = f'{type(error).__name__}: {error}'
-        raise ProductError(f'{folder}: the products cannot be drawn: {why}') from error
-    write_atomically(path, text)
+    write_atomically(path, render(read_folder(folder), folder))
     return path
 
 
@@ -135,12 +130,30 @@ def read_folder(folder: Path) -> Found:
         read_residuals(residuals) if residuals.is_file() else None,
         recorded,
         read_thumbnails(folder / THUMBNAILS_FOLDER),
-        tuple(name for name in _PRODUCTS if (folder / name).is_file()),
+        tuple(name for name in PRODUCTS if (folder / name).is_file()),
     )
 
 
-def render(found: Found) -> str:
-    """HTML text of the report."""
+def render(found: Found, folder: Path) -> str:
+    """
+    HTML text of the report of a folder.
+
+    Raises
+    ------
+    ProductError
+        When the contents cannot be drawn.
+    """
+    try:
+        return template().render(_context(found))
+    # A file can hold numbers that no calibration has; the errors of drawing have no common base.
+    except Exception as error:
+        why = f'{type(error).__name__}: {error}'
+        raise ProductError(f'{folder}: the products cannot be drawn: {why}') from error
+
+
+@functools.cache
+def template() -> jinja2.Template:
+    """Template of the report, compiled at the first call."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader('starcal_ros.report'),
         autoescape=True,
@@ -148,7 +161,7 @@ def render(found: Found) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template('report.html').render(_context(found))
+    return environment.get_template('report.html')
 
 
 def _context(found: Found) -> Mapping[str, object]:

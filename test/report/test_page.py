@@ -68,6 +68,11 @@ def page_of(folder: Path) -> str:
     return report.write_report(folder).read_text()
 
 
+def test_the_page_of_a_calibration_is_that_of_its_folder(folder: Path, page: str) -> None:
+    """`starcal calibrate` draws what it holds, `starcal report` what it reads."""
+    assert page == page_of(folder)
+
+
 def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> None:
     calibration = read_calibration(folder / CALIBRATION_FILE)
     assert '✓ Accepted' in page

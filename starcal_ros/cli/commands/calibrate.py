@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+import contextlib
 import dataclasses
 from pathlib import Path
 import sys
@@ -29,7 +30,7 @@ from starcal_ros.pipeline.provenance import inputs_of, software_version
 from starcal_ros.pipeline.retry import measured_again
 from starcal_ros.pipeline.setup import files_of, read_setup, Setup
 from starcal_ros.pipeline.topics import Topics
-from starcal_ros.products.files import REPORT_FILE
+from starcal_ros.products.files import REPORT_FILE, write_atomically
 from starcal_ros.products.folder import write_observations, write_products
 from starcal_ros.products.not_calibrated import NotCalibrated, write_not_calibrated
 from starcal_ros.records import (
@@ -70,14 +71,11 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
         stopped = threading.Event()
         inputs = thread.submit(inputs_of, files, stopped.is_set)
         try:
-            calibration, observations = calibrate_into(
-                args.output, args.bags, asked, setup, inputs.result, wanted
+            calibration, observations, report = calibrate_into(
+                args.output, args.bags, asked, setup, inputs.result, wanted, not args.no_report
             )
         finally:
             stopped.set()
-    if args.no_report:
-        (args.output / REPORT_FILE).unlink(missing_ok=True)  # of the products that were replaced
-    report = '' if args.no_report else f'; {write_report(args.output)}'
     output.print_calibration(calibration, setup.prior)
     if not tracker_sigma_is_given(setup.calibration):
         sigma = ', '.join(f'{arcsec:.1f}' for arcsec in calibration.star_tracker_sigma_arcsec)
@@ -85,7 +83,7 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
             f'star tracker    {sigma}" (x, y, z) from the scatter: star_tracker_sigma_arcsec'
             ' is not given'
         )
-    print_text(f'products written to {args.output}{report}')
+    print_text(f'products written to {args.output}' + (f'; {report}' if report else ''))
     if args.split_half:
         _split(args.output, observations, setup, inputs.result())
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
@@ -98,8 +96,13 @@ def calibrate_into(
     setup: Setup,
     inputs: Callable[[], Mapping[str, str]],
     wanted: Wanted | None = None,
-) -> tuple[Calibration, list[StarObservations]]:
-    """Calibrate from bags and write the files that a report is made from."""
+    with_report: bool = False,
+) -> tuple[Calibration, list[StarObservations], str]:
+    """
+    Calibrate from bags and write the products, with or without a report.
+
+    Also returns the observations and where the report is, or why there is none.
+    """
     topics = bag_topics.choose_topics(bags, asked, setup)
     count = bag_topics.count(bags, topics)
     album, expected = thumbnails.Album(count), ExpectedAlbum(setup)
@@ -115,6 +118,8 @@ def calibrate_into(
     write_observations(observations, folder, setup.frames.camera_frame)
     with ThreadPoolExecutor(1, 'pictures') as thread:
         drawn = thread.submit(album.thumbnails)
+        if with_report:
+            thread.submit(_load_report)
         try:
             calibration, left, observations = _solve_twice(
                 folder, bags, topics, setup, inputs(), observations
@@ -123,11 +128,54 @@ def calibrate_into(
             failure = _failure(str(error), bags, asked, setup, observations, bool(topics.image))
             _write_failure(folder, failure, expected.pictures)
             raise TooFewObservations(failure.reason) from error
-        pictures = folder / thumbnails.THUMBNAILS_FOLDER
-        written = thread.submit(thumbnails.write_thumbnails, drawn.result(), pictures)
-        write_products(calibration, folder, left)
-        written.result()
-    return calibration, observations
+        pictures = drawn.result()
+        written = thread.submit(_write_all, calibration, left, pictures, folder)
+        try:
+            page, report = '', ''
+            if with_report:
+                page, report = _drawn(calibration, left, observations, pictures, folder)
+        finally:
+            written.result()
+    # After the products that it is of.
+    if page:
+        write_atomically(folder / REPORT_FILE, page)
+    else:
+        (folder / REPORT_FILE).unlink(missing_ok=True)  # of the products that were replaced
+    return calibration, observations, report
+
+
+def _load_report() -> None:
+    """Import the modules of the report and compile its template."""
+    with contextlib.suppress(ModuleNotFoundError):
+        from starcal_ros.report import page
+
+        page.template()
+
+
+def _write_all(
+    calibration: Calibration,
+    left: Residuals,
+    pictures: Sequence[thumbnails.Thumbnail],
+    folder: Path,
+) -> None:
+    thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
+    write_products(calibration, folder, left)
+
+
+def _drawn(
+    calibration: Calibration,
+    left: Residuals,
+    observations: Sequence[StarObservations],
+    pictures: Sequence[thumbnails.Thumbnail],
+    folder: Path,
+) -> tuple[str, str]:
+    """The report of what is being written, and where it will be; or why there is none."""
+    try:
+        from starcal_ros.report import page
+    except ModuleNotFoundError as error:
+        return '', f'no report: {missing_extra(error, "report")}'
+    found = page.Found(calibration, left, tuple(observations), thumbnails.ordered(pictures))
+    return page.render(found, folder), f'look at {folder / REPORT_FILE}'
 
 
 def _solve_twice(
@@ -223,13 +271,9 @@ def _write_failure(
     software = f'starcal {software_version()}'
     write_not_calibrated(dataclasses.replace(failure, software=software), folder)
     thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
-    write_report(folder)
-
-
-def write_report(folder: Path) -> str:
-    """Write the report of a folder; returns where it is, or why there is none."""
     try:
         from starcal_ros.report import page
     except ModuleNotFoundError as error:
-        return f'no report: {missing_extra(error, "report")}'
-    return f'look at {page.write_report(folder)}'
+        missing_extra(error, 'report')  # raises where another module is missing
+    else:
+        page.write_report(folder)

@@ -168,7 +168,13 @@ def read_thumbnails(folder: Path) -> tuple[Thumbnail, ...]:
         if encoded.startswith(_MAGIC[path.suffix]):
             time_ns = int(name['image_ns'] or name['star_ns'])
             found.append(Thumbnail(time_ns, name['reason'] or '', int(name['n'] or 0), encoded))
-    return tuple(sorted(found, key=lambda t: (t.time_ns, t.reason, t.number)))
+    return ordered(found)
+
+
+def ordered(thumbnails: Iterable[Thumbnail]) -> tuple[Thumbnail, ...]:
+    """Thumbnails by time, reason and number; of those with one file name the last."""
+    named = {thumbnail.name: thumbnail for thumbnail in thumbnails}
+    return tuple(sorted(named.values(), key=lambda t: (t.time_ns, t.reason, t.number)))
 
 
 def _reduced(pixels: Pixels) -> Pixels:
