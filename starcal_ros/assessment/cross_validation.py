@@ -32,12 +32,7 @@ _FEWEST_STARS = 30  # of a bin: its normalised residual is known to 9 %
 _FEWEST_IMAGES = 4  # three may determine no calibration without one of them
 
 
-def cross_validation(
-    estimate: Estimate,
-    measurements: Measurements,
-    blocks: Floats,
-    field: LinearTerms | None,
-) -> tuple[ResidualBin, ...]:
+def cross_validation(estimate: Estimate, measurements: Measurements) -> tuple[ResidualBin, ...]:
     """
     Return the normalised residuals of images that others predict, by parts of the data.
 
@@ -45,10 +40,6 @@ def cross_validation(
     ----------
     measurements : Measurements
         The stars that were used.
-    blocks : (m, p + 4, p + 4)
-        Of `problem.image_blocks` at the minimum.
-    field : LinearTerms or None
-        Of `problem.field_terms` there.
 
     Returns
     -------
@@ -58,7 +49,7 @@ def cross_validation(
     table = estimate.table
     if table.image_count < _FEWEST_IMAGES:
         return ()
-    found, expected = predicted_residuals(estimate, measurements, blocks, field)
+    found, expected = predicted_residuals(estimate, measurements)
     used = estimate.kept & np.isfinite(found)
     if not used.any():
         return ()
@@ -73,12 +64,7 @@ def cross_validation(
     )
 
 
-def predicted_residuals(
-    estimate: Estimate,
-    measurements: Measurements,
-    blocks: Floats,
-    field: LinearTerms | None,
-) -> tuple[Floats, Floats]:
+def predicted_residuals(estimate: Estimate, measurements: Measurements) -> tuple[Floats, Floats]:
     """
     Return squared whitened residuals (n,) of stars, their image predicted by the others.
 
@@ -88,7 +74,7 @@ def predicted_residuals(
     problem, state = estimate.problem, estimate.state
     squared: Floats = np.full(len(estimate.table), np.nan)
     expected: Floats = np.full(len(estimate.table), np.nan)
-    shared = _shared_information(problem, state, blocks, field)
+    shared = _shared_information(problem, state, estimate.blocks, estimate.field_terms)
     for rows, found, variance in _images(problem, state, measurements, shared):
         squared[rows], expected[rows] = found, variance
     return squared, expected

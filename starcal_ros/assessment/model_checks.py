@@ -15,47 +15,38 @@ import dataclasses
 import math
 
 import numpy as np
-from scipy.special import chdtrc, ndtr
+from scipy.special import chdtrc
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.assessment.cross_validation import cross_validation
+from starcal_ros.assessment.detector_step import detector_step
 from starcal_ros.camera import CameraModel, pixel_grid, rotation_jacobian
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.least_squares.linear_terms import linear_terms, LinearTerms
 from starcal_ros.least_squares.normal_equations import arrange, Measurements
 from starcal_ros.methods.assembly import score_of
-from starcal_ros.methods.problem import (
-    field_terms,
-    image_blocks,
-    image_parameters,
-    scalar_terms_at,
-)
-from starcal_ros.records import DetectorStep, HeldTerm, ModelChecks
+from starcal_ros.methods.problem import image_parameters
+from starcal_ros.records import HeldTerm, ModelChecks
 
 _SPEED_OF_LIGHT_KM_S = 299792.458
-_INNER = (0.1, 0.9)  # of the detector: beyond, too few stars lie on one side
-_STEPS = 31  # places along each axis at which a step is looked for
 _GRID = 25
 
 
 def model_checks(estimate: Estimate) -> ModelChecks:
     """Return what the stars of an estimate show of the model that it assumes."""
-    problem, state = estimate.problem, estimate.state
     covariance = estimate.variance.of(estimate.table.covariance_px2, estimate.table.magnitude)
     covariance = covariance * estimate.repetition[:, None]
     measurements = arrange(estimate.table, estimate.kept, covariance)
-    _, blocks = image_blocks(problem, state, measurements)
-    field = field_terms(problem, state, measurements)
     camera = estimate.geometry.camera
     test, variation, correlation = estimate.field_test, estimate.variation, estimate.correlation
-    velocity = _velocity(estimate, measurements, blocks, field)
+    velocity = _velocity(estimate, measurements)
     rms_px, worst_px = _field_px(camera)
     return ModelChecks(
         field_p_value=test.p_value if test else float('nan'),
         field_rms_px=rms_px,
         field_worst_px=worst_px,
-        held=_held_terms(estimate, blocks, field),
-        step=_step(estimate, measurements, blocks, field),
+        held=_held_terms(estimate),
+        step=detector_step(estimate, measurements),
         velocity_error_km_s=velocity[0],
         velocity_sigma_km_s=velocity[1],
         velocity_p_value=velocity[2],
@@ -67,7 +58,7 @@ def model_checks(estimate: Estimate) -> ModelChecks:
         independent_images=float(correlation.independent_images.min()),
         pointings=estimate.pointings,
         independent_pointings=_independent_pointings(estimate),
-        cross_validation=cross_validation(estimate, measurements, blocks, field),
+        cross_validation=cross_validation(estimate, measurements),
     )
 
 
@@ -92,23 +83,21 @@ def _field_px(camera: CameraModel) -> tuple[float, float]:
     return float(np.sqrt((moved**2).mean())), float(np.linalg.norm(moved, axis=1).max())
 
 
-def _held_terms(
-    estimate: Estimate, blocks: Floats, field: LinearTerms | None
-) -> tuple[HeldTerm, ...]:
+def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     """Camera parameters that are held or bound by their prior, with what the stars ask for."""
-    problem, state = estimate.problem, estimate.state
+    problem, state, field = estimate.problem, estimate.state, estimate.field_terms
     p = problem.camera_count
     names = problem.parameter_names
     terms = []
     held = np.setdiff1d(np.arange(p), problem.free)
     if len(held):
         # The held columns are terms like any other; their sums stand in the blocks.
-        rows = blocks[:, held, :]
+        rows = estimate.blocks[:, held, :]
         tested = LinearTerms(rows[:, :, held].sum(axis=0), rows)
         between = None
         if field is not None:
             between = field.cross[:, :, held].sum(axis=0).T
-        value, sigma = score_of(problem, state, blocks, field, tested, between).single()
+        value, sigma = score_of(problem, state, estimate.blocks, field, tested, between).single()
         for k, j in enumerate(held):
             if np.isfinite(sigma[k]):
                 asked = float(state.parameters[j] + value[k])
@@ -126,11 +115,9 @@ def _held_terms(
     return tuple(terms)
 
 
-def _velocity(
-    estimate: Estimate, measurements: Measurements, blocks: Floats, field: LinearTerms | None
-) -> tuple[float, float, float]:
+def _velocity(estimate: Estimate, measurements: Measurements) -> tuple[float, float, float]:
     """Length of the velocity that the stars miss, its largest 1-sigma, km/s; p-value of none."""
-    problem, state = estimate.problem, estimate.state
+    problem, state, field = estimate.problem, estimate.state, estimate.field_terms
     camera, R = estimate.geometry.camera, state.camera_from_icrf.as_matrix()
     modes = problem.field_prior
 
@@ -158,7 +145,7 @@ def _velocity(
     )
     between = terms.information[:3, 3:] if field is not None else None
     tested = LinearTerms(terms.information[:3, :3], terms.cross[:, :3])
-    score = score_of(problem, state, blocks, field, tested, between)
+    score = score_of(problem, state, estimate.blocks, field, tested, between)
     if not (np.diag(score.information) > 0).all():
         return 0.0, float('inf'), 1.0
     missed = np.linalg.solve(score.information, score.gradient)
@@ -166,41 +153,3 @@ def _velocity(
     sigma = 1.0 / np.sqrt(least) if least > 0 else float('inf')
     chi2 = float(score.gradient @ missed)
     return float(np.linalg.norm(missed)), float(sigma), float(chdtrc(3.0, chi2))
-
-
-def _step(
-    estimate: Estimate, measurements: Measurements, blocks: Floats, field: LinearTerms | None
-) -> DetectorStep:
-    """The most significant step of the detector between two parts."""
-    problem, state = estimate.problem, estimate.state
-    camera, prior = estimate.geometry.camera, problem.field_prior
-    along = np.linspace(*_INNER, _STEPS)
-    at = (along * camera.width - 0.5, along * camera.height - 0.5)
-
-    def scalars(pixels: Floats) -> Floats:
-        steps = [0.5 * np.sign(pixels[k] - place[:, None]) for k, place in enumerate(at)]
-        if prior is None:
-            return np.concatenate(steps)
-        return np.concatenate([*steps, prior.polynomials(pixels)])
-
-    terms = scalar_terms_at(problem, state, measurements, scalars)
-    t = len(terms.information) // 2
-    count = 2 * _STEPS
-    steps = np.r_[0:count, t : t + count]
-    polynomials = np.setdiff1d(np.arange(2 * t), steps)
-    between = None
-    if prior is not None:
-        between = terms.information[np.ix_(steps, polynomials)] @ prior.modes
-    tested = LinearTerms(terms.information[np.ix_(steps, steps)], terms.cross[:, steps])
-    size_px, sigma_px = score_of(problem, state, blocks, field, tested, between).single()
-    k = int(np.argmax(np.abs(size_px) / sigma_px))
-    significance = abs(float(size_px[k] / sigma_px[k]))
-    p_value = min(1.0, 2.0 * len(steps) * float(ndtr(-significance)))
-    axis, place = divmod(k % count, _STEPS)
-    return DetectorStep(
-        across='uv'[axis],
-        place_px=float(at[axis][place]),
-        moved='uv'[k // count],
-        size_px=float(size_px[k]),
-        p_value=p_value,
-    )

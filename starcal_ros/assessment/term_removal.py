@@ -16,13 +16,14 @@ from scipy.special import chdtrc
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.least_squares.levenberg_marquardt import inverse, NotObservable
-from starcal_ros.least_squares.normal_equations import arrange, Measurements, residuals_px
+from starcal_ros.least_squares.normal_equations import arrange, residuals_px
 from starcal_ros.methods.assembly import reduced_information
-from starcal_ros.methods.minimise import minimise
-from starcal_ros.methods.problem import image_blocks, image_parameters, Problem, State
+from starcal_ros.methods.minimise import minimise, Minimum, without_parameter
+from starcal_ros.methods.problem import image_parameters, Problem, State
 from starcal_ros.records import TermRemoval
 
 _HELD_AT_PRIOR = ('fx', 'fy', 'cx', 'cy')  # skew and distortion terms are held at zero
+_LEAST_GAIN = 1e-9  # a step of 0.00005 sigma
 _SIGNIFICANT = 0.01  # p-value below which a rise of chi^2 shows that a term is needed
 
 
@@ -40,16 +41,17 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
     problem, state = estimate.problem, estimate.state
     covariance_px2 = estimate.variance.of(estimate.table.covariance_px2, estimate.table.magnitude)
     measurements = arrange(estimate.table, estimate.kept, covariance_px2)
-    solution = minimise(problem, state, measurements)
+    solution = minimise(problem, state, measurements, least_gain=_LEAST_GAIN)
     cost = solution.normal.cost
     names = estimate.geometry.camera.parameter_names
-    alone = sigmas = _sigmas(names, problem, solution.state, measurements)
+    alone = sigmas = _sigmas(names, problem, solution)
     removals = [_removal(estimate, problem, solution.state, '', 0.0, 0.0, 0.0, negligible=True)]
     while sigmas:
         least = min(sigmas, key=lambda name: abs(sigmas[name]))
-        problem, state = _without(names, least, problem, solution.state)
+        k = names.index(least)
         try:
-            solution = minimise(problem, state, measurements)
+            problem, state = without_parameter(problem, solution, k, _held_at(names, k, problem))
+            solution = minimise(problem, state, measurements, least_gain=_LEAST_GAIN)
         except NotObservable:
             break
         if not solution.converged:
@@ -67,7 +69,7 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
                 negligible=bool(chdtrc(len(removals), rise) > _SIGNIFICANT),
             )
         )
-        sigmas = _sigmas(names, problem, solution.state, measurements)
+        sigmas = _sigmas(names, problem, solution)
     return tuple(removals)
 
 
@@ -93,31 +95,16 @@ def _held_at(names: tuple[str, ...], k: int, problem: Problem) -> float:
     return float(problem.prior_parameters[k]) if names[k] in _HELD_AT_PRIOR else 0.0
 
 
-def _sigmas(
-    names: tuple[str, ...], problem: Problem, state: State, measurements: Measurements
-) -> dict[str, float]:
+def _sigmas(names: tuple[str, ...], problem: Problem, solution: Minimum) -> dict[str, float]:
     """Distance of each free parameter from the value it would be held at, in its sigma."""
-    _, blocks = image_blocks(problem, state, measurements)
-    information = reduced_information(problem, state, blocks)
+    state = solution.state
+    information = reduced_information(problem, state, solution.normal.blocks)
     estimated = np.concatenate([problem.free, np.arange(len(names), len(information))])
     variance = np.diag(inverse(information[np.ix_(estimated, estimated)]))
     return {
         names[i]: float((state.parameters[i] - _held_at(names, i, problem)) / np.sqrt(v))
         for i, v in zip(problem.free, variance, strict=False)
     }
-
-
-def _without(
-    names: tuple[str, ...], name: str, problem: Problem, state: State
-) -> tuple[Problem, State]:
-    """The problem without a parameter, and the state with the parameter at its held value."""
-    k = names.index(name)
-    parameters = state.parameters.copy()
-    parameters[k] = _held_at(names, k, problem)
-    return (
-        dataclasses.replace(problem, free=problem.free[problem.free != k]),
-        dataclasses.replace(state, parameters=parameters),
-    )
 
 
 def _of_prior(names: tuple[str, ...], before: Problem, after: Problem) -> float:

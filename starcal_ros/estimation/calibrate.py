@@ -73,6 +73,10 @@ class Estimate:
     problem : Problem
         The one whose minimum the state is.
     state : State
+    blocks : (m, p + 4, p + 4)
+        Its `image_blocks`, with the stars that were used and their final covariances.
+    field_terms : LinearTerms or None
+        Its `problem.field_terms`; None where no field is estimated.
     table : StarTable
     kept : (n,) bool
         Stars used.
@@ -121,6 +125,8 @@ class Estimate:
     shared_names: tuple[str, ...]
     problem: Problem
     state: State
+    blocks: Floats
+    field_terms: LinearTerms | None
     table: StarTable
     kept: Mask
     residual_px: Floats
@@ -315,6 +321,8 @@ def _estimate(
         shared_names=names,
         problem=problem,
         state=state,
+        blocks=blocks,
+        field_terms=terms,
         table=table,
         kept=kept,
         residual_px=residual_px,

@@ -13,6 +13,7 @@ from starcal_ros.least_squares.levenberg_marquardt import (
     levenberg_marquardt,
     NormalEquations,
     Solution,
+    solve_arrow,
 )
 from starcal_ros.least_squares.linear_terms import LinearTerms
 from starcal_ros.least_squares.normal_equations import Measurements
@@ -84,6 +85,40 @@ def minimise(
         return _move(problem, state, shared, blocks)
 
     return levenberg_marquardt(start, evaluate, move, least_gain)
+
+
+def without_parameter(
+    problem: Problem, minimum: Minimum, k: int, value: float
+) -> tuple[Problem, State]:
+    """
+    The problem with the k-th camera parameter held at a value, and where to start the search.
+
+    That is where the normal equations of the minimum have the least cost under that condition.
+
+    Raises
+    ------
+    NotObservable
+        When the stars do not determine all other unknowns.
+    """
+    state, normal = minimum.state, minimum.normal
+    shared = np.arange(len(normal.a))
+    at = int(np.flatnonzero(problem.free == k)[0])
+    keep = shared[shared != at]
+    step = value - float(state.parameters[k])
+    left, blocks = solve_arrow(
+        NormalEquations(
+            normal.cost,
+            normal.A[np.ix_(keep, keep)],
+            normal.a[keep] - normal.A[keep, at] * step,
+            normal.B[:, :, keep],
+            normal.C,
+            normal.c - normal.B[:, :, at] * step,
+        ),
+        0.0,
+    )
+    moved = _move(problem, state, np.insert(left, at, step), blocks)
+    moved.parameters[k] = value  # to the last digit
+    return replace(problem, free=problem.free[problem.free != k]), moved
 
 
 def _move(problem: Problem, state: State, shared: Floats, blocks: Floats) -> State:

@@ -16,7 +16,6 @@ from starcal_ros.assessment.cross_validation import cross_validation, predicted_
 from starcal_ros.camera import project
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.least_squares.normal_equations import arrange, whitening
-from starcal_ros.methods.problem import field_terms, image_blocks
 from starcal_ros.records import Ensemble, ResidualBin
 from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.simulation.scenario import Scenario
@@ -25,9 +24,7 @@ from starcal_ros.simulation.scenario import Scenario
 def bins_of(found: Estimate) -> tuple[ResidualBin, ...]:
     covariance = found.variance.of(found.table.covariance_px2, found.table.magnitude)
     measurements = arrange(found.table, found.kept, covariance)
-    _, blocks = image_blocks(found.problem, found.state, measurements)
-    field = field_terms(found.problem, found.state, measurements)
-    return cross_validation(found, measurements, blocks, field)
+    return cross_validation(found, measurements)
 
 
 def without_image(given: Scenario, ensemble: Ensemble, k: int) -> Floats:
@@ -55,8 +52,7 @@ def test_the_linear_step_is_the_calibration_without_the_image() -> None:
         given, ensemble, variance_components=False, outlier_sigma=20.0, residual_field=False
     )
     measurements = arrange(found.table, found.kept, found.table.covariance_px2)
-    _, blocks = image_blocks(found.problem, found.state, measurements)
-    squared, expected = predicted_residuals(found, measurements, blocks, None)
+    squared, expected = predicted_residuals(found, measurements)
     for k in (0, 3):
         inside = (found.table.image == k) & found.kept
         assert inside.sum() == len(ensemble.images[k].measured_px)
