@@ -23,6 +23,7 @@ _MOST_GROUPS = 12
 _CLIP_SIGMA = 4.5  # length of a normal residual: one in 25,000 is longer
 _CLASS_P_VALUE = 0.1  # of classes that differ where none do: then a factor each costs nothing
 _FACTOR_LIMITS = (0.1, 100.0)
+_SETTLED = 1e-3  # relative change of a round; the largest group has its variance to 1 %
 _FEWEST_IMAGES = 3  # whose scatter can contradict a sigma, or one of them the others
 _MISFIT_SIGMA = 6.0  # of an attitude: one in 10^8 is farther off, and a jump is far larger
 _GIVEN_P_VALUE = 0.01  # of contradicting a sigma that is right
@@ -125,8 +126,11 @@ def _line(own: Floats, squared: Floats, parts: list[NDArray[np.intp]]) -> tuple[
     for _ in range(8):
         weight = 1.0 / np.maximum(scale * mean_own + floor_px2, 1e-12)
         A = np.stack([mean_own, np.ones(len(parts))], axis=-1) * weight[:, None]
+        before = scale, floor_px2
         (scale, floor_px2), _ = nnls(A, found(scale, floor_px2) * weight)
         scale = max(float(scale), 0.1)
+        if np.allclose((scale, floor_px2), before, rtol=_SETTLED, atol=0.0):
+            break
     return scale, float(floor_px2)
 
 
@@ -153,8 +157,10 @@ def _class_factors(
     factors = np.clip(mean, *_FACTOR_LIMITS)
     # Linear between the nodes, the mean of a class is not its node: repeated until it is.
     for _ in range(8):
-        left = ratio / np.interp(magnitude, nodes, factors)
+        before, left = factors, ratio / np.interp(magnitude, nodes, factors)
         factors = np.clip(factors * _clipped(_in_rows(left, where))[0], *_FACTOR_LIMITS)
+        if np.allclose(factors, before, rtol=_SETTLED, atol=0.0):
+            break
     return tuple(nodes.tolist()), tuple(factors.tolist())
 
 
