@@ -14,6 +14,7 @@ import bisect
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+import io
 import os
 from pathlib import Path
 import struct
@@ -32,19 +33,21 @@ Damage = Callable[[str], None]
 
 MAGIC = b'\x89MCAP0\r\n'
 _FOOTER = struct.Struct('<BQQQI')  # kind, length, start of summary and of its offsets, checksum
+_RECORD = struct.Struct('<BQ')  # kind, length
+_MESSAGE = struct.Struct('<HIQQ')  # channel, sequence, times of log and publication
 # Damaged bytes are parsed as an arbitrary record, so the exceptions have no common base class.
 _DAMAGE_ERRORS = (McapError, ValueError, struct.error, KeyError, OverflowError, MemoryError)
 
 
 @dataclass(frozen=True)
 class RawMessage:
-    """One recorded message; ``data`` is serialised CDR with its header."""
+    """One recorded message; ``data`` is serialised CDR with its header, a view of its chunk."""
 
     topic: str
     type_name: str
     definition: str
     log_time_ns: int
-    data: bytes
+    data: bytes | memoryview
 
 
 def read_summary(file: Path) -> Summary | None:
@@ -220,18 +223,30 @@ class _Pieces:
         except Exception as error:
             self.report(f'skipped the damaged chunk that ends at byte {end}: {error}')
             return False
-        yield from _inside(stream, length)
+        yield from _inside(stream.read(length) if length else b'')
         return True
 
 
-def _inside(stream: ReadDataStream, length: int) -> Iterator[McapRecord]:
-    while stream.count < length:
-        opcode, size = stream.read1(), stream.read8()
+def _inside(data: bytes) -> Iterator[McapRecord]:
+    """
+    Records of a decompressed chunk.
+
+    The bytes of a message are a view: images are most of a bag, and a copy takes as long as the
+    check of their sum.
+    """
+    view = memoryview(data)
+    start = 0
+    while start < len(data):
+        opcode, size = _RECORD.unpack_from(data, start)
+        start, end = start + _RECORD.size, start + _RECORD.size + size
+        if end > len(data) or (opcode == Opcode.MESSAGE and size < _MESSAGE.size):
+            raise EndOfFile
         if opcode == Opcode.MESSAGE:
-            yield Message.read(stream, size)
+            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, start)
+            content = view[start + _MESSAGE.size : end]
+            yield Message(channel, log_time, content, publish_time, sequence)  # type: ignore[arg-type]
         elif opcode == Opcode.CHANNEL:
-            yield Channel.read(stream)
+            yield Channel.read(ReadDataStream(io.BytesIO(view[start:end])))
         elif opcode == Opcode.SCHEMA:
-            yield Schema.read(stream)
-        else:
-            stream.read(size)
+            yield Schema.read(ReadDataStream(io.BytesIO(view[start:end])))
+        start = end

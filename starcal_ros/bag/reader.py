@@ -246,7 +246,8 @@ def decode(raw: RawMessage) -> Message:
     """
     try:
         store = typestore_of(raw.type_name, raw.definition)
-        return store.deserialize_cdr(raw.data, raw.type_name)
+        # Slices of bytes would copy each image.
+        return store.deserialize_cdr(memoryview(raw.data), raw.type_name)
     # The exceptions of wrong bytes depend on the field and have no common base class.
     except Exception as error:
         raise BagError(
