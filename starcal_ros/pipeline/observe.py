@@ -40,18 +40,6 @@ _IMAGES_OF_A_RESTART = 3  # two images may be swapped in transit, three are not
 
 
 @dataclass(frozen=True)
-class HeldAttitude:
-    """
-    Attitude of an image by the star tracker, and the alignment that its stars give with it.
-
-    Both are (4,); the alignment is that of the prior camera, so that two can be compared.
-    """
-
-    icrf_from_star_tracker_xyzw: Floats
-    star_tracker_from_camera_xyzw: Floats
-
-
-@dataclass(frozen=True)
 class Track:
     """
     State of an image sequence.
@@ -59,10 +47,10 @@ class Track:
     ``geometry`` predicts the stars of a searched image; ``latest_ns`` stamps the last one used.
     ``tracked_camera`` measures the next image without a search; None before the first image.
     ``behind`` images in a row, the last of them at ``behind_ns``, were stamped before the last one
-    used.  ``seen`` is the last frame of all, used or not,
-    which a stuck camera shows again; ``hot`` the hot pixels found so far.  ``held`` is the first
-    image used at the attitude of the last one.  ``taken`` counts the images by star tracker, and
-    ``others`` have the state of the sequence by the further ones, whose mountings are not exact.
+    used.  ``seen`` is the last frame of all, used or not, which a stuck camera shows again;
+    ``hot`` the hot pixels found so far.  ``held`` is the first image used at the attitude that the
+    last one has.  ``taken`` counts the images by star tracker, and ``others`` have the state of
+    the sequence by the further ones, whose mountings are not exact.
     """
 
     geometry: CameraGeometry
@@ -72,7 +60,7 @@ class Track:
     behind_ns: int = 0
     seen: Fingerprint | None = None
     hot: HotPixels | None = None
-    held: HeldAttitude | None = None
+    held: StarObservations | None = None
     taken: Mapping[str, int] = dataclasses.field(default_factory=dict)
     others: Mapping[str, Track] = dataclasses.field(default_factory=dict)
 
@@ -195,7 +183,7 @@ def _with_one(
     )
     if observations.refusal:
         return observations, track
-    after = dataclasses.replace(after, held=_held_attitude(observations, before.held, setup))
+    after = dataclasses.replace(after, held=_first_at_attitude(observations, before.held, setup))
     taken = {**track.taken, name: track.taken.get(name, 0) + 1}
     if not name:
         return observations, dataclasses.replace(after, taken=taken)
@@ -284,11 +272,11 @@ def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservat
     return observations, _with_hot_pixels(after, exposure, observations, setup)
 
 
-def _held_attitude(
-    observations: StarObservations, held: HeldAttitude | None, setup: Setup
-) -> HeldAttitude:
+def _first_at_attitude(
+    observations: StarObservations, held: StarObservations | None, setup: Setup
+) -> StarObservations:
     """
-    The first image at the attitude of this one.
+    The first image at the attitude of this one, of which ``held`` is the one before.
 
     Raises
     ------
@@ -297,12 +285,14 @@ def _held_attitude(
         of a working star tracker never gives, and the stars have turned by more than its sigma.
     """
     attitude = observations.icrf_from_star_tracker_xyzw
-    measured = realigned(setup.prior, observations).star_tracker_from_camera_xyzw
-    now = HeldAttitude(attitude, measured)
     if held is None or np.abs(attitude - held.icrf_from_star_tracker_xyzw).max() > _SAME_ATTITUDE:
-        return now
-    before = Rotation.from_quat(held.star_tracker_from_camera_xyzw)
-    turn = np.abs((before.inv() * Rotation.from_quat(measured)).as_rotvec())
+        return observations
+    # Both by the prior camera, so that they can be compared.
+    before, now = (
+        Rotation.from_quat(realigned(setup.prior, image).star_tracker_from_camera_xyzw)
+        for image in (held, observations)
+    )
+    turn = np.abs((before.inv() * now).as_rotvec())
     across_rad, around_rad = float(np.hypot(turn[0], turn[1])), float(turn[2])
     camera = setup.prior.camera
     noise_rad = _TURN_PX / camera.parameters[0]
