@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import functools
 from typing import Any
 
 import contourpy
@@ -238,8 +239,14 @@ def _upright(panel: Panel, top: float) -> Scale:
 
 def _coloured(levels: NDArray[Any]) -> NDArray[np.uint8]:
     """BGR picture of levels 0 to 255."""
-    shades = np.rint(np.clip(levels, 0, 255)).astype(np.uint8)
-    return np.asarray(cv2.applyColorMap(shades, cv2.COLORMAP_VIRIDIS), np.uint8)
+    return np.asarray(_viridis()[np.rint(np.clip(levels, 0, 255)).astype(np.uint8)])
+
+
+@functools.cache
+def _viridis() -> NDArray[np.uint8]:
+    """Colours (256, 3) BGR; OpenCV takes as long for one as for a million pixels."""
+    shades = np.arange(256, dtype=np.uint8)
+    return np.asarray(cv2.applyColorMap(shades, cv2.COLORMAP_VIRIDIS)[:, 0], np.uint8)
 
 
 def pointings(

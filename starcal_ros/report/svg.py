@@ -202,7 +202,10 @@ class Panel:
         )
         bgra = np.empty((rows, columns, 4), np.uint8)
         bgra[..., :3] = _POINTS_BGR
-        bgra[..., 3] = np.rint(255 * (1 - (1 - opacity) ** np.maximum(covered, 0)))
+        # Rounded: large discs are applied by Fourier transforms.
+        count = np.maximum(np.rint(covered), 0).astype(np.int64)
+        of_count = np.rint(255 * (1 - (1 - opacity) ** np.arange(count.max() + 1)))
+        bgra[..., 3] = of_count.astype(np.uint8)[count]
         self.picture(bgra)
 
     def picture(self, pixels: NDArray[np.uint8]) -> None:
