@@ -293,7 +293,7 @@ def _batch(messages: Iterator[RawMessage]) -> deque[RawMessage]:
     size = 0
     for raw in messages:
         batch.append(raw)
-        size += len(raw.data)
+        size += len(raw.view)
         if size >= _BATCH_BYTES:
             break
     return batch

@@ -41,13 +41,18 @@ _DAMAGE_ERRORS = (McapError, ValueError, struct.error, KeyError, OverflowError, 
 
 @dataclass(frozen=True)
 class RawMessage:
-    """One recorded message; ``data`` is serialised CDR with its header, a view of its chunk."""
+    """One recorded message; ``view`` is serialised CDR with its header, part of a chunk."""
 
     topic: str
     type_name: str
     definition: str
     log_time_ns: int
-    data: bytes | memoryview
+    view: memoryview
+
+    @property
+    def data(self) -> bytes:
+        """The message as bytes of its own, which middleware asks for."""
+        return bytes(self.view)
 
 
 def read_summary(file: Path) -> Summary | None:
@@ -98,9 +103,8 @@ def read_messages(
                 continue  # its channel was lost with a damaged chunk, or it is not ROS 2
             if wanted is None or channel.topic in wanted:
                 definition = schema.data.decode(errors='replace')
-                yield RawMessage(
-                    channel.topic, schema.name, definition, record.log_time, record.data
-                )
+                view = memoryview(record.data)
+                yield RawMessage(channel.topic, schema.name, definition, record.log_time, view)
     if summary is None and pieces.complete:
         pieces.report('truncated, or its summary is damaged; all messages before it were read')
     if known.statistics is not None:

@@ -246,12 +246,11 @@ def decode(raw: RawMessage) -> Message:
     """
     try:
         store = typestore_of(raw.type_name, raw.definition)
-        # Slices of bytes would copy each image.
-        return store.deserialize_cdr(memoryview(raw.data), raw.type_name)
+        return store.deserialize_cdr(raw.view, raw.type_name)
     # The exceptions of wrong bytes depend on the field and have no common base class.
     except Exception as error:
         raise BagError(
-            f'{raw.topic}: cannot decode {len(raw.data)} bytes as {raw.type_name}'
+            f'{raw.topic}: cannot decode {len(raw.view)} bytes as {raw.type_name}'
         ) from error
 
 
