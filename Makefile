@@ -1,7 +1,8 @@
 # make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, test, bench, lint, docs.
 # make test TESTS='-m nodes' runs a part: what follows is handed to pytest. The whole is two runs:
-# tests that start nodes have the machine to themselves. VERSIONS=oldest: with the oldest versions of
-# the Python packages that starcal is tested on, in an environment of their own; no linters there.
+# tests that start nodes wait most of the time, so three run at once. VERSIONS=oldest: with the
+# oldest versions of the Python packages that starcal is tested on, in an environment of their own;
+# no linters there.
 ROS_DISTRO ?= jazzy
 VERSIONS ?= newest
 VENV := .venv$(filter-out -jazzy,-$(ROS_DISTRO))$(filter-out -newest,-$(VERSIONS))
@@ -23,7 +24,7 @@ ifdef TESTS
 	$(RUN)/python -m pytest $(TESTS)
 else
 	@failed=0; \
-	for part in "-m 'not nodes' --numprocesses 2" "-m nodes"; do \
+	for part in "-m 'not nodes' --numprocesses 2" "-m nodes --numprocesses 3"; do \
 		echo "$(RUN)/python -m pytest $$part"; \
 		eval $(RUN)/python -m pytest $$part || failed=1; \
 	done; \

@@ -21,7 +21,7 @@ from starcal_ros.simulation import scenario as synthetic
 
 MOST_MB = 300.0
 # Scenario, images, most wall time in seconds, and as a multiple of the bare read.
-SIZES = (('small', 24, 1.5, None), ('paper', 60, None, 3.0))
+SIZES = (('small', 24, 1.5, None), ('paper', 60, None, 3.0), ('paper', 359, None, 2.0))
 _ROUNDS = 4
 
 # Reads every message as the package's own documentation does.

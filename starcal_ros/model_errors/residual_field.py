@@ -182,7 +182,7 @@ def _kernel_root(
     width: int, height: int, degree: int, length: float, wave: Wave | None = None
 ) -> Floats:
     """Return L (t, r) with ``L L' = W``, the covariance of the coefficients of one component."""
-    nodes, weights = np.polynomial.legendre.leggauss(64)
+    nodes, weights = _quadrature()
     polynomials = legendre(nodes, degree) * (0.5 * weights)
 
     def along(side: int, own: float, wave_number: float = 0.0) -> Floats:
@@ -206,6 +206,12 @@ def _kernel_root(
     root = vectors[:, large] * np.sqrt(values[large])
     root.setflags(write=False)
     return np.asarray(root)
+
+
+@functools.cache
+def _quadrature() -> tuple[Floats, Floats]:
+    """Nodes (64,) and weights (64,) of Gauss and Legendre."""
+    return np.polynomial.legendre.leggauss(64)
 
 
 @dataclass(frozen=True)
