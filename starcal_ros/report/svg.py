@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import html
 import math
+import re
 
 import cv2
 from markupsafe import Markup
@@ -29,6 +30,8 @@ INK, MUTED, GRID, PAPER, BAD = (
 SERIES = tuple(f'var(--series-{k})' for k in (1, 2, 3))
 
 _POINTS_BGR = (212, 139, 61)  # of clouds, which are bitmaps: readable on white and on black
+_TICK_CHARACTERS = 5  # beside the axis; more reach its label
+_UNIT = re.compile(r'\(([^\s()]+)\)')
 _PER_UNIT = 2  # pixels of a bitmap
 _MARKS = {
     'circle': 'M{r},0A{r},{r} 0 1 1 -{r},0A{r},{r} 0 1 1 {r},0Z',
@@ -119,10 +122,11 @@ class Panel:
                 draw(_line(x, top, x, bottom, GRID, 0.7))
             draw(_text(x, bottom + 15, name, 'middle'))
         y_ticks = self.y.ticks(most) if y_label else []
-        for value, y in zip(y_ticks, self.y(np.array(y_ticks)), strict=True):
+        names, y_label = _short(y_ticks, y_label)
+        for name, y in zip(names, self.y(np.array(y_ticks)), strict=True):
             if not is_framed:
                 draw(_line(left, y, right, y, GRID, 0.7))
-            draw(_text(left - 6, y + 4, in_digits(value), 'end'))
+            draw(_text(left - 6, y + 4, name, 'end'))
         if is_framed:
             draw(
                 f'<rect x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}"'
@@ -310,6 +314,18 @@ def _mark(x: float, y: float, colour: str, shape: str, size: float, title: str) 
     )
     inside = f'<title>{html.escape(title)}</title>' if title else ''
     return f'<path transform="translate({x:.1f} {y:.1f})" d="{path}" {style}>{inside}</path>'
+
+
+def _short(values: Sequence[float], label: str) -> tuple[list[str], str]:
+    """Names of the ticks of an axis and its label, in thousandths where they would meet."""
+    names = [in_digits(value) for value in values]
+    unit = _UNIT.search(label)
+    if unit is None or max(map(len, names), default=0) <= _TICK_CHARACTERS:
+        return names, label
+    thousandths = [in_digits(1000.0 * value) for value in values]
+    if max(map(len, thousandths)) > _TICK_CHARACTERS:
+        return names, label
+    return thousandths, f'{label[: unit.start(1)]}0.001 {label[unit.start(1) :]}'
 
 
 def _text(

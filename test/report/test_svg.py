@@ -70,3 +70,15 @@ def test_an_arrow_ends_where_it_points() -> None:
     assert 'M40.0,50.0L' in svg.arrow(np.array([10.0, 10.0]), np.array([30.0, 40.0]), svg.INK)
     assert svg.arrow(np.zeros(2), np.array([0.1, 0.0]), svg.INK).startswith('<circle')
     assert svg.arrow(np.zeros(2), np.array([np.nan, 0.0]), svg.INK) == ''
+
+
+def test_long_numbers_beside_an_axis_become_thousandths() -> None:
+    """At the usual size they would reach the label of the axis."""
+    small = svg.Panel(svg.Scale(0.0, 1.0, 50.0, 450.0), svg.Scale(0.0, 0.0012, 300.0, 20.0))
+    small.axes('x', 'residual (px), rms')
+    text = ''.join(small.parts)
+    assert 'residual (0.001 px), rms' in text
+    assert '>0.6<' in text and '0.0006' not in text
+    large = svg.Panel(svg.Scale(0.0, 1.0, 50.0, 450.0), svg.Scale(0.0, 0.4, 300.0, 20.0))
+    large.axes('x', 'residual (px), rms')
+    assert 'residual (px), rms' in ''.join(large.parts)
