@@ -501,6 +501,25 @@ def test_no_report_is_written_where_none_is_wanted(
     assert not (tmp_path / 'report.html').exists()
 
 
+def test_no_older_report_stands_beside_products_that_cannot_be_drawn(
+    run: Run,
+    tmp_path: Path,
+    tiny_bag: Path,
+    tiny_products: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def cannot(*_: object) -> None:
+        raise ValueError('no such colour')
+
+    monkeypatch.setattr('starcal_ros.report.page.charts_of', cannot)
+    (tmp_path / 'report.html').write_text('of earlier products')
+    bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
+    status, _, err = run('calibrate', bag, '--params', params, '-o', tmp_path)
+    assert status == 2 and 'the products cannot be drawn: ValueError: no such colour' in err
+    assert (tmp_path / 'calibration.json').is_file()
+    assert not (tmp_path / 'report.html').exists()
+
+
 def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[list[str]] = []
     monkeypatch.setattr('os.execv', lambda path, arguments: called.append(arguments))

@@ -130,17 +130,16 @@ def calibrate_into(
             raise TooFewObservations(failure.reason) from error
         pictures = drawn.result()
         written = thread.submit(_write_all, calibration, left, pictures, folder)
+        page, report = '', ''
         try:
-            page, report = '', ''
             if with_report:
                 page, report = _drawn(calibration, left, observations, pictures, folder)
         finally:
             written.result()
-    # After the products that it is of.
+            if not page:  # one that is there is of the products that were replaced
+                (folder / REPORT_FILE).unlink(missing_ok=True)
     if page:
-        write_atomically(folder / REPORT_FILE, page)
-    else:
-        (folder / REPORT_FILE).unlink(missing_ok=True)  # of the products that were replaced
+        write_atomically(folder / REPORT_FILE, page)  # after the products that it is of
     return calibration, observations, report
 
 
