@@ -227,7 +227,7 @@ class _Pieces:
         except Exception as error:
             self.report(f'skipped the damaged chunk that ends at byte {end}: {error}')
             return False
-        yield from _inside(stream.read(length) if length else b'')
+        yield from _inside(stream.read(length))
         return True
 
 
@@ -235,8 +235,8 @@ def _inside(data: bytes) -> Iterator[McapRecord]:
     """
     Records of a decompressed chunk.
 
-    The bytes of a message are a view: images are most of a bag, and a copy takes as long as the
-    check of their sum.
+    The bytes of a message are a view: a copy of each image would be made under Python's lock,
+    which the other thread waits for.
     """
     view = memoryview(data)
     start = 0

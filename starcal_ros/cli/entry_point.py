@@ -13,7 +13,7 @@ import signal
 import sys
 
 _AGAIN_S = 0.01
-# Imports make objects by the 100,000 and few cycles: looking for those at every 700 takes 0.1 s.
+# Imports make many objects and few cycles: looking for these at every 700 takes 0.1 s.
 _OBJECTS_BETWEEN_COLLECTIONS = 10_000
 
 
