@@ -56,7 +56,7 @@ from starcal_ros.untrusted import json_value
 
 _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200
-PRODUCTS = (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, OBSERVATIONS_FILE)
+_PRODUCTS = (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, OBSERVATIONS_FILE)
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Found:
     residuals: Residuals | None
     observations: tuple[StarObservations, ...] | None
     thumbnails: tuple[Thumbnail, ...]
-    files: tuple[str, ...] = PRODUCTS
+    files: tuple[str, ...] = _PRODUCTS
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def read_folder(folder: Path) -> Found:
         read_residuals(residuals) if residuals.is_file() else None,
         recorded,
         read_thumbnails(folder / THUMBNAILS_FOLDER),
-        tuple(name for name in PRODUCTS if (folder / name).is_file()),
+        tuple(name for name in _PRODUCTS if (folder / name).is_file()),
     )
 
 
