@@ -34,20 +34,15 @@ from starcal_ros.methods.problem import (
     scalar_terms_at,
     State,
 )
-from starcal_ros.model_errors.image_variation import ImageVariation, shape_modes
-from starcal_ros.model_errors.residual_field import (
-    best_prior,
-    degree_for,
+from starcal_ros.model_errors.field_kernel import degree_for, NO_WAVES, TEST_DEGREE, Waves
+from starcal_ros.model_errors.field_likelihood import (
     field_likelihood,
     FieldLikelihood,
-    FieldPrior,
-    NO_WAVES,
     polynomials,
     sees_detector,
-    TEST_DEGREE,
-    unseen_prior,
-    Waves,
 )
+from starcal_ros.model_errors.image_variation import ImageVariation, shape_modes
+from starcal_ros.model_errors.residual_field import best_prior, FieldPrior, unseen_prior
 from starcal_ros.model_errors.variance_components import CentroidVariance
 
 _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
@@ -191,7 +186,7 @@ def _with_field(
         return plain
     if test.p_value > options.max_field_p_value:
         return _considering(plain, shown, test)
-    degree = degree_for(test)
+    degree = degree_for(test.length, test.waves)
     best = _field_prior(found, table, camera, degree, looks_for_waves=True)
     for k in range(_FIELD_ROUNDS):
         if best is None:
@@ -200,7 +195,7 @@ def _with_field(
         found = _settle(_started(found, best), weighted, table, options)
         del weighted
         # A smoother kernel of a larger amplitude needs the same degree.
-        degree = max(degree, degree_for(best))
+        degree = max(degree, degree_for(best.length, best.waves))
         # The first search was among residuals whose variance held the field.
         again = _field_prior(found, table, camera, degree, best.waves, looks_for_waves=k == 0)
         if again is not None and k and again.is_close_to(best):
