@@ -47,23 +47,36 @@ def neighbour_pulls(
     flux_dn: Floats,
     model: ImageModel,
     modelled: Mask | None = None,
+    measured: Mask | None = None,
 ) -> Pulls:
     """
     Pull of the neighbours on the centroid of each star.
 
     ``flux_dn`` (n,) is measured and includes light of neighbours; the flux of a neighbour follows
     from the difference of the magnitudes.  For an unresolved pair the pull is from the star to the
-    common centre of light.  The light of ``modelled`` (n,) stars is already subtracted.
+    common centre of light.  The light of ``modelled`` (n,) stars is already subtracted.  Only the
+    ``measured`` (n,) stars get a pull: in a wide field most are too faint to have a place.
     """
     sigma_px = model.psf_sigma_px or 1.0
     reach_px = stamp_radius_px(sigma_px) * math.sqrt(2.0) + 2.0 * sigma_px
     pairs = cKDTree(xy_px).query_pairs(reach_px, output_type='ndarray')
     star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     ratio = 10.0 ** (0.4 * (magnitude[star] - magnitude[other]))
-    flux = np.maximum(flux_dn[star], 1.0)
     offset_px = xy_px[other] - xy_px[star]
     distance_px = np.linalg.norm(offset_px, axis=1)
     known = np.zeros(len(star), bool) if modelled is None else modelled[other]
+    # A neighbour half as bright or more dominates part of the window: the pull is not small.  The
+    # centre of a double of similar stars is not used either: its orbital motion, which the catalog
+    # lacks, reaches arcseconds (zeta Herculis).
+    near = distance_px < np.where(known, SWAMPED_SIGMA, _NEAR_SIGMA) * sigma_px
+    swamped, outshone = np.zeros((2, len(xy_px)), bool)
+    swamped[star[near & (ratio > 0.5)]] = True
+    outshone[star[(distance_px < _NEAR_SIGMA * sigma_px) & (ratio > 1.0)]] = True
+    if measured is not None:
+        of_measured = measured[star]
+        star, ratio, known = star[of_measured], ratio[of_measured], known[of_measured]
+        offset_px, distance_px = offset_px[of_measured], distance_px[of_measured]
+    flux = np.maximum(flux_dn[star], 1.0)
     # Share of the neighbour's light in the measured flux: the overlap of two Gaussians.
     within = np.where(known, 0.0, np.exp(-((0.5 * distance_px / sigma_px) ** 2)))
     own_flux = flux / (1.0 + ratio * within)
@@ -79,13 +92,6 @@ def neighbour_pulls(
     np.add.at(total_px, star[~known], pull_px[~known])
     part = np.where(known, _MODELLED_UNCERTAINTY, _PULL_UNCERTAINTY)
     np.add.at(uncertain_px, star, part[:, None] * pull_px)
-    # A neighbour half as bright or more dominates part of the window: the pull is not small.  The
-    # centre of a double of similar stars is not used either: its orbital motion, which the catalog
-    # lacks, reaches arcseconds (zeta Herculis).
-    near = distance_px < np.where(known, SWAMPED_SIGMA, _NEAR_SIGMA) * sigma_px
-    swamped, outshone = np.zeros((2, len(xy_px)), bool)
-    swamped[star[near & (ratio > 0.5)]] = True
-    outshone[star[(distance_px < _NEAR_SIGMA * sigma_px) & (ratio > 1.0)]] = True
     return Pulls(total_px, uncertain_px, swamped, outshone)
 
 
@@ -124,8 +130,10 @@ def separate(
     catalog flags but does not list.
     """
     magnitude = catalog.magnitude[prediction.catalog_index]
+    # The search for lost lines looks at the places of stars that were not found where they belong.
+    measured = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
     pulls = neighbour_pulls(
-        prediction.xy_px, magnitude, centroids.flux_dn, model, centroids.modelled
+        prediction.xy_px, magnitude, centroids.flux_dn, model, centroids.modelled, measured
     )
     unlisted = _alone(prediction.direction_icrf, catalog.close_pair[prediction.catalog_index])
     faintest = float(catalog.magnitude[-1])
