@@ -32,7 +32,7 @@ from starcal_ros.identification.prediction import (
     SPACE,
     within_image,
 )
-from starcal_ros.image.centroiding import Centroids, measure_stars
+from starcal_ros.image.centroiding import Centroids, measure_stars, with_faint
 from starcal_ros.image.detection import (
     Background,
     detect,
@@ -40,6 +40,7 @@ from starcal_ros.image.detection import (
     measure_background,
     Sources,
 )
+from starcal_ros.image.faint_end import detectable_count
 from starcal_ros.image.hot_pixels import NO_HOT_PIXELS, refuse_on_hot_pixels
 from starcal_ros.image.image_model import CentroidOptions, ImageModel, model_image
 from starcal_ros.image.psf_field import Instrument, learn, MeasuredStars
@@ -182,10 +183,16 @@ def measure_predicted(
     catalog, options = search.catalog, search.identification
     height, width = exposure.image.pixels.shape
     shown = within_image(prediction, width, height)
-    centroids = measure_stars(
-        exposure.image.pixels, shown.xy_px, model, search.centroid, exposure.hot_pixels
+    count = detectable_count(
+        exposure.image.pixels, shown.xy_px, model.background, search.centroid.min_snr
     )
-    centroids, alone = separate(shown, catalog, centroids, model, options.max_blend_sigma)
+    measured = measure_stars(
+        exposure.image.pixels, shown.xy_px[:count], model, search.centroid, exposure.hot_pixels
+    )
+    # The faint ones, too, may pull the others, and are listed as refused.
+    centroids, alone = separate(
+        shown, catalog, with_faint(measured, shown.xy_px), model, options.max_blend_sigma
+    )
     _refuse_line_loss(shown.xy_px, centroids, (height, width))
     psf_sigma_px = model.psf_sigma_px or 1.0
     refusal = refuse_on_hot_pixels(
@@ -211,14 +218,14 @@ def measure_predicted(
     observations = _observations(
         exposure, shown, catalog, centroids, model, options.min_stars_per_image
     )
-    if observations.refusal or centroids.fit is None:
+    if observations.refusal or measured.fit is None:
         return observations, instrument
     stars = MeasuredStars(
-        centroids.xy_px,
-        centroids.fit,
-        centroids.psf_sigma_px,
-        centroids.noise_dn,
-        (refusal == StarRefusal.NONE) & alone,
+        centroids.xy_px[:count],
+        measured.fit,
+        measured.psf_sigma_px,
+        measured.noise_dn,
+        ((refusal == StarRefusal.NONE) & alone)[:count],
     )
     shown_dn = model.saturation_dn if np.isfinite(model.saturation_dn) else 0.0
     return observations, learn(instrument, stars, model.pixel_noise, shown_dn, (width, height))

@@ -89,6 +89,30 @@ def measure_stars(
     return _measure_by_moments(pixels, predicted_px, model, options)
 
 
+def with_faint(measured: Centroids, predicted_px: Floats) -> Centroids:
+    """
+    Centroids of predicted stars (n, 2) of which the first were measured and the others are faint.
+
+    The PSF fit is not in the result, as the others have none.
+    """
+    more = len(predicted_px) - len(measured.refusal)
+
+    def extended(values: Floats, value: float) -> Floats:
+        return np.concatenate([values, np.full((more, *values.shape[1:]), value)])
+
+    return Centroids(
+        xy_px=np.concatenate([measured.xy_px, predicted_px[len(predicted_px) - more :]]),
+        covariance_px2=extended(measured.covariance_px2, np.nan),
+        flux_dn=extended(measured.flux_dn, 0.0),
+        snr=extended(measured.snr, 0.0),
+        refusal=np.concatenate([measured.refusal, np.full(more, StarRefusal.FAINT, np.uint8)]),
+        fit=None,
+        psf_sigma_px=extended(measured.psf_sigma_px, np.nan),
+        noise_dn=extended(measured.noise_dn, np.nan),
+        modelled=np.concatenate([measured.modelled, np.zeros(more, bool)]),
+    )
+
+
 def _measure_by_psf(
     pixels: Pixels,
     predicted_px: Floats,

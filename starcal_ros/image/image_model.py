@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ from starcal_ros.robust_statistics import centre_and_scatter, median
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by their sensitivity
 _BRIGHTEST = 60  # stars that may show the level of saturation
 _MAX_PSF_SIGMA_PX = 4.0
+_CUT_OFF_BELOW_DN = 1.0  # a background below it shows 0 DN in a good part of its pixels
 
 
 @dataclass(frozen=True)
@@ -158,6 +160,7 @@ def model_image(
         fit = fit_psf(stamps, sigma, noise_dn, noise_model)
         noise_model = noise_sums(fit, noise_dn, noise_model).pixel_noise(gain)
     psf = uniform_width(sigma, shape[1], shape[0])
+    noise_model = _at_least_sky(noise_model, background)
     return ImageModel(background, psf, noise_model, saturation_dn, shape_median, shape_scatter)
 
 
@@ -183,11 +186,19 @@ def known_model(
     return ImageModel(
         background,
         known.psf_width(),
-        known.noise.pixel_noise(options.gain_e_per_dn),
+        _at_least_sky(known.noise.pixel_noise(options.gain_e_per_dn), background),
         saturation_dn or np.inf,
         known.shape_median,
         known.shape_scatter,
     )
+
+
+def _at_least_sky(noise: PixelNoise, background: Background) -> PixelNoise:
+    """Noise beside a star that is no less than that of the sky where the converter cuts it off."""
+    if background.level_dn >= _CUT_OFF_BELOW_DN:
+        return noise
+    # Pixels at 0 DN do not scatter: their residuals would make faint stars look certain.
+    return dataclasses.replace(noise, background=max(noise.background, 1.0))
 
 
 def _isolated(xy_px: Floats, distance_px: float) -> Floats:

@@ -133,11 +133,14 @@ def learn(
     size : (int, int)
         Width and height of the detector.
     """
-    fit = stars.fit
-    bright = np.nonzero(stars.usable & (fit.snr > _BRIGHT_SNR))[0][:_MOST]
+    usable = np.nonzero(stars.usable)[0]
+    bright = usable[stars.fit.snr[usable] > _BRIGHT_SNR][:_MOST]
     if len(bright) < _FEWEST:
         return before
-    fit, noise_dn = select(fit, bright), stars.noise_dn[bright]
+    # Bright stars alone do not tell photon noise from a PSF error, which fainter ones do not show.
+    shown = usable[:_MOST]
+    noise = noise_sums(select(stars.fit, shown), stars.noise_dn[shown], expected)
+    fit = select(stars.fit, bright)
     variance = stars.sigma_px[bright] ** 2
     median, scatter = centre_and_scatter(fit.shape_change)
     change = fit.shape_change[:, :2].mean(axis=1)
@@ -148,7 +151,6 @@ def learn(
     basis = width_basis(stars.xy_px[bright], *size)
     weighted = basis * weight[:, None]
     normal, right = weighted.T @ basis, weighted.T @ (variance * (1.0 + change))
-    noise = noise_sums(fit, noise_dn, expected)
     if before is not None:
         keep = _MEMORY
         normal, right = normal + keep * before.width_normal, right + keep * before.width_right

@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import dataclasses
 import functools
+from typing import Any
 
 import numpy as np
 import pytest
 from sample_sky import with_planets  # type: ignore[import-not-found]
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.errors import ImageRefused
+from starcal_ros.identification import star_finder
 from starcal_ros.identification.star_finder import (
     Exposure,
     IdentificationOptions,
@@ -67,6 +71,24 @@ def followed(image: Exposure, before: TrackedCamera) -> tuple[StarObservations, 
     return track_stars(image, before, StarSearch(catalog(), CENTROIDS, OPTIONS))
 
 
+def of_detector(seed: int, count: int, **changes: Any) -> Iterator[tuple[Scene, StarObservations]]:
+    """Scenes and observations with another detector, from the image that starts a track on."""
+    given = scenario('tiny', seed=seed)
+    other = dataclasses.replace(given, detector=dataclasses.replace(given.detector, **changes))
+    prior, known = other.prior, None
+    for index in range(count):
+        one = scene(other, index)
+        image = render(other, one, index)
+        exposed = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
+        if known is not None:
+            observations, known = track_stars(exposed, known, StarSearch(catalog()))
+        else:
+            observations, instrument = observe_stars(exposed, prior, StarSearch(catalog()))
+            known = start_tracking(prior, observations, instrument)
+        if known is not None:
+            yield one, observations
+
+
 @pytest.mark.parametrize('index', [1, 2, 5])
 def test_tracking_gives_the_stars_of_a_search(index: int) -> None:
     _, known = searched(0)
@@ -99,6 +121,40 @@ def test_an_ensemble_knows_its_light_better_than_an_image() -> None:
     width = known.instrument.psf_width()
     assert width.sigma_px == pytest.approx(detector.psf_sigma_px, rel=0.006)
     assert not width.coefficients[1:].any()  # the same all over the field
+
+
+def test_a_background_cut_off_at_zero_makes_no_star_look_certain() -> None:
+    errors = []
+    for seed in (8, 9, 10, 11):
+        cut = of_detector(seed, 10, zero_point_electrons=2.5e4, psf_sigma_px=0.55, offset_dn=0.0)
+        for one, observations in cut:
+            apart_px, nearest = cKDTree(one.pixel_px).query(observations.measured_px)
+            assert apart_px.max() < 3.0
+            sigma_px = np.sqrt(observations.covariance_px2[:, [0, 2]])
+            errors.append((observations.measured_px - one.pixel_px[nearest]) / sigma_px)
+    of_sigma = np.concatenate(errors)
+    # 3,000 errors tell their RMS to 0.013.  A Gaussian for a PSF of half a pixel costs 0.04; with
+    # the small scatter of the pixels at 0 DN it was 1.13.
+    assert float(np.sqrt((of_sigma**2).mean())) < 1.09
+
+
+def test_stars_left_out_as_too_faint_are_listed_as_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole, _ = searched(1)
+    used = np.flatnonzero(np.isin(catalog().id, whole.catalog_id))
+    refused = np.flatnonzero(np.isin(catalog().id, whole.refused_catalog_id))
+    # All that were used, and half of those that are fainter: the catalog is sorted by magnitude.
+    fainter = int((refused > used.max()).sum())
+    count = len(used) + len(refused) - fainter // 2
+    assert fainter > 100
+    monkeypatch.setattr(star_finder, 'detectable_count', lambda *_: count)
+    part, _ = searched(1)
+    assert part.catalog_id.tolist() == whole.catalog_id.tolist()
+    assert set(part.refused_catalog_id) == set(whole.refused_catalog_id)
+    # Light of the faint ones that the fits found is no longer subtracted.
+    sigma_px = np.sqrt(whole.covariance_px2[:, [0, 2]])
+    assert np.median(np.abs(part.measured_px - whole.measured_px) / sigma_px) < 1e-3
 
 
 def test_a_width_that_changes_over_the_field_is_learnt() -> None:
