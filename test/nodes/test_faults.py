@@ -32,6 +32,7 @@ from starcal_ros.records import Image
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.nodes
 @pytest.mark.slow
 @pytest.mark.timeout(400)  # fifteen node starts of 2 s, ten times as long on a busy machine
 def test_no_fault_loses_or_kills(tmp_path: Path) -> None:
