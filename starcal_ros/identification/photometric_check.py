@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import best_share, missed_parts, part_of, PARTS
 from starcal_ros.image.centroiding import Centroids
@@ -91,16 +91,24 @@ def refuse_by_brightness(
     least_dn = 10.0 ** (0.4 * (faintest - magnitude.astype(np.float64)))
     seen = expected_snr(least_dn, psf_sigma_px, noise_dn, model.pixel_noise) > min_snr
     refusal[seen & (refusal == StarRefusal.FAINT)] = StarRefusal.NOT_DETECTED
+    refusal[_alone_in_part(refusal, seen, predicted_px, shape)] = StarRefusal.AMBIGUOUS
+    return refusal
+
+
+def _alone_in_part(
+    refusal: NDArray[np.uint8], seen: Mask, predicted_px: Floats, shape: tuple[int, int]
+) -> Mask:
+    """Mask (n,) of the good stars in parts that lack almost all stars that are to be ``seen``."""
     kept = refusal == StarRefusal.NONE
     gone = seen & ((refusal == StarRefusal.NOT_DETECTED) | (refusal == StarRefusal.AMBIGUOUS))
     if np.count_nonzero(gone) < _FEWEST - 1:
-        return refusal
+        return np.zeros_like(kept)
     height, width = shape
     part = part_of(predicted_px, width, height)
     found = np.bincount(part[seen & kept], minlength=PARTS)
     shown = found + np.bincount(part[gone], minlength=PARTS)
-    if missed_parts(shown, found).any():
-        # Accept only parts with at least half the share of the best one.
-        accepted = (shown > 0) & (found >= 0.5 * best_share(shown, found) * shown)
-        refusal[kept & ~accepted[part]] = StarRefusal.AMBIGUOUS
-    return refusal
+    if not missed_parts(shown, found).any():
+        return np.zeros_like(kept)
+    # Accept only parts with at least half the share of the best one.
+    accepted = (shown > 0) & (found >= 0.5 * best_share(shown, found) * shown)
+    return np.asarray(kept & ~accepted[part])

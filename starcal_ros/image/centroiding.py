@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,54 +123,22 @@ def _measure_by_psf(
     hot_pixels: NDArray[np.int64],
 ) -> Centroids:
     """Centroids by `fit_psf`, in windows about the predicted pixels."""
-    shape = (pixels.shape[0], pixels.shape[1])
-    radius = stamp_radius_px(psf.sigma_px)
-    n = len(predicted_px)
-    refusal = np.full(n, StarRefusal.NONE, np.uint8)
-    centre = np.rint(np.where(np.isnan(predicted_px), -1e6, predicted_px)).astype(np.int64)
-    inside = windows_inside(shape, centre, 1)
-    innermost = np.array([shape[1] - 2, shape[0] - 2])
-    centre = np.minimum(np.maximum(centre, 1), innermost)
-    # The window is centred on the brightest pixel next to the prediction.
-    near = windows_about(pixels, centre, 1)
-    near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0
-    near = near.reshape(n, 9)
-    best = near.argmax(axis=1)
-    best[near[:, 4] == near.max(axis=1)] = 4  # on a saturated plateau, the predicted pixel
-    centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
-    centre = np.minimum(np.maximum(centre, 1), innermost)
-    stamps, outside = stamps_at_edges(pixels, centre, radius)
-    saturated = (stamps >= model.saturation_dn) & ~outside
-    at_px = centre.astype(np.float64)
-    noise_dn = sample_mesh(model.background.noise_mesh, shape, at_px)
-    invalid = (stamps == 0.0) & (
-        sample_mesh(model.background.level_mesh, shape, at_px) > GAP_SIGMA * noise_dn
-    )[:, None, None]
-    # The fit has a level and no slope: a slope in the data would bias faint stars.
-    stamps -= _slopes(model.background, shape, at_px, radius)
-    sigma_px = psf.at(at_px)
-    hot = hot_in_stamps(hot_pixels, centre, radius, shape[1]) & ~outside
-    level_dn = border_level_dn(stamps)
-    hot |= _single_pixels(pixels, stamps, centre, level_dn, noise_dn, model.pixel_noise)
-    # The first guess uses all pixels; the fit leaves these out.
-    if hot.any():
-        stamps[hot] = level_dn[np.nonzero(hot)[0]]
-    out = saturated | hot | outside | invalid
-    windows = Stamps(stamps, sigma_px, noise_dn[:, None] ** 2, out if out.any() else None)
-    parameters = approach(windows, first_guess(windows, level_dn), model.pixel_noise)
-    saturated_pixels = np.count_nonzero(saturated & ~hot, axis=(1, 2))
-    windows, parameters, modelled = _without_neighbours(
-        windows,
-        parameters,
+    centre, inside = _brightest_beside(pixels, predicted_px, hot_pixels)
+    windows = _windows(pixels, centre, model, psf, hot_pixels)
+    guess = first_guess(windows.stamps, windows.level_dn)
+    stamps, parameters, modelled = _without_neighbours(
+        windows.stamps,
+        approach(windows.stamps, guess, model.pixel_noise),
         predicted_px,
         centre,
-        inside & (saturated_pixels == 0),
+        inside & (windows.saturated_pixels == 0),
         model.pixel_noise,
     )
-    fit = fit_at(windows, parameters, model.pixel_noise)
+    fit = fit_at(stamps, parameters, model.pixel_noise)
+    refusal = np.full(len(predicted_px), StarRefusal.NONE, np.uint8)
     for bad, reason in (
         (~inside, StarRefusal.BORDER),
-        (saturated_pixels > options.max_saturated_pixels, StarRefusal.SATURATED),
+        (windows.saturated_pixels > options.max_saturated_pixels, StarRefusal.SATURATED),
         ((fit.snr < options.min_snr) | ~np.isfinite(fit.snr), StarRefusal.FAINT),
         (np.abs(fit.parameters[:, :2]).max(axis=1) > _IN_PLACE_PX, StarRefusal.NOT_DETECTED),
         (_misshapen(fit, model, options), StarRefusal.ELONGATED),
@@ -182,9 +151,70 @@ def _measure_by_psf(
         snr=fit.snr,
         refusal=refusal,
         fit=fit,
-        psf_sigma_px=sigma_px,
-        noise_dn=noise_dn,
+        psf_sigma_px=stamps.sigma_px,
+        noise_dn=windows.noise_dn,
         modelled=modelled,
+    )
+
+
+def _brightest_beside(
+    pixels: Pixels, predicted_px: Floats, hot_pixels: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The brightest pixel (n, 2) next to each predicted one, and a mask (n,) of those inside."""
+    shape = (pixels.shape[0], pixels.shape[1])
+    centre = np.rint(np.where(np.isnan(predicted_px), -1e6, predicted_px)).astype(np.int64)
+    inside = windows_inside(shape, centre, 1)
+    innermost = np.array([shape[1] - 2, shape[0] - 2])
+    centre = np.minimum(np.maximum(centre, 1), innermost)
+    near = windows_about(pixels, centre, 1)
+    near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0
+    near = near.reshape(len(centre), 9)
+    best = near.argmax(axis=1)
+    best[near[:, 4] == near.max(axis=1)] = 4  # on a saturated plateau, the predicted pixel
+    centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
+    return np.minimum(np.maximum(centre, 1), innermost), inside
+
+
+class _Windows(NamedTuple):
+    """Windows about stars; level of their borders, noise of the sky and saturated pixels (n,)."""
+
+    stamps: Stamps
+    level_dn: Floats
+    noise_dn: Floats
+    saturated_pixels: NDArray[np.int64]
+
+
+def _windows(
+    pixels: Pixels,
+    centre: NDArray[np.int64],
+    model: ImageModel,
+    psf: PsfWidth,
+    hot_pixels: NDArray[np.int64],
+) -> _Windows:
+    """Windows for a fit about pixels (n, 2), without pixels that show no light of the star."""
+    shape = (pixels.shape[0], pixels.shape[1])
+    radius = stamp_radius_px(psf.sigma_px)
+    stamps, outside = stamps_at_edges(pixels, centre, radius)
+    saturated = (stamps >= model.saturation_dn) & ~outside
+    at_px = centre.astype(np.float64)
+    noise_dn = sample_mesh(model.background.noise_mesh, shape, at_px)
+    invalid = (stamps == 0.0) & (
+        sample_mesh(model.background.level_mesh, shape, at_px) > GAP_SIGMA * noise_dn
+    )[:, None, None]
+    # The fit has a level and no slope: a slope in the data would bias faint stars.
+    stamps -= _slopes(model.background, shape, at_px, radius)
+    hot = hot_in_stamps(hot_pixels, centre, radius, shape[1]) & ~outside
+    level_dn = border_level_dn(stamps)
+    hot |= _single_pixels(pixels, stamps, centre, level_dn, noise_dn, model.pixel_noise)
+    # The first guess uses all pixels; the fit leaves these out.
+    if hot.any():
+        stamps[hot] = level_dn[np.nonzero(hot)[0]]
+    out = saturated | hot | outside | invalid
+    return _Windows(
+        Stamps(stamps, psf.at(at_px), noise_dn[:, None] ** 2, out if out.any() else None),
+        level_dn,
+        noise_dn,
+        np.count_nonzero(saturated & ~hot, axis=(1, 2)),
     )
 
 
