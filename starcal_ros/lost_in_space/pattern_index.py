@@ -71,7 +71,7 @@ def pattern_index(catalog: StarCatalog, scale: int) -> PatternIndex:
     sky_by_disc = 2.0 / (1.0 - math.cos(radius_rad))
     stars = catalog.direction_icrs[: int(_DEPTH * of_disc * sky_by_disc)]
     centres = sphere_points(int(4 * math.pi / (_SPACING * radius_rad) ** 2))
-    members = brightest_within(stars, centres, radius_rad, of_disc)
+    members = brightest_within(cKDTree(stars), centres, radius_rad, of_disc)
     chosen = np.array(list(itertools.combinations(range(of_disc), 4)))
     quads = np.sort(members[:, chosen].reshape(-1, 4), axis=1)
     quads = quads[quads[:, 0] >= 0]  # -1 fills up a disc with fewer stars
@@ -155,10 +155,9 @@ def sphere_points(count: int) -> Floats:
     return np.stack([r * np.cos(longitude), r * np.sin(longitude), z], axis=-1)
 
 
-def brightest_within(stars: Floats, centres: Floats, radius_rad: float, count: int) -> Indices:
-    """Rows (p, count) of the brightest of sorted stars (n, 3) about centres (p, 3); -1: none."""
-    tree = cKDTree(stars)
-    found = tree.query_ball_point(centres, 2 * math.sin(radius_rad / 2), return_sorted=True)
+def brightest_within(stars: cKDTree, centres: Floats, radius_rad: float, count: int) -> Indices:
+    """Rows (p, count) of the brightest of sorted stars about centres (p, 3); -1: none."""
+    found = stars.query_ball_point(centres, 2 * math.sin(radius_rad / 2), return_sorted=True)
     rows = np.full((len(centres), count), -1, np.int64)
     for k, inside in enumerate(found):
         few = inside[:count]

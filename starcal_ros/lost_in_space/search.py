@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.lost_in_space.pattern_index import (
+    brightest_within,
     equivalent,
     pattern_index,
     scales_for,
@@ -51,6 +52,7 @@ _ALIKE = 0.03  # largest shift of one star to the next, half diagonals
 _OF_A_GUESS = 40  # brightest stars and sources
 _CANDIDATES = 20_000  # tested candidates of a lookup, drawn at random from more
 _TESTED = 16  # brightest predictions used to test a candidate
+_TABLED = 5000  # points all over the sky whose stars are kept: fields wider than 10 degrees
 _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
 _NEAR, _FAR = 0.006, 0.02  # 1-sigma of the predictions of a candidate, in half diagonals
@@ -350,14 +352,24 @@ def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTr
 def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: int) -> Indices:
     """Rows (n, count) of the brightest stars within about a radius of axes (n, 3); -1 if fewer."""
     points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
-    point, place = np.unique(points.query(axes)[1], return_inverse=True)
-    widened = 2 * math.sin(min(1.25 * radius_rad, math.pi) / 2)
-    found = stars.query_ball_point(points.data[point], widened, return_sorted=True)
-    rows = np.full((len(point), count), -1, np.int64)
-    for k, inside in enumerate(found):
-        few = inside[:count]
-        rows[k, : len(few)] = few
-    return np.asarray(rows[place.ravel()])
+    point = points.query(axes)[1]
+    if points.n <= _TABLED:
+        return np.asarray(_bright_everywhere(catalog, radius_rad, count)[point])
+    point, place = np.unique(point, return_inverse=True)
+    found = brightest_within(stars, points.data[point], _widened(radius_rad), count)
+    return np.asarray(found[place.ravel()])
+
+
+@functools.lru_cache(maxsize=8)
+def _bright_everywhere(catalog: StarCatalog, radius_rad: float, count: int) -> Indices:
+    """Rows (p, count) of `_bright_about` for all points of `_bright_stars`."""
+    points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
+    return brightest_within(stars, points.data, _widened(radius_rad), count)
+
+
+def _widened(radius_rad: float) -> float:
+    """Radius about the nearest point that holds the disc about an axis."""
+    return min(1.25 * radius_rad, math.pi)
 
 
 def _stars_about(image: SourceImage, catalog: StarCatalog, axis: Floats) -> Indices:

@@ -56,19 +56,21 @@ def equal_shapes(
     lowest, highest = np.maximum(lowest, 0), np.minimum(highest, grid.cells - 1)
     within = np.flatnonzero((lowest <= highest).all(axis=1))
     lowest, highest = lowest[within], highest[within]
-    most = (highest - lowest).max(axis=0, initial=0)[:3]
+    # One row an axis: comparisons of long rows take a quarter of the time of short ones.
+    span = np.ascontiguousarray((highest - lowest).T)
+    lowest_cell = np.ravel_multi_index(tuple(lowest.T), tuple(grid.cells))
     pairs = []
-    for step in itertools.product(*(range(int(k) + 1) for k in most)):
-        there = np.flatnonzero((lowest[:, :3] + step <= highest[:, :3]).all(axis=1))
-        start = np.ravel_multi_index(
-            (*(lowest[there, :3] + step).T, lowest[there, 3]), tuple(grid.cells)
-        )
+    for step in itertools.product(*(range(int(k) + 1) for k in span[:3].max(axis=1, initial=0))):
+        there = np.flatnonzero((span[0] >= step[0]) & (span[1] >= step[1]) & (span[2] >= step[2]))
+        start = lowest_cell[there] + int(np.ravel_multi_index((*step, 0), tuple(grid.cells)))
         # Cells along the last place follow one another.
-        end = start + highest[there, 3] - lowest[there, 3] + 1
+        end = start + span[3, there] + 1
         pairs.append(_rows_between(within[there], grid.first[start], grid.first[end]))
     query, row = np.concatenate(pairs, axis=1)
-    off = np.abs(grid.shape[row] - shape[query])
-    equal = (off[:, :4] <= place_tolerance).all(axis=1) & (off[:, 4] <= size_tolerance)
+    off = np.abs(grid.shape[row] - shape[query]).T
+    equal = off[4] <= size_tolerance
+    for place in off[:4]:
+        equal &= place <= place_tolerance
     return query[equal], row[equal]
 
 
