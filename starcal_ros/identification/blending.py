@@ -46,8 +46,8 @@ def neighbour_pulls(
     magnitude: Floats,
     flux_dn: Floats,
     model: ImageModel,
-    modelled: Mask | None = None,
-    measured: Mask | None = None,
+    modelled: Mask,
+    measured: Mask,
 ) -> Pulls:
     """
     Pull of the neighbours on the centroid of each star.
@@ -64,7 +64,7 @@ def neighbour_pulls(
     ratio = 10.0 ** (0.4 * (magnitude[star] - magnitude[other]))
     offset_px = xy_px[other] - xy_px[star]
     distance_px = np.linalg.norm(offset_px, axis=1)
-    known = np.zeros(len(star), bool) if modelled is None else modelled[other]
+    known = modelled[other]
     # A neighbour half as bright or more dominates part of the window: the pull is not small.  The
     # centre of a double of similar stars is not used either: its orbital motion, which the catalog
     # lacks, reaches arcseconds (zeta Herculis).
@@ -72,10 +72,9 @@ def neighbour_pulls(
     swamped, outshone = np.zeros((2, len(xy_px)), bool)
     swamped[star[near & (ratio > 0.5)]] = True
     outshone[star[(distance_px < _NEAR_SIGMA * sigma_px) & (ratio > 1.0)]] = True
-    if measured is not None:
-        of_measured = measured[star]
-        star, ratio, known = star[of_measured], ratio[of_measured], known[of_measured]
-        offset_px, distance_px = offset_px[of_measured], distance_px[of_measured]
+    of_measured = measured[star]
+    star, ratio, known = star[of_measured], ratio[of_measured], known[of_measured]
+    offset_px, distance_px = offset_px[of_measured], distance_px[of_measured]
     flux = np.maximum(flux_dn[star], 1.0)
     # Share of the neighbour's light in the measured flux: the overlap of two Gaussians.
     within = np.where(known, 0.0, np.exp(-((0.5 * distance_px / sigma_px) ** 2)))

@@ -102,7 +102,7 @@ def with_faint(measured: Centroids, predicted_px: Floats) -> Centroids:
         return np.concatenate([values, np.full((more, *values.shape[1:]), value)])
 
     return Centroids(
-        xy_px=np.concatenate([measured.xy_px, predicted_px[len(predicted_px) - more :]]),
+        xy_px=np.concatenate([measured.xy_px, predicted_px[len(measured.refusal) :]]),
         covariance_px2=extended(measured.covariance_px2, np.nan),
         flux_dn=extended(measured.flux_dn, 0.0),
         snr=extended(measured.snr, 0.0),
@@ -361,32 +361,12 @@ def _measure_by_moments(
     mask = disc & (signal > (options.mask_threshold_sigma * noise_dn)[:, None, None])
     weight = np.where(mask, signal, 0.0)
     flux = weight.sum(axis=(1, 2))
-    total = np.maximum(flux, 1e-12)
-    x = (weight * offsets[None, None, :]).sum(axis=(1, 2)) / total
-    y = (weight * offsets[None, :, None]).sum(axis=(1, 2)) / total
     of_pixel = model.pixel_noise.variance(signal, noise_dn[:, None, None], flux[:, None, None])
     variance = np.where(mask, of_pixel, 0.0)
-    dx = offsets[None, None, :] - x[:, None, None]
-    dy = offsets[None, :, None] - y[:, None, None]
-    covariance = (
-        np.stack(
-            [
-                (variance * dx * dx).sum(axis=(1, 2)),
-                (variance * dx * dy).sum(axis=(1, 2)),
-                (variance * dy * dy).sum(axis=(1, 2)),
-            ],
-            axis=-1,
-        )
-        / (total**2)[:, None]
-    )
+    place_px, covariance_px2, ellipticity = _moments(weight, variance, offsets)
+    snr = flux / np.sqrt(np.maximum(variance.sum(axis=(1, 2)), 1e-12))
     # A mask of one pixel would give a covariance of zero.
     count = mask.sum(axis=(1, 2))
-    snr = flux / np.sqrt(np.maximum(variance.sum(axis=(1, 2)), 1e-12))
-    moment_xx = (weight * dx * dx).sum(axis=(1, 2)) / total
-    moment_yy = (weight * dy * dy).sum(axis=(1, 2)) / total
-    moment_xy = (weight * dx * dy).sum(axis=(1, 2)) / total
-    size = np.maximum(moment_xx + moment_yy, 1e-12)
-    ellipticity = np.hypot(moment_xx - moment_yy, 2 * moment_xy) / size
     for bad, reason in (
         (stamps.max(axis=(1, 2)) >= model.saturation_dn, StarRefusal.SATURATED),
         (snr < options.min_snr, StarRefusal.FAINT),
@@ -395,8 +375,8 @@ def _measure_by_moments(
     ):
         refusal[bad & (refusal == StarRefusal.NONE)] = reason
     return Centroids(
-        xy_px=centre + np.stack([x, y], axis=-1),
-        covariance_px2=covariance,
+        xy_px=centre + place_px,
+        covariance_px2=covariance_px2,
         flux_dn=flux,
         snr=snr,
         refusal=refusal,
@@ -405,3 +385,25 @@ def _measure_by_moments(
         noise_dn=noise_dn,
         modelled=np.zeros(n, bool),
     )
+
+
+def _moments(weight: Floats, variance: Floats, offsets: Floats) -> tuple[Floats, Floats, Floats]:
+    """
+    Centres of intensity (n, 2) from the middles, their covariances (n, 3) and ellipticities (n,).
+
+    ``weight`` and ``variance`` (n, w, w) are those of the pixels, 0 outside the mask; ``offsets``
+    (w,) are the places of the pixels along each axis.
+    """
+    total = np.maximum(weight.sum(axis=(1, 2)), 1e-12)
+    x = (weight * offsets[None, None, :]).sum(axis=(1, 2)) / total
+    y = (weight * offsets[None, :, None]).sum(axis=(1, 2)) / total
+    dx = offsets[None, None, :] - x[:, None, None]
+    dy = offsets[None, :, None] - y[:, None, None]
+
+    def second(values: Floats) -> Floats:
+        pairs = ((dx, dx), (dx, dy), (dy, dy))
+        return np.stack([(values * a * b).sum(axis=(1, 2)) for a, b in pairs], axis=-1)
+
+    xx, xy, yy = (second(weight) / total[:, None]).T
+    ellipticity = np.hypot(xx - yy, 2 * xy) / np.maximum(xx + yy, 1e-12)
+    return np.stack([x, y], axis=-1), second(variance) / (total**2)[:, None], ellipticity

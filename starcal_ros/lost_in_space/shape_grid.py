@@ -56,7 +56,7 @@ def equal_shapes(
     lowest, highest = np.maximum(lowest, 0), np.minimum(highest, grid.cells - 1)
     within = np.flatnonzero((lowest <= highest).all(axis=1))
     lowest, highest = lowest[within], highest[within]
-    # One row an axis: comparisons of long rows take a quarter of the time of short ones.
+    # One row an axis: comparisons of long rows are faster than those of short ones.
     span = np.ascontiguousarray((highest - lowest).T)
     lowest_cell = np.ravel_multi_index(tuple(lowest.T), tuple(grid.cells))
     pairs = []

@@ -174,7 +174,7 @@ def _mutual(
     seen = image.xy_px[:most_sources]
     if len(xy_px) == 0 or len(seen) == 0:
         return none, none, np.empty(0)
-    # Along each axis by itself: the sum over an axis of two numbers takes three times as long.
+    # Along each axis by itself: the sum over an axis of two numbers takes several times as long.
     apart = (xy_px[:, 0, None] - seen[:, 0]) ** 2
     apart += (xy_px[:, 1, None] - seen[:, 1]) ** 2
     source = apart.argmin(axis=1)

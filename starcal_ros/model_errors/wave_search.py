@@ -9,7 +9,7 @@ import functools
 import numpy as np
 
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import CameraModel
+from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.detector_field import basis
 from starcal_ros.model_errors.field_kernel import covariance, Wave, Waves
 from starcal_ros.model_errors.field_likelihood import ComponentLikelihood, FieldLikelihood
@@ -47,27 +47,36 @@ def _refined(
     found = []
     # A long envelope has a narrow line: it is looked for where a shorter one has found it.
     for envelope in _ENVELOPES:
-        wave, step = dataclasses.replace(wave, envelope=envelope), _STEP / envelope
+        wave = dataclasses.replace(wave, envelope=envelope)
         _, amplitude_px = shown.best_amplitude(length, _in_order(wave, other, component))
         likelihood = shown.of_component(component, length, other, amplitude_px)
-
-        @functools.cache
-        def ratio(one: Wave, likelihood: ComponentLikelihood = likelihood) -> float:
-            size = shown.camera.width, shown.camera.height
-            return likelihood.ratio(covariance(*size, shown.degree, length, one))
-
-        for _ in range(_REFINEMENTS):
-            around = [
-                Wave(abs(wave.along_u + i * step), abs(wave.along_v + j * step), envelope)
-                for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1))
-            ]
-            best = max(around, key=ratio)
-            if ratio(best) > ratio(wave):
-                wave = best
-            else:
-                step *= 0.5
-        found.append((ratio(wave), envelope, wave))
+        ratio, wave = _likeliest(likelihood, shown, length, wave)
+        found.append((ratio, envelope, wave))
     return _in_order(max(found)[2], other, component)
+
+
+def _likeliest(
+    likelihood: ComponentLikelihood, shown: FieldLikelihood, length: float, wave: Wave
+) -> tuple[float, Wave]:
+    """The wave of most likely numbers near a given one, its envelope held, and its ratio."""
+
+    @functools.cache
+    def ratio(one: Wave) -> float:
+        size = shown.camera.width, shown.camera.height
+        return likelihood.ratio(covariance(*size, shown.degree, length, one))
+
+    step = _STEP / wave.envelope
+    for _ in range(_REFINEMENTS):
+        around = [
+            Wave(abs(wave.along_u + i * step), abs(wave.along_v + j * step), wave.envelope)
+            for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1))
+        ]
+        best = max(around, key=ratio)
+        if ratio(best) > ratio(wave):
+            wave = best
+        else:
+            step *= 0.5
+    return ratio(wave), wave
 
 
 def _in_order(own: Wave, other: Wave, component: int) -> tuple[Wave, Wave]:
@@ -77,15 +86,13 @@ def _in_order(own: Wave, other: Wave, component: int) -> tuple[Wave, Wave]:
 
 def _dominant_wave(camera: CameraModel, degree: int, coefficients: Floats) -> tuple[float, float]:
     """Wave numbers along u and v of the largest power of a component of a field."""
-    longer = max(camera.width, camera.height)
-    u = np.linspace(0.0, camera.width - 1.0, _GRID)
-    v = np.linspace(0.0, camera.height - 1.0, _GRID)
-    pixels = np.stack([grid.ravel() for grid in np.meshgrid(u, v)], axis=-1)
+    pixels = pixel_grid(camera, _GRID, _GRID)
     values = basis(pixels, camera.width, camera.height, degree) @ coefficients
+    image, u, v = (one.reshape(_GRID, _GRID) for one in (values, *pixels.T))
+    half = 0.5 * max(camera.width, camera.height)
     numbers = np.arange(0.0, _FASTEST, _STEP)
-    along_u = np.exp(1j * np.outer(numbers, 2.0 * u / longer))
-    along_v = np.exp(1j * np.outer(numbers, 2.0 * v / longer))
-    image = values.reshape(_GRID, _GRID)
+    along_u = np.exp(1j * np.outer(numbers, u[0] / half))
+    along_v = np.exp(1j * np.outer(numbers, v[:, 0] / half))
     power = sum(np.abs(one @ image @ along_u.T) ** 2 for one in (along_v, along_v.conj()))
     j, i = np.unravel_index(int(np.argmax(power)), (len(numbers), len(numbers)))
     return float(numbers[i]), float(numbers[j])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.identification.blending import neighbour_pulls, unlisted_pull_px
+from starcal_ros.identification.blending import neighbour_pulls, Pulls, unlisted_pull_px
 from starcal_ros.identification.star_finder import IdentificationOptions
 from starcal_ros.image.detection import Background
 from starcal_ros.image.image_model import ImageModel
@@ -44,13 +44,21 @@ def image_model(noise_dn: float) -> ImageModel:
     return ImageModel(background, psf, noise, 4095.0, np.zeros(3), np.zeros(3))
 
 
+def pulls_on(
+    xy_px: np.ndarray, magnitude: np.ndarray, flux_dn: np.ndarray, model: ImageModel
+) -> Pulls:
+    """Pulls on stars that are all measured, and none subtracted from another."""
+    none = np.zeros(len(xy_px), bool)
+    return neighbour_pulls(xy_px, magnitude, flux_dn, model, none, ~none)
+
+
 def pulls(
     flux_dn: float, ratio: float, distance_px: float, noise_dn: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
     magnitude = np.array([5.0, 5.0 - 2.5 * np.log10(ratio)])
     flux = flux_dn * np.array([1.0, ratio])
-    found = neighbour_pulls(pair, magnitude, flux, image_model(noise_dn))
+    found = pulls_on(pair, magnitude, flux, image_model(noise_dn))
     return found.pull_px, found.uncertain_px, found.swamped
 
 
@@ -91,7 +99,7 @@ def test_of_two_stars_that_look_like_one_the_centre_of_light_is_measured(ratio: 
     total = 2000.0 * np.array([1.0 + ratio, 1.0 + ratio])
     pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
     magnitude = np.array([5.0, 5.0 - 2.5 * np.log10(ratio)])
-    found = neighbour_pulls(pair, magnitude, total, image_model(2.1)).pull_px
+    found = pulls_on(pair, magnitude, total, image_model(2.1)).pull_px
     # To first order in the distance; the second is (distance / sigma)^2, 1 %.
     assert found[0, 0] == pytest.approx(ratio / (1.0 + ratio) * distance_px, rel=0.02)
 
@@ -112,7 +120,7 @@ def test_what_a_companion_that_the_catalog_has_not_may_pull() -> None:
 def test_only_the_fainter_of_two_unlike_stars_is_swamped() -> None:
     pair = np.array([[100.0, 100.0], [104.0, 100.0], [300.0, 300.0]])
     flux = np.array([5000.0, 50.0, 800.0])
-    found = neighbour_pulls(pair, np.array([4.0, 9.0, 6.0]), flux, image_model(2.1))
+    found = pulls_on(pair, np.array([4.0, 9.0, 6.0]), flux, image_model(2.1))
     pull_px, swamped = found.pull_px, found.swamped
     np.testing.assert_array_equal(swamped, [False, True, False])
     np.testing.assert_array_equal(found.outshone, [False, True, False])
@@ -121,8 +129,8 @@ def test_only_the_fainter_of_two_unlike_stars_is_swamped() -> None:
 
 def test_no_neighbours_no_pulls() -> None:
     model = image_model(2.1)
-    none = neighbour_pulls(np.empty((0, 2)), np.empty(0), np.empty(0), model)
+    none = pulls_on(np.empty((0, 2)), np.empty(0), np.empty(0), model)
     pull_px, swamped = none.pull_px, none.swamped
     assert pull_px.shape == (0, 2) and swamped.shape == (0,)
     alone = np.array([[5.0, 5.0]])
-    assert not neighbour_pulls(alone, np.array([3.0]), np.array([90.0]), model).pull_px.any()
+    assert not pulls_on(alone, np.array([3.0]), np.array([90.0]), model).pull_px.any()
