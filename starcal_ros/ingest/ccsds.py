@@ -1,10 +1,11 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-CCSDS attitude and orbit ephemerides (AEM, OEM), KVN or XML, read by ccsds-ndm.
+CCSDS attitude and orbit ephemerides (AEM, OEM), KVN or XML.
 
-Sources: CCSDS 504.0-B-2 (ADM) and 502.0-B-3 (ODM).  A quaternion A to B of an AEM gives, as frame
+Sources: CCSDS 504.0-B (ADM) and 502.0-B (ODM).  A quaternion A to B of an AEM gives, as frame
 transformation, coordinates in B from those in A; as rotation operator, as in ROS and here, it
-takes coordinates in B to those in A.
+takes coordinates in B to those in A.  AEM 1.0 states direction and order of its quaternions by
+keywords; in AEM 2.0 they are A to B, scalar last.
 """
 
 from __future__ import annotations
@@ -12,14 +13,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 import re
-from typing import Any
 
 import erfa
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.constants import AU_M, NANOSECONDS_PER_SECOND, utc_text
+from starcal_ros.ingest.navigation_messages import read_segments, Segment
 from starcal_ros.ingest.records import (
     Attitudes,
     frame_notes,
@@ -27,7 +29,6 @@ from starcal_ros.ingest.records import (
     IngestError,
     is_inertial,
     start_of,
-    text_of,
     Velocities,
 )
 from starcal_ros.ingest.time_systems import from_text, system_of, TimeError
@@ -36,16 +37,17 @@ from starcal_ros.sky.astrometry import tt_julian_date
 _KM = 1000.0
 _DAY_S = 86400.0
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
-_STATES = ('quaternion_state', 'quaternion_ephemeris', 'quaternion_derivative')
-# ccsds-ndm 3.1.1 fails on KVN of AEM 2.0; its quaternions are those of AEM 1.0, A2B, scalar last.
-_AEM_2 = re.compile(r'^(\s*CCSDS_AEM_VERS\s*=\s*)2\.0', re.MULTILINE)
-_ATTITUDE_TYPE = re.compile(r'^(\s*ATTITUDE_TYPE\s*=\s*QUATERNION\S*)[ \t]*$', re.MULTILINE)
+_KVN = re.compile(rb'^\s*CCSDS_\w+_VERS\s*=', re.MULTILINE)
+# ATTITUDE_TYPE -> numbers of a line, of which four are the quaternion.
+_NUMBERS = {'QUATERNION': 4, 'QUATERNION/DERIVATIVE': 8}
+_TYPES = {'1.0': {**_NUMBERS, 'QUATERNION/RATE': 7}, '2.0': {**_NUMBERS, 'QUATERNION/ANGVEL': 7}}
+_STATE_NUMBERS = (6, 9)  # position and velocity, without and with acceleration
 
 
 def is_ccsds(path: Path) -> bool:
-    """Whether a file begins as a CCSDS message, KVN or XML."""
-    start = start_of(path)
-    return b'CCSDS_' in start or b'<aem' in start or b'<oem' in start
+    """Whether a file begins as a CCSDS message in KVN, or as XML."""
+    start = start_of(path).removeprefix(b'\xef\xbb\xbf')
+    return start.lstrip().startswith(b'<') or _KVN.search(start) is not None
 
 
 def read_aem(path: Path, star_tracker: str = '') -> Attitudes:
@@ -59,28 +61,32 @@ def read_aem(path: Path, star_tracker: str = '') -> Attitudes:
         converted.
     """
     where = str(path)
-    segments = _segments(path, 'Aem')
-    bodies = dict.fromkeys(_frames(segment.metadata, where)[1] for segment in segments)
+    segments = read_segments(path, 'AEM')
+    bodies = dict.fromkeys(_frames(segment, where)[1] for segment in segments)
     chosen = star_tracker.upper() or next(iter(bodies))
     if chosen not in bodies or (len(bodies) > 1 and not star_tracker):
         raise IngestError(
             f'{where}: body frames {", ".join(bodies)}: choose one with --star-tracker'
         )
-    stamps: list[int] = []
+    stamps: list[Indices] = []
     quaternions: list[Floats] = []
     notes: list[str] = []
     for segment in segments:
-        inertial, body, is_operator = _frames(segment.metadata, where)
+        inertial, body, is_forward = _frames(segment, where)
         if body != chosen:
             continue
         notes += frame_notes(inertial, where)
-        system = _system(segment.metadata, where)
-        for epoch, q in _quaternions(segment, where):
-            stamps.append(_stamp(epoch, system, where))
-            quaternions.append(q if is_operator else q * _CONJUGATE)
+        system = _system(segment, where)
+        q, is_a_to_b = _quaternions(segment, where)
+        at = _stamps(segment, system, where)
+        keep = _useable(segment, at, system, where)
+        stamps.append(at[keep])
+        quaternions.append(q[keep] if is_forward == is_a_to_b else q[keep] * _CONJUGATE)
         if system != 'UTC':
             notes.append(f'times converted from {system} to UTC')
-    return in_order(stamps, quaternions, where, tuple(dict.fromkeys(notes)))
+    return in_order(
+        np.concatenate(stamps), np.concatenate(quaternions), where, tuple(dict.fromkeys(notes))
+    )
 
 
 def read_oem(path: Path, at_ns: Sequence[int]) -> Velocities:
@@ -99,21 +105,19 @@ def read_oem(path: Path, at_ns: Sequence[int]) -> Velocities:
     at = np.array(at_ns, np.int64)
     found = np.full((len(at), 3), np.nan)
     notes: list[str] = []
-    for segment in _segments(path, 'Oem'):
-        notes += frame_notes(str(segment.metadata.ref_frame), where)
-        system = _system(segment.metadata, where)
-        states = segment.data.state_vector
-        stamps = np.array([_stamp(state.epoch, system, where) for state in states], np.int64)
-        position = np.array([[state.x.value, state.y.value, state.z.value] for state in states])
-        velocity = np.array([[s.x_dot.value, s.y_dot.value, s.z_dot.value] for s in states])
+    for segment in read_segments(path, 'OEM'):
+        notes += frame_notes(_keyword(segment, 'REF_FRAME', where), where)
+        system = _system(segment, where)
+        stamps = _stamps(segment, system, where)
+        states = _numbers(segment, _STATE_NUMBERS, where)
         if len(stamps) < 2 or not (np.diff(stamps) > 0).all():
             raise IngestError(f'{where}: a segment has fewer than two states, or is out of order')
-        inside = (at >= stamps[0]) & (at <= stamps[-1])
+        inside = (at >= stamps[0]) & (at <= stamps[-1]) & _useable(segment, at, system, where)
         # Seconds since the first state: those since 1970 have a resolution of 0.1 us.
         seconds = (stamps - stamps[0]) / NANOSECONDS_PER_SECOND
-        orbit = CubicHermiteSpline(seconds, position, velocity)
+        orbit = CubicHermiteSpline(seconds, states[:, :3], states[:, 3:6])
         since_s = (at[inside] - stamps[0]) / NANOSECONDS_PER_SECOND
-        center = str(segment.metadata.center_name)
+        center = _keyword(segment, 'CENTER_NAME', where)
         found[inside] = orbit(since_s, 1) * _KM + _center_velocity(center, at[inside], where)
     missing = ~np.isfinite(found[:, 0])
     if missing.any():
@@ -124,74 +128,86 @@ def read_oem(path: Path, at_ns: Sequence[int]) -> Velocities:
     return Velocities(at, found, tuple(dict.fromkeys(notes)))
 
 
-def _segments(path: Path, kind: str) -> list[Any]:
-    try:
-        from ccsds_ndm.ndm_io import NdmIo
-    except ModuleNotFoundError as error:
+def _keyword(segment: Segment, key: str, where: str, *values: str) -> str:
+    """Value of a keyword that is needed, one of ``values`` if there are any."""
+    found = segment.metadata.get(key, '').upper()
+    if not found or (values and found not in values):
+        expected = f' {" or ".join(values)}' if values else ''
         raise IngestError(
-            f"{path}: CCSDS files need ccsds-ndm: pip install 'starcal_ros[mission]'"
-        ) from error
-    text = text_of(path)
-    # A few lines of nested entities expand to gigabytes, and an entity can name another file.
-    if '<!DOCTYPE' in text or '<!ENTITY' in text:
-        raise IngestError(f'{path}: a document type definition is not read; remove it')
-    if _AEM_2.search(text):
-        text = _ATTITUDE_TYPE.sub(r'\1\nATTITUDE_DIR = A2B\nQUATERNION_TYPE = LAST', text)
-        text = _AEM_2.sub(r'\g<1>1.0', text)
-    try:
-        message = NdmIo().from_string(text)
-    # The exceptions of its parsers depend on the field and have no common base class.
-    except Exception as error:
-        words = ' '.join(str(error).split())[:160]
-        raise IngestError(f'{path}: not readable as CCSDS {kind.upper()}: {words}') from error
-    if type(message).__name__ != kind:
-        raise IngestError(f'{path}: is {type(message).__name__.upper()}, not {kind.upper()}')
-    segments: list[Any] = message.body.segment
-    return segments
+            f'{where}: keyword {key} is {found or "missing"}, and version {segment.version} needs'
+            f' it{expected}: ask who wrote the file'
+        )
+    return found
 
 
-def _frames(metadata: Any, where: str) -> tuple[str, str, bool]:
-    """
-    Inertial frame, body frame, and whether the quaternion is the rotation operator here.
-
-    That is: it takes body coordinates to inertial ones.
-    """
-    a, b = str(metadata.ref_frame_a).upper(), str(metadata.ref_frame_b).upper()
+def _frames(segment: Segment, where: str) -> tuple[str, str, bool]:
+    """Inertial frame, body frame, and whether frame A is the inertial one."""
+    a, b = (_keyword(segment, f'REF_FRAME_{name}', where) for name in 'AB')
     if is_inertial(a) == is_inertial(b):
         raise IngestError(
             f'{where}: frames {a} and {b}: one must be ICRF or EME2000, the other the star tracker'
         )
-    direction = getattr(metadata, 'attitude_dir', None)
-    forward = 'A2B' if direction is None else str(direction.value).upper()
-    from_inertial = is_inertial(a) == (forward == 'A2B')
-    return (a, b, from_inertial) if is_inertial(a) else (b, a, from_inertial)
+    return (a, b, True) if is_inertial(a) else (b, a, False)
 
 
-def _system(metadata: Any, where: str) -> str:
-    name = metadata.time_system
+def _quaternions(segment: Segment, where: str) -> tuple[Floats, bool]:
+    """Quaternions (n, 4), scalar last, and whether they are from A to B."""
+    is_old = segment.version == '1.0'
+    is_a_to_b = not is_old or _keyword(segment, 'ATTITUDE_DIR', where, 'A2B', 'B2A') == 'A2B'
+    kind = _keyword(segment, 'ATTITUDE_TYPE', where)
+    if kind not in _TYPES[segment.version]:
+        raise IngestError(f'{where}: attitudes of type {kind}, not QUATERNION: convert them')
+    if segment.is_xml:
+        return _numbers(segment, (4,), where), is_a_to_b
+    values = _numbers(segment, (_TYPES[segment.version][kind],), where)[:, :4]
+    if is_old and _keyword(segment, 'QUATERNION_TYPE', where, 'FIRST', 'LAST') == 'FIRST':
+        values = np.roll(values, -1, axis=1)
+    return values, is_a_to_b
+
+
+def _numbers(segment: Segment, counts: Sequence[int], where: str) -> Floats:
+    """Numbers (n, k) of a segment, k one of ``counts`` and the same for each epoch."""
+    if not segment.values:
+        raise IngestError(f'{where}: a segment without data')
+    count = len(segment.values[0])
+    odd = [k for k, values in enumerate(segment.values) if len(values) != count]
+    if odd or count not in counts:
+        k = odd[0] if odd else 0
+        raise IngestError(
+            f'{where}: {len(segment.values[k])} numbers at {segment.epochs[k]}, expected '
+            f'{" or ".join(map(str, counts))}'
+        )
+    values = np.array(segment.values)
+    if not np.isfinite(values).all():
+        k = int(np.argmin(np.isfinite(values).all(axis=1)))
+        raise IngestError(f'{where}: a number at {segment.epochs[k]} is not finite')
+    return values
+
+
+def _system(segment: Segment, where: str) -> str:
     try:
-        return system_of(str(getattr(name, 'value', name)))
+        return system_of(_keyword(segment, 'TIME_SYSTEM', where))
     except TimeError as error:
         raise IngestError(f'{where}: {error}') from error
 
 
-def _quaternions(segment: Any, where: str) -> list[tuple[str, Floats]]:
-    found = []
-    for state in segment.data.attitude_state:
-        value = next(
-            (v for v in (getattr(state, n, None) for n in _STATES) if v is not None), None
-        )
-        if value is None:
-            kind = getattr(segment.metadata.attitude_type, 'value', segment.metadata.attitude_type)
-            raise IngestError(f'{where}: attitudes of type {kind}, not QUATERNION: convert them')
-        q = value.quaternion
-        found.append((str(value.epoch), np.array([q.q1, q.q2, q.q3, q.qc], np.float64)))
-    return found
+def _stamps(segment: Segment, system: str, where: str) -> Indices:
+    return np.array([_stamp(epoch, system, where) for epoch in segment.epochs], np.int64)
+
+
+def _useable(segment: Segment, at: Indices, system: str, where: str) -> NDArray[np.bool_]:
+    """Stamps within the useable span of a segment; the other states are for interpolation."""
+    keep = np.ones(len(at), np.bool_)
+    if 'USEABLE_START_TIME' in segment.metadata:
+        keep &= at >= _stamp(segment.metadata['USEABLE_START_TIME'], system, where)
+    if 'USEABLE_STOP_TIME' in segment.metadata:
+        keep &= at <= _stamp(segment.metadata['USEABLE_STOP_TIME'], system, where)
+    return keep
 
 
 def _stamp(epoch: str, system: str, where: str) -> int:
     try:
-        return from_text(str(epoch), system)
+        return from_text(epoch, system)
     except TimeError as error:
         raise IngestError(f'{where}: {error}') from error
 

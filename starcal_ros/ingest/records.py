@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import StarcalError
@@ -63,7 +63,7 @@ def text_of(path: Path) -> str:
         When it cannot be read, is too large or no text.
     """
     try:
-        return read_text(path, _TEXT_BYTES)
+        return read_text(path, _TEXT_BYTES).removeprefix('\ufeff')  # byte-order mark
     except OSError as error:
         raise IngestError(f'{path}: cannot be read: {error.strerror}') from error
     except ValueError as error:
@@ -110,9 +110,7 @@ def is_inertial(name: str) -> bool:
     return name.strip().upper() in (*ICRF_NAMES, *EME2000_NAMES)
 
 
-def in_order(
-    time_ns: list[int], xyzw: list[Floats], where: str, notes: tuple[str, ...]
-) -> Attitudes:
+def in_order(time_ns: ArrayLike, xyzw: ArrayLike, where: str, notes: tuple[str, ...]) -> Attitudes:
     """
     Attitudes sorted by time, each stamp once (of equal stamps the first), scaled to unit length.
 
@@ -121,10 +119,10 @@ def in_order(
     IngestError
         When there are none, or a quaternion is not of unit length.
     """
-    if not time_ns:
+    stamps, first = np.unique(np.asarray(time_ns, np.int64), return_index=True)
+    if not len(stamps):
         raise IngestError(f'{where}: no attitudes')
-    stamps, first = np.unique(np.array(time_ns, np.int64), return_index=True)
-    quaternions = np.array(xyzw, np.float64)[first]
+    quaternions = np.asarray(xyzw, np.float64)[first]
     norm = np.linalg.norm(quaternions, axis=1)
     wrong = ~(np.abs(norm - 1.0) <= 1e-3)  # single precision keeps 1e-7; this is no rounding
     if wrong.any():

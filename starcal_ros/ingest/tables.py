@@ -10,12 +10,16 @@ image.
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterator
 import csv
 import math
 from pathlib import Path
+import re
 
 import numpy as np
 
+from starcal_ros.arrays import Floats, Indices
 from starcal_ros.ingest.records import Attitudes, in_order, IngestError, text_of, Velocities
 from starcal_ros.ingest.time_systems import from_text, SYSTEMS, TimeError, to_utc_ns
 
@@ -32,31 +36,36 @@ def read_attitudes(path: Path) -> Attitudes:
     IngestError
         Naming the line that is wrong.
     """
-    rows = _rows(path, _QUATERNION)
-    stamps = [_stamp(row, f'{path} line {number}') for number, row in rows]
-    numbers = [_numbers(row, _QUATERNION, f'{path} line {number}') for number, row in rows]
-    return in_order(stamps, [np.array(q) for q in numbers], str(path), ())
+    stamps, quaternions = _stamps_and_numbers(path, _QUATERNION)
+    return in_order(stamps, quaternions, str(path), ())
 
 
 def read_velocities(path: Path) -> Velocities:
     """Velocities of a CSV file, in order of time; raises as `read_attitudes`."""
-    rows = _rows(path, _VELOCITY)
-    stamps = np.array([_stamp(row, f'{path} line {n}') for n, row in rows], np.int64)
-    values = np.array([_numbers(row, _VELOCITY, f'{path} line {n}') for n, row in rows])
+    stamps, values = _stamps_and_numbers(path, _VELOCITY)
     order = np.argsort(stamps, kind='stable')
-    return Velocities(stamps[order], values[order].reshape(-1, 3))
+    return Velocities(stamps[order], values[order])
 
 
 def read_times(path: Path) -> dict[str, int]:
     """Stamps by the names of images, without folders; raises as `read_attitudes`."""
-    rows = _rows(path, ('file',))
     return {
-        Path(row['file'] or '').name: _stamp(row, f'{path} line {number}') for number, row in rows
+        Path(row['file'] or '').name: _stamp(row, where) for where, row in _rows(path, ('file',))
     }
 
 
-def _rows(path: Path, needed: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
-    lines = text_of(path).splitlines()
+def _stamps_and_numbers(path: Path, names: tuple[str, ...]) -> tuple[Indices, Floats]:
+    """Stamps (n,) and the numbers (n, k) of some columns."""
+    stamps, numbers = array('q'), array('d')
+    for where, row in _rows(path, names):
+        stamps.append(_stamp(row, where))
+        numbers.extend(_numbers(row, names, where))
+    return np.array(stamps, np.int64), np.array(numbers).reshape(-1, len(names))
+
+
+def _rows(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[str, dict[str, str]]]:
+    """Rows, one at a time, each with its place for an error message."""
+    lines = (found[0] for found in re.finditer(r'[^\r\n]+', text_of(path)))
     table = csv.DictReader(line for line in lines if not line.startswith('#'))
     try:
         names = [name.strip() for name in table.fieldnames or ()]
@@ -65,7 +74,8 @@ def _rows(path: Path, needed: tuple[str, ...]) -> list[tuple[int, dict[str, str]
             wanted = ', '.join((*missing, 'time_utc'))
             raise IngestError(f'{path}: a table without the columns {wanted}')
         table.fieldnames = names
-        return [(number, row) for number, row in enumerate(table, start=2)]
+        for number, row in enumerate(table, start=2):
+            yield f'{path} line {number}', row
     except csv.Error as error:
         raise IngestError(f'{path}: not a table of text: {error}') from error
 

@@ -19,7 +19,6 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE', 'msg')
 OF_EXTRAS = (
-    'ccsds_ndm',
     'dask',
     'distributed',
     'jinja2',
