@@ -22,18 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
-from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.image.file_header import png_header, tiff_header
+from starcal_ros.image.file_header import has_surplus, png_header, tiff_header
+from starcal_ros.ingest.header_times import Card, middle_of_exposure
 from starcal_ros.ingest.records import IngestError
-from starcal_ros.ingest.time_systems import from_mjd, from_text, system_of, TimeError
+from starcal_ros.ingest.time_systems import TimeError
 from starcal_ros.messages.colour import of_mosaic, plane
 from starcal_ros.untrusted import read_bytes
 
 FITS_ENDINGS = ('.fits', '.fit', '.fts', '.fits.gz', '.fit.gz', '.fits.fz', '.fz')
-_EXPOSURE_KEYS = ('XPOSURE', 'EXPTIME', 'EXPOSURE')  # s; the first is that of the FITS standard
 _RGB, _GREY = 3, 2
-_MOST_VALUES = 2**28  # of an image, all colours: 1 GB in single precision
+_MOST_VALUES = 2**27  # of an image, all colours: as many as a node takes
 _MOST_BYTES = 2**31
+_ROWS = 256  # mapped at a time: an image in double precision can exceed the memory
 _FULL = 65000  # of 16 bit: below the end of the range, which stands for saturation
 
 
@@ -94,9 +94,13 @@ class Scale:
         """Pixels of values; not-a-number becomes the median of the image."""
         if self.is_none and values.dtype.kind in 'ui':
             return self._cast(values)
-        known = np.nan_to_num(values, nan=float(np.nanmedian(values)))
-        dn = np.rint((known - self.offset) / self.step)
-        return self._cast(np.clip(dn, 0, np.iinfo(self.dtype).max))
+        middle = float(np.nanmedian(values)) if np.isnan(values).any() else 0.0
+        pixels = self._cast(np.zeros(values.shape, self.dtype))
+        for top in range(0, len(values), _ROWS):
+            known = np.nan_to_num(values[top : top + _ROWS], nan=middle)
+            dn = np.rint((known - self.offset) / self.step)
+            pixels[top : top + _ROWS] = np.clip(dn, 0, np.iinfo(self.dtype).max)
+        return pixels
 
     def _cast(self, values: NDArray[Any]) -> Pixels:
         return values.astype(np.uint8) if self.dtype is np.uint8 else values.astype(np.uint16)
@@ -112,9 +116,10 @@ def look(path: Path, options: ImageOptions) -> ImageFile:
         When the file cannot be read or has no time; the text names the remedy.
     """
     values, header = _read(path, options)
-    finite = values if values.dtype.kind in 'ui' else values[np.isfinite(values)]
-    if finite.size == 0:
+    finite = np.isfinite(values)
+    if not finite.any():
         raise IngestError(f'{path}: no pixel is a finite number')
+    some = values.flat[int(finite.argmax())]
     steps = np.abs(np.diff(values[:: max(1, len(values) // 200)].astype(np.float64), axis=1))
     height, width = values.shape
     return ImageFile(
@@ -123,8 +128,8 @@ def look(path: Path, options: ImageOptions) -> ImageFile:
         width,
         height,
         values.dtype,
-        float(finite.min()),
-        float(finite.max()),
+        float(values.min(where=finite, initial=some)),
+        float(values.max(where=finite, initial=some)),
         # The median step between neighbours is 0.954 sigma for white noise.
         float(np.nanmedian(steps)) / 0.954,
         _number(header, 'SATURATE'),
@@ -184,12 +189,12 @@ def check_alike(files: Sequence[ImageFile]) -> None:
             raise IngestError(f'{after.path}: has the time of {before.path}')
 
 
-def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str, Any]]:
+def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str, Card]]:
     if path.name.lower().endswith(FITS_ENDINGS):
         values, header = _read_fits(path, options.hdu)
     else:
         values, header = _read_picture(path), {}
-    if values.ndim == _RGB:
+    if values.ndim == _RGB and values.shape[2] == _RGB:
         if options.channel not in ('red', 'green', 'blue'):
             raise IngestError(f'{path}: a colour image: choose --channel red, green or blue')
         values = plane(values, 'rgb', options.channel)
@@ -198,11 +203,14 @@ def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str,
             raise IngestError(f'{path}: of a mosaic choose --channel red, green or blue')
         values = of_mosaic(values, options.bayer.lower(), options.channel)
     if values.ndim != _GREY or min(values.shape) < 2:
-        raise IngestError(f'{path}: of shape {values.shape}, not an image')
+        raise IngestError(
+            f'{path}: of shape {values.shape}, neither an image nor three planes of colour: '
+            'write each image to a file of its own'
+        )
     return values, header
 
 
-def _read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Any]]:
+def _read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
     try:
         from astropy.io import fits
     except ModuleNotFoundError as error:
@@ -231,9 +239,9 @@ def _read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Any]]:
             if math.prod(sides) > _MOST_VALUES or unit.data is None:
                 raise IngestError(f'{path}: no image of up to {_MOST_VALUES} values')
             # The time may be in the primary header, the image in an extension.
-            header = {**dict(units[0].header), **dict(unit.header)}
+            header = {**_cards(units[0].header), **_cards(unit.header)}
             values = np.asarray(unit.data)
-    except IngestError:
+    except (IngestError, MemoryError):
         raise
     except Exception as error:  # astropy raises whatever a damaged file brings about
         words = ' '.join(str(error).split())[:160]
@@ -242,6 +250,18 @@ def _read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Any]]:
     if values.ndim == _RGB and values.shape[0] == _RGB:
         values = np.moveaxis(values, 0, -1)  # a cube of three planes
     return values.astype(values.dtype.newbyteorder('=')), header
+
+
+def _cards(header: Any) -> dict[str, Card]:
+    """Cards of a header of astropy, of equal keywords the first."""
+    found: dict[str, Card] = {}
+    for card in header.cards:
+        try:
+            value = Card(card.value, card.comment)
+        except Exception:  # astropy cannot parse it: it matters where it is needed, as this text
+            value = Card(str(card.image)[10:].strip())
+        found.setdefault(card.keyword, value)
+    return found
 
 
 @contextlib.contextmanager
@@ -278,6 +298,8 @@ def _read_picture(path: Path) -> NDArray[Any]:
     # None is decoded before its size is known.
     if header.width * header.height * header.channels > _MOST_VALUES:
         raise IngestError(f'{path}: claims {header.width} x {header.height} pixels')
+    if png_header(content) and has_surplus(content, header):
+        raise IngestError(f'{path}: inflates to far more than its pixels')
     values = None
     with contextlib.suppress(cv2.error):
         values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -288,7 +310,7 @@ def _read_picture(path: Path) -> NDArray[Any]:
     return np.asarray(values)
 
 
-def _time_ns(path: Path, header: Mapping[str, Any], options: ImageOptions) -> int:
+def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> int:
     if options.times is not None:
         if path.name not in options.times:
             raise IngestError(f'{path}: not in the table of --times')
@@ -296,47 +318,11 @@ def _time_ns(path: Path, header: Mapping[str, Any], options: ImageOptions) -> in
     if not header:
         raise IngestError(f'{path}: has no time: give --times FILE with columns file, time_utc')
     try:
-        return _time_of_header(header, options.time_key)
-    except (TimeError, KeyError, ValueError, OverflowError) as error:
-        words = error.args[0] if error.args else error
-        raise IngestError(f'{path}: {words}') from error
+        return middle_of_exposure(header, options.time_key)
+    except (TimeError, ValueError, OverflowError) as error:
+        raise IngestError(f'{path}: {error}') from error
 
 
-def _time_of_header(header: Mapping[str, Any], key: str) -> int:
-    """Stamp of the middle of the exposure; FITS standard 4.0, section 9."""
-    system = system_of(str(header.get('TIMESYS', 'UTC')))
-
-    def stamp(name: str) -> int:
-        value = header[name]
-        if isinstance(value, (int, float)):
-            return from_mjd(float(value), system)
-        # The date alone, with a time of its own: an older custom.
-        clock = str(header.get('TIME-OBS', ''))
-        text = str(value)
-        return from_text(text if 'T' in text or not clock else f'{text}T{clock}', system)
-
-    if key:
-        if key not in header:
-            raise KeyError(f'no keyword {key} (see --time-key)')
-        return stamp(key)
-    for name in ('DATE-AVG', 'MJD-AVG'):
-        if name in header:
-            return stamp(name)
-    for start, end in (('DATE-BEG', 'DATE-END'), ('MJD-BEG', 'MJD-END')):
-        if start in header and end in header:
-            return (stamp(start) + stamp(end)) // 2
-    exposure_s = next((float(header[k]) for k in _EXPOSURE_KEYS if k in header), None)
-    for name in ('DATE-BEG', 'DATE-OBS', 'MJD-OBS'):
-        if name in header:
-            if exposure_s is None:
-                raise KeyError(
-                    f'{name} is the start, and no exposure time is given: --time-key {name} '
-                    'takes it as the middle'
-                )
-            return stamp(name) + round(exposure_s * NANOSECONDS_PER_SECOND / 2)
-    raise KeyError('no time (DATE-AVG, DATE-BEG, DATE-OBS): give --time-key or --times')
-
-
-def _number(header: Mapping[str, Any], key: str) -> float:
-    value = header.get(key)
+def _number(header: Mapping[str, Card], key: str) -> float:
+    value = header[key].value if key in header else None
     return float(value) if isinstance(value, (int, float)) else np.nan

@@ -62,7 +62,7 @@ def from_text(text: str, system: str) -> int:
     Raises
     ------
     TimeError
-        For other text, or a time before 1972.
+        For other text, a date alone, or a time before 1972.
     """
     text = text.strip()
     found = _CALENDAR.fullmatch(text)
@@ -80,6 +80,8 @@ def from_text(text: str, system: str) -> int:
         days = date(int(year), 1, 1).toordinal() - 1 + int(of_year) - _UNIX_DAY
     else:
         raise TimeError(f'{text!r} is not a date and time, as 2026-05-15T07:20:00.5')
+    if clock[0] is None:
+        raise TimeError(f'{text!r} has no time of day')  # midnight would be a guess
     hour, minute, second = (int(part or 0) for part in clock[:3])
     leap = system == 'UTC' and (hour, minute, second) == (23, 59, 60)
     if hour > 23 or minute > 59 or second > 59 + leap:
@@ -88,6 +90,11 @@ def from_text(text: str, system: str) -> int:
     in_day_ns = (hour * 3600 + minute * 60 + second) * NANOSECONDS_PER_SECOND
     in_day_ns += (int(fraction) + 500) // 1000
     return to_utc_ns(days * _DAY_S * NANOSECONDS_PER_SECOND + in_day_ns, system)
+
+
+def has_clock(text: str) -> bool:
+    """Whether a text is not a date alone."""
+    return not re.fullmatch(r'\d{4}-(\d\d-\d\d|\d{3})Z?', text, re.ASCII)
 
 
 def from_mjd(days: float, system: str) -> int:

@@ -95,7 +95,9 @@ def test_a_colour_of_an_image_is_chosen(tmp_path: Path) -> None:
     rgb = np.random.default_rng(1).integers(0, 60000, (12, 10, 3), np.uint16)
     path, cube = tmp_path / 'a.png', tmp_path / 'a.fits'
     cv2.imwrite(str(path), rgb[:, :, ::-1])  # OpenCV writes BGR
-    hdu = fits.PrimaryHDU(np.moveaxis(rgb, -1, 0), fits.Header({'DATE-AVG': '2026-05-15'}))
+    hdu = fits.PrimaryHDU(
+        np.moveaxis(rgb, -1, 0), fits.Header({'DATE-AVG': '2026-05-15T07:20:00'})
+    )
     hdu.writeto(cube)
     for number, channel in enumerate(('red', 'green', 'blue')):
         options = ImageOptions(times={'a.png': 1, 'a.fits': 1}, channel=channel)
@@ -129,6 +131,19 @@ MIDDLE = '2026-05-15T07:20:00.5'
         {'DATE-BEG': '2026-05-15T07:20:00', 'DATE-END': '2026-05-15T07:20:01'},
         {'DATE-OBS': '2026-05-15T07:20:00', 'EXPTIME': 1.0},
         {'DATE-OBS': '2026-05-15', 'TIME-OBS': '07:20:00', 'XPOSURE': 1.0},
+        {'DATE-OBS': '2026-05-15', 'UT': '07:20:00', 'EXPTIME': 1.0},
+        {'DATE-OBS': '2026-05-15', 'UTSTART': '07:20:00', 'UT': '07:20:00.0', 'EXPTIME': 1.0},
+        {'DATE-OBS': '2026-05-15', 'UT': '07:20:00', 'EXPTIME': 1.0, 'TIMESYS': 'TAI'},
+        {
+            'DATE-BEG': '2026-05-15',
+            'TIME-BEG': '07:20',
+            'DATE-END': '2026-05-15',
+            'TIME-END': '07:20:01',
+        },
+        {'DATE-OBS': '2026-05-15T07:20:00.375', 'EXPOSURE': (250, '[ms]')},
+        {'DATE-OBS': '2026-05-15T07:19:00.5', 'EXPTIME': (2, '[min] of the shutter')},
+        {'DATE-OBS': '2026-05-15T07:20:00', 'EXPTIME': (1.0, 'Exposure time in seconds')},
+        {'DATE-BEG': '2026-05-15T07:19:00.5', 'XPOSURE': 2, 'TIMEUNIT': 'min'},
         {'DATE-BEG': '2026-05-15T07:20:37', 'XPOSURE': 1.0, 'TIMESYS': 'TAI'},
         {'DATE-AVG': '2026-05-15T07:21:09.684', 'TIMESYS': 'TT'},
         {'DATE-AVG': '2026-05-15T07:20:18.5', 'TIMESYS': 'GPS'},
@@ -156,6 +171,57 @@ def test_a_time_that_is_not_known_is_one_line(tmp_path, header, words) -> None:
     with pytest.raises(IngestError, match=words) as error:
         look(path, PLAIN)
     assert str(path) in str(error.value) and '\n' not in str(error.value)
+
+
+START = {'DATE-OBS': '2026-05-15T07:20:00'}
+
+
+@pytest.mark.parametrize(
+    ('header', 'why'),
+    [
+        # Midnight would be a guess; so would be one of two times of day.
+        ({'DATE-OBS': '2026-05-15', 'EXPTIME': 1.0}, 'no time of day, and no keyword has one'),
+        ({'DATE-AVG': '2026-05-15'}, 'no time of day'),
+        (
+            {'DATE-OBS': '2026-05-15', 'UT': '07:20:00', 'TIME-OBS': '09:20:00', 'EXPTIME': 1},
+            'TIME-OBS, UT differ: give --time-key or --times',
+        ),
+        ({'DATE-OBS': '2026-05-15', 'UT': 26400.0, 'EXPTIME': 1.0}, 'T26400.0. is not a date'),
+        ({**START, 'EXPTIME': -1}, 'EXPTIME = -1 is not the duration'),
+        ({**START, 'EXPTIME': 0.0}, 'EXPTIME = 0.0 is not the duration'),
+        ({**START, 'EXPTIME': 'long'}, 'EXPTIME = long is not the duration'),
+        # Free text may say anything: only brackets are a unit (FITS standard 4.0, 4.3.2).
+        ({**START, 'EXPTIME': (250, 'exposure in ms')}, "EXPTIME is in 'exposure in ms'"),
+        ({**START, 'EXPTIME': (250, '[adu]')}, "EXPTIME is in 'adu', expected a unit as"),
+        ({'DATE-BEG': MIDDLE, 'DATE-END': '2026-05-15T07:20:00'}, 'DATE-END is before DATE-BEG'),
+    ],
+)
+def test_a_time_that_would_be_a_guess_is_refused(tmp_path: Path, header: dict, why: str) -> None:
+    path = write_fits(tmp_path / 'a.fits', IMAGE, **header)
+    with pytest.raises(IngestError, match=why):
+        look(path, PLAIN)
+
+
+@pytest.mark.parametrize('kind', ['uint16', 'tiled'])
+def test_a_card_that_nothing_needs_may_be_damaged(tmp_path: Path, kind: str) -> None:
+    header = {'DATE-OBS': MIDDLE, 'EXPTIME': 1.0, 'OBSERVER': 'x', 'SITELAT': 1.0}
+    path = write_fits(tmp_path / 'a.fits', IMAGE, kind, **header)
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"'x       '", b'  M. Night'))
+    assert (read(path) == IMAGE.pixels).all()
+    path.write_bytes(content.replace(b"'2026-05-15T07:20:00.5'", b' 2026-05-15T07:20:00:5 '))
+    with pytest.raises(IngestError, match='is not a date and time') as error:
+        look(path, PLAIN)
+    assert '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize('shape', [(10, 48, 64), (48, 64, 4), (2, 48, 64)])
+def test_a_cube_is_no_colour_image(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    path = tmp_path / 'a.fits'
+    fits.PrimaryHDU(np.zeros(shape, np.int16), fits.Header({'DATE-AVG': MIDDLE})).writeto(path)
+    for channel in ('', 'red'):
+        with pytest.raises(IngestError, match=r'of shape .*, neither an image nor three planes'):
+            look(path, ImageOptions(channel=channel))
 
 
 def test_a_time_key_is_taken_as_the_middle(tmp_path: Path) -> None:
@@ -208,6 +274,20 @@ def test_an_image_that_claims_gigabytes_is_not_decoded(tmp_path: Path) -> None:
     (tmp_path / 'a.fits').write_bytes(content)
     with pytest.raises(IngestError, match=r'a\.fits: no image of up to'):
         look(tmp_path / 'a.fits', PLAIN)
+
+
+def test_a_png_that_inflates_to_far_more_is_not_decoded(tmp_path: Path) -> None:
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack('>I', len(data)) + name + data + struct.pack('>I', zlib.crc32(name + data))
+        )
+
+    size = struct.pack('>IIBBBBB', 64, 64, 8, 0, 0, 0, 0)
+    surplus = zlib.compress(bytes(1 << 26))
+    content = chunk(b'IHDR', size) + chunk(b'IDAT', surplus) + chunk(b'IEND', b'')
+    (tmp_path / 'a.png').write_bytes(b'\x89PNG\r\n\x1a\n' + content)
+    with pytest.raises(IngestError, match=r'a\.png: inflates to far more than its pixels'):
+        look(tmp_path / 'a.png', ImageOptions(times={'a.png': 1}))
 
 
 def test_images_of_two_sizes_or_one_time_are_refused(tmp_path: Path) -> None:
