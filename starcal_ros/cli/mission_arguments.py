@@ -93,7 +93,7 @@ def _import(command: argparse.ArgumentParser) -> None:
     )
     what = 'OEM, CSV, or SPICE kernels (SPK with the Earth or the Sun, LSK); default: the Earth'
     command.add_argument('--velocity', nargs='+', type=Path, metavar='FILE', help=what)
-    what = 'bag folder or .mcap file to write; an existing one is replaced'
+    what = 'bag folder or .mcap file to write; replaces an earlier import, no other file'
     command.add_argument('-o', '--output', type=Path, required=True, metavar='BAG', help=what)
     what = 'star tracker frame: a body frame of the AEM, or a frame name or number of the CK'
     command.add_argument('--star-tracker', default='', metavar='FRAME', help=what)

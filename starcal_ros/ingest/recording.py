@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 
 from starcal_ros.arrays import Floats
+from starcal_ros.bag.places import check_replaceable
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.files import same_as_one_of
@@ -59,7 +60,9 @@ class Recorded:
 
 
 def look_at_all(
-    paths: Sequence[Path], options: ImageOptions, on_image: Callable[[], None] = lambda: None
+    paths: Sequence[Path],
+    options: ImageOptions,
+    on_image: Callable[[], None] = lambda: None,
 ) -> tuple[list[ImageFile], list[str]]:
     """
     The image files in order of time, and one line for each file that cannot be taken.
@@ -81,23 +84,30 @@ def look_at_all(
     return sorted(files, key=lambda file: file.time_ns), problems
 
 
-def check_place(bag: Path, inputs: Sequence[Path]) -> None:
+def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -> None:
     """
-    Check that a bag and the files beside it replace no input.
+    Check that a bag and the files beside it replace no input and no file of another origin.
 
     Raises
     ------
-    ProductError
+    BagError, ProductError
         Naming the file.
     """
-    file = BagWriter(bag).file
-    names = (file.name, f'{_beside(bag)}import.json', f'{_beside(bag)}params.yaml')
-    check_not_inputs([file.with_name(name) for name in names], inputs)
+    record, params, copied = _files_beside(bag)
+    check_not_inputs([BagWriter(bag).file, record, params], inputs)
+    others = [params, copied] if camera else []
+    others = [path for path in others if not same_as_one_of(path, filter(None, [camera]))]
+    check_replaceable(bag, record, others, 'scale', 'an imported bag')
 
 
-def _beside(bag: Path) -> str:
-    """Start of the names of the files beside a bag."""
-    return f'{bag.stem}_' if bag.suffix == '.mcap' else ''
+def _files_beside(bag: Path) -> tuple[Path, Path, Path]:
+    """Paths of the record, the parameter file and the camera file of a bag."""
+    start = f'{bag.stem}_' if bag.suffix == '.mcap' else ''
+    record, params, camera = (
+        BagWriter(bag).file.with_name(f'{start}{name}')
+        for name in ('import.json', 'params.yaml', 'camera.yaml')
+    )
+    return record, params, camera
 
 
 def write_bag(
@@ -121,10 +131,20 @@ def write_bag(
     """
     covered = [_gap_s(attitudes, file.time_ns) for file in files]
     notes = [*attitudes.notes, *(velocities.notes if velocities else ())]
-    notes += _coverage_notes(files, covered)
+    notes += _coverage_notes(files, attitudes, covered)
     scale = common_scale(files, options)
     notes += _scale_notes(files, scale)
     writer = BagWriter(bag)
+    record, params, copied = _files_beside(bag)
+    content = {
+        'bag': writer.file.name,
+        'images': [file.path.name for file in files],
+        'scale': {'offset': scale.offset, 'step': scale.step, 'dtype': scale.dtype.__name__},
+        'channel': options.channel,
+        'bayer': options.bayer,
+        'notes': list(dict.fromkeys(notes)),
+    }
+    prior_files = {} if prior is None else _prior_files(prior, params, copied, files, scale)
     with writer:
         for _, _, write in heapq.merge(
             _image_messages(files, options, scale, on_image),
@@ -133,21 +153,11 @@ def write_bag(
             key=lambda message: message[:2],
         ):
             write(writer)
-    beside = _beside(bag)
-    record = {
-        'images': [file.path.name for file in files],
-        'scale': {'offset': scale.offset, 'step': scale.step, 'dtype': scale.dtype.__name__},
-        'channel': options.channel,
-        'bayer': options.bayer,
-        'notes': list(dict.fromkeys(notes)),
-    }
-    path = writer.file.with_name(f'{beside}import.json')
-    write_atomically(path, json.dumps(record, indent=1) + '\n')
-    params = None
-    if prior is not None:
-        params = writer.file.with_name(f'{beside}params.yaml')
-        _write_params(params, prior, files, scale, beside)
-    return Recorded(bag, params, tuple(dict.fromkeys(notes)))
+        # Just before the bag replaces an older one; the record first, which marks it as ours.
+        write_atomically(record, json.dumps(content, indent=1) + '\n')
+        for path, text in prior_files.items():
+            write_atomically(path, text)
+    return Recorded(bag, params if prior else None, tuple(dict.fromkeys(notes)))
 
 
 def _near(attitudes: Attitudes, files: Sequence[ImageFile]) -> Attitudes:
@@ -169,13 +179,20 @@ def _gap_s(attitudes: Attitudes, time_ns: int) -> float:
     return float(stamps[k] - stamps[k - 1]) / NANOSECONDS_PER_SECOND
 
 
-def _coverage_notes(files: Sequence[ImageFile], gaps_s: Sequence[float]) -> list[str]:
+def _span(first_ns: int, last_ns: int) -> str:
+    return f'{utc_text(first_ns)} to {utc_text(last_ns)}'
+
+
+def _coverage_notes(
+    files: Sequence[ImageFile], attitudes: Attitudes, gaps_s: Sequence[float]
+) -> list[str]:
     longest_s = AttitudeOptions().max_attitude_gap_s
     outside = [file for file, gap_s in zip(files, gaps_s, strict=True) if math.isinf(gap_s)]
     if len(outside) == len(files):
         raise IngestError(
-            f'no attitude before and after any image, {utc_text(files[0].time_ns)} to '
-            f'{utc_text(files[-1].time_ns)}: the attitudes are of another time'
+            f'no attitude before and after any image: the images are from '
+            f'{_span(files[0].time_ns, files[-1].time_ns)}, the attitudes of another time, from '
+            f'{_span(*attitudes.time_ns[[0, -1]].tolist())}'
         )
     notes = []
     if outside:
@@ -252,18 +269,16 @@ def _velocity_messages(velocities: Velocities | None) -> Iterator[_Message]:
         yield time_ns, 1, write
 
 
-def _write_params(
-    path: Path, prior: Prior, files: Sequence[ImageFile], scale: Scale, beside: str
-) -> None:
+def _prior_files(
+    prior: Prior, params: Path, copied: Path, files: Sequence[ImageFile], scale: Scale
+) -> dict[Path, str]:
+    """Texts of the parameter file and of the copy of the prior camera."""
     camera = read_camera_info(prior.camera)
     if (camera.width, camera.height) != (files[0].width, files[0].height):
         raise IngestError(
             f'{prior.camera}: a camera of {camera.width} x {camera.height}, the images have '
             f'{files[0].width} x {files[0].height}'
         )
-    copied = path.with_name(f'{beside}camera.yaml')
-    if not same_as_one_of(copied, [prior.camera]):
-        write_atomically(copied, read_text(prior.camera, PARAMETER_BYTES))
     values: dict[str, object] = {
         'camera_info_url': copied.name,
         'prior_alignment': list(prior.star_tracker_from_camera_xyzw),
@@ -274,4 +289,7 @@ def _write_params(
     if saturation:
         values['saturation_dn'] = (min(saturation) - scale.offset) / scale.step
     content = {'/**': {'ros__parameters': values}}
-    write_atomically(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    texts = {params: yaml.safe_dump(content, sort_keys=False, default_flow_style=None)}
+    if not same_as_one_of(copied, [prior.camera]):
+        texts[copied] = read_text(prior.camera, PARAMETER_BYTES)
+    return texts

@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 import dataclasses
 from dataclasses import dataclass
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,12 @@ from scipy.spatial.transform import Rotation
 import yaml
 
 from starcal_ros.arrays import Floats
+from starcal_ros.bag.places import check_replaceable
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import BagError, ProductError
 from starcal_ros.products.camera_yaml import write_camera_info
-from starcal_ros.products.files import read_text, write_atomically
+from starcal_ros.products.files import write_atomically
 from starcal_ros.records import AttitudeSample, CameraGeometry
 from starcal_ros.simulation.centroids import (
     bound_names,
@@ -32,11 +31,9 @@ from starcal_ros.simulation.centroids import (
 from starcal_ros.simulation.images import images
 from starcal_ros.simulation.mistakes import Mistakes, NO_MISTAKES
 from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenes
-from starcal_ros.untrusted import PRODUCT_BYTES
 
 IMAGE_TOPIC = '/opnav/image_raw'
 ATTITUDE_TOPIC = '/star_tracker/attitude'
-_OF_BAGS = ('metadata.yaml', '*.mcap', '*.db3')
 
 
 @dataclass(frozen=True)
@@ -132,7 +129,7 @@ def write_bag(
     else:
         beside = ('truth.json', 'params.yaml', 'camera.yaml')
     truth, params, camera = (writer.file.with_name(name) for name in beside)
-    _check_replaceable(path, writer.file, truth, (params, camera))
+    check_replaceable(path, truth, (params, camera), 'scenario', 'a simulated bag')
     scenario = dataclasses.replace(scenario, prior=mistakes.prior(scenario.prior))
     content = parameters(scenario, camera_url or f'file://{camera.resolve()}')
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
@@ -154,33 +151,6 @@ def write_bag(
         write_camera_info(scenario.prior.camera, camera, 'opnav')
         write_atomically(params, text)
     return SimulatedBag(path, truth, params, camera)
-
-
-def _check_replaceable(path: Path, bag: Path, truth: Path, others: Iterable[Path]) -> None:
-    """
-    Check that a bag would replace nothing but an earlier simulated one.
-
-    Raises
-    ------
-    BagError
-        Naming a file of another origin.
-    """
-    there = [file for file in (bag, truth, *others) if os.path.lexists(file)]
-    if path != bag:
-        there += [file for end in _OF_BAGS for file in path.glob(end)]
-    if there and not _is_truth_of(bag.name, truth):
-        raise BagError(
-            f'{there[0]}: is not of a simulated bag and would be replaced; choose another place'
-        )
-
-
-def _is_truth_of(bag_name: str, truth: Path) -> bool:
-    """Whether a file is the truth of a simulated bag of this name."""
-    try:
-        content = json.loads(read_text(truth, PRODUCT_BYTES))
-        return bool(content['bag'] == bag_name and content['scenario'])
-    except (ProductError, ValueError, KeyError, TypeError, RecursionError):
-        return False
 
 
 def _write_attitude(writer: BagWriter, sample: AttitudeSample, mistakes: Mistakes) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+import shutil
 
 from mission_files import (  # type: ignore[import-not-found]
     attitudes,
@@ -23,6 +24,7 @@ import starcal_ros
 from starcal_ros.bag import reader
 from starcal_ros.bag.frames import FrameTopics, read_telemetry
 from starcal_ros.cli.main import main
+from starcal_ros.constants import utc_text
 from starcal_ros.records import Image
 
 ALIGNMENT = yaml.safe_load((TINY / 'params.yaml').read_text())['/**']['ros__parameters'][
@@ -102,7 +104,12 @@ def test_attitudes_of_another_day_are_refused(night: Path, tmp_path: Path, capsy
                  b=tmp_path / 'bag')  # fmt: skip
     assert main(line) == 2
     error = capsys.readouterr().err
-    assert 'the attitudes are of another time' in error and error.count('\n') == 1
+    spans = [
+        f'{utc_text(times[0])} to {utc_text(times[-1])}'
+        for times in ([image.time_ns for image in images()], [time for time, _ in attitudes()])
+    ]
+    assert f'the images are from {spans[0]}, the attitudes of another time, from 2027' in error
+    assert spans[1].replace('2026', '2027') in error and error.count('\n') == 1
 
 
 def test_each_bad_file_is_one_line(night: Path, tmp_path: Path, capsys) -> None:
@@ -142,6 +149,51 @@ def test_no_input_is_replaced(night: Path, tmp_path: Path, capsys) -> None:
                  b=tmp_path)  # fmt: skip
     assert main(line) == 2
     assert 'would be replaced' in capsys.readouterr().err and aem.read_bytes() == before
+
+
+def tree(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob('*') if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ('bag', 'name'),
+    [
+        ('there', 'metadata.yaml'),
+        ('there', 'params.yaml'),
+        ('there', 'camera.yaml'),
+        ('there', 'tiny_0.mcap'),
+        ('there/bag.mcap', 'bag_params.yaml'),
+        ('there/bag.mcap', 'bag_camera.yaml'),
+        ('there/bag.mcap', 'bag.mcap'),
+    ],
+)
+def test_no_file_of_another_origin_is_replaced(
+    night: Path, tmp_path: Path, capsys, bag: str, name: str
+) -> None:
+    folder = tmp_path / 'there'
+    folder.mkdir()
+    (folder / name).write_bytes(b'of another program')
+    before = tree(folder)
+    aem = write_aem(tmp_path / 'a.aem')
+    line = words('import --images {n}/[0-3].fits --attitude {a} -o {b} --camera {c}', n=night,
+                 a=aem, b=tmp_path / bag, c=TINY / 'camera.yaml')  # fmt: skip
+    assert main(line) == 2
+    error = capsys.readouterr().err
+    assert 'is not of an imported bag and would be replaced' in error and error.count('\n') == 1
+    assert tree(folder) == before
+
+
+def test_an_imported_bag_is_replaced_and_its_prior_may_lie_beside_it(
+    night: Path, tmp_path: Path, capsys
+) -> None:
+    (tmp_path / 'bag').mkdir()
+    camera = shutil.copy(TINY / 'camera.yaml', tmp_path / 'bag/camera.yaml')
+    for images_of in ('[0-3].fits', '*.fits'):
+        line = words('import --images {n}/{i} --attitude {a} -o {b} --camera {c}', n=night,
+                     i=images_of, a=write_aem(tmp_path / 'a.aem'), b=tmp_path / 'bag',
+                     c=camera)  # fmt: skip
+        assert main(line) == 0, capsys.readouterr().err
+    assert len(json.loads((tmp_path / 'bag/import.json').read_text())['images']) == 10
 
 
 def test_a_coarse_scale_is_named(tmp_path: Path, capsys) -> None:

@@ -63,7 +63,7 @@ def _import(args: argparse.Namespace) -> int:
     )
     paths = _expanded(args.images)
     inputs = [args.times, args.camera, *args.attitude, *(args.velocity or ())]
-    recording.check_place(args.output, [*paths, *filter(None, inputs)])
+    recording.check_place(args.output, [*paths, *filter(None, inputs)], args.camera)
     with progress_bar(2 * len(paths), 'images') as advance:
         files, problems = recording.look_at_all(paths, options, advance)
         for problem in problems:
