@@ -105,9 +105,11 @@ def read_bytes(path: Path, most_bytes: int, follow_links: bool = True) -> bytes:
     except ValueError as error:  # of a name with NUL or half a surrogate pair
         raise ValueError('not the name of a file') from error
     with open(number, 'rb') as file:
-        if not stat.S_ISREG(os.fstat(number).st_mode):
+        found = os.fstat(number)
+        if not stat.S_ISREG(found.st_mode):
             raise ValueError('not a regular file')
-        content = file.read(most_bytes + 1)
+        # A read allocates all that it is asked for; a file of /proc has the size 0.
+        content = file.read(min(most_bytes, max(found.st_size, 2**20)) + 1)
     if len(content) > most_bytes:
         raise ValueError(f'larger than {most_bytes // 1024} kB')
     return content

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+import dataclasses
 from dataclasses import dataclass, field
 import heapq
 import json
@@ -18,6 +19,7 @@ from starcal_ros.bag.places import check_replaceable
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.files import same_as_one_of
+from starcal_ros.ingest.guard import Guard
 from starcal_ros.ingest.images import (
     check_alike,
     common_scale,
@@ -62,6 +64,7 @@ class Recorded:
 def look_at_all(
     paths: Sequence[Path],
     options: ImageOptions,
+    guard: Guard,
     on_image: Callable[[], None] = lambda: None,
 ) -> tuple[list[ImageFile], list[str]]:
     """
@@ -75,13 +78,21 @@ def look_at_all(
     files, problems = [], []
     for path in paths:
         try:
-            files.append(look(path, options))
+            files.append(guard.call(path, look, path, _options_of(path, options)))
         except IngestError as error:
             problems.append(str(error))
         on_image()
     if files:
         check_alike(files)
     return sorted(files, key=lambda file: file.time_ns), problems
+
+
+def _options_of(path: Path, options: ImageOptions) -> ImageOptions:
+    """Options without the times of the other images, which are not sent with each."""
+    if options.times is None:
+        return options
+    times = {name: options.times[name] for name in (path.name,) if name in options.times}
+    return dataclasses.replace(options, times=times)
 
 
 def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -> None:
@@ -114,6 +125,7 @@ def write_bag(
     bag: Path,
     files: Sequence[ImageFile],
     options: ImageOptions,
+    guard: Guard,
     attitudes: Attitudes,
     velocities: Velocities | None = None,
     prior: Prior | None = None,
@@ -147,7 +159,7 @@ def write_bag(
     prior_files = {} if prior is None else _prior_files(prior, params, copied, files, scale)
     with writer:
         for _, _, write in heapq.merge(
-            _image_messages(files, options, scale, on_image),
+            _image_messages(files, options, scale, guard, on_image),
             _attitude_messages(_near(attitudes, files)),
             _velocity_messages(velocities),
             key=lambda message: message[:2],
@@ -229,6 +241,7 @@ def _image_messages(
     files: Sequence[ImageFile],
     options: ImageOptions,
     scale: Scale,
+    guard: Guard,
     on_image: Callable[[], None],
 ) -> Iterator[_Message]:
     for file in files:
@@ -238,7 +251,9 @@ def _image_messages(
                 writer.write_temperature(
                     TEMPERATURE_TOPIC, file.time_ns, file.temperature_degc, 'camera'
                 )
-            image = Image(file.time_ns, pixels_of(file.path, options, scale))
+            path = file.path
+            pixels = guard.call(path, pixels_of, path, _options_of(path, options), scale)
+            image = Image(file.time_ns, pixels)
             writer.write_image(IMAGE_TOPIC, image, 'camera')
             on_image()
 

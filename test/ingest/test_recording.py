@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 import shutil
 
+from astropy.io import fits
 from mission_files import (  # type: ignore[import-not-found]
     attitudes,
     FRAME_ID,
@@ -194,6 +195,23 @@ def test_an_imported_bag_is_replaced_and_its_prior_may_lie_beside_it(
                      c=camera)  # fmt: skip
         assert main(line) == 0, capsys.readouterr().err
     assert len(json.loads((tmp_path / 'bag/import.json').read_text())['images']) == 10
+
+
+def test_a_hostile_file_costs_one_line(night: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / 'cut.fits').write_bytes(b'nothing')
+    with (tmp_path / 'huge.fits').open('wb') as file:
+        file.write(fits.PrimaryHDU(np.zeros((2, 2))).header.tostring().encode())
+        file.seek(80 * 3)  # NAXIS1 and NAXIS2: 968 MB, all of them a hole in the file
+        for axis in (1, 2):
+            file.write(f'NAXIS{axis}  = {11000:20}'.ljust(80).encode())
+        file.truncate(2880 * (2 + 11000 * 11000 * 8 // 2880))
+    aem = write_aem(tmp_path / 'a.aem')
+    line = words('import --images {n}/0.fits {t}/*.fits --attitude {a} -o {b}', n=night,
+                 t=tmp_path, a=aem, b=tmp_path / 'bag')  # fmt: skip
+    assert main(line) == 2
+    first, second = capsys.readouterr().err.splitlines()
+    assert 'cut.fits: not readable as FITS' in first
+    assert 'huge.fits: needs more than 1 GB of memory to be read' in second
 
 
 def test_a_coarse_scale_is_named(tmp_path: Path, capsys) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+import dataclasses
 import glob
 import math
 from pathlib import Path
@@ -50,11 +51,11 @@ def _export(args: argparse.Namespace) -> int:
 def _import(args: argparse.Namespace) -> int:
     """Make a bag from the files of a mission."""
     from starcal_ros.ingest import recording, sources, tables
+    from starcal_ros.ingest.guard import Guard
     from starcal_ros.ingest.images import ImageOptions
 
     options = ImageOptions(
         time_key=args.time_key,
-        times=None if args.times is None else tables.read_times(args.times),
         hdu=args.hdu,
         channel=args.channel,
         bayer=args.bayer,
@@ -64,18 +65,25 @@ def _import(args: argparse.Namespace) -> int:
     paths = _expanded(args.images)
     inputs = [args.times, args.camera, *args.attitude, *(args.velocity or ())]
     recording.check_place(args.output, [*paths, *filter(None, inputs)], args.camera)
-    with progress_bar(2 * len(paths), 'images') as advance:
-        files, problems = recording.look_at_all(paths, options, advance)
+    with Guard() as guard, progress_bar(2 * len(paths), 'images') as advance:
+        if args.times:
+            times = guard.call(args.times, tables.read_times, args.times)
+            options = dataclasses.replace(options, times=times)
+        files, problems = recording.look_at_all(paths, options, guard, advance)
         for problem in problems:
             complain(problem)
         if problems:
             return EXIT_BAD_INPUT
         stamps = [file.time_ns for file in files]
-        attitudes = sources.attitudes(args.attitude, args.star_tracker, stamps)
-        velocities = args.velocity and sources.velocities(args.velocity, args.spacecraft, stamps)
+        attitudes = guard.call(
+            _names(args.attitude), sources.attitudes, args.attitude, args.star_tracker, stamps
+        )
+        velocities = args.velocity and guard.call(
+            _names(args.velocity), sources.velocities, args.velocity, args.spacecraft, stamps
+        )
         prior = args.camera and recording.Prior(args.camera, tuple(args.alignment))
         made = recording.write_bag(
-            args.output, files, options, attitudes, velocities, prior, advance
+            args.output, files, options, guard, attitudes, velocities, prior, advance
         )
     print_text(f'bag {made.bag}: {len(files)} images')
     for note in made.notes:
@@ -83,6 +91,10 @@ def _import(args: argparse.Namespace) -> int:
     if made.params:
         print_text(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
     return EXIT_ACCEPTED
+
+
+def _names(paths: Sequence[Path]) -> str:
+    return ', '.join(map(str, paths))
 
 
 def _expanded(patterns: Sequence[str]) -> list[Path]:
