@@ -39,6 +39,8 @@ def _export(args: argparse.Namespace) -> int:
     make_folder(args.output)
     done = export(calibration, args.to, args.output, names, args.image_topic)
     print_text(f'written: {", ".join(map(str, done.files))}')
+    if not calibration.accepted:
+        complain(f'warning: the gate refused this calibration: {"; ".join(calibration.reasons)}')
     if not math.isfinite(done.worst_px):
         print_text('the format cannot see the whole detector: use spice, opencv or csv')
     else:

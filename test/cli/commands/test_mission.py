@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 from export_calibrations import calibration  # type: ignore[import-not-found]
@@ -52,6 +53,16 @@ def test_export_refuses_in_one_line(folder, tmp_path, capsys, line: str, words: 
     assert main(f'export {folder} -o {tmp_path} {line}'.split()) == 2
     error = capsys.readouterr().err
     assert words in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize('accepted', [True, False])
+def test_export_warns_of_a_refused_calibration(folder, tmp_path, capsys, accepted: bool) -> None:
+    reasons = () if accepted else ('error of the map 2 px, limit 0.1 px',)
+    judged = dataclasses.replace(calibration(), accepted=accepted, reasons=reasons)
+    write_calibration(judged, folder / 'calibration.json')
+    assert main(f'export {folder} --to csv -o {tmp_path}'.split()) == 0
+    expected = [f'starcal: warning: the gate refused this calibration: {one}' for one in reasons]
+    assert capsys.readouterr().err.splitlines() == expected
 
 
 def test_export_needs_a_calibration(tmp_path: Path, capsys) -> None:
