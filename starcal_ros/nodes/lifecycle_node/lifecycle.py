@@ -28,9 +28,11 @@ from rclpy.node import Node
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.nodes.lifecycle_node.inputs import Inputs
 from starcal_ros.nodes.lifecycle_node.parameters import OptionParameters, unread_sections
+from starcal_ros.nodes.lifecycle_node.printable_log import PrintableLog
 from starcal_ros.options import nearest
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import OPTION_CLASSES, Setup
+from starcal_ros.text import printable
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Health = tuple[bytes, str, dict[str, object]]
@@ -40,7 +42,7 @@ _SILENT_S = 5.0
 _THREADS = 8
 
 
-class StarcalNode(LifecycleNode):
+class StarcalNode(PrintableLog, LifecycleNode):
     """
     Base class of the lifecycle nodes.
 
@@ -414,5 +416,5 @@ def _spin(node: StarcalNode, executor: MultiThreadedExecutor) -> None:
 
 
 def one_line(error: Exception) -> str:
-    """Return the text of an error without line breaks."""
-    return ' '.join(str(error).split())
+    """Return the text of an error in one line that is safe to print."""
+    return printable(' '.join(str(error).split()))
