@@ -52,7 +52,7 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
     wanted = selection(args.from_time, args.to_time, args.first, args.every)
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
-    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames)))
+    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames).values()))
     files = (*reader.mcap_files(args.bags), args.params)
     found = ''
     try:
