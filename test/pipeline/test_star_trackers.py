@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.bag.reader import log_damage
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import BagError, OptionError
@@ -37,14 +38,18 @@ def setup_with(**others: object) -> Setup:
     return load_setup({**VALUES, 'camera_info_url': str(TINY / 'camera.yaml'), **two, **others})
 
 
-def bag_of(path: Path, first_until: float = 1.0, other_until: float = 1.0) -> Path:
+def bag_of(
+    path: Path, first_until: float = 1.0, other_until: float = 1.0, absent: str = ''
+) -> Path:
     """The small bag with a second star tracker; each repeats itself after a part of the time."""
     samples = attitudes()
     with BagWriter(path) as writer:
-        for topic, mounted, until in (
-            ('/star_tracker/attitude', Rotation.identity(), first_until),
-            ('/other/attitude', FIRST_FROM_OTHER, other_until),
+        for which, topic, mounted, until in (
+            ('first', '/star_tracker/attitude', Rotation.identity(), first_until),
+            ('other', '/other/attitude', FIRST_FROM_OTHER, other_until),
         ):
+            if which == absent:
+                continue
             last = int(until * (len(samples) - 1))
             for k, (time_ns, xyzw) in enumerate(samples):
                 if until < 0.0 and k >= len(samples) // 2:
@@ -96,9 +101,30 @@ def test_one_that_falls_silent_or_repeats_itself_costs_no_image(
     assert used(records)[lost] < 5 < used(records)[kept]
 
 
-def test_a_topic_that_is_not_there_is_named() -> None:
-    with pytest.raises(BagError, match='^/other/attitude: no such topic of type geometry_msgs'):
-        topics.choose_topics([TINY], Topics(), setup_with())
+@pytest.mark.parametrize(
+    ('which', 'says'),
+    [
+        ('other', '/other/attitude: no such topic of type geometry_msgs/msg/QuaternionStamped;'),
+        ('first', 'the first star tracker, star_tracker, is left out'),
+    ],
+)
+def test_one_that_is_not_in_the_bag_is_named_and_the_rest_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, which: str, says: str
+) -> None:
+    log_damage.cache_clear()
+    bag = bag_of(tmp_path / 'one', absent=which)
+    records = observed(bag, setup_with())
+    assert [record.refusal for record in records] == [''] * 10
+    assert used(records) == {'' if which == 'other' else 'other': 10}
+    (warning,) = caplog.messages
+    assert says in warning
+
+
+def test_a_bag_without_any_attitude_is_refused(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'none') as writer:
+        writer.write_image('/image', images()[0], 'camera')
+    with pytest.raises(BagError, match='no topic of type geometry_msgs/msg/QuaternionStamped'):
+        topics.choose_topics([tmp_path / 'none'], Topics(), setup_with())
 
 
 @pytest.mark.parametrize(
@@ -109,8 +135,14 @@ def test_a_topic_that_is_not_there_is_named() -> None:
         ({'more_star_trackers': ['a b']}, "more_star_trackers: 'a b' is no name of a frame"),
         (
             {'more_star_trackers': ['a', 'a'], 'more_alignments': 8 * [0.0]},
-            'more_star_trackers: a, a: a name comes twice',
+            "more_star_trackers: 'a' comes twice",
         ),
+        # As star_tracker_frame and camera_frame, whose attitudes and transforms they would be.
+        (
+            {'more_star_trackers': ['/star_tracker']},
+            "'/star_tracker' comes twice: .* a name of th",
+        ),
+        ({'more_star_trackers': ['camera'], 'camera_frame': '/camera'}, "'camera' comes twice"),
         ({'prior_alignment': 4 * [0.0]}, 'more_star_trackers: prior_alignment is needed'),
     ],
 )
