@@ -7,6 +7,7 @@ import array
 from collections.abc import Sequence
 from pathlib import Path
 import sys
+import threading
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped
@@ -40,7 +41,7 @@ from starcal_ros.nodes.set_camera_info_client import CameraDriver
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import CalibratorOptions
 from starcal_ros.pipeline.setup import load_setup
-from starcal_ros.records import Calibration, IMAGE_REFUSALS
+from starcal_ros.records import IMAGE_REFUSALS
 
 NAME = 'calibrator'
 _NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)
@@ -61,7 +62,8 @@ class Calibrator(StarcalNode):
     def __init__(self) -> None:
         super().__init__(NAME)
         self._made: list[tuple[Any, Any]] = []
-        self._state = CalibratorState()
+        self._publishing = threading.Lock()
+        self._state = CalibratorState(self._now_ns)
         self._reports = CalibratorReports(self.guarded(self._on_report))
         self._last_answer = Answer(True, '')
         self._last_gate = 'none'
@@ -128,9 +130,7 @@ class Calibrator(StarcalNode):
         retry = self.steady_timer(_RETRY_S, self.guarded(self._save_again), collecting)
         self._listeners.append((self.destroy_timer, retry))
         self._status_thread = StatusThread(self.guarded(self._publish_status))
-        active = self._state.active
-        if active is not None:
-            self._publish_calibration(active)
+        self._publish_active()
 
     def deactivate(self) -> None:
         """Stop collecting observations and serving requests."""
@@ -223,12 +223,11 @@ class Calibrator(StarcalNode):
         self._status.publish(status_to_message(status, frame_id, make_message))
 
     def _on_calibrate(self, _request: Any, response: Any) -> Any:
-        return self._told(self._judged(self._state.solve(self._now_ns())), response)
+        return self._told(self._judged(self._state.solve()), response)
 
     def _on_solve(self, request: Any, response: Any) -> Any:
         answer = self._judged(
             self._state.solve(
-                self._now_ns(),
                 request.method,
                 tuple(request.estimate),
                 request.dry_run,
@@ -245,7 +244,7 @@ class Calibrator(StarcalNode):
         return self._told(answer, response)
 
     def _on_rollback(self, _request: Any, response: Any) -> Any:
-        return self._told(self._state.rollback(self._now_ns()), response)
+        return self._told(self._state.rollback(), response)
 
     def _on_lookup(self, request: Any, response: Any) -> Any:
         active = self._state.active
@@ -288,12 +287,11 @@ class Calibrator(StarcalNode):
         return answer
 
     def _told(self, answer: Answer, response: Any) -> Any:
-        """Publish the activated or refused calibration; return the filled response."""
+        """Publish the active or the refused calibration; return the filled response."""
         if not self.is_active:
             pass  # deactivated meanwhile: activation publishes the active calibration
         elif answer.calibration is not None and answer.active:
-            self._publish_calibration(answer.calibration)
-            self._show(ACTIVE, answer)
+            self._publish_active(answer)
         elif answer.calibration is not None and not answer.success:
             self._candidate.publish(calibration_to_message(answer.calibration, make_message))
             self._show(CANDIDATE, answer)
@@ -313,17 +311,26 @@ class Calibrator(StarcalNode):
             self.get_logger().info(f'report: {page}')
         self.publish_health_change()
 
-    def _publish_calibration(self, calibration: Calibration) -> None:
-        camera_info = camera_info_to_message(calibration, make_message)
-        alignment = alignment_to_message(calibration, make_message)
-        self._camera_info.publish(camera_info)
-        self._alignment.publish(alignment)
-        self._calibration.publish(calibration_to_message(calibration, make_message))
-        if self._tf_static is not None:
-            transforms = [alignment, *mountings_to_messages(calibration, make_message)]
-            self._tf_static.publish(make_message('tf2_msgs/msg/TFMessage', transforms=transforms))
-        if self._driver is not None:
-            self._driver.hand_over(camera_info)
+    def _publish_active(self, answer: Answer | None = None) -> None:
+        """Publish the active calibration, and its report where it is that of an answer."""
+        # Two requests may activate one each: of all publishers the last is of the later one.
+        with self._publishing:
+            calibration = self._state.active_on_disk
+            if calibration is None:
+                return
+            camera_info = camera_info_to_message(calibration, make_message)
+            alignment = alignment_to_message(calibration, make_message)
+            self._camera_info.publish(camera_info)
+            self._alignment.publish(alignment)
+            self._calibration.publish(calibration_to_message(calibration, make_message))
+            if self._tf_static is not None:
+                transforms = [alignment, *mountings_to_messages(calibration, make_message)]
+                message = make_message('tf2_msgs/msg/TFMessage', transforms=transforms)
+                self._tf_static.publish(message)
+            if self._driver is not None:
+                self._driver.hand_over(camera_info)
+            if answer is not None and answer.calibration is calibration:
+                self._show(ACTIVE, answer)
 
     def _answered(self, answer: Any) -> Any:
         """Return the service callback wrapped so that errors are answered, logged and counted."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from mission_files import attitudes, images, TINY  # type: ignore[import-not-found]
 import numpy as np
@@ -94,7 +95,8 @@ def test_both_star_trackers_are_used_and_aligned(tmp_path: Path) -> None:
 def test_one_that_falls_silent_or_repeats_itself_costs_no_image(
     tmp_path: Path, which: str, until: float
 ) -> None:
-    bag = bag_of(tmp_path / 'two', **{f'{which}_until': until})
+    end: dict[str, Any] = {f'{which}_until': until}
+    bag = bag_of(tmp_path / 'two', **end)
     records = observed(bag, setup_with())
     assert [record.refusal for record in records] == [''] * 10
     lost, kept = ('', 'other') if which == 'first' else ('other', '')
