@@ -103,6 +103,18 @@ def test_one_that_falls_silent_or_repeats_itself_costs_no_image(
     assert used(records)[lost] < 5 < used(records)[kept]
 
 
+def test_a_wrong_one_is_tried_seldom_and_costs_no_image(tmp_path: Path) -> None:
+    """The alignment to the other star tracker is off by 5 degrees."""
+    off = Rotation.from_euler('x', 5.0, degrees=True) * Rotation.from_quat(other_alignment())
+    setup = setup_with(more_alignments=[float(x) for x in off.as_quat()])
+    records = observed(bag_of(tmp_path / 'two'), setup)
+    assert used(records) == {'': 10}
+    details = [record.detail for record in records]
+    # The first image is that of the first star tracker; then ten images count as one in vain.
+    assert details[1].startswith('other not used: no_match: ')
+    assert [bool(detail) for detail in details] == [k == 1 for k in range(10)]
+
+
 @pytest.mark.parametrize(
     ('which', 'says'),
     [

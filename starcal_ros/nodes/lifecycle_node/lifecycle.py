@@ -61,7 +61,8 @@ class StarcalNode(PrintableLog, LifecycleNode):
         self.inputs = Inputs(self)
         self._incompatible: list[str] = []  # publishers that are not received
         self._errors = 0
-        self._taken: Counter[str] = Counter()
+        self._taken: Counter[Callable[[Any], None]] = Counter()
+        self._counting = threading.Lock()  # of errors and messages
         self._level: bytes | None = None
         self._listening_since_s = math.inf
         self._diagnostics_lock = threading.Lock()
@@ -98,7 +99,7 @@ class StarcalNode(PrintableLog, LifecycleNode):
 
     def taken(self, callback: Callable[[Any], None]) -> int:
         """Return the number of messages that a callback, wrapped by `taking`, has had."""
-        return self._taken[callback.__name__]
+        return self._taken[callback]
 
     @property
     def is_active(self) -> bool:
@@ -127,8 +128,8 @@ class StarcalNode(PrintableLog, LifecycleNode):
         guarded = self.guarded(callback)
 
         def run(message: Any) -> None:
-            # Callbacks of one input never run concurrently, those of different inputs may.
-            self._taken[callback.__name__] += 1
+            with self._counting:
+                self._taken[callback] += 1
             guarded(message)
 
         return run
@@ -137,7 +138,8 @@ class StarcalNode(PrintableLog, LifecycleNode):
         """Log an unexpected error and count it for the diagnostics."""
         if not self.context.ok():
             return  # at shutdown, handles are destroyed under running callbacks
-        self._errors += 1
+        with self._counting:
+            self._errors += 1
         where = error.__traceback__
         while where is not None and where.tb_next is not None:
             where = where.tb_next
