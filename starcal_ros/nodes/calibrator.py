@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import array
 from collections.abc import Sequence
+import contextlib
 from pathlib import Path
 import sys
 import threading
@@ -38,6 +39,7 @@ from starcal_ros.messages.status import status_to_message
 from starcal_ros.nodes.lifecycle_node.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
 from starcal_ros.nodes.lifecycle_node.message_factory import make_message, message_class
 from starcal_ros.nodes.set_camera_info_client import CameraDriver
+from starcal_ros.nodes.transforms import Transforms
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import CalibratorOptions
 from starcal_ros.pipeline.setup import load_setup
@@ -48,6 +50,9 @@ _NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Deep enough to lose no image at one a second during a solve of minutes.
 _OBSERVATIONS = QoSProfile(depth=1000)
+_TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+# Of every publisher of static transforms the last message.
+_ALL_LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _RETRY_S = 1.0  # after a failed write
 _TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB
 
@@ -107,10 +112,11 @@ class Calibrator(StarcalNode):
         self._calibration = latched(CalibrationMessage, 'calibration')
         self._candidate = latched(CalibrationMessage, 'candidate_calibration')
         self._status = latched(StatusMessage, 'ensemble_status')
-        try:
-            self._tf_static = latched(message_class('tf2_msgs/msg/TFMessage'), '/tf_static')
-        except ImportError:
-            self._tf_static = None
+        self._transforms = self._tf_static = None
+        with contextlib.suppress(ImportError):  # tf2_msgs need not be installed
+            self._tf_static = latched(message_class(_TRANSFORMS), '/tf_static')
+            frames = [self._setup.frames.camera_frame]
+            self._transforms = Transforms([*frames, *(one.frame for one in self._setup.mountings)])
 
     def activate(self) -> None:
         """Start to collect observations and to serve requests."""
@@ -127,6 +133,15 @@ class Calibrator(StarcalNode):
             _OBSERVATIONS,
             group=collecting,
         )
+        if self._transforms is not None:
+            heard = self.create_subscription(
+                message_class(_TRANSFORMS),
+                '/tf_static',
+                self.guarded(self._transforms.hear),
+                _ALL_LATCHED,
+                callback_group=collecting,
+            )
+            self._listeners.append((self.destroy_subscription, heard))
         retry = self.steady_timer(_RETRY_S, self.guarded(self._save_again), collecting)
         self._listeners.append((self.destroy_timer, retry))
         self._status_thread = StatusThread(self.guarded(self._publish_status))
@@ -190,6 +205,8 @@ class Calibrator(StarcalNode):
         topic = self.resolve_topic_name('calibration')
         if self.count_publishers(topic) > 1:
             return WARN, f'another node publishes {topic}', numbers
+        if foreign := self._foreign_transforms():
+            return WARN, foreign, numbers
         if state.damage:
             return WARN, f'set aside as damaged: {"; ".join(state.damage)}', numbers
         if driver is not None and driver.has_failed:
@@ -199,6 +216,14 @@ class Calibrator(StarcalNode):
         if self._reports.trouble:
             return WARN, f'no report: {self._reports.trouble}', numbers
         return OK, 'collecting' if active is None else 'calibration active', numbers
+
+    def _foreign_transforms(self) -> str:
+        """Return which transforms another node publishes as well; empty: none."""
+        if self._transforms is None or self.count_publishers('/tf_static') < 2:
+            return ''
+        names = ', '.join(self._transforms.foreign())
+        remedy = 'each camera needs frames of its own (camera_frame, more_star_trackers)'
+        return names and f'/tf_static: another node publishes {names} too: {remedy}'
 
     def _on_observations(self, message: Any) -> None:
         observations = checked_observations(message)
@@ -323,10 +348,10 @@ class Calibrator(StarcalNode):
             self._camera_info.publish(camera_info)
             self._alignment.publish(alignment)
             self._calibration.publish(calibration_to_message(calibration, make_message))
-            if self._tf_static is not None:
+            if self._tf_static is not None and self._transforms is not None:
                 transforms = [alignment, *mountings_to_messages(calibration, make_message)]
-                message = make_message('tf2_msgs/msg/TFMessage', transforms=transforms)
-                self._tf_static.publish(message)
+                self._transforms.own(transforms)
+                self._tf_static.publish(make_message(_TRANSFORMS, transforms=transforms))
             if self._driver is not None:
                 self._driver.hand_over(camera_info)
             if answer is not None and answer.calibration is calibration:
