@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
+import os
 from pathlib import Path
 import subprocess
 from typing import Any, TYPE_CHECKING
@@ -149,6 +150,29 @@ def test_replay_launch(make: Make, tiny_bag: Path, tmp_path: Path) -> None:
     words = info.stdout.split()
     assert words[words.index('Messages:') + 1] == '10', info.stdout + info.stderr
     row(FAST, 'rosbag2', 'ros2 bag info STATE_DIR/ensemble', '10 messages')
+
+
+@pytest.mark.parametrize(
+    ('argument', 'says'),
+    [('rate:=abc', "bag_player: rate: 'abc' is not a number"), ('respawn:=abc', "got 'abc'")],
+)
+def test_a_wrong_launch_argument_leaves_no_process(
+    make: Make, tiny_bag: Path, tmp_path: Path, argument: str, says: str
+) -> None:
+    """The launch ends by itself, and the nodes with it: another calibrator can have the folder."""
+    ros2 = make(FAST)
+    values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())
+    values['/**']['ros__parameters']['state_dir'] = str(tmp_path / 'state')
+    params = tmp_path / 'params.yaml'
+    params.write_text(yaml.safe_dump(values))
+    launch = ros2.start(
+        'launch', 'starcal', 'replay.launch.py', f'params:={params}', f'bag:={tiny_bag}', argument
+    )
+    launch.wait()
+    assert says in launch.said()
+    with pytest.raises(ProcessLookupError):
+        os.killpg(launch.process.pid, 0)
+    Archive(tmp_path / 'state', 'camera').close()
 
 
 def test_two_cameras_with_one_frame_are_named(
