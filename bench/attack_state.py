@@ -64,7 +64,7 @@ def _copied(sound: Path) -> Iterator[Path]:
 
 def _opened(folder: Path, setup: Setup, key_file: str = '') -> CalibratorState:
     """A calibrator's state after a restart, closed again."""
-    state = CalibratorState()
+    state = CalibratorState(time.time_ns)
     options = CalibratorOptions(state_dir=str(folder), state_key_file=key_file)
     with contextlib.suppress(StarcalError):  # in one line, and the node does not start
         state.open(setup, options)
@@ -199,7 +199,7 @@ def no_files(sound: Path) -> AttackRow:
             before = {name: old for name, old in before.items() if (folder / name).is_file()}
             state = _opened(folder, setup)
             wrong += _is_wrong(state, setup) or state.active is None
-            assert state.solve(1).message, 'no answer'
+            assert state.solve().message, 'no answer'
             lost += len(sample.changed(before, sample.digests(folder)))
             lost += len(state.ensemble.images) != 2
     return AttackRow(
@@ -251,7 +251,7 @@ _STRANGE: dict[str, Callable[[Path], object]] = {
 def refusals(folder: Path, count: int) -> AttackRow:
     """Refused images, each for a reason of its own: file and time stay small."""
     tally = sample.Tally('refusals')
-    state = CalibratorState()
+    state = CalibratorState(time.time_ns)
     state.open(sample.setup(), CalibratorOptions(state_dir=str(folder)))
     took_s: list[float] = []
     for k in range(count):

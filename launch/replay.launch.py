@@ -46,9 +46,10 @@ def generate_launch_description() -> LaunchDescription:
         parameters=[
             {
                 'bag': ParameterValue(LaunchConfiguration('bag'), value_type=str),
-                'rate': ParameterValue(LaunchConfiguration('rate'), value_type=float),
-                'loop': ParameterValue(LaunchConfiguration('loop'), value_type=bool),
-                'clock': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool),
+                # Of no type: the player refuses a wrong one by its name, and the launch ends.
+                'rate': LaunchConfiguration('rate'),
+                'loop': LaunchConfiguration('loop'),
+                'clock': LaunchConfiguration('use_sim_time'),
                 # The calibrator may start last; the first observations would be lost.
                 'wait_for_topic': 'observations',
             }

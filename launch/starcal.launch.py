@@ -1,14 +1,24 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Launch the star observer and the calibrator, with one parameter file for both."""
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, RegisterEventHandler, Shutdown
+from launch.conditions import UnlessCondition
+from launch.event_handlers import OnProcessExit
+from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 
-from launch import LaunchDescription
+from launch import LaunchContext, LaunchDescription
 
 TOPICS = ('image', 'attitude', 'velocity', 'temperature')
+
+
+def end_after_error(event: ProcessExited, _context: LaunchContext) -> Shutdown | None:
+    """Shut down where a process ended by an error: without it the others wait for ever."""
+    # 1 of the player: it played the bag, but was not told that all messages arrived.
+    if event.returncode == 0 or (event.returncode == 1 and 'bag_player' in event.process_name):
+        return None
+    return Shutdown(reason=f'{event.process_name} ended with status {event.returncode}')
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -42,7 +52,8 @@ def generate_launch_description() -> LaunchDescription:
             parameters=[
                 LaunchConfiguration('params'),
                 {
-                    option: ParameterValue(LaunchConfiguration(option), value_type=bool)
+                    # Of no type: the node refuses a wrong one by its name.
+                    option: LaunchConfiguration(option)
                     for option in ('autostart', 'use_sim_time')
                 },
             ],
@@ -57,4 +68,8 @@ def generate_launch_description() -> LaunchDescription:
             ('calibrator', []),
         )
     ]
-    return LaunchDescription([*arguments, *nodes])
+    errors = RegisterEventHandler(
+        OnProcessExit(on_exit=end_after_error),
+        condition=UnlessCondition(LaunchConfiguration('respawn')),
+    )
+    return LaunchDescription([*arguments, errors, *nodes])

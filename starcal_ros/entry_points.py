@@ -14,6 +14,11 @@ import os
 import signal
 import sys
 
+_REMEDY = (
+    'Source the setup files of ROS 2 and of the workspace with starcal, or run it from the'
+    ' environment that make setup makes'
+)
+
 
 def star_observer() -> int:
     """Run the star observer; see `starcal_ros.nodes.star_observer.main`."""
@@ -38,7 +43,17 @@ def _run(name: str) -> int:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     # `starcal play` and `starcal monitor` block it until here.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    module = importlib.import_module(f'starcal_ros.nodes.{name}')
+    try:
+        module = importlib.import_module(f'starcal_ros.nodes.{name}')
+    except ImportError as error:
+        if (error.name or '').startswith('starcal_ros'):
+            raise
+        why = ' '.join(str(error).split())
+        print(
+            f'{name}: ROS 2 is not complete for {sys.executable}: {why}. {_REMEDY}',
+            file=sys.stderr,
+        )
+        return 2
     return int(module.main())
 
 

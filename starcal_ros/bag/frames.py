@@ -47,7 +47,7 @@ _stamp_ns = operator.itemgetter(0)
 @dataclass(frozen=True)
 class FrameTopics:
     """
-    Topics of images and of their telemetry; velocity and temperature may be empty.
+    Topics of images and of their telemetry; all but that of the images may be empty.
 
     ``more_attitudes`` are those of further star trackers.
     """
@@ -205,7 +205,7 @@ def read_frames(
     """
     options = options or AttitudeOptions()
     # Which of several star trackers an image takes depends on all that are there.
-    is_complete = bool(topics.more_attitudes)
+    is_complete = any(topics.more_attitudes)
     telemetry = (
         read_telemetry(paths, topics, options, on_damage)
         if is_complete

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,13 +44,20 @@ class CalibratorState:
     Both are frozen records: a solve works on the ensemble it began with while the next grows.
     With a state folder both are on disk before they are published; while the disk fails they are
     in memory, `trouble` has the cause, and `save` tries again.
+
+    Parameters
+    ----------
+    now_ns : callable
+        The time, read at the moment of an activation: a solve may take minutes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self._now_ns = now_ns
         self.trouble = ''  # why the last attempt to save failed
         self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
         self.withheld: tuple[str, ...] = ()  # why the gate of today refuses the last calibration
-        self._records = threading.Lock()  # of the records below; never held during a solve
+        # Of the records below, never held during a solve; the activations change under both locks.
+        self._records = threading.Lock()
         self._ensemble = Ensemble()
         self._history: tuple[Activation, ...] = ()
         self._active: Activation | None = None  # of the history
@@ -136,6 +143,12 @@ class CalibratorState:
         with self._records:
             return self._active.calibration if self._active else None
 
+    @property
+    def active_on_disk(self) -> Calibration | None:
+        """The active calibration, once an activation under way is on disk."""
+        with self._disk:
+            return self.active
+
     def add(self, observations: StarObservations) -> None:
         """Add one image, or count the reason why it was refused."""
         with self._records:
@@ -165,7 +178,6 @@ class CalibratorState:
 
     def solve(
         self,
-        now_ns: int,
         method: str = '',
         estimate: Sequence[str] = (),
         dry_run: bool = False,
@@ -187,20 +199,17 @@ class CalibratorState:
             calibration = dataclasses.replace(calibration, reasons=why, forced=True)
         if dry_run:
             return Answer(True, f'would be activated: {summary(calibration)}', calibration)
-        with self._disk, self._records:
+        with self._disk:
             if self._folder and self._archive is None:
                 return Answer(False, 'not activated: the node was cleaned up meanwhile')
             before = self._active.event if self._active else 0
-            event = self._next_event()
-            calibration = dataclasses.replace(calibration, number=event, active_since_ns=now_ns)
-            self._append(Activation(event, before, calibration))
-        self.save()
+            calibration = self._activate(self._next_event(), before, calibration)
         message = self._answer(f'activated: {summary(calibration)}').message
         return Answer(True, message, calibration, True, residuals, ensemble.images)
 
-    def rollback(self, now_ns: int) -> Answer:
+    def rollback(self) -> Answer:
         """Activate the calibration before the active one again."""
-        with self._disk, self._records:
+        with self._disk:
             if self._folder and self._archive is None:
                 return Answer(False, 'not activated: the node was cleaned up meanwhile')
             if self._active is None:
@@ -210,32 +219,34 @@ class CalibratorState:
             if not found:
                 kept = ' on record' if wanted else ''
                 return Answer(False, f'there is no calibration before the active one{kept}')
-            refusals = refusals_today(found[0].calibration, self._setup)
+            before = found[0].calibration
+            refusals = refusals_today(before, self._setup)
             if refusals:
-                number = found[0].calibration.number
                 return Answer(
-                    False, f'calibration {number} is refused by the gate: {"; ".join(refusals)}'
+                    False,
+                    f'calibration {before.number} is refused by the gate: {"; ".join(refusals)}',
                 )
-            calibration = dataclasses.replace(found[0].calibration, active_since_ns=now_ns)
-            self._append(Activation(self._next_event(), found[0].before, calibration))
-        self.save()
+            calibration = self._activate(before.number, found[0].before, before)
         answer = self._answer(f'activated again: {summary(calibration)}')
         return dataclasses.replace(answer, calibration=calibration, active=True)
 
     def save(self) -> None:
         """Write the records to disk; returns at once where they are there."""
         with self._disk:
-            if self._archive is None:
-                return
-            with self._records:
-                ensemble, history = self._ensemble, self._history
-            try:
-                self._archive.keep(ensemble, history)
-                self.trouble = ''
-            except ArchiveError as error:
-                self.trouble = str(error)
-            except Exception as error:  # whatever it is, the records are not on disk
-                self.trouble = f'{type(error).__name__}: {" ".join(str(error).split())}'
+            self._save()
+
+    def _save(self) -> None:
+        if self._archive is None:
+            return
+        with self._records:
+            ensemble, history = self._ensemble, self._history
+        try:
+            self._archive.keep(ensemble, history)
+            self.trouble = ''
+        except ArchiveError as error:
+            self.trouble = str(error)
+        except Exception as error:  # whatever it is, the records are not on disk
+            self.trouble = f'{type(error).__name__}: {" ".join(str(error).split())}'
 
     def disk_free_bytes(self) -> int | None:
         """Free space for the state folder; None without one."""
@@ -246,9 +257,15 @@ class CalibratorState:
         last = self._history[-1].event if self._history else 0
         return 1 + max(last, self._archive.last_event if self._archive else 0)
 
-    def _append(self, record: Activation) -> None:
-        self._history = (*self._history, record)[-self._options.calibration_history :]
-        self._active, self.withheld = record, ()
+    def _activate(self, number: int, before: int, calibration: Calibration) -> Calibration:
+        """Activate a calibration from now on, and save it before anyone else can activate one."""
+        active = dataclasses.replace(calibration, number=number, active_since_ns=self._now_ns())
+        record = Activation(self._next_event(), before, active)
+        with self._records:
+            self._history = (*self._history, record)[-self._options.calibration_history :]
+            self._active, self.withheld = record, ()
+        self._save()
+        return active
 
     def _answer(self, message: str) -> Answer:
         unsaved = f'; not on disk: {self.trouble}' if self.trouble else ''

@@ -142,7 +142,7 @@ def _inspect(args: argparse.Namespace) -> int:
         from starcal_ros.diagnosis.bags import aligned_by_bags
 
         setup, aligned = aligned_by_bags(args.bags, _asked(args), setup)
-        print(aligned, end='\n' if aligned else '', file=sys.stderr)
+        print_text(aligned, end='\n' if aligned else '', file=sys.stderr)
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:
@@ -213,7 +213,7 @@ def _compare_with_truth(args: argparse.Namespace) -> int:
     if args.output:
         raise OptionError('--output: a plot needs two calibrations')
     found = truth.compare_with(read_calibration(calibration_file(args.a)), args.b)
-    print(json.dumps(truth.content(found), indent=1) if args.json else '\n'.join(found.lines))
+    print_text(json.dumps(truth.content(found), indent=1) if args.json else '\n'.join(found.lines))
     return EXIT_ACCEPTED
 
 

@@ -115,10 +115,11 @@ def _print_images(inspection: Inspection) -> None:
     bad = sum(refused.count for refused in inspection.refused)
     chosen = inspection.chosen
     assert chosen is not None  # images come from a chosen topic
+    attitudes = ', '.join(filter(None, (chosen.attitude, *chosen.more_attitudes)))
     print_text(
         f'{inspection.images - bad} of {inspection.images} images of '
         f'{chosen.image or chosen.observations} can be used'
-        + (f', with the attitudes of {chosen.attitude}' if chosen.attitude else '')
+        + (f', with the attitudes of {attitudes}' if attitudes else '')
     )
     if math.isfinite(inspection.longest_attitude_gap_s):
         print_text(

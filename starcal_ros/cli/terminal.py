@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
 import os
 import sys
-from typing import TypeVar
+from typing import TextIO, TypeVar
 
 from starcal_ros.text import printable
 
@@ -42,9 +42,9 @@ def discard(*names: str) -> None:
             os.close(devnull)
 
 
-def print_text(text: str = '', end: str = '\n') -> None:
+def print_text(text: str = '', end: str = '\n', file: TextIO | None = None) -> None:
     """Print lines with characters that act on a terminal escaped (`printable`)."""
-    print('\n'.join(map(printable, text.split('\n'))), end=end)
+    print('\n'.join(map(printable, text.split('\n'))), end=end, file=file)
 
 
 @contextlib.contextmanager

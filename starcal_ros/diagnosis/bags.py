@@ -37,6 +37,8 @@ def diagnose_bags(paths: Sequence[Path], asked: Topics, setup: Setup) -> Diagnos
     topics = bag_topics.choose_topics(paths, asked, setup)
     if topics.observations:
         raise BagError(f'{paths[0]}: no images to look at, only observations')
+    if not topics.attitude:
+        raise BagError(f'{paths[0]}: no attitudes of the first star tracker, only of others')
     attitudes = _attitudes(paths, topics.attitude)
     images = _images(paths, topics.image, setup)
     return diagnose(images, attitudes, set_up(setup), setup.catalog)

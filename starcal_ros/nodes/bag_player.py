@@ -13,7 +13,6 @@ from typing import Any
 import rclpy
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
@@ -34,6 +33,7 @@ from starcal_ros.messages.types import (
 from starcal_ros.nodes.lifecycle_node.lifecycle import end_quietly, until_told_to_end
 from starcal_ros.nodes.lifecycle_node.message_factory import message_class
 from starcal_ros.nodes.lifecycle_node.parameters import OptionParameters
+from starcal_ros.nodes.lifecycle_node.printable_log import PrintableLog
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import PlayerOptions
 
@@ -49,7 +49,7 @@ _CLOCK_S = 0.01  # wall-clock period of /clock
 _LATCHED_TYPES = (CALIBRATION_TYPE, STATUS_TYPE, CAMERA_INFO_TYPE)
 
 
-class BagPlayer(Node):
+class BagPlayer(PrintableLog):
     """Publishes the messages of a bag in order, with their stamps, at a given rate."""
 
     def __init__(self) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import array
 from collections.abc import Sequence
+import contextlib
 from pathlib import Path
 import sys
+import threading
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped
@@ -37,16 +39,20 @@ from starcal_ros.messages.status import status_to_message
 from starcal_ros.nodes.lifecycle_node.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
 from starcal_ros.nodes.lifecycle_node.message_factory import make_message, message_class
 from starcal_ros.nodes.set_camera_info_client import CameraDriver
+from starcal_ros.nodes.transforms import Transforms
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import CalibratorOptions
 from starcal_ros.pipeline.setup import load_setup
-from starcal_ros.records import Calibration, IMAGE_REFUSALS
+from starcal_ros.records import IMAGE_REFUSALS
 
 NAME = 'calibrator'
 _NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Deep enough to lose no image at one a second during a solve of minutes.
 _OBSERVATIONS = QoSProfile(depth=1000)
+_TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+# Of every publisher of static transforms the last message.
+_ALL_LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _RETRY_S = 1.0  # after a failed write
 _TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB
 
@@ -61,7 +67,8 @@ class Calibrator(StarcalNode):
     def __init__(self) -> None:
         super().__init__(NAME)
         self._made: list[tuple[Any, Any]] = []
-        self._state = CalibratorState()
+        self._publishing = threading.Lock()
+        self._state = CalibratorState(self._now_ns)
         self._reports = CalibratorReports(self.guarded(self._on_report))
         self._last_answer = Answer(True, '')
         self._last_gate = 'none'
@@ -105,10 +112,11 @@ class Calibrator(StarcalNode):
         self._calibration = latched(CalibrationMessage, 'calibration')
         self._candidate = latched(CalibrationMessage, 'candidate_calibration')
         self._status = latched(StatusMessage, 'ensemble_status')
-        try:
-            self._tf_static = latched(message_class('tf2_msgs/msg/TFMessage'), '/tf_static')
-        except ImportError:
-            self._tf_static = None
+        self._transforms = self._tf_static = None
+        with contextlib.suppress(ImportError):  # tf2_msgs need not be installed
+            self._tf_static = latched(message_class(_TRANSFORMS), '/tf_static')
+            frames = [self._setup.frames.camera_frame]
+            self._transforms = Transforms([*frames, *(one.frame for one in self._setup.mountings)])
 
     def activate(self) -> None:
         """Start to collect observations and to serve requests."""
@@ -125,12 +133,19 @@ class Calibrator(StarcalNode):
             _OBSERVATIONS,
             group=collecting,
         )
+        if self._transforms is not None:
+            heard = self.create_subscription(
+                message_class(_TRANSFORMS),
+                '/tf_static',
+                self.guarded(self._transforms.hear),
+                _ALL_LATCHED,
+                callback_group=collecting,
+            )
+            self._listeners.append((self.destroy_subscription, heard))
         retry = self.steady_timer(_RETRY_S, self.guarded(self._save_again), collecting)
         self._listeners.append((self.destroy_timer, retry))
         self._status_thread = StatusThread(self.guarded(self._publish_status))
-        active = self._state.active
-        if active is not None:
-            self._publish_calibration(active)
+        self._publish_active()
 
     def deactivate(self) -> None:
         """Stop collecting observations and serving requests."""
@@ -190,6 +205,8 @@ class Calibrator(StarcalNode):
         topic = self.resolve_topic_name('calibration')
         if self.count_publishers(topic) > 1:
             return WARN, f'another node publishes {topic}', numbers
+        if foreign := self._foreign_transforms():
+            return WARN, foreign, numbers
         if state.damage:
             return WARN, f'set aside as damaged: {"; ".join(state.damage)}', numbers
         if driver is not None and driver.has_failed:
@@ -199,6 +216,14 @@ class Calibrator(StarcalNode):
         if self._reports.trouble:
             return WARN, f'no report: {self._reports.trouble}', numbers
         return OK, 'collecting' if active is None else 'calibration active', numbers
+
+    def _foreign_transforms(self) -> str:
+        """Return which transforms another node publishes as well; empty: none."""
+        if self._transforms is None or self.count_publishers('/tf_static') < 2:
+            return ''
+        names = ', '.join(self._transforms.foreign())
+        remedy = 'each camera needs frames of its own (camera_frame, more_star_trackers)'
+        return names and f'/tf_static: another node publishes {names} too: {remedy}'
 
     def _on_observations(self, message: Any) -> None:
         observations = checked_observations(message)
@@ -223,12 +248,11 @@ class Calibrator(StarcalNode):
         self._status.publish(status_to_message(status, frame_id, make_message))
 
     def _on_calibrate(self, _request: Any, response: Any) -> Any:
-        return self._told(self._judged(self._state.solve(self._now_ns())), response)
+        return self._told(self._judged(self._state.solve()), response)
 
     def _on_solve(self, request: Any, response: Any) -> Any:
         answer = self._judged(
             self._state.solve(
-                self._now_ns(),
                 request.method,
                 tuple(request.estimate),
                 request.dry_run,
@@ -245,7 +269,7 @@ class Calibrator(StarcalNode):
         return self._told(answer, response)
 
     def _on_rollback(self, _request: Any, response: Any) -> Any:
-        return self._told(self._state.rollback(self._now_ns()), response)
+        return self._told(self._state.rollback(), response)
 
     def _on_lookup(self, request: Any, response: Any) -> Any:
         active = self._state.active
@@ -288,12 +312,11 @@ class Calibrator(StarcalNode):
         return answer
 
     def _told(self, answer: Answer, response: Any) -> Any:
-        """Publish the activated or refused calibration; return the filled response."""
+        """Publish the active or the refused calibration; return the filled response."""
         if not self.is_active:
             pass  # deactivated meanwhile: activation publishes the active calibration
         elif answer.calibration is not None and answer.active:
-            self._publish_calibration(answer.calibration)
-            self._show(ACTIVE, answer)
+            self._publish_active(answer)
         elif answer.calibration is not None and not answer.success:
             self._candidate.publish(calibration_to_message(answer.calibration, make_message))
             self._show(CANDIDATE, answer)
@@ -313,17 +336,26 @@ class Calibrator(StarcalNode):
             self.get_logger().info(f'report: {page}')
         self.publish_health_change()
 
-    def _publish_calibration(self, calibration: Calibration) -> None:
-        camera_info = camera_info_to_message(calibration, make_message)
-        alignment = alignment_to_message(calibration, make_message)
-        self._camera_info.publish(camera_info)
-        self._alignment.publish(alignment)
-        self._calibration.publish(calibration_to_message(calibration, make_message))
-        if self._tf_static is not None:
-            transforms = [alignment, *mountings_to_messages(calibration, make_message)]
-            self._tf_static.publish(make_message('tf2_msgs/msg/TFMessage', transforms=transforms))
-        if self._driver is not None:
-            self._driver.hand_over(camera_info)
+    def _publish_active(self, answer: Answer | None = None) -> None:
+        """Publish the active calibration, and its report where it is that of an answer."""
+        # Two requests may activate one each: of all publishers the last is of the later one.
+        with self._publishing:
+            calibration = self._state.active_on_disk
+            if calibration is None:
+                return
+            camera_info = camera_info_to_message(calibration, make_message)
+            alignment = alignment_to_message(calibration, make_message)
+            self._camera_info.publish(camera_info)
+            self._alignment.publish(alignment)
+            self._calibration.publish(calibration_to_message(calibration, make_message))
+            if self._tf_static is not None and self._transforms is not None:
+                transforms = [alignment, *mountings_to_messages(calibration, make_message)]
+                self._transforms.own(transforms)
+                self._tf_static.publish(make_message(_TRANSFORMS, transforms=transforms))
+            if self._driver is not None:
+                self._driver.hand_over(camera_info)
+            if answer is not None and answer.calibration is calibration:
+                self._show(ACTIVE, answer)
 
     def _answered(self, answer: Any) -> Any:
         """Return the service callback wrapped so that errors are answered, logged and counted."""

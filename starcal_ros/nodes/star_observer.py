@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 import dataclasses
+import functools
 import math
 import operator
 import sys
@@ -52,9 +53,10 @@ from starcal_ros.records import (
     StarObservations,
 )
 from starcal_ros.report.pictures.annotation import annotate
-from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
+from starcal_ros.sky.attitude import attitude_sample
 from starcal_ros.star_observer.image_queue import ImageQueue, Waiting
 from starcal_ros.star_observer.sliding_window import Recent
+from starcal_ros.star_observer.star_trackers import StarTrackers
 
 NAME = 'star_observer'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -116,9 +118,12 @@ class StarObserver(StarcalNode):
     def activate(self) -> None:
         """Subscribe to images and attitudes, start the worker thread."""
         jump_s = max(_JUMP_S, self._setup.attitude.max_attitude_gap_s)
-        self._attitudes = AttitudeHistory(self._own.attitude_history_s, jump_s)
-        self._more_attitudes = tuple(
-            AttitudeHistory(self._own.attitude_history_s, jump_s) for _ in self._setup.mountings
+        self._star_trackers = StarTrackers(
+            1 + len(self._setup.mountings),
+            self._own.attitude_history_s,
+            jump_s,
+            self._setup.attitude.max_attitude_gap_s,
+            self._own.attitude_timeout_s,
         )
         self._track = observe.Track(self._geometry)
         self._predicted_from = self._geometry
@@ -127,10 +132,12 @@ class StarObserver(StarcalNode):
         self._counts.clear()
         self._restarts = self._retried = self._retried_used = 0
         self._last_refusal = ''
-        self._unmatched = Unmatched(self._setup, self.guarded(self._on_diagnosis))
+        self._unmatched = Unmatched(
+            self._setup, functools.partial(self._in_worker, self._on_diagnosis)
+        )
         self._image_arrivals, self._latency_s, self._attitude_step_s = Recent(), Recent(), Recent()
         self._queue = ImageQueue(
-            self._own.image_queue, self._own.attitude_timeout_s, self._attitude_has_come
+            self._own.image_queue, self._own.attitude_timeout_s, self._star_trackers.has_come
         )
         self._worker = threading.Thread(target=self._measure_all, name='measure')
         self._worker.start()
@@ -150,14 +157,10 @@ class StarObserver(StarcalNode):
             (*self._image_input(), self._on_image, images, asked == 'auto'),
         ):
             self.inputs.add(kind, topic, self.taking(callback), qos, adapts=adapts)
-        for mounting, history in zip(self._setup.mountings, self._more_attitudes, strict=True):
-            self.inputs.add(
-                attitude_message,
-                f'{mounting.frame}/attitude',
-                self.taking(self._adding_to(history)),
-                _SAMPLES,
-                adapts=True,
-            )
+        for which, mounting in enumerate(self._setup.mountings, 1):
+            callback = functools.partial(self._add_attitude, which)
+            topic = f'{mounting.frame}/attitude'
+            self.inputs.add(attitude_message, topic, self.taking(callback), _SAMPLES, adapts=True)
 
     def _image_input(self) -> tuple[Any, str]:
         if self._own.image_transport == 'raw':
@@ -186,6 +189,8 @@ class StarObserver(StarcalNode):
         """Diagnostics: counts of used and refused images."""
         why = None if self._unmatched is None else self._unmatched.diagnosis
         counts = dict(self._counts)  # the worker thread continues counting
+        unfit, first = self._track.unfit, self._setup.frames.star_tracker_frame
+        not_used = [f'{name or first}: {one.images}' for name, one in unfit.items()]
         numbers: dict[str, object] = {
             'images': sum(counts.values()),
             'images_used': counts.get('', 0),
@@ -193,9 +198,10 @@ class StarObserver(StarcalNode):
             'image_rate_hz': _short(self._image_arrivals.rate_hz()),
             'latency_median_s': _short(self._latency_s.median()),
             'latency_worst_s': _short(self._latency_s.largest()),
-            'attitudes': len(self._attitudes),
+            'attitudes': len(self._star_trackers.histories[0]),
             'attitude_rate_hz': _short(self._attitude_step_s.rate_hz()),
             'attitude_gap_s': _short(self._attitude_step_s.largest()),
+            'attitudes_not_used': ', '.join(not_used) or 'none',
             'restarts': self._restarts,
             'retried': self._retried,
             'retried_used': self._retried_used,
@@ -208,6 +214,8 @@ class StarObserver(StarcalNode):
             return WARN, f'no image matches: {why.in_a_sentence()}', numbers
         if self._last_refusal:
             return WARN, f'last image refused: {self._last_refusal}', numbers
+        if why_not := [one.why for one in unfit.values() if one.why]:
+            return WARN, '; '.join(why_not), numbers
         if not counts:
             return OK, 'waiting for images', numbers
         return OK, 'observing', numbers
@@ -222,7 +230,9 @@ class StarObserver(StarcalNode):
             if not self.taken(callback)
         ] + [
             self.resolve_topic_name(f'{mounting.frame}/attitude')
-            for mounting, history in zip(self._setup.mountings, self._more_attitudes, strict=True)
+            for mounting, history in zip(
+                self._setup.mountings, self._star_trackers.histories[1:], strict=True
+            )
             if not len(history)
         ]
 
@@ -250,23 +260,18 @@ class StarObserver(StarcalNode):
         time_ns, quaternion = attitude_from_message(message)
         if self._unmatched is not None:
             self._unmatched.add_attitude(time_ns, quaternion)
-        before_ns = self._attitudes.latest_ns
-        self._add_attitude(self._attitudes, message)
+        history = self._star_trackers.histories[0]
+        before_ns = history.latest_ns
+        self._add_attitude(0, message)
         # Late samples and steps back of the clock are not gaps.
-        latest_ns = self._attitudes.latest_ns or 0
+        latest_ns = history.latest_ns or 0
         step_ns = 0 if before_ns is None else max(0, latest_ns - before_ns)
         self._attitude_step_s.add(step_ns / NANOSECONDS_PER_SECOND)
 
-    def _adding_to(self, history: AttitudeHistory) -> Callable[[Any], None]:
-        def on_more_attitudes(message: Any) -> None:
-            self._add_attitude(history, message)
-
-        return on_more_attitudes
-
-    def _add_attitude(self, history: AttitudeHistory, message: Any) -> None:
+    def _add_attitude(self, which: int, message: Any) -> None:
         time_ns, quaternion = attitude_from_message(message)
         direction = self._setup.attitude.attitude_direction
-        history.add(time_ns, attitude_sample(time_ns, quaternion, direction))
+        self._star_trackers.add(which, time_ns, attitude_sample(time_ns, quaternion, direction))
         if self._queue is not None:
             self._queue.wake()
 
@@ -290,19 +295,18 @@ class StarObserver(StarcalNode):
         prior = self._setup.prior.camera
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
             raise ValueError('calibration: image size differs from the prior camera')
-        self._geometry, self._calibration_number = geometry, calibration.number
         if self._camera_infos is not None:
             self._camera_info = camera_info_to_message(calibration, make_message)
+        self._in_worker(self._predict_with, geometry, calibration.number)
+
+    def _predict_with(self, geometry: CameraGeometry, number: int) -> None:
+        self._geometry, self._calibration_number = geometry, number
         self.get_logger().info('predicting stars with the active calibration')
         self._measure_again()
 
-    def _attitude_has_come(self, time_ns: int) -> bool:
-        """Return True if the attitude samples of an image have arrived or can no longer arrive."""
-        gap_s = self._setup.attitude.max_attitude_gap_s
-        return any(
-            _covers(history, time_ns, gap_s)
-            for history in (self._attitudes, *self._more_attitudes)
-        )
+    def _in_worker(self, function: Callable[..., None], *arguments: Any) -> None:
+        if self._queue is not None:
+            self._queue.call(functools.partial(self.guarded(function), *arguments))
 
     def _measure_all(self) -> None:
         assert self._queue is not None  # created before the thread
@@ -356,15 +360,7 @@ class StarObserver(StarcalNode):
             self._publish(self._refused(waiting, 'no_match', detail))
             return
         before = self._track
-        observations, self._track = observe.observe_next(
-            image,
-            self._attitudes,
-            self._setup,
-            before,
-            latest_at(sorted(self._velocities, key=_STAMP_NS), image.time_ns, None),
-            latest_at(sorted(self._temperatures, key=_STAMP_NS), image.time_ns, math.nan),
-            self._more_attitudes,
-        )
+        observations, self._track = self._observe_next(image, before)
         if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
             self._restarts += 1
             self.get_logger().warning('image stamps went back: restarted the sequence')
@@ -375,6 +371,20 @@ class StarObserver(StarcalNode):
             self._unmatched.matched()
         if self._annotated.get_subscription_count():
             self._publish_annotated(image, observations, before.geometry)
+
+    def _observe_next(
+        self, image: Image, track: observe.Track
+    ) -> tuple[StarObservations, observe.Track]:
+        first, *more = self._star_trackers.histories
+        return observe.observe_next(
+            image,
+            first,
+            self._setup,
+            track,
+            latest_at(sorted(self._velocities, key=_STAMP_NS), image.time_ns, None),
+            latest_at(sorted(self._temperatures, key=_STAMP_NS), image.time_ns, math.nan),
+            more,
+        )
 
     def _keep(self, image: Image) -> None:
         if self._unmatched is not None:
@@ -402,15 +412,7 @@ class StarObserver(StarcalNode):
         """Measure the images that matched nothing, with the calibration or alignment found."""
         kept = [] if self._unmatched is None else self._unmatched.take()
         for image in kept:
-            observations, _ = observe.observe_next(
-                image,
-                self._attitudes,
-                self._setup,
-                observe.Track(self._geometry),
-                latest_at(sorted(self._velocities, key=_STAMP_NS), image.time_ns, None),
-                latest_at(sorted(self._temperatures, key=_STAMP_NS), image.time_ns, math.nan),
-                self._more_attitudes,
-            )
+            observations, _ = self._observe_next(image, observe.Track(self._geometry))
             self._retried += 1
             if not observations.refusal:
                 self._retried_used += 1
@@ -432,9 +434,10 @@ class StarObserver(StarcalNode):
         self._last_refusal = (
             observations.refusal and f'{observations.refusal}: {observations.detail}'
         )
-        if observations.refusal:
+        text = (self._last_refusal and f'refused: {self._last_refusal}') or observations.detail
+        if text:
             seconds = observations.time_ns / NANOSECONDS_PER_SECOND
-            self.get_logger().warning(f'image at {seconds:.3f} s refused: {self._last_refusal}')
+            self.get_logger().warning(f'image at {seconds:.3f} s: {text}')
         else:
             self.get_logger().debug(f'{len(observations)} stars')
 
@@ -446,19 +449,6 @@ class StarObserver(StarcalNode):
         self._annotated.publish(
             color_image_to_message(image.time_ns, picture, frame_id, make_message)
         )
-
-
-def _covers(history: AttitudeHistory, time_ns: int, gap_s: float) -> bool:
-    latest_ns = history.latest_ns
-    if latest_ns is None or latest_ns < time_ns:
-        return False
-    if latest_ns > time_ns + offset_ns(gap_s):
-        return True
-    try:
-        history.at(time_ns, gap_s)
-    except ImageRefused:
-        return False
-    return True
 
 
 def _short(number: float | None) -> str:

@@ -37,6 +37,15 @@ _SAME_ATTITUDE = 1e-12  # of a component; interpolation between equal samples ro
 _TURN_SIGMAS = 2.0  # of the star tracker: a coarse output may repeat itself within its noise
 _TURN_PX = 0.1  # noise of the turn between two images, of their centroids and the prior camera
 _IMAGES_OF_A_RESTART = 3  # two images may be swapped in transit, three are not
+_IMAGES_OF_AN_UNFIT = 10  # an attitude in vain counts as so many: a search takes as long as five
+
+
+@dataclass(frozen=True)
+class Unfit:
+    """Images for which the attitude of a star tracker was unfit, and why the last one was."""
+
+    images: int = 0
+    why: str = ''  # empty: it has been used since
 
 
 @dataclass(frozen=True)
@@ -50,7 +59,8 @@ class Track:
     used.  ``seen`` is the last frame of all, used or not, which a stuck camera shows again;
     ``hot`` the hot pixels found so far.  ``held`` is the first image used at the attitude that the
     last one has.  ``taken`` counts the images by star tracker, and ``others`` have the state of
-    the sequence by the further ones, whose mountings are not exact.
+    the sequence by the further ones, whose mountings are not exact.  ``unfit`` is about the star
+    trackers whose attitude led to a refusal where that of another one did not.
     """
 
     geometry: CameraGeometry
@@ -62,6 +72,7 @@ class Track:
     hot: HotPixels | None = None
     held: StarObservations | None = None
     taken: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    unfit: Mapping[str, Unfit] = dataclasses.field(default_factory=dict)
     others: Mapping[str, Track] = dataclasses.field(default_factory=dict)
 
 
@@ -78,7 +89,8 @@ def observe_next(
     Observations of the next image of a sequence, and the state of the sequence after it.
 
     ``more_attitudes`` are those of the further star trackers of the setup.  The one that has given
-    the fewest images is taken; where its attitude leads to a refusal, the next one.
+    the fewest images is taken; where its attitude leads to a refusal, the next one.  Such a
+    refusal costs the image nothing: ``detail`` has it, and the star tracker is tried seldom.
 
     A sequence starts with the prior or the active calibration.  An image stamped at or before the
     last one used is refused and does not change the state, so that one wrong stamp costs one
@@ -141,18 +153,36 @@ def _with_any(
     """Observations with the first attitude that leads to no refusal, else the first refusal."""
     outcomes: list[tuple[StarObservations, Track]] = []
     errors: list[ImageRefused] = []
+    unfit: dict[str, str] = {}
     for attitude in attitudes:
+        label = attitude.star_tracker or setup.frames.star_tracker_frame
         try:
             observations, after = _with_one(attitude, exposure, setup, track)
         except ImageRefused as refused:
             errors.append(refused)
+            unfit[attitude.star_tracker] = f'{label} not used: {refused.reason}: {refused.detail}'
             continue
         if not observations.refusal:
-            return observations, after
+            detail = '; '.join(unfit.values())
+            observations = dataclasses.replace(observations, detail=detail)
+            return observations, _with_fitness(after, attitude.star_tracker, unfit)
+        why = f'{observations.refusal}: {observations.detail}'
+        unfit[attitude.star_tracker] = f'{label} not used: {why}'
         outcomes.append((observations, after))
     if errors and len(errors) == len(attitudes):
         raise errors[0]
     return outcomes[0]
+
+
+def _with_fitness(track: Track, used: str, unfit: Mapping[str, str]) -> Track:
+    """State after an image for which one star tracker was used and others were unfit."""
+    taken, known = dict(track.taken), dict(track.unfit)
+    if used in known:
+        known[used] = dataclasses.replace(known[used], why='')
+    for name, why in unfit.items():
+        taken[name] = taken.get(name, 0) + _IMAGES_OF_AN_UNFIT
+        known[name] = Unfit(known.get(name, Unfit()).images + 1, why)
+    return dataclasses.replace(track, taken=taken, unfit=known)
 
 
 def _with_one(
@@ -237,7 +267,7 @@ def _after_order(track: Track, time_ns: int) -> Track:
     behind = track.behind + 1 if track.behind and time_ns > track.behind_ns else 1
     if behind < _IMAGES_OF_A_RESTART:
         return dataclasses.replace(track, behind=behind, behind_ns=time_ns)
-    return Track(track.geometry, hot=track.hot)
+    return Track(track.geometry, hot=track.hot, unfit=track.unfit)
 
 
 def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservations, Track]:

@@ -172,21 +172,32 @@ def read_setup(params: Path) -> Setup:
         raise OptionError(f'{params}: {error}') from error
 
 
-def files_of(frames: SetupOptions) -> tuple[Path, ...]:
+def files_of(frames: SetupOptions) -> dict[str, Path]:
     """
-    The files that options name: prior camera, catalog and detector frames.
+    The files that options name, by option: prior camera, catalog and detector frames.
 
     Raises
     ------
     ProductError
         For a camera URL that names no file.
     """
-    files = [resolve_url(frames.camera_info_url)] if frames.camera_info_url else []
-    if frames.catalog:
-        files.append(Path(frames.catalog))
-    for path in filter(None, (frames.dark_frame, frames.flat_field, frames.bad_pixel_map)):
-        files.append(Path(path.removeprefix('file://')))
-    return tuple(files)
+    files = (
+        {'camera_info_url': resolve_url(frames.camera_info_url)} if frames.camera_info_url else {}
+    )
+    for name in ('catalog', 'dark_frame', 'flat_field', 'bad_pixel_map'):
+        if path := getattr(frames, name):
+            files[name] = Path(path.removeprefix('file://'))
+    return files
+
+
+def _check_relative(files: Mapping[str, Path]) -> None:
+    """Raise OptionError for a relative path that leads to no file from the current folder."""
+    for name, path in files.items():
+        if not path.is_absolute() and not path.exists():
+            raise OptionError(
+                f'{name}: {path}: No such file in {Path.cwd()}, the folder of this process; give'
+                ' its whole path'
+            )
 
 
 def load_setup(
@@ -214,6 +225,7 @@ def load_setup(
             raise OptionError(f'{said}: no such parameter{nearest(name, known)}')
     groups = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS.items()}
     frames: SetupOptions = groups['frames']
+    _check_relative(files_of(frames))
     is_aligned = prior is not None or any(frames.prior_alignment)
     prior = prior or _prior(frames)
     check_options(groups['calibration'], prior.camera.model)
@@ -237,7 +249,7 @@ def load_setup(
         if frames.camera_info_url
         else DEFAULT_CAMERA_NAME,
         flat=flat,
-        mountings=_mountings(groups['attitude'], prior, is_aligned),
+        mountings=_mountings(groups['attitude'], frames, prior, is_aligned),
     )
 
 
@@ -248,14 +260,19 @@ def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
 
 
 def _mountings(
-    options: AttitudeOptions, prior: CameraGeometry, is_aligned: bool
+    options: AttitudeOptions, setup: SetupOptions, prior: CameraGeometry, is_aligned: bool
 ) -> tuple[Mounting, ...]:
     """The further star trackers, each in the frame of the first by the prior alignments."""
     frames = [frame for frame in options.more_star_trackers if frame]
     if not frames:
         return ()
-    if len(set(frames)) < len(frames):
-        raise OptionError(f'more_star_trackers: {", ".join(frames)}: a name comes twice')
+    others = [setup.star_tracker_frame, setup.camera_frame]
+    for k, frame in enumerate(frames):
+        if frame.lstrip('/') in (name.lstrip('/') for name in [*others, *frames[:k]]):
+            raise OptionError(
+                f'more_star_trackers: {shown(frame)} comes twice: each of them, star_tracker_frame'
+                ' and camera_frame need a name of their own'
+            )
     for frame in frames:
         if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', frame):
             raise OptionError(f'more_star_trackers: {shown(frame)} is no name of a frame')

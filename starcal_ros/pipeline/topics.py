@@ -32,7 +32,8 @@ class Topics:
     """
     Topic of each kind of message; empty: not requested, or not in the bag.
 
-    ``more_attitudes`` are those of the further star trackers, in the order of the setup.
+    ``more_attitudes`` are those of the further star trackers, in the order of the setup; empty
+    where the bag has none of one.
     """
 
     image: str = ''
@@ -67,23 +68,7 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
         if any(t.type_name == kind and t.name == f'/{asked.image.lstrip("/")}' for t in there):
             image_type = kind
     image = _choose(paths, image_type, asked.image, 'image')
-    attitude_type = ATTITUDE_TYPES[setup.attitude.attitude_message] if setup else ATTITUDE_TYPE
-    more = more_attitude_topics(setup)
-    types_of = {topic.name: topic.type_name for topic in there}
-    missing = [name for name in more if types_of.get(name, '') != attitude_type]
-    if missing:
-        raise BagError(
-            f'{", ".join(missing)}: no such topic of type {attitude_type}, but more_star_trackers'
-            ' names its star tracker'
-        )
-    first = [n for n, kind in types_of.items() if kind == attitude_type and n not in more]
-    only = first[0] if more and len(first) == 1 else ''
-    try:
-        attitude = _choose(paths, attitude_type, asked.attitude or only, 'attitude')
-    except BagError as error:
-        if first:
-            raise
-        raise BagError(f'{error}{_other_attitudes(there, asked.attitude)}') from error
+    attitude, more = _choose_attitudes(paths, there, asked.attitude, setup)
     velocity, temperature = asked.velocity, asked.temperature
     if velocity or VELOCITY_TYPE in types:
         velocity = _choose(paths, VELOCITY_TYPE, velocity, 'velocity')
@@ -94,6 +79,39 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
     if temperature or thermometers == 1 or (thermometers and used):
         temperature = _choose(paths, TEMPERATURE_TYPE, temperature, 'temperature')
     return Topics(image, attitude, velocity, temperature, more_attitudes=more)
+
+
+def _choose_attitudes(
+    paths: Sequence[Path], there: Sequence[reader.Topic], asked: str, setup: Setup | None
+) -> tuple[str, tuple[str, ...]]:
+    """
+    Topics of the first and of each further star tracker; empty, with a warning: not in the bags.
+
+    A star tracker may drop out, but not all of them.
+    """
+    kind = ATTITUDE_TYPES[setup.attitude.attitude_message] if setup else ATTITUDE_TYPE
+    fitting = [topic.name for topic in there if topic.type_name == kind]
+    named = more_attitude_topics(setup)
+    more = tuple(name if name in fitting else '' for name in named)
+    for name in set(named) - set(more):
+        reader.log_damage(
+            f'{name}: no such topic of type {kind}; the star tracker that more_star_trackers names'
+            ' is left out'
+        )
+    first = [name for name in fitting if name not in named]
+    if setup and not (asked or first) and any(more):
+        reader.log_damage(
+            f'no topic of type {kind} but those of more_star_trackers; the first star tracker,'
+            f' {setup.frames.star_tracker_frame}, is left out'
+        )
+        return '', more
+    only = first[0] if named and len(first) == 1 else ''
+    try:
+        return _choose(paths, kind, asked or only, 'attitude'), more
+    except BagError as error:
+        if first:
+            raise
+        raise BagError(f'{error}{_other_attitudes(there, asked)}') from error
 
 
 def _other_attitudes(there: Sequence[reader.Topic], asked: str) -> str:

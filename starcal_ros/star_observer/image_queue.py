@@ -49,6 +49,7 @@ class ImageQueue:
         self._timeout_s = timeout_s
         self._is_ready = is_ready
         self._images: deque[Waiting] = deque()
+        self._calls: deque[Callable[[], None]] = deque()
         self._held = 0
         self._closed = False
         self._changed = threading.Condition()
@@ -65,6 +66,12 @@ class ImageQueue:
             self._images.append(Waiting(time_ns, width, height, kept, time.monotonic()))
             self._changed.notify()
 
+    def call(self, function: Callable[[], None]) -> None:
+        """Have the thread of `take` call a function before the next image; never waits."""
+        with self._changed:
+            self._calls.append(function)
+            self._changed.notify()
+
     def wake(self) -> None:
         """Check the first image again."""
         with self._changed:
@@ -78,8 +85,15 @@ class ImageQueue:
 
     def take(self) -> Waiting | None:
         """Return the next image once it is ready or timed out; None after `close`."""
+        while callable(taken := self._next()):
+            taken()
+        return taken
+
+    def _next(self) -> Waiting | Callable[[], None] | None:
         with self._changed:
             while not self._closed:
+                if self._calls:
+                    return self._calls.popleft()
                 left_s = None
                 if self._images:
                     first = self._images[0]

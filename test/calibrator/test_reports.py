@@ -42,11 +42,11 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Subject:
     setup = load_setup(
         {'camera_info_url': str(folder / 'camera.yaml'), 'prior_alignment': alignment}
     )
-    state = CalibratorState()
+    state = CalibratorState(lambda: 1_800_000_000_000_000_000)
     state.open(setup, CalibratorOptions())
     for image in true_observations(SCENARIO).images:
         state.add(image)
-    answer = state.solve(1_800_000_000_000_000_000)
+    answer = state.solve()
     assert answer.calibration is not None and answer.residuals is not None
     return Subject(answer.calibration, answer.residuals, answer.observations)
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 from pathlib import Path
 import resource
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from starcal_ros.calibrator.archive import Archive
 from starcal_ros.calibrator.seal import CHECKSUMS
 from starcal_ros.calibrator.state import Answer, CalibratorState
 from starcal_ros.errors import ArchiveError, OptionError
+from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.node_options import CalibratorOptions
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.products.camera_yaml import write_camera_info
@@ -48,7 +51,7 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> Setup:
 
 
 def started(setup: Setup, folder: Path | str = '', history: int = 20) -> CalibratorState:
-    state = CalibratorState()
+    state = CalibratorState(itertools.count(1).__next__)
     state.open(setup, CalibratorOptions(state_dir=str(folder), calibration_history=history))
     return state
 
@@ -68,15 +71,15 @@ def test_a_restart_goes_on_where_it_stood(
     """The same solution to the last bit, and the same active calibration."""
     first = filled(setup, shown, tmp_path)
     first.add(refused_image(5, 8, 8, 'no_stars', ''))
-    answer = first.solve(1_000)
+    answer = first.solve()
     assert answer.success and answer.active and answer.calibration is not None
-    assert (answer.calibration.number, answer.calibration.active_since_ns) == (1, 1_000)
+    assert (answer.calibration.number, answer.calibration.active_since_ns) == (1, 1)
     status = first.status()
     assert status.images == status.images_saved == len(shown)
     first.close()
     second = started(setup, tmp_path)
     assert dict(second.status().refused) == {'no_stars': 1}
-    active, again = second.active, second.solve(2_000).calibration
+    active, again = second.active, second.solve().calibration
     assert active is not None and again is not None
     for found in (active, again):
         assert found.covariance.tobytes() == answer.calibration.covariance.tobytes()
@@ -92,20 +95,20 @@ def test_rollback_outlasts_a_restart(
     without = dataclasses.replace(setup.calibration, residual_field=False)
     setup = dataclasses.replace(setup, calibration=without)
     state = filled(setup, shown, tmp_path)
-    for now_ns, estimate in ((1, ('fx', 'fy')), (2, ('fx', 'fy', 'k1')), (3, ('fx',))):
-        assert state.solve(now_ns, estimate=estimate, force=True).success
-    assert state.rollback(4).success
+    for estimate in (('fx', 'fy'), ('fx', 'fy', 'k1'), ('fx',)):
+        assert state.solve(estimate=estimate, force=True).success
+    assert state.rollback().success
     state.close()
     state = started(setup, tmp_path)
     active = state.active
     assert active is not None and active.estimated == ('fx', 'fy', 'k1')
     assert (active.number, active.active_since_ns) == (2, 4)
-    back = state.rollback(5)
+    back = state.rollback()
     assert back.calibration is not None and back.calibration.number == 1
-    assert state.rollback(6) == Answer(False, 'there is no calibration before the active one')
+    assert state.rollback() == Answer(False, 'there is no calibration before the active one')
     # A new one goes back to what was in force when it came.
-    assert state.solve(7, estimate=('fx', 'fy'), force=True).success
-    back = state.rollback(8)
+    assert state.solve(estimate=('fx', 'fy'), force=True).success
+    back = state.rollback()
     assert back.calibration is not None and back.calibration.number == 1
     state.close()
 
@@ -116,13 +119,34 @@ def test_history_is_bounded(
     state = started(setup, tmp_path, history=2)
     for image in shown:
         state.add(image)
-    for now_ns in range(1, 5):
-        assert state.solve(now_ns).success
+    for _ in range(4):
+        assert state.solve().success
     assert len(list((tmp_path / 'calibrations').iterdir())) == 2
-    assert state.rollback(9).success
-    gone = state.rollback(10)
+    assert state.rollback().success
+    gone = state.rollback()
     assert gone.message == 'there is no calibration before the active one on record'
     state.close()
+
+
+def test_the_time_of_an_activation_is_read_when_it_is_made(
+    setup: Setup, shown: tuple[StarObservations, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A roll-back during a solve is the earlier activation, and its time the earlier one."""
+    state = filled(setup, shown)
+    assert state.solve().success and state.solve().success
+    solve, times = solving.solve_with_residuals, []
+
+    def long_solve(*arguments: Any, **options: Any) -> Any:
+        solved = solve(*arguments, **options)
+        back = state.rollback()
+        assert back.calibration is not None
+        times.append(back.calibration.active_since_ns)
+        return solved
+
+    monkeypatch.setattr(solving, 'solve_with_residuals', long_solve)
+    answer = state.solve()
+    assert answer.calibration is not None and answer.calibration is state.active
+    assert times[0] < answer.calibration.active_since_ns
 
 
 def test_what_is_forced_says_so(
@@ -130,12 +154,12 @@ def test_what_is_forced_says_so(
 ) -> None:
     gate = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
     state = filled(dataclasses.replace(setup, gate=gate), shown, tmp_path)
-    refused = state.solve(1)
+    refused = state.solve()
     assert not refused.success and refused.calibration is not None
     assert (refused.calibration.number, refused.calibration.forced) == (0, False)
     assert state.active is None
-    assert state.solve(1, dry_run=True, force=True).success and state.active is None
-    assert state.solve(2, force=True).success
+    assert state.solve(dry_run=True, force=True).success and state.active is None
+    assert state.solve(force=True).success
     state.close()
     state = started(setup, tmp_path)
     active = state.active
@@ -205,7 +229,7 @@ def test_a_full_disk_costs_nothing_that_memory_holds(
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
     try:
         state.add(shown[-1])
-        answer = state.solve(1)
+        answer = state.solve()
         status = state.status()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -255,12 +279,12 @@ def test_damage_is_named(
 
 def test_memory_alone(setup: Setup, shown: tuple[StarObservations, ...]) -> None:
     state = started(setup)
-    assert state.rollback(1) == Answer(False, 'no calibration is active')
-    assert 'too few observations' in state.solve(1).message
+    assert state.rollback() == Answer(False, 'no calibration is active')
+    assert 'too few observations' in state.solve().message
     assert state.ensemble == Ensemble() and state.disk_free_bytes() is None
     for image in shown:
         state.add(image)
-    assert state.solve(1).success
+    assert state.solve().success
     state.close()
     state.open(setup, CalibratorOptions())
     active = state.active
@@ -272,7 +296,7 @@ def test_the_gate_of_today_judges_what_was_stored(
 ) -> None:
     """With another prior or limit it is not active, stays on disk, and comes back with them."""
     state = filled(setup, shown, tmp_path)
-    first, second = state.solve(1).calibration, state.solve(2).calibration
+    first, second = state.solve().calibration, state.solve().calibration
     assert first is not None and second is not None
     state.close()
     kept = sorted((tmp_path / 'calibrations').iterdir())
@@ -288,7 +312,7 @@ def test_the_gate_of_today_judges_what_was_stored(
         state = started(changed, tmp_path)
         assert state.active is None
         assert len(state.withheld) == 2 and all(option in text for text in state.withheld)
-        assert state.rollback(3) == Answer(False, 'no calibration is active')
+        assert state.rollback() == Answer(False, 'no calibration is active')
         assert state.damage == ()
         state.close()
         assert sorted((tmp_path / 'calibrations').iterdir()) == kept
@@ -302,7 +326,7 @@ def test_the_gate_judges_what_is_in_memory_alone(
 ) -> None:
     """Cleaned up, configured with a tighter limit, and back."""
     state = filled(setup, shown)
-    assert state.solve(1).success
+    assert state.solve().success
     state.close()
     tighter = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
     state.open(dataclasses.replace(setup, gate=tighter), CalibratorOptions())
@@ -316,7 +340,7 @@ def test_a_forged_verdict_does_not_go_past_a_rolled_back_one(
 ) -> None:
     """Event 3 went back from 2 to 1: where 1 is refused, 2 must not come up again."""
     state = filled(setup, shown, tmp_path)
-    assert state.solve(1).success and state.solve(2).success and state.rollback(3).success
+    assert state.solve().success and state.solve().success and state.rollback().success
     state.close()
     for path in (tmp_path / 'calibrations').glob('*_calibration_00000001.json'):
         content = CHECKSUMS.opened(path.read_bytes())
@@ -332,7 +356,7 @@ def test_what_was_forced_stays_for_its_own_reasons_only(
 ) -> None:
     gate = dataclasses.replace(setup.gate, max_residual_rms_px=1e-3)
     state = filled(dataclasses.replace(setup, gate=gate), shown, tmp_path)
-    assert state.solve(1, force=True).success
+    assert state.solve(force=True).success
     state.close()
     state = started(dataclasses.replace(setup, gate=gate), tmp_path)
     assert state.active is not None and state.active.forced
@@ -388,13 +412,13 @@ def test_without_the_key_nothing_is_believed(
     key.write_bytes(b'sixteen bytes...')
     filled(setup, shown[:2], tmp_path / 'state').close()
     options = CalibratorOptions(state_dir=str(tmp_path / 'state'), state_key_file=str(key))
-    state = CalibratorState()
+    state = CalibratorState(itertools.count(1).__next__)
     state.open(setup, options)
     assert len(state.ensemble.images) == 0
     assert all('the HMAC is missing' in text for text in state.damage) and len(state.damage) == 2
     state.add(shown[0])
     state.close()
-    state = CalibratorState()
+    state = CalibratorState(itertools.count(1).__next__)
     state.open(setup, options)
     assert len(state.ensemble.images) == 1 and state.damage == ()
     state.close()

@@ -528,6 +528,24 @@ def test_monitor_becomes_the_node(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     assert called == [[*module, '--once', '2.5', '--ros-args', '-r', '__ns:=/cam1']]
 
 
+@pytest.mark.parametrize('missing', ['rclpy', 'starcal'])
+@pytest.mark.parametrize('command', [('play', str(TINY)), ('monitor', '--once', '1')])
+def test_without_ros_one_line_names_the_remedy(
+    tmp_path: Path, command: tuple[str, ...], missing: str
+) -> None:
+    """ROS 2 itself or the messages of starcal cannot be imported, as where nothing is sourced."""
+    (tmp_path / 'sitecustomize.py').write_text(f'import sys; sys.modules[{missing!r}] = None\n')
+    done = subprocess.run(
+        [sys.executable, '-m', 'starcal_ros.cli.main', *command],
+        env={**os.environ, 'PYTHONPATH': str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2 and done.stderr.count('\n') == 1, done.stderr
+    assert missing in done.stderr and 'Source the setup files of ROS 2' in done.stderr
+
+
 def test_parameters_of_the_nodes_are_known_to_the_tool(
     run: Run, tmp_path: Path, params: Callable[..., Path]
 ) -> None:

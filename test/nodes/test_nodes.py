@@ -97,6 +97,13 @@ def play(start_node: StartNode, folder: Path, *more: str) -> None:
     assert player.wait(120.0) == 0, player.said()
 
 
+def send_observations(client: Client, products: Path) -> None:
+    """Publish the observations of products; a player would take as long to start as a node."""
+    publisher = client.publisher(StarObservations, 'observations')
+    for raw in reader.read_raw([products / 'observations.mcap']):
+        publisher.publish(raw.data)
+
+
 def test_nodes_and_tool_give_the_same_calibration(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
 ) -> None:
@@ -136,7 +143,7 @@ def calibrated(
 ) -> list[Any]:
     """Calibrations published by a calibrator that has collected the tiny bag: one so far."""
     start_node('calibrator', ros=parameters(tiny_bag))
-    play(start_node, tiny_products / 'observations.mcap')
+    send_observations(client, tiny_products)
     images = json.loads((tiny_bag / 'truth.json').read_text())['images']
     status = client.latched(EnsembleStatus, 'ensemble_status')
     client.until(lambda: status and status[-1].images == images)
@@ -207,7 +214,7 @@ def test_gate_refusal_and_force(
     state = tmp_path / 'state'
     strict = ('max_residual_rms_px:=0.001', f'state_dir:={state}')
     calibrator = start_node('calibrator', ros=parameters(tiny_bag, *strict))
-    play(start_node, tiny_products / 'observations.mcap')
+    send_observations(client, tiny_products)
     status = client.latched(EnsembleStatus, 'ensemble_status')
     client.until(lambda: status and status[-1].images >= 10)
     found = client.latched(Calibration, 'calibration')
@@ -480,7 +487,7 @@ def test_calibrator_collects_while_it_solves(
 ) -> None:
     """Observations that arrive during a calibration are all counted."""
     start_node('calibrator', ros=parameters(tiny_bag))
-    play(start_node, tiny_products / 'observations.mcap')
+    send_observations(client, tiny_products)
     status = client.latched(EnsembleStatus, 'ensemble_status')
     client.until(lambda: status and status[-1].images >= 10)
     observations = client.publisher(StarObservations, 'observations')

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import pytest
 from scipy.spatial.transform import Rotation
@@ -16,30 +16,44 @@ if TYPE_CHECKING:
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import QuaternionStamped
 from mission_files import attitudes, images  # type: ignore[import-not-found]
+from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
-from starcal.msg import Calibration, EnsembleStatus
+from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ros.bag.writer import BagWriter
+from starcal_ros.constants import NANOSECONDS_PER_SECOND as SECOND_NS
 from starcal_ros.messages.calibration import calibration_from_message
+from starcal_ros.messages.images import image_to_message
+from starcal_ros.messages.telemetry import attitude_to_message
+from starcal_ros.nodes.lifecycle_node.message_factory import make_message
+from starcal_ros.records import Image as ImageRecord
 
 pytestmark = pytest.mark.nodes
 
 FIRST_FROM_OTHER = Rotation.from_euler('xyz', [100.0, -20.0, 35.0], degrees=True)
 
 
+def parameter_file(bag: Path, path: Path, wrong_by_deg: float = 0.0) -> Path:
+    """Parameters with a second star tracker, whose alignment may be wrong."""
+    parameters = yaml.safe_load((bag / 'params.yaml').read_text())
+    values = parameters['/**']['ros__parameters']
+    first_from_camera = Rotation.from_quat(values['prior_alignment'])
+    wrong = Rotation.from_euler('x', wrong_by_deg, degrees=True)
+    values['more_star_trackers'] = ['other']
+    alignment = (wrong * FIRST_FROM_OTHER.inv() * first_from_camera).as_quat()
+    values['more_alignments'] = [float(x) for x in alignment]
+    path.write_text(yaml.safe_dump(parameters))
+    return path
+
+
 def test_one_takes_over_from_another(
     client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
 ) -> None:
     """Every image is used, and the calibration has the alignment to each star tracker."""
-    parameters = yaml.safe_load((tiny_bag / 'params.yaml').read_text())
-    values = parameters['/**']['ros__parameters']
-    first_from_camera = Rotation.from_quat(values['prior_alignment'])
-    values['more_star_trackers'] = ['other']
-    alignment = (FIRST_FROM_OTHER.inv() * first_from_camera).as_quat()
-    values['more_alignments'] = [float(x) for x in alignment]
-    params = tmp_path / 'params.yaml'
-    params.write_text(yaml.safe_dump(parameters))
+    params = parameter_file(tiny_bag, tmp_path / 'params.yaml')
     bag, samples = tmp_path / 'two', attitudes()
     with BagWriter(bag) as writer:
         for k, (time_ns, xyzw) in enumerate(samples):
@@ -63,3 +77,48 @@ def test_one_takes_over_from_another(
     first, other = calibration_from_message(found[0]).star_trackers
     assert (first.frame, other.frame) == ('star_tracker', 'other')
     assert first.images + other.images == len(images()) and 0 < first.images < other.images
+
+
+def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(
+    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
+) -> None:
+    """The first star tracker is right and comes later, the other is 5 degrees off."""
+    params = parameter_file(tiny_bag, tmp_path / 'params.yaml', wrong_by_deg=5.0)
+    patient = ('--params-file', str(params), '-p', 'attitude_timeout_s:=60.0')
+    start_node('star_observer', ros=patient)
+    found = client.collect(StarObservations, 'observations')
+    health = client.collect(DiagnosticArray, '/diagnostics')
+    first = client.publisher(QuaternionStamped, '/attitude')
+    other = client.publisher(QuaternionStamped, '/other/attitude')
+    shown = client.publisher(Image, '/image', 10)
+    sent = 0
+
+    def send(publisher: Any, *messages: Any) -> None:
+        nonlocal sent
+        for message in messages:
+            publisher.publish(message)
+        sent += len(messages)
+
+    def send_attitudes(publisher: Any, image: ImageRecord) -> None:
+        """Send those about an image."""
+        mounted = Rotation.identity() if publisher is first else FIRST_FROM_OTHER
+        for time_ns, xyzw in attitudes():
+            if abs(time_ns - image.time_ns) < 2 * SECOND_NS:
+                quaternion = (Rotation.from_quat(xyzw) * mounted).as_quat()
+                send(publisher, attitude_to_message(time_ns, quaternion, 'icrf', make_message))
+
+    def values() -> dict[str, str]:
+        return {one.key: one.value for one in health[-1].status[0].values} if health else {}
+
+    for k, image in enumerate(images()[:4]):
+        if k >= 2:  # the delay of the first is known
+            send(shown, image_to_message(image, 'camera', make_message))
+        send_attitudes(other, image)
+        client.until(lambda: values().get('messages') == str(sent))
+        send_attitudes(first, image)
+        client.until(lambda k=k: len(found) == max(0, k - 1))
+    assert [(one.refusal, one.star_tracker) for one in found] == 2 * [('', '')]
+    assert found[0].detail == '' and found[1].detail.startswith('other not used: no_match: ')
+    client.until(lambda: values().get('attitudes_not_used') == 'other: 1')
+    status = health[-1].status[0]
+    assert status.level == DiagnosticStatus.WARN and status.message == found[1].detail

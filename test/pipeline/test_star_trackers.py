@@ -5,12 +5,14 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from mission_files import attitudes, images, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.bag.reader import log_damage
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import BagError, OptionError
@@ -37,14 +39,18 @@ def setup_with(**others: object) -> Setup:
     return load_setup({**VALUES, 'camera_info_url': str(TINY / 'camera.yaml'), **two, **others})
 
 
-def bag_of(path: Path, first_until: float = 1.0, other_until: float = 1.0) -> Path:
+def bag_of(
+    path: Path, first_until: float = 1.0, other_until: float = 1.0, absent: str = ''
+) -> Path:
     """The small bag with a second star tracker; each repeats itself after a part of the time."""
     samples = attitudes()
     with BagWriter(path) as writer:
-        for topic, mounted, until in (
-            ('/star_tracker/attitude', Rotation.identity(), first_until),
-            ('/other/attitude', FIRST_FROM_OTHER, other_until),
+        for which, topic, mounted, until in (
+            ('first', '/star_tracker/attitude', Rotation.identity(), first_until),
+            ('other', '/other/attitude', FIRST_FROM_OTHER, other_until),
         ):
+            if which == absent:
+                continue
             last = int(until * (len(samples) - 1))
             for k, (time_ns, xyzw) in enumerate(samples):
                 if until < 0.0 and k >= len(samples) // 2:
@@ -89,16 +95,50 @@ def test_both_star_trackers_are_used_and_aligned(tmp_path: Path) -> None:
 def test_one_that_falls_silent_or_repeats_itself_costs_no_image(
     tmp_path: Path, which: str, until: float
 ) -> None:
-    bag = bag_of(tmp_path / 'two', **{f'{which}_until': until})
+    end: dict[str, Any] = {f'{which}_until': until}
+    bag = bag_of(tmp_path / 'two', **end)
     records = observed(bag, setup_with())
     assert [record.refusal for record in records] == [''] * 10
     lost, kept = ('', 'other') if which == 'first' else ('other', '')
     assert used(records)[lost] < 5 < used(records)[kept]
 
 
-def test_a_topic_that_is_not_there_is_named() -> None:
-    with pytest.raises(BagError, match='^/other/attitude: no such topic of type geometry_msgs'):
-        topics.choose_topics([TINY], Topics(), setup_with())
+def test_a_wrong_one_is_tried_seldom_and_costs_no_image(tmp_path: Path) -> None:
+    """The alignment to the other star tracker is off by 5 degrees."""
+    off = Rotation.from_euler('x', 5.0, degrees=True) * Rotation.from_quat(other_alignment())
+    setup = setup_with(more_alignments=[float(x) for x in off.as_quat()])
+    records = observed(bag_of(tmp_path / 'two'), setup)
+    assert used(records) == {'': 10}
+    details = [record.detail for record in records]
+    # The first image is that of the first star tracker; then ten images count as one in vain.
+    assert details[1].startswith('other not used: no_match: ')
+    assert [bool(detail) for detail in details] == [k == 1 for k in range(10)]
+
+
+@pytest.mark.parametrize(
+    ('which', 'says'),
+    [
+        ('other', '/other/attitude: no such topic of type geometry_msgs/msg/QuaternionStamped;'),
+        ('first', 'the first star tracker, star_tracker, is left out'),
+    ],
+)
+def test_one_that_is_not_in_the_bag_is_named_and_the_rest_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, which: str, says: str
+) -> None:
+    log_damage.cache_clear()
+    bag = bag_of(tmp_path / 'one', absent=which)
+    records = observed(bag, setup_with())
+    assert [record.refusal for record in records] == [''] * 10
+    assert used(records) == {'' if which == 'other' else 'other': 10}
+    (warning,) = caplog.messages
+    assert says in warning
+
+
+def test_a_bag_without_any_attitude_is_refused(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'none') as writer:
+        writer.write_image('/image', images()[0], 'camera')
+    with pytest.raises(BagError, match='no topic of type geometry_msgs/msg/QuaternionStamped'):
+        topics.choose_topics([tmp_path / 'none'], Topics(), setup_with())
 
 
 @pytest.mark.parametrize(
@@ -109,8 +149,14 @@ def test_a_topic_that_is_not_there_is_named() -> None:
         ({'more_star_trackers': ['a b']}, "more_star_trackers: 'a b' is no name of a frame"),
         (
             {'more_star_trackers': ['a', 'a'], 'more_alignments': 8 * [0.0]},
-            'more_star_trackers: a, a: a name comes twice',
+            "more_star_trackers: 'a' comes twice",
         ),
+        # As star_tracker_frame and camera_frame, whose attitudes and transforms they would be.
+        (
+            {'more_star_trackers': ['/star_tracker']},
+            "'/star_tracker' comes twice: .* a name of th",
+        ),
+        ({'more_star_trackers': ['camera'], 'camera_frame': '/camera'}, "'camera' comes twice"),
         ({'prior_alignment': 4 * [0.0]}, 'more_star_trackers: prior_alignment is needed'),
     ],
 )

@@ -81,3 +81,23 @@ def test_a_stamp_in_the_future_does_not_hold_the_others_back() -> None:
     taken = take(queue)
     assert taken.time_ns == 11 * SECOND_NS
     assert time.monotonic() - taken.arrived_s >= 0.05
+
+
+def test_calls_are_made_by_the_thread_that_takes_before_the_next_image() -> None:
+    queue = ImageQueue(2, 60.0, lambda stamp: stamp > 0)
+    made: list[object] = []
+
+    def takes() -> None:
+        while (taken := queue.take()) is not None:
+            made.append(taken.time_ns)
+        made.append(threading.current_thread())
+
+    thread = threading.Thread(target=takes)
+    queue.call(lambda: made.append(threading.current_thread()))
+    put(queue, 1)
+    queue.call(queue.close)  # while the lock of the queue is free
+    thread.start()
+    thread.join(10.0)
+    assert made == [thread, thread]
+    queue.call(lambda: made.append('too late'))
+    assert queue.take() is None and len(made) == 2

@@ -8,18 +8,29 @@ Run with ``-s``, each test prints a row of the table in docs/reliability.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+import contextlib
+import dataclasses
+import os
 from pathlib import Path
 import subprocess
+from typing import Any, TYPE_CHECKING
 
 import pytest
 import yaml
 
+if TYPE_CHECKING:
+    from conftest import Client
+
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
+from diagnostic_msgs.msg import DiagnosticArray
 from ros_tools import find_tools, RosTools  # type: ignore[import-not-found]
 
 from starcal_ros.bag import reader
+from starcal_ros.calibrator.archive import Activation, Archive
+from starcal_ros.products.calibration_json import CALIBRATION_FILE, read_calibration
+from starcal_ros.records import Ensemble
 
 pytestmark = [pytest.mark.nodes, pytest.mark.timeout(600)]  # tens of processes of 2 s and more
 
@@ -139,6 +150,58 @@ def test_replay_launch(make: Make, tiny_bag: Path, tmp_path: Path) -> None:
     words = info.stdout.split()
     assert words[words.index('Messages:') + 1] == '10', info.stdout + info.stderr
     row(FAST, 'rosbag2', 'ros2 bag info STATE_DIR/ensemble', '10 messages')
+
+
+@pytest.mark.parametrize(
+    ('argument', 'says'),
+    [('rate:=abc', "bag_player: rate: 'abc' is not a number"), ('respawn:=abc', "got 'abc'")],
+)
+def test_a_wrong_launch_argument_leaves_no_process(
+    make: Make, tiny_bag: Path, tmp_path: Path, argument: str, says: str
+) -> None:
+    """The launch ends by itself, and the nodes with it: another calibrator can have the folder."""
+    ros2 = make(FAST)
+    values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())
+    values['/**']['ros__parameters']['state_dir'] = str(tmp_path / 'state')
+    params = tmp_path / 'params.yaml'
+    params.write_text(yaml.safe_dump(values))
+    launch = ros2.start(
+        'launch', 'starcal', 'replay.launch.py', f'params:={params}', f'bag:={tiny_bag}', argument
+    )
+    launch.wait()
+    assert says in launch.said()
+    with pytest.raises(ProcessLookupError):
+        os.killpg(launch.process.pid, 0)
+    Archive(tmp_path / 'state', 'camera').close()
+
+
+def test_two_cameras_with_one_frame_are_named(
+    make: Make, client: Client, tiny_bag: Path, tiny_products: Path, tmp_path: Path
+) -> None:
+    """In namespaces of their own, but with one transform; another name of the frame mends it."""
+    ros2 = make(FAST)
+    params = ('--params-file', tiny_bag / 'params.yaml', '-p', 'state_report:=false')
+    stored = read_calibration(tiny_products / CALIBRATION_FILE)
+    for k, name in enumerate(('left', 'right', 'third')):
+        frame = 'third' if name == 'third' else stored.child_frame
+        one = dataclasses.replace(
+            stored, number=1, active_since_ns=1, time_ns=stored.time_ns + k, child_frame=frame
+        )
+        with contextlib.closing(Archive(tmp_path / name, frame)) as archive:
+            archive.keep(Ensemble(), (Activation(1, 0, one),))
+        options = ('-r', f'__ns:=/{name}', '-p', f'state_dir:={tmp_path / name}')
+        ros2.start_node('calibrator', *params, *options, '-p', f'camera_frame:={frame}')
+    told: list[Any] = client.collect(DiagnosticArray, '/diagnostics')
+
+    def message(name: str) -> str:
+        heard = [one.status[0] for one in told if f'{name}/calibrator' in one.status[0].name]
+        return str(heard[-1].message) if heard else ''
+
+    says = f'/tf_static: another node publishes {stored.child_frame} too: each camera needs frames'
+    for name in ('left', 'right'):
+        client.until(lambda name=name: message(name).startswith(says))
+    client.until(lambda: message('third') == 'calibration active')
+    row(FAST, 'tf2_msgs', 'two calibrators with one `camera_frame`', 'both name it')
 
 
 def test_lifecycle_and_parameters(ros2: RosTools, tiny_bag: Path, tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
     wanted = selection(args.from_time, args.to_time, args.first, args.every)
     if args.output.exists() and not args.output.is_dir():
         raise OptionError(f'{args.output}: not a folder')
-    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames)))
+    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames).values()))
     files = (*reader.mcap_files(args.bags), args.params)
     found = ''
     try:
@@ -65,7 +65,7 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
         _write_failure(args.output, NotCalibrated(str(error), tuple(map(str, args.bags)), {}))
         raise
     if found:
-        print(found, file=sys.stderr)
+        print_text(found, file=sys.stderr)
     with ThreadPoolExecutor(1, 'digests') as thread:
         # While the images are read; an error or Ctrl-C ends it at once.
         stopped = threading.Event()
@@ -193,7 +193,7 @@ def _solve_twice(
     gained = _used(again) - _used(observations)
     if not gained:
         return calibration, left, observations
-    print(
+    print_text(
         f'{gained} images matched nothing at first, and are used with the calibration of the'
         ' others',
         file=sys.stderr,

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 import dataclasses
 from dataclasses import dataclass, field
 
@@ -12,12 +12,14 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.panel import Panel
+from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.records import Calibration, EnsembleStatus, GateCheck, StarObservations
+from starcal_ros.text import printable
 
 _HEALTH = {0: ('ok', 'green'), 1: ('warning', 'yellow'), 2: ('error', 'bold red')}
 _STALE = ('stale', 'yellow')
@@ -47,6 +49,22 @@ class Seen:
         )
 
 
+class Line(Text):
+    """A line in which characters that act on a terminal are escaped; names come from others."""
+
+    def __init__(self, text: str = '', style: str = '') -> None:
+        super().__init__(printable(text), style)
+
+    def append(self, text: Text | str, style: Style | str | None = None) -> Line:
+        """Append words."""
+        super().append(printable(text) if isinstance(text, str) else text, style)
+        return self
+
+
+def _lines(lines: Iterable[Text]) -> Text:
+    return Text('\n').join(lines)
+
+
 def view(seen: Seen) -> Group:
     """All panels below each other; they fit in 80 columns."""
     return Group(
@@ -58,27 +76,26 @@ def view(seen: Seen) -> Group:
 
 
 def _images(seen: Seen) -> Text:
-    text = Text()
-    if seen.last is None:
-        return text.append('no image since the start of this view', 'dim')
-    refused = sum(seen.refused.values())
-    text.append(f'{seen.images} since the start of this view, {seen.images - refused} used\n')
-    for reason, count in sorted(seen.refused.items(), key=lambda item: -item[1]):
-        text.append(f'  {count} refused: {reason.replace("_", " ")}\n', 'yellow')
     last = seen.last
-    text.append(f'last {utc_text(last.time_ns)}: ')
+    if last is None:
+        return Line('no image since the start of this view', 'dim')
+    refused = sum(seen.refused.values())
+    lines = [Line(f'{seen.images} since the start of this view, {seen.images - refused} used')]
+    for reason, count in sorted(seen.refused.items(), key=lambda item: -item[1]):
+        lines.append(Line(f'  {count} refused: {reason.replace("_", " ")}', 'yellow'))
+    line = Line(f'last {utc_text(last.time_ns)}: ')
     if last.refusal:
-        text.append(f'refused, {last.refusal.replace("_", " ")}: {last.detail}', 'yellow')
+        line.append(f'refused, {last.refusal.replace("_", " ")}: {last.detail}', 'yellow')
     else:
-        text.append(f'{len(last)} stars', 'green')
-    return text
+        line.append(f'{len(last)} stars', 'green')
+    return _lines([*lines, line])
 
 
 def _ensemble(seen: Seen) -> Group | Text:
     status = seen.status
     if status is None:
-        return Text('no status received from a calibrator', 'dim')
-    head = Text()
+        return Line('no status received from a calibrator', 'dim')
+    head = Line()
     for there, needed, what in (
         (status.images, status.min_images, 'images'),
         (status.stars, status.min_stars, 'stars'),
@@ -95,9 +112,9 @@ def _ensemble(seen: Seen) -> Group | Text:
         before = active.get(name)
         style = 'green' if before is not None and sigma < before else ''
         sigmas.add_row(
-            Text(name),
-            Text(_sigma_text(name, float(sigma)), style),
-            Text('' if before is None else _sigma_text(name, before)),
+            Line(name),
+            Line(_sigma_text(name, float(sigma)), style),
+            Line('' if before is None else _sigma_text(name, before)),
         )
     grid = Table.grid(padding=(0, 3))
     grid.add_row(sigmas, coverage_text(status.coverage))
@@ -107,15 +124,16 @@ def _ensemble(seen: Seen) -> Group | Text:
 def coverage_text(coverage: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Text:
     """The detector as shades, two letters for a cell; empty cells in red."""
     most = max(int(coverage.max(initial=0)), 1)
-    text = Text(f'most in a cell: {most}\n')
+    lines = [Line(f'most in a cell: {most}')]
     for row in coverage:
+        line = Line()
         for count in row:
             if count == 0:
-                text.append('··', 'red')
+                line.append('··', 'red')
             else:
-                text.append(2 * _SHADES[1 + int(3 * count // most)], 'cyan')
-        text.append('\n')
-    return text
+                line.append(2 * _SHADES[1 + int(3 * count // most)], 'cyan')
+        lines.append(line)
+    return _lines(lines)
 
 
 def _sigmas(calibration: Calibration | None) -> dict[str, float]:
@@ -136,13 +154,13 @@ def _sigma_text(name: str, sigma: float) -> str:
 def _calibration(seen: Seen) -> Group | Text:
     parts: list[Text | Table] = []
     if seen.active is None:
-        parts.append(Text('none active: the prior is in use', 'dim'))
+        parts.append(Line('none active: the prior is in use', 'dim'))
     else:
         active = seen.active
         style = 'green' if active.accepted else 'bold red'
         words = 'accepted by the gate' if active.accepted else 'activated against the gate'
         parts.append(
-            Text(
+            Line(
                 f'active: number {active.number}, {words}, since'
                 f' {utc_text(active.active_since_ns)}, {active.images_used} images,'
                 f' residual {active.residual_rms_px:.3f} px',
@@ -152,7 +170,7 @@ def _calibration(seen: Seen) -> Group | Text:
     last = seen.candidate or seen.active
     if seen.candidate is not None:
         reasons = '; '.join(seen.candidate.reasons)
-        parts.append(Text(f'last candidate refused: {reasons}', 'bold red'))
+        parts.append(Line(f'last candidate refused: {reasons}', 'bold red'))
     if last is not None:
         parts.append(_gate(last))
     return Group(*parts)
@@ -175,10 +193,10 @@ def _gate(calibration: Calibration) -> Table:
         share = min(share_of_limit(check), 1.0)
         style = 'bold red' if check.passed is False else ''
         table.add_row(
-            Text(check.name, style),
-            Text(check.found_text, style),
-            Text(check.limit_text),
-            Text('█' * round(10 * share) + '·' * (10 - round(10 * share)), style or 'cyan'),
+            Line(check.name, style),
+            Line(check.found_text, style),
+            Line(check.limit_text),
+            Line('█' * round(10 * share) + '·' * (10 - round(10 * share)), style or 'cyan'),
         )
     return table
 
@@ -194,10 +212,10 @@ def share_of_limit(check: GateCheck) -> float:
 
 def _health(health: Mapping[str, tuple[int, str]]) -> Text:
     lines = list(_health_lines(health))
-    return Text('\n').join(lines) if lines else Text('no diagnostics received', 'dim')
+    return _lines(lines) if lines else Line('no diagnostics received', 'dim')
 
 
 def _health_lines(health: Mapping[str, tuple[int, str]]) -> Iterator[Text]:
     for name, (level, message) in sorted(health.items()):
         words, style = _HEALTH.get(level, _STALE)
-        yield Text(f'{name}: ').append(words, style).append(f' {message}')
+        yield Line(f'{name}: ').append(words, style).append(f' {message}')

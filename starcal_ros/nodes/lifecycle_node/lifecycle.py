@@ -28,9 +28,11 @@ from rclpy.node import Node
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.nodes.lifecycle_node.inputs import Inputs
 from starcal_ros.nodes.lifecycle_node.parameters import OptionParameters, unread_sections
+from starcal_ros.nodes.lifecycle_node.printable_log import PrintableLog
 from starcal_ros.options import nearest
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import OPTION_CLASSES, Setup
+from starcal_ros.text import printable
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Health = tuple[bytes, str, dict[str, object]]
@@ -40,7 +42,7 @@ _SILENT_S = 5.0
 _THREADS = 8
 
 
-class StarcalNode(LifecycleNode):
+class StarcalNode(PrintableLog, LifecycleNode):
     """
     Base class of the lifecycle nodes.
 
@@ -59,7 +61,8 @@ class StarcalNode(LifecycleNode):
         self.inputs = Inputs(self)
         self._incompatible: list[str] = []  # publishers that are not received
         self._errors = 0
-        self._taken: Counter[str] = Counter()
+        self._taken: Counter[Callable[[Any], None]] = Counter()
+        self._counting = threading.Lock()  # of errors and messages
         self._level: bytes | None = None
         self._listening_since_s = math.inf
         self._diagnostics_lock = threading.Lock()
@@ -96,7 +99,7 @@ class StarcalNode(LifecycleNode):
 
     def taken(self, callback: Callable[[Any], None]) -> int:
         """Return the number of messages that a callback, wrapped by `taking`, has had."""
-        return self._taken[callback.__name__]
+        return self._taken[callback]
 
     @property
     def is_active(self) -> bool:
@@ -125,8 +128,8 @@ class StarcalNode(LifecycleNode):
         guarded = self.guarded(callback)
 
         def run(message: Any) -> None:
-            # Callbacks of one input never run concurrently, those of different inputs may.
-            self._taken[callback.__name__] += 1
+            with self._counting:
+                self._taken[callback] += 1
             guarded(message)
 
         return run
@@ -135,7 +138,8 @@ class StarcalNode(LifecycleNode):
         """Log an unexpected error and count it for the diagnostics."""
         if not self.context.ok():
             return  # at shutdown, handles are destroyed under running callbacks
-        self._errors += 1
+        with self._counting:
+            self._errors += 1
         where = error.__traceback__
         while where is not None and where.tb_next is not None:
             where = where.tb_next
@@ -414,5 +418,5 @@ def _spin(node: StarcalNode, executor: MultiThreadedExecutor) -> None:
 
 
 def one_line(error: Exception) -> str:
-    """Return the text of an error without line breaks."""
-    return ' '.join(str(error).split())
+    """Return the text of an error in one line that is safe to print."""
+    return printable(' '.join(str(error).split()))

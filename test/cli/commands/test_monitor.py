@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+import contextlib
 import dataclasses
 import io
+from typing import Any
 
 import numpy as np
 import pytest
@@ -95,3 +98,38 @@ def test_it_fits_a_terminal_of_80_columns() -> None:
         last=observations(), status=status(), active=calibration(), candidate=calibration()
     )
     assert max(map(len, shown(seen).splitlines())) <= 80
+
+
+def hostile(value: Any) -> Any:
+    """The same record with an escape sequence and a line break at the start of every text."""
+    if isinstance(value, str):
+        return f'\x1b[2J\ncalibrator: ok {value}'
+    if isinstance(value, tuple):
+        return tuple(map(hostile, value))
+    if isinstance(value, Mapping):
+        return {hostile(key): hostile(item) for key, item in value.items()}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = [field.name for field in dataclasses.fields(value) if field.init]
+        changed = {name: hostile(getattr(value, name)) for name in fields}
+        with contextlib.suppress(ValueError):  # a lens model, which is checked
+            return dataclasses.replace(value, **changed)
+    return value
+
+
+def test_no_text_of_a_message_acts_on_the_terminal() -> None:
+    gate = (check(2.0, 1.0, passed=False), check(0.5, 1.0))
+    sound = Seen(
+        last=refused_image(1, 640, 512, 'frozen', 'of a detail'),
+        refused={'frozen': 1},
+        status=status(),
+        active=calibration(),
+        candidate=dataclasses.replace(calibration(), reasons=('late',), gate=gate),
+        health={'calibrator': (2, 'x')},
+    )
+    text = shown(hostile(sound), 500)
+    assert '\x1b' not in text
+    assert not any(line.lstrip('│ ').startswith('calibrator: ok') for line in text.splitlines())
+    quoted = ('calibrator: error', 'of a detail', 'late', 'residual per axis', 'fx')
+    for line in text.splitlines():
+        if any(word in line for word in quoted):
+            assert '\\x1b[2J\\ncalibrator: ok' in line

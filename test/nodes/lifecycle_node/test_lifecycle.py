@@ -124,14 +124,15 @@ def work():
         os.kill(os.getpid(), signal.SIGTERM)
         while rclpy.ok():
             time.sleep(0.01)
-    raise RuntimeError('the context\\nis invalid')
+    raise RuntimeError('the context\\nis invalid\x1b[2J')
 
 sys.exit(until_told_to_end('maker', [], work, lambda: end_quietly(None)))
 """
 
 
 @pytest.mark.parametrize(
-    ('argument', 'status', 'said'), [('', 2, 'maker: the context is invalid\n'), ('told', 0, '')]
+    ('argument', 'status', 'said'),
+    [('', 2, 'maker: the context is invalid\\x1b[2J\n'), ('told', 0, '')],
 )
 def test_what_fails_after_a_signal_is_no_error(argument: str, status: int, said: str) -> None:
     """Errors after a signal give status 0; other errors give one line and status 2."""
