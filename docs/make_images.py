@@ -19,6 +19,8 @@ import cv2
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
+import PIL.Image
+from PIL.PngImagePlugin import PngInfo
 import yaml
 
 from starcal_ros.arrays import Floats, Picture
@@ -29,8 +31,9 @@ from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe as observing
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.products.calibration_json import read_calibration
 from starcal_ros.products.camera_yaml import write_camera_info
-from starcal_ros.records import CameraGeometry, Ensemble, Image, StarObservations
+from starcal_ros.records import Calibration, CameraGeometry, Ensemble, Image, StarObservations
 from starcal_ros.report.pictures.annotation import annotate_reduced
 from starcal_ros.simulation import bag as simulated_bag
 from starcal_ros.simulation import images as simulated_images
@@ -163,15 +166,27 @@ def report_page(file: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         arguments = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', folder]
         assert cli.main(arguments) == 0
-        draw_page(Path(folder) / 'report.html', file, REPORT_SIZE)
+        if draw_page(Path(folder) / 'report.html', file, REPORT_SIZE):
+            describe(file, read_calibration(Path(folder) / 'calibration.json'))
 
 
-def draw_page(page: Path, file: Path, size: tuple[int, int]) -> None:
-    """Draw the top of a page as a browser shows it, if chromium is installed."""
+def describe(file: Path, calibration: Calibration) -> None:
+    """Write the numbers of a calibration into its picture, for the test that it is of today."""
+    camera = calibration.geometry.camera
+    shown = dict(zip(camera.parameter_names, camera.parameters, strict=True))
+    shown['residual_rms_px'] = calibration.residual_rms_px
+    text = PngInfo()
+    text.add_text('Description', '; '.join(f'{name}={value:.9g}' for name, value in shown.items()))
+    with PIL.Image.open(file) as picture:
+        picture.save(file, pnginfo=text, optimize=True)
+
+
+def draw_page(page: Path, file: Path, size: tuple[int, int]) -> bool:
+    """Draw the top of a page as a browser shows it; False if chromium is not installed."""
     browser = next(filter(None, map(shutil.which, ('chromium', 'google-chrome'))), None)
     if browser is None:
         print(f'{file.name}: not drawn, chromium is not installed')
-        return
+        return False
     look = [
         '--headless',
         '--no-sandbox',
@@ -183,6 +198,7 @@ def draw_page(page: Path, file: Path, size: tuple[int, int]) -> None:
         page.resolve().as_uri(),
     ]
     subprocess.run([browser, *look], check=True, capture_output=True)
+    return True
 
 
 def main() -> None:

@@ -10,6 +10,9 @@ import starcal_ros
 
 def main() -> int:
     """Calibrate; the exit status is 2 for bad input and 3 for a refused calibration."""
+    if len(sys.argv) != 4:
+        print('usage: python from_bag.py BAG PARAMS CALIBRATION_JSON', file=sys.stderr)
+        return 2
     bag, params, output = sys.argv[1:]
     try:
         calibration = starcal_ros.calibrate_bag(bag, params)

@@ -72,7 +72,10 @@ def run(*words: object) -> None:
 
 def main() -> int:
     """Import, calibrate, export, and read the kernels."""
-    bag, params, folder = map(Path, sys.argv[1:4])
+    if len(sys.argv) != 4:
+        print('usage: python mission.py BAG PARAMS DIR', file=sys.stderr)
+        return 2
+    bag, params, folder = map(Path, sys.argv[1:])
     folder.mkdir(parents=True, exist_ok=True)
     write_mission_files(bag, folder)
     values = yaml.safe_load(params.read_text())['/**']['ros__parameters']

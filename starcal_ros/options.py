@@ -190,6 +190,13 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
         meant = meant_node(name, nodes)
         if meant and meant not in named:
             raise OptionError(f'{path}: section {shown(name)} is not read: write /**/{meant}')
+    values_only = [name for name, body in sections.items() if not isinstance(body, dict)]
+    if not applied and (values_only or 'ros__parameters' in sections):
+        above = '/**:' if 'ros__parameters' in sections else '/**: and ros__parameters:'
+        raise OptionError(
+            f'{path}: parameters in no section of a node: write {above} above them, and indent'
+            ' them below'
+        )
     if not applied:
         there = ', '.join(sections)
         raise OptionError(

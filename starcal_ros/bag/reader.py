@@ -31,6 +31,7 @@ from starcal_ros.untrusted import METADATA_BYTES, read_text, yaml_value
 
 _SQLITE, _ROS_1 = b'SQLite format 3', b'#ROSBAG V'  # how bags of other kinds begin
 _MAGIC_BYTES = 16
+_IMAGE_SUFFIXES = frozenset(['.fits', '.fit', '.fts', '.tif', '.tiff', '.png'])
 _LONGEST_NAME = 4096  # of a path on Linux
 
 
@@ -75,7 +76,8 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
         except OSError as error:
             raise BagError(f'{file}: cannot be read: {error.strerror}') from error
         if not magic.startswith(MAGIC):
-            raise BagError(f'{file}: not an MCAP bag{_how_to_convert(file, magic)}')
+            other = _how_to_convert(file, magic) or _how_to_import(file.parent, file)
+            raise BagError(f'{file}: not an MCAP bag{other}')
     return files
 
 
@@ -268,7 +270,8 @@ def _files_of_folder(folder: Path) -> list[Path]:
         other = _how_to_convert(folder, _SQLITE) if any(folder.glob('*.db3')) else ''
         inside = next(folder.glob('*/*.mcap'), None)
         near = f' (did you mean {inside.parent}?)' if inside and not other else ''
-        raise BagError(f'{folder}: no .mcap files in the folder{other}{near}')
+        other = other or near or _how_to_import(folder)
+        raise BagError(f'{folder}: no .mcap files in the folder{other}')
     missing = [name for name in names if not (folder / name).is_file()]
     if missing and listed:
         raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing')
@@ -310,6 +313,18 @@ def _how_to_convert(path: Path, magic: bytes) -> str:
     return (
         f' but {kind}: rosbags-convert --src {source} --dst {destination} --dst-storage mcap'
         ' makes one'
+    )
+
+
+def _how_to_import(folder: Path, file: Path | None = None) -> str:
+    """End of an error message: the command that makes a bag of image files, if there are some."""
+    files = sorted(folder.iterdir()) if file is None else [file]
+    found = next((one.suffix for one in files if one.suffix.lower() in _IMAGE_SUFFIXES), '')
+    if not found:
+        return ''
+    return (
+        f' but {found.lstrip(".").upper()} images: starcal import --images'
+        f" '{folder / '*'}{found}' --attitude FILE -o BAG makes one"
     )
 
 

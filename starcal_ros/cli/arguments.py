@@ -319,7 +319,7 @@ def _mistakes(command: argparse.ArgumentParser) -> None:
     for name, metavar, what in (
         ('alignment-error', 'DEG', 'error of the prior alignment, degrees'),
         ('focal-error', 'PERCENT', 'error of the prior focal length, percent'),
-        ('clock-error', 'S', 'stamps of the images late by so many seconds'),
+        ('clock-error', 'S', 'stamps of the images late by so many seconds, more than 0.75'),
     ):
         mistakes.add_argument(f'--{name}', type=float, default=0.0, metavar=metavar, help=what)
     what = 'length of the streak that a star becomes, px'

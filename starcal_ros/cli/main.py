@@ -147,12 +147,13 @@ def _inspect(args: argparse.Namespace) -> int:
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with progress_bar(total, 'images') as advance:
         found = inspect.inspect(args.bags, _asked(args), setup, on_image=advance)
-    if setup and found.images and not found.stars_per_image and found.chosen:
-        import dataclasses
-
+    if found.chosen and found.images and sum(r.count for r in found.refused) == found.images:
         from starcal_ros.cli.commands import diagnosis
+        from starcal_ros.diagnosis.refusals import of_refusals
 
-        why = diagnosis.of_a_failure(args.bags, _asked(args), setup)
+        why = of_refusals(found.refused, found.images)
+        if setup and not found.chosen.observations:
+            why = diagnosis.of_a_failure(args.bags, _asked(args), setup, found.refused)
         if why:
             problems = (*found.problems, why.in_a_sentence())
             found = dataclasses.replace(found, problems=problems)
@@ -312,6 +313,7 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _mistakes(args: argparse.Namespace) -> Mistakes:
     from starcal_ros.simulation.mistakes import Mistakes
+    from starcal_ros.simulation.scenario import ATTITUDE_OFFSETS_S
 
     if not 1 <= args.smear <= 200:
         raise OptionError(f'--smear: {args.smear} px is not within 1 to 200')
@@ -319,6 +321,12 @@ def _mistakes(args: argparse.Namespace) -> Mistakes:
         raise OptionError(f'--gamma: {args.gamma:g} is not within 0.2 to 5')
     if not -90.0 < args.focal_error < 400.0:
         raise OptionError(f'--focal-error: {args.focal_error:g} % is not within -90 to 400')
+    still_s = max(ATTITUDE_OFFSETS_S)
+    if 0 < abs(args.clock_error) <= still_s:
+        raise OptionError(
+            f'--clock-error: {args.clock_error:g} s changes no result: in the scenarios the camera'
+            f' is at rest, or turns evenly, within {still_s:g} s of an image; give more'
+        )
     return Mistakes(
         flip=args.flip or '',
         rotate_deg=args.rotate,

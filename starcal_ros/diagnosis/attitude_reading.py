@@ -47,7 +47,8 @@ class SetUp:
     The set-up that is held against the images.
 
     ``star_tracker_from_camera`` is the prior alignment, None where it is not given;
-    ``acquisition_rad`` the largest error of it that a search of the image covers.
+    ``acquisition_rad`` the largest error of it that a search of the image covers; ``shift_s`` was
+    added to the stamps of the images, whose clock is far from that of the attitudes.
     """
 
     camera: CameraModel
@@ -57,6 +58,7 @@ class SetUp:
     max_attitude_gap_s: float
     acquisition_rad: float
     acquisition_roll_rad: float
+    shift_s: float = 0.0
 
 
 @dataclass(frozen=True)

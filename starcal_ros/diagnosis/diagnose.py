@@ -50,6 +50,8 @@ CAUSES = (
     'focal_length', 'clock', 'smear', 'no_stars', 'not_linear', 'unknown',
 )  # fmt: skip
 
+_NO_PARAMETER = 'no parameter mends this: '
+_SAME_DATE_S = 86400.0  # aberration changes by 0.35 arcsec in a day
 _FOCAL_SHARE = 0.03  # error of the focal length that an image is still matched with
 _LINEAR_SLOPE = 0.5  # of brightness against that of the catalog; a display gamma of 2.2 has 0.45
 _SAME_ALIGNMENT_RAD = math.radians(3.0)  # of one written in another way and the one found
@@ -60,9 +62,10 @@ class Diagnosis:
     """
     Why images match nothing.
 
-    ``cause`` is one of `CAUSES`, ``also`` are others found with it; ``found`` the value that was
-    found, None where there is none; ``sentence`` says both in words, ``evidence`` how it is known,
-    ``mend`` are lines of the parameter file.  ``images`` agree on how the attitudes are meant.
+    ``cause`` is one of `CAUSES` or a reason to refuse an image, ``also`` are others found with it;
+    ``found`` the value that was found, None where there is none; ``sentence`` says both in words,
+    ``evidence`` how it is known, ``mend`` are lines of the parameter file.  ``images`` agree on
+    how the attitudes are meant.
     """
 
     cause: str
@@ -76,7 +79,11 @@ class Diagnosis:
     def in_a_sentence(self) -> str:
         """Cause and remedy, as the end of a complaint."""
         lines = '; '.join(line for line in self.mend if not line.startswith('#'))
-        return f'{self.sentence}{f" Set {lines}." if lines else ""} (details: starcal diagnose)'
+        advice = [line.removeprefix('# ').removeprefix(_NO_PARAMETER) for line in self.mend]
+        advice = [line for line in advice if line not in self.mend]
+        said = [self.sentence, *([f'Set {lines}.'] if lines else [])]
+        said += [f'{line[0].upper()}{line[1:]}.' for line in advice]
+        return f'{" ".join(said)} (details: starcal diagnose)'
 
 
 def diagnose(
@@ -140,7 +147,7 @@ def _nothing_found(found: Identified, setup: SetUp) -> Diagnosis:
         (
             looked,
             'no pattern of them was found in the sky, mirrored or not, in the time of the search',
-            f'tried: focal lengths within 25 % of {focal_px:.0f} px, {width_deg:.1f} deg wide',
+            f'tried: focal lengths of 0.25 to 4 times {focal_px:.0f} px, {width_deg:.1f} deg wide',
         ),
         ('# check camera_info_url: focal length in pixels, size of the image',),
     )
@@ -250,16 +257,20 @@ def _direction(reading: Reading, setup: SetUp) -> Diagnosis | None:
 
 def _clock(reading: Reading, setup: SetUp) -> Diagnosis | None:
     """The stamps as a cause; None: they are right."""
-    if not reading.shift_s:
+    shift_s = setup.shift_s + reading.shift_s
+    if not shift_s:
         return None
-    offset_s = round(setup.stamp_offset_s + reading.shift_s, 2)
+    offset_s = round(setup.stamp_offset_s + shift_s, 2)
+    mend = [f'stamp_offset_s: {offset_s}']
+    if abs(shift_s) > _SAME_DATE_S:
+        mend.append('# that takes the date of the attitudes: if it is wrong, correct their stamps')
     return Diagnosis(
         'clock',
         offset_s,
-        f'The stamps of the images are {abs(reading.shift_s):.2f} s'
-        f' {"behind" if reading.shift_s > 0 else "ahead of"} those of the attitudes.',
+        f'The stamps of the images are {abs(shift_s):.2f} s'
+        f' {"behind" if shift_s > 0 else "ahead of"} those of the attitudes.',
         ('the attitude at the shifted stamps gives one alignment, at others not',),
-        (f'stamp_offset_s: {offset_s}',),
+        tuple(mend),
     )
 
 

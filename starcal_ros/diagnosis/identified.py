@@ -32,7 +32,9 @@ from starcal_ros.sky.catalog import StarCatalog
 
 IMAGES = 8  # identified: more would not change an answer
 _SEARCHED = 12  # at most
-_LOOKED_AT = 40  # at most, those without sources included
+LOOKED_AT = 40  # at most, those without sources included
+# Focal lengths over that of the camera, each searched to 25 %: of other pixels or of binned ones.
+_OTHER_SCALES = (0.55, 1.8, 0.3, 3.3)
 _FEW = 3  # identified, with which no image is searched further
 FEWEST_SOURCES = 6
 SEARCH_S = 10.0  # of the 20 s that a diagnosis may take; reading and measuring are the rest
@@ -117,7 +119,9 @@ def identify_images(
                 solved.append(confirmed)
             elif not _search(one, ROUNDS[0], camera, catalog, solved, deadline_s):
                 pending.append(one)
-        if len(solved) == most or searched == _SEARCHED or looked_at == _LOOKED_AT:
+                if len(pending) == _FEW and not solved:
+                    pending = _rescaled(pending, camera, catalog, solved, deadline_s)
+        if len(solved) == most or searched == _SEARCHED or looked_at == LOOKED_AT:
             break
         if time.thread_time() > deadline_s:
             break
@@ -151,6 +155,27 @@ def _confirmed(
                     one.time_ns, sky, one.sources, sky.camera_from_icrf, one.quarter_turned
                 )
     return None
+
+
+def _rescaled(
+    pending: list[_Pending],
+    camera: CameraModel,
+    catalog: StarCatalog,
+    solved: list[Solved],
+    deadline_s: float,
+) -> list[_Pending]:
+    """The images that no focal length far from that of the camera identifies."""
+    fx, fy = (float(camera.parameters[k]) for k in (0, 2))
+    for scale in _OTHER_SCALES:
+        tried = camera.replace(fx=scale * fx, fy=scale * fy)
+        left = [
+            one
+            for one in pending
+            if not _search(one, ROUNDS[0], tried, catalog, solved, deadline_s)
+        ]
+        if solved:
+            return left
+    return pending
 
 
 def _search(

@@ -19,6 +19,7 @@ import zlib
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
@@ -30,7 +31,11 @@ from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 _ROWS = 64
 _GOLDEN = 0.618034
 _BELOW_STEP_PX = 8  # the row below is only compared: every eighth pixel is enough
-_SEGMENT_PX = 64  # a piece of a row: as wide as a cell in which a background is taken as flat
+_SEGMENT_PX = 64  # a piece of a row: as wide as a cell of the background
+_BY_CHANCE = 1e-6  # probability of equal rows above which a row like the one below is no fault
+# Error of a slope by central differences between cells, interpolated to the middle of two:
+# (1/6 + 1/8) of its second difference.
+_SLOPE_LEFT = 7.0 / 24.0
 # Largest values of converters of 8 to 16 bits, in the low or in the high bits of 16.
 _ENDS_DN = (255, 1023, 4095, 16383, 65472, 65520, 65532, 65535)
 
@@ -50,8 +55,8 @@ class ScreeningOptions:
     )
     max_gradient: float = option(
         0.05,
-        'largest change of the slope of the background from one 64 px cell to the next over half'
-        ' of an image, in pixel noise per pixel; a steady slope is subtracted',
+        'largest slope that is left of the background once its level in 64 px cells is'
+        ' subtracted, over half of an image, in pixel noise per pixel',
         low=0.0,
         high=100.0,
     )
@@ -126,11 +131,6 @@ def _segments(rows: Pixels) -> Pixels:
     return rows[:, : count * length].reshape(k, count, length)
 
 
-def _means(rows: Pixels) -> NDArray[np.float32]:
-    """Means (k, m) of the segments of rows."""
-    return _mean_of_each(_segments(rows))
-
-
 def _mean_of_each(segments: NDArray[Any]) -> NDArray[np.float32]:
     """Means (k, m) of (k, m, length)."""
     length = segments.shape[2]
@@ -172,30 +172,30 @@ def screen(
     ImageRefused
         ``overexposed``, ``blank``, ``frozen``, ``incomplete`` or ``glare``.
     """
-    saturated = _saturated(sample, saturation_dn, options)
+    least_dn = _saturation_dn(sample, saturation_dn)
+    _refuse_overexposed(sample, least_dn, options)
     if sample.constant.all() and np.ptp(sample.pixels) == 0:
         raise ImageRefused('blank', f'every pixel is {int(sample.pixels[0, 0])}')
     if before is not None:
         _refuse_repeated(seen, before, options)
-    _refuse_incomplete(sample, seen, saturated, options)
-    _refuse_glare(sample, dark, options)
+    _refuse_incomplete(sample, seen, least_dn, options)
+    _refuse_glare(sample, least_dn, dark, options)
 
 
-def _saturated(
-    sample: RowSample, saturation_dn: float, options: ScreeningOptions
-) -> NDArray[np.bool_]:
-    """Mask (k, m) of the segments that are saturated throughout; refuses an overexposed frame."""
+def _saturation_dn(sample: RowSample, saturation_dn: float) -> int:
+    """Least value of a saturated pixel."""
     peak = int(sample.pixels.max())
     if not saturation_dn:
         saturation_dn = 0.98 * peak if peak in _ENDS_DN else peak + 1.0
     # An integer: compared with a float, every pixel would be converted.
-    least_dn = math.ceil(saturation_dn)
-    if least_dn > peak:
-        return np.zeros(sample.constant.shape, bool)
+    return math.ceil(saturation_dn)
+
+
+def _refuse_overexposed(sample: RowSample, least_dn: int, options: ScreeningOptions) -> None:
+    """Refuse a frame of which too much is saturated."""
     part = np.count_nonzero(sample.pixels >= least_dn) / sample.pixels.size
     if part > options.max_saturated_fraction:
-        raise ImageRefused('overexposed', f'{part:.0%} of the pixels are at {saturation_dn:.0f}')
-    return np.asarray(_segments(sample.pixels).min(axis=2) >= least_dn)
+        raise ImageRefused('overexposed', f'{part:.0%} of the pixels are at {least_dn}')
 
 
 def _refuse_repeated(seen: Fingerprint, before: Fingerprint, options: ScreeningOptions) -> None:
@@ -219,7 +219,7 @@ def _refuse_repeated(seen: Fingerprint, before: Fingerprint, options: ScreeningO
 def _refuse_incomplete(
     sample: RowSample,
     seen: Fingerprint,
-    saturated: NDArray[np.bool_],
+    least_dn: int,
     options: ScreeningOptions,
 ) -> None:
     """Refuse a frame with lost parts: repeated rows or constant segments."""
@@ -227,20 +227,40 @@ def _refuse_incomplete(
     _, first = np.unique(seen.rows, return_index=True)
     again = np.ones(len(distinctive), bool)
     again[first] = False
-    again |= (sample.pixels[:, ::_BELOW_STEP_PX] == sample.below).all(axis=1)
+    again |= _repeats_below(sample)
     repeated = float((distinctive & again).mean())
     if repeated > options.max_lost_fraction:
         raise ImageRefused('incomplete', f'{repeated:.0%} of its rows repeat others')
-    values = _segments(sample.pixels)[:, :, 0].astype(np.float64)
     alive = ~sample.constant
     if alive.all() or not alive.any():
         return
-    # A dark sky that the converter cuts off at zero is constant too, but with a gradual edge.
-    off_px = np.abs(values - median(values[alive])) > 5.0 * _noise_dn(sample, alive)
+    saturated = _segments(sample.pixels)[:, :, 0] >= least_dn
+    # A dark or compressed sky is constant in places too, but near the level around them.
     sharp = sample.noisy[alive].mean() > 0.9
-    lost = float((sample.constant & ~saturated & (off_px | sharp)).mean())
+    lost = float((sample.constant & ~saturated & (_off_level(sample, alive) | sharp)).mean())
     if lost > options.max_lost_fraction:
         raise ImageRefused('incomplete', f'{lost:.0%} of it is constant')
+
+
+def _repeats_below(sample: RowSample) -> NDArray[np.bool_]:
+    """Mask (k,) of the rows that equal the row below; none where chance may do that."""
+    equal = sample.pixels[:, ::_BELOW_STEP_PX] == sample.below
+    repeats = equal.all(axis=1)
+    # Compression makes rows of one block equal: the other rows then have many equal pixels.
+    by_chance = equal[~repeats].mean() ** equal.shape[1] if not repeats.all() else 0.0
+    return np.asarray(repeats & (by_chance < _BY_CHANCE))
+
+
+def _off_level(sample: RowSample, alive: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask (k, m) of the segments that differ from the nearest live one beyond the noise."""
+    level = np.median(_segments(sample.pixels), axis=2)
+    nearest = distance_transform_edt(~alive, return_distances=False, return_indices=True)
+    beside = alive[:, 1:] & alive[:, :-1]
+    step = np.abs(np.diff(level, axis=1))[beside]
+    # Neighbours of a compressed sky differ by its quantisation, which leaves no noise in a block.
+    scatter_dn = MAD_TO_SIGMA * median(step) / math.sqrt(2.0) if step.size else 0.0
+    noise_dn = max(_noise_dn(sample, alive), scatter_dn)
+    return np.asarray(np.abs(level - level[tuple(nearest)]) > 5.0 * noise_dn)
 
 
 def _noise_dn(sample: RowSample, alive: NDArray[np.bool_]) -> float:
@@ -253,37 +273,58 @@ def _noise_dn(sample: RowSample, alive: NDArray[np.bool_]) -> float:
     return max(MAD_TO_SIGMA * spread / math.sqrt(2.0), math.sqrt(1.0 / 12.0))
 
 
-def _refuse_glare(sample: RowSample, dark: Pixels | None, options: ScreeningOptions) -> None:
-    """Refuse a frame whose background is steep over more than half of it."""
-    bend = background_bend(sample, dark)
-    if bend > options.max_gradient:
+def _refuse_glare(
+    sample: RowSample, least_dn: int, dark: Pixels | None, options: ScreeningOptions
+) -> None:
+    """Refuse a frame whose background is too uneven over more than half of it."""
+    slope = slope_left(sample, least_dn, dark)
+    if slope > options.max_gradient:
         raise ImageRefused(
             'glare',
-            f'the slope of the background changes by {bend:.2f} of its noise per pixel within'
-            f' {_SEGMENT_PX} px',
+            f'the background is uneven within {_SEGMENT_PX} px: a slope of {slope:.2f} of its'
+            ' noise per pixel is left of it',
         )
 
 
-def background_bend(sample: RowSample, dark: Pixels | None = None) -> float:
+def slope_left(sample: RowSample, least_dn: int, dark: Pixels | None = None) -> float:
     """
-    Median change of the slope of the background from one cell to the next, in noise per pixel.
+    Median slope that is left once the background in cells is subtracted, in noise per pixel.
 
-    A steady slope is subtracted before the stars are fitted.  A remaining slope g pulls the
+    Cells with pixels saturated from ``least_dn`` on are left out.  A remaining slope g pulls the
     centroid of a star of any flux by up to 5 sigma_px^2 g of its own sigma (Gaussian of width
     sigma_px, white noise).
     """
-    level = _means(sample.pixels)
-    if dark is not None:
-        level -= _means(dark[sample.row])
-    height = len(level) * sample.step
-    rows = max(1, height // _SEGMENT_PX)
-    mesh = cv2.resize(level, (level.shape[1], rows), interpolation=cv2.INTER_AREA)
-    mesh = mesh.reshape(rows, level.shape[1])
-    if min(mesh.shape) < 3:
+    pixels = _sorted_cells(sample.pixels, sample.step)
+    mesh = _middle_mean(pixels)
+    mesh[pixels[:, :, -pixels.shape[2] // 4] >= least_dn] = np.inf
+    if min(mesh.shape) < 4:
         return 0.0  # too small to separate a slope from its stars
     # A 3 x 3 median removes cells with a bright star.
     mesh = np.asarray(cv2.medianBlur(mesh, 3), np.float32)
-    down = np.diff(mesh, 2, axis=0)[:, 1:-1] * (rows / height)
-    across = np.diff(mesh, 2, axis=1)[1:-1] / _SEGMENT_PX
+    mesh[np.isinf(mesh)] = np.nan
+    if dark is not None:
+        glow = _middle_mean(_sorted_cells(dark[sample.row], sample.step))
+        mesh = mesh - np.asarray(cv2.medianBlur(glow, 3), np.float32)
+    cell_v_px = sample.pixels.shape[0] * sample.step / len(mesh)
+    down = np.diff(mesh, 3, axis=0)[:, 1:-2] / cell_v_px
+    across = np.diff(mesh, 3, axis=1)[1:-2] / _SEGMENT_PX
+    left = np.hypot(down, across)
+    left = left[np.isfinite(left)]
     everywhere = np.ones(sample.constant.shape, bool)
-    return median(np.hypot(down, across)) / _noise_dn(sample, everywhere)
+    return _SLOPE_LEFT * median(left) / _noise_dn(sample, everywhere) if left.size else 0.0
+
+
+def _sorted_cells(rows: Pixels, step: int) -> NDArray[Any]:
+    """Every second pixel of square cells of sampled rows (down, across, n), ascending in each."""
+    segments = _segments(rows)[:, :, ::2]
+    k, m, length = segments.shape
+    per_cell = max(1, min(_SEGMENT_PX // step, k))
+    down = k // per_cell
+    cells = segments[: down * per_cell].reshape(down, per_cell, m, length).transpose(0, 2, 1, 3)
+    return np.sort(cells.reshape(down, m, -1), axis=2)
+
+
+def _middle_mean(ascending: NDArray[Any]) -> NDArray[np.float32]:
+    """Means (down, across) of middle halves: dead rows, stuck columns and stars are outside."""
+    count = ascending.shape[2]
+    return _mean_of_each(ascending[:, :, count // 4 : count - count // 4])

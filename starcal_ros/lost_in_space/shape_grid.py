@@ -37,9 +37,10 @@ class ShapeGrid:
 
 def shape_grid(shape: Floats) -> tuple[Indices, ShapeGrid]:
     """Rows (q,) of the shapes (q, 5) in the order of a grid, and the grid."""
-    low = shape[:, :4].min(axis=0)
+    # Without shapes, of a catalog too small for a pattern, one empty cell.
+    low = shape[:, :4].min(axis=0, initial=0.0)
     at = np.floor((shape[:, :4] - low) / _CELL).astype(np.int64)
-    cells = at.max(axis=0) + 1
+    cells = at.max(axis=0, initial=0) + 1
     cell = np.ravel_multi_index(tuple(at.T), tuple(cells))
     rows = np.argsort(cell, kind='stable')
     first = np.zeros(int(np.prod(cells)) + 1, np.int32)

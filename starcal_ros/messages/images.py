@@ -25,6 +25,7 @@ from starcal_ros.messages.types import IMAGE_TYPE, Make, Message
 from starcal_ros.records import Image, refused_image, StarObservations
 
 _MOST_PIXELS = 2**27  # of a camera that is not known: 256 MB of 16 bit
+_JPEG = b'\xff\xd8'  # how its files begin
 _PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 
 
@@ -60,7 +61,9 @@ def decode_image(
     """
     is_colour = encoding in RGB_ENCODINGS or encoding in BAYER_ENCODINGS
     if is_colour and not channel:
-        raise ImageRefused('bad_encoding', f'{encoding} is a colour image: set image_channel')
+        raise ImageRefused(
+            'bad_encoding', f'{encoding} is a colour image: set image_channel, e.g. to green'
+        )
     letters, pixel_bytes = RGB_ENCODINGS.get(encoding, ('', 0))
     if not letters:
         pixel_bytes = _PIXEL_BYTES.get(encoding) or BAYER_ENCODINGS.get(encoding, ('', 0))[1]
@@ -112,7 +115,8 @@ def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> 
     # A JPEG would decode too, but its compression changes stars of two pixels.
     header = png_header(bytes(data[:PNG_HEADER_BYTES]))
     if header is None:
-        raise ImageRefused('bad_encoding', 'the compressed image is not a PNG')
+        kind = 'a JPEG' if bytes(data[:2]) == _JPEG else 'not a PNG'
+        raise ImageRefused('bad_encoding', f'the compressed image is {kind}; PNG is read')
     found = (header.width, header.height)
     if header.channels != 1:
         raise ImageRefused('bad_encoding', f'the PNG has {header.channels} channels, not one')

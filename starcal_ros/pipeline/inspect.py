@@ -156,7 +156,7 @@ def inspect(
         elif chosen.observations:
             found = reader.read_observations(paths, chosen.observations)
         else:
-            found = _placed(paths, chosen, options)
+            found = placed(paths, chosen, options)
         for observations in found:
             seen.append(observations)
             on_image()
@@ -179,7 +179,7 @@ def inspect(
         topics=topics,
         chosen=chosen,
         images=len(seen),
-        refused=_refused(seen),
+        refused=refusals(seen),
         longest_attitude_gap_s=max(
             (o.attitude_gap_s for o in used if math.isfinite(o.attitude_gap_s)), default=math.nan
         ),
@@ -264,12 +264,13 @@ def _kind(message: Message) -> str:
     return f'PNG {8 * pixels.itemsize} bit {pixels.shape[1]} x {pixels.shape[0]}'
 
 
-def _placed(
-    paths: Sequence[Path], topics: Topics, options: AttitudeOptions
+def placed(
+    paths: Sequence[Path], topics: Topics, options: AttitudeOptions, channel: str = ''
 ) -> Iterator[StarObservations]:
     """Images without their stars, refused for bad encoding, order or attitude."""
     latest_ns = None
-    for frame in read_frames(paths, FrameTopics(topics.image, topics.attitude), options):
+    frame_topics = FrameTopics(topics.image, topics.attitude)
+    for frame in read_frames(paths, frame_topics, options, channel=channel):
         if isinstance(frame, StarObservations):
             yield frame
             continue
@@ -286,7 +287,8 @@ def _placed(
         yield refused_image(image.time_ns, width, height, '', '', attitude_gap_s=gap_s)
 
 
-def _refused(seen: Iterable[StarObservations]) -> tuple[Refused, ...]:
+def refusals(seen: Iterable[StarObservations]) -> tuple[Refused, ...]:
+    """Refused images by their reason, the most frequent first."""
     groups: dict[str, list[StarObservations]] = {}
     for observations in seen:
         if observations.refusal:

@@ -17,7 +17,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.camera import CameraModel
 from starcal_ros.camera_conversion import convert
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions, check_options
@@ -46,6 +45,12 @@ from starcal_ros.options import (
 )
 from starcal_ros.pipeline.detector_frames import read_bad_pixels, read_flat, with_bad_pixels
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
+from starcal_ros.pipeline.set_up_checks import (
+    check_field_of_stars,
+    check_prior_camera,
+    check_site,
+    check_tracker_sigma,
+)
 from starcal_ros.products.camera_yaml import (
     DEFAULT_CAMERA_NAME,
     read_camera_info,
@@ -61,7 +66,6 @@ from starcal_ros.sky.star_trackers import Mounting
 from starcal_ros.untrusted import read_bytes, shown
 
 NODES = ('star_observer', 'calibrator')
-_LONGEST = 500.0  # focal length by the width: a field of 0.1 degrees
 
 
 @dataclass(frozen=True)
@@ -228,15 +232,20 @@ def load_setup(
     _check_relative(files_of(frames))
     is_aligned = prior is not None or any(frames.prior_alignment)
     prior = prior or _prior(frames)
+    check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
+    check_site(groups['site'])
     check_options(groups['calibration'], prior.camera.model)
     check_gate_options(groups['gate'], prior.camera)
     path = Path(frames.catalog) if frames.catalog else None
+    magnitude_limit = groups['identification'].magnitude_limit
+    catalog = load_catalog(path, magnitude_limit)
+    check_field_of_stars(len(catalog), magnitude_limit, prior.camera)
     dark = _read_dark(frames.dark_frame, prior.camera.width, prior.camera.height)
     flat = read_flat(frames.flat_field, prior.camera.width, prior.camera.height)
     return Setup(
         **groups,
         prior=prior,
-        catalog=load_catalog(path, groups['identification'].magnitude_limit),
+        catalog=catalog,
         dark=dark,
         dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
         hot=with_bad_pixels(
@@ -324,37 +333,6 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
     if not any(frames.prior_alignment):
         return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
     return CameraGeometry(camera, _unit_quaternion('prior_alignment', frames.prior_alignment))
-
-
-def check_prior_camera(camera: CameraModel, location: str) -> None:
-    """
-    Raise `OptionError` for a camera that no lens makes, beyond `camera.check_plausible`.
-
-    Raises
-    ------
-    OptionError
-        Naming the file, the value and the unit that it may have been given in.
-    """
-    width, height = camera.width, camera.height
-    fx, _, fy, cx, cy = (float(value) for value in camera.intrinsics[:5])
-    if not 0.5 < fx / fy < 2.0:
-        raise OptionError(f'{location}: fx = {fx:g} and fy = {fy:g} px differ by a factor of two')
-    width_deg = math.degrees(2 * math.atan(width / 2 / fx))
-    if fx > _LONGEST * width:
-        raise OptionError(
-            f'{location}: focal length of {fx:g} px makes a field of {width_deg:.2g} degrees:'
-            ' it seems to be in micrometres; divide it by the size of a pixel'
-        )
-    if not (-0.5 * width < cx < 1.5 * width and -0.5 * height < cy < 1.5 * height):
-        raise OptionError(
-            f'{location}: principal point ({cx:g}, {cy:g}) px is far outside the image of {width}'
-            f' x {height}'
-        )
-    if 0 < abs(cx) < 0.05 * width and 0 < abs(cy) < 0.05 * height:
-        raise OptionError(
-            f'{location}: principal point ({cx:g}, {cy:g}) is in the first corner of an image of'
-            f' {width} x {height}: give it in pixels, not in metres or millimetres'
-        )
 
 
 def _read_dark(path: str, width: int, height: int) -> Pixels | None:

@@ -27,6 +27,15 @@ if TYPE_CHECKING:
     from starcal_ros.pipeline.setup import Setup
 
 
+_WITHOUT = {
+    'image': 'record the images, or make a bag of image files with starcal import',
+    'attitude': (
+        'record the attitudes of the star tracker, give the bag that holds them as well, or make'
+        ' a bag of both with starcal import'
+    ),
+}
+
+
 @dataclass(frozen=True)
 class Topics:
     """
@@ -134,7 +143,9 @@ def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str
     try:
         return reader.choose_topic(paths, type_name, asked)
     except BagError as error:
-        raise BagError(f'{error}; choose one with --{what}-topic') from error
+        several = any(topic.type_name == type_name for topic in reader.topics(paths))
+        remedy = f'choose one with --{what}-topic' if several else _WITHOUT.get(what, '')
+        raise BagError(f'{error}{remedy and "; "}{remedy}') from error
 
 
 def read(

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from starcal_ros.bag import reader
 from starcal_ros.image.centroiding import Centroids, measure_stars
 from starcal_ros.image.detection import (
     Background,
@@ -16,15 +18,17 @@ from starcal_ros.image.detection import (
     sample_background,
     sample_mesh,
 )
+from starcal_ros.image.frame_checks import fingerprint, sample_rows, screen, ScreeningOptions
 from starcal_ros.image.image_model import CentroidOptions, model_image
 from starcal_ros.image.pixel_noise import NoiseSums
-from starcal_ros.records import StarRefusal
+from starcal_ros.records import Image, StarRefusal
 from starcal_ros.simulation.images import expose, star_electrons
 from starcal_ros.simulation.scenario import Detector
 
 SHAPE = (512, 640)
 QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
 OPTIONS = CentroidOptions()
+WISPR = Path(__file__).parents[3] / 'shared' / 'realsky' / 'wispr_i_2022'
 
 
 def star_grid(seed: int, spacing: int = 32) -> np.ndarray:
@@ -138,3 +142,25 @@ def test_the_gain_is_no_refuge_for_an_error_of_the_psf() -> None:
     modelled += noise.psf_error**2 * signal * 9000.0
     # Either explains the pixels; their variance is what must be right, to 7 % of 400 squares.
     assert (modelled / variance).mean() == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_steep_sky_is_measured_in_small_cells() -> None:
+    v, u = np.mgrid[:1024, :960]
+    corona = 60000.0 / (1.0 + np.hypot(u + 100.0, v - 512.0) / 150.0) ** 2
+    electrons = np.random.default_rng(6).poisson(20.0 * (corona + 500.0))
+    pixels = np.rint(electrons / 20.0).astype(np.uint16)
+    small = measure_background(pixels).level_mesh
+    assert (sample_background(pixels).level_mesh == small).all()
+    flat = np.random.default_rng(7).normal(500.0, 5.0, pixels.shape).astype(np.uint16)
+    assert sample_background(flat).level_mesh.size < small.size
+
+
+@pytest.mark.skipif(not WISPR.exists(), reason='images of others, not part of the tree')
+def test_stars_beside_the_corona_are_measured() -> None:
+    """Two images of a telescope near the Sun, whose sky spans a factor of 200."""
+    for image in reader.read_images([WISPR], '/opnav/image_raw'):
+        assert isinstance(image, Image)
+        sample = sample_rows(image.pixels)
+        screen(sample, fingerprint(image, sample), None, 0.0, None, ScreeningOptions())
+        found = detect(image.pixels, measure_background(image.pixels), OPTIONS.detection_sigma)
+        assert len(found.snr) > 300

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import functools
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -13,12 +14,12 @@ import pytest
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import ImageRefused
 from starcal_ros.image.frame_checks import (
-    background_bend,
     Fingerprint,
     fingerprint,
     sample_rows,
     screen,
     ScreeningOptions,
+    slope_left,
 )
 from starcal_ros.records import Image
 from starcal_ros.simulation import images as simulated_images
@@ -169,7 +170,7 @@ def ramp(slope: float) -> Pixels:
 def test_a_steady_slope_of_the_sky_is_no_glare(slope: float) -> None:
     # It is subtracted before the stars are fitted.  Means of 128 pixels give the change of a slope
     # from one cell to the next to 0.003 noise per pixel.
-    assert background_bend(sample_rows(ramp(slope))) < 0.006
+    assert slope_left(sample_rows(ramp(slope)), 65536) < 0.006
     assert refusal(ramp(slope)) == ''
 
 
@@ -191,3 +192,34 @@ def test_what_the_dark_frame_explains_is_no_glare() -> None:
     assert refusal(bent(0.5)) == 'glare'
     glow = bent(0.5).astype(np.int64) - ramp(0.0)
     assert refusal(bent(0.5), dark=np.maximum(glow - glow.min(), 0).astype(np.uint16)) == ''
+
+
+def test_dead_rows_and_stuck_columns_are_no_glare() -> None:
+    """One per cent of the rows and columns: cells are judged by the rest of their pixels."""
+    rng = np.random.default_rng(5)
+    pixels = rng.normal(200.0, 5.0, (2048, 1024)).astype(np.uint16)
+    pixels[rng.choice(2048, 20, replace=False)] = 0
+    pixels[:, rng.choice(1024, 10, replace=False)] = 4095
+    assert slope_left(sample_rows(pixels), 4095) < 0.006
+    assert refusal(pixels) == ''
+
+
+def test_a_corona_is_no_glare() -> None:
+    """A sky that falls off from one side, as beside the Sun, is subtracted cell by cell."""
+    v, u = np.mgrid[:1024, :960]
+    corona = 60000.0 / (1.0 + np.hypot(u + 100.0, v - 512.0) / 150.0) ** 2
+    electrons = np.random.default_rng(6).poisson(20.0 * (corona + 500.0))
+    assert refusal(np.rint(electrons / 20.0).astype(np.uint16)) == ''
+
+
+@pytest.mark.parametrize('quality', [60, 75])
+@pytest.mark.parametrize('offset_dn', [-20, 0, 20])
+def test_a_compressed_sky_is_complete(quality: int, offset_dn: int) -> None:
+    """JPEG leaves blocks without noise, and rows of blocks that are equal."""
+    bytes_ = np.clip(frame().astype(np.int64) + offset_dn, 0, 255).astype(np.uint8)
+    coded = cv2.imencode('.jpg', bytes_, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    pixels: Pixels = cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)  # type: ignore[assignment]
+    assert refusal(pixels) == ''
+    lost = pixels.copy()
+    lost[LOWER] = 0
+    assert refusal(lost) == 'incomplete'

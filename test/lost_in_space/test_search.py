@@ -187,3 +187,9 @@ def test_bright_false_sources_do_not_hide_the_stars(catalog: StarCatalog) -> Non
     # Six of ten; ten of the forty brightest sources are stars, and their shift must be found.
     # Judged by chance from the first radius on, four.
     assert confirmed >= 6
+
+
+def test_a_catalog_too_small_for_a_pattern_identifies_nothing(catalog: StarCatalog) -> None:
+    frame = next(frames(catalog, 20, 20, 10, 0.0, 1))
+    few = catalog.select(np.arange(49))
+    assert isinstance(find_sky(frame.xy_px, frame.prior, few, try_mirrored=True), NotFound)

@@ -143,7 +143,7 @@ def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_pat
     assert (lens.name, velocity.name) == ('/lens', '/velocity')
     assert lens.backward == 1 and lens.rate_hz == pytest.approx(1.0)
     assert found.problems and 'no topic of type sensor_msgs/msg/Image' in found.problems[0]
-    assert '--image-topic' in found.problems[0] and '/lens' in found.problems[0]
+    assert 'starcal import' in found.problems[0] and '/lens' in found.problems[0]
 
 
 def test_compressed_images_are_told_apart(tmp_path: Path, tiny_images: list[Image]) -> None:

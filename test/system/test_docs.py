@@ -17,13 +17,16 @@ from xml.etree import ElementTree
 
 import cv2
 import numpy as np
+from PIL import Image
 import pytest
 
 from starcal_ros.cli import main
 from starcal_ros.cli.arguments import parser
+from starcal_ros.cli.commands import demo
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES, PlayerOptions
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES
+from starcal_ros.products.calibration_json import read_calibration
 
 pytestmark = pytest.mark.slow
 
@@ -257,6 +260,67 @@ def test_a_parameter_file_of_a_document_is_one(document: Path, text: str, tmp_pa
     camera = ROOT / 'bags' / 'tiny' / 'camera.yaml'
     setup = load_setup({**values, 'camera_info_url': str(camera)}, OPTIONS)
     assert setup.prior.camera.width > 0
+
+
+PROGRAMS = [
+    (document, text)
+    for document in DOCUMENTS
+    for _, kind, text in FENCE.findall(document.read_text())
+    if kind == 'python'
+]
+
+
+@pytest.mark.parametrize(('document', 'text'), PROGRAMS, ids=[path.name for path, _ in PROGRAMS])
+def test_what_a_program_of_a_document_imports_is_there(document: Path, text: str) -> None:
+    imports: list[ast.stmt] = [
+        n for n in ast.walk(ast.parse(text)) if isinstance(n, (ast.Import, ast.ImportFrom))
+    ]
+    assert imports
+    exec(compile(ast.Module(imports, []), document.name, 'exec'), {})
+
+
+@pytest.mark.parametrize(
+    'text', [text for document, text in PROGRAMS if document.name == 'performance.md']
+)
+def test_the_programs_of_the_figures_run(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """On the small campaign in place of the paper's."""
+    assert "scenario('paper')" in text
+    exec(compile(text.replace("scenario('paper')", "scenario('tiny')"), 'figures', 'exec'), {})
+    assert ' stars' in capsys.readouterr().out
+
+
+def test_the_demo_lines_of_the_readme_are_those_of_the_demo(tiny_products: Path) -> None:
+    """Estimates within a tenth of their sigma, sigmas within 2 %."""
+    bag = demo.tiny_bag(tiny_products)
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    table = demo.compare(calibration, bag.truth, bag.prior)
+    made = {line.rpartition('  ')[0][:11].strip(): numbers(line) for line in table.lines[1:]}
+    shown = re.findall(
+        r'^    (fx|k1|p1|alignment x) (.*)$', (ROOT / 'README.md').read_text(), re.MULTILINE
+    )
+    assert len(shown) == 4
+    for name, text in shown:
+        prior, estimate, sigma, true, error = numbers(text)
+        expected = made[name]
+        assert (prior, true) == (expected[0], expected[3]), name
+        assert abs(estimate - expected[1]) < 0.1 * sigma, name
+        assert sigma == pytest.approx(expected[2], rel=0.02), name
+        assert error == pytest.approx(expected[4], abs=0.1), name
+
+
+def test_the_picture_of_the_report_is_of_todays_calibration(tiny_products: Path) -> None:
+    """Redraw it with ``python -m docs.make_images``."""
+    with Image.open(ROOT / 'docs' / 'images' / 'report.png') as picture:
+        drawn = dict(part.split('=') for part in picture.info['Description'].split('; '))
+    today = read_calibration(tiny_products / 'calibration.json')
+    for k, name in enumerate(today.geometry.camera.parameter_names):
+        apart = abs(float(drawn[name]) - today.geometry.camera.parameters[k])
+        assert apart < 0.1 * today.sigma[k], name
+    assert abs(float(drawn['residual_rms_px']) - today.residual_rms_px) < 1e-3
+
+
+def numbers(line: str) -> list[float]:
+    return [float(n) for n in re.findall(r'(?<!\w)[-+]?[\d.]+(?:e[-+]?\d+)?', line)]
 
 
 def test_readme_and_tutorial_show_a_parameter_file() -> None:

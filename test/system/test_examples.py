@@ -74,3 +74,11 @@ def test_mission(tmp_path: Path) -> None:
     difference = done.stdout.splitlines()[-1].removeprefix('difference from the calibration: ')
     assert float(difference.split()[0]) < 1e-9
     assert (tmp_path / 'mission/camera.ti').read_text().startswith('KPL/IK')
+
+
+@pytest.mark.parametrize('name', ['from_bag.py', 'mission.py'])
+def test_without_arguments_the_usage_is_printed(name: str, tmp_path: Path) -> None:
+    done = run(tmp_path, EXAMPLES / name)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f'usage: python {name} BAG PARAMS ')
+    assert done.stderr.count('\n') == 1

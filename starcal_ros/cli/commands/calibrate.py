@@ -17,13 +17,13 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.bag import reader
 from starcal_ros.cli import output
 from starcal_ros.cli.arguments import EXIT_ACCEPTED, EXIT_REFUSED
-from starcal_ros.cli.commands.selection import selection
+from starcal_ros.cli.commands.selection import Selection, selection
 from starcal_ros.cli.folders import make_folder, missing_extra
 from starcal_ros.cli.output_places import check_folder
 from starcal_ros.cli.terminal import print_text, with_progress
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.options import tracker_sigma_is_given
-from starcal_ros.pipeline import solve
+from starcal_ros.pipeline import inspect, solve
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.observe import Wanted
 from starcal_ros.pipeline.provenance import inputs_of, software_version
@@ -113,6 +113,8 @@ def calibrate_into(
 
     records = bag_topics.read(bags, topics, setup, show, wanted)
     observations = list(with_progress(records, count, 'images'))
+    if not observations and isinstance(wanted, Selection):
+        raise OptionError(wanted.without_images())
     make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     write_observations(observations, folder, setup.frames.camera_frame)
@@ -245,22 +247,24 @@ def _failure(
     observations: Sequence[StarObservations],
     has_images: bool,
 ) -> NotCalibrated:
-    """The record of a failure, with the diagnosis where no image matches."""
-    refused: dict[str, int] = {}
-    for record in observations:
-        if record.refusal:
-            refused[record.refusal] = refused.get(record.refusal, 0) + 1
+    """The record of a failure, with the cause for which most images are refused."""
+    from starcal_ros.cli.commands import diagnosis  # seldom needed, slow to load
+    from starcal_ros.diagnosis.refusals import of_refusals
+
+    groups = inspect.refusals(observations)
+    refused = {group.reason: group.count for group in groups}
+    if observations and not _used(observations):
+        words = f'no image of {len(observations)} can be used'
     if refused:
         words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
     named = tuple(map(str, bags))
+    found = of_refusals(groups, len(observations))
     if has_images and not _used(observations):
-        from starcal_ros.cli.commands import diagnosis  # seldom needed, slow to load
-
-        found = diagnosis.of_a_failure(bags, asked, setup)
-        if found:
-            words += f'. {found.in_a_sentence()}'
-            return NotCalibrated(words, named, refused, found.cause, found.evidence, found.mend)
-    return NotCalibrated(words, named, refused)
+        found = diagnosis.of_a_failure(bags, asked, setup, groups)
+    if found is None:
+        return NotCalibrated(words, named, refused)
+    words += f'. {found.in_a_sentence()}'
+    return NotCalibrated(words, named, refused, found.cause, found.evidence, found.mend)
 
 
 def _write_failure(

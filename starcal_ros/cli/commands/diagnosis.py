@@ -9,6 +9,7 @@ from pathlib import Path
 from starcal_ros.diagnosis.bags import diagnose_bags
 from starcal_ros.diagnosis.diagnose import Diagnosis
 from starcal_ros.errors import BagError
+from starcal_ros.pipeline.inspect import Refused
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.topics import Topics
 
@@ -33,10 +34,12 @@ def text(found: Diagnosis) -> str:
     return '\n'.join(lines)
 
 
-def of_a_failure(paths: Sequence[Path], asked: Topics, setup: Setup) -> Diagnosis | None:
-    """The diagnosis of bags whose images match nothing; None where it finds nothing wrong."""
+def of_a_failure(
+    paths: Sequence[Path], asked: Topics, setup: Setup, refused: Sequence[Refused]
+) -> Diagnosis | None:
+    """The diagnosis of bags whose images are all refused; None where it finds nothing wrong."""
     try:
-        found = diagnose_bags(paths, asked, setup)
+        found = diagnose_bags(paths, asked, setup, refused)
     except BagError:
         return None
     return None if found.cause == 'none' else found

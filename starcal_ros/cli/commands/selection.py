@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timezone
 import math
 
-from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import OptionError
 
 
@@ -33,6 +33,7 @@ class Selection:
     first: int | None = None
     every: int = 1
     _first_ns: int | None = None
+    _last_ns: int = 0
     _between: int = 0
     _taken: int = 0
     _answers: dict[int, bool] = field(default_factory=dict)
@@ -46,6 +47,7 @@ class Selection:
     def _takes(self, time_ns: int) -> bool:
         if self._first_ns is None:
             self._first_ns = time_ns
+        self._last_ns = max(self._last_ns, time_ns)
         if self.start is not None and time_ns < self._ns(self.start):
             return False
         if self.end is not None and time_ns > self._ns(self.end):
@@ -55,6 +57,16 @@ class Selection:
             return False
         self._taken += 1
         return self.first is None or self._taken <= self.first
+
+    def without_images(self) -> str:
+        """Sentence on a selection that has taken no image."""
+        if self._first_ns is None:
+            return '--from, --to, --every: there is no image to choose'
+        first, last = (utc_text(time_ns) for time_ns in (self._first_ns, self._last_ns))
+        return (
+            f'--from, --to: no image is between these times: the images are of {first} to {last},'
+            f' +0 to +{(self._last_ns - self._first_ns) / NANOSECONDS_PER_SECOND:g} s'
+        )
 
     def _ns(self, time: Time) -> int:
         origin_ns = (self._first_ns or 0) if time.since_first_image else 0
