@@ -51,8 +51,6 @@ _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed b
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns the exit status."""
-    # Read when NumPy is loaded: on matrices of this size two threads of BLAS wait for each other.
-    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     command = ''
     try:
         open_missing_streams()
@@ -379,8 +377,6 @@ def _demo(args: argparse.Namespace) -> int:
 
 def _campaign(args: argparse.Namespace) -> int:
     """Run a Monte Carlo study."""
-    # Trials run in parallel, one thread each; results must not depend on the number of threads.
-    os.environ.update(OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1')
     import dataclasses
     import time
 
