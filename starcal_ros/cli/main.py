@@ -29,6 +29,7 @@ from starcal_ros.cli.arguments import (
     parser,
 )
 from starcal_ros.cli.commands import mission
+from starcal_ros.cli.drawings import Drawings
 from starcal_ros.cli.folders import make_folder, missing_extra
 from starcal_ros.cli.terminal import (
     discard,
@@ -370,7 +371,8 @@ def _demo(args: argparse.Namespace) -> int:
         if same
         else f'starcal calibrate gives another calibration from the bag: {apart_px:.2g} px apart',
     )
-    print_text(f'open {page.write_report(args.output)}')
+    with Drawings().kind('report'):
+        print_text(f'open {page.write_report(args.output)}')
     good = good and same
     return EXIT_ACCEPTED if good else EXIT_REFUSED
 
