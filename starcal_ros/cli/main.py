@@ -342,6 +342,7 @@ def _demo(args: argparse.Namespace) -> int:
     from starcal_ros.products.folder import write_products
     from starcal_ros.report import page
 
+    demo.check_ros()
     make_folder(args.output)
     bag = demo.tiny_bag(args.output)
     check_folder(args.output, [bag.bag], ())
