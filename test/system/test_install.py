@@ -17,7 +17,16 @@ from packaging.requirements import Requirement
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE', 'msg')
+SOURCES = (
+    'setup.py',
+    'setup.cfg',
+    'pyproject.toml',
+    'MANIFEST.in',
+    'package.xml',
+    'LICENSE',
+    'msg',
+)
+SDIST = 'from setuptools.build_meta import build_sdist; print(build_sdist(".."))'
 OF_EXTRAS = (
     'ccsds_ndm',
     'dask',
@@ -79,8 +88,12 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='module')
 def wheel(sources: Path) -> Path:
+    """A wheel made from the source distribution, which must have all that it takes."""
     folder = sources.parent
-    built = run(*PIP, 'wheel', *ALONE, '--no-build-isolation', sources, cwd=folder)
+    packed = run(sys.executable, '-c', SDIST, cwd=sources)
+    assert packed.returncode == 0, packed.stderr
+    sdist = folder / packed.stdout.splitlines()[-1]
+    built = run(*PIP, 'wheel', *ALONE, '--no-build-isolation', sdist, cwd=folder)
     assert built.returncode == 0, built.stdout + built.stderr
     (wheel,) = folder.glob('starcal_ros-*.whl')
     return wheel
