@@ -1,11 +1,11 @@
 # make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, test, bench, lint, docs.
 # make test TESTS='-m nodes' runs a part: what follows is handed to pytest. The whole is two runs:
 # tests that start nodes wait most of the time, so three run at once. VERSIONS=oldest: with the
-# oldest versions of the Python packages that starcal is tested on, in an environment of their own;
-# no linters there.
+# oldest versions of the Python packages that starcal is tested on; VERSIONS=newest: with the newest
+# ones that PyPI has today. Each in an environment of its own, without linters.
 ROS_DISTRO ?= jazzy
-VERSIONS ?= newest
-VENV := .venv$(filter-out -jazzy,-$(ROS_DISTRO))$(filter-out -newest,-$(VERSIONS))
+VERSIONS ?= pinned
+VENV := .venv$(filter-out -jazzy,-$(ROS_DISTRO))$(filter-out -pinned,-$(VERSIONS))
 # An environment keeps the interpreter it was made with unless another is asked for.
 PYTHON ?= $(or $(wildcard $(VENV)/bin/python),python3)
 RUN := $(VENV)/bin

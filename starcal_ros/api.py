@@ -3,7 +3,7 @@
 The public functions of the package, for use without ROS; imported as attributes of `starcal_ros`.
 
 A calibration from arrays or from a bag is the one that ``starcal calibrate`` and the nodes give
-from the same observations, with the same options.
+from the same observations, with the same options.  BLAS runs on one thread meanwhile.
 """
 
 from __future__ import annotations

@@ -10,7 +10,6 @@ runs a node in the same way.
 from __future__ import annotations
 
 import importlib
-import os
 import signal
 import sys
 
@@ -36,8 +35,6 @@ def bag_player() -> int:
 
 
 def _run(name: str) -> int:
-    # Read when NumPy is loaded: on matrices of this size two threads of BLAS wait for each other.
-    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     # Unless nohup or a shell ignores it; `main` sets the handler of the node.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -14,12 +14,13 @@ stay texts.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+import contextlib
 import json
 import os
 from pathlib import Path
 import re
 import stat
-from typing import Any
+from typing import Any, IO
 
 import yaml
 
@@ -99,20 +100,36 @@ def read_bytes(path: Path, most_bytes: int, follow_links: bool = True) -> bytes:
     ValueError
         In one line, for a file that is not regular or is too large.
     """
+    with regular_file(path, follow_links) as file:
+        # A read allocates all that it is asked for; a file of /proc has the size 0.
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(min(most_bytes, max(size, 2**20)) + 1)
+    if len(content) > most_bytes:
+        raise ValueError(f'larger than {most_bytes // 1024} kB')
+    return content
+
+
+@contextlib.contextmanager
+def regular_file(path: Path, follow_links: bool = True) -> Iterator[IO[bytes]]:
+    """
+    A regular file, open to read; never waits, as for a pipe.
+
+    Raises
+    ------
+    OSError
+        When the file cannot be opened.
+    ValueError
+        In one line, for a file that is not regular.
+    """
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow_links else os.O_NOFOLLOW)
     try:
         number = os.open(path, flags)
     except ValueError as error:  # of a name with NUL or half a surrogate pair
         raise ValueError('not the name of a file') from error
-    with open(number, 'rb') as file:
-        found = os.fstat(number)
-        if not stat.S_ISREG(found.st_mode):
+    with os.fdopen(number, 'rb') as file:
+        if not stat.S_ISREG(os.fstat(number).st_mode):
             raise ValueError('not a regular file')
-        # A read allocates all that it is asked for; a file of /proc has the size 0.
-        content = file.read(min(most_bytes, max(found.st_size, 2**20)) + 1)
-    if len(content) > most_bytes:
-        raise ValueError(f'larger than {most_bytes // 1024} kB')
-    return content
+        yield file
 
 
 def yaml_value(text: str) -> Any:

@@ -12,6 +12,7 @@ The Python package is installed editable, so its sources are live.
 from __future__ import annotations
 
 import argparse
+from datetime import date
 import fcntl
 import hashlib
 import os
@@ -25,6 +26,7 @@ import sysconfig
 ROOT = Path(__file__).resolve().parent.parent
 OLDEST_PYTHON, NEWEST_PYTHON = (3, 10), (3, 13)
 HASHES = ROOT / 'requirements/hashes.txt'
+PACKAGES = {'pinned': ('runtime', 'mission', 'dev'), 'oldest': ('oldest',), 'newest': ()}
 WHEELS_STAMP, PACKAGE_STAMP = '.starcal-wheels', '.starcal-package'
 SOURCED = ('AMENT_', 'CMAKE_PREFIX_PATH', 'COLCON_', 'PYTHONHOME', 'PYTHONPATH', 'ROS_')
 
@@ -36,9 +38,9 @@ def main() -> None:
     parser.add_argument('--ros', default='jazzy', metavar='DISTRO', help='ROS 2 distribution')
     parser.add_argument(
         '--versions',
-        choices=('newest', 'oldest'),
-        default='newest',
-        help='of Python packages: requirements/oldest.txt has those of Ubuntu 24.04',
+        choices=('pinned', 'oldest', 'newest'),
+        default='pinned',
+        help='of Python packages: oldest, those of Ubuntu 24.04; newest, those on PyPI today',
     )
     parser.add_argument(
         '--also',
@@ -49,19 +51,21 @@ def main() -> None:
     )
     args = parser.parse_args()
     venv = args.venv.absolute()
-    packages = ('oldest',) if args.versions == 'oldest' else ('runtime', 'mission', 'dev')
-    names = (*packages, 'colcon', args.ros)
+    names = (*PACKAGES[args.versions], 'colcon', args.ros)
     requirements = [ROOT / 'requirements' / f'{name}.txt' for name in names]
     check_request(args.ros, requirements[-1])
-    bring_up_to_date(venv, args.ros, requirements)
+    bring_up_to_date(venv, args.ros, requirements, is_newest=args.versions == 'newest')
     for name in args.also:
         pip_install(venv, [ROOT / 'requirements' / f'{name}.txt'])
 
 
-def bring_up_to_date(venv: Path, ros: str, requirements: list[Path]) -> None:
-    """Make the steps whose inputs have changed."""
+def bring_up_to_date(venv: Path, ros: str, requirements: list[Path], is_newest: bool) -> None:
+    """Make the steps whose inputs have changed; the newest versions do so each day."""
     # The interfaces are generated and compiled by the wheels: new wheels, new interfaces.
-    wheels = digest([Path(__file__), HASHES, *requirements], f'{ros} {python_name()}')
+    inputs = [Path(__file__), HASHES, *requirements]
+    wheels = digest(inputs, f'{ros} {python_name()}')
+    if is_newest:
+        wheels = digest([*inputs, ROOT / 'setup.cfg'], f'{ros} {python_name()} {date.today()}')
     package = digest(package_inputs(), wheels)
     if is_stamped(venv, WHEELS_STAMP, wheels) and is_stamped(venv, PACKAGE_STAMP, package):
         return
@@ -71,7 +75,7 @@ def bring_up_to_date(venv: Path, ros: str, requirements: list[Path]) -> None:
     lock = os.open(ROOT, os.O_RDONLY)  # two calls at once: the second waits, then finds it done
     fcntl.flock(lock, fcntl.LOCK_EX)
     if not is_stamped(venv, WHEELS_STAMP, wheels):
-        install_wheels(venv, requirements)
+        install_wheels(venv, requirements, is_newest)
         write_stamp(venv, WHEELS_STAMP, wheels)
     if not is_stamped(venv, PACKAGE_STAMP, package):
         install_package(venv)
@@ -157,8 +161,8 @@ def leave_environment() -> None:
         os.execv(base, [base, *sys.orig_argv[1:]])
 
 
-def install_wheels(venv: Path, requirements: list[Path]) -> None:
-    """Install the pinned wheels, into the environment there is if it was complete and fits."""
+def install_wheels(venv: Path, requirements: list[Path], is_newest: bool) -> None:
+    """Install the wheels, into the environment there is if it was complete and fits."""
     same_python = (venv / 'bin/python').resolve() == Path(sys.executable).resolve()
     usable = same_python and stamped_folder(venv, WHEELS_STAMP) == str(venv)
     for stamp in (WHEELS_STAMP, PACKAGE_STAMP):
@@ -170,9 +174,15 @@ def install_wheels(venv: Path, requirements: list[Path]) -> None:
         run([sys.executable, '-m', 'venv', '--clear', str(venv)])
 
     say('installing wheels from PyPI (about a minute)')
-    pip_install(venv, requirements[:1])
-    # empy alone has no wheel; it is built with the pinned setuptools that has just come.
-    pip_install(venv, requirements, '--no-binary', 'empy', '--no-build-isolation', '--use-pep517')
+    options = ['--no-binary', 'empy', '--no-build-isolation', '--use-pep517']
+    if is_newest:
+        newest = ('--upgrade', '--upgrade-strategy', 'eager', '--only-binary', ':all:')
+        pip(venv, 'install', *newest, 'setuptools', '--editable', f'{ROOT}[test]')
+        options.append('--no-deps')  # the pinned files need packages that have just come
+    else:
+        pip_install(venv, requirements[:1])
+    # empy alone has no wheel; it is built with the setuptools that has just come.
+    pip_install(venv, requirements, *options)
     point_cmake_files_here(venv)
 
 

@@ -26,12 +26,14 @@ calibration; 2 bad input, named in one line; 130 interrupted."""
 _INTRODUCTION = 'In-flight star calibration of spacecraft cameras.'
 _FIRST_STEPS = f"""\
 first steps:
-  # check the installation
-  starcal demo
-  # list the contents of a bag
-  starcal inspect bags/tiny
+  # render a bag with known truth
+  starcal simulate --scenario tiny -o tiny
   # calibrate
-  starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out
+  starcal calibrate tiny --params tiny/params.yaml -o out
+  # compare with the truth
+  starcal compare out tiny/truth.json
+  # the same by the ROS nodes, where ROS 2 is installed
+  starcal demo
 
 starcal COMMAND --help shows examples of each command.
 {_EXIT_STATUS}"""

@@ -29,6 +29,7 @@ from starcal_ros.cli.arguments import (
     parser,
 )
 from starcal_ros.cli.commands import mission
+from starcal_ros.cli.drawings import Drawings
 from starcal_ros.cli.folders import make_folder, missing_extra
 from starcal_ros.cli.terminal import (
     discard,
@@ -51,8 +52,6 @@ _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed b
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns the exit status."""
-    # Read when NumPy is loaded: on matrices of this size two threads of BLAS wait for each other.
-    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     command = ''
     try:
         open_missing_streams()
@@ -351,6 +350,7 @@ def _demo(args: argparse.Namespace) -> int:
     from starcal_ros.products.folder import write_products
     from starcal_ros.report import page
 
+    demo.check_ros()
     make_folder(args.output)
     bag = demo.tiny_bag(args.output)
     check_folder(args.output, [bag.bag], ())
@@ -380,15 +380,14 @@ def _demo(args: argparse.Namespace) -> int:
         if same
         else f'starcal calibrate gives another calibration from the bag: {apart_px:.2g} px apart',
     )
-    print_text(f'open {page.write_report(args.output)}')
+    with Drawings().kind('report'):
+        print_text(f'open {page.write_report(args.output)}')
     good = good and same
     return EXIT_ACCEPTED if good else EXIT_REFUSED
 
 
 def _campaign(args: argparse.Namespace) -> int:
     """Run a Monte Carlo study."""
-    # Trials run in parallel, one thread each; results must not depend on the number of threads.
-    os.environ.update(OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1')
     import dataclasses
     import time
 

@@ -18,6 +18,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.diagnosis.attitude_reading import (
     best_reading,
     CLOCK_SEARCH_S,
@@ -86,6 +87,7 @@ class Diagnosis:
         return f'{" ".join(said)} (details: starcal diagnose)'
 
 
+@one_blas_thread()
 def diagnose(
     images: Iterable[Image],
     attitudes: WireAttitudes,

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.bag.frames import check_order, FrameTopics, read_frames
+from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
@@ -76,6 +77,7 @@ class Track:
     others: Mapping[str, Track] = dataclasses.field(default_factory=dict)
 
 
+@one_blas_thread()
 def observe_next(
     image: Image,
     attitudes: AttitudeHistory,

@@ -22,6 +22,7 @@ from starcal_ros.assessment.observability import (
 from starcal_ros.assessment.observability import ensemble_status as _ensemble_status
 from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.assessment.term_removal import removal_study
+from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera_conversion import ros_fit
 from starcal_ros.constants import ARCSECOND_RAD
@@ -100,12 +101,14 @@ def aligned_by(ensemble: Ensemble, setup: Setup) -> Setup:
     return aligned(setup, shown[int(np.median(apart, axis=1).argmax())].as_quat())
 
 
+@one_blas_thread()
 def within_limit(ensemble: Ensemble, setup: Setup) -> Ensemble:
     """Return the ensemble without its least informative images, down to ``max_images``."""
     setup = aligned_by(ensemble, setup)
     return keep_most_informative(ensemble, setup.prior, setup.calibration)
 
 
+@one_blas_thread()
 def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
     """Images and stars collected, and the predicted precision of a calibration from them."""
     setup = aligned_by(ensemble, setup)
@@ -137,6 +140,7 @@ def solve(
     return solve_with_residuals(ensemble, setup, method, estimate, inputs, active)[0]
 
 
+@one_blas_thread()
 def solve_with_residuals(
     ensemble: Ensemble,
     setup: Setup,

@@ -13,6 +13,7 @@ from starcal_ros.records.calibration import (
     calibration_parameter_names,
     CameraGeometry,
     check_calibration,
+    check_drawable,
     Correlation,
     DetectorMaps,
     GateCheck,
@@ -64,6 +65,7 @@ __all__ = [
     'TermRemoval',
     'calibration_parameter_names',
     'check_calibration',
+    'check_drawable',
     'counted_refusal',
     'refused_image',
 ]

@@ -432,19 +432,34 @@ def check_calibration(calibration: Calibration) -> None:
     ValueError
         Naming the field and its value.
     """
-    camera = calibration.geometry.camera
     if calibration.accepted or calibration.forced:
-        check_plausible(camera)
-    elif np.abs(camera.parameters).max() > _MOST:
-        raise ValueError(f'parameters: {np.abs(camera.parameters).max():.6g} is over {_MOST:g}')
-    rotation = calibration.geometry.star_tracker_from_camera_xyzw
+        check_plausible(calibration.geometry.camera)
+    check_drawable(
+        calibration.geometry,
+        time_ns=calibration.time_ns,
+        first_image_ns=calibration.first_image_ns,
+        active_since_ns=calibration.active_since_ns,
+    )
+
+
+def check_drawable(geometry: CameraGeometry, **stamps_ns: int) -> None:
+    """
+    Check that a report can show a geometry and stamps.
+
+    Raises
+    ------
+    ValueError
+        Naming the field and its value.
+    """
+    camera = geometry.camera
+    largest, shortest_px = np.abs(camera.parameters).max(), camera.parameters[[0, 2]].min()
+    if largest > _MOST:
+        raise ValueError(f'parameters: {largest:.6g} is over {_MOST:g}')
+    if shortest_px < 1.0 / _MOST:
+        raise ValueError(f'fx, fy: {shortest_px:.6g} px is under {1.0 / _MOST:g} px')
+    rotation = geometry.star_tracker_from_camera_xyzw
     if not abs(np.linalg.norm(rotation) - 1.0) < _UNIT_TOLERANCE:
         raise ValueError(f'alignment.rotation: {rotation.tolist()} is not a unit quaternion')
-    stamps_ns = {
-        'time_ns': calibration.time_ns,
-        'first_image_ns': calibration.first_image_ns,
-        'active_since_ns': calibration.active_since_ns,
-    }
     for name, stamp_ns in stamps_ns.items():
         if not 0 <= stamp_ns <= MAX_STAMP_NS:
             raise ValueError(f'{name}: {stamp_ns} ns is not within the range of ROS stamps')

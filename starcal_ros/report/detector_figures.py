@@ -245,7 +245,7 @@ def _coloured(levels: NDArray[Any]) -> NDArray[np.uint8]:
 @functools.cache
 def _viridis() -> NDArray[np.uint8]:
     """Colours (256, 3) BGR; OpenCV makes its own table anew, in 10 ms, for each picture."""
-    shades = np.arange(256, dtype=np.uint8)
+    shades = np.arange(256, dtype=np.uint8)[:, None]  # OpenCV 5 returns another shape for (256,)
     return np.asarray(cv2.applyColorMap(shades, cv2.COLORMAP_VIRIDIS)[:, 0], np.uint8)
 
 

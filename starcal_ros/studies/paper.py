@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.assessment.term_removal import removal_study
+from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
@@ -168,6 +169,7 @@ def spread(count: int, most: int) -> tuple[int, ...]:
     return tuple(sorted({round(k) for k in np.linspace(0, most - 1, min(count, most))}))
 
 
+@one_blas_thread()
 def study(observations: Sequence[StarObservations], table1: StudyResult, seed: int) -> PaperStudy:
     """
     Results of the paper's figures from the observations of a night.

@@ -21,6 +21,7 @@ import threading
 from types import FrameType
 from typing import Any, IO, TYPE_CHECKING, TypeVar
 
+from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.safe_path import module_command
 from starcal_ros.studies.monte_carlo import Design, Row, run_trial
@@ -36,6 +37,7 @@ _CONNECT_S = 10.0
 _POLL_S = 0.2  # interval of checks for an interrupt
 _TRIES = 3  # of an item whose process ends, the last of them alone
 _AHEAD = 8  # trials submitted ahead for each worker thread of a cluster
+# One process for each processor: threads that never work would take 0.1 s each to start.
 _ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
 _ADDRESS = re.compile(r'(tcp|tls)://[^/\s]+:\d{1,5}')
 
@@ -112,6 +114,8 @@ def stream_each(
     """
     if not items:
         return
+    # Here and not in the worker processes: those of a cluster are not ours.
+    function = functools.partial(_on_one_thread, function)
     if not scheduler and workers == 0:
         for number, item in enumerate(items):
             try:
@@ -133,6 +137,12 @@ def stream_each(
             start = pickle.dumps(sys.path) + pickle.dumps(function)
             processes = stack.enter_context(contextlib.closing(_Processes(start)))
             yield from _in_processes(processes, items, min(workers, len(items)), stop)
+
+
+def _on_one_thread(function: Callable[[Item], Result], item: Item) -> Result:
+    """Result of a function, which must not depend on the threads of BLAS."""
+    with one_blas_thread():
+        return function(item)
 
 
 class _Processes:

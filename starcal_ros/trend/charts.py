@@ -31,7 +31,8 @@ def series_figure(series: Series, rows: Sequence[Row]) -> Markup:
     at = _times([rows[index] for index in series.row])
     low = float((series.value - series.sigma).min())
     high = float((series.value + series.sigma).max())
-    room = 0.06 * (high - low)
+    # A sigma below the last digit of its value leaves no range.
+    room = 0.06 * max(high - low, 1e-12 * max(abs(low), abs(high)))
     low, high = low - room, high + room + _HEADROOM * (high - low)
     offset = _offset(low, high)
     panel = Panel(_dates(at), Scale(low - offset, high - offset, _HEIGHT - _BELOW, _TOP))

@@ -9,10 +9,12 @@ import math
 from pathlib import Path
 
 import jinja2
+import numpy as np
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.products.files import write_atomically
 from starcal_ros.report.charts import Chart
+from starcal_ros.text import printable
 from starcal_ros.trend.change_points import MAX_P_VALUE, SECONDS_PER_YEAR, Term
 from starcal_ros.trend.charts import change_figure, series_figure
 from starcal_ros.trend.rows import Row
@@ -78,7 +80,7 @@ def write_page(rows: Sequence[Row], folder: Path, root: str) -> Path:
     failures = [row for row in rows if row.error]
     cameras = [_camera(name, group) for name, group in groups(rows).items()]
     text = environment.get_template('trend.html').render(
-        root=root,
+        root=printable(root),
         cameras=cameras,
         failures=[(row.path, row.error) for row in failures[:_LISTED]],
         failure_count=len(failures),
@@ -90,6 +92,7 @@ def write_page(rows: Sequence[Row], folder: Path, root: str) -> Path:
     return path
 
 
+@np.errstate(all='ignore')  # a refused camera may be wild: no line of sight is not drawn
 def _camera(name: str, group: Sequence[Row]) -> Camera:
     rows = newest_of_each(group)
     active = activations(group)

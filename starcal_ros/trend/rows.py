@@ -3,20 +3,25 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import check_shape, Count, Finite, Floats
 from starcal_ros.assessment.lookup import line_of_sight_jacobian
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.records import Calibration, CameraGeometry
+from starcal_ros.pipeline.provenance import software_version
+from starcal_ros.records import Calibration, CameraGeometry, check_drawable
+from starcal_ros.text import printable
+from starcal_ros.untrusted import check_text
 
 RECORDED, COMPUTED, FAILED = 'recorded', 'computed', 'failed'
+_LONGEST = 20_000  # characters of a text: a path has 4096, each of up to four after `printable`
+_LONGEST_ERROR = 2000
+_MOST, _LEAST = 1e15, 1e-30  # of a number whose square and its inverse must stay finite
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,7 @@ class Row:
         Source; ``recorded`` (read from a file), ``computed`` (from a bag by this version) or
         ``failed`` with its error.
     software : str
+        That made the calibration, or that failed to.
     time_ns, first_ns, last_ns : int
         Middle, first and last image.
     number, active_since_ns : int
@@ -42,12 +48,17 @@ class Row:
     width, height, images, stars : int
     residual_rms_px, temperature_degc : float
         NaN where not known.
-    names : list of str
+    names : tuple of str
         Camera parameters; ``sigmas`` has the three alignment angles (rad) too.
-    values, sigmas, star_tracker_from_camera_xyzw : list of float
-    boresight_sigma_arcsec : list of float
+    values, sigmas, star_tracker_from_camera_xyzw : tuple of float
+    boresight_sigma_arcsec : tuple of float
         About the x and the y axis of the camera, of the middle of the detector, in the star
         tracker frame.
+
+    Raises
+    ------
+    ValueError
+        In one line, for a row that the page could not show.
     """
 
     key: str
@@ -55,11 +66,11 @@ class Row:
     kind: str
     error: str = ''
     software: str = ''
-    time_ns: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
+    time_ns: Count = 0
+    first_ns: Count = 0
+    last_ns: Count = 0
     number: int = 0
-    active_since_ns: int = 0
+    active_since_ns: Count = 0
     accepted: bool = False
     forced: bool = False
     reasons: str = ''
@@ -72,21 +83,41 @@ class Row:
     stars: int = 0
     residual_rms_px: float = math.nan
     temperature_degc: float = math.nan
-    names: list[str] = dataclasses.field(default_factory=list)
-    values: list[float] = dataclasses.field(default_factory=list)
-    sigmas: list[float] = dataclasses.field(default_factory=list)
-    star_tracker_from_camera_xyzw: list[float] = dataclasses.field(default_factory=list)
-    boresight_sigma_arcsec: list[float] = dataclasses.field(default_factory=list)
+    names: tuple[str, ...] = ()
+    values: Annotated[tuple[float, ...], Finite()] = ()
+    sigmas: tuple[float, ...] = ()
+    star_tracker_from_camera_xyzw: Annotated[tuple[float, ...], Finite()] = ()
+    boresight_sigma_arcsec: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check what `trend.series` and `trend.page` rely on."""
+        for name, value in vars(self).items():
+            if isinstance(value, str) and len(check_text(value)) > _LONGEST:
+                raise ValueError(f'{name}: {len(value)} characters')
+        if self.error:
+            return
+        names = self.geometry.camera.parameter_names
+        if self.names != names:
+            raise ValueError(f'names: not {", ".join(names)}')
+        lengths = {'sigmas': len(names) + 3, 'boresight_sigma_arcsec': 2}
+        for name, length in {**lengths, 'star_tracker_from_camera_xyzw': 4}.items():
+            check_shape((len(getattr(self, name)),), (length,), name, {})
+        for number in (*self.sigmas, *self.boresight_sigma_arcsec, self.temperature_degc):
+            if abs(number) > _MOST or 0.0 < abs(number) < _LEAST:
+                raise ValueError(f'{number:.6g} is not a plausible sigma or temperature')
+        check_drawable(
+            self.geometry,
+            time_ns=self.time_ns,
+            first_ns=self.first_ns,
+            last_ns=self.last_ns,
+            active_since_ns=self.active_since_ns,
+        )
 
     @property
     def geometry(self) -> CameraGeometry:
         """Camera, without a field, and alignment."""
         camera = CameraModel(self.width, self.height, np.array(self.values), self.lens_model)
         return CameraGeometry(camera, np.array(self.star_tracker_from_camera_xyzw))
-
-    def content(self) -> dict[str, Any]:
-        """The fields by name."""
-        return dataclasses.asdict(self)
 
 
 def row_of(
@@ -99,7 +130,7 @@ def row_of(
     first_ns = calibration.first_image_ns or calibration.time_ns
     return Row(
         key=key,
-        path=path,
+        path=printable(path),
         kind=kind,
         software=calibration.provenance.get('software', ''),
         time_ns=(first_ns + calibration.time_ns) // 2,
@@ -119,13 +150,21 @@ def row_of(
         stars=calibration.stars_used,
         residual_rms_px=calibration.residual_rms_px,
         temperature_degc=temperature_degc,
-        names=list(camera.parameter_names),
-        values=camera.parameters.tolist(),
-        sigmas=calibration.sigma.tolist(),
-        star_tracker_from_camera_xyzw=(
+        names=camera.parameter_names,
+        values=tuple(camera.parameters.tolist()),
+        sigmas=tuple(calibration.sigma.tolist()),
+        star_tracker_from_camera_xyzw=tuple(
             calibration.geometry.star_tracker_from_camera_xyzw.tolist()
         ),
-        boresight_sigma_arcsec=_boresight_sigma(calibration).tolist(),
+        boresight_sigma_arcsec=tuple(_boresight_sigma(calibration).tolist()),
+    )
+
+
+def failure(key: str, path: str, error: str) -> Row:
+    """Row of a calibration or bag that this version cannot use."""
+    text = printable(' '.join(error.split()) or 'failed')
+    return Row(
+        key, printable(path), FAILED, text[:_LONGEST_ERROR], f'starcal {software_version()}'
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+import itertools
 import math
 
 import numpy as np
@@ -135,10 +136,9 @@ def activations(rows: Sequence[Row]) -> list[Active]:
     on_board = [(row.last_ns, k) for k, row in enumerate(rows) if row.accepted]
     on_board = [(since, k) for since, k in on_board if rows[k].kind != COMPUTED] or on_board
     starts = recorded or sorted(on_board)
-    ends = [since for since, _ in starts[1:]] + [0]
     return [
         Active(k, since, until, not recorded)
-        for (since, k), until in zip(starts, ends, strict=True)
+        for (since, k), (until, _) in itertools.pairwise([*starts, (0, -1)])
         if since != until
     ]
 

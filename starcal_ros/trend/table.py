@@ -8,7 +8,7 @@ crash between writing a merged file and removing its parts, counts once.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator
 import dataclasses
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -18,19 +18,24 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from starcal_ros.errors import ProductError
+from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.products.files import write_atomically
+from starcal_ros.products.json_codec import from_json, to_json
 from starcal_ros.trend.rows import Row
+from starcal_ros.untrusted import read_bytes
 
 TABLE_FOLDER = 'trend.parquet'
 _BATCH = 16  # rows in a part: what a crash can lose, a few seconds of work
 _MERGE = 64  # parts from which they are merged into one file
+_MOST_BYTES = 256 * 2**20  # of a file; a row has 0.5 kB
+_MOST_VALUES = 2**25  # of a file, repeated ones counted, which compress to nothing
 _TYPES: dict[Any, pa.DataType] = {
     str: pa.string(),
     int: pa.int64(),
     bool: pa.bool_(),
     float: pa.float64(),
-    list[str]: pa.list_(pa.string()),
-    list[float]: pa.list_(pa.float64()),
+    tuple[str, ...]: pa.list_(pa.string()),
+    tuple[float, ...]: pa.list_(pa.float64()),
 }
 SCHEMA = pa.schema(
     [
@@ -91,26 +96,31 @@ class Table:
         if len(self._parts()) >= _MERGE:
             self._merge(self.rows())
 
-    def forget_failed(self) -> None:
-        """Remove the rows of failures, so that they are tried again."""
-        kept = [row for row in self.rows() if not row.error]
-        self._merge(kept)
-        self._keys = {row.key for row in kept}
+    def forget_failed(self, but: Collection[str] = ()) -> None:
+        """Remove the rows of failures, but those of some keys that this version has tried."""
+        software = f'starcal {software_version()}'
+        rows = self.rows()
+        kept = [
+            row for row in rows if not row.error or (row.key in but and row.software == software)
+        ]
+        if len(kept) < len(rows):
+            self._merge(kept)
+            self._keys = {row.key for row in kept}
 
     def rows(self) -> list[Row]:
         """All rows on disk, in order of time."""
         found: dict[str, Row] = {}
         for part in self._parts():
             try:
-                content = pq.read_table(part, schema=SCHEMA).to_pylist()
-            except (OSError, pa.ArrowException) as error:
+                for row in _rows_of(part):
+                    found.setdefault(row.key, row)
+            # The exceptions of damaged Parquet have no common base class.
+            except Exception as error:
                 words = ' '.join(str(error).split())[:120]
                 raise ProductError(
                     f'{part}: not a table of starcal trend: {words}; remove the file to make its '
                     'rows again'
                 ) from error
-            for one in content:
-                found.setdefault(one['key'], Row(**one))
         return sorted(found.values(), key=lambda row: (row.time_ns, row.key))
 
     def _parts(self) -> list[Path]:
@@ -126,6 +136,24 @@ class Table:
         if not rows:
             return
         memory = pa.BufferOutputStream()
-        pq.write_table(pa.Table.from_pylist([row.content() for row in rows], SCHEMA), memory)
+        pq.write_table(pa.Table.from_pylist([to_json(row) for row in rows], SCHEMA), memory)
         path = self.folder / f'{uuid.uuid4().hex}.parquet'
         write_atomically(path, memory.getvalue().to_pybytes())
+
+
+def _rows_of(part: Path) -> Iterator[Row]:
+    """Rows of a file, which need not be one of ours."""
+    file = pq.ParquetFile(pa.BufferReader(read_bytes(part, _MOST_BYTES)))
+    groups = [file.metadata.row_group(k) for k in range(file.metadata.num_row_groups)]
+    if sum(g.column(k).num_values for g in groups for k in range(g.num_columns)) > _MOST_VALUES:
+        raise ValueError(f'more than {_MOST_VALUES} values')
+    for batch in file.iter_batches(_BATCH):
+        for content in batch.to_pylist():
+            yield from_json(Row, {name: _written(value) for name, value in content.items()})
+
+
+def _written(value: Any) -> Any:
+    """A value as `to_json` writes it: NaN is null; earlier versions wrote it as it is."""
+    if isinstance(value, list):
+        return [_written(item) for item in value]
+    return None if value != value else value

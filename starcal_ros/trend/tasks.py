@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import hashlib
 import math
+import os
 from pathlib import Path
 import re
 
@@ -17,16 +18,16 @@ from starcal_ros.errors import ProductError, StarcalError
 from starcal_ros.messages.types import OBSERVATIONS_TYPE
 from starcal_ros.pipeline import solve, topics
 from starcal_ros.pipeline.provenance import software_version
-from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
+from starcal_ros.pipeline.setup import files_of, load_setup, read_setup, Setup
 from starcal_ros.products.calibration_json import (
     CALIBRATION_FILE,
     prior_of,
     read_calibration,
 )
-from starcal_ros.products.files import OBSERVATIONS_FILE, read_text
+from starcal_ros.products.files import OBSERVATIONS_FILE
 from starcal_ros.records import Ensemble, StarObservations
-from starcal_ros.trend.rows import COMPUTED, FAILED, RECORDED, Row, row_of
-from starcal_ros.untrusted import json_value, PARAMETER_BYTES
+from starcal_ros.trend.rows import COMPUTED, failure, RECORDED, Row, row_of
+from starcal_ros.untrusted import json_value, regular_file
 
 _ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # of the state folder of a calibrator
 
@@ -34,16 +35,17 @@ _ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # of the state folde
 @dataclass(frozen=True)
 class Task:
     """
-    A calibration file to read, or a bag to calibrate; ``key`` is the digest of both and settings.
+    A calibration file to read, or a bag to calibrate; ``key`` is the digest of all that it reads.
 
     ``params`` is the parameter file for a bag; empty: the options and the prior in the calibration
-    beside it.
+    beside it.  ``error`` is the reason why there is no digest; empty: there is one.
     """
 
     key: str
     path: Path
     is_bag: bool
     params: str = ''
+    error: str = ''
 
 
 def find(root: Path, params: Path | None) -> Iterator[Task]:
@@ -52,27 +54,47 @@ def find(root: Path, params: Path | None) -> Iterator[Task]:
 
     A bag is a task where ``params`` is given, or where the calibration beside it was made by
     another version: its options and prior are used again.
+
+    Raises
+    ------
+    StarcalError
+        When the parameter file or a file that it names cannot be read.
     """
-    # By content: a copy counts once, and a tree may move.
     version = software_version()
-    settings = ''
+    settings: tuple[Path, ...] = ()
     if params is not None:
-        settings = hashlib.sha256(read_text(params, PARAMETER_BYTES).encode()).hexdigest()
+        settings = (params, *files_of(read_setup(params).frames))
     for path in sorted(root.rglob('*.json')):
-        if not path.is_file():
-            continue
         if path.name == CALIBRATION_FILE or _ARCHIVED.fullmatch(path.name):
-            yield Task(_digest(path, ''), path, is_bag=False)
+            yield _task(path)
     for bag in _bags(root):
-        beside = (bag if bag.is_dir() else bag.parent) / CALIBRATION_FILE
-        if params is not None and not beside.exists():
-            yield Task(_digest(bag, version + settings), bag, True, str(params))
-        elif beside.exists() and bag.name == OBSERVATIONS_FILE and _is_older(beside, version):
-            yield Task(_digest(bag, version), bag, True)
+        beside = (bag if os.path.isdir(bag) else bag.parent) / CALIBRATION_FILE
+        if params is not None and not os.path.exists(beside):
+            yield _task(bag, version, settings, str(params))
+        elif bag.name == OBSERVATIONS_FILE and _is_older(beside, version):
+            yield _task(bag, version, (beside,))
+
+
+def _task(path: Path, version: str = '', others: Sequence[Path] = (), params: str = '') -> Task:
+    """The task of a calibration file or, with the version that would calibrate it, of a bag."""
+    is_bag = bool(version)
+    try:
+        # By content: a copy counts once, a tree may move, and what is repaired is another task.
+        files = reader.files_of_bags([path]) if is_bag else (path,)
+        return Task(_digest((*files, *others), version), path, is_bag, params)
+    except OSError as error:
+        reason = f'cannot be read: {error.strerror}'
+    except (StarcalError, ValueError) as error:
+        reason = str(error)
+    return Task(
+        hashlib.sha256(f'{path!r} {reason}'.encode()).hexdigest(), path, is_bag, params, reason
+    )
 
 
 def compute(task: Task) -> Row:
     """The row of a task; of one that fails, the row with its error."""
+    if task.error:
+        return failed(task, task.error)
     try:
         if task.is_bag:
             return _calibrated(task)
@@ -88,7 +110,7 @@ def compute(task: Task) -> Row:
 
 def failed(task: Task, error: str) -> Row:
     """The row of a task that failed."""
-    return Row(task.key, str(task.path), FAILED, error=' '.join(error.split()) or 'failed')
+    return failure(task.key, str(task.path), error)
 
 
 def _calibrated(task: Task) -> Row:
@@ -119,6 +141,7 @@ def _setup_beside(bag: Path) -> Setup:
 
 
 def _is_older(calibration: Path, version: str) -> bool:
+    """True for a calibration by another version; False for none."""
     try:
         software = read_calibration(calibration).provenance.get('software', '')
     except StarcalError:
@@ -132,18 +155,19 @@ def _bags(root: Path) -> list[Path]:
     for file in sorted(root.rglob('*.mcap')):
         folder = file.parent
         # One image each: the state of a calibrator, calibrated there.
-        if folder.name == 'ensemble' or not file.is_file():
+        if folder.name == 'ensemble' or os.path.isdir(file):
             continue
-        listed = (folder / 'metadata.yaml').exists() and file.name != OBSERVATIONS_FILE
+        listed = os.path.exists(folder / 'metadata.yaml') and file.name != OBSERVATIONS_FILE
         found[folder if listed else file] = None
     return list(found)
 
 
-def _digest(path: Path, settings: str) -> str:
-    digest = hashlib.sha256(settings.encode())
-    files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
+def _digest(files: Sequence[Path], version: str) -> str:
+    digest = hashlib.sha256(version.encode())
     for file in files:
-        with file.open('rb') as stream:
+        if not os.path.lexists(file):
+            continue  # metadata.yaml of a bag, which need not be there
+        with regular_file(file) as stream:
             while block := stream.read(1 << 20):
                 digest.update(block)
     return digest.hexdigest()

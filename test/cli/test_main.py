@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Callable
+import importlib.util
 import json
 import os
 from pathlib import Path
@@ -450,6 +451,39 @@ def test_each_command_has_examples_that_it_takes() -> None:
         parser().parse_args(words[1:])  # exits where it does not understand
 
 
+@pytest.mark.slow
+def test_the_first_steps_run_in_an_empty_folder(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after `pip install`, where there is neither ROS nor the bag of the repository."""
+    monkeypatch.chdir(tmp_path)
+    *steps, demo_step = [words[1:] for name, words in examples() if not name]
+    assert [words[0] for words in steps] == ['simulate', 'calibrate', 'compare']
+    for words in steps:
+        assert run(*words)[0] == 0, words
+    assert demo_step == ['demo']
+
+
+@pytest.mark.parametrize(
+    'line', ['demo -o {t}/out', 'play {b}', 'monitor --once 1'], ids=lambda line: line.split()[0]
+)
+@pytest.mark.parametrize('missing', ['rclpy', 'starcal'])
+def test_what_needs_ros_names_it(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, missing: str
+) -> None:
+    find_spec = importlib.util.find_spec
+
+    def without(name: str) -> object:
+        if name == 'starcal.msg' and missing == 'starcal':
+            raise ModuleNotFoundError(name='starcal')
+        return None if name == missing else find_spec(name)
+
+    monkeypatch.setattr(importlib.util, 'find_spec', without)
+    result = run(*line.format(t=tmp_path, b=TINY).split())
+    assert_refused(result, missing, 'is not installed', 'starcal calibrate')
+    assert not (tmp_path / 'out').exists()
+
+
 @pytest.mark.parametrize(
     ('line', 'expected'),
     [
@@ -515,7 +549,7 @@ def test_no_older_report_stands_beside_products_that_cannot_be_drawn(
     (tmp_path / 'report.html').write_text('of earlier products')
     bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
     status, _, err = run('calibrate', bag, '--params', params, '-o', tmp_path)
-    assert status == 2 and 'the products cannot be drawn: ValueError: no such colour' in err
+    assert status == 0 and 'the products cannot be drawn: ValueError: no such colour' in err
     assert (tmp_path / 'calibration.json').is_file()
     assert not (tmp_path / 'report.html').exists()
 

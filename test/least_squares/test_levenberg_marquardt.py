@@ -159,8 +159,11 @@ def test_it_finds_the_minimum_that_scipy_finds() -> None:
         lambda x: residuals(x).ravel(), START, method='lm', xtol=1e-15, ftol=1e-15, gtol=1e-15
     )
     sigma = np.sqrt(np.diag(np.linalg.inv(reference.jac.T @ reference.jac)))
+    # Exchanging the two rates of all decays changes nothing: some versions of SciPy end there.
+    slow_first = np.argsort(reference.x[:2])
+    found, sigma = (x.reshape(-1, 2)[:, slow_first].ravel() for x in (reference.x, sigma))
     # SciPy's numerical derivatives carry it to 1e-6 sigma or so.
-    assert np.abs((solution.state - reference.x) / sigma).max() < 1e-4
+    assert np.abs((solution.state - found) / sigma).max() < 1e-4
     assert solution.normal.cost == pytest.approx(reference.cost, rel=1e-11)
     # The gradient is gone, in units in which 1-sigma steps change the cost by one half: a step
     # that promises less than 1e-13 of the cost, here 5e-6 sigma, is not taken any more.

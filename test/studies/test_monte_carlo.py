@@ -20,6 +20,7 @@ import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
 from scipy.stats import chi2
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import line_of_sight, pixel_grid
@@ -98,6 +99,18 @@ def test_a_cluster_that_is_there_gives_the_same_rows(scheduler: str) -> None:
     design = small('coverage')
     rows = workers.run_trials(design, scheduler=scheduler)
     assert summary.conclude(design, rows) == here(design)
+
+
+def blas_threads(_: int) -> int:
+    blas = [one for one in threadpool_info() if one['user_api'] == 'blas']
+    return max(int(one['num_threads']) for one in blas)
+
+
+def test_a_worker_of_a_cluster_computes_on_one_thread(scheduler: str) -> None:
+    """One without a nanny has those of its processors; this one is in our process."""
+    with threadpool_limits(2, user_api='blas'):
+        assert workers.run_each(blas_threads, 1, scheduler=scheduler) == [(0, 1)]
+        assert blas_threads(0) == 2
 
 
 def test_workers_are_reached_through_no_socket() -> None:

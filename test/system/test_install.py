@@ -17,7 +17,16 @@ from packaging.requirements import Requirement
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml', 'LICENSE', 'msg')
+SOURCES = (
+    'setup.py',
+    'setup.cfg',
+    'pyproject.toml',
+    'MANIFEST.in',
+    'package.xml',
+    'LICENSE',
+    'msg',
+)
+SDIST = 'from setuptools.build_meta import build_sdist; print(build_sdist(".."))'
 OF_EXTRAS = (
     'dask',
     'distributed',
@@ -29,23 +38,27 @@ OF_EXTRAS = (
 )
 
 
+PIP, ALONE = (sys.executable, '-m', 'pip'), ('--no-deps', '--no-index')
+
+
 def run(*command: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*map(str, command)], cwd=cwd, capture_output=True, text=True)
 
 
-def required(installed: metadata.Distribution) -> set[str]:
-    """Names of the distributions that one needs without its extras, directly or not."""
+def required(installed: metadata.Distribution, extra: str) -> set[str]:
+    """Names of the distributions that one needs with one of its extras, directly or not."""
     found: set[str] = set()
-    waiting = [installed]
+    waiting = [(installed, extra)]
     while waiting:
-        for text in waiting.pop().requires or ():
+        distribution, of_extra = waiting.pop()
+        for text in distribution.requires or ():
             requirement = Requirement(text)
-            if requirement.marker and not requirement.marker.evaluate({'extra': ''}):
+            if requirement.marker and not requirement.marker.evaluate({'extra': of_extra}):
                 continue
             name = requirement.name.lower().replace('_', '-')
             if name not in found:
                 found.add(name)
-                waiting.append(metadata.distribution(name))
+                waiting.append((metadata.distribution(name), ''))
     return found
 
 
@@ -60,36 +73,59 @@ def link_distribution(name: str, packages: Path) -> None:
 
 
 @pytest.fixture(scope='module')
-def flight_install(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """
-    An environment with starcal and the closure of its requirements, no extras and no network.
-
-    starcal is built and installed by pip; what it requires is linked from this environment.
-    """
-    folder = tmp_path_factory.mktemp('flight')
-    sources = folder / 'sources'
+def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files that a wheel is built from."""
+    sources = tmp_path_factory.mktemp('build') / 'sources'
     shutil.copytree(
         ROOT / 'starcal_ros', sources / 'starcal_ros', ignore=shutil.ignore_patterns('__pycache__')
     )
     for name in SOURCES:
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, sources / name)
+    return sources
+
+
+@pytest.fixture(scope='module')
+def wheel(sources: Path) -> Path:
+    """A wheel made from the source distribution, which must have all that it takes."""
+    folder = sources.parent
+    packed = run(sys.executable, '-c', SDIST, cwd=sources)
+    assert packed.returncode == 0, packed.stderr
+    sdist = folder / packed.stdout.splitlines()[-1]
+    built = run(*PIP, 'wheel', *ALONE, '--no-build-isolation', sdist, cwd=folder)
+    assert built.returncode == 0, built.stdout + built.stderr
+    (wheel,) = folder.glob('starcal_ros-*.whl')
+    return wheel
+
+
+def installed(wheel: Path, folder: Path, extra: str) -> Path:
+    """
+    An environment with starcal and the closure of its requirements, without network.
+
+    starcal is installed by pip; what it requires is linked from this environment.
+    """
     venv = folder / 'venv'
     made = run(sys.executable, '-m', 'venv', '--without-pip', venv, cwd=folder)
     if made.returncode:
         pytest.skip(f'no venv can be made here: {made.stderr}')
-    pip, alone = (sys.executable, '-m', 'pip'), ('--no-deps', '--no-index')
-    built = run(*pip, 'wheel', *alone, '--no-build-isolation', sources, cwd=folder)
-    assert built.returncode == 0, built.stdout + built.stderr
-    (wheel,) = folder.glob('starcal_ros-*.whl')
     to_venv = ('--python', venv / 'bin/python')
-    done = run(*pip, *to_venv, 'install', *alone, wheel, cwd=folder)
+    done = run(*PIP, *to_venv, 'install', *ALONE, wheel, cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     (packages,) = venv.glob('lib/python*/site-packages')
     (information,) = packages.glob('starcal_ros-*.dist-info')
-    for name in required(metadata.Distribution.at(information)):
+    for name in required(metadata.Distribution.at(information), extra):
         link_distribution(name, packages)
     return venv
+
+
+@pytest.fixture(scope='module')
+def flight_install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return installed(wheel, tmp_path_factory.mktemp('flight'), '')
+
+
+@pytest.fixture(scope='module')
+def report_install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return installed(wheel, tmp_path_factory.mktemp('report'), 'report')
 
 
 @pytest.mark.slow
@@ -114,14 +150,42 @@ def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_pip_lines_of_the_readme(flight_install: Path) -> None:
+def test_a_bag_is_calibrated_with_a_report(report_install: Path, tmp_path: Path) -> None:
+    """With the versions of this environment: in `make test VERSIONS=newest` those of today."""
+    tiny, bin_ = ROOT / 'bags/tiny', report_install / 'bin'
+    params = tiny / 'params.yaml'
+    done = run(bin_ / 'starcal', 'calibrate', tiny, '--params', params, '-o', 'out', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert 'look at out/report.html' in done.stdout
+    assert '<svg' in (tmp_path / 'out/report.html').read_text()
+    write = (
+        'import sys, starcal_ros; found = starcal_ros.calibrate_bag(*sys.argv[1:]);'
+        "starcal_ros.write_calibration(found, 'again.json')"
+    )
+    done = run(bin_ / 'python', '-W', 'error', '-c', write, tiny, params, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    made, again = (
+        json.loads((tmp_path / name).read_text())
+        for name in ('out/calibration.json', 'again.json')
+    )
+    assert made['accepted'] and made['intrinsics'] == again['intrinsics']
+
+
+@pytest.mark.slow
+def test_a_demo_without_ros_names_it(report_install: Path, tmp_path: Path) -> None:
+    refused = run(report_install / 'bin/starcal', 'demo', cwd=tmp_path)
+    assert refused.returncode == 2 and refused.stderr.count('\n') == 1
+    assert 'rclpy is not installed' in refused.stderr and not any(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_pip_lines_of_the_readme(sources: Path) -> None:
     """Pip accepts each line that installs from the clone, with every extra that it names."""
     lines = re.findall(r'`pip install ([^`]+)`', (ROOT / 'README.md').read_text())
     assert '.' in lines and "'.[report]'" in lines
-    pip = (sys.executable, '-m', 'pip', 'install', '--dry-run')
-    offline = ('--no-deps', '--no-index', '--no-build-isolation')
+    pip, offline = (*PIP, 'install', '--dry-run'), (*ALONE, '--no-build-isolation')
     for line in lines:
-        tried = run(*pip, *offline, *shlex.split(line), cwd=flight_install.parent / 'sources')
+        tried = run(*pip, *offline, *shlex.split(line), cwd=sources)
         assert tried.returncode == 0, tried.stderr
         assert 'does not provide the extra' not in tried.stderr
 

@@ -70,6 +70,11 @@ def test_without_activations_each_accepted_one_is_taken_as_active() -> None:
     assert [change.against for change in changes(rows, activations(rows))] == [0, 0]
 
 
+def test_refused_calibrations_alone_were_never_active() -> None:
+    rows = [made(day, accepted=False, reasons=('bad',)) for day in (1, 2)]
+    assert activations(rows) == [] and changes(rows, []) == []
+
+
 def test_a_newer_version_of_the_same_images_is_compared_and_counts_once() -> None:
     old = made(1)
     new = dataclasses.replace(made(1, (5.0, 0, 0)), kind=COMPUTED, key='new', software='starcal 9')

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import os
 from pathlib import Path
 import re
 import shutil
@@ -90,6 +92,85 @@ def test_a_bad_calibration_costs_itself(mission: Path, capsys) -> None:
     assert '1 new, 7 known before, 0 failed' in capsys.readouterr().out
     assert trend(mission, '--retry') == 0
     assert '0 new, 8 known before' in capsys.readouterr().out
+
+
+def test_a_repaired_file_has_not_failed(mission: Path, capsys) -> None:
+    (mission / '3/calibration.json').write_text('{"schema": 1}')
+    assert trend(mission) == 0
+    capsys.readouterr()
+    write(mission / '3', 3)
+    assert trend(mission) == 0
+    out = capsys.readouterr().out
+    assert '1 new, 7 known before, 0 failed' in out and 'calibration.json' not in out
+    assert 'Not calibrated' not in (mission.parent / 'out/trend.html').read_text()
+
+
+def test_a_failure_that_a_repaired_camera_file_mends_is_tried_again(tmp_path: Path, capsys):
+    """The parameters name files that decide as well, and so does the metadata of a bag."""
+    shutil.copytree(TINY, tmp_path / 'fleet/one')
+    shutil.copytree(TINY, tmp_path / 'setup')
+    camera, params = tmp_path / 'setup/camera.yaml', tmp_path / 'setup/params.yaml'
+    good = camera.read_text()
+    camera.write_text(re.sub('image_width: [0-9]+', 'image_width: 500', good))
+    line = ['trend', str(tmp_path / 'fleet'), '-o', str(tmp_path / 'out'), '--params', str(params)]
+    assert main(line) == 3 and '1 failed' in capsys.readouterr().out
+    assert main(line) == 3 and '0 failed' in capsys.readouterr().out
+    camera.write_text(good)
+    assert main(line) == 0 and '1 new, 0 known before, 0 failed' in capsys.readouterr().out
+    camera.write_text('image_width: wide')
+    assert main(line) == 2 and capsys.readouterr().err.count('\n') == 1
+
+
+def test_refused_calibrations_alone_have_a_page(mission: Path, capsys) -> None:
+    for day in range(3):
+        folder = mission / f'refused/{day}'
+        write(folder, day, child_frame='other_camera', accepted=False, reasons=('bad',))
+    assert trend(mission) == 0
+    page = (mission.parent / 'out/trend.html').read_text()
+    assert 'other_camera' in page and '11 calibrations' in page
+
+
+def test_a_path_that_is_not_utf_8_costs_nothing(mission: Path, capsys) -> None:
+    (mission / '3').rename(os.fsdecode(os.fsencode(mission) + b'/caf\xe9'))
+    bad = write(Path(os.fsdecode(os.fsencode(mission) + b'/\xff')), 9)
+    (bad / 'calibration.json').write_text('')
+    moved = mission.rename(os.fsdecode(os.fsencode(mission) + b'\xe9'))
+    assert trend(moved) == 0
+    out = capsys.readouterr().out
+    assert '8 new, 0 known before, 1 failed' in out and '\\udcff/calibration.json' in out
+    assert trend(moved) == 0 and '0 new, 9 known before, 0 failed' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('make', [os.mkfifo, Path.mkdir])
+@pytest.mark.parametrize('name', ['x.mcap', 'calibration.json'])
+def test_what_is_no_file_costs_itself(mission: Path, capsys, make, name: str) -> None:
+    (mission / 'odd').mkdir()
+    make(mission / 'odd' / name)
+    assert trend(mission, '--params', str(TINY / 'params.yaml')) == 0
+    failed = 0 if (make, name) == (Path.mkdir, 'x.mcap') else 1  # a folder for a bag
+    assert f'8 new, 0 known before, {failed} failed' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('target', ['/dev/zero', '/dev/tty', 'nowhere', 'x.mcap'])
+@pytest.mark.parametrize('with_metadata', [False, True])
+def test_a_link_to_no_file_costs_itself(mission: Path, capsys, target, with_metadata) -> None:
+    (mission / 'odd').mkdir()
+    (mission / 'odd/x.mcap').symlink_to(target)
+    if with_metadata:
+        (mission / 'odd/metadata.yaml').write_text('')
+        shutil.copy(TINY / 'tiny_0.mcap', mission / 'odd/good.mcap')
+    assert trend(mission, '--params', str(TINY / 'params.yaml')) == 0
+    expected = '9 new, 0 known before, 0 failed' if with_metadata else '8 new, 0 known before, 1 f'
+    assert expected in capsys.readouterr().out
+
+
+def test_a_calibration_that_no_page_can_show_costs_itself(mission: Path, capsys) -> None:
+    path = mission / '3/calibration.json'
+    wild = json.loads(path.read_text())
+    wild['covariance'][0][0] = 1e300
+    path.write_text(json.dumps(wild))
+    assert trend(mission) == 0
+    assert '7 new, 0 known before, 1 failed' in capsys.readouterr().out
 
 
 def test_bags_are_calibrated_with_parameters(tmp_path: Path, capsys) -> None:

@@ -18,6 +18,7 @@ from starcal_ros.bag import reader
 from starcal_ros.cli import output
 from starcal_ros.cli.arguments import EXIT_ACCEPTED, EXIT_REFUSED
 from starcal_ros.cli.commands.selection import Selection, selection
+from starcal_ros.cli.drawings import Drawings
 from starcal_ros.cli.folders import make_folder, missing_extra
 from starcal_ros.cli.output_places import check_folder
 from starcal_ros.cli.terminal import print_text, with_progress
@@ -106,10 +107,12 @@ def calibrate_into(
     topics = bag_topics.choose_topics(bags, asked, setup)
     count = bag_topics.count(bags, topics)
     album, expected = thumbnails.Album(count), ExpectedAlbum(setup)
+    drawings = Drawings()
 
     def show(image: Image, observed: StarObservations, geometry: CameraGeometry) -> None:
-        album.show(image, observed, geometry)
-        expected.show(image, observed, geometry)
+        with drawings.kind('pictures of images'):
+            album.show(image, observed, geometry)
+            expected.show(image, observed, geometry)
 
     records = bag_topics.read(bags, topics, setup, show, wanted)
     observations = list(with_progress(records, count, 'images'))
@@ -130,12 +133,15 @@ def calibrate_into(
             failure = _failure(str(error), bags, asked, setup, observations, bool(topics.image))
             _write_failure(folder, failure, expected.pictures)
             raise TooFewObservations(failure.reason) from error
-        pictures = drawn.result()
+        pictures: Sequence[thumbnails.Thumbnail] = ()
+        with drawings.kind('pictures of images'):
+            pictures = drawn.result()
         written = thread.submit(_write_all, calibration, left, pictures, folder)
         page, report = '', ''
         try:
             if with_report:
-                page, report = _drawn(calibration, left, observations, pictures, folder)
+                with drawings.kind('report'):
+                    page, report = _drawn(calibration, left, observations, pictures, folder)
         finally:
             written.result()
             if not page:  # one that is there is of the products that were replaced
@@ -274,9 +280,10 @@ def _write_failure(
     software = f'starcal {software_version()}'
     write_not_calibrated(dataclasses.replace(failure, software=software), folder)
     thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
-    try:
-        from starcal_ros.report import page
-    except ModuleNotFoundError as error:
-        missing_extra(error, 'report')  # raises where another module is missing
-    else:
-        page.write_report(folder)
+    with Drawings().kind('report'):
+        try:
+            from starcal_ros.report import page
+        except ModuleNotFoundError as error:
+            missing_extra(error, 'report')  # raises where another module is missing
+        else:
+            page.write_report(folder)

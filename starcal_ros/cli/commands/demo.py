@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 import contextlib
 from dataclasses import dataclass
+import importlib.util
 import json
 import os
 from pathlib import Path
@@ -40,6 +41,27 @@ _NODES = ('star_observer', 'calibrator')
 
 class NodeError(StarcalError):
     """A node did not start, or ended early."""
+
+
+def check_ros() -> None:
+    """
+    Check that nodes can run.
+
+    Raises
+    ------
+    NodeError
+        Where ROS, or the generated messages, cannot be imported.
+    """
+    for name in ('rclpy', 'starcal.msg'):
+        try:
+            is_there = importlib.util.find_spec(name) is not None
+        except ModuleNotFoundError:
+            is_there = False
+        if not is_there:
+            raise NodeError(
+                f'no ROS nodes here: {name} is not installed; source a ROS 2 workspace with'
+                ' starcal (README, "On a vehicle"), or calibrate without ROS: starcal calibrate'
+            )
 
 
 @dataclass(frozen=True)
@@ -138,7 +160,15 @@ def run(
 
 
 def become(command: list[str]) -> NoReturn:
-    """Replace this process; a Ctrl-C waits until the new one answers it without a traceback."""
+    """
+    Replace this process by a node; a Ctrl-C waits until that answers it without a traceback.
+
+    Raises
+    ------
+    NodeError
+        Where nodes cannot run.
+    """
+    check_ros()
     sys.stdout.flush()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

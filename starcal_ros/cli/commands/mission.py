@@ -121,9 +121,9 @@ def _trend(args: argparse.Namespace) -> int:
         raise OptionError(f'--workers: {args.workers} is not within 0 to 1024')
     make_folder(args.output)
     table = Table(args.output)
-    if args.retry:
-        table.forget_failed()
     found = list(tasks.find(args.root, args.params))
+    # A file that was repaired or removed is no longer among the tasks.
+    table.forget_failed(() if args.retry else {task.key for task in found})
     if not found:
         raise OptionError(
             f'{args.root}: no calibration.json below it, and no bag to calibrate with --params'

@@ -58,6 +58,46 @@ def test_a_failure_replaces_an_older_calibration(
     assert 'Accepted' in (out / 'report.html').read_text()
 
 
+def broken(*_: object) -> None:
+    raise TypeError('another version')
+
+
+@pytest.mark.parametrize(
+    ('place', 'missing'),
+    [
+        ('starcal_ros.report.page._context', 'report'),
+        ('starcal_ros.report.page.template', 'report'),
+        ('starcal_ros.report.pictures.thumbnails.annotate_reduced', 'pictures of images'),
+        ('starcal_ros.report.pictures.thumbnails._cut_out', 'pictures of images'),
+    ],
+)
+def test_a_drawing_that_fails_costs_the_drawing_only(
+    tmp_path: Path, capsys, monkeypatch, place: str, missing: str
+) -> None:
+    out = tmp_path / 'out'
+    monkeypatch.setattr(place, broken)
+    calibrate = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]
+    assert main.main(calibrate) == 0
+    said = capsys.readouterr()
+    assert 'verdict         accepted' in said.out
+    assert f'warning: no {missing}, ' in said.err and 'TypeError: another version' in said.err
+    assert said.err.count('\n') == 1
+    assert (out / 'report.html').exists() == (missing != 'report')
+    assert json.loads((out / 'calibration.json').read_text())['accepted']
+
+
+def test_a_failure_page_that_fails_hides_no_failure(tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr('starcal_ros.report.page.write_failure_page', broken)
+    monkeypatch.setattr('starcal_ros.report.pictures.expected._picture', broken)
+    params = params_with(tmp_path, attitude_direction='inertial_to_st')
+    out = tmp_path / 'out'
+    assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
+    words = capsys.readouterr().err.splitlines()
+    assert len(words) == 3 and 'no pictures of images' in words[0] and 'no report' in words[1]
+    assert 'Set attitude_direction: st_to_inertial.' in words[2]
+    assert (out / NOT_CALIBRATED_FILE).exists() and not (out / 'report.html').exists()
+
+
 def test_alignment_and_tracker_sigma_are_found_and_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

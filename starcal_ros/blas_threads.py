@@ -1,0 +1,50 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""BLAS on one thread while starcal computes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import contextlib
+import threading
+from typing import Any
+
+from threadpoolctl import ThreadpoolController
+
+_lock = threading.Lock()
+_inside = 0  # blocks that have begun and not ended, in all threads of the process
+_before: list[tuple[Any, int]] = []  # libraries, each with its number of threads outside
+
+
+@contextlib.contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """
+    BLAS runs on one thread within the block, and as before after it; also a decorator.
+
+    On matrices of this package's sizes several threads of BLAS wait for each other: a calibration
+    takes up to twenty times the processor time.  The number is one of the process, so blocks of
+    several threads that overlap are one: the first limits BLAS, the last restores it.
+    """
+    global _inside, _before
+    with _lock:
+        if not _inside:
+            libraries = ThreadpoolController().select(user_api='blas').lib_controllers
+            _before = [(library, library.get_num_threads()) for library in libraries]
+            _set_threads((library, 1) for library, _ in _before)
+        _inside += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _inside -= 1
+            if not _inside:
+                _set_threads(_before)
+
+
+def _set_threads(numbers: Iterable[tuple[Any, int]]) -> None:
+    for library, number in numbers:
+        # From threadpoolctl 3.8 on, only the first thread to set a number can set another; here
+        # the block that ends last may be in a different one.
+        clear = getattr(library, 'clear_controlling_thread', lambda force: None)
+        clear(force=True)
+        library.set_num_threads(number)
+        clear(force=True)
