@@ -63,7 +63,7 @@ def find(root: Path, params: Path | None) -> Iterator[Task]:
     version = software_version()
     settings: tuple[Path, ...] = ()
     if params is not None:
-        settings = (params, *files_of(read_setup(params).frames))
+        settings = (params, *files_of(read_setup(params).frames).values())
     for path in sorted(root.rglob('*.json')):
         if path.name == CALIBRATION_FILE or _ARCHIVED.fullmatch(path.name):
             yield _task(path)
