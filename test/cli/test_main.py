@@ -577,7 +577,7 @@ def test_without_ros_one_line_names_the_remedy(
         check=False,
     )
     assert done.returncode == 2 and done.stderr.count('\n') == 1, done.stderr
-    assert missing in done.stderr and 'Source the setup files of ROS 2' in done.stderr
+    assert missing in done.stderr and 'source a ROS 2 workspace' in done.stderr
 
 
 def test_parameters_of_the_nodes_are_known_to_the_tool(
