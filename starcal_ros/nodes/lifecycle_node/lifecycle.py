@@ -124,13 +124,13 @@ class StarcalNode(PrintableLog, LifecycleNode):
         return run
 
     def taking(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Return the guarded callback of an input with its messages counted."""
+        """Return the guarded callback of an input; a message counts when its callback has ended."""
         guarded = self.guarded(callback)
 
         def run(message: Any) -> None:
+            guarded(message)
             with self._counting:
                 self._taken[callback] += 1
-            guarded(message)
 
         return run
 
