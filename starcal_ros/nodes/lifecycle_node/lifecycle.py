@@ -124,7 +124,7 @@ class StarcalNode(PrintableLog, LifecycleNode):
         return run
 
     def taking(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Return the guarded callback of an input; a message counts when its callback has ended."""
+        """Return the guarded callback of an input, which counts messages when it has ended."""
         guarded = self.guarded(callback)
 
         def run(message: Any) -> None:
