@@ -7,6 +7,7 @@ NAMES = ('solver', 'ensemble', 'measure', 'calibrate', 'observer', 'gate')
 LONG = (
     'accuracy',
     'trust',
+    'worlds',
     'acquisition',
     'lost_in_space',
     'paper',

@@ -117,9 +117,8 @@ def _changed_setup(k: int, draw: np.random.Generator) -> Setup:
         found = sample.calibration().gate
         limits = [c for c in found if c.option.startswith('max_') and hasattr(gate, c.option)]
         chosen = limits[draw.integers(len(limits))]
-        if chosen.option != 'max_parameter_sigma':
-            limit: Any = draw.uniform(0, 2) * chosen.found
-            gate = dataclasses.replace(gate, **{chosen.option: limit})
+        limit: Any = draw.uniform(0, 2) * chosen.found
+        gate = dataclasses.replace(gate, **{chosen.option: limit})
     return dataclasses.replace(setup, prior=prior, gate=gate)
 
 

@@ -256,7 +256,7 @@ def _calibration(sound: Calibration, folder: Path) -> _Kind:
                 compare(sound, found)
                 line_of_sight_table(
                     found.geometry.camera,
-                    found.joint_covariance,
+                    found.map_covariance,
                     pixel_grid(found.geometry.camera, 3, 3),
                 )
 

@@ -85,7 +85,7 @@ def campaign(month: int, base: Scenario) -> Scenario:
 def calibrations(months: int = MONTHS) -> Iterator[tuple[Calibration, Ensemble]]:
     """One calibration a month with its observations; that of each January is activated."""
     base = scenario('small', seed=18)
-    options = {'star_tracker_sigma_arcsec': [3.0, 3.0, 10.0], 'residual_field': False}
+    options = {'star_tracker_sigma_arcsec': [3.0, 3.0, 10.0]}
     active, number = None, 0
     for month in range(months):
         one = campaign(month, base)

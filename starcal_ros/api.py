@@ -25,7 +25,7 @@ from starcal_ros.diagnosis.bags import aligned_by_bags
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.gate.options import GateOptions
-from starcal_ros.options import names_of, nearest
+from starcal_ros.options import names_of, unknown_option
 from starcal_ros.pipeline import solve, topics
 from starcal_ros.pipeline.provenance import inputs_of
 from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
@@ -67,6 +67,8 @@ def observations_of(
     icrf_from_star_tracker_xyzw: ArrayLike,
     catalog_id: ArrayLike | None = None,
     temperature_degc: float = float('nan'),
+    star_tracker_rate_rad_s: ArrayLike = (float('nan'),) * 3,
+    velocity_sigma_m_s: float = float('nan'),
 ) -> StarObservations:
     """
     Observations of the n stars of one image, from arrays.
@@ -91,6 +93,12 @@ def observations_of(
         found.  Without it, stars of exactly equal directions are taken as the same.
     temperature_degc : float
         Temperature of the camera; NaN if not measured.
+    star_tracker_rate_rad_s : (3,)
+        Angular rate at that time about the axes of the star tracker; NaN if not known.  A time of
+        read-out or an offset of the stamps is estimated only with it.
+    velocity_sigma_m_s : float
+        1-sigma of each component of the velocity of the observer in ``direction_icrf``; NaN: of an
+        orbit about the Earth.
 
     Returns
     -------
@@ -139,6 +147,10 @@ def observations_of(
         flux_dn=unknown,
         snr=unknown,
         temperature_degc=temperature_degc,
+        star_tracker_rate_rad_s=np.broadcast_to(
+            np.asarray(star_tracker_rate_rad_s, np.float64), (3,)
+        ),
+        velocity_sigma_m_s=velocity_sigma_m_s,
     )
 
 
@@ -174,7 +186,7 @@ def calibrate(
     known = names_of(CalibrationOptions, GateOptions)
     for name in options:
         if name not in known:
-            raise OptionError(f'{name}: no such option{nearest(name, known)}')
+            raise OptionError(unknown_option(name, known))
     setup = load_setup(options, prior=prior)
     # The caller has looked the stars up: the bundled catalog has no part in the result.
     none = dataclasses.replace(setup.catalog.select(slice(0)), digest='')

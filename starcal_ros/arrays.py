@@ -53,6 +53,12 @@ class Finite:
 Count = Annotated[int, AtLeast(0)]
 
 
+def to_digits(values: Floats, digits: int) -> Floats:
+    """Return numbers rounded to so many significant digits: texts of them are as short."""
+    rounded = [float(f'{value:.{digits - 1}e}') for value in values.ravel().tolist()]
+    return np.array(rounded, np.float64).reshape(values.shape)
+
+
 @dataclass(frozen=True)
 class FieldType:
     """

@@ -2,19 +2,59 @@
 """
 Smooth vector fields over a detector: displacements that no lens model describes.
 
-A field is a sum of products of Legendre polynomials of both pixel coordinates up to a total
-degree, one sum for each pixel axis.  The products are normalised to a mean square of 1 over the
-detector, so a coefficient is the RMS displacement of its term in pixels.
+A field is a sum of functions of the pixel, one sum for each pixel axis.  The functions are of one
+of two families:
+
+- ``cosine``: products of cosines over a domain a fifth longer than the detector, ordered by
+  wavelength.  An octave has wavelengths from its longest to half of that; the first also has
+  everything longer than the detector.  A field is as rough at the border as in the middle.
+- ``legendre``: products of Legendre polynomials up to a total degree, as older calibrations have.
+
+All functions have a mean square near 1, so a coefficient is about the RMS displacement of its
+term in pixels.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+import functools
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Indices
+
+FAMILIES = ('legendre', 'cosine')
+_DOMAIN = 1.2  # of the cosines, in sides of the detector: a field need not be flat at the border
+
+
+@functools.lru_cache(maxsize=16)
+def cosine_terms(width: int, height: int, octaves: int) -> tuple[NDArray[np.int64], Indices]:
+    """Half waves (t, 2) of the cosines along u and v, and the octave (t,) of each, ascending."""
+    most = math.ceil(_DOMAIN * 2.0**octaves * max(1.0, height / width)) + 1
+    i, j = (one.ravel() for one in np.meshgrid(np.arange(most), np.arange(most), indexing='ij'))
+    # Wave number over that of one wave along the width.
+    number = 0.5 / _DOMAIN * np.hypot(i, j * width / height)
+    octave = np.maximum(np.ceil(np.log2(np.maximum(number, 1e-9))), 0.0).astype(np.int64)
+    used = np.flatnonzero((octave < octaves) & (i + j > 0))
+    order = used[np.lexsort((number[used], octave[used]))]
+    terms = np.stack([i[order], j[order]], axis=1)
+    found = octave[order]
+    terms.setflags(write=False)
+    found.setflags(write=False)
+    return terms, found
+
+
+def _cosines(pixels: Floats, width: int, height: int, octaves: int) -> Floats:
+    terms, _ = cosine_terms(width, height, octaves)
+    along = []
+    for axis, size in enumerate((width, height)):
+        x = ((pixels[:, axis] + 0.5) / size - 0.5) / _DOMAIN + 0.5
+        waves = np.cos(np.pi * np.outer(np.arange(int(terms[:, axis].max()) + 1), x))
+        waves[1:] *= math.sqrt(2.0)
+        along.append(waves[terms[:, axis]])
+    return np.asarray((along[0] * along[1]).T)
 
 
 def degrees(total: int) -> NDArray[np.int64]:
@@ -22,22 +62,29 @@ def degrees(total: int) -> NDArray[np.int64]:
     return np.array([(d - j, j) for d in range(total + 1) for j in range(d + 1)], np.int64)
 
 
-def basis(pixels: Floats, width: int, height: int, total_degree: int) -> Floats:
-    """Return the products (n, t) of `degrees` at pixels (n, 2)."""
-    along_u, along_v = _along_axes(np.asarray(pixels, np.float64), width, height, total_degree)
-    of_u, of_v = degrees(total_degree).T
+def basis(pixels: Floats, width: int, height: int, degree: int, family: str) -> Floats:
+    """
+    Return the functions (n, t) of a family at pixels (n, 2).
+
+    ``degree`` is the total degree of Legendre polynomials, or the number of octaves of cosines.
+    """
+    pixels = np.asarray(pixels, np.float64)
+    if family == 'cosine':
+        return _cosines(pixels, width, height, degree)
+    along_u = _legendre((2.0 * pixels[:, 0] + 1.0) / width - 1.0, degree)
+    along_v = _legendre((2.0 * pixels[:, 1] + 1.0) / height - 1.0, degree)
+    of_u, of_v = degrees(degree).T
     return np.asarray((along_u[of_u] * along_v[of_v]).T)
 
 
-def _along_axes(pixels: Floats, width: int, height: int, degree: int) -> tuple[Floats, Floats]:
-    """Return the polynomials (degree + 1, n) of u and of v at pixels (n, 2)."""
-    return (
-        legendre((2.0 * pixels[:, 0] + 1.0) / width - 1.0, degree),
-        legendre((2.0 * pixels[:, 1] + 1.0) / height - 1.0, degree),
-    )
+def term_count(width: int, height: int, degree: int, family: str) -> int:
+    """Return the number of functions of `basis`."""
+    if family == 'cosine':
+        return len(cosine_terms(width, height, degree)[0])
+    return len(degrees(degree))
 
 
-def legendre(x: Floats, degree: int) -> Floats:
+def _legendre(x: Floats, degree: int) -> Floats:
     """Return the Legendre polynomials (degree + 1, n) with mean square 1 over [-1, 1]."""
     values = np.empty((degree + 1, len(x)))
     values[0] = 1.0
@@ -53,33 +100,30 @@ class DetectorField:
     """
     A displacement of every pixel: a star that the lens model places at u is measured at u + f(u).
 
-    ``coefficients`` is (2, t): px, of `degrees` of ``degree``, for u and for v.  The field is a
-    function of the measured pixel.
+    ``coefficients`` is (2, t): px, of the functions of `basis` of ``degree`` and ``family``, for u
+    and for v.  The field is a function of the measured pixel.
     """
 
     width: int
     height: int
     degree: int
     coefficients: Floats
+    family: str = 'legendre'
 
     def displacement_px(self, pixels: Floats) -> Floats:
         """Return the displacement (..., 2) at measured pixels (..., 2)."""
         pixels = np.asarray(pixels, np.float64)
         # Beyond the detector polynomials grow without limit; the field at its border stands there.
         inside = np.clip(pixels.reshape(-1, 2), -0.5, [self.width - 0.5, self.height - 0.5])
-        along_u, along_v = _along_axes(inside, self.width, self.height, self.degree)
-        of_u, of_v = degrees(self.degree).T
-        # Summed over v first: the products of both, six times as many numbers, are never formed.
-        table = np.zeros((2, self.degree + 1, self.degree + 1))
-        table[:, of_u, of_v] = self.coefficients
-        sums = [((of_axis @ along_v) * along_u).sum(axis=0) for of_axis in table]
-        return np.stack(sums, axis=-1).reshape(pixels.shape)
+        parts = [
+            self.basis(inside[k : k + _CHUNK]) @ self.coefficients.T
+            for k in range(0, max(len(inside), 1), _CHUNK)
+        ]
+        return np.concatenate(parts).reshape(pixels.shape)
+
+    def basis(self, pixels: Floats) -> Floats:
+        """Return the functions (n, t) of the field at pixels (n, 2)."""
+        return basis(pixels, self.width, self.height, self.degree, self.family)
 
 
-def in_degree(field: DetectorField, degree: int) -> Floats:
-    """Return the coefficients (2 t,), for u then for v, of a field in another degree."""
-    count = len(degrees(degree))
-    coefficients = np.zeros((2, count))
-    shared = min(count, field.coefficients.shape[1])
-    coefficients[:, :shared] = field.coefficients[:, :shared]
-    return coefficients.ravel()
+_CHUNK = 8192  # pixels at a time: their functions are a hundred times as many numbers

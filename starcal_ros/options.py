@@ -131,6 +131,37 @@ def is_of_ros(name: str) -> bool:
     return name in ('use_sim_time', 'start_type_description_service') or '.' in name
 
 
+_FIELD = 'the field over the detector is always estimated, as large as the stars show it'
+_SIGMAS = 'max_map_sigma_px and max_line_of_sight_sigma_arcsec limit all that is not determined'
+_PREDICTED = 'max_cross_validated_residual limits how far images are off what the others predict'
+REMOVED: Mapping[str, str] = {
+    'residual_field': _FIELD,
+    'max_field_p_value': _FIELD,
+    'max_field_px': 'max_change_px limits the change of the map, the field included',
+    'max_parameter_sigma': _SIGMAS,
+    'min_singular_value': _SIGMAS,
+    'min_independent_images': _SIGMAS,
+    'max_star_tracker_excess': 'max_line_of_sight_sigma_arcsec limits what a bad one leads to',
+    'max_halves_px': _PREDICTED,
+    'max_halves_rotation_arcsec': _PREDICTED,
+    'min_halves_p_value': _PREDICTED,
+    'min_model_p_value': 'errors outside of the model are estimated, whether significant or not',
+    'max_velocity_error_km_s': 'the velocity is estimated with the prior velocity_sigma_m_s, and'
+    ' max_held_term_sigma limits how far it is off',
+    'max_zero_skew_cost_px': 'zero_skew_cost_px is reported with the calibration',
+    'max_step_sigma': 'max_step_px and max_step_rotation_deg limit changes of the lines of sight',
+}
+"""Options of earlier versions, and what replaces them."""
+
+
+def unknown_option(name: str, known: Iterable[str]) -> str:
+    """Return one line for a name that is no option: what replaced it, or a similar name."""
+    said = name if name.isidentifier() and len(name) < _LONGEST_NAME else shown(name)
+    if name in REMOVED:
+        return f'{said}: not an option any more: {REMOVED[name]}; take it out'
+    return f'{said}: no such parameter{nearest(name, known)}'
+
+
 def nearest(word: str, known: Iterable[str]) -> str:
     """Suggestion for an unknown word, to append to an error message; '' without a close match."""
     # Of a word of a million letters each comparison takes seconds.

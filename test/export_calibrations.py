@@ -50,7 +50,7 @@ def calibration(
         return made
     t = len(degrees(4))
     coefficients_px = np.random.default_rng(5).normal(0, 0.03, (2, t))
-    field = ResidualField(4, coefficients_px, np.eye(p + 2 * t) * 1e-8, 0.4, 0.05)
+    field = ResidualField(4, coefficients_px, np.eye(p + 2 * t) * 1e-8)
     return dataclasses.replace(made, field=field)
 
 

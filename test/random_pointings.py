@@ -46,9 +46,10 @@ def displaced(ensemble: Ensemble, move: Callable[[Floats], Floats]) -> Ensemble:
 
 
 def estimated(given: Scenario, ensemble: Ensemble, **options: object) -> Estimate:
+    values: dict[str, object] = {'velocity_sigma_m_s': 10.0, **options}  # as with a topic
     changed = CalibrationOptions(
         star_tracker_sigma_arcsec=given.star_tracker_sigma_arcsec,
-        **options,  # type: ignore[arg-type]
+        **values,  # type: ignore[arg-type]
     )
     return estimate_calibration(ensemble, given.prior, changed)
 
@@ -63,7 +64,7 @@ def honesty(
     for _ in range(30):  # a contraction: 0.3 px over hundreds of pixels
         at = pixels - move(at)
     true = line_of_sight(camera, at)
-    table = line_of_sight_table(found.geometry.camera, found.joint_covariance, pixels)
+    table = line_of_sight_table(found.geometry.camera, found.map_covariance, pixels)
     rotation, _ = Rotation.align_vectors(true, table.direction_camera)
     error = np.linalg.norm(rotation.apply(table.direction_camera) - true, axis=1) / ARCSECOND_RAD
     rms = float(np.sqrt(np.mean(error**2)))

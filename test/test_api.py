@@ -34,6 +34,8 @@ def arrays(image: StarObservations) -> dict[str, Any]:
         'direction_icrf': image.direction_icrf,
         'icrf_from_star_tracker_xyzw': image.icrf_from_star_tracker_xyzw,
         'catalog_id': image.catalog_id,
+        'star_tracker_rate_rad_s': image.star_tracker_rate_rad_s,
+        'velocity_sigma_m_s': image.velocity_sigma_m_s,
     }
 
 
@@ -117,7 +119,7 @@ def test_options_are_checked_by_name() -> None:
         starcal_ros.calibrate(ensemble().images, SCENARIO.prior, methd='single')
     with pytest.raises(starcal_ros.OptionError, match='method: .* is not one of'):
         starcal_ros.calibrate(ensemble().images, SCENARIO.prior, method='best')
-    with pytest.raises(starcal_ros.OptionError, match='prior_alignment: no such option'):
+    with pytest.raises(starcal_ros.OptionError, match='prior_alignment: no such parameter'):
         starcal_ros.calibrate(ensemble().images, SCENARIO.prior, prior_alignment=(0, 0, 0, 1))
 
 

@@ -104,13 +104,13 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     rotation, _ = Rotation.align_vectors(new, old)
     sight_sigma_rad = _both(
         *(
-            line_of_sight_sigma_arcsec(c.geometry.camera, c.joint_covariance, GRID, GRID)
+            line_of_sight_sigma_arcsec(c.geometry.camera, c.map_covariance, GRID, GRID)
             * ARCSECOND_RAD
             for c in (a, b)
         )
     )
     shape_sigma_px = _both(
-        *(map_sigma_px(c.geometry.camera, c.joint_covariance, GRID) for c in (a, b))
+        *(map_sigma_px(c.geometry.camera, c.map_covariance, GRID) for c in (a, b))
     )
     shape_sigma_rad = shape_sigma_px / camera_a.parameters[0]
     return Comparison(

@@ -1,106 +1,60 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-A step between two parts of the detector, as between two stitched ones or two amplifiers.
+Steps of the detector: lost or shifted columns and rows.
 
-A score test as those of `model_checks`, for steps at many places along each axis.
+The field is smooth, so a step is left in the residuals near its place: on both sides of it they
+differ by its size within a strip that is narrower than the field's shortest wave.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy.special import ndtr
 
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.least_squares.linear_terms import Scalars
-from starcal_ros.least_squares.normal_equations import Measurements
-from starcal_ros.methods.assembly import score_of
-from starcal_ros.methods.problem import scalar_terms_at
 from starcal_ros.records import DetectorStep
 
 _INNER = (0.1, 0.9)  # of the detector: beyond, too few stars lie on one side
-_STEPS = 31  # places along each axis at which a step is looked for
-# Half a pixel below and above the step (31) in each of the parts between the steps (32).
-_SIDES = np.where(np.arange(_STEPS + 1) > np.arange(_STEPS)[:, None], 0.5, -0.5)
+_STEPS = 97  # places along each axis at which a step is looked for
+_STRIP = 1 / 24  # of the width: a quarter of the shortest wave of the field
 
 
-def detector_step(estimate: Estimate, measurements: Measurements) -> DetectorStep:
-    """The most significant step of the detector between two parts, by the stars that were used."""
-    problem, state = estimate.problem, estimate.state
-    camera, prior = estimate.geometry.camera, problem.field_prior
-    along = np.asarray(np.linspace(*_INNER, _STEPS), np.float64)
-    places = _Places(along * camera.width - 0.5, along * camera.height - 0.5)
-    information, between = _information(measurements, places, prior.polynomials if prior else None)
-    terms = scalar_terms_at(problem, state, measurements, places.steps, information)
-    size_px, sigma_px = score_of(
-        problem,
-        state,
-        estimate.blocks,
-        estimate.field_terms,
-        terms,
-        between @ prior.modes if prior else None,
-    ).single()
-    count = 2 * _STEPS
-    k = int(np.argmax(np.abs(size_px) / sigma_px))
-    significance = abs(float(size_px[k] / sigma_px[k]))
-    p_value = min(1.0, 2.0 * 2 * count * float(ndtr(-significance)))
-    axis, place = divmod(k % count, _STEPS)
-    return DetectorStep(
-        across='uv'[axis],
-        place_px=float(places[axis][place]),
-        moved='uv'[k // count],
-        size_px=float(size_px[k]),
-        p_value=p_value,
-    )
+def detector_step(estimate: Estimate) -> DetectorStep:
+    """Return the most significant step between two parts of the detector."""
+    kept = estimate.kept
+    camera, strip_px = estimate.geometry.camera, _STRIP * estimate.geometry.camera.width
+    residual_px = estimate.residual_px[kept]
+    weight = 2.0 / (estimate.covariance_px2[kept, 0] + estimate.covariance_px2[kept, 2])
+    best, best_significance = ('u', 0.0, 'u', 0.0), 0.0
+    for axis, size in enumerate((camera.width, camera.height)):
+        place_px: Floats = np.asarray(np.linspace(*_INNER, _STEPS), np.float64) * size - 0.5
+        pixels = estimate.table.measured_px[kept, axis]
+        before, variance_before = _means(
+            pixels, residual_px, weight, place_px - strip_px, place_px
+        )
+        after, variance_after = _means(pixels, residual_px, weight, place_px, place_px + strip_px)
+        step, sigma = after - before, np.sqrt(variance_before + variance_after)[:, None]
+        significance = np.abs(step) / sigma
+        k, moved = np.unravel_index(int(np.argmax(significance)), significance.shape)
+        if significance[k, moved] > best_significance:
+            best_significance = float(significance[k, moved])
+            best = ('uv'[axis], float(place_px[k]), 'uv'[moved], float(step[k, moved]))
+    # Twice two axes, and places that do not overlap.
+    trials = 4 * min(_STEPS, round((_INNER[1] - _INNER[0]) / _STRIP))
+    p_value = min(1.0, 2.0 * trials * float(ndtr(-best_significance)))
+    return DetectorStep(*best, p_value)
 
 
-class _Places(NamedTuple):
-    """Where steps are looked for along u and along v, (31,) each, px."""
-
-    u_px: Floats
-    v_px: Floats
-
-    def parts(self, pixels: Floats) -> Indices:
-        """Part of the detector (2, n) along u and along v of pixels (2, n), from 0 to 31."""
-        return np.stack([np.searchsorted(at, x) for at, x in zip(self, pixels, strict=True)])
-
-    def steps(self, pixels: Floats) -> Floats:
-        """Unit steps (62, n) at pixels (2, n), those along u first."""
-        return np.concatenate([_SIDES[:, part] for part in self.parts(pixels)])
-
-
-def _information(
-    measurements: Measurements, places: _Places, polynomials: Scalars | None
+def _means(
+    pixels: Floats, residual_px: Floats, weight: Floats, low_px: Floats, high_px: Floats
 ) -> tuple[Floats, Floats]:
-    """
-    Information (124, 124) of the steps, and that (124, 2 t) which they share with polynomials.
-
-    Rows and columns: of what moves u, then of what moves v.  A step is constant within the cells
-    between the places, so the weights are summed over the stars of each cell first.
-    """
-    cells = np.zeros((3, (_STEPS + 1) ** 2))
-    shared: list[Floats] = []
-    for chunk in measurements.chunks:
-        wuu, wuv, wvv = chunk.whitener
-        weights = (wuu**2, wuu * wuv, wuv**2 + wvv**2)  # uu, uv, vv
-        part = places.parts(chunk.measured_px)
-        cell = part[0] * (_STEPS + 1) + part[1]
-        cells += [np.bincount(cell, weight, cells.shape[1]) for weight in weights]
-        if polynomials is not None:
-            steps = places.steps(chunk.measured_px)
-            phi = polynomials(chunk.measured_px)
-            shared.append(np.stack([steps @ (phi * weight).T for weight in weights]))
-    by_part = cells.reshape(3, _STEPS + 1, _STEPS + 1)
-    across = _SIDES @ by_part @ _SIDES.T
-    along_u, along_v = ((_SIDES * by_part.sum(axis=k)[:, None]) @ _SIDES.T for k in (2, 1))
-    own = np.block([[along_u, across], [across.transpose(0, 2, 1), along_v]])
-    between = np.sum(shared, axis=0) if shared else np.zeros((3, 2 * _STEPS, 0))
-    return _by_axis(own), _by_axis(between)
-
-
-def _by_axis(weighted: Floats) -> Floats:
-    """Matrix (2 s, 2 t) of what moves u and v, from sums (3, s, t) with weights uu, uv, vv."""
-    uu, uv, vv = weighted
-    return np.block([[uu, uv], [uv, vv]])
+    """Weighted means (k, 2) of residuals between pixels (k,) and (k,), and their variances."""
+    order = np.argsort(pixels)
+    ends = np.searchsorted(pixels[order], np.stack([low_px, high_px]))
+    columns = np.column_stack([weight, weight[:, None] * residual_px])[order]
+    summed = np.concatenate([np.zeros((1, 3)), np.cumsum(columns, axis=0)])
+    total = summed[ends[1]] - summed[ends[0]]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        means = np.nan_to_num(total[:, 1:] / total[:, :1])
+        return means, 1.0 / total[:, 0]

@@ -94,6 +94,6 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
         colour_bp_rp=colour_bp_rp,
         measured_px=table.measured_px,
         residual_px=estimate.residual_px,
-        covariance_px2=estimate.variance.of(table.covariance_px2, table.magnitude),
+        covariance_px2=estimate.covariance_px2,
         used=estimate.kept,
     )

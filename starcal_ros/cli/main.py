@@ -238,7 +238,7 @@ def _lookup(args: argparse.Namespace) -> int:
         if not 2 <= args.points <= 2000:
             raise OptionError(f'--points: {args.points} is not in the range 2 to 2000')
         pixels = pixel_grid(camera, args.points, args.points)
-    table = line_of_sight_table(camera, calibration.joint_covariance, pixels)
+    table = line_of_sight_table(camera, calibration.map_covariance, pixels)
     write_lookup_table(table, args.output)
     print_text(f'{len(pixels)} lines of sight written to {args.output}')
     return EXIT_ACCEPTED

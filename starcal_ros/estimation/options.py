@@ -11,8 +11,8 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import ALL_PARAMETER_NAMES, parameter_names
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
+from starcal_ros.estimation.problem import METHODS
 from starcal_ros.lens import COEFFICIENTS
-from starcal_ros.methods.problem import METHODS
 from starcal_ros.options import option
 from starcal_ros.records import Ensemble
 
@@ -79,16 +79,39 @@ class CalibrationOptions:
     variance_components: bool = option(
         True, 'estimate the sigmas of centroids and star tracker again from the residuals'
     )
-    residual_field: bool = option(
-        True,
-        'estimate a smooth field over the detector beside the lens model where stars show one;'
-        ' where they do not, what they do not exclude is in the sigmas',
+    velocity_sigma_m_s: float = option(
+        -1.0,
+        "1-sigma of each component of the observer's velocity, m/s; -1: by the observations, 10"
+        ' with a velocity, 0 on the ground, and 8000 (an orbit about the Earth) without one',
+        low=-1.0,
+        high=3e5,
     )
-    max_field_p_value: float = option(
-        0.01,
-        'p-value of no field below which one is estimated; 0: no test',
+    shutter: str = option(
+        'unknown',
+        'global: all rows are exposed at once; rolling: one after the other over readout_s, the'
+        ' middle one at the stamp; unknown: the time is estimated, 20 ms 1-sigma. The star tracker'
+        ' gives the rate, images without one are taken as still',
+        choices=('global', 'rolling', 'unknown'),
+    )
+    readout_s: float = option(
+        0.0,
+        'time from the first to the last row of a rolling shutter, by the data sheet (to 1 %), s;'
+        ' negative: the last row comes first',
+        low=-10.0,
+        high=10.0,
+    )
+    stamp_sigma_s: float = option(
+        0.005,
+        '1-sigma of a constant offset of the image stamps against the attitudes, s',
         low=0.0,
-        high=1.0,
+        high=10.0,
+    )
+    star_tracker_slow_arcsec: float = option(
+        0.0,
+        '1-sigma of star-tracker errors that last longer than an image, arcsec; 0: not known, as'
+        ' large as the noise until the images show otherwise',
+        low=0.0,
+        high=3600.0,
     )
     focal_temperature_order: int = option(
         0, 'degree of the polynomial of focal length in temperature; 0: none', low=0, high=2
@@ -121,6 +144,14 @@ def check_options(options: CalibrationOptions, model: str) -> None:
         raise OptionError(
             f'star_tracker_sigma_arcsec: {list(options.star_tracker_sigma_arcsec)} has a sigma of'
             ' zero; give three, or none'
+        )
+    if options.shutter == 'rolling' and not options.readout_s:
+        raise OptionError(
+            'readout_s: not set, which shutter: rolling needs; without it, shutter: unknown'
+        )
+    if options.shutter != 'rolling' and options.readout_s:
+        raise OptionError(
+            f'readout_s: {options.readout_s:g} s, but shutter is {options.shutter}; set rolling'
         )
     names = parameter_names(model)
     for name in estimated_parameters(options, model):

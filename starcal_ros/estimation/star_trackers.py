@@ -9,7 +9,6 @@ is ``exp(-[h x]) A M``.  Of small rotations a of A, that alignment turns by ``a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
@@ -20,7 +19,7 @@ from scipy.special import stdtr
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.methods.problem import Problem, State
+from starcal_ros.estimation.problem import Problem, State
 from starcal_ros.records import Ensemble, StarTrackerAlignment
 
 _FEWEST_IMAGES = 4  # for a mean, a slope and a scatter about them
@@ -63,7 +62,6 @@ def star_tracker_alignments(
     state: State,
     covariance: Floats,
     errors: AttitudeErrors,
-    correlated_rad2: Sequence[Floats],
 ) -> tuple[StarTrackerAlignment, ...]:
     """
     Return the alignments to the star trackers of an ensemble; none where there is one only.
@@ -73,18 +71,15 @@ def star_tracker_alignments(
     names : tuple of str
         Of `star_tracker_names`.
     covariance : (3 + 3 s, 3 + 3 s)
-        Of alignment and mountings of the s further ones, errors independent in time.
+        Of alignment and mountings of the s further ones.
     errors : AttitudeErrors
         Each about the axes of its own star tracker.
-    correlated_rad2 : sequence of (3,)
-        What the correlation of the errors of each in time adds to the variance of its mean.
     """
     if problem.first_from_star_tracker is None:
         return ()
     mountings = np.concatenate([np.zeros(3), state.mountings]).reshape(-1, 3)
     A = state.camera_from_star_tracker
     found = []
-    correlated: list[Floats] = []
     for k, name in enumerate(names):
         here = problem.star_tracker == k
         assumed = problem.first_from_star_tracker[here][0] if k else Rotation.identity()
@@ -95,8 +90,6 @@ def star_tracker_alignments(
             to_mounting[:, 3 * k : 3 * k + 3] = np.eye(3)
         to_angles[:, :3] = np.eye(3)
         to_angles += to_mounting
-        R = alignment.as_matrix()
-        correlated.append(R @ np.diag(correlated_rad2[k]) @ R.T)
         of_mounting = to_mounting @ covariance @ to_mounting.T
         rate, total, p_value = _drift(errors, here)
         found.append(
@@ -104,11 +97,9 @@ def star_tracker_alignments(
                 frame=name,
                 images=int(here.sum()),
                 star_tracker_from_camera_xyzw=canonical_xyzw(alignment.inv()),
-                alignment_covariance_rad2=to_angles @ covariance @ to_angles.T + correlated[k],
+                alignment_covariance_rad2=to_angles @ covariance @ to_angles.T,
                 first_from_star_tracker_xyzw=canonical_xyzw(A.inv() * alignment),
-                mounting_covariance_rad2=of_mounting + correlated[0] + correlated[k]
-                if k
-                else of_mounting,
+                mounting_covariance_rad2=of_mounting,
                 drift_arcsec_per_hour=tuple(float(one) for one in rate),
                 drift_arcsec=total,
                 drift_p_value=p_value,

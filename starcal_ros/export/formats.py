@@ -68,7 +68,7 @@ def export(
     if kind == 'csv':
         camera = calibration.geometry.camera
         table = line_of_sight_table(
-            camera, calibration.joint_covariance, pixel_grid(camera, CSV_POINTS, CSV_POINTS)
+            camera, calibration.map_covariance, pixel_grid(camera, CSV_POINTS, CSV_POINTS)
         )
         path = folder / 'lines_of_sight.csv'
         write_lookup_table(table, path)

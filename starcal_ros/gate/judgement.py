@@ -11,11 +11,10 @@ import numpy as np
 
 from starcal_ros.assessment.agreement import Difference, difference, movement
 from starcal_ros.assessment.observability import map_sigma_px
-from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.gate.model import model_gate, star_tracker_gate
 from starcal_ros.gate.options import GateOptions, limit_check
-from starcal_ros.records import Calibration, CameraGeometry, GateCheck, HalvesComparison
+from starcal_ros.records import Calibration, CameraGeometry, GateCheck
 
 
 def judge(
@@ -55,8 +54,7 @@ def judge(
     return (
         *checks,
         *_fit(calibration, options, estimation),
-        *_halves(calibration.halves, options),
-        *model_gate(calibration.model_checks, options, estimation),
+        *model_gate(calibration.model_checks, options),
         *star_tracker_gate(calibration.star_trackers, options),
         *_precision(calibration, options),
         *_changes(calibration, prior, active, options),
@@ -107,12 +105,10 @@ def _fit(
 ) -> Iterator[GateCheck]:
     """Residuals, outliers, and the number of images and stars that fit."""
     stars = max(calibration.stars_used + calibration.stars_rejected, 1)
-    images, misfits = calibration.images_used, len(calibration.misfit_images_ns)
-    assumed_arcsec = np.array(estimation.star_tracker_sigma_arcsec)
-    estimated_arcsec = np.array(calibration.star_tracker_sigma_arcsec)
     yield limit_check(
         options, 'max_residual_rms_px', 'residual per axis', calibration.residual_rms_px, 'px'
     )
+    images, misfits = calibration.images_used, len(calibration.misfit_images_ns)
     yield limit_check(
         options,
         'max_rejected_fraction',
@@ -127,45 +123,6 @@ def _fit(
     )
     yield limit_check(estimation, 'min_images', 'number of images that fit', images - misfits)
     yield limit_check(estimation, 'min_stars', 'number of stars that fit', calibration.stars_used)
-    yield limit_check(
-        options,
-        'max_star_tracker_excess',
-        'largest ratio of estimated to assumed star-tracker sigma',
-        float((estimated_arcsec / assumed_arcsec).max())
-        if assumed_arcsec.all()
-        else 'star_tracker_sigma_arcsec is not given',
-    )
-
-
-def _halves(halves: HalvesComparison | None, options: GateOptions) -> Iterator[GateCheck]:
-    """Agreement of the calibrations of the earlier and of the later images."""
-    halves = halves or HalvesComparison(note='not recorded')
-    for name, parameter, found, unit, p_value in (
-        (
-            'change of the distortion map between the halves of the images',
-            'max_halves_px',
-            halves.shape_px,
-            'px',
-            halves.shape_p_value,
-        ),
-        (
-            'rotation between the halves of the images',
-            'max_halves_rotation_arcsec',
-            halves.rotation_arcsec,
-            'arcsec',
-            halves.p_value,
-        ),
-    ):
-        check = limit_check(options, parameter, name, halves.note or found, unit)
-        if check.passed is None:
-            yield check
-            continue
-        likely = p_value >= options.min_halves_p_value
-        note = (
-            f'the p-value is {p_value:.1g}, {"at least" if likely else "under"} '
-            f'{options.min_halves_p_value:g} (min_halves_p_value)'
-        )
-        yield dataclasses.replace(check, passed=check.passed or likely, note=note)
 
 
 def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateCheck]:
@@ -186,45 +143,19 @@ def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateC
         _map_sigma_px(calibration),
         'px',
     )
-    check = limit_check(
+    yield limit_check(
         options,
         'max_line_of_sight_sigma_arcsec',
         'largest 1-sigma of a line of sight',
         float(maps.line_of_sight_sigma_arcsec.max()),
         'arcsec',
     )
-    model = calibration.model_checks
-    if model is not None and model.correlation_time_s > 0:
-        note = f'star-tracker errors are correlated over {model.correlation_time_s:.3g} s'
-        check = dataclasses.replace(check, note=note)
-    yield check
-    names = calibration.parameter_names
-    limits = np.broadcast_to(options.max_parameter_sigma, len(names)).tolist()
-    intrinsic, angles = 5, len(calibration.geometry.camera.parameters)
-    for k, (name, sigma, limit) in enumerate(zip(names, calibration.sigma, limits, strict=True)):
-        if limit > 0:
-            unit = 'px' if k < intrinsic else '' if k < angles else 'arcsec'
-            found = float(sigma) / (ARCSECOND_RAD if unit == 'arcsec' else 1.0)
-            yield GateCheck(
-                f'1-sigma of {name}',
-                'max_parameter_sigma',
-                found,
-                limit,
-                unit,
-                found <= limit,
-            )
-    yield limit_check(
-        options,
-        'min_singular_value',
-        'smallest singular value',
-        calibration.singular_values[-1],
-    )
 
 
 def _map_sigma_px(calibration: Calibration) -> float:
     """Largest 1-sigma of the distortion map; NaN where a pixel has no line of sight."""
     try:
-        return float(map_sigma_px(calibration.geometry.camera, calibration.joint_covariance).max())
+        return float(map_sigma_px(calibration.geometry.camera, calibration.map_covariance).max())
     except np.linalg.LinAlgError:
         return math.nan
 
@@ -236,16 +167,8 @@ def _changes(
     options: GateOptions,
 ) -> Iterator[GateCheck]:
     """Changes against the prior and against the active calibration."""
-    yield limit_check(
-        options,
-        'max_zero_skew_cost_px',
-        'largest error of camera_info, which carries neither skew nor field,',
-        calibration.zero_skew_cost_px,
-        'px',
-    )
     rotation_rad, left_px = movement(prior, calibration.geometry)
     step = _step(active, calibration)
-    no_limit = '' if options.max_step_sigma > 0 else 'no limit is set'
     of_map, of_sight = 'change of the distortion map', 'rotation of the lines of sight'
     for parameter, name, found, unit in (
         ('max_change_px', f'largest {of_map} from the prior', left_px.max(), 'px'),
@@ -261,12 +184,6 @@ def _changes(
             f'{of_sight} from the active calibration',
             step if isinstance(step, str) else math.degrees(step.rotation_rad),
             'deg',
-        ),
-        (
-            'max_step_sigma',
-            'change of the estimated parameters from the active calibration',
-            no_limit or (step if isinstance(step, str) else step.total.rms_sigma),
-            'sigma',
         ),
     ):
         check = limit_check(options, parameter, name, found, unit)

@@ -6,11 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from starcal_ros.camera import CameraModel
-from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.options import option
-from starcal_ros.records import calibration_parameter_names, GateCheck
+from starcal_ros.records import GateCheck
 
 
 @dataclass(frozen=True)
@@ -50,77 +48,21 @@ class GateOptions:
     max_misfit_fraction: float = option(
         0.3, 'largest fraction of images whose attitude does not fit the others', low=0.0, high=1.0
     )
-    max_star_tracker_excess: float = option(
-        10.0,
-        'largest ratio of the estimated to the assumed star-tracker sigma, around any axis',
-        low=1.0,
-        high=1e6,
-    )
     max_line_of_sight_sigma_arcsec: float = option(
         60.0,
         'largest 1-sigma of a line of sight in the star tracker frame over the detector, arcsec',
         low=0.0,
         high=3600.0,
     )
-    max_parameter_sigma: tuple[float, ...] = option(
-        (0.0,),
-        'largest 1-sigma of fx, skew, fy, cx, cy (px), of the coefficients of the lens model, and'
-        " of the alignment around the camera's x, y, z (arcsec); 0: no limit, a single 0: none at"
-        ' all',
-        low=0.0,
-    )
-    min_singular_value: float = option(
-        1e-4,
-        'smallest singular value of the information, scaled to a unit diagonal: below it the'
-        ' estimated parameters cannot be separated',
-        low=0.0,
-        high=1.0,
-    )
-    max_zero_skew_cost_px: float = option(
-        5.0, 'largest error of the camera without skew in camera_info, px', low=0.0, high=1e5
-    )
-    max_halves_px: float = option(
-        1.0,
-        'largest difference of the distortion maps of the earlier and the later half of the'
-        ' images, common rotation removed, where it is significant, px',
-        low=0.0,
-        high=1e5,
-    )
-    max_halves_rotation_arcsec: float = option(
-        120.0,
-        'largest rotation between the two halves where it is significant, arcsec',
-        low=0.0,
-        high=648000.0,
-    )
-    min_halves_p_value: float = option(
-        1e-4,
-        'p-value below which a difference of the halves is significant: the rate at which the gate'
-        ' refuses two halves of one camera; 0: the halves are not compared',
-        low=0.0,
-        high=1.0,
-    )
-    max_field_px: float = option(
-        20.0,
-        'largest displacement of the field that is estimated beside the lens model, px; a field'
-        ' that is needed and not estimated exceeds every limit',
-        low=0.0,
-        high=1e5,
-    )
     max_held_term_sigma: float = option(
         5.0,
-        'largest distance of a camera parameter that is held, or bound by its prior, from the'
-        ' value that the stars give it, in sigma',
+        'largest distance of an unknown that is held, or has a stated prior, from the value that'
+        ' the stars give it, in sigma',
         low=0.0,
         high=1e6,
     )
     max_detector_step_px: float = option(
         0.2, 'largest step between two parts of the detector, px', low=0.0, high=1e5
-    )
-    max_velocity_error_km_s: float = option(
-        10.0,
-        'largest velocity of the observer that the aberration of the stars misses, km/s',
-        low=0.0,
-        high=1e5,
     )
     max_image_variation_px: float = option(
         0.3,
@@ -136,25 +78,12 @@ class GateOptions:
         low=1.0,
         high=100.0,
     )
-    min_independent_images: float = option(
-        0.0,
-        'smallest number of images with independent star-tracker errors that determine the'
-        ' alignment as well; 0: the loss is carried in the covariance alone',
-        low=0.0,
-        high=1e5,
-    )
     max_star_tracker_drift_arcsec: float = option(
         30.0,
         'largest drift of one of several star trackers against the stars over the images that it'
         ' gave the attitude of, arcsec',
         low=0.0,
         high=648000.0,
-    )
-    min_model_p_value: float = option(
-        1e-6,
-        'p-value below which a step, a missed velocity or a change from image to image is real',
-        low=0.0,
-        high=1.0,
     )
     max_step_px: float = option(
         10.0,
@@ -169,31 +98,6 @@ class GateOptions:
         low=0.0,
         high=180.0,
     )
-    max_step_sigma: float = option(
-        0.0,
-        'largest change against the active calibration in the sigmas of both, RMS over the'
-        ' parameters that both estimate; 0: no limit, since a significant change is the reason'
-        ' to calibrate again',
-        low=0.0,
-        high=1e6,
-    )
-
-
-def check_gate_options(options: GateOptions, camera: CameraModel) -> None:
-    """
-    Raise `OptionError` for limits that do not go with the lens model of a camera.
-
-    Raises
-    ------
-    OptionError
-        Naming the option.
-    """
-    names, count = calibration_parameter_names(camera), len(options.max_parameter_sigma)
-    if count not in (1, len(names)):
-        raise OptionError(
-            f'max_parameter_sigma: {count} numbers, but there are {len(names)} parameters with '
-            f'the lens model {camera.model}: {", ".join(names)}'
-        )
 
 
 def limit_check(

@@ -47,7 +47,7 @@ from starcal_ros.image.psf_field import Instrument, learn, MeasuredStars
 from starcal_ros.image.psf_fit import stamp_radius_px
 from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
-from starcal_ros.sky.astrometry import SiteOptions
+from starcal_ros.sky.astrometry import EARTH, SiteOptions, Velocity
 from starcal_ros.sky.catalog import StarCatalog
 
 _NEAREST = 200  # brightest predictions, searched in windows first
@@ -113,7 +113,7 @@ class Exposure:
     image: Image
     icrf_from_star_tracker_xyzw: Floats
     attitude_gap_s: float
-    velocity_m_s: Floats | None = None
+    velocity: Velocity = EARTH
     site: SiteOptions = SPACE
     hot_pixels: Indices = dataclasses.field(default_factory=lambda: NO_HOT_PIXELS.index)
     temperature_degc: float = math.nan
@@ -144,7 +144,7 @@ def observe_stars(
         search.catalog,
         options.magnitude_limit,
         math.radians(options.acquisition_radius_deg),
-        exposure.velocity_m_s,
+        exposure.velocity.m_s,
         exposure.site,
     )
     if len(prediction.catalog_index) < 4:
@@ -276,6 +276,7 @@ def _observations(
         psf_sigma_px=model.psf_sigma_px,
         catalog_digest=catalog.digest,
         temperature_degc=exposure.temperature_degc,
+        velocity_sigma_m_s=exposure.velocity.sigma_m_s,
     )
 
 

@@ -140,7 +140,7 @@ def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> P
     catalog, limit = search.catalog, search.identification.magnitude_limit
     index = cone(catalog, icrf_from_camera[:, 2], before.field_radius_rad, limit)
     index, direction_icrf = visible(
-        catalog, index, exposure.image.time_ns, exposure.velocity_m_s, exposure.site
+        catalog, index, exposure.image.time_ns, exposure.velocity.m_s, exposure.site
     )
     direction_camera = direction_icrf @ icrf_from_camera
     # Outside the field the distortion polynomial may fold back into the image.

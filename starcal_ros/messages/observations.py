@@ -111,8 +111,17 @@ def _check_image(record: StarObservations) -> None:
     low, high = _DEGC
     if not (math.isnan(record.temperature_degc) or low <= record.temperature_degc <= high):
         raise ValueError(f'temperature_degc: {record.temperature_degc:.6g} is no temperature')
-    for name in ('attitude_gap_s', 'background_dn', 'noise_dn', 'psf_sigma_px'):
-        if math.isinf(getattr(record, name)):
+    if record.velocity_sigma_m_s < 0:
+        raise ValueError(f'velocity_sigma_m_s: {record.velocity_sigma_m_s:.6g} is no sigma')
+    for name in (
+        'attitude_gap_s',
+        'background_dn',
+        'noise_dn',
+        'psf_sigma_px',
+        'star_tracker_rate_rad_s',
+        'velocity_sigma_m_s',
+    ):
+        if np.isinf(getattr(record, name)).any():
             raise ValueError(f'{name}: not finite')
     names = [record.catalog_digest, record.star_tracker, *record.refused_stars]
     if len(names) > _MOST_REASONS or max(map(len, names)) > _LONGEST_NAME:

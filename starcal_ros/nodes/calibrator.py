@@ -33,6 +33,7 @@ from starcal_ros.messages.calibration import (
     camera_info_to_message,
     mountings_to_messages,
 )
+from starcal_ros.messages.codec import record_to_message
 from starcal_ros.messages.fields import make_header
 from starcal_ros.messages.observations import checked_observations
 from starcal_ros.messages.status import status_to_message
@@ -282,10 +283,13 @@ class Calibrator(StarcalNode):
         else:
             camera = active.geometry.camera
             pixels = pixel_grid(camera, points, points)
-            table = line_of_sight_table(camera, active.joint_covariance, pixels)
+            table = line_of_sight_table(camera, active.map_covariance, pixels)
             response.header = make_header(active.active_since_ns, active.child_frame, make_message)
             for name, column in table.columns().items():
                 setattr(response, name, array.array('d', column.tobytes()))
+            response.sigma_budget = [
+                record_to_message(part, make_message) for part in active.sigma_budget
+            ]
             response.success = True
             response.message = f'{len(pixels)} lines of sight of calibration {active.number}'
         return response

@@ -8,6 +8,7 @@ import dataclasses
 from dataclasses import dataclass
 import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,6 +29,7 @@ from starcal_ros.image.image_model import saturation_level
 from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.sky.astrometry import velocity_of
 from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.sky.star_trackers import Attitude, attitudes_at
 
@@ -101,7 +103,11 @@ def observe_next(
     pixels of the image before, used or not, and another stamp is refused.
     """
     track = _after_order(track, image.time_ns)
-    known: dict[str, object] = {'temperature_degc': temperature_degc}
+    velocity = velocity_of(setup.site, velocity_m_s)
+    known: dict[str, object] = {
+        'temperature_degc': temperature_degc,
+        'velocity_sigma_m_s': velocity.sigma_m_s,
+    }
     remembered = track
     try:
         check_order(image, track.latest_ns)
@@ -125,7 +131,7 @@ def observe_next(
             flattened(_without_dark(image, setup), setup.flat, setup.dark_pedestal_dn),
             found[0].icrf_from_star_tracker_xyzw,
             found[0].gap_s,
-            velocity_m_s,
+            velocity,
             setup.site,
             hot,
             temperature_degc,
@@ -139,13 +145,14 @@ def observe_next(
         return observations, remembered
 
 
-def _known_of(attitude: Attitude) -> dict[str, object]:
+def _known_of(attitude: Attitude) -> dict[str, Any]:
     """Fields of observations that an attitude gives."""
     return {
         'icrf_from_star_tracker_xyzw': attitude.icrf_from_star_tracker_xyzw,
         'attitude_gap_s': attitude.gap_s,
         'star_tracker': attitude.star_tracker,
         'first_from_star_tracker_xyzw': attitude.first_from_star_tracker_xyzw,
+        'star_tracker_rate_rad_s': attitude.rate_rad_s,
     }
 
 
@@ -208,11 +215,7 @@ def _with_one(
         attitude_gap_s=attitude.gap_s,
     )
     observations, after = _stars(exposure, setup, before)
-    observations = dataclasses.replace(
-        observations,
-        star_tracker=name,
-        first_from_star_tracker_xyzw=attitude.first_from_star_tracker_xyzw,
-    )
+    observations = dataclasses.replace(observations, **_known_of(attitude))
     if observations.refusal:
         return observations, track
     after = dataclasses.replace(after, held=_first_at_attitude(observations, before.held, setup))
@@ -239,7 +242,7 @@ def observe(
     Observations of one image, or the record of its refusal; never raises for a bad image.
 
     ``geometry`` predicts the stars: the prior or the active calibration.  ``velocity_m_s`` (3,) is
-    the observer's barycentric velocity, ICRF axes; None: the Earth's.
+    the observer's barycentric velocity, ICRF axes; None: that of the options, else the Earth's.
     """
     return observe_next(image, attitudes, setup, Track(geometry), velocity_m_s)[0]
 

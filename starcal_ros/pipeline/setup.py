@@ -20,7 +20,7 @@ from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera_conversion import convert
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions, check_options
-from starcal_ros.gate.options import check_gate_options, GateOptions
+from starcal_ros.gate.options import GateOptions
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
 from starcal_ros.image.file_header import most_bytes, png_header, tiff_header
 from starcal_ros.image.frame_checks import ScreeningOptions
@@ -38,10 +38,10 @@ from starcal_ros.options import (
     holds_options,
     is_of_ros,
     names_of,
-    nearest,
     option,
     OptionValue,
     read_parameter_file,
+    unknown_option,
 )
 from starcal_ros.pipeline.detector_frames import read_bad_pixels, read_flat, with_bad_pixels
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
@@ -225,8 +225,7 @@ def load_setup(
     known = names_of(*OPTION_CLASSES, *others)
     for name in values:
         if name not in known and not is_of_ros(name):
-            said = name if name.isidentifier() and len(name) < 60 else shown(name)
-            raise OptionError(f'{said}: no such parameter{nearest(name, known)}')
+            raise OptionError(unknown_option(name, known))
     groups = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS.items()}
     frames: SetupOptions = groups['frames']
     _check_relative(files_of(frames))
@@ -235,7 +234,6 @@ def load_setup(
     check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
     check_site(groups['site'])
     check_options(groups['calibration'], prior.camera.model)
-    check_gate_options(groups['gate'], prior.camera)
     path = Path(frames.catalog) if frames.catalog else None
     magnitude_limit = groups['identification'].magnitude_limit
     catalog = load_catalog(path, magnitude_limit)

@@ -38,11 +38,6 @@ _REPLACED = ('geometry', 'parent_frame', 'child_frame')  # by the keys of `_Publ
 _OLD_KEYS: Mapping[str, Mapping[str, str]] = {
     '': {'in_force_since_ns': 'active_since_ns'},
     'removals': {'within_chance': 'negligible'},
-    'halves': {
-        'shape_chance': 'shape_p_value',
-        'turn_arcsec': 'rotation_arcsec',
-        'chance': 'p_value',
-    },
     'gate': {'kept': 'passed'},
 }
 

@@ -178,10 +178,12 @@ def _array(kind: FieldType, value: object, key: str, sizes: dict[str, int]) -> N
         return found
 
     found = rows(value, key, len(kind.shape))
-    try:
-        array = np.array(found, kind.dtype)
-    except OverflowError:
-        raise ValueError(f'{key}: a number is out of the range of {kind.dtype}') from None
+    array = np.array(found, np.float64 if wanted is float else np.int64)
+    if kind.dtype.kind != 'f' and array.size:
+        low, high = np.iinfo(kind.dtype).min, np.iinfo(kind.dtype).max
+        if array.min() < low or array.max() > high:
+            raise ValueError(f'{key}: a number is out of the range of {kind.dtype}')
+    array = array.astype(kind.dtype)
     if array.ndim < len(kind.shape):  # no rows: their length is not in the file
         array = array.reshape(0, *(d if isinstance(d, int) else 0 for d in kind.shape[1:]))
     check_shape(array.shape, kind.shape, key, sizes)

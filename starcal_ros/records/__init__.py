@@ -17,12 +17,16 @@ from starcal_ros.records.calibration import (
     Correlation,
     DetectorMaps,
     GateCheck,
-    HalvesComparison,
-    ResidualField,
     TemperatureTerms,
     TermRemoval,
 )
-from starcal_ros.records.model_checks import DetectorStep, HeldTerm, ModelChecks, ResidualBin
+from starcal_ros.records.model_checks import (
+    Amplitude,
+    DetectorStep,
+    HeldTerm,
+    ModelChecks,
+    ResidualBin,
+)
 from starcal_ros.records.observations import (
     AttitudeSample,
     counted_refusal,
@@ -36,6 +40,8 @@ from starcal_ros.records.observations import (
     StarObservations,
     StarRefusal,
 )
+from starcal_ros.records.residual_field import factored_field, MapCovariance, ResidualField
+from starcal_ros.records.sigma_budget import parts_that_matter, SigmaPart, TOTAL
 from starcal_ros.records.star_trackers import StarTrackerAlignment
 
 __all__ = [
@@ -43,6 +49,8 @@ __all__ = [
     'IMAGE_REFUSALS',
     'STAR_COLUMNS',
     'STAR_REFUSALS',
+    'TOTAL',
+    'Amplitude',
     'AttitudeSample',
     'Calibration',
     'CameraGeometry',
@@ -52,12 +60,13 @@ __all__ = [
     'Ensemble',
     'EnsembleStatus',
     'GateCheck',
-    'HalvesComparison',
     'HeldTerm',
     'Image',
+    'MapCovariance',
     'ModelChecks',
     'ResidualBin',
     'ResidualField',
+    'SigmaPart',
     'StarObservations',
     'StarRefusal',
     'StarTrackerAlignment',
@@ -67,5 +76,7 @@ __all__ = [
     'check_calibration',
     'check_drawable',
     'counted_refusal',
+    'factored_field',
+    'parts_that_matter',
     'refused_image',
 ]

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Count, Finite, Floats, Shape
 from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.constants import MAX_STAMP_NS
-from starcal_ros.detector_field import degrees, DetectorField
 from starcal_ros.records.model_checks import ModelChecks
+from starcal_ros.records.residual_field import MapCovariance, ResidualField
+from starcal_ros.records.sigma_budget import SigmaPart
 from starcal_ros.records.star_trackers import StarTrackerAlignment
 
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
@@ -150,72 +151,6 @@ class TermRemoval:
 
 
 @dataclass(frozen=True)
-class HalvesComparison:
-    """
-    Difference of the calibrations of the earlier and the later half of the images.
-
-    Attributes
-    ----------
-    shape_px, shape_p_value : float
-        Largest change of a line of sight, common rotation removed, px at the focal length; and the
-        p-value of the difference of the camera parameters.
-    rotation_arcsec, p_value : float
-        The common rotation; and the p-value of the difference of camera and alignment together.
-    note : str
-        Why the halves were not compared; empty where they were.  The numbers are NaN then.
-    """
-
-    shape_px: float = math.nan
-    shape_p_value: float = math.nan
-    rotation_arcsec: float = math.nan
-    p_value: float = math.nan
-    note: str = ''
-
-
-@dataclass(frozen=True)
-class ResidualField:
-    """
-    Field over the detector beside the lens model.
-
-    With coefficients of zero none was found; its covariance is that of what no star excludes.
-
-    Attributes
-    ----------
-    degree : int
-        Of its polynomials (`detector_field.degrees`).
-    coefficients : (2, t)
-        px, for u and for v; a star that the lens model places at u is measured at u + f(u).
-    joint_covariance : (p + 2 t, p + 2 t)
-        Of the parameters of the calibration and the coefficients of u, then of v.
-    length : float
-        Length of the field, in half lengths of the longer side of the detector.
-    amplitude_px : float
-        Its prior 1-sigma per axis.
-    """
-
-    degree: Count
-    coefficients: Annotated[Floats, Finite(), Shape((2, 'terms'))]
-    joint_covariance: Annotated[Floats, Finite(), Shape(('joint', 'joint'))]
-    length: float
-    amplitude_px: float
-
-    def on(self, width: int, height: int) -> DetectorField:
-        """
-        Return the field on a detector of a size.
-
-        Raises
-        ------
-        ValueError
-            When the coefficients are not those of the degree.
-        """
-        expected = len(degrees(self.degree))
-        if self.coefficients.shape[1] != expected:
-            found = self.coefficients.shape[1]
-            raise ValueError(f'field.coefficients: {found} for an axis, not {expected}')
-        return DetectorField(width, height, self.degree, self.coefficients)
-
-
-@dataclass(frozen=True)
 class GateCheck:
     """
     One check of the gate.
@@ -329,12 +264,12 @@ class Calibration:
         When it was activated, or activated again by a roll-back; 0 for a candidate.
     forced : bool
         Activated by request despite the gate.
-    halves : HalvesComparison or None
-        None where not recorded.
     star_trackers : tuple of StarTrackerAlignment
         The first one, that of ``geometry``, and the others; empty where there is one only.
     gate : tuple of GateCheck
         The checks of the gate; empty where not recorded.
+    sigma_budget : tuple of SigmaPart
+        The total, then the causes; empty where not recorded.
 
     Raises
     ------
@@ -377,11 +312,11 @@ class Calibration:
     number: Count = 0
     active_since_ns: int = 0
     forced: bool = False
-    halves: HalvesComparison | None = None
     star_trackers: tuple[StarTrackerAlignment, ...] = ()
     model_checks: ModelChecks | None = None
     field: ResidualField | None = None
     gate: tuple[GateCheck, ...] = ()
+    sigma_budget: tuple[SigmaPart, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the size of the covariance."""
@@ -394,9 +329,8 @@ class Calibration:
             camera = self.geometry.camera
             detector_field = self.field.on(camera.width, camera.height)
             count = p + detector_field.coefficients.size
-            if len(self.field.joint_covariance) != count:
-                rows = len(self.field.joint_covariance)
-                raise ValueError(f'field.joint_covariance: {rows} rows, not {count}')
+            if self.field.rows != count:
+                raise ValueError(f'field: covariance of {self.field.rows} rows, not {count}')
             camera = dataclasses.replace(camera, field=detector_field)
             geometry = dataclasses.replace(self.geometry, camera=camera)
             object.__setattr__(self, 'geometry', geometry)
@@ -407,9 +341,16 @@ class Calibration:
         return self.geometry.camera.parameter_names + ALIGNMENT_NAMES
 
     @property
+    def map_covariance(self) -> MapCovariance:
+        """Covariance of lines of sight, by `parameter_names` and the coefficients of a field."""
+        if self.field is None:
+            return MapCovariance(self.covariance)
+        return MapCovariance(self.field.covariance, self.field.unresolved_px)
+
+    @property
     def joint_covariance(self) -> Floats:
         """Covariance of `parameter_names`, then of the coefficients of a field."""
-        return self.covariance if self.field is None else self.field.joint_covariance
+        return self.map_covariance.matrix
 
     @property
     def sigma(self) -> Floats:

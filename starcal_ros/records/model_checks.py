@@ -47,13 +47,14 @@ class DetectorStep:
 @dataclass(frozen=True)
 class ResidualBin:
     """
-    Residuals of images that the other images predict, in a part of the data.
+    Residuals of what the others predict, in a part of the data.
 
     Attributes
     ----------
     by : str
         ``radius`` (px from the middle of the detector), ``magnitude`` or ``image`` (its number in
-        order of time).
+        order of time) for images that others predict; ``star`` (its number of images) or ``cell``
+        (px from the middle) for sums over stars and cells of the detector.
     low, high : float
         Of the part.
     stars : int
@@ -72,48 +73,49 @@ class ResidualBin:
 
 
 @dataclass(frozen=True)
-class ModelChecks:
+class Amplitude:
     """
-    Tests of the model that the calibration assumes.
+    An estimated amplitude of errors that the model does not describe.
 
     Attributes
     ----------
-    field_p_value : float
-        Probability of the residuals if the lens model describes the lens; NaN where not tested.
-    field_rms_px, field_worst_px : float
-        Field that was estimated beside the lens model, RMS per axis and largest length over the
-        detector; 0 where none was needed.
-    held : tuple of HeldTerm
-    step : DetectorStep
-    velocity_error_km_s, velocity_sigma_km_s, velocity_p_value : float
-        Velocity of the observer that the aberration of the stars misses, its largest 1-sigma, and
-        the p-value of none.
-    image_variation_px, image_variation_p_value : float
-        1-sigma change of the camera from image to image in a corner, carried in the covariance;
-        and the p-value of none.
-    correlation_time_s, independent_images : float
-        Of the star-tracker errors: 0 where they are independent; and how many independent images
-        determine the alignment as well.
-    pointings : int
-        Number of different pointings.
-    independent_pointings : float
-        Number of images; one that repeats the stars of others counts by its new information.
-    cross_validation : tuple of ResidualBin
-        Empty where it was not made: fewer than four images, or an older calibration.
+    name : str
+    value : float
+        1-sigma, in ``unit``.
+    unit : str
+    likelihood_ratio : float
+        Twice the log likelihood against none; it decides nothing.
     """
 
-    field_p_value: float
+    name: str
+    value: float
+    unit: str
+    likelihood_ratio: float
+
+
+@dataclass(frozen=True)
+class ModelChecks:
+    """
+    What the data show beyond the model and its priors.
+
+    Attributes
+    ----------
+    field_rms_px, field_worst_px : float
+        Field beside the lens model, RMS per axis and largest length over the detector.
+    held : tuple of HeldTerm
+        Unknowns that are held, or that have a stated prior.
+    step : DetectorStep
+    image_variation_px : float
+        1-sigma change of the camera from image to image in a corner, carried in the covariance.
+    amplitudes : tuple of Amplitude
+    predictions : tuple of ResidualBin
+        Empty where they were not made: fewer than four images, or an older calibration.
+    """
+
     field_rms_px: float
     field_worst_px: float
     held: tuple[HeldTerm, ...]
     step: DetectorStep
-    velocity_error_km_s: float
-    velocity_sigma_km_s: float
-    velocity_p_value: float
     image_variation_px: float
-    image_variation_p_value: float
-    correlation_time_s: float
-    independent_images: float
-    pointings: int
-    independent_pointings: float
-    cross_validation: tuple[ResidualBin, ...] = ()
+    amplitudes: tuple[Amplitude, ...] = ()
+    predictions: tuple[ResidualBin, ...] = ()

@@ -163,6 +163,12 @@ class StarObservations:
         Which catalog the identifiers refer to.
     temperature_degc : float
         Temperature of the camera; NaN if unknown.
+    star_tracker_rate_rad_s : (3,)
+        Angular rate at ``time_ns`` by the attitude samples, in the frame of the first star
+        tracker; NaN if unknown.
+    velocity_sigma_m_s : float
+        1-sigma of each component of the observer's velocity in ``direction_icrf``; 0 for a site on
+        the ground, NaN where none was given and the Earth's was taken.
     """
 
     time_ns: int
@@ -198,6 +204,10 @@ class StarObservations:
     refused_reason: Annotated[NDArray[np.uint8], Shape(('m',))] = dataclasses.field(
         default_factory=lambda: np.empty(0, np.uint8)
     )
+    star_tracker_rate_rad_s: Annotated[Floats, Shape((3,))] = dataclasses.field(
+        default_factory=lambda: np.full(3, math.nan)
+    )
+    velocity_sigma_m_s: float = math.nan
 
     def __len__(self) -> int:
         """Return the number of stars."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.products.calibration_json import prior_of
-from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.records import Calibration, parts_that_matter, StarObservations
 from starcal_ros.report import detector_figures, figures
 
 
@@ -80,6 +80,13 @@ def charts_of(
                 f'1-sigma of the line of sight of each pixel, {text}: '
                 f'{sigma.min():.4g}″ to {sigma.max():.4g}″. The colours start at zero.',
             )
+    if calibration.sigma_budget:
+        charts['budget'] = Chart(
+            'Causes of the uncertainty',
+            figures.sigma_budget(parts_that_matter(calibration.sigma_budget)),
+            'Share of the variance of a line of sight, over the detector, that would be gone if '
+            'the cause were known exactly.',
+        )
     if len(calibration.removals) > 1:
         insignificant = [r.removed for r in calibration.removals[1:] if r.negligible]
         charts['terms'] = Chart(

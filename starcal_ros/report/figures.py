@@ -13,8 +13,8 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.least_squares.normal_equations import whitening
-from starcal_ros.records import CameraGeometry, StarObservations, TermRemoval
+from starcal_ros.estimation.star_equations import whitening
+from starcal_ros.records import CameraGeometry, SigmaPart, StarObservations, TermRemoval
 from starcal_ros.report import svg
 from starcal_ros.report.pictures.annotation import predicted_px
 from starcal_ros.report.svg import INK, MUTED, Panel, Scale, SERIES
@@ -253,6 +253,31 @@ def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Ma
         panel.marks(minutes[misfit], error[misfit], SERIES[1], 'cross', 4.0)
         panels.append(panel)
     return svg.chart(panels, _TOP + 3 * high + 28 + _BELOW)
+
+
+def sigma_budget(parts: Sequence[SigmaPart]) -> Markup:
+    """Share of the variance by cause as horizontal bars; the first part is the total."""
+    total, causes = parts[0], parts[1:]
+    bottom = max(_TOP + 24.0 + 34.0 * len(causes), _HEIGHT - _BELOW)
+    panel = Panel(
+        Scale(0.0, 100.0, _LEFT + 110.0, _RIGHT), Scale(len(causes) - 0.5, -0.9, bottom, _TOP)
+    )
+    panel.axes('share of the variance (%)', '')
+    shares = (
+        ('camera alone', SERIES[0], [part.map_arcsec / total.map_arcsec for part in causes]),
+        (
+            'with alignment',
+            SERIES[1],
+            [part.pointing_arcsec / total.pointing_arcsec for part in causes],
+        ),
+    )
+    for k, part in enumerate(causes):
+        y = float(panel.y(float(k))) + 4.0
+        panel.parts.append(svg.words_at(_LEFT + 104.0, y, part.cause, 'end'))
+        for (_, colour, values), shift in zip(shares, (-0.14, 0.14), strict=True):
+            panel.line([0.0, 100.0 * values[k] ** 2], [k + shift, k + shift], colour, 8.0)
+    panel.legend(*((name, colour, 'line') for name, colour, _ in shares))
+    return svg.chart([panel], bottom + _BELOW)
 
 
 def term_worth(removals: Sequence[TermRemoval]) -> Markup:

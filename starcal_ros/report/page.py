@@ -28,8 +28,8 @@ from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import ProductError
 from starcal_ros.estimation.star_trackers import summary as tracker_summary
+from starcal_ros.estimation.temperature import summary as thermal_summary
 from starcal_ros.messages.types import OBSERVATIONS_TYPE
-from starcal_ros.model_errors.temperature import summary as thermal_summary
 from starcal_ros.products.calibration_json import CALIBRATION_FILE, prior_of, read_calibration
 from starcal_ros.products.camera_yaml import CAMERA_INFO_FILE
 from starcal_ros.products.files import OBSERVATIONS_FILE, REPORT_FILE, write_atomically

@@ -18,7 +18,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.bag.places import check_replaceable
 from starcal_ros.bag.writer import BagWriter
 from starcal_ros.camera import CameraModel
-from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.products.camera_yaml import write_camera_info
 from starcal_ros.products.files import write_atomically
 from starcal_ros.records import AttitudeSample, CameraGeometry
@@ -31,9 +31,11 @@ from starcal_ros.simulation.centroids import (
 from starcal_ros.simulation.images import images
 from starcal_ros.simulation.mistakes import Mistakes, NO_MISTAKES
 from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenes
+from starcal_ros.sky.astrometry import observer_at
 
 IMAGE_TOPIC = '/opnav/image_raw'
 ATTITUDE_TOPIC = '/star_tracker/attitude'
+VELOCITY_TOPIC = '/spacecraft/velocity'
 
 
 @dataclass(frozen=True)
@@ -141,10 +143,10 @@ def write_bag(
         for index, image in enumerate(images(scenario)):
             samples = attitude_samples(scenario, index)
             for sample in (s for s in samples if s.time_ns <= image.time_ns):
-                _write_attitude(writer, sample, mistakes)
+                _write_telemetry(writer, sample, mistakes)
             writer.write_image(IMAGE_TOPIC, mistakes.image(image), 'camera')
             for sample in (s for s in samples if s.time_ns > image.time_ns):
-                _write_attitude(writer, sample, mistakes)
+                _write_telemetry(writer, sample, mistakes)
             on_image(index)
         # Just before the bag replaces an older one, so that they replace theirs together.
         write_atomically(truth, truth_text)
@@ -153,7 +155,10 @@ def write_bag(
     return SimulatedBag(path, truth, params, camera)
 
 
-def _write_attitude(writer: BagWriter, sample: AttitudeSample, mistakes: Mistakes) -> None:
+def _write_telemetry(writer: BagWriter, sample: AttitudeSample, mistakes: Mistakes) -> None:
+    # The Earth's, which the simulated directions have.
+    velocity_m_s = observer_at(sample.time_ns).velocity_c * SPEED_OF_LIGHT_M_S
+    writer.write_velocity(VELOCITY_TOPIC, sample.time_ns, velocity_m_s, 'icrf')
     quaternion = mistakes.attitude(sample.icrf_from_star_tracker_xyzw)
     writer.write_attitude(ATTITUDE_TOPIC, sample.time_ns, quaternion, 'icrf')
 
@@ -166,5 +171,6 @@ def parameters(scenario: Scenario, camera_url: str) -> dict[str, object]:
         'star_tracker_frame': 'star_tracker',
         'camera_frame': 'camera',
         'star_tracker_sigma_arcsec': list(scenario.star_tracker_sigma_arcsec),
+        'shutter': 'global',
     }
     return {'/**': {'ros__parameters': values}}

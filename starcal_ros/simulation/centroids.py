@@ -8,6 +8,8 @@ Simulated centroids without pixels, and Cramer-Rao bounds.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from starcal_ros.arrays import Floats
@@ -15,6 +17,7 @@ from starcal_ros.camera import CameraModel, project_jacobians
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.simulation.images import pixel_stamps
 from starcal_ros.simulation.scenario import (
+    attitude_samples,
     CENTROID_STREAM,
     Detector,
     random_stream,
@@ -23,6 +26,8 @@ from starcal_ros.simulation.scenario import (
     scene,
     scenes,
 )
+from starcal_ros.sky.astrometry import GIVEN_SIGMA_M_S
+from starcal_ros.sky.attitude import rate_between
 from starcal_ros.sky.catalog import StarCatalog
 
 BOUND_SNR = 5.0
@@ -55,8 +60,13 @@ def true_observations(
     for index in range(scenario.image_count):
         shown = scene(scenario, index, catalog, attitude_noise)
         rng = random_stream(scenario.seed, CENTROID_STREAM, index)
+        observed = _observations(
+            scenario, shown, centroid_sigma_px, snr_limit, centroid_noise, rng
+        )
+        # All samples about an image have one error.
+        _, before, after, _ = attitude_samples(scenario, index)
         ensemble = ensemble.add(
-            _observations(scenario, shown, centroid_sigma_px, snr_limit, centroid_noise, rng)
+            dataclasses.replace(observed, star_tracker_rate_rad_s=rate_between(before, after))
         )
     return ensemble
 
@@ -104,6 +114,7 @@ def _observations(
         noise_dn=detector.noise_electrons / detector.electrons_per_dn,
         psf_sigma_px=detector.psf_sigma_px,
         catalog_digest=shown.catalog_digest,
+        velocity_sigma_m_s=GIVEN_SIGMA_M_S,
     )
     return every.select(inside.all(axis=1) & (snr > snr_limit))
 

@@ -71,6 +71,46 @@ class SiteOptions:
         low=3.0,
         high=90.0,
     )
+    observer_velocity_m_s: tuple[float, ...] = option(
+        (0.0, 0.0, 0.0),
+        'velocity of the observer about the solar-system barycentre along ICRF axes where no'
+        " velocity message gives it, m/s; zeros: the Earth's, with a sigma of an orbit about it",
+        low=-1e6,
+        high=1e6,
+        length=3,
+    )
+
+
+@dataclass(frozen=True)
+class Velocity:
+    """
+    Barycentric velocity of the observer, ICRF axes.
+
+    Attributes
+    ----------
+    m_s : (3,) or None
+        None: that of the Earth.
+    sigma_m_s : float
+        1-sigma of each component; NaN where none was given and the Earth's was taken.
+    """
+
+    m_s: Floats | None = None
+    sigma_m_s: float = math.nan
+
+
+EARTH = Velocity()
+"""The Earth's in place of one that is not known."""
+# Of telemetry: the last sample may be a second old, in which an orbit turns it by as much.
+GIVEN_SIGMA_M_S = 10.0
+
+
+def velocity_of(site: SiteOptions, measured_m_s: Floats | None) -> Velocity:
+    """Velocity of the observer, from a message (3,) or None, or else from the options."""
+    if site.observer == 'ground':
+        return Velocity(None, 0.0)
+    if measured_m_s is None and any(site.observer_velocity_m_s):
+        measured_m_s = np.array(site.observer_velocity_m_s)
+    return EARTH if measured_m_s is None else Velocity(measured_m_s, GIVEN_SIGMA_M_S)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from array import array
 import bisect
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 import threading
@@ -175,11 +176,29 @@ class AttitudeHistory:
         ImageRefused
             ``no_attitude``, ``bad_attitude`` or ``attitude_gap``.
         """
+        return self._found(lambda run: run.around(time_ns, max_gap_s))
+
+    def rate_at(self, time_ns: int, max_gap_s: float) -> Floats:
+        """
+        Angular rate (3,) at a time in the star tracker frame, rad/s; NaN where it is not known.
+
+        From the samples on both sides; where one has exactly this stamp, from it and the one
+        before.
+        """
+        try:
+            return rate_between(*self._found(lambda run: run.step_to(time_ns, max_gap_s)))
+        except ImageRefused:
+            return np.full(3, math.nan)
+
+    def _found(
+        self, look_up: Callable[[_Run], tuple[AttitudeSample, AttitudeSample]]
+    ) -> tuple[AttitudeSample, AttitudeSample]:
+        """Samples of the most recently extended run that has them."""
         refusals = []
         with self._lock:
             for run in reversed(self._runs):
                 try:
-                    return run.around(time_ns, max_gap_s)
+                    return look_up(run)
                 except ImageRefused as refused:
                     refusals.append(refused)
         if not refusals:
@@ -265,8 +284,32 @@ class _Run:
         gap_s = (self._times_ns[k] - self._times_ns[k - 1]) / NANOSECONDS_PER_SECOND
         raise ImageRefused('attitude_gap', f'{gap_s:.3f} s between samples, over {max_gap_s:g} s')
 
+    def step_to(self, time_ns: int, max_gap_s: float) -> tuple[AttitudeSample, AttitudeSample]:
+        """
+        Return two samples next to each other, the second one at or after a time.
+
+        That of the stamp itself needs no sample after it, which a node may not have yet.
+        """
+        before, after = self.around(time_ns, max_gap_s)
+        if before is not after:
+            return before, after
+        low, k = self._index(time_ns - _nanoseconds(max_gap_s)), self._index(time_ns)
+        valid = self._valid(low, k).nonzero()[0]
+        if not len(valid):
+            raise ImageRefused('no_attitude', 'no attitude sample before that of the image')
+        return self._sample(low + int(valid[-1])), after
+
     def _sample(self, k: int) -> AttitudeSample:
         return AttitudeSample(self._times_ns[k], np.array(self._xyzw[4 * k : 4 * k + 4]))
+
+
+def rate_between(before: AttitudeSample, after: AttitudeSample) -> Floats:
+    """Angular rate (3,) between two samples in the star tracker frame, rad/s."""
+    from scipy.spatial.transform import Rotation  # half of the start of a short command
+
+    first, last = (Rotation.from_quat(s.icrf_from_star_tracker_xyzw) for s in (before, after))
+    step_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
+    return np.asarray((first.inv() * last).as_rotvec() / step_s)
 
 
 def _between(before: AttitudeSample, after: AttitudeSample, time_ns: int) -> Floats:

@@ -39,6 +39,8 @@ class Attitude:
         Of the first star tracker.
     gap_s : float
         Between the two samples about the image.
+    rate_rad_s : (3,)
+        Angular rate of the first star tracker in its frame; NaN where it is not known.
     star_tracker : str
         Frame of the star tracker that gave it; empty: the first.
     first_from_star_tracker_xyzw : (4,)
@@ -47,6 +49,7 @@ class Attitude:
 
     icrf_from_star_tracker_xyzw: Floats
     gap_s: float
+    rate_rad_s: Floats
     star_tracker: str = ''
     first_from_star_tracker_xyzw: Floats = field(default_factory=lambda: IDENTITY_XYZW)
 
@@ -74,7 +77,7 @@ def attitudes_at(
     found: list[Attitude] = []
     refusal: ImageRefused | None = None
     try:
-        found.append(Attitude(*first.at(time_ns, max_gap_s)))
+        found.append(Attitude(*first.at(time_ns, max_gap_s), first.rate_at(time_ns, max_gap_s)))
     except ImageRefused as refused:
         refusal = refused
     for history, mounting in zip(others, mountings, strict=True):
@@ -84,8 +87,15 @@ def attitudes_at(
             continue
         mounted = Rotation.from_quat(mounting.first_from_star_tracker_xyzw)
         first_xyzw = (Rotation.from_quat(quaternion) * mounted.inv()).as_quat()
+        rate_rad_s = mounted.apply(history.rate_at(time_ns, max_gap_s))
         found.append(
-            Attitude(first_xyzw, gap_s, mounting.frame, mounting.first_from_star_tracker_xyzw)
+            Attitude(
+                first_xyzw,
+                gap_s,
+                rate_rad_s,
+                mounting.frame,
+                mounting.first_from_star_tracker_xyzw,
+            )
         )
     if refusal is not None and not found:
         raise refusal

@@ -278,7 +278,7 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
                 names = calibration_parameter_names(estimate.geometry.camera)
                 yield {
                     **row,
-                    'reported_px': map_bound_px(estimate.geometry.camera, estimate.covariance),
+                    'reported_px': map_bound_px(estimate.geometry.camera, estimate.map_covariance),
                     'bound_px': least,
                     'rejected': int((~estimate.kept).sum()),
                     **{

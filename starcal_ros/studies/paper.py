@@ -25,8 +25,8 @@ from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.least_squares.normal_equations import squared_sigmas, star_table
-from starcal_ros.methods.problem import METHODS
+from starcal_ros.estimation.problem import METHODS
+from starcal_ros.estimation.star_equations import squared_sigmas, star_table
 from starcal_ros.pipeline.observe import observe
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Ensemble, StarObservations, TermRemoval
@@ -119,8 +119,11 @@ def setup_of(seed: int) -> Setup:
     values: dict[str, object] = {
         'estimate': PAPER_ESTIMATE,
         'principal_point_prior': 0.0,
-        'residual_field': False,
         'star_tracker_sigma_arcsec': night.star_tracker_sigma_arcsec,
+        # Of the scenario: the directions have the velocity of the Earth.
+        'velocity_sigma_m_s': 0.0,
+        'shutter': 'global',
+        'stamp_sigma_s': 0.0,
     }
     return load_setup(values, prior=night.prior)
 

@@ -26,8 +26,8 @@ from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, proj
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.least_squares.normal_equations import arrange, normal_blocks, star_table
-from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
+from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
+from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, StarObservations
 from starcal_ros.simulation.scenario import Scenario, scenario
 
 CENTROID_SIGMA_PX = 0.1
@@ -169,6 +169,7 @@ def observe(field: StarField, tracker_arcsec: float, outlier_share: float = 0.0)
             noise_dn=1.0,
             psf_sigma_px=1.0,
             catalog_digest='',
+            velocity_sigma_m_s=0.0,
         )
         for k, quaternion in enumerate(reported.as_quat())
     ]
@@ -187,7 +188,7 @@ def information_blocks(field: StarField) -> Floats:
     return blocks[:, :13, :13]
 
 
-def bound(method: str, blocks: Floats, tracker_arcsec: float) -> Floats:
+def bound(method: str, blocks: Floats, tracker_arcsec: float) -> MapCovariance:
     """
     Cramer-Rao bound (13, 13) under the assumptions of a method.
 
@@ -201,19 +202,19 @@ def bound(method: str, blocks: Floats, tracker_arcsec: float) -> Floats:
     covariance = np.zeros((13, 13))
     if method == 'single':
         covariance[np.ix_(ESTIMATED, ESTIMATED)] = _inverse(N.sum(axis=0))
-        return covariance
+        return MapCovariance(covariance)
     A, B, C = N[:, :f, :f].sum(axis=0), N[:, f:, :f], N[:, f:, f:]
     if method == 'per_image':
         S = A - np.einsum('mqi,mqj->ij', B, np.linalg.solve(C, B))
         covariance[np.ix_(_FREE, _FREE)] = _inverse(S)
-        return covariance
+        return MapCovariance(covariance)
     tracker = np.eye(3) / (max(tracker_arcsec, LEAST_TRACKER_ARCSEC) * ARCSECOND_RAD) ** 2
     B = np.concatenate([B, np.broadcast_to(-tracker, C.shape)], axis=2)
     S = np.zeros((f + 3, f + 3))
     S[:f, :f], S[f:, f:] = A, len(blocks) * tracker
     S -= np.einsum('mqi,mqj->ij', B, np.linalg.solve(C + tracker, B))
     covariance[np.ix_(ESTIMATED, ESTIMATED)] = _inverse(S)
-    return covariance
+    return MapCovariance(covariance)
 
 
 def _inverse(information: Floats) -> Floats:
@@ -222,13 +223,13 @@ def _inverse(information: Floats) -> Floats:
     return np.asarray(scaled * np.outer(scale, scale))
 
 
-def map_bound_px(camera: CameraModel, covariance: Floats) -> float:
-    """Expected `map_error_px` for a covariance (13, 13), RMS over the detector, px."""
+def map_bound_px(camera: CameraModel, covariance: MapCovariance) -> float:
+    """Expected `map_error_px` for a covariance, RMS over the detector, px."""
     return _rms(map_sigma_px(camera, covariance, GRID))
 
 
-def pointing_bound_arcsec(camera: CameraModel, covariance: Floats) -> float:
-    """Expected `pointing_error_arcsec` for a covariance (13, 13), RMS over the detector."""
+def pointing_bound_arcsec(camera: CameraModel, covariance: MapCovariance) -> float:
+    """Expected `pointing_error_arcsec` for a covariance, RMS over the detector."""
     return _rms(line_of_sight_sigma_arcsec(camera, covariance, GRID, GRID))
 
 
@@ -269,16 +270,18 @@ def calibration_options(method: str, tracker_arcsec: float, **other: object) -> 
     """
     Options of the paper's model, for few images and stars.
 
-    Eight camera parameters, or those of ``estimate`` without a prior, and no field; the assumed
-    star tracker sigma is per axis.
+    Eight camera parameters, or those of ``estimate`` without a prior, at a known velocity and
+    without motion in an image; the assumed star tracker sigma is per axis.
     """
     assumed = max(tracker_arcsec, LEAST_TRACKER_ARCSEC)
     options = CalibrationOptions(
         method=method,
         estimate=PAPER_ESTIMATE,
         principal_point_prior=0.0,
-        residual_field=False,
         star_tracker_sigma_arcsec=(assumed, assumed, assumed),
+        velocity_sigma_m_s=0.0,
+        shutter='global',
+        stamp_sigma_s=0.0,
         min_images=2,
         min_stars=10,
     )

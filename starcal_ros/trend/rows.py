@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from starcal_ros.arrays import check_shape, Count, Finite, Floats
-from starcal_ros.assessment.lookup import line_of_sight_jacobian
+from starcal_ros.assessment.lookup import Derivatives
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.pipeline.provenance import software_version
@@ -172,7 +172,8 @@ def _boresight_sigma(calibration: Calibration) -> Floats:
     """1-sigma (2,) of the line of sight of the middle, about the x and y axes, arcsec."""
     camera = calibration.geometry.camera
     middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
-    _, J = line_of_sight_jacobian(camera, middle)
-    covariance = J[0] @ calibration.joint_covariance @ J[0].T
+    found = Derivatives.at(camera, middle)
+    J, of_pixel = found.J[0], found.by_pixel[0] * calibration.map_covariance.unresolved_px
+    covariance = J @ calibration.map_covariance.matrix @ J.T + of_pixel @ of_pixel.T
     # A small rotation about x moves the direction along y, one about y along x.
     return np.asarray(np.sqrt(np.diag(covariance)[[1, 0]]) / ARCSECOND_RAD)

@@ -28,6 +28,7 @@ def left(request: pytest.FixtureRequest) -> Residuals:
     options = CalibrationOptions(
         method=request.param,
         star_tracker_sigma_arcsec=SCENARIO.star_tracker_sigma_arcsec,
+        velocity_sigma_m_s=10.0,
     )
     estimate = estimate_calibration(ensemble, SCENARIO.prior, options)
     return residuals_of(estimate, ensemble, np.full(len(estimate.table), np.nan))

@@ -91,9 +91,6 @@ def test_a_restart_goes_on_where_it_stood(
 def test_rollback_outlasts_a_restart(
     setup: Setup, shown: tuple[StarObservations, ...], tmp_path: Path
 ) -> None:
-    # Held terms that are not zero would be taken for a field beside the lens, ten seconds each.
-    without = dataclasses.replace(setup.calibration, residual_field=False)
-    setup = dataclasses.replace(setup, calibration=without)
     state = filled(setup, shown, tmp_path)
     for estimate in (('fx', 'fy'), ('fx', 'fy', 'k1'), ('fx',)):
         assert state.solve(estimate=estimate, force=True).success

@@ -11,12 +11,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from starcal_ros.arrays import Indices, Mask
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
+from starcal_ros.estimation import calibrate as module
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.centroid_noise import CentroidVariance
 from starcal_ros.estimation.options import CalibrationOptions, check_enough, estimated_parameters
-from starcal_ros.methods.problem import METHODS
+from starcal_ros.estimation.problem import METHODS
+from starcal_ros.estimation.shared_errors import SharedError
+from starcal_ros.estimation.star_equations import star_table
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.simulation.centroids import bound_names, cramer_rao_covariance, true_observations
 from starcal_ros.simulation.scenario import scenario
@@ -24,9 +29,12 @@ from starcal_ros.simulation.scenario import scenario
 SCENARIO = scenario('tiny', seed=3)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior
 TRACKER_ARCSEC = (10.0, 10.0, 40.0)
-# The eight parameters of the Cramer-Rao bound, without a prior, and no field beside them.
+# The eight parameters of the Cramer-Rao bound, without a prior; what else is not known is small.
 EIGHT = CalibrationOptions(
-    estimate=('fx', 'skew', 'fy', 'distortion'), principal_point_prior=0.0, residual_field=False
+    estimate=('fx', 'skew', 'fy', 'distortion'),
+    principal_point_prior=0.0,
+    velocity_sigma_m_s=10.0,
+    star_tracker_slow_arcsec=0.1,
 )
 NAMES = estimated_parameters(EIGHT, 'plumb_bob')
 FREE = [PARAMETER_NAMES.index(name) for name in NAMES]
@@ -72,7 +80,8 @@ def with_noise(
 
 
 def options(method: str, **other: object) -> CalibrationOptions:
-    values: dict[str, object] = {'star_tracker_sigma_arcsec': TRACKER_ARCSEC, **other}
+    tracker_arcsec = (1e-3,) * 3 if method == 'single' else TRACKER_ARCSEC
+    values: dict[str, object] = {'star_tracker_sigma_arcsec': tracker_arcsec, **other}
     return dataclasses.replace(EIGHT, method=method, **values)  # type: ignore[arg-type]
 
 
@@ -134,9 +143,7 @@ def test_without_noise_the_truth_comes_back(method: str, with_principal_point: b
     off = Rotation.from_euler('xyz', [0.2, -0.2, 0.1], degrees=True)
     mounting = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw) * off
     prior = CameraGeometry(prior_camera, mounting.as_quat())
-    chosen = options(method, estimate=estimate, residual_field=True)
-    found = estimate_calibration(clean(), prior, chosen)
-    assert not found.geometry.camera.has_field
+    found = estimate_calibration(clean(), prior, options(method, estimate=estimate))
     assert found.termination == 'converged' and found.kept.all()
     error = error_of(found, list(range(13)))
     # 1e-9 of each term at the edge of the field (r = 0.23, f = 1800 px) and of a radian.
@@ -248,8 +255,10 @@ def test_hierarchical_is_no_worse_than_the_better_of_the_others() -> None:
     )
     rows = [*FREE, 10, 11, 12]
     sigma = np.sqrt(np.diag(other.covariance))[rows]
-    assert (np.abs(error_of(one, rows) - error_of(other, rows)) / sigma).max() < 0.01
-    np.testing.assert_allclose(np.sqrt(np.diag(one.covariance))[rows], sigma, rtol=0.01)
+    # The errors that the stars show of a perfect star tracker are their own noise, which its
+    # sigma takes in: hierarchical does not trust it as single does.
+    assert (np.abs(error_of(one, rows) - error_of(other, rows)) / sigma).max() < 1.0
+    assert (np.sqrt(np.diag(one.covariance))[FREE] < 2.0 * sigma[: len(FREE)]).all()
 
 
 @each_method
@@ -406,12 +415,11 @@ def test_stars_in_one_spot_leave_an_honest_uncertainty(method: str) -> None:
         return image.select(np.hypot(*(image.measured_px - [320, 256]).T) < 40)
 
     spot = with_noise(Ensemble(tuple(middle(image) for image in clean().images)), 1)
-    # All ten parameters, and a field where one can be determined: here it cannot.
+    # All ten parameters.
     chosen = CalibrationOptions(
         method=method, star_tracker_sigma_arcsec=TRACKER_ARCSEC, min_stars=10
     )
     found = estimate_calibration(spot, PRIOR, chosen)
-    assert found.geometry.camera.field is None and found.field_test is None
     sigma = np.sqrt(np.diag(found.covariance))
     # 0.022 rad from the axis k1 moves nothing by 0.1 px before it is 5: nobody knows it.
     assert sigma[PARAMETER_NAMES.index('k1')] > 1.0
@@ -422,3 +430,21 @@ def test_fewer_residuals_than_unknowns() -> None:
     few = Ensemble(tuple(image.select(np.arange(len(image)) < 1) for image in clean().images))
     with pytest.raises(TooFewObservations, match='the stars do not determine'):
         estimate_calibration(few, PRIOR, options('per_image', min_stars=10))
+
+
+def test_a_variance_that_moves_no_weight_holds_nothing_up() -> None:
+    """Places of stars that are seen once: their variance creeps to zero for twenty rounds."""
+    table = star_table(clean().images)
+    kept = np.ones(len(table), bool)
+    seen: Mask = np.ones(table.image_count, bool)
+    none = np.zeros((table.image_count, 3))
+    attitudes = module._Attitudes(none, np.zeros((len(none), 3, 3)), seen, ~seen, (), ())
+
+    def judged(variance_px2: float, stars: Indices) -> module._Judged:
+        error = SharedError('star places', stars, variance_px2, 0.0, True, 1.0)
+        return module._Judged(CentroidVariance(1.0, 0.0), (error,), kept, attitudes)
+
+    once = dataclasses.replace(table, star=np.arange(len(table)))
+    assert module._agree(judged(4e-6, once.star), judged(2e-6, once.star), once)
+    often = dataclasses.replace(table, star=np.zeros(len(table), np.int64))
+    assert not module._agree(judged(4e-6, often.star), judged(2e-6, often.star), often)

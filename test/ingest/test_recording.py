@@ -16,6 +16,7 @@ from mission_files import (  # type: ignore[import-not-found]
     write_aem,
     write_ck,
     write_fits,
+    write_velocities,
 )
 import numpy as np
 import pytest
@@ -54,7 +55,8 @@ def test_the_imported_bag_gives_the_calibration_of_the_original(
         'import --images {night}/*.fits --attitude {aem} -o {bag} --camera {camera}',
         night=night, aem=aem, bag=bag, camera=TINY / 'camera.yaml',
     )  # fmt: skip
-    assert main([*line, '--alignment', *map(repr, ALIGNMENT)]) == 0
+    velocities = str(write_velocities(tmp_path / 'velocity.csv'))
+    assert main([*line, '--velocity', velocities, '--alignment', *map(repr, ALIGNMENT)]) == 0
     out = capsys.readouterr().out
     assert '10 images' in out and 'params.yaml -o DIR' in out
     found = list(reader.read_images([bag], '/camera/image_raw'))

@@ -16,13 +16,14 @@ from sample_records import (  # type: ignore[import-not-found]
     calibration,
     plain,
     plain_calibration,
+    with_joint_covariance,
     without_field,
 )
 
 from starcal_ros.bag.typestore import make_message, typestore
 from starcal_ros.camera import line_of_sight, project
+from starcal_ros.estimation import levenberg_marquardt
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.least_squares import levenberg_marquardt
 from starcal_ros.messages.calibration import (
     alignment_to_message,
     calibration_from_message,
@@ -42,7 +43,8 @@ def test_calibration_round_trip(make: Any) -> None:
     left_out = dataclasses.replace(
         calibration(), temperature=TemperatureTerms(20.0, note='left out')
     )
-    for record in (calibration(), without_field(), plain_calibration(), left_out):
+    records = (calibration(), without_field(), plain_calibration(), with_joint_covariance())
+    for record in (*records, left_out):
         assert_same(record, calibration_from_message(calibration_to_message(record, make)))
 
 
@@ -98,8 +100,8 @@ def test_every_field_of_a_record_has_its_field_in_the_message() -> None:
 def test_fields_that_an_older_definition_lacks_have_their_defaults() -> None:
     message = calibration_to_message(calibration(), plain)
     for name in (
-        'temperature', 'maps', 'correlation', 'removals', 'halves', 'model_checks', 'field',
-        'gate', 'star_trackers',
+        'temperature', 'maps', 'correlation', 'removals', 'model_checks', 'field', 'gate',
+        'star_trackers', 'sigma_budget',
     ):  # fmt: skip
         delattr(message, name)
     assert_same(calibration_from_message(message), plain_calibration())
@@ -114,7 +116,9 @@ def test_fields_that_an_older_definition_lacks_have_their_defaults() -> None:
         ('correlation', 'matrix', 'matrix: 1 numbers, not 2 x 2'),
         ('removals', 'residual_std_px', 'residual_std_px: 1 numbers, not 2'),
         ('field', 'coefficients', 'coefficients: 1 numbers, not 2 x 3'),
-        ('field', 'joint_covariance', 'joint_covariance: 1 numbers, not 19 x 19'),
+        ('field', 'joint_covariance', 'joint_covariance: 1 numbers, not 0 x 0'),
+        ('field', 'covariance_factor', 'covariance_factor: 1 numbers, not 19 x 2'),
+        ('field', 'remainder', 'remainder: 1 numbers, not 21'),
         ('temperature', 'focal_per_degc_sigma', 'focal_per_degc_sigma: 1 numbers, not 2'),
         (
             'temperature',

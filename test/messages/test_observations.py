@@ -56,6 +56,9 @@ def test_bad_observations_are_refused(field: str, value: Any, text: str) -> None
         ('attitude.w', 0.0, 'attitude: a quaternion of length 0.714'),
         ('attitude.w', 1e300, 'attitude: a quaternion of length'),
         ('temperature_degc', 1e300, 'temperature_degc: 1e'),
+        ('velocity_sigma_m_s', -1.0, 'velocity_sigma_m_s: -1 is no sigma'),
+        ('velocity_sigma_m_s', np.inf, 'velocity_sigma_m_s: not finite'),
+        ('star_tracker_rate_rad_s', np.array([0, 0, np.inf]), 'star_tracker_rate_rad_s: not fin'),
         ('background_dn', np.inf, 'background_dn: not finite'),
         ('width', 2**32 - 1, 'width, height: 4294967295 x 1024 px is no image'),
         ('refusal', 'x' * 10**6, "refusal: 'x{100}' is no known reason"),
@@ -121,7 +124,9 @@ def test_older_observations_are_read() -> None:
     del message.temperature_degc
     message.attitude_gap_s = -1.0
     del message.refused_star_id, message.refused_star_px, message.refused_star_reason
+    del message.star_tracker_rate_rad_s, message.velocity_sigma_m_s
     record = observations_from_message(message)
     assert np.isnan(record.temperature_degc) and np.isnan(record.attitude_gap_s)
+    assert np.isnan(record.star_tracker_rate_rad_s).all() and np.isnan(record.velocity_sigma_m_s)
     assert record.refused_stars == {'blend': 3, 'saturated': 1}
     assert record.refused_px.shape == (0, 2)

@@ -40,9 +40,7 @@ def calibrator(
     ros_domain: None, tiny_bag: Path, tiny_observations: Ensemble
 ) -> Iterator[Calibrator]:
     """An active calibrator in this process that holds the images of the small bag."""
-    # Held terms that are not zero would be taken for a field beside the lens, ten seconds each.
-    given = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'residual_field:=false')
-    rclpy.init(args=['--ros-args', *given])
+    rclpy.init(args=['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')])
     node = Calibrator()
     try:
         node.trigger_configure()

@@ -36,7 +36,10 @@ from starcal_ros.records import Ensemble, IMAGE_REFUSALS
 pytestmark = pytest.mark.nodes
 
 ICD = Path(__file__).parents[2] / 'docs' / 'icd.md'
-REMAPS = ('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude')
+REMAPS = (
+    *('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude'),
+    *('-r', 'velocity:=/spacecraft/velocity'),
+)
 
 
 def documented(*tables: str) -> set[str]:

@@ -68,7 +68,10 @@ from starcal_ros.records import refused_image
 pytestmark = pytest.mark.nodes
 
 BOTH = ('star_observer', 'calibrator')
-REMAPS = ('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude')
+REMAPS = (
+    *('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude'),
+    *('-r', 'velocity:=/spacecraft/velocity'),
+)
 
 
 def parameters(folder: Path, *more: str) -> tuple[str, ...]:
@@ -188,6 +191,9 @@ def test_the_table_of_lines_of_sight_is_that_of_the_tool(
     assert len(columns) == 49
     for name in COLUMNS:
         np.testing.assert_array_equal(getattr(answer, name), columns[name])
+    budget = calibration_from_message(calibrated[0]).sigma_budget
+    assert [part.cause for part in answer.sigma_budget] == [part.cause for part in budget]
+    assert answer.sigma_budget[0].map_arcsec == budget[0].map_arcsec > 0.0
     default = client.call(LineOfSightTable, '/calibrator/lookup')
     assert len(default.u_px) == 25**2
     for points in (1, 201, 2**32 - 1):
@@ -348,6 +354,20 @@ def test_observations_carry_the_temperature(
         attitudes.publish(sample.data)
     client.until(lambda: answers)
     assert answers[0].refusal == '' and answers[0].temperature_degc == -7.25
+
+
+def test_observations_carry_rate_and_velocity_sigma(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """Of a camera that is still, with the velocity in its bag."""
+    start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
+    answers: list[Any] = client.collect(StarObservations, 'observations')
+    client.until_listened()
+    start_node('bag_player', ros=('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0'))
+    client.until(lambda: len(answers) == 10)
+    assert {answer.velocity_sigma_m_s for answer in answers} == {10.0}
+    rates_rad_s = np.array([answer.star_tracker_rate_rad_s for answer in answers])
+    assert rates_rad_s.shape == (10, 3) and np.abs(rates_rad_s).max() < 1e-12
 
 
 def test_compressed_images(client: Client, start_node: StartNode, tiny_bag: Path) -> None:

@@ -23,8 +23,9 @@ from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, Image,
 from starcal_ros.simulation.bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.simulation.images import render, star_electrons
 from starcal_ros.simulation.scenario import attitude_samples, Inertial, scene
-from starcal_ros.sky.astrometry import through_the_air
+from starcal_ros.sky.astrometry import apparent_directions, through_the_air
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
+from starcal_ros.sky.star_trackers import attitudes_at, Mounting
 
 S = 1_000_000_000
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
@@ -388,3 +389,61 @@ def test_a_hung_star_tracker_is_refused_once_the_stars_have_turned(setup: Setup)
     assert _observed(setup, 72.0, is_hung=False) == [ok] * 5
     # A spacecraft that holds its attitude, with a star tracker without noise.
     assert _observed(setup, 0.0, is_hung=True) == [ok] * 5
+
+
+def test_the_rate_of_the_star_tracker_is_recorded(setup: Setup) -> None:
+    """Two samples half a second before and after the image, 0.02 degrees apart."""
+    step = Rotation.from_rotvec(np.radians([0.0, 0.01, 0.0]))
+    held = AttitudeHistory()
+    middle = Rotation.from_quat(scene(SCENARIO, 1).icrf_from_star_tracker_xyzw)
+    for time_s, turned in ((-0.5, middle * step.inv()), (0.5, middle * step)):
+        time_ns = image().time_ns + round(time_s * S)
+        held.add(time_ns, attitude_sample(time_ns, turned.as_quat(), 'st_to_inertial'))
+    found = observe.observe(image(), held, setup, setup.prior)
+    assert not found.refusal
+    expected = np.radians([0.0, 0.02, 0.0])
+    np.testing.assert_allclose(found.star_tracker_rate_rad_s, expected, atol=1e-12)
+
+
+def test_the_rate_of_a_further_star_tracker_is_about_the_axes_of_the_first() -> None:
+    rate_rad_s = np.array([0.01, 0.0, 0.0])
+    held = AttitudeHistory()
+    for time_s in (0.0, 1.0):
+        turned = Rotation.from_rotvec(time_s * rate_rad_s).as_quat()
+        held.add(round(time_s * S), attitude_sample(round(time_s * S), turned, 'st_to_inertial'))
+    mounted = Mounting('second', Rotation.from_euler('z', 90, degrees=True).as_quat())
+    (found,) = attitudes_at(S // 2, AttitudeHistory(), [held], [mounted], 2.0, {})
+    np.testing.assert_allclose(found.rate_rad_s, [0.0, 0.01, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('others', 'measured_m_s', 'sigma_m_s'),
+    [
+        ({}, None, np.nan),
+        ({}, [0.0, 3e4, 0.0], 10.0),
+        ({'observer_velocity_m_s': [0.0, 3e4, 0.0]}, None, 10.0),
+        ({'observer_velocity_m_s': [9e4, 0.0, 0.0]}, [0.0, 3e4, 0.0], 10.0),
+        ({'observer': 'ground', 'latitude_deg': 30.0}, [0.0, 3e4, 0.0], 0.0),
+    ],
+)
+def test_the_sigma_of_the_velocity_is_recorded(
+    camera_yaml: Path,
+    others: dict[str, object],
+    measured_m_s: list[float] | None,
+    sigma_m_s: float,
+) -> None:
+    """Of used and of refused images; a message stands before the constant of the options."""
+    setup = load_setup(values(camera_yaml, **others, min_elevation_deg=3.0))
+    given = None if measured_m_s is None else np.array(measured_m_s)
+    blank = Image(image().time_ns, np.full_like(image().pixels, 32))
+    for one in (image(), blank):
+        found = observe.observe(one, attitudes(), setup, setup.prior, given)
+        np.testing.assert_equal(found.velocity_sigma_m_s, sigma_m_s)
+    if sigma_m_s == 10.0:
+        found = observe.observe(image(), attitudes(), setup, setup.prior, given)
+        stars = setup.catalog.select(np.flatnonzero(np.isin(setup.catalog.id, found.catalog_id)))
+        expected = apparent_directions(stars, image().time_ns, np.array([0.0, 3e4, 0.0]))
+        order, by_id = np.argsort(found.catalog_id), np.argsort(stars.id)
+        np.testing.assert_allclose(
+            found.direction_icrf[order], expected[by_id], rtol=0, atol=1e-15
+        )

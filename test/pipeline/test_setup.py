@@ -12,7 +12,7 @@ from tiny_campaign import SCENARIO, values, write_png  # type: ignore[import-not
 
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import CatalogError, OptionError, ProductError
-from starcal_ros.options import holds_options
+from starcal_ros.options import holds_options, names_of, REMOVED
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, Setup
 from starcal_ros.products.camera_yaml import write_camera_info
@@ -66,10 +66,6 @@ def test_another_lens_model_starts_from_the_prior_camera(
     for name, value in (('estimate', ['fx', 's1']), ('prior_sigma', [0.0] * 10)):
         with pytest.raises(OptionError, match=f'{name}: .* the lens model rational_polynomial'):
             load_setup(values(camera_yaml, lens_model='rational_polynomial', **{name: value}))
-    with pytest.raises(OptionError, match='max_parameter_sigma: 12 numbers, .* 16 parameters'):
-        load_setup(
-            values(camera_yaml, lens_model='rational_polynomial', max_parameter_sigma=[1.0] * 12)
-        )
     fisheye = CameraModel(
         640, 480, np.array([160, 0, 155, 322, 236, -0.02, 0.01, -0.004, 5e-4]), 'equidistant'
     )
@@ -91,9 +87,24 @@ def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> 
         load_setup(both)
 
 
+def test_an_option_that_was_removed_is_named_with_what_replaces_it(camera_yaml: Path) -> None:
+    """As in a parameter file of an older version."""
+    assert not REMOVED.keys() & names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
+    text = 'residual_field: not an option any more: .* always estimated, .*; take it out'
+    with pytest.raises(OptionError, match=text):
+        load_setup(values(camera_yaml, residual_field=True))
+    words = ' '.join(REMOVED.values()).replace(',', ' ').split()
+    named = {word for word in words if word.startswith(('max_', 'velocity_sigma'))}
+    assert len(named) > 5 and named <= names_of(*OPTION_CLASSES)
+
+
 @pytest.mark.parametrize(
     ('wrong', 'says'),
     [
+        ({'shutter': 'rolling'}, 'readout_s: not set, which shutter: rolling needs'),
+        ({'readout_s': 0.03}, 'readout_s: 0.03 s, but shutter is unknown; set rolling'),
+        ({'observer_velocity_m_s': [0.0, 3e4]}, 'observer_velocity_m_s: .* is not a list of 3'),
+        ({'observer_velocity_m_s': [0, 0, 3e8]}, 'observer_velocity_m_s: .* is not within'),
         ({'max_residual_rms': 1.0}, 'max_residual_rms: no such parameter'),
         ({'camera_info_url': ''}, 'camera_info_url: not set'),
         (

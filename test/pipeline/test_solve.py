@@ -126,11 +126,9 @@ def test_a_solution_is_mapped_over_the_detector(setup: Setup) -> None:
 
 
 def test_a_solution_says_what_each_term_is_worth(setup: Setup) -> None:
-    # The sigma of a removal is that of the noise, without a field that is not excluded.
-    options = dataclasses.replace(setup.calibration, residual_field=False)
-    found = solve.solve(ensemble(), dataclasses.replace(setup, calibration=options))
+    found = solve.solve(ensemble(), setup)
     first, *removals = found.removals
-    assert first.residual_rms_px == pytest.approx(found.residual_rms_px, rel=1e-9)
+    assert first.residual_rms_px == pytest.approx(found.residual_rms_px, rel=1e-6)
     assert {removal.removed for removal in removals} == set(found.estimated)
     for removal in removals:
         if removal.removed in ('fx', 'fy'):
@@ -140,7 +138,8 @@ def test_a_solution_says_what_each_term_is_worth(setup: Setup) -> None:
         principal = removal.removed in ('cx', 'cy')
         held = setup.prior.camera.parameters[k] if principal else 0.0
         expected = (found.geometry.camera.parameters[k] - held) / found.sigma[k]
-        assert removal.significance == pytest.approx(expected, rel=1e-6)
+        # The sigma of a removal is that of the noise: field and velocity widen the reported one.
+        assert 0.999 <= removal.significance / expected < 1.15
 
 
 def test_method_and_names_can_be_said_for_one_solution(setup: Setup) -> None:
@@ -228,6 +227,11 @@ def test_a_bag_with_temperatures_to_a_calibration_with_terms(
     # The simulated camera does not change with temperature, and that is what is found.
     terms = solve.solve(Ensemble(tuple(found)), warm).temperature
     assert terms is not None and terms.reference_degc == 20.0
-    assert 'within chance' in terms.note
+    assert terms.note == ''
+    for values_found, sigma in (
+        (terms.focal_per_degc, terms.focal_per_degc_sigma),
+        (terms.alignment_rate_rad_per_degc, terms.alignment_rate_rad_per_degc_sigma),
+    ):
+        assert values_found and (np.abs(values_found) < 4 * np.array(sigma)).all()
     terms = solve.solve(Ensemble(tuple(plain)), warm).temperature
     assert terms is not None and terms.note == 'left out: 4 of 4 images have no temperature'

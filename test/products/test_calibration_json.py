@@ -18,11 +18,15 @@ from sample_records import (  # type: ignore[import-not-found]
     calibration,
     calibration_of_0_1,
     plain_calibration,
+    with_joint_covariance,
     without_field,
 )
 
+from starcal_ros.bag.typestore import make_message, typestore
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ProductError
+from starcal_ros.messages.calibration import calibration_to_message
+from starcal_ros.messages.types import CALIBRATION_TYPE
 from starcal_ros.products.calibration_json import read_calibration, write_calibration
 from starcal_ros.records import (
     CameraGeometry,
@@ -171,14 +175,52 @@ def test_an_older_file_is_read(tmp_path: Path) -> None:
     content = json.loads(path.read_text())
     del content['temperature'], content['maps'], content['correlation'], content['removals']
     del (
-        content['halves'],
         content['gate'],
         content['star_trackers'],
         content['model_checks'],
         content['field'],
+        content['sigma_budget'],
     )
     path.write_text(json.dumps(content))
     assert_same(plain_calibration(), read_calibration(path))
+
+
+def test_a_file_with_the_covariance_of_a_field_itself_is_read(tmp_path: Path) -> None:
+    record = with_joint_covariance()
+    write_calibration(record, tmp_path / 'c.json')
+    content = json.loads((tmp_path / 'c.json').read_text())
+    for name in ('unresolved_px', 'covariance_factor', 'remainder_unit_px', 'remainder'):
+        del content['field'][name]
+    content['field'].update(length=0.4375, amplitude_px=0.02)  # keys of that time
+    (tmp_path / 'c.json').write_text(json.dumps(content))
+    found = read_calibration(tmp_path / 'c.json')
+    assert_same(record, found)
+    assert found.map_covariance.unresolved_px == 0.0
+    assert found.field is not None
+    np.testing.assert_array_equal(found.map_covariance.matrix, found.field.joint_covariance)
+
+
+def test_a_covariance_of_a_field_is_its_factor_and_remainder(tmp_path: Path) -> None:
+    write_calibration(calibration(), tmp_path / 'c.json')
+    found = read_calibration(tmp_path / 'c.json')
+    F = np.arange(38.0).reshape(19, 2) / 11
+    expected = F @ F.T
+    R = np.array([
+        [-10, 0, 0, 0, 0, 0], [-9, -8, 0, 0, 0, 0], [-7, -6, -5, 0, 0, 0], [-4, -3, -2, -1, 0, 0],
+        [0, 1, 2, 3, 4, 0], [5, 6, 7, 8, 9, 10],
+    ]) * np.arange(1.0, 7.0)[:, None] / 7e4  # fmt: skip
+    expected[13:, 13:] += R @ R.T
+    np.testing.assert_allclose(found.map_covariance.matrix, expected, rtol=1e-14)
+    assert found.map_covariance.unresolved_px == 0.0625
+
+
+def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> None:
+    path = tiny_products / 'calibration.json'
+    assert path.stat().st_size < 150_000
+    found = read_calibration(path)
+    assert found.field is not None and found.sigma_budget
+    message = calibration_to_message(found, make_message)
+    assert len(bytes(typestore().serialize_cdr(message, CALIBRATION_TYPE))) < 100_000
 
 
 @pytest.mark.parametrize(
@@ -231,7 +273,21 @@ def test_an_older_file_is_read(tmp_path: Path) -> None:
         (lambda c: c['field'].update(degree=2), 'field.coefficients: 3 for an axis, not 6'),
         (
             lambda c: c['field'].update(joint_covariance=[[1.0]]),
-            'field.joint_covariance: 1 rows, not 19',
+            'field: covariance of 1 rows, not 19',
+        ),
+        (lambda c: c['field']['remainder'].pop(), 'field.remainder: 20 numbers, not 21'),
+        (
+            lambda c: c['field']['remainder'].__setitem__(0, 40000),
+            'field.remainder: a number is out of the range of int16',
+        ),
+        (
+            lambda c: c['field'].update(remainder_unit_px=[1.0], remainder=[1]),
+            'field.remainder_unit_px: 1 numbers, not 6',
+        ),
+        (lambda c: c['field']['covariance_factor'].pop(), 'field: covariance of 18 rows, not 19'),
+        (
+            lambda c: c['sigma_budget'][1].update(map_arcsec='a'),
+            r"sigma_budget\[1\].map_arcsec: 'a' is not a number",
         ),
     ],
 )

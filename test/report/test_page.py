@@ -11,6 +11,7 @@ import shutil
 import subprocess
 from typing import Any
 
+from markupsafe import Markup
 import numpy as np
 import pytest
 
@@ -39,11 +40,13 @@ FIGURES = (
     'before',
     'images',
     'histogram',
+    'lens_field',
     'field',
     'spectrum',
     'magnitude',
     'colour',
     'phase',
+    'budget',
     'line_of_sight',
     'shape',
     'terms',
@@ -81,9 +84,17 @@ def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> N
     assert f'{calibration.residual_rms_px:.3f} px' in page
     assert f'{calibration.stars_used:,}' in page
     assert calibration.weakest_direction in page
+    total, *causes = calibration.sigma_budget
+    assert f'<th scope="row">total</th><td>{total.map_arcsec:.3g}</td>' in page
+    for part in causes:
+        assert str(Markup.escape(part.assumption)) in page
     for name in FIGURES:
         assert page.count(f'id="figure-{name}"') == 1
     assert calibration.provenance['observations_sha256'] in page
+    checks = calibration.model_checks
+    assert checks is not None and len(checks.amplitudes) >= 3
+    for one in checks.amplitudes:
+        assert f'<th scope="row">{one.name}</th><td>{one.value:.2g}</td>' in page
 
 
 def test_the_page_needs_nothing_else(page: str) -> None:

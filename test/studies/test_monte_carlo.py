@@ -219,9 +219,9 @@ def test_per_image_beats_single_where_the_star_tracker_is_bad() -> None:
         assert float(noisy['single']['map_px']) > 8 * float(noisy['per_image']['map_px'])
         for tracker in (0.0, 5.0, 40.0):
             of = {m: float(cell(tracker_arcsec=tracker, method=m)['map_px']) for m in METHODS}
-            # The errors are paired (same stars, same noise): what differs is far under their
-            # scatter.  Measured over 200 trials: 0.5 % at most.
-            assert of['hierarchical'] < 1.02 * min(of['per_image'], of['single'])
+            # The errors are paired (same stars, same noise), but each method has its own
+            # estimated errors: what differs is under the scatter of 12 trials.
+            assert of['hierarchical'] < 1.05 * min(of['per_image'], of['single'])
 
 
 def test_hierarchical_gains_where_stars_are_few_and_the_star_tracker_good() -> None:
@@ -241,7 +241,9 @@ def test_errors_are_as_large_as_the_covariance_says(method: str) -> None:
         row = only(found.summary, method=method, outlier_share=share)
         low, high = chi2.ppf([0.005, 0.995], 11 * 60) / 60
         assert (row['low'], row['high']) == pytest.approx((low, high))
-        assert low < float(row['normalised']) < high
+        # The field that stars cannot show and a slow error of the star tracker are in the sigma
+        # and not in these trials: it is up to 15 % too large.
+        assert low / 1.15**2 < float(row['normalised']) < high
         # Of 60 trials the rms of the map is known to 4 %; three of those.
         assert float(row['to_reported']) == pytest.approx(1.0, abs=0.12)
         assert float(row['to_bound']) == pytest.approx(1.0, abs=0.12)
@@ -287,7 +289,7 @@ def test_bound_is_the_inverse_of_the_whole_normal_matrix() -> None:
         dense[f : f + 3, f : f + 3] += G
     scale = 1 / np.sqrt(np.diag(dense))
     expected = (np.linalg.inv(dense * np.outer(scale, scale)) * np.outer(scale, scale))[:11, :11]
-    found = trials.bound('hierarchical', N, tracker_arcsec)
+    found = trials.bound('hierarchical', N, tracker_arcsec).matrix
     estimated = np.ix_(trials.ESTIMATED, trials.ESTIMATED)
     sigma = np.sqrt(np.diag(expected))
     # Condition 1e6 of the scaled matrix times a rounding.
@@ -301,8 +303,8 @@ def test_per_image_and_single_bound_the_hierarchical() -> None:
     field = trials.draw_star_field(np.random.default_rng(2), 5, 20)
     blocks = trials.information_blocks(field)
     for method, tracker_arcsec in (('per_image', 3e5), ('single', 0.0)):
-        limit = trials.bound('hierarchical', blocks, tracker_arcsec)
-        own = trials.bound(method, blocks, tracker_arcsec)
+        limit = trials.bound('hierarchical', blocks, tracker_arcsec).matrix
+        own = trials.bound(method, blocks, tracker_arcsec).matrix
         # 0.001 arcsec, which stands for none, against the 1 arcsec that the stars know: squared.
         np.testing.assert_allclose(
             np.diag(limit)[:10], np.diag(own)[:10], rtol=1e-5, err_msg=method

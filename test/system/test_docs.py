@@ -176,10 +176,14 @@ def test_named_functions_exist(document: Path) -> None:
     for path in (ROOT / 'starcal_ros').rglob('*.py'):
         dotted = '.'.join(path.relative_to(ROOT).with_suffix('').parts)
         homes.setdefault(path.stem, []).append(dotted)
-    for module, name in re.findall(r'`(\w+)\.(\w+)`', document.read_text()):
-        if module in homes and name not in FILE_ENDINGS:
-            found = (importlib.import_module(home) for home in homes[module])
-            assert any(hasattr(home, name) for home in found), f'{module}.{name}'
+    cited = re.findall(r'`(?:(\w+)/)?(\w+)\.(\w+)(?:\.\w+)?`', document.read_text())
+    for room, module, name in cited:
+        if module not in homes or name in FILE_ENDINGS or room == module:
+            continue  # the last is a file in a folder of its name
+        places = [home for home in homes[module] if not room or f'.{room}.' in home]
+        assert places, f'{room}/{module}'
+        found = (importlib.import_module(home) for home in places)
+        assert any(hasattr(home, name) for home in found), f'{module}.{name}'
 
 
 def test_topics_and_services_are_names_that_the_nodes_use() -> None:

@@ -192,8 +192,12 @@ def monitor_command(once_after_s: float | None, remaps: Sequence[str]) -> list[s
 
 
 def _nodes_command(name: str, params: Path) -> list[str]:
-    topics = (f'image:={simulated_bag.IMAGE_TOPIC}', f'attitude:={simulated_bag.ATTITUDE_TOPIC}')
-    remaps = [part for topic in topics for part in ('-r', topic)]
+    topics = {
+        'image': simulated_bag.IMAGE_TOPIC,
+        'attitude': simulated_bag.ATTITUDE_TOPIC,
+        'velocity': simulated_bag.VELOCITY_TOPIC,
+    }
+    remaps = [part for name, topic in topics.items() for part in ('-r', f'{name}:={topic}')]
     return [*_module_command(name), '--ros-args', '--params-file', str(params), *remaps]
 
 

@@ -29,7 +29,7 @@ from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.nodes.lifecycle_node.inputs import Inputs
 from starcal_ros.nodes.lifecycle_node.parameters import OptionParameters, unread_sections
 from starcal_ros.nodes.lifecycle_node.printable_log import PrintableLog
-from starcal_ros.options import nearest
+from starcal_ros.options import unknown_option
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import OPTION_CLASSES, Setup
 from starcal_ros.text import printable
@@ -55,8 +55,7 @@ class StarcalNode(PrintableLog, LifecycleNode):
         super().__init__(name)
         self.options = OptionParameters(self, (*OPTION_CLASSES, *NODE_OPTION_CLASSES))
         for unknown in self.options.unknown():
-            close = nearest(unknown, self.options.names())
-            raise OptionError(f'{unknown}: no such parameter{close}')
+            raise OptionError(unknown_option(unknown, self.options.names()))
         self.failure = ''  # why the last transition failed, one line
         self.inputs = Inputs(self)
         self._incompatible: list[str] = []  # publishers that are not received

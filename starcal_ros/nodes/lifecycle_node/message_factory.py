@@ -15,6 +15,7 @@ from starcal_ros.messages.types import Message
 _CODES = {
     np.dtype(np.int8): 'b',
     np.dtype(np.uint8): 'B',
+    np.dtype(np.int16): 'h',
     np.dtype(np.uint32): 'I',
     np.dtype(np.int64): 'q',
     np.dtype(np.float32): 'f',
