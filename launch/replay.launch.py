@@ -14,7 +14,14 @@ def generate_launch_description() -> LaunchDescription:
     """Return the nodes, the player and the arguments; those of starcal.launch.py apply too."""
     arguments = [
         DeclareLaunchArgument('bag', description='an .mcap file or a bag folder'),
-        DeclareLaunchArgument('params', description='ROS parameter file, as config/starcal.yaml'),
+        DeclareLaunchArgument(
+            'params', default_value='', description='former name of params_file'
+        ),
+        DeclareLaunchArgument(
+            'params_file',
+            default_value=LaunchConfiguration('params'),
+            description='ROS parameter file of the camera that took the bag',
+        ),
         DeclareLaunchArgument(
             'rate',
             default_value='1.0',
@@ -35,7 +42,7 @@ def generate_launch_description() -> LaunchDescription:
         ),
         launch_arguments=[
             (name, LaunchConfiguration(name))
-            for name in ('params', 'namespace', 'log_level', 'use_sim_time')
+            for name in ('params_file', 'namespace', 'log_level', 'use_sim_time')
         ],
     )
     player = Node(

@@ -5,8 +5,9 @@ from launch.actions import DeclareLaunchArgument, RegisterEventHandler, Shutdown
 from launch.conditions import UnlessCondition
 from launch.event_handlers import OnProcessExit
 from launch.events.process import ProcessExited
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchContext, LaunchDescription
 
@@ -24,7 +25,18 @@ def end_after_error(event: ProcessExited, _context: LaunchContext) -> Shutdown |
 def generate_launch_description() -> LaunchDescription:
     """Return both nodes and the arguments they take."""
     arguments = [
-        DeclareLaunchArgument('params', description='ROS parameter file, as config/starcal.yaml'),
+        DeclareLaunchArgument(
+            'params',
+            default_value=PathJoinSubstitution(
+                [FindPackageShare('starcal'), 'config', 'starcal.yaml']
+            ),
+            description='former name of params_file',
+        ),
+        DeclareLaunchArgument(
+            'params_file',
+            default_value=LaunchConfiguration('params'),
+            description='ROS parameter file; the default leaves camera_info_url to be set',
+        ),
         DeclareLaunchArgument('namespace', default_value='', description='of both nodes'),
         DeclareLaunchArgument('log_level', default_value='info', description='of both nodes'),
         DeclareLaunchArgument(
@@ -50,7 +62,7 @@ def generate_launch_description() -> LaunchDescription:
             name=name,
             namespace=LaunchConfiguration('namespace'),
             parameters=[
-                LaunchConfiguration('params'),
+                LaunchConfiguration('params_file'),
                 {
                     # Of no type: the node refuses a wrong one by its name.
                     option: LaunchConfiguration(option)

@@ -21,9 +21,13 @@ The public functions and records are those of ``__all__``; `api` describes them.
 at its first use, so that ``import starcal_ros`` loads neither NumPy nor OpenCV.
 """
 
-from starcal_ros.safe_path import leave_current_folder
+import sys
 
-leave_current_folder()  # before any other import, __future__ included
+# ``python -m starcal_ros...`` in the folder of an untrusted bag would import a ``yaml.py`` that
+# lies there.  Before any other import, __future__ included; other programs keep their path.
+_is_found = sys.argv[:1] == ['-m'] and not getattr(sys.flags, 'safe_path', False)
+if _is_found and any(word.startswith('starcal_ros.') for word in sys.orig_argv):
+    del sys.path[0]
 
 from typing import TYPE_CHECKING  # noqa: E402
 
@@ -31,6 +35,7 @@ if TYPE_CHECKING:
     from starcal_ros.api import (
         calibrate,
         calibrate_bag,
+        calibrate_images,
         Calibration,
         CameraGeometry,
         CameraModel,
@@ -58,6 +63,7 @@ __all__ = [
     '__version__',
     'calibrate',
     'calibrate_bag',
+    'calibrate_images',
     'lines_of_sight',
     'observations_of',
     'project',

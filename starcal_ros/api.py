@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 import dataclasses
 import hashlib
 from pathlib import Path
+import tempfile
 from typing import Literal
 
 import numpy as np
@@ -19,24 +20,20 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.bag import reader
+from starcal_ros.assessment.gate_options import GateOptions
 from starcal_ros.camera import CameraModel, line_of_sight, project
-from starcal_ros.diagnosis.bags import aligned_by_bags
 from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
-from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.gate.options import GateOptions
-from starcal_ros.options import names_of, nearest
-from starcal_ros.pipeline import solve, topics
+from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.products import calibration_json
+from starcal_ros.options import names_of, unknown_option
+from starcal_ros.pipeline import night_sky, solve, topics
+from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags
 from starcal_ros.pipeline.provenance import inputs_of
-from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
-from starcal_ros.products import calibration_json
-from starcal_ros.records import (
-    Calibration,
-    CameraGeometry,
-    Ensemble,
-    refused_image,
-    StarObservations,
-)
+from starcal_ros.pipeline.setup import load_setup, read_setup
+from starcal_ros.record_codec import check_shape, plain_record, read_record, read_value
+from starcal_ros.record_fields import fields_of
+from starcal_ros.records import Calibration, CameraGeometry, refused_image, StarObservations
 
 __all__ = [
     'Calibration',
@@ -48,14 +45,13 @@ __all__ = [
     'TooFewObservations',
     'calibrate',
     'calibrate_bag',
+    'calibrate_images',
     'lines_of_sight',
     'observations_of',
     'project',
     'read_calibration',
     'write_calibration',
 ]
-
-_UNIT_TOLERANCE = 1e-6  # 0.2 arcsec in a difference of directions; single precision meets it
 
 
 def observations_of(
@@ -67,6 +63,8 @@ def observations_of(
     icrf_from_star_tracker_xyzw: ArrayLike,
     catalog_id: ArrayLike | None = None,
     temperature_degc: float = float('nan'),
+    star_tracker_rate_rad_s: ArrayLike = (float('nan'),) * 3,
+    velocity_sigma_m_s: float = float('nan'),
 ) -> StarObservations:
     """
     Observations of the n stars of one image, from arrays.
@@ -91,6 +89,12 @@ def observations_of(
         found.  Without it, stars of exactly equal directions are taken as the same.
     temperature_degc : float
         Temperature of the camera; NaN if not measured.
+    star_tracker_rate_rad_s : (3,)
+        Angular rate at that time about the axes of the star tracker; NaN if not known.  A time of
+        read-out or an offset of the stamps is estimated only with it.
+    velocity_sigma_m_s : float
+        1-sigma of each component of the velocity of the observer in ``direction_icrf``; NaN: of an
+        orbit about the Earth.
 
     Returns
     -------
@@ -103,42 +107,43 @@ def observations_of(
         For an array of the wrong shape, a number that is not finite, a vector that is not of unit
         length or a covariance that is not positive definite; the text names the argument.
     """
-    pixels = _finite('measured_px', measured_px)
-    if pixels.ndim != 2 or pixels.shape[1] != 2:
-        raise ValueError(f'measured_px: shape {pixels.shape} is not (n, 2)')
+    # First: a wrong number of rows is then named as that of another argument.
+    of_pixels = fields_of(StarObservations)['measured_px']
+    pixels = read_value(of_pixels, np.asarray(measured_px), 'measured_px', {})
     n = len(pixels)
-    covariance = _finite('covariance_px2', covariance_px2)
-    if covariance.shape not in ((n, 2, 2), (2, 2)):
-        raise ValueError(f'covariance_px2: shape {covariance.shape} is not ({n}, 2, 2) or (2, 2)')
-    covariance = np.broadcast_to(covariance, (n, 2, 2))
-    uu, uv, vv = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    if not ((uu > 0) & (uu * vv > uv**2) & np.isclose(uv, covariance[:, 1, 0])).all():
-        raise ValueError('covariance_px2: not symmetric and positive definite')
-    directions = _unit('direction_icrf', direction_icrf, (n, 3))
-    if catalog_id is None:
-        identifiers = _identifiers(directions)
-    else:
-        identifiers = np.asarray(catalog_id, np.int64)
-        if identifiers.shape != (n,):
-            raise ValueError(f'catalog_id: shape {identifiers.shape} is not ({n},)')
+    covariance = np.asarray(covariance_px2, np.float64)
+    if covariance.shape[-2:] != (2, 2):
+        raise ValueError(f'covariance_px2: shape {covariance.shape} is not (n, 2, 2) or (2, 2)')
+    rows = covariance[..., [0, 0, 1], [0, 1, 1]]
+    identifiers = np.zeros(n, np.int64) if catalog_id is None else np.asarray(catalog_id)
+    check_shape(identifiers.shape, (n,), 'catalog_id', {})
     unknown = np.full(n, np.nan, np.float32)
-    return refused_image(
-        time_ns,
-        camera.width,
-        camera.height,
-        refusal='',
-        detail='',
-        icrf_from_star_tracker_xyzw=_unit(
-            'icrf_from_star_tracker_xyzw', icrf_from_star_tracker_xyzw, (4,)
-        ),
-        catalog_id=identifiers,
+    stars = read_record(
+        StarObservations,
+        {
+            **plain_record(refused_image(time_ns, camera.width, camera.height, '', '')),
+            'icrf_from_star_tracker_xyzw': np.asarray(icrf_from_star_tracker_xyzw),
+            'catalog_id': identifiers,
+            'direction_icrf': np.asarray(direction_icrf),
+            'magnitude': unknown,
+            'measured_px': pixels,
+            'covariance_px2': np.tile(rows, (n, 1)) if rows.ndim == 1 else rows,
+            'flux_dn': unknown,
+            'snr': unknown,
+            'temperature_degc': temperature_degc,
+            'star_tracker_rate_rad_s': np.asarray(star_tracker_rate_rad_s),
+            'velocity_sigma_m_s': velocity_sigma_m_s,
+        },
+    )
+    uu, uv, vv = stars.covariance_px2.T
+    if not ((uu > 0) & (uu * vv > uv**2) & np.isclose(uv, covariance[..., 1, 0])).all():
+        raise ValueError('covariance_px2: not symmetric and positive definite')
+    directions = _unit(stars.direction_icrf)
+    return dataclasses.replace(
+        stars,
+        icrf_from_star_tracker_xyzw=_unit(stars.icrf_from_star_tracker_xyzw),
+        catalog_id=_identifiers(directions) if catalog_id is None else stars.catalog_id,
         direction_icrf=directions,
-        magnitude=unknown,
-        measured_px=pixels,
-        covariance_px2=np.stack([uu, uv, vv], axis=-1),
-        flux_dn=unknown,
-        snr=unknown,
-        temperature_degc=temperature_degc,
     )
 
 
@@ -174,11 +179,11 @@ def calibrate(
     known = names_of(CalibrationOptions, GateOptions)
     for name in options:
         if name not in known:
-            raise OptionError(f'{name}: no such option{nearest(name, known)}')
+            raise OptionError(unknown_option(name, known))
     setup = load_setup(options, prior=prior)
     # The caller has looked the stars up: the bundled catalog has no part in the result.
     none = dataclasses.replace(setup.catalog.select(slice(0)), digest='')
-    return solve.solve(_ensemble(images, setup), dataclasses.replace(setup, catalog=none))
+    return solve.solve(solve.ensemble_of(images, setup), dataclasses.replace(setup, catalog=none))
 
 
 def calibrate_bag(
@@ -220,7 +225,41 @@ def calibrate_bag(
     setup, _ = aligned_by_bags(paths, asked, setup)
     images = topics.read(paths, topics.choose_topics(paths, asked, setup), setup)
     inputs = inputs_of((*reader.mcap_files(paths), Path(params)))
-    return solve.solve(_ensemble(images, setup), setup, inputs=inputs)
+    return solve.solve(solve.ensemble_of(images, setup), setup, inputs=inputs)
+
+
+def calibrate_images(images: Path | str | Sequence[Path | str], **options: object) -> Calibration:
+    """
+    Calibration of a camera from photographs of the sky alone; nothing is written.
+
+    Parameters
+    ----------
+    images : path or sequence of paths
+        FITS, JPEG, PNG or TIFF files, folders of them, or patterns.
+    **options
+        Options of a parameter file by name.
+
+    Returns
+    -------
+    Calibration
+        Of the camera alone: ``has_alignment`` is False.
+
+    Raises
+    ------
+    StarcalError
+        One line that names the cause, and the images to take.
+    """
+    paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
+    chosen, _ = night_sky.photographs_of(paths)
+    with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
+        found = night_sky.from_photographs(chosen, options, Path(folder))
+        bags = found.bags
+        measured = topics.read(
+            bags, topics.choose_topics(bags, topics.Topics(), found.setup), found.setup
+        )
+        through_air = found.through_air(list(measured))[0]
+        ensemble = solve.ensemble_of(through_air, found.setup)
+    return solve.solve(ensemble, found.setup, inputs=inputs_of([one.path for one in chosen]))
 
 
 def read_calibration(path: Path | str) -> Calibration:
@@ -283,34 +322,14 @@ def lines_of_sight(
     return np.asarray(in_camera @ star_tracker_from_camera.as_matrix().T)
 
 
-def _ensemble(images: Iterable[StarObservations], setup: Setup) -> Ensemble:
-    ensemble = Ensemble()
-    for image in images:
-        ensemble = solve.add_to_ensemble(ensemble, image, setup)
-    return ensemble
-
-
 def _calibration_file(path: Path | str) -> Path:
     path = Path(path)
     return path / calibration_json.CALIBRATION_FILE if path.is_dir() else path
 
 
-def _finite(name: str, values: ArrayLike) -> Floats:
-    array = np.array(values, np.float64)
-    if not np.isfinite(array).all():
-        raise ValueError(f'{name}: not all numbers are finite')
-    return array
-
-
-def _unit(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
+def _unit(vectors: Floats) -> Floats:
     """Vectors of unit length to the last bit, from ones that are nearly so."""
-    array = _finite(name, values)
-    if array.shape != shape:
-        raise ValueError(f'{name}: shape {array.shape} is not {shape}')
-    length = np.linalg.norm(array, axis=-1, keepdims=True)
-    if (np.abs(length - 1.0) > _UNIT_TOLERANCE).any():
-        raise ValueError(f'{name}: not of unit length')
-    return np.asarray(array / length)
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def _identifiers(directions: Floats) -> NDArray[np.int64]:

@@ -8,7 +8,10 @@ import contextlib
 import threading
 from typing import Any
 
-from threadpoolctl import ThreadpoolController
+try:
+    from threadpoolctl import ThreadpoolController
+except ModuleNotFoundError:  # rosdep has no key for it: the entry points set the environment
+    ThreadpoolController = None
 
 _lock = threading.Lock()
 _inside = 0  # blocks that have begun and not ended, in all threads of the process
@@ -27,7 +30,7 @@ def one_blas_thread() -> Iterator[None]:
     global _inside, _before
     with _lock:
         if not _inside:
-            libraries = ThreadpoolController().select(user_api='blas').lib_controllers
+            libraries = _blas()
             _before = [(library, library.get_num_threads()) for library in libraries]
             _set_threads((library, 1) for library, _ in _before)
         _inside += 1
@@ -38,6 +41,12 @@ def one_blas_thread() -> Iterator[None]:
             _inside -= 1
             if not _inside:
                 _set_threads(_before)
+
+
+def _blas() -> list[Any]:
+    if ThreadpoolController is None:
+        return []
+    return list(ThreadpoolController().select(user_api='blas').lib_controllers)
 
 
 def _set_threads(numbers: Iterable[tuple[Any, int]]) -> None:

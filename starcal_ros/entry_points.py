@@ -10,6 +10,7 @@ runs a node in the same way.
 from __future__ import annotations
 
 import importlib
+import os
 import signal
 import sys
 
@@ -20,36 +21,39 @@ _REMEDY = (
 
 
 def star_observer() -> int:
-    """Run the star observer; see `starcal_ros.nodes.star_observer.main`."""
+    """Run the star observer; see `starcal_ros.ros.star_observer.main`."""
     return _run('star_observer')
 
 
 def calibrator() -> int:
-    """Run the calibrator; see `starcal_ros.nodes.calibrator.main`."""
+    """Run the calibrator; see `starcal_ros.ros.calibrator.main`."""
     return _run('calibrator')
 
 
 def bag_player() -> int:
-    """Run the bag player; see `starcal_ros.nodes.bag_player.main`."""
+    """Run the bag player; see `starcal_ros.ros.bag_player.main`."""
     return _run('bag_player')
 
 
 def _run(name: str) -> int:
+    # Read when NumPy is imported: see `starcal_ros.blas_threads`, which a vehicle may not have.
+    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     # Unless nohup or a shell ignores it; `main` sets the handler of the node.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     # `starcal play` and `starcal monitor` block it until here.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
-        module = importlib.import_module(f'starcal_ros.nodes.{name}')
+        module = importlib.import_module(f'starcal_ros.ros.{name}')
     except ImportError as error:
         if (error.name or '').startswith('starcal_ros'):
             raise
-        why = ' '.join(str(error).split())
-        print(
-            f'{name}: ROS 2 is not complete for {sys.executable}: {why}. {_REMEDY}',
-            file=sys.stderr,
-        )
+        if error.name in ('mcap', 'rosbags'):  # rosdep has no key for them
+            why = f'{error.name} is not installed: pip install mcap rosbags'
+        else:
+            words = ' '.join(str(error).split())
+            why = f'ROS 2 is not complete for {sys.executable}: {words}. {_REMEDY}'
+        print(f'{name}: {why}', file=sys.stderr)
         return 2
     return int(module.main())
 

@@ -1,5 +1,12 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Exceptions that a caller may catch; each text is one line that names cause and remedy."""
+"""
+Exceptions that a caller may catch; each text is one line that names cause and remedy.
+
+The tool prints it on stderr and ends with status 2, a node logs it::
+
+    starcal: params.yaml: star_tracker_sigma_arcsec: [5e-05, 5e-05, 5e-05] looks like radians: in
+    arcseconds it is [10.3, 10.3, 10.3]
+"""
 
 from __future__ import annotations
 
@@ -22,6 +29,14 @@ class BagError(StarcalError):
 
 class ProductError(StarcalError):
     """A calibration file or a camera YAML file cannot be read."""
+
+
+class IngestError(StarcalError):
+    """A file of a mission cannot be read; the text names file, cause and remedy."""
+
+
+class NotFromStars(StarcalError):
+    """Images without attitudes give no camera; the text says what to photograph next."""
 
 
 class ArchiveError(StarcalError):

@@ -25,12 +25,8 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     """
     A file to write to, which replaces ``path`` when the block ends without an exception.
 
-    A link at ``path`` is replaced, never followed.
-
-    Raises
-    ------
-    OSError
-        When the file cannot be written; the old one is then unchanged.
+    A link at ``path`` is replaced, never followed. Raises OSError when the file cannot be written;
+    the old one is then unchanged.
     """
     _remove_abandoned(path)
     part = path.with_name(f'.{path.name}.{secrets.token_hex(4)}{PART}')
@@ -77,7 +73,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def same_as_one_of(path: Path, others: Iterable[Path]) -> bool:
-    """Whether a path names the same file, by whatever name, as one of the others."""
+    """True if a path names the same file, by whatever name, as one of the others."""
     try:
         found = path.stat()
     except OSError:

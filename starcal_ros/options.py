@@ -3,25 +3,26 @@
 Options: dataclass fields with a description, a unit and a range; reading of parameter files.
 
 Each stage has a frozen options dataclass beside the function that it tunes.  ROS parameters, the
-parameter file and the documentation are generated from the fields made with `option`.
+parameter file and the documentation are generated from the fields made with `option`.  The tool
+reads them from a parameter file (`pipeline.setup.read_setup`); a node declares them as parameters
+(`ros.lifecycle_node.parameters.OptionParameters`) and gives their values to `load_setup`.
 """
 
 from __future__ import annotations
 
-import array
 from collections.abc import Iterable, Mapping
 import dataclasses
 import difflib
-import math
 from pathlib import Path
 from typing import Any, TypeVar
 
 from starcal_ros.errors import OptionError
-from starcal_ros.untrusted import check_text, PARAMETER_BYTES, read_text, shown, yaml_value
+from starcal_ros.record_codec import nearest, read_value
+from starcal_ros.record_fields import FieldType, MOST
+from starcal_ros.untrusted import PARAMETER_BYTES, read_text, shown, yaml_value
 
 OptionValue = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 OptionsT = TypeVar('OptionsT')
-_INT64 = 2**63
 _MOST_CHARACTERS = 4096  # of a text: the longest path of Linux
 _MOST_ITEMS = 100  # of a list; the longest in use has 22 numbers
 _LONGEST_NAME = 100
@@ -37,11 +38,13 @@ def option(
     high: float | None = None,
     choices: tuple[str, ...] = (),
     length: int | None = None,
+    basic: bool = False,
 ) -> Any:
     """
     Dataclass field with the content of a ROS parameter descriptor.
 
     ``low`` and ``high`` are inclusive; like ``choices`` they apply to each element of a list.
+    ``basic`` marks the few options that most cameras need; the others are advanced.
     """
     return dataclasses.field(
         default=default,
@@ -51,6 +54,7 @@ def option(
             'high': high,
             'choices': choices,
             'length': length,
+            'basic': basic,
         },
     )
 
@@ -59,110 +63,127 @@ def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
     """
     Value converted to the type of the field.
 
-    Raises
-    ------
-    OptionError
-        With the option, the value and the expected type or range.
+    Raises OptionError with the option, the value and the expected type or range.
     """
-    default, meta = field.default, field.metadata
-    if isinstance(value, array.array):  # a list, as rclpy hands it over
-        value = value.tolist()
-
-    def refuse(expected: str) -> OptionError:
-        return OptionError(f'{field.name}: {shown(value)} is not {expected}')
-
-    def number(item: object) -> float:
-        if isinstance(item, bool) or not isinstance(item, (int, float)):
-            raise refuse('a number')
-        if isinstance(item, int) and not -_INT64 <= item < _INT64:
-            raise refuse('within 64 bit')
-        if not math.isfinite(item):
-            raise refuse('finite')
-        low, high = meta['low'], meta['high']
-        if (low is not None and item < low) or (high is not None and item > high):
-            raise refuse(f'within {low} to {high}')
-        return item
-
-    def text(item: object) -> str:
-        if not isinstance(item, str):
-            raise refuse('a string')
-        try:
-            check_text(item)
-        except ValueError as error:
-            raise OptionError(f'{field.name}: {error}') from error
-        if len(item) > _MOST_CHARACTERS:
-            raise refuse(f'a text of at most {_MOST_CHARACTERS} characters')
-        if meta['choices'] and item not in meta['choices']:
-            raise refuse('one of ' + ', '.join(meta['choices']) + nearest(item, meta['choices']))
-        return item
-
-    if isinstance(default, bool):
-        if not isinstance(value, bool):
-            raise refuse('true or false')
-        return value
-    if isinstance(default, int):
-        whole = number(value)
-        if whole != int(whole):
-            raise refuse('an integer')
-        return int(whole)
-    if isinstance(default, float):
-        return float(number(value))
-    if isinstance(default, str):
-        return text(value)
-    if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
-        raise refuse('a list')
-    items = list(value)
-    if len(items) > _MOST_ITEMS:
-        raise OptionError(f'{field.name}: {len(items)} values, at most {_MOST_ITEMS} are read')
-    if meta['length'] is not None and len(items) != meta['length']:
-        raise refuse(f'a list of {meta["length"]} values')
-    of_text = meta['choices'] or (isinstance(default, tuple) and isinstance(default[0], str))
-    if of_text:
-        texts = tuple(text(item) for item in items)
-        if meta['choices'] and len(set(texts)) < len(texts):
-            twice = next(item for item in texts if texts.count(item) > 1)
-            raise OptionError(f'{field.name}: {twice} stands twice')
-        return texts
-    return tuple(float(number(item)) for item in items)
+    meta, default = field.metadata, field.default
+    low, high = meta['low'], meta['high']
+    kind = FieldType(
+        type(default[0]) if isinstance(default, tuple) else type(default),
+        low=-MOST if low is None else low,
+        high=MOST if high is None else high,
+        is_finite=True,
+        choices=meta['choices'],
+        most_characters=_MOST_CHARACTERS,
+    )
+    if isinstance(default, tuple):
+        kind = FieldType(
+            tuple,
+            item=kind,
+            dimensions=(meta['length'] or '',),
+            most_items=_MOST_ITEMS,
+            are_different=bool(meta['choices']),
+        )
+    try:
+        found: OptionValue = read_value(kind, value, field.name, {})
+        return found
+    except ValueError as error:
+        raise OptionError(str(error)) from error
 
 
 def is_of_ros(name: str) -> bool:
     """True if a parameter of a ``ros2 param dump`` is one that every ROS node has."""
-    return name in ('use_sim_time', 'start_type_description_service') or '.' in name
+    return '.' in name or name in (
+        'use_sim_time',
+        'start_type_description_service',
+        'qos_overrides',
+    )
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
-    """Suggestion for an unknown word, to append to an error message; '' without a close match."""
-    # Of a word of a million letters each comparison takes seconds.
-    near = difflib.get_close_matches(word[:_LONGEST_NAME], known, 1)
-    return f' (did you mean {near[0]}?)' if near else ''
+_FIELD = 'the field over the detector is always estimated, as large as the stars show it'
+_SIGMAS = 'max_map_sigma_px and max_line_of_sight_sigma_arcsec limit all that is not determined'
+_CONSTANT = 'it is a constant of the method'
+_SEARCH = 'leave out prior_alignment if it may be off by more than 1.5 degrees, or 5 in roll'
+_PREDICTED = 'max_cross_validated_residual limits how far images are off what the others predict'
+REMOVED: Mapping[str, str] = {
+    'residual_field': _FIELD,
+    'max_field_p_value': _FIELD,
+    'max_field_px': 'max_change_px limits the change of the map, the field included',
+    'max_parameter_sigma': _SIGMAS,
+    'min_singular_value': _SIGMAS,
+    'min_independent_images': _SIGMAS,
+    'max_star_tracker_excess': 'max_line_of_sight_sigma_arcsec limits what a bad one leads to',
+    'max_halves_px': _PREDICTED,
+    'max_halves_rotation_arcsec': _PREDICTED,
+    'min_halves_p_value': _PREDICTED,
+    'min_model_p_value': 'errors outside of the model are estimated, whether significant or not',
+    'max_velocity_error_km_s': 'the velocity is estimated with the prior velocity_sigma_m_s, and'
+    ' max_held_term_sigma limits how far it is off',
+    'max_zero_skew_cost_px': 'zero_skew_cost_px is reported with the calibration',
+    'max_step_sigma': 'max_step_px and max_step_rotation_deg limit changes of the lines of sight',
+    'max_saturated_fraction': _CONSTANT,
+    'max_gradient': _CONSTANT,
+    'hot_pixel_sigma': f'{_CONSTANT}; bad_pixel_map adds pixels',
+    'detection_sigma': 'min_snr limits the stars used',
+    'mask_radius_px': _CONSTANT,
+    'mask_threshold_sigma': _CONSTANT,
+    'min_pixels': _CONSTANT,
+    'max_shape_change': _CONSTANT,
+    'acquisition_radius_deg': _SEARCH,
+    'acquisition_roll_deg': _SEARCH,
+    'search_radius_px': _SEARCH,
+    'min_stars_per_image': 'every image needs 8 measured stars',
+    'max_blend_sigma': _CONSTANT,
+    'relative_humidity': _CONSTANT,
+    'wavelength_um': _CONSTANT,
+    'min_elevation_deg': _CONSTANT,
+    'outlier_sigma': f'{_CONSTANT}; max_rejected_fraction limits the outliers',
+    'principal_point_prior': 'prior_sigma states the 1-sigma of cx and cy',
+    'variance_components': 'the sigmas are always scaled by the residuals',
+    'image_reliability': 'auto is the default; the ROS parameter'
+    ' qos_overrides.<topic>.subscription.reliability sets another',
+    'attitude_history_s': _CONSTANT,
+    'camera_info_per_image': 'image_camera_info is always published',
+    'calibration_history': 'the last 20 calibrations are kept',
+    'set_camera_info_timeout_s': _CONSTANT,
+}
+"""Options of earlier versions, and what replaces them."""
+
+
+def unknown_option(name: str, known: Iterable[str]) -> str:
+    """Return one line for a name that is no option: what replaced it, or a similar name."""
+    said = name if name.isidentifier() and len(name) < _LONGEST_NAME else shown(name)
+    if name in REMOVED:
+        return f'{said}: not an option any more: {REMOVED[name]}; take it out'
+    return f'{said}: no such parameter{nearest(name, known)}'
+
+
+def option_fields(*kinds: type[Any]) -> list[dataclasses.Field[Any]]:
+    """
+    Fields of dataclasses that were made with `option`.
+
+    The other fields of such a dataclass are constants in flight, which studies vary.
+    """
+    return [f for kind in kinds for f in dataclasses.fields(kind) if 'description' in f.metadata]
 
 
 def holds_options(kind: object) -> bool:
-    """Return True for a dataclass whose fields were all made with `option`."""
-    return (
-        isinstance(kind, type)
-        and dataclasses.is_dataclass(kind)
-        and all('description' in field.metadata for field in dataclasses.fields(kind))
-    )
+    """Return True for a dataclass with a field that was made with `option`."""
+    return isinstance(kind, type) and dataclasses.is_dataclass(kind) and bool(option_fields(kind))
 
 
 def names_of(*option_classes: type[Any]) -> set[str]:
     """Option names of the given dataclasses."""
-    return {f.name for cls in option_classes for f in dataclasses.fields(cls)}
+    return {field.name for field in option_fields(*option_classes)}
 
 
 def from_mapping(cls: type[OptionsT], values: Mapping[str, object]) -> OptionsT:
     """
     Options dataclass from the entries of a mapping that match its fields.
 
-    Raises
-    ------
-    OptionError
-        If a value has the wrong type or is out of range.
+    Raises OptionError if a value has the wrong type or is out of range.
     """
-    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
-    return cls(**{f.name: check_value(f, values[f.name]) for f in fields if f.name in values})
+    given = [field for field in option_fields(cls) if field.name in values]
+    return cls(**{field.name: check_value(field, values[field.name]) for field in given})
 
 
 def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]:
@@ -172,11 +193,8 @@ def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]
     Sections apply as in ROS: ``/**`` to all, then a node's own name, in any namespace that it is
     given with a wildcard or not at all, later ones winning.
 
-    Raises
-    ------
-    OptionError
-        When the file cannot be read or is not a ROS parameter file, or has a section that seems
-        meant for one of the nodes and applies to none.
+    Raises OptionError when the file cannot be read or is not a ROS parameter file, or has a
+    section that seems meant for one of the nodes and applies to none.
     """
     values: dict[str, object] = {}
     sections = parameter_sections(path)
@@ -215,10 +233,7 @@ def parameter_sections(path: Path) -> dict[str, object]:
     """
     Content of a ROS 2 parameter file by section: the full name of a node, or a pattern of it.
 
-    Raises
-    ------
-    OptionError
-        If the file cannot be read or is not a ROS parameter file.
+    Raises OptionError if the file cannot be read or is not a ROS parameter file.
     """
     try:
         content = yaml_value(read_text(path, PARAMETER_BYTES))

@@ -22,14 +22,19 @@ import pytest
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
-NODES = 'starcal_ros.nodes.'
+NODES = 'starcal_ros.ros.'
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 
 
 def free_domain() -> int:
-    """Return a ROS domain without participants on this machine."""
-    for k in range(100):
-        domain = 1 + (os.getpid() + k) % 100
+    """Return a ROS domain without participants on this machine, of no other worker."""
+    # Workers choose before any of them has a participant: each has every n-th domain.
+    workers = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))
+    worker = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
+    rounds = 100 // workers
+    start = os.getppid() if workers > 1 else os.getpid()
+    for k in range(rounds):
+        domain = 1 + worker + workers * ((start + k) % rounds)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
                 # The first participant of a domain holds this port (RTPS 9.6.1.1).
@@ -282,8 +287,8 @@ def other_client(ros_domain: None) -> Iterator[Client]:
 @pytest.fixture(scope='session')
 def tiny_observations() -> Any:
     """Simulated observations of scenario tiny, without pixels."""
-    synthetic = pytest.importorskip('starcal_ros.simulation.scenario')
-    centroids = pytest.importorskip('starcal_ros.simulation.centroids')
+    synthetic = pytest.importorskip('starcal_ros.studies.simulation.scenario')
+    centroids = pytest.importorskip('starcal_ros.studies.simulation.centroids')
     return centroids.true_observations(synthetic.scenario('tiny'))
 
 
@@ -292,7 +297,7 @@ def camera_yaml(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Camera file of the prior of `tiny_campaign`."""
     from tiny_campaign import SCENARIO  # type: ignore[import-not-found]
 
-    from starcal_ros.products.camera_yaml import write_camera_info
+    from starcal_ros.formats.products.camera_yaml import write_camera_info
 
     path = tmp_path_factory.mktemp('prior') / 'camera.yaml'
     write_camera_info(SCENARIO.prior.camera, path)

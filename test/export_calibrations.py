@@ -9,7 +9,7 @@ import numpy as np
 from sample_records import without_field  # type: ignore[import-not-found]
 
 from starcal_ros.camera import CameraModel
-from starcal_ros.detector_field import degrees
+from starcal_ros.camera.detector_field import degrees
 from starcal_ros.records import Calibration, CameraGeometry, ResidualField, TemperatureTerms
 
 _COEFFICIENTS = {
@@ -50,7 +50,7 @@ def calibration(
         return made
     t = len(degrees(4))
     coefficients_px = np.random.default_rng(5).normal(0, 0.03, (2, t))
-    field = ResidualField(4, coefficients_px, np.eye(p + 2 * t) * 1e-8, 0.4, 0.05)
+    field = ResidualField(4, coefficients_px, np.eye(p + 2 * t) * 1e-8)
     return dataclasses.replace(made, field=field)
 
 

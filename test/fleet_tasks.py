@@ -8,24 +8,25 @@ import os
 from pathlib import Path
 import signal
 
-from starcal_ros.trend import tasks
-from starcal_ros.trend.rows import Row
-from starcal_ros.trend.tasks import Task
+from starcal_ros.mission.trend import answers
+from starcal_ros.mission.trend.answers import Seen
+from starcal_ros.mission.trend.rows import Row
+from starcal_ros.mission.trend.tasks import Task
 
 
-def kill_on_poison(task: Task) -> Row:
+def kill_on_poison(task: Task) -> Row | Seen:
     """Row of a task; a poisonous one kills the process that it runs in."""
-    if task.path.name == 'poison':
+    if task.url == 'poison':
         os.kill(os.getpid(), signal.SIGKILL)
-    return tasks.compute(task)
+    return answers.compute(task)
 
 
-def kill_once(task: Task) -> Row:
+def kill_once(task: Task) -> Row | Seen:
     """Row of a task; the first to find the marker kills its process."""
     marker = Path(task.params)
     try:
         marker.unlink()
     except FileNotFoundError:
-        return tasks.compute(dataclasses.replace(task, params=''))
+        return answers.compute(dataclasses.replace(task, params=''))
     os.kill(os.getpid(), signal.SIGKILL)
     raise AssertionError

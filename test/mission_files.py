@@ -13,8 +13,8 @@ import erfa
 import numpy as np
 import spiceypy
 
-from starcal_ros.bag import reader
-from starcal_ros.messages.telemetry import attitude_from_message
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.messages.telemetry import attitude_from_message, velocity_from_message
 from starcal_ros.records import Image
 
 TINY = Path(__file__).parents[1] / 'bags/tiny'
@@ -32,6 +32,17 @@ def attitudes() -> tuple[tuple[int, np.ndarray], ...]:
     """Stamps and quaternions, icrf_from_star_tracker."""
     raw = reader.read_raw([TINY], ['/star_tracker/attitude'])
     return tuple(attitude_from_message(reader.decode(message)) for message in raw)
+
+
+def write_velocities(path: Path) -> Path:
+    """A table of the velocities of the small bag."""
+    raws = reader.read_raw([TINY], ['/spacecraft/velocity'])
+    lines = ['time_ns,vx_m_s,vy_m_s,vz_m_s']
+    for raw in raws:
+        time_ns, velocity_m_s = velocity_from_message(reader.decode(raw))
+        lines.append(','.join(map(repr, [time_ns, *velocity_m_s.tolist()])))
+    path.write_text('\n'.join(lines) + '\n')
+    return path
 
 
 def date(time_ns: int, system: str = 'utc') -> str:

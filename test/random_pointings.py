@@ -14,9 +14,9 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import Ensemble
-from starcal_ros.simulation.scenario import Inertial, Scenario, scenario
+from starcal_ros.studies.simulation.scenario import Inertial, Scenario, scenario
 
 WIDTH, HEIGHT = 1296, 1024
 
@@ -46,9 +46,10 @@ def displaced(ensemble: Ensemble, move: Callable[[Floats], Floats]) -> Ensemble:
 
 
 def estimated(given: Scenario, ensemble: Ensemble, **options: object) -> Estimate:
+    values: dict[str, object] = {'velocity_sigma_m_s': 10.0, **options}  # as with a topic
     changed = CalibrationOptions(
         star_tracker_sigma_arcsec=given.star_tracker_sigma_arcsec,
-        **options,  # type: ignore[arg-type]
+        **values,  # type: ignore[arg-type]
     )
     return estimate_calibration(ensemble, given.prior, changed)
 
@@ -63,7 +64,7 @@ def honesty(
     for _ in range(30):  # a contraction: 0.3 px over hundreds of pixels
         at = pixels - move(at)
     true = line_of_sight(camera, at)
-    table = line_of_sight_table(found.geometry.camera, found.joint_covariance, pixels)
+    table = line_of_sight_table(found.geometry.camera, found.map_covariance, pixels)
     rotation, _ = Rotation.align_vectors(true, table.direction_camera)
     error = np.linalg.norm(rotation.apply(table.direction_camera) - true, axis=1) / ARCSECOND_RAD
     rms = float(np.sqrt(np.mean(error**2)))

@@ -84,7 +84,7 @@ class RosTools:
 
     def start_node(self, name: str, *ros: str | Path) -> Started:
         """Start a node of starcal with ROS arguments."""
-        module = f'starcal_ros.nodes.{name}'
+        module = f'starcal_ros.ros.{name}'
         return self._start([sys.executable, '-m', module, '--ros-args', *map(str, ros)])
 
     def _start(self, command: list[str]) -> Started:

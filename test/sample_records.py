@@ -11,6 +11,7 @@ import numpy as np
 
 from starcal_ros.camera import CameraModel
 from starcal_ros.records import (
+    Amplitude,
     Calibration,
     CameraGeometry,
     Correlation,
@@ -18,12 +19,12 @@ from starcal_ros.records import (
     DetectorStep,
     EnsembleStatus,
     GateCheck,
-    HalvesComparison,
     HeldTerm,
     ModelChecks,
     refused_image,
     ResidualBin,
     ResidualField,
+    SigmaPart,
     StarObservations,
     StarTrackerAlignment,
     TemperatureTerms,
@@ -54,6 +55,10 @@ def observations(n: int = 5) -> StarObservations:
         psf_sigma_px=0.95,
         catalog_digest='abc',
         temperature_degc=-12.3,
+        star_tracker_rate_rad_s=np.array([1e-3, -2e-3, 5e-4]),
+        velocity_sigma_m_s=10.0,
+        zenith_icrf=np.array([0.36, 0.48, 0.8]),
+        refraction_arcsec=np.array([54.0, 6.0]),
         refused_catalog_id=np.array([2**62 + 20, -5, 7, 8], np.int64),
         refused_px=random.uniform(0, 1000, (4, 2)).astype(np.float32),
         refused_reason=np.array([0, 1, 0, 0], np.uint8),
@@ -100,7 +105,6 @@ def calibration() -> Calibration:
             np.arange(12.0).reshape(4, 3) / 7,
             np.sqrt(np.arange(12.0)).reshape(4, 3),
         ),
-        halves=HalvesComparison(0.03, 0.4, 1.7, 0.6),
         correlation=Correlation(('fx', 'fy'), np.array([[1.0, 1 / 3], [1 / 3, 1.0]])),
         removals=(
             TermRemoval('', 0.0, 0.0, 0.0, True, 0.1, (0.09, 0.11), 0.0),
@@ -123,9 +127,20 @@ def calibration() -> Calibration:
         field=ResidualField(
             1,
             np.array([[0.011, -0.007, 0.003], [0.005, 0.0025, -0.0125]]),
-            np.arange(361.0).reshape(19, 19) / 11,
-            0.4375,
-            0.02,
+            unresolved_px=0.0625,
+            covariance_factor=np.arange(38.0).reshape(19, 2) / 11,
+            remainder_unit_px=np.asarray(np.arange(1.0, 7.0) / 7e4, np.float64),
+            remainder=np.arange(-10, 11, dtype=np.int16),
+        ),
+        sigma_budget=(
+            SigmaPart('total', 0.7, 12.5, ''),
+            SigmaPart(
+                'velocity',
+                0.6,
+                0.75,
+                'not given: 8 km/s per axis assumed',
+                tuple(0.01 * k for k in range(63)),
+            ),
         ),
         gate=(
             GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 0.25, 'px', False, 'a word'),
@@ -137,24 +152,33 @@ def calibration() -> Calibration:
 def model_checks() -> ModelChecks:
     """Checks of the model with a different number in every field, within the default limits."""
     return ModelChecks(
-        field_p_value=0.3,
         field_rms_px=0.009,
         field_worst_px=0.02,
         held=(HeldTerm('cx', 647.5, 648.25, 1.5), HeldTerm('k3', 0.01, 0.02, 0.04)),
         step=DetectorStep('u', 512.5, 'v', -0.015, 0.7),
-        velocity_error_km_s=1.25,
-        velocity_sigma_km_s=0.6,
-        velocity_p_value=0.2,
         image_variation_px=0.03,
-        image_variation_p_value=0.45,
-        correlation_time_s=12.5,
-        independent_images=7.5,
-        pointings=14,
-        independent_pointings=13.25,
-        cross_validation=(
+        amplitudes=(
+            Amplitude('field', 0.0125, 'px', 41.5),
+            Amplitude('change from image to image', 0.0003, 'px', 0.75),
+        ),
+        predictions=(
             ResidualBin('radius', 3.5, 320.25, 140, 1.02, 0.04),
             ResidualBin('magnitude', 1.5, 4.5, 137, 0.97, 0.043),
         ),
+    )
+
+
+def with_joint_covariance() -> Calibration:
+    """The calibration as files and messages before the factor held it."""
+    joint = np.arange(361.0).reshape(19, 19) / 11
+    coefficients_px = np.array([[0.011, -0.007, 0.003], [0.005, 0.0025, -0.0125]])
+    bare = without_field()
+    camera = dataclasses.replace(
+        bare.geometry.camera, field=ResidualField(1, coefficients_px).on(1296, 1024)
+    )
+    geometry = dataclasses.replace(bare.geometry, camera=camera)
+    return dataclasses.replace(
+        bare, geometry=geometry, field=ResidualField(1, coefficients_px, joint), sigma_budget=()
     )
 
 
@@ -168,7 +192,9 @@ def without_field() -> Calibration:
 
 def calibration_of_0_1() -> Calibration:
     """What a file of version 0.1 holds of it: no field, no checks of the model, one alignment."""
-    return dataclasses.replace(without_field(), model_checks=None, star_trackers=())
+    return dataclasses.replace(
+        without_field(), model_checks=None, star_trackers=(), sigma_budget=()
+    )
 
 
 def plain_calibration() -> Calibration:
@@ -179,10 +205,10 @@ def plain_calibration() -> Calibration:
         maps=None,
         correlation=None,
         removals=(),
-        halves=None,
         star_trackers=(),
         model_checks=None,
         gate=(),
+        sigma_budget=(),
     )
 
 

@@ -9,14 +9,8 @@ from opencv_points import undistorted  # type: ignore[import-not-found]
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.camera import (
-    CameraModel,
-    line_of_sight,
-    pixel_grid,
-    project,
-    project_jacobians,
-)
-from starcal_ros.lens import COEFFICIENTS, ros_distortion
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, project_jacobians
+from starcal_ros.camera.lens import COEFFICIENTS, ros_distortion
 
 # Distortion at the edge of a 20 degree field and of a wide one: (k1, k2, k3, p1, p2) scales.
 NARROW = np.array([0.1, 0.3, 1.0, 1e-3, 1e-3])

@@ -17,7 +17,7 @@ from tiny_campaign import ensemble, SCENARIO  # type: ignore[import-not-found]
 import starcal_ros
 from starcal_ros import api
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import Ensemble, StarObservations
 
 SIGMA_ARCSEC = (10.0, 10.0, 40.0)
@@ -34,6 +34,8 @@ def arrays(image: StarObservations) -> dict[str, Any]:
         'direction_icrf': image.direction_icrf,
         'icrf_from_star_tracker_xyzw': image.icrf_from_star_tracker_xyzw,
         'catalog_id': image.catalog_id,
+        'star_tracker_rate_rad_s': image.star_tracker_rate_rad_s,
+        'velocity_sigma_m_s': image.velocity_sigma_m_s,
     }
 
 
@@ -53,6 +55,7 @@ def test_the_import_alone_loads_nothing() -> None:
     assert not {'numpy', 'cv2', 'starcal_ros.api'} & set(done.stdout.split())
 
 
+@pytest.mark.slow
 def test_arrays_give_the_estimate_of_the_records() -> None:
     images = [
         starcal_ros.observations_of(SCENARIO.prior.camera, **arrays(image))
@@ -96,14 +99,14 @@ def test_one_covariance_serves_all_stars() -> None:
 @pytest.mark.parametrize(
     ('argument', 'value', 'complaint'),
     [
-        ('measured_px', np.zeros(4), r'measured_px: shape \(4,\) is not \(n, 2\)'),
-        ('measured_px', [[np.nan, 0.0]], 'measured_px: not all numbers are finite'),
+        ('measured_px', np.zeros(4), 'measured_px: 4 numbers, not n x 2'),
+        ('measured_px', [[np.nan, 0.0]], r'measured_px\[0\]\[0\]: nan is not a finite number'),
         ('covariance_px2', np.zeros((3, 3)), r'covariance_px2: shape \(3, 3\) is not'),
         ('covariance_px2', -np.eye(2), 'covariance_px2: not symmetric and positive definite'),
         ('covariance_px2', [[1.0, 0.1], [0.0, 1.0]], 'covariance_px2: not symmetric'),
-        ('direction_icrf', [[0.0, 0.0, 1.0]], r'direction_icrf: shape \(1, 3\) is not'),
-        ('icrf_from_star_tracker_xyzw', [0.0, 0.0, 0.0, 2.0], 'not of unit length'),
-        ('catalog_id', [1, 2], r'catalog_id: shape \(2,\) is not'),
+        ('direction_icrf', [[0.0, 0.0, 1.0]], r'direction_icrf: 1 x 3 numbers, not [0-9]+ x 3'),
+        ('icrf_from_star_tracker_xyzw', [0.0, 0.0, 0.0, 2.0], 'xyzw: length 2 is not 1'),
+        ('catalog_id', [1, 2], 'catalog_id: 2 numbers, not [0-9]+'),
     ],
 )
 def test_a_bad_array_is_named(argument: str, value: Any, complaint: str) -> None:
@@ -117,7 +120,7 @@ def test_options_are_checked_by_name() -> None:
         starcal_ros.calibrate(ensemble().images, SCENARIO.prior, methd='single')
     with pytest.raises(starcal_ros.OptionError, match='method: .* is not one of'):
         starcal_ros.calibrate(ensemble().images, SCENARIO.prior, method='best')
-    with pytest.raises(starcal_ros.OptionError, match='prior_alignment: no such option'):
+    with pytest.raises(starcal_ros.OptionError, match='prior_alignment: no such parameter'):
         starcal_ros.calibrate(ensemble().images, SCENARIO.prior, prior_alignment=(0, 0, 0, 1))
 
 
@@ -126,6 +129,7 @@ def test_too_few_images_are_refused() -> None:
         starcal_ros.calibrate(ensemble().images[:2], SCENARIO.prior)
 
 
+@pytest.mark.slow
 def test_a_bag_gives_what_the_tool_gives(tiny_bag: Path, tiny_products: Path) -> None:
     found = starcal_ros.calibrate_bag(tiny_bag, tiny_bag / 'params.yaml')
     written = starcal_ros.read_calibration(tiny_products)

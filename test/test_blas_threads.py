@@ -84,6 +84,7 @@ print(found.images_used, time.process_time() - time.thread_time() - before)
 """
 
 
+@pytest.mark.slow
 def test_a_calibration_from_python_takes_the_processor_time_of_one_thread() -> None:
     environment = {**os.environ, 'OPENBLAS_NUM_THREADS': '4'}
     done = subprocess.run(

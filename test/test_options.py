@@ -12,14 +12,17 @@ import numpy as np
 import pytest
 
 from starcal_ros.errors import OptionError
+from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.options import (
     from_mapping,
     names_of,
     option,
+    option_fields,
     parameter_sections,
     read_parameter_file,
     section_applies,
 )
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import OPTION_CLASSES
 
 
@@ -70,30 +73,30 @@ def test_good_values(values: dict[str, object], expected: Sample) -> None:
     [
         ({'yes': 1}, 'yes: 1 is not true or false'),
         ({'yes': 'true'}, "yes: 'true' is not true or false"),
-        ({'count': True}, 'count: True is not a number'),
-        ({'count': 2.5}, 'count: 2.5 is not an integer'),
+        ({'count': True}, 'count: True is not a whole number'),
+        ({'count': 2.5}, 'count: 2.5 is not a whole number'),
         ({'count': 0}, 'count: 0 is not within 1 to 10'),
         ({'count': 11}, 'count: 11 is not within 1 to 10'),
-        ({'count': '5'}, "count: '5' is not a number"),
-        ({'count': None}, 'count: None is not a number'),
-        ({'count': math.nan}, 'count: nan is not finite'),
-        ({'size_px': math.inf}, 'size_px: inf is not finite'),
-        ({'size_px': 0.49}, 'size_px: 0.49 is not within 0.5 to None'),
+        ({'count': '5'}, "count: '5' is not a whole number"),
+        ({'count': None}, 'count: None is not a whole number'),
+        ({'count': math.nan}, 'count: nan is not a whole number'),
+        ({'size_px': math.inf}, 'size_px: inf is not a finite number'),
+        ({'size_px': 0.49}, 'size_px: 0.49 is not at least 0.5'),
         ({'size_px': False}, 'size_px: False is not a number'),
         ({'size_px': [1.0]}, 'size_px: [1.0] is not a number'),
         ({'kind': 'c'}, "kind: 'c' is not one of a, b"),
-        ({'kind': 1}, 'kind: 1 is not a string'),
-        ({'name': 3.0}, 'name: 3.0 is not a string'),
-        ({'axes': [1.0, 2.0]}, 'axes: [1.0, 2.0] is not a list of 3 values'),
+        ({'kind': 1}, 'kind: 1 is not a text'),
+        ({'name': 3.0}, 'name: 3.0 is not a text'),
+        ({'axes': [1.0, 2.0]}, 'axes: 2 numbers, not 3'),
         ({'axes': 1.0}, 'axes: 1.0 is not a list'),
         ({'axes': 'abc'}, "axes: 'abc' is not a list"),
-        ({'axes': [1.0, 2.0, -1.0]}, 'axes: [1.0, 2.0, -1.0] is not within 0.0 to None'),
-        ({'axes': [1.0, 2.0, math.nan]}, 'axes: [1.0, 2.0, nan] is not finite'),
-        ({'axes': [1.0, 2.0, True]}, 'axes: [1.0, 2.0, True] is not a number'),
-        ({'parts': ['u', 'x']}, "parts: ['u', 'x'] is not one of u, v, w"),
+        ({'axes': [1.0, 2.0, -1.0]}, 'axes[2]: -1.0 is not at least 0.0'),
+        ({'axes': [1.0, 2.0, math.nan]}, 'axes[2]: nan is not a finite number'),
+        ({'axes': [1.0, 2.0, True]}, 'axes[2]: True is not a number'),
+        ({'parts': ['u', 'x']}, "parts[1]: 'x' is not one of u, v, w"),
         ({'parts': 'u'}, "parts: 'u' is not a list"),
-        ({'parts': [1]}, 'parts: [1] is not a string'),
-        ({'words': [2]}, 'words: [2] is not a string'),
+        ({'parts': [1]}, 'parts[0]: 1 is not a text'),
+        ({'words': [2]}, 'words[0]: 2 is not a text'),
     ],
 )
 def test_bad_values(values: dict[str, object], text: str) -> None:
@@ -104,9 +107,9 @@ def test_bad_values(values: dict[str, object], text: str) -> None:
 
 def test_long_values_are_refused_in_a_short_line() -> None:
     for name, value, says in (
-        ('estimate', ['fx', 'fx'], 'estimate: fx stands twice'),
+        ('estimate', ['fx', 'fx'], 'estimate: fx is given twice'),
         ('estimate', ['fx'] * 100_000, 'estimate: 100000 values, at most 100 are read'),
-        ('estimate', ['x' * 10**6], 'estimate: .* is not a text of at most 4096'),
+        ('estimate', ['x' * 10**6], r'estimate\[0\]: .* is not a text of at most 4096'),
         ('method', 'm' * 4000, 'method: .* is not one of'),
         ('min_images', 10**5000, 'min_images: an integer of more than 60 digits is not within 64'),
         ('catalog', 'a\0b', 'catalog: a text with a NUL character'),
@@ -119,16 +122,30 @@ def test_long_values_are_refused_in_a_short_line() -> None:
 
 @pytest.mark.parametrize('options_class', OPTION_CLASSES)
 def test_every_default_is_a_value_that_its_own_option_takes(options_class: type) -> None:
-    defaults = {f.name: f.default for f in dataclasses.fields(options_class)}
+    defaults = {f.name: f.default for f in option_fields(options_class)}
     assert from_mapping(options_class, defaults) == options_class()
-    for field in dataclasses.fields(options_class):
+    for field in option_fields(options_class):
         assert field.metadata['description'], field.name
 
 
 def test_no_two_stages_share_a_name() -> None:
     # One flat file holds the options of all stages.
-    count = sum(len(dataclasses.fields(c)) for c in OPTION_CLASSES)
-    assert len(names_of(*OPTION_CLASSES)) == count
+    fields = option_fields(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
+    assert len(names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)) == len(fields)
+
+
+def test_options_are_few_and_about_ten_are_basic() -> None:
+    fields = option_fields(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
+    assert len(fields) <= 70
+    assert 8 <= sum(field.metadata['basic'] for field in fields) <= 12
+
+
+def test_a_constant_that_studies_vary_is_not_a_parameter() -> None:
+    constants = {'outlier_sigma', 'principal_point_prior', 'variance_components'}
+    assert constants <= {field.name for field in dataclasses.fields(CalibrationOptions)}
+    assert not constants & names_of(CalibrationOptions)
+    given = from_mapping(CalibrationOptions, {'outlier_sigma': 3.0, 'min_images': 5})
+    assert given == CalibrationOptions(min_images=5)
 
 
 def parameter_file(folder: Path, text: str) -> Path:

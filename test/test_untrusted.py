@@ -33,13 +33,11 @@ from starcal_ros.untrusted import json_value, read_text, shown, yaml_value
         ('yes', True),
         ('Off', False),
         ('"yes"', 'yes'),
-        ('! 5', '5'),
         ('!!str 5', '5'),
         ('!!float 5', 5),
         ('~', None),
         ('-.INF', -math.inf),
         ('[1, {a: b}]', [1, {'a': 'b'}]),
-        ('{a: &x [1], b: *x}', {'a': [1], 'b': [1]}),
         ('', None),
     ],
 )
@@ -50,7 +48,7 @@ def test_values_of_yaml(text: str, value: object) -> None:
 @pytest.mark.parametrize(
     ('text', 'says'),
     [
-        ('a: 1\na: 2', "line 2: key 'a' stands twice"),
+        ('a: 1\na: 2', "line 2: duplicate key 'a'"),
         ('5: 1', 'line 1: key 5 is not a text'),
         ('no: 1', 'line 1: key False is not a text'),
         ('a: ' + 5000 * '9', 'line 1: an integer of 5000 digits is beyond 64 bit'),
@@ -61,8 +59,9 @@ def test_values_of_yaml(text: str, value: object) -> None:
         ('%TAG ! x\n---\na: 1', 'tag directives'),
         (40 * '[' + 40 * ']', 'line 1: nested deeper than 32'),
         (100_000 * '[', 'nested deeper'),
-        ('a: &a [*a]', "line 1: alias 'a' of no value before it"),
-        ('--- 1\n--- 2', 'several YAML documents'),
+        ('a: &a [*a]', 'line 1: YAML aliases are not read'),
+        ('[' + 100_000 * '1,' + '1]', 'more than 100000 values'),
+        ('--- 1\n--- 2', 'not YAML: expected a single document'),
         ('a: [', 'not YAML: .*line 2, column 1'),
         ('x\ud800', 'not YAML'),
     ],
@@ -77,7 +76,7 @@ def test_aliases_do_not_multiply() -> None:
     """Nine levels of ten aliases each are a gigabyte where they are written out."""
     lines = ['a0: &a0 [1]']
     lines += [f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 10)}]' for k in range(1, 10)]
-    with pytest.raises(ValueError, match='line 6: more than 100000 values'):
+    with pytest.raises(ValueError, match='line 2: YAML aliases are not read'):
         yaml_value('\n'.join(lines))
 
 
@@ -116,6 +115,7 @@ documents = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=200, derandomize=True, deadline=None)
 @given(documents)
 def test_what_the_libraries_write_comes_back(value: object) -> None:

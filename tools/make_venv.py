@@ -178,19 +178,26 @@ def install_wheels(venv: Path, requirements: list[Path], is_newest: bool) -> Non
     if is_newest:
         newest = ('--upgrade', '--upgrade-strategy', 'eager', '--only-binary', ':all:')
         pip(venv, 'install', *newest, 'setuptools', '--editable', f'{ROOT}[test]')
-        options.append('--no-deps')  # the pinned files need packages that have just come
     else:
         pip_install(venv, requirements[:1])
     # empy alone has no wheel; it is built with the setuptools that has just come.
     pip_install(venv, requirements, *options)
+    if not is_newest:
+        pip(venv, 'check')
     point_cmake_files_here(venv)
 
 
 def pip_install(venv: Path, requirements: list[Path], *options: str) -> None:
-    """Install pinned versions, and of these only files whose digests are in hashes.txt."""
+    """
+    Install pinned versions, and of these only files whose digests are in hashes.txt.
+
+    The files name every package that another one needs, so pip is not to look for more: with
+    digests it refuses what it would add, even an extra of a package that is pinned.
+    """
     together = venv / 'requirements.txt'
     together.write_text('\n'.join(line for path in requirements for line in hashed_lines(path)))
-    pip(venv, 'install', '--only-binary', ':all:', *options, '--require-hashes', '-r', together)
+    exact = ('--no-deps', '--require-hashes', '--only-binary', ':all:')
+    pip(venv, 'install', *exact, *options, '-r', together)
 
 
 def hashed_lines(path: Path) -> list[str]:

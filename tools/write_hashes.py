@@ -69,7 +69,7 @@ def hash_lines(name: str, version: str) -> Iterator[str]:
 
 
 def is_usable(filename: str, version: str) -> bool:
-    """Whether a file is a wheel of a version that one of the environments can take."""
+    """True if a file is a wheel of a version that one of the environments can take."""
     if not filename.endswith('.whl'):
         return False
     _, found, _, tags = parse_wheel_filename(filename)

@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
-import math
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,14 +11,8 @@ from scipy.special import chdtrc
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import line_of_sight, pixel_grid
-from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.records import CameraGeometry, Ensemble, HalvesComparison
+from starcal_ros.records import CameraGeometry
 
-FEWEST_IMAGES = 6  # of an ensemble that can be cut in two: a scatter needs three images
-FEWEST_STARS = 100  # of a half: with fewer, its sigmas are too uncertain for a test
 _SINGULAR = 1e-12  # eigenvalue of a correlation matrix that is zero but for rounding
 
 
@@ -36,12 +28,6 @@ class ChiSquared:
         """Probability of a value as large from noise alone; 1 without degrees of freedom."""
         n = self.degrees_of_freedom
         return float(chdtrc(n, self.value)) if n else 1.0
-
-    @property
-    def rms_sigma(self) -> float:
-        """RMS in sigmas, about 1 from noise alone; 0 without degrees of freedom."""
-        n = self.degrees_of_freedom
-        return math.sqrt(self.value / n) if n else 0.0
 
 
 def chi_squared(difference: Floats, covariance: Floats) -> ChiSquared:
@@ -157,40 +143,3 @@ def difference(
         for rows in (camera, [*camera, *angles])
     )
     return Difference(rotation_rad, float(left_px.max()), of_camera, total)
-
-
-def compare_halves(
-    ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
-) -> HalvesComparison:
-    """
-    Difference of the calibrations of the earlier and of the later half of the images.
-
-    A drift or a jump during the collection of an ensemble shows here; interleaved halves would
-    share it.  The halves are not compared, and the note gives the reason, with too few images,
-    where a half does not determine what is to be estimated, and where a change with temperature
-    is: the halves have different temperatures.
-    """
-    images = sorted(ensemble.images, key=lambda image: image.time_ns)
-    if len(images) < FEWEST_IMAGES:
-        return HalvesComparison(note=f'{len(images)} images, {FEWEST_IMAGES} make two halves')
-    if options.focal_temperature_order or options.alignment_temperature:
-        return HalvesComparison(note='the halves have different temperatures')
-    options = dataclasses.replace(options, min_images=2, min_stars=FEWEST_STARS)
-    middle = len(images) // 2
-    try:
-        first, second = (
-            estimate_calibration(Ensemble(tuple(part)), prior, options)
-            for part in (images[:middle], images[middle:])
-        )
-    except TooFewObservations as error:
-        return HalvesComparison(note=f'a half alone cannot be solved: {error}')
-    estimated = estimated_parameters(options, prior.camera.model)
-    found = difference(
-        first.geometry, first.covariance, second.geometry, second.covariance, estimated
-    )
-    return HalvesComparison(
-        shape_px=found.shape_px,
-        shape_p_value=found.camera.p_value,
-        rotation_arcsec=found.rotation_rad / ARCSECOND_RAD,
-        p_value=found.total.p_value,
-    )

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Two calibrations beside each other: parameters, alignment, and the lines of sight."""
+"""Comparison of two calibrations: parameters, alignment and lines of sight."""
 
 from __future__ import annotations
 
@@ -78,10 +78,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     """
     Difference of B from A.
 
-    Raises
-    ------
-    ProductError
-        When the cameras differ in size or model, or a pixel has no line of sight.
+    Raises ProductError when the cameras differ in size or model, or a pixel has no line of sight.
     """
     camera_a, camera_b = a.geometry.camera, b.geometry.camera
     if (camera_a.width, camera_a.height) != (camera_b.width, camera_b.height):
@@ -104,13 +101,13 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     rotation, _ = Rotation.align_vectors(new, old)
     sight_sigma_rad = _both(
         *(
-            line_of_sight_sigma_arcsec(c.geometry.camera, c.joint_covariance, GRID, GRID)
+            line_of_sight_sigma_arcsec(c.geometry.camera, c.map_covariance, GRID, GRID)
             * ARCSECOND_RAD
             for c in (a, b)
         )
     )
     shape_sigma_px = _both(
-        *(map_sigma_px(c.geometry.camera, c.joint_covariance, GRID) for c in (a, b))
+        *(map_sigma_px(c.geometry.camera, c.map_covariance, GRID) for c in (a, b))
     )
     shape_sigma_rad = shape_sigma_px / camera_a.parameters[0]
     return Comparison(

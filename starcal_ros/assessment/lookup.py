@@ -10,10 +10,10 @@ import numpy as np
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.detector_field import basis
+from starcal_ros.records import MapCovariance
 
 _CHUNK = 4096  # pixels at a time: the derivatives by a field of 300 terms take 30 MB
-_GRID = 25  # pixels a side over which the common rotation is taken
+GRID = 25  # pixels a side over which the common rotation is taken
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,9 @@ COLUMNS = ('u_px', 'v_px', 'x', 'y', 'z', 'shape_sigma_arcsec', 'sigma_arcsec')
 
 
 def line_of_sight_table(
-    camera: CameraModel, covariance: Floats, pixels: Floats
+    camera: CameraModel, covariance: MapCovariance, pixels: Floats
 ) -> LineOfSightTable:
-    """
-    Return the lines of sight of pixels (n, 2).
-
-    ``covariance`` is that of `line_of_sight_jacobian`'s numbers.
-    """
+    """Return the lines of sight of pixels (n, 2)."""
     parts = [pixels[k : k + _CHUNK] for k in range(0, len(pixels), _CHUNK)]
     found = [_table(camera, covariance, part) for part in parts]
     return LineOfSightTable(
@@ -67,11 +63,14 @@ def line_of_sight_table(
 
 
 def _table(
-    camera: CameraModel, covariance: Floats, pixels: Floats
+    camera: CameraModel, covariance: MapCovariance, pixels: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    directions, J = line_of_sight_jacobian(camera, pixels)
-    shape = np.sqrt(_trace(_shape_jacobian(camera, directions, J), covariance))
-    return directions, shape / ARCSECOND_RAD, np.sqrt(_trace(J, covariance)) / ARCSECOND_RAD
+    derivatives = Derivatives.at(camera, pixels)
+    shape, full = (
+        np.sqrt(derivatives.variance_rad2(covariance, J)) / ARCSECOND_RAD
+        for J in (derivatives.of_shape(camera), derivatives.J)
+    )
+    return derivatives.directions, shape, full
 
 
 def pixels_every(camera: CameraModel, step_px: float) -> Floats:
@@ -82,60 +81,93 @@ def pixels_every(camera: CameraModel, step_px: float) -> Floats:
     return np.stack([u.ravel(), v.ravel()], axis=-1)
 
 
-def shape_sigma_rad(camera: CameraModel, covariance: Floats, pixels: Floats) -> Floats:
+def shape_sigma_rad(camera: CameraModel, covariance: MapCovariance, pixels: Floats) -> Floats:
     """1-sigma (n,) of the directions of pixels (n, 2), the common rotation removed, rad."""
-    directions, J = line_of_sight_jacobian(camera, pixels)
-    return np.asarray(np.sqrt(_trace(_shape_jacobian(camera, directions, J), covariance)))
+    found = Derivatives.at(camera, pixels)
+    return np.asarray(np.sqrt(found.variance_rad2(covariance, found.of_shape(camera))))
 
 
-def line_of_sight_sigma_rad(camera: CameraModel, covariance: Floats, pixels: Floats) -> Floats:
+def line_of_sight_sigma_rad(
+    camera: CameraModel, covariance: MapCovariance, pixels: Floats
+) -> Floats:
     """1-sigma (n,) of the directions of pixels (n, 2) in the star tracker frame, rad."""
-    _, J = line_of_sight_jacobian(camera, pixels)
-    return np.asarray(np.sqrt(_trace(J, covariance)))
+    found = Derivatives.at(camera, pixels)
+    return np.asarray(np.sqrt(found.variance_rad2(covariance, found.J)))
 
 
-def line_of_sight_jacobian(camera: CameraModel, pixels: Floats) -> tuple[Floats, Floats]:
+@dataclass(frozen=True)
+class Derivatives:
     """
-    Lines of sight (n, 3) of pixels (n, 2) and their derivatives (n, 3, p + 3 + 2 t).
+    Lines of sight of n pixels and what moves them, in the camera frame.
 
-    By the p camera parameters, the alignment angles and the t coefficients of the field of the
-    camera for u, then for v, in the camera frame.  For a fixed pixel: a direction moves so as to
-    undo what the parameter does to its image.
+    For a fixed pixel: a direction moves so as to undo the effect of a parameter on its image.
+
+    Attributes
+    ----------
+    directions : (n, 3)
+    J : (n, 3, p + 3 + 2 t)
+        By the p camera parameters, the alignment angles and the t coefficients of the field of the
+        camera for u, then for v.
+    by_pixel : (n, 3, 2)
+        By a displacement of the pixel.
     """
-    directions = line_of_sight(camera, pixels)
-    _, J_parameters, J_rotation = project_jacobians(camera, directions)
-    J_pixel = J_parameters
-    if camera.field is not None:
-        phi = basis(pixels, camera.width, camera.height, camera.field.degree)
-        n, t = phi.shape
-        J_field = np.zeros((n, 2, 2 * t))
-        J_field[:, 0, :t], J_field[:, 1, t:] = phi, phi
-        J_pixel = np.concatenate([J_parameters, J_field], axis=-1)
-    # A rotation about the line of sight itself moves nothing: the pseudo-inverse leaves it out.
-    angles = np.linalg.pinv(np.nan_to_num(J_rotation)) @ np.nan_to_num(J_pixel)
-    p = J_parameters.shape[-1]
-    alignment = np.broadcast_to(np.eye(3), (len(angles), 3, 3))
-    angles = np.concatenate([angles[..., :p], alignment, angles[..., p:]], axis=-1)
-    moved = np.cross(directions[:, None, :], np.swapaxes(angles, 1, 2))
-    return directions, -np.swapaxes(moved, 1, 2)
+
+    directions: Floats
+    J: Floats
+    by_pixel: Floats
+
+    @classmethod
+    def at(cls, camera: CameraModel, pixels: Floats) -> Derivatives:
+        """Return those of pixels (n, 2)."""
+        directions = line_of_sight(camera, pixels)
+        _, J_parameters, J_rotation = project_jacobians(camera, directions)
+        # A rotation about the line of sight itself moves nothing: the pseudo-inverse leaves it
+        # out.
+        to_angles = np.linalg.pinv(np.nan_to_num(J_rotation))
+        p = J_parameters.shape[-1]
+        alignment = np.broadcast_to(np.eye(3), (len(to_angles), 3, 3))
+        angles = [to_angles @ np.nan_to_num(J_parameters), alignment, to_angles]
+        moved = np.cross(
+            directions[:, None, :], np.swapaxes(np.concatenate(angles, axis=-1), 1, 2)
+        )
+        J = -np.swapaxes(moved, 1, 2)
+        by_pixel = J[..., p + 3 :]
+        if camera.field is None:
+            return cls(directions, J[..., : p + 3], by_pixel)
+        phi = camera.field.basis(pixels)
+        of_field = [by_pixel[..., k, None] * phi[:, None, :] for k in range(2)]
+        return cls(directions, np.concatenate([J[..., : p + 3], *of_field], axis=-1), by_pixel)
+
+    def of_shape(self, camera: CameraModel, common: Floats | None = None) -> Floats:
+        """
+        Return J without the alignment, and without the rotation common to the detector.
+
+        That rotation belongs to the alignment: `common_rotation` if it is not given.
+        """
+        p = len(camera.parameters)
+        J = self.J.copy()
+        J[:, :, p : p + 3] = 0.0
+        common = common_rotation(camera) if common is None else common
+        return np.asarray(J - _rotations(self.directions) @ common)
+
+    def variance_rad2(self, covariance: MapCovariance, J: Floats) -> Floats:
+        """Return the variances (n,) of the directions, both angles summed; J as here."""
+        unresolved = covariance.unresolved_px**2 * (self.by_pixel**2).sum(axis=(1, 2))
+        return np.asarray(_trace(J, covariance.matrix) + unresolved)
 
 
-def _shape_jacobian(camera: CameraModel, directions: Floats, J: Floats) -> Floats:
+def common_rotation(camera: CameraModel) -> Floats:
     """
-    The derivatives without the alignment, and without the rotation common to the detector.
+    Least-squares rotation (3, k) common to a grid of pixels, by the k numbers of `Derivatives`.
 
-    That rotation belongs to the alignment: it is the least-squares one over a grid of pixels.
+    Zero for the alignment.
     """
     p = len(camera.parameters)
-    grid = pixel_grid(camera, _GRID, _GRID)
-    at_grid, J_grid = line_of_sight_jacobian(camera, grid)
-    seen = np.isfinite(at_grid[:, 0])
-    J = J.copy()
-    J[:, :, p : p + 3] = 0.0
-    J_grid[:, :, p : p + 3] = 0.0
-    to_rotation = np.linalg.pinv(_rotations(at_grid[seen]).reshape(-1, 3))
-    common = to_rotation @ J_grid[seen].reshape(-1, J.shape[-1])
-    return np.asarray(J - _rotations(directions) @ common)
+    grid = Derivatives.at(camera, pixel_grid(camera, GRID, GRID))
+    seen = np.isfinite(grid.directions[:, 0])
+    grid.J[:, :, p : p + 3] = 0.0
+    to_rotation = np.linalg.pinv(_rotations(grid.directions[seen]).reshape(-1, 3))
+    return np.asarray(to_rotation @ grid.J[seen].reshape(-1, grid.J.shape[-1]))
 
 
 def _rotations(directions: Floats) -> Floats:

@@ -21,20 +21,23 @@ from starcal_ros.camera import (
 )
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import problem_of, start_of
-from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.estimation.verdict import FEWEST_STARS
-from starcal_ros.least_squares.levenberg_marquardt import NotObservable
-from starcal_ros.least_squares.normal_equations import arrange, star_table
-from starcal_ros.methods.assembly import information_of_images
-from starcal_ros.methods.covariance import shared_covariance, shared_names
-from starcal_ros.methods.problem import image_blocks, Problem, State
-from starcal_ros.model_errors.temperature import why_unsupported
+from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.equations import information_of_images, stars_alone, StarSums
+from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.estimation.minimise import estimated
+from starcal_ros.estimation.problem import image_blocks, Problem, State
+from starcal_ros.estimation.reweighting import FEWEST_STARS
+from starcal_ros.estimation.star_equations import arrange, star_table
+from starcal_ros.estimation.temperature import why_unsupported
+from starcal_ros.estimation.unknowns import unknowns_in_state
 from starcal_ros.records import (
+    ALIGNMENT_NAMES,
     CameraGeometry,
     Correlation,
     DetectorMaps,
     Ensemble,
     EnsembleStatus,
+    MapCovariance,
     StarObservations,
 )
 
@@ -71,17 +74,24 @@ def image_information(
     """
     ensemble = Ensemble(images)
     order, with_rate = _supported_terms(ensemble, options)
-    problem, state, blocks, _ = _at_the_prior(ensemble, prior, options, order, with_rate)
-    information = information_of_images(problem, state, blocks)
-    shared = np.concatenate([problem.free, np.arange(problem.camera_count, information.shape[1])])
-    return information[:, shared][:, :, shared] * blocks.any(axis=(1, 2), keepdims=True)
+    problem, state, sums, _ = _at_the_prior(ensemble, prior, options, order, with_rate)
+    layout = unknowns_in_state(problem, state)
+    kept = estimated(layout)
+    information = information_of_images(sums, problem, state, layout)
+    seen = np.asarray(sums.blocks.any(axis=(1, 2)))
+    return information[:, kept][:, :, kept] * seen[:, None, None]
 
 
 def estimated_names(options: CalibrationOptions, model: str) -> tuple[str, ...]:
     """Names of all that is to be estimated: camera, terms of temperature, alignment, its rate."""
-    names = shared_names(model, options.focal_temperature_order, options.alignment_temperature)
-    held = set(parameter_names(model)) - set(estimated_parameters(options, model))
-    return tuple(name for name in names if name not in held)
+    estimated_names = set(estimated_parameters(options, model))
+    rate = ALIGNMENT_NAMES if options.alignment_temperature else ()
+    return (
+        *(name for name in parameter_names(model) if name in estimated_names),
+        *(f'focal_temperature_{i + 1}' for i in range(options.focal_temperature_order)),
+        *ALIGNMENT_NAMES,
+        *(f'{name}_temperature' for name in rate),
+    )
 
 
 def predicted_sigma(
@@ -100,7 +110,7 @@ def predicted_sigma(
     terms = _supported_terms(ensemble, options)
     found = _sigma_with(ensemble, prior, options, *terms)
     if not found and terms != (0, False):
-        # As the calibration does: without temperature terms if they are not observable.
+        # Sigmas of the others until images of more temperatures come.
         found = _sigma_with(ensemble, prior, options, 0, False)
     return np.array([found.get(name, np.inf) for name in names])
 
@@ -120,15 +130,15 @@ def _at_the_prior(
     options: CalibrationOptions,
     order: int,
     with_rate: bool,
-) -> tuple[Problem, State, Floats, bool]:
-    """Problem, initial state, normal matrices, and whether all stars are in front."""
+) -> tuple[Problem, State, StarSums, bool]:
+    """Problem, initial state, sums over its stars, and whether all of them are in front."""
     problem = problem_of(ensemble, prior, options)
     state = start_of(problem, prior, order, with_rate)
     table = star_table(ensemble.images)
     enough = np.array([len(image) >= FEWEST_STARS for image in ensemble.images])
     measurements = arrange(table, enough[table.image], table.covariance_px2)
     cost, blocks = image_blocks(problem, state, measurements)
-    return problem, state, blocks, math.isfinite(cost)
+    return problem, state, stars_alone(blocks), math.isfinite(cost)
 
 
 def _sigma_with(
@@ -139,18 +149,24 @@ def _sigma_with(
     with_rate: bool,
 ) -> dict[str, float]:
     """1-sigma by name; empty if not observable."""
-    problem, state, blocks, in_front = _at_the_prior(ensemble, prior, options, order, with_rate)
-    seen = np.einsum('mii->m', blocks) > 0
+    problem, state, sums, in_front = _at_the_prior(ensemble, prior, options, order, with_rate)
+    if not in_front:
+        return {}
+    layout = unknowns_in_state(problem, state)
+    kept = estimated(layout)
+    whole = information_of_images(sums, problem, state, layout).sum(axis=0)
+    information = whole[np.ix_(kept, kept)] + np.diag(layout.prior_precision[kept])
     try:
-        if not in_front:
-            return {}
-        _, covariance = shared_covariance(
-            problem, state, blocks, seen, problem.star_tracker_sigma_rad[0]
-        )
+        covariance = inverse(information)
     except (NotObservable, np.linalg.LinAlgError):
         return {}
-    names = shared_names(problem.model, order, with_rate, len(state.mountings) // 3)
-    return dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
+    # What is held with a prior sigma moves the others, as in the estimate.
+    first = layout.places['camera'].start
+    held = np.setdiff1d(first + np.flatnonzero(np.isfinite(problem.prior_sigma)), kept)
+    by_held = covariance @ whole[np.ix_(kept, held)] * problem.prior_sigma[held - first]
+    variance = np.diag(covariance) + (by_held**2).sum(axis=1)
+    names = [layout.labels[k] for k in kept]
+    return dict(zip(names, np.sqrt(variance).tolist(), strict=True))
 
 
 def ensemble_status(
@@ -226,19 +242,18 @@ def keep_most_informative(
 
 
 def line_of_sight_sigma_arcsec(
-    camera: CameraModel, covariance: Floats, columns: int = 25, rows: int = 20
+    camera: CameraModel, covariance: MapCovariance, columns: int = 25, rows: int = 20
 ) -> Floats:
     """
     1-sigma (rows, columns) of the line of sight of pixels in the star tracker frame, arcsec.
 
-    Root of the summed variance of the two angles; the covariance is that of the numbers of
-    `lookup.line_of_sight_jacobian`.
+    Root of the summed variance of the two angles.
     """
     sigma_rad = line_of_sight_sigma_rad(camera, covariance, pixel_grid(camera, columns, rows))
     return sigma_rad.reshape(rows, columns) / ARCSECOND_RAD
 
 
-def map_sigma_px(camera: CameraModel, covariance: Floats, columns: int = 25) -> Floats:
+def map_sigma_px(camera: CameraModel, covariance: MapCovariance, columns: int = 25) -> Floats:
     """1-sigma (columns * columns,) of the shape of the map, in pixels at the centre."""
     sigma_rad = shape_sigma_rad(camera, covariance, pixel_grid(camera, columns, columns))
     return np.asarray(sigma_rad * camera.parameters[0])
@@ -260,7 +275,7 @@ def map_error_px(found: CameraModel, true: CameraModel) -> float:
     return float(np.sqrt(np.mean(angle**2)) * true.parameters[0])
 
 
-def detector_maps(camera: CameraModel, covariance: Floats, pixels: Floats) -> DetectorMaps:
+def detector_maps(camera: CameraModel, covariance: MapCovariance, pixels: Floats) -> DetectorMaps:
     """Maps of a camera with a covariance that is from stars at pixels (n, 2)."""
     grid = pixel_grid(camera, MAP_COLS, MAP_ROWS)
     return DetectorMaps(

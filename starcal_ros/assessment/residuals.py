@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
+from starcal_ros.record_fields import Shape, Within
 from starcal_ros.records import Ensemble
 
 
@@ -44,18 +46,18 @@ class Residuals:
         False for outliers and stars of images that were left out.
     """
 
-    image_time_ns: NDArray[np.int64]
-    image_misfit: NDArray[np.bool_]
-    attitude_error_arcsec: Floats
-    attitude_sigma_arcsec: Floats
-    image: NDArray[np.int64]
-    catalog_id: NDArray[np.int64]
-    magnitude: Floats
-    colour_bp_rp: Floats
-    measured_px: Floats
-    residual_px: Floats
-    covariance_px2: Floats
-    used: NDArray[np.bool_]
+    image_time_ns: Annotated[NDArray[np.int64], Shape(('m',))]
+    image_misfit: Annotated[NDArray[np.bool_], Shape(('m',))]
+    attitude_error_arcsec: Annotated[Floats, Shape(('m', 3))]
+    attitude_sigma_arcsec: Annotated[Floats, Shape(('m', 3))]
+    image: Annotated[NDArray[np.int64], Within(0), Shape(('n',))]
+    catalog_id: Annotated[NDArray[np.int64], Shape(('n',))]
+    magnitude: Annotated[Floats, Shape(('n',))]
+    colour_bp_rp: Annotated[Floats, Shape(('n',))]
+    measured_px: Annotated[Floats, Shape(('n', 2))]
+    residual_px: Annotated[Floats, Shape(('n', 2))]
+    covariance_px2: Annotated[Floats, Shape(('n', 3))]
+    used: Annotated[NDArray[np.bool_], Shape(('n',))]
 
     def image_rms_px(self) -> Floats:
         """RMS per axis (m,) over the used stars of each image; NaN if none is used."""
@@ -94,6 +96,6 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
         colour_bp_rp=colour_bp_rp,
         measured_px=table.measured_px,
         residual_px=estimate.residual_px,
-        covariance_px2=estimate.variance.of(table.covariance_px2, table.magnitude),
+        covariance_px2=estimate.covariance_px2,
         used=estimate.kept,
     )

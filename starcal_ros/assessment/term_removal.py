@@ -15,11 +15,11 @@ from scipy.special import chdtrc
 
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.least_squares.levenberg_marquardt import inverse, NotObservable
-from starcal_ros.least_squares.normal_equations import arrange, residuals_px
-from starcal_ros.methods.assembly import reduced_information
-from starcal_ros.methods.minimise import minimise, Minimum, without_parameter
-from starcal_ros.methods.problem import image_parameters, Problem, State
+from starcal_ros.estimation.levenberg_marquardt import covariance, NotObservable
+from starcal_ros.estimation.minimise import minimise, Minimum, without_parameter
+from starcal_ros.estimation.problem import image_parameters, Problem, State
+from starcal_ros.estimation.star_equations import arrange, residuals_px
+from starcal_ros.estimation.unknowns import IMAGE_ROTATION, moved
 from starcal_ros.records import TermRemoval
 
 _HELD_AT_PRIOR = ('fx', 'fy', 'cx', 'cy')  # skew and distortion terms are held at zero
@@ -36,15 +36,15 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
     squared distance to the value that it is then held at, over its variance); then all is solved
     again.  The study ends early where the solver fails without a term.
     """
-    # A field beside the lens model stands as it was estimated.
-    estimate = _without_field(estimate)
+    # Unknowns outside of the search (field, shapes, velocity) keep their estimates.
+    estimate = _with_search_alone(estimate)
     problem, state = estimate.problem, estimate.state
-    covariance_px2 = estimate.variance.of(estimate.table.covariance_px2, estimate.table.magnitude)
-    measurements = arrange(estimate.table, estimate.kept, covariance_px2)
+    measurements = arrange(estimate.table, estimate.kept, estimate.covariance_px2)
     solution = minimise(problem, state, measurements, least_gain=_LEAST_GAIN)
     cost = solution.normal.cost
     names = estimate.geometry.camera.parameter_names
-    alone = sigmas = _sigmas(names, problem, solution)
+    sigmas = _sigmas(names, problem, solution)
+    alone = _significances(names, estimate)
     removals = [_removal(estimate, problem, solution.state, '', 0.0, 0.0, 0.0, negligible=True)]
     while sigmas:
         least = min(sigmas, key=lambda name: abs(sigmas[name]))
@@ -73,20 +73,21 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
     return tuple(removals)
 
 
-def _without_field(estimate: Estimate) -> Estimate:
-    """The estimate with the displacements of its field taken off the stars."""
-    field = estimate.geometry.camera.field
-    if field is None:
-        return estimate
-    measured_px = estimate.table.measured_px
-    measured_px = measured_px - field.displacement_px(measured_px)
+def _with_search_alone(estimate: Estimate) -> Estimate:
+    """Return the estimate whose stars are where camera and rotations of the state put them."""
+    problem = estimate.problem
+    layout, found = estimate.layout, estimate.posterior
+    state = moved(problem, estimate.state, layout, found.mean, found.of_images[:, IMAGE_ROTATION])
+    rotations = state.camera_from_icrf.as_matrix()
+    table = estimate.table
+    explained = residuals_px(table, problem.model, image_parameters(problem, state), rotations)
     camera = dataclasses.replace(estimate.geometry.camera, field=None)
+    measured_px = table.measured_px - explained + estimate.residual_px
     return dataclasses.replace(
         estimate,
         geometry=dataclasses.replace(estimate.geometry, camera=camera),
-        table=dataclasses.replace(estimate.table, measured_px=measured_px),
-        problem=dataclasses.replace(estimate.problem, field_prior=None),
-        state=dataclasses.replace(estimate.state, modes=np.empty(0)),
+        table=dataclasses.replace(table, measured_px=measured_px),
+        state=state,
     )
 
 
@@ -95,12 +96,19 @@ def _held_at(names: tuple[str, ...], k: int, problem: Problem) -> float:
     return float(problem.prior_parameters[k]) if names[k] in _HELD_AT_PRIOR else 0.0
 
 
+def _significances(names: tuple[str, ...], estimate: Estimate) -> dict[str, float]:
+    """Distance of each free parameter from the value it would be held at, in all its sigma."""
+    found, problem = estimate.geometry.camera.parameters, estimate.problem
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    return {
+        names[k]: float((found[k] - _held_at(names, k, problem)) / sigma[k]) for k in problem.free
+    }
+
+
 def _sigmas(names: tuple[str, ...], problem: Problem, solution: Minimum) -> dict[str, float]:
     """Distance of each free parameter from the value it would be held at, in its sigma."""
     state = solution.state
-    information = reduced_information(problem, state, solution.normal.blocks)
-    estimated = np.concatenate([problem.free, np.arange(len(names), len(information))])
-    variance = np.diag(inverse(information[np.ix_(estimated, estimated)]))
+    variance = np.diag(covariance(solution.normal)[0])
     return {
         names[i]: float((state.parameters[i] - _held_at(names, i, problem)) / np.sqrt(v))
         for i, v in zip(problem.free, variance, strict=False)

@@ -7,14 +7,15 @@ import argparse
 from collections.abc import Callable, Iterable
 import contextlib
 import difflib
+import math
 from pathlib import Path
 import re
 import sys
 from types import FrameType
 from typing import Any, NoReturn
 
-from starcal_ros.cli import mission_arguments
 from starcal_ros.cli.command_help import HELP
+from starcal_ros.cli.commands.selection import parse_time
 from starcal_ros.text import printable
 
 EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_INTERRUPTED = 0, 2, 3, 130
@@ -23,6 +24,7 @@ _EXIT_STATUS = """\
 exit status: 0 the command succeeded, and a calibration passed the gate; 3 the gate refused the
 calibration; 2 bad input, named in one line; 130 interrupted."""
 
+STUDIES = ('table1', 'images', 'terms', 'coverage', 'paper')
 _INTRODUCTION = 'In-flight star calibration of spacecraft cameras.'
 _FIRST_STEPS = f"""\
 first steps:
@@ -59,21 +61,34 @@ def is_interrupt(error: BaseException) -> bool:
     """
     Return True for a Ctrl-C, and for an error that one became.
 
-    A module in C that is interrupted while it is loaded raises ImportError or SystemError, not
-    always with the KeyboardInterrupt as its cause; a dataclass RuntimeError, up to Python 3.11.
+    A module in C that is interrupted while it is loaded raises ImportError or SystemError.
     """
-    if _interrupts:
-        return True
-    seen: BaseException | None = error
-    while seen is not None and not isinstance(seen, KeyboardInterrupt):
-        seen = seen.__cause__ or seen.__context__
-    return seen is not None
+    return bool(_interrupts) or isinstance(error, KeyboardInterrupt)
 
 
 def _path(text: str) -> Path:
     if not text:
         raise argparse.ArgumentTypeError('empty path')  # Path('') means the current folder
     return Path(text)
+
+
+def _number(kind: type[int] | type[float], low: float, high: float = math.inf) -> Any:
+    """Type of an argument that is a number from ``low`` to ``high``."""
+
+    def read(text: str) -> float:
+        value = kind(text)
+        if not low <= value <= high:  # nor is NaN
+            raise argparse.ArgumentTypeError(f'{text} is not within {low:g} to {high:g}')
+        return value
+
+    read.__name__ = kind.__name__  # argparse names it where the text is no number
+    return read
+
+
+def _remap(text: str) -> str:
+    if not all(text.partition(':=')[::2]):
+        raise argparse.ArgumentTypeError(f'{text!r} is not of the form A:=B')
+    return text
 
 
 class _Parser(argparse.ArgumentParser):
@@ -89,13 +104,15 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _words(parser: argparse.ArgumentParser) -> list[str]:
-    """Every command and option of a parser and its commands."""
+    """Every command, option and choice of a parser and its commands."""
     words: list[str] = []
     for action in parser._actions:
         words += action.option_strings
         if isinstance(action, argparse._SubParsersAction):
             for name, command in action.choices.items():
                 words += [name, *_words(command)]
+        else:
+            words += map(str, action.choices or ())
     return words
 
 
@@ -163,18 +180,6 @@ def _files_of(*endings: str) -> Any:
     return complete
 
 
-def _scenarios(**_: object) -> Iterable[str]:
-    from starcal_ros.simulation.scenario import SCENARIOS
-
-    return SCENARIOS
-
-
-def _studies(**_: object) -> Iterable[str]:
-    from starcal_ros.studies.monte_carlo import STUDIES
-
-    return (*STUDIES, 'paper')
-
-
 def _output(command: argparse.ArgumentParser, metavar: str, what: str, **settings: Any) -> None:
     _add(command, '-o', '--output', type=_path, metavar=metavar, help=what, **settings)
 
@@ -206,6 +211,23 @@ def _demo(command: argparse.ArgumentParser) -> None:
     _output(command, 'DIR', what, default=Path('starcal_demo'))
 
 
+def _init(command: argparse.ArgumentParser) -> None:
+    what = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
+    _add(command, 'bags', type=_path, metavar='BAG', help=what, completer=_files_of('.mcap'),
+         nargs='+')  # fmt: skip
+    what = 'folder for params.yaml and camera.yaml, created if absent; no file is replaced'
+    _output(command, 'DIR', what, required=True)
+    _lens(command)
+    _topics(command)
+
+
+def _lens(command: argparse.ArgumentParser) -> None:
+    what = 'focal length of the lens, mm, with --pixel-size-um (default: EXIF, FITS, else found)'
+    _add(command, '--focal-length-mm', type=float, default=0.0, metavar='MM', help=what)
+    what = 'size of a pixel of the images, micrometres'
+    _add(command, '--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
+
+
 def _inspect(command: argparse.ArgumentParser) -> None:
     _bags(command, 'bags', nargs='+')
     _params(command, 'ROS parameter file; with it the stars are measured too', required=False)
@@ -221,27 +243,62 @@ def _diagnose(command: argparse.ArgumentParser) -> None:
 
 
 def _calibrate(command: argparse.ArgumentParser) -> None:
-    _bags(command, 'bags', nargs='+')
-    _params(command, 'ROS parameter file: prior camera, mounting and options', required=True)
+    what = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
+    _add(command, 'bags', type=_path, metavar='BAG', help=what, completer=_files_of('.mcap'),
+         nargs='+')  # fmt: skip
+    what = 'ROS parameter file: prior camera, mounting and options; images need none'
+    _params(command, what, required=False)
     what = 'folder for the products, created if absent; existing products are replaced'
     _output(command, 'DIR', what, required=True)
     _add(
         command, '--no-report', action='store_true',
         help='write no report; starcal report DIR writes it later',
     )  # fmt: skip
+    _lens(command)
     _topics(command)
     when = 'UTC in ISO 8601, seconds since 1970, or +seconds after the first image'
-    _add(command, '--from', dest='from_time', metavar='T', help=f'use images from T on: {when}')
-    _add(command, '--to', dest='to_time', metavar='T', help='use images up to T')
-    _add(command, '--first', type=int, metavar='N', help='use only the first N of these images')
-    _add(command, '--every', type=int, metavar='K', help='use only every K-th of these images')
+    what = f'use images from T on: {when}'
+    _add(command, '--from', dest='from_time', type=parse_time, metavar='T', help=what)
+    _add(command, '--to', dest='to_time', type=parse_time, metavar='T', help='use images up to T')
+    count = _number(int, 1)
+    _add(command, '--first', type=count, metavar='N', help='use only the first N of these images')
+    _add(command, '--every', type=count, metavar='K', help='use only every K-th of these images')
     what = 'compare calibrations of the images of odd and of even number, DIR/odd and DIR/even'
     _add(command, '--split-half', action='store_true', help=what)
+
+
+def _plan(command: argparse.ArgumentParser) -> None:
+    what = 'images or observations so far: an .mcap file or a bag folder'
+    _add(command, 'bags', type=_path, metavar='BAG', help=what, completer=_files_of('.mcap'),
+         nargs='+')  # fmt: skip
+    _params(command, 'ROS parameter file: prior camera, mounting and options', required=True)
+    what = 'images that may be taken (default: 10)'
+    _add(command, '--images', type=_number(int, 1, 1000), default=10, metavar='N', help=what)
+    what = 'sigma to lower: line_of_sight (default), map, or a parameter such as fx or k1'
+    _add(command, '--minimise', default='line_of_sight', metavar='NAME', help=what)
+    allowed = command.add_mutually_exclusive_group()
+    what = 'CSV of the allowed pointings, with the columns ra_deg, dec_deg and, if fixed, roll_deg'
+    allowed.add_argument('--pointings', type=_path, metavar='FILE', help=what)
+    cone = ('RA', 'DEC', 'DEG')
+    what = 'allow boresights within DEG degrees of a direction, ICRF (default: the whole sky)'
+    allowed.add_argument('--within', type=float, nargs=3, metavar=cone, help=what)
+    what = 'no boresight within DEG degrees of a direction: Sun, Moon, Earth; may be repeated'
+    _add(command, '--avoid', type=float, nargs=3, action='append', default=[], metavar=cone,
+         help=what)  # fmt: skip
+    what = 'largest angle between the boresights of an image and the next (default: 180)'
+    _add(
+        command, '--slew', type=_number(float, 0.001, 180), default=180.0, metavar='DEG', help=what
+    )
+    _output(command, 'FILE', 'write the pointings as CSV too')
+    _topics(command)
+    _json(command)
 
 
 def _report(command: argparse.ArgumentParser) -> None:
     what = 'folder with the products of starcal calibrate'
     _add(command, 'folder', type=_path, metavar='DIR', help=what)
+    what = 'write report.pdf too, to print and sign'
+    _add(command, '--pdf', action='store_true', help=what)
 
 
 def _compare(command: argparse.ArgumentParser) -> None:
@@ -249,7 +306,7 @@ def _compare(command: argparse.ArgumentParser) -> None:
         what = f'{which}: calibration.json or its folder'
         completer = _files_of('.json')
         _add(command, name, type=_path, metavar=name.upper(), help=what, completer=completer)
-    _output(command, 'FILE', 'plot of the difference over the detector: .png, .svg or .pdf')
+    _output(command, 'FILE', 'plot of the difference over the detector (.svg)')
     _json(command)
 
 
@@ -260,44 +317,62 @@ def _lookup(command: argparse.ArgumentParser) -> None:
     _output(command, 'FILE', what, required=True)
     grid = command.add_mutually_exclusive_group()
     what = 'N x N pixels from corner to corner of the detector, u fastest (default: 25)'
-    grid.add_argument('--points', type=int, default=25, metavar='N', help=what)
+    grid.add_argument('--points', type=_number(int, 2, 2000), default=25, metavar='N', help=what)
     what = 'a pixel every PX pixels along both axes, in place of --points'
     grid.add_argument('--step', type=float, metavar='PX', help=what)
+
+
+def _remaps(command: argparse.ArgumentParser, what: str) -> None:
+    _add(command, '--remap', type=_remap, action='append', default=[], metavar='A:=B', help=what)
 
 
 def _play(command: argparse.ArgumentParser) -> None:
     _bags(command, 'bag')
     what = 'playback speed; 1 is real time, 0 is as fast as stars are observed (default: 1)'
-    _add(command, '--rate', type=float, default=1.0, metavar='R', help=what)
-    what = 'publish topic A of the bag as B; may be repeated'
-    _add(command, '--remap', action='append', default=[], metavar='A:=B', help=what)
+    _add(command, '--rate', type=_number(float, 0, 1e6), default=1.0, metavar='R', help=what)
+    _remaps(command, 'publish topic A of the bag as B; may be repeated')
 
 
 def _monitor(command: argparse.ArgumentParser) -> None:
     what = 'print one view after S seconds and end; needed where the output is not a terminal'
-    _add(command, '--once', type=float, metavar='S', help=what)
-    what = 'read topic A of the nodes from B; may be repeated'
-    _add(command, '--remap', action='append', default=[], metavar='A:=B', help=what)
+    _add(command, '--once', type=_number(float, 0, 3600), metavar='S', help=what)
+    _remaps(command, 'read topic A of the nodes from B; may be repeated')
+
+
+def _request(command: argparse.ArgumentParser) -> None:
+    services = ('calibrate', 'solve', 'rollback', 'reset', 'lookup')
+    command.add_argument('service', choices=services, help='service of the calibrator')
+    what = 'solve: activate nothing'
+    command.add_argument('--dry-run', action='store_true', help=what)
+    what = 'solve: activate the result despite the gate'
+    command.add_argument('--force', action='store_true', help=what)
+    what = 'file for the table of lookup (.csv, .npz, .fits)'
+    _output(command, 'FILE', what, required=False)
+    what = 'longest wait for the answer, s (default: 600)'
+    seconds = _number(float, 0.1, 86400)
+    _add(command, '--timeout', type=seconds, default=600.0, metavar='S', help=what)
+    _remaps(command, 'rename A of the calibrator to B, e.g. __ns:=/cam1; may be repeated')
 
 
 def _seed(command: argparse.ArgumentParser, what: str) -> None:
-    _add(command, '--seed', type=int, default=1, metavar='N', help=f'{what} (default: 1)')
+    seed = _number(int, 0, 2**63 - 1)
+    _add(command, '--seed', type=seed, default=1, metavar='N', help=f'{what} (default: 1)')
 
 
 def _simulate(command: argparse.ArgumentParser) -> None:
     what = 'bag folder or .mcap file to write; an existing one is replaced'
     _output(command, 'BAG', what, required=True)
-    what = 'scenario: tiny, small or paper'
-    _add(command, '--scenario', required=True, metavar='NAME', help=what, completer=_scenarios)
+    what, names = 'scenario: tiny, small or paper', ('tiny', 'small', 'paper')
+    _add(command, '--scenario', required=True, choices=names, metavar='NAME', help=what)
     _seed(command, 'seed of the truth and the noise')
     what = (
         'seed of the camera and its mounting: the same camera with other noise (default: --seed)'
     )
-    _add(command, '--camera-seed', type=int, metavar='N', help=what)
+    _add(command, '--camera-seed', type=_number(int, 0), metavar='N', help=what)
     what = 'number of images (default: that of the scenario)'
-    _add(command, '--images', type=int, metavar='N', help=what)
+    _add(command, '--images', type=_number(int, 1), metavar='N', help=what)
     what = 'draw only the N brightest stars of each image'
-    _add(command, '--stars-per-image', type=int, metavar='N', help=what)
+    _add(command, '--stars-per-image', type=_number(int, 1), metavar='N', help=what)
     _mistakes(command)
 
 
@@ -318,52 +393,170 @@ def _mistakes(command: argparse.ArgumentParser) -> None:
     mistakes.add_argument(
         '--quaternion-order', choices=('xyzw', 'wxyz'), default='xyzw', help=what
     )
-    for name, metavar, what in (
-        ('alignment-error', 'DEG', 'error of the prior alignment, degrees'),
-        ('focal-error', 'PERCENT', 'error of the prior focal length, percent'),
-        ('clock-error', 'S', 'stamps of the images late by so many seconds, more than 0.75'),
+    for name, low, high, metavar, what in (
+        ('alignment-error', -180, 180, 'DEG', 'error of the prior alignment, degrees'),
+        ('focal-error', -90, 400, 'PERCENT', 'error of the prior focal length, percent'),
+        ('clock-error', -1e9, 1e9, 'S', 'stamps of the images late by so many seconds, over 0.75'),
     ):
-        mistakes.add_argument(f'--{name}', type=float, default=0.0, metavar=metavar, help=what)
+        kind = _number(float, low, high)
+        mistakes.add_argument(f'--{name}', type=kind, default=0.0, metavar=metavar, help=what)
     what = 'length of the streak that a star becomes, px'
-    mistakes.add_argument('--smear', type=int, default=1, metavar='PX', help=what)
+    mistakes.add_argument('--smear', type=_number(int, 1, 200), default=1, metavar='PX', help=what)
     what = 'tone curve: pixel values grow with light to the power 1/G'
-    mistakes.add_argument('--gamma', type=float, default=1.0, metavar='G', help=what)
+    gamma = _number(float, 0.2, 5)
+    mistakes.add_argument('--gamma', type=gamma, default=1.0, metavar='G', help=what)
 
 
 def _campaign(command: argparse.ArgumentParser) -> None:
-    what = 'study: table1, images, terms, coverage, start or paper'
-    _add(command, 'study', metavar='STUDY', help=what, completer=_studies)
-    _output(command, 'DIR', 'folder for STUDY.json and STUDY.png', required=True)
+    what = f'study: {", ".join(STUDIES[:-1])} or {STUDIES[-1]}'
+    _add(command, 'study', metavar='STUDY', choices=STUDIES, help=what)
+    _output(command, 'DIR', 'folder for STUDY.json and STUDY.svg', required=True)
     what = 'number of trials (default: depends on the study)'
-    _add(command, '--trials', type=int, metavar='N', help=what)
+    _add(command, '--trials', type=_number(int, 1, 1e6), metavar='N', help=what)
     _seed(command, 'seed of all trials')
+    arcsec = _number(float, 0, 3600)
     for name, kind, metavar, what in (
-        ('images', int, 'M', 'numbers of images in a calibration'),
-        ('stars', int, 'N', 'numbers of stars in an image'),
-        ('tracker', float, 'ARCSEC', 'true star tracker 1-sigma values about each axis, arcsec'),
-        ('methods', str, 'METHOD', 'methods to compare: per_image, single, hierarchical'),
+        ('images', _number(int, 2, 1000), 'M', 'numbers of images in a calibration'),
+        ('stars', _number(int, 3, 1000), 'N', 'numbers of stars in an image'),
+        ('tracker', arcsec, 'ARCSEC', 'true star tracker 1-sigma values about each axis, arcsec'),
     ):
         _add(command, f'--{name}', type=kind, nargs='+', metavar=metavar, help=what)
+    methods = ('per_image', 'single', 'hierarchical')
+    what = f'methods to compare: {", ".join(methods)}'
+    _add(command, '--methods', nargs='+', choices=methods, metavar='METHOD', help=what)
     what = 'star tracker 1-sigma assumed by the calibration, arcsec (default: the true one)'
-    _add(command, '--tracker-assumed', type=float, metavar='ARCSEC', help=what)
+    _add(command, '--tracker-assumed', type=arcsec, metavar='ARCSEC', help=what)
     where = command.add_mutually_exclusive_group()
     what = 'worker processes; 0 runs in-process (default: one per CPU)'
-    where.add_argument('--workers', type=int, metavar='N', help=what)
+    where.add_argument('--workers', type=_number(int, 0, 1024), metavar='N', help=what)
+    what = 'address of a Dask scheduler, e.g. tcp://host:8786'
+    where.add_argument('--scheduler', default='', metavar='ADDRESS', help=what)
+
+
+def _export(command: argparse.ArgumentParser) -> None:
+    what = 'calibration.json or its folder'
+    command.add_argument('calibration', type=Path, metavar='DIR', help=what)
+    what = 'format: spice, ck, isd, opencv, kalibr, ros, giant, mrcal, csv or c'
+    command.add_argument('--to', required=True, metavar='FORMAT', help=what)
+    what = 'folder for the files, created if absent'
+    command.add_argument('-o', '--output', type=Path, required=True, metavar='OUT', help=what)
+    spice = command.add_argument_group('SPICE')
+    what = 'NAIF ID of the spacecraft, negative'
+    spice.add_argument('--spacecraft-id', type=int, metavar='ID', help=what)
+    what = 'NAIF ID of the camera (default: 1000 times that of the spacecraft, minus 1)'
+    spice.add_argument('--instrument-id', type=int, default=0, metavar='ID', help=what)
+    what = (
+        'frame ID of the star tracker; the kernel then defines its frame as a CK frame (default: '
+        'the frame kernel of the mission does)'
+    )
+    spice.add_argument('--star-tracker-id', type=int, default=0, metavar='ID', help=what)
+    for name in ('camera', 'star-tracker'):
+        what = f'name of the {name.replace("-", " ")} frame (default: that of the calibration)'
+        spice.add_argument(f'--{name}-frame', default='', metavar='NAME', help=what)
+    what = 'pixel size, micrometres, for a focal length in mm (default: pixels only)'
+    spice.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
+    what = 'LSK and SCLK of the spacecraft, for ck'
+    spice.add_argument('--kernels', nargs='+', type=Path, default=(), metavar='FILE', help=what)
+    what = 'image topic, for kalibr'
+    command.add_argument('--image-topic', default='', metavar='T', help=what)
+    what = 'binary table alone, for C code that is compiled already'
+    command.add_argument('--table', action='store_true', help=what)
+
+
+def _import(command: argparse.ArgumentParser) -> None:
+    what = 'image files; a pattern in quotes is expanded here'
+    command.add_argument('--images', nargs='+', required=True, metavar='FILE', help=what)
+    what = (
+        'AEM, CSV, SPICE kernels (CK, SCLK, LSK and, for a frame by name, FK), or FITS with the'
+        ' WCS of each image: the images themselves, or files of their names'
+    )
+    command.add_argument('--attitude', nargs='+', required=True, metavar='FILE', help=what)
+    what = 'OEM, CSV, or SPICE kernels (SPK with the Earth or the Sun, LSK); default: the Earth'
+    command.add_argument('--velocity', nargs='+', type=Path, metavar='FILE', help=what)
+    what = 'bag folder or .mcap file to write; replaces an earlier import, no other file'
+    command.add_argument('-o', '--output', type=Path, required=True, metavar='BAG', help=what)
+    what = 'star tracker frame: a body frame of the AEM, or a frame name or number of the CK'
+    command.add_argument('--star-tracker', default='', metavar='FRAME', help=what)
+    what = 'frames of further star trackers in the same files'
+    command.add_argument('--more-star-trackers', nargs='+', default=(), metavar='FRAME', help=what)
+    what = 'name or NAIF ID of the spacecraft in the SPK'
+    command.add_argument('--spacecraft', default='', metavar='BODY', help=what)
+    what = 'FITS keyword of the middle of the exposure (default: DATE-AVG, else from DATE-BEG)'
+    command.add_argument('--time-key', default='', metavar='KEY', help=what)
+    what = 'CSV with columns file and time_utc (or time_tai, time_tdb, time_gps, time_ns)'
+    command.add_argument('--times', type=Path, metavar='FILE', help=what)
+    what = 'FITS keyword of the camera temperature, degC, e.g. CCD-TEMP'
+    command.add_argument('--temperature-key', default='', metavar='KEY', help=what)
+    what = 'FITS extension by number or name (default: the first image)'
+    command.add_argument('--hdu', default='', metavar='N', help=what)
+    what = 'colour to take from an RGB image or a mosaic'
+    command.add_argument('--channel', default='', choices=('red', 'green', 'blue'), help=what)
+    what = 'Bayer pattern of a mosaic; the image then has half the width and height'
+    command.add_argument(
+        '--bayer', default='', choices=('rggb', 'bggr', 'gbrg', 'grbg'), help=what
+    )
+    what = 'range of pixel values that is mapped to 16 bit (default: that of all images)'
+    command.add_argument('--value-range', nargs=2, type=float, metavar=('LOW', 'HIGH'), help=what)
+    what = 'prior camera, ROS YAML or .cameramodel of mrcal; params.yaml is written then'
+    command.add_argument('--camera', type=Path, metavar='FILE', help=what)
+    what = (
+        'prior orientation x y z w of the camera in the star tracker frame, then in that of each'
+        ' further one (default: found from the first images)'
+    )
+    command.add_argument(
+        '--alignment', nargs='+', type=float, default=(0.0, 0.0, 0.0, 0.0), help=what, metavar='Q'
+    )
+
+
+def _catalog(command: argparse.ArgumentParser) -> None:
+    what = 'table of Gaia DR3 by the Gaia archive or VizieR: VOTable, FITS, CSV or Parquet'
+    _add(command, 'table', type=_path, metavar='GAIA_FILE', help=what)
+    what = 'catalog file to write (.npz), for the option catalog; no file is replaced'
+    _output(command, 'FILE', what, required=True)
+
+
+def _trend(command: argparse.ArgumentParser) -> None:
+    what = 'folder tree with calibrations and bags, or its URL, e.g. s3://bucket/fleet'
+    command.add_argument('root', metavar='ROOT', help=what)
+    what = 'folder or URL for trend.html and the table trend.parquet, created if absent'
+    command.add_argument('-o', '--output', required=True, metavar='DIR', help=what)
+    what = (
+        'ROS parameter file for bags without a calibration beside them; {spacecraft} and {camera} '
+        'in its path are replaced'
+    )
+    command.add_argument('--params', default='', metavar='FILE', help=what)
+    what = (
+        "names of spacecraft and cameras: a pattern, e.g. '{spacecraft}/{camera}/*.mcap', or a "
+        'CSV file with columns path, spacecraft, camera, params'
+    )
+    command.add_argument('--cameras', default='', metavar='PATTERN', help=what)
+    what = 'try what failed before again'
+    command.add_argument('--retry', action='store_true', help=what)
+    where = command.add_mutually_exclusive_group()
+    what = 'worker processes (default: 0, in-process)'
+    most = _number(int, 0, 1024)
+    where.add_argument('--workers', type=most, default=0, metavar='N', help=what)
     what = 'address of a Dask scheduler, e.g. tcp://host:8786'
     where.add_argument('--scheduler', default='', metavar='ADDRESS', help=what)
 
 
 _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     'demo': _demo,
+    'init': _init,
     'inspect': _inspect,
     'diagnose': _diagnose,
     'calibrate': _calibrate,
+    'plan': _plan,
     'report': _report,
     'compare': _compare,
     'lookup': _lookup,
     'play': _play,
     'monitor': _monitor,
+    'request': _request,
     'simulate': _simulate,
     'campaign': _campaign,
-    **mission_arguments.ARGUMENTS,
+    'export': _export,
+    'import': _import,
+    'catalog': _catalog,
+    'trend': _trend,
 }

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from starcal_ros.cli import mission_arguments
-
 # Command -> summary, description, and examples: a comment, then the line to type.
 HELP: dict[str, tuple[str, str, str]] = {
     'demo': (
@@ -18,6 +16,19 @@ HELP: dict[str, tuple[str, str, str]] = {
   starcal demo
   # write to another folder
   starcal demo -o /tmp/first_look""",
+    ),
+    'init': (
+        'write the first parameter file of a bag or of photographs',
+        (
+            'Finds the camera by its stars and, where the bag has attitudes, how they are meant '
+            'and the alignment; writes params.yaml and camera.yaml, and lists what was found and '
+            'what is left to state.'
+        ),
+        """\
+  # the bag in the repository, with nothing known
+  starcal init bags/tiny -o first
+  # photographs of the night sky
+  starcal init 'night/*.jpg' -o first""",
     ),
     'inspect': (
         'list the contents of a bag and the images a calibration would refuse',
@@ -55,11 +66,14 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
         (
             'Measures the stars of all images, estimates camera and alignment, checks the result '
             'against the limits of the gate and writes report.html, calibration.json, '
-            'camera_info.yaml and observations.mcap to DIR.'
+            'camera_info.yaml and observations.mcap to DIR. Images without attitudes give the '
+            'camera alone: their attitudes are found from the stars.'
         ),
         """\
   # the bag in the repository
   starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out
+  # photographs of the night sky, and nothing else
+  starcal calibrate 'night/*.jpg' -o out
   # the images of the first 30 s, and a comparison of its two halves
   starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out --to +30 --split-half
   # two bags together, with several cameras in them
@@ -80,19 +94,33 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   # with the truth of a simulated bag
   starcal compare out sim/truth.json
   # with a map of the difference over the detector
-  starcal compare out again -o difference.png
+  starcal compare out again -o difference.svg
   # machine-readable output
   starcal compare out/calibration.json again/calibration.json --json""",
+    ),
+    'plan': (
+        'say where to point the camera next',
+        (
+            'Estimates from the images so far, and chooses from the allowed pointings those whose '
+            'stars lower a sigma most, one after the other, with the sigma to expect after each.'
+        ),
+        """\
+  # the next ten images, anywhere on the sky
+  starcal plan bags/tiny --params bags/tiny/params.yaml
+  # five images, within 60 degrees of the zenith of Houston, away from the Sun
+  starcal plan bags/tiny --params bags/tiny/params.yaml --images 5 \
+      --within 250 30 60 --avoid 83 23 40 -o pointings.csv""",
     ),
     'report': (
         'rewrite report.html of a calibration',
         (
             'Makes one page from the files of a folder: gate verdict, parameters, residuals, '
-            'uncertainties, refused images and stars. The page needs no network.'
+            'uncertainties, refused images and stars. The page needs no network. --pdf writes the '
+            'same as numbered pages with a block for signatures (extra pdf).'
         ),
         """\
-  # from the files of an earlier calibration
-  starcal report out""",
+  # from the files of an earlier calibration, with pages to sign
+  starcal report out --pdf""",
     ),
     'lookup': (
         'write a table of lines of sight and their sigma by pixel',
@@ -122,7 +150,8 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
         'show running nodes in the terminal',
         (
             'Shows images and refusals by reason, coverage, the forecast sigma of each parameter '
-            'beside that of the active calibration, the gate and the health of the nodes.'
+            'beside that of the active calibration, the gate and the health of the nodes. Keys '
+            'request a calibration, a dry run, a roll-back or a reset.'
         ),
         """\
   # live, until Ctrl-C
@@ -131,6 +160,21 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   starcal monitor --remap __ns:=/cam1
   # one view after five seconds, for a log
   starcal monitor --once 5""",
+    ),
+    'request': (
+        'call a service of the running calibrator',
+        (
+            'Requests a calibration (calibrate, or solve with its options), the one before '
+            '(rollback), an empty ensemble (reset) or a table of lines of sight (lookup), and '
+            'prints the answer. Exit status 3: the calibrator declined.'
+        ),
+        """\
+  # calibrate from the images collected so far
+  starcal request calibrate
+  # the same without activating the result
+  starcal request solve --dry-run
+  # lines of sight of the active calibration of a calibrator in a namespace
+  starcal request lookup -o sights.csv --remap __ns:=/cam1""",
     ),
     'simulate': (
         'render a bag with known truth',
@@ -163,5 +207,72 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   # twelve frames of it, in a minute
   starcal campaign paper -o paper --images 12 --trials 20""",
     ),
-    **mission_arguments.HELP,
+    'export': (
+        'write a calibration in the format of another tool',
+        (
+            'Writes SPICE kernels (FK and IK, or CK with the attitude of each image), an ALE '
+            'fragment and ISIS keywords, YAML of OpenCV, kalibr or ROS, arguments of GIANT, '
+            'a model of mrcal, a table of lines of sight, or C99 source; prints the parts that '
+            'the format cannot hold and their cost in pixels. SPICE kernels, tables and C hold '
+            'everything.'
+        ),
+        """\
+  # frame and instrument kernel; the star tracker frame is defined too
+  starcal export out --to spice -o kernels --spacecraft-id -999 --star-tracker-id -999100
+  # with the frame names of the mission, whose frame kernel defines the star tracker
+  starcal export out --to spice -o kernels --spacecraft-id -999 --star-tracker-frame MSN_ST1
+  # attitude of the camera at each image, by its stars
+  starcal export out --to ck -o kernels --spacecraft-id -999 --kernels naif.tls clock.tsc
+  # for cv2.projectPoints
+  starcal export out --to opencv -o opencv
+  # C99 for flight software; later calibrations as tables that starcal_load checks
+  starcal export out --to c -o src
+  starcal export newer --to c --table -o uplink""",
+    ),
+    'import': (
+        'make a bag from images and attitudes in the formats of a mission',
+        (
+            'Images are FITS (tiled, scaled and floating point too), TIFF or PNG; attitudes, of '
+            'several star trackers too, CCSDS AEM, CSV, SPICE CK with SCLK and LSK, or the WCS '
+            'that a program such as astrometry.net wrote; velocities CCSDS OEM, CSV or SPK. '
+            'Times of UTC, TAI, TT, TDB and GPS become UTC. With --camera a parameter file to '
+            'calibrate the bag is written beside it.'
+        ),
+        """\
+  # FITS and an attitude ephemeris
+  starcal import --images 'night/*.fits' --attitude attitude.aem -o bag --camera prior.yaml
+  # SPICE kernels for attitude and velocity
+  starcal import --images 'night/*.fits' --attitude ck.bc clk.tsc lsk.tls --star-tracker ST1 -o bag
+  # FITS solved by astrometry.net, which writes NAME.wcs beside NAME.fits
+  starcal import --images 'night/*.fits' --attitude 'night/*.wcs' -o bag --camera prior.yaml
+  # PNG with a table of times and one of attitudes
+  starcal import --images 'night/*.png' --times times.csv --attitude attitude.csv -o bag""",
+    ),
+    'catalog': (
+        'make a deeper star catalog from a table of Gaia',
+        (
+            'Adds the stars of a table of Gaia DR3 to the bundled catalog, which ends at V = 9: '
+            'for narrow fields. The table is of the sky that is photographed, with source_id, '
+            'ra, dec, pmra, pmdec, parallax, phot_g_mean_mag and bp_rp, or their names in VizieR.'
+        ),
+        """\
+  # stars about one field, from the Gaia archive
+  starcal catalog gaia.vot -o deep.npz""",
+    ),
+    'trend': (
+        'follow calibrations over years',
+        (
+            'Reads every calibration.json and state folder under ROOT, calibrates bags with '
+            '--params, and observations of older versions again, into a Parquet table that grows; '
+            'writes trend.html: each parameter, boresight and alignment over time, steps and '
+            'drifts with p-values, and what a recalibration would have changed.'
+        ),
+        """\
+  # all calibrations of a mission; run again, only what is new is computed
+  starcal trend mission -o trend
+  # a thousand bags on two processes
+  starcal trend fleet -o trend --params camera.yaml --workers 2
+  # on a Dask cluster that sees the same files
+  starcal trend /data/fleet -o trend --params camera.yaml --scheduler tcp://host:8786""",
+    ),
 }

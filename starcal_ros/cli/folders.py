@@ -7,26 +7,24 @@ from pathlib import Path
 
 from starcal_ros.errors import OptionError
 
-# setup.cfg; contourpy comes with matplotlib
+# setup.cfg
 _MODULES_OF_EXTRAS = (
     'contourpy',
     'dask',
     'distributed',
     'jinja2',
     'markupsafe',
-    'matplotlib',
     'pyarrow',
+    'weasyprint',
 )
+_WITHOUT_KEY = ('mcap', 'rosbags')  # needed, but rosdep has no key for them
 
 
 def make_folder(path: Path) -> None:
     """
     Make a folder and those above it where they are not there.
 
-    Raises
-    ------
-    OptionError
-        When it cannot be made.
+    Raises OptionError when it cannot be made.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -36,6 +34,8 @@ def make_folder(path: Path) -> None:
 
 def missing_extra(error: ModuleNotFoundError, extra: str) -> str:
     """One line that names the extra to install; raises what is missing for another reason."""
+    if error.name in _WITHOUT_KEY:
+        return f'{error.name} is not installed: pip install {" ".join(_WITHOUT_KEY)}'
     if error.name not in _MODULES_OF_EXTRAS:
         raise error
     return f"{error.name} is not installed: pip install 'starcal_ros[{extra}]'"

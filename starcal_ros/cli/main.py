@@ -19,32 +19,16 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from starcal_ros.cli.arguments import (
-    complain,
-    EXIT_ACCEPTED,
-    EXIT_BAD_INPUT,
-    EXIT_INTERRUPTED,
-    EXIT_REFUSED,
-    is_interrupt,
-    parser,
-)
+from starcal_ros.cli import arguments, terminal
 from starcal_ros.cli.commands import mission
-from starcal_ros.cli.drawings import Drawings
 from starcal_ros.cli.folders import make_folder, missing_extra
-from starcal_ros.cli.terminal import (
-    discard,
-    open_missing_streams,
-    print_text,
-    print_verdict,
-    progress_bar,
-)
 from starcal_ros.errors import OptionError, StarcalError
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
 # --help answers at once.
 if TYPE_CHECKING:
     from starcal_ros.pipeline.topics import Topics
-    from starcal_ros.simulation.mistakes import Mistakes
+    from starcal_ros.studies.simulation.mistakes import Mistakes
 
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
@@ -54,10 +38,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool; returns the exit status."""
     command = ''
     try:
-        open_missing_streams()
+        terminal.open_missing_streams()
         if isinstance(sys.stdout, io.TextIOWrapper):  # the name of a file need not be UTF-8
             sys.stdout.reconfigure(errors='backslashreplace')
-        tool = parser()
+        tool = arguments.parser()
         if '_ARGCOMPLETE' in os.environ:  # set by a shell that completes a command line
             import argcomplete
 
@@ -69,33 +53,34 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             sys.stdout.flush()  # at the end of Python an error has no handler
     except StarcalError as error:
-        return complain(str(error))
+        return arguments.complain(str(error))
     except BrokenPipeError:
         # The reader of our output has ended (starcal ... | head).
-        discard('stdout')
-        return EXIT_BAD_INPUT
+        terminal.discard('stdout')
+        return arguments.EXIT_BAD_INPUT
     except OSError as error:
-        discard('stdout')
-        return complain(f'{error.filename or "input/output"}: {error.strerror or error}')
+        terminal.discard('stdout')
+        return arguments.complain(f'{error.filename or "input/output"}: {error.strerror or error}')
     except (KeyboardInterrupt, Exception) as error:
-        if is_interrupt(error):
-            complain('interrupted')
-            return EXIT_INTERRUPTED
+        if arguments.is_interrupt(error):
+            arguments.complain('interrupted')
+            return arguments.EXIT_INTERRUPTED
         if not isinstance(error, ModuleNotFoundError):
             raise
-        extra = {'campaign': 'studies', 'trend': 'mission'}.get(command, 'report')
-        return complain(missing_extra(error, extra))
+        of_command = {'campaign': 'studies', 'trend': 'mission'}.get(command, 'report')
+        extra = 'pdf' if error.name == 'weasyprint' else of_command
+        return arguments.complain(missing_extra(error, extra))
 
 
 def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:
     """Run the command that was asked for."""
     if args.version:
-        print_text(_software())
+        terminal.print_text(_software())
     elif args.command is None:
         tool.print_help()
     else:
         return _COMMANDS[args.command](args)
-    return EXIT_ACCEPTED
+    return arguments.EXIT_ACCEPTED
 
 
 def _calibrate(args: argparse.Namespace) -> int:
@@ -103,6 +88,20 @@ def _calibrate(args: argparse.Namespace) -> int:
     from starcal_ros.cli.commands.calibrate import calibrate
 
     return calibrate(args, _asked(args))
+
+
+def _init(args: argparse.Namespace) -> int:
+    """Write the first parameter file of a bag or of photographs."""
+    from starcal_ros.cli.commands.init import init
+
+    return init(args, _asked(args))
+
+
+def _plan(args: argparse.Namespace) -> int:
+    """Print the pointings to take next."""
+    from starcal_ros.cli.commands.plan import plan
+
+    return plan(args, _asked(args))
 
 
 def _asked(args: argparse.Namespace) -> Topics:
@@ -121,15 +120,18 @@ def _report(args: argparse.Namespace) -> int:
     """Write the report of a folder."""
     from starcal_ros.report import page
 
-    print_text(f'report written to {page.write_report(args.folder)}')
-    return EXIT_ACCEPTED
+    written = page.write_report(args.folder)
+    terminal.print_text(f'report written to {written}')
+    if args.pdf:
+        terminal.print_text(f'report written to {page.write_pdf(written)}')
+    return arguments.EXIT_ACCEPTED
 
 
 def _inspect(args: argparse.Namespace) -> int:
     """List the contents of a bag and the images that a calibration would refuse."""
-    from starcal_ros.bag import reader
     from starcal_ros.cli import output
-    from starcal_ros.messages.types import COMPRESSED_TYPE, IMAGE_TYPE, OBSERVATIONS_TYPE
+    from starcal_ros.formats.bag import reader
+    from starcal_ros.formats.messages.types import COMPRESSED_TYPE, IMAGE_TYPE, OBSERVATIONS_TYPE
     from starcal_ros.pipeline import inspect
 
     setup = None
@@ -138,52 +140,56 @@ def _inspect(args: argparse.Namespace) -> int:
 
         setup = read_setup(args.params)
     if setup and not setup.is_aligned:
-        from starcal_ros.diagnosis.bags import aligned_by_bags
+        from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags
 
         setup, aligned = aligned_by_bags(args.bags, _asked(args), setup)
-        print_text(aligned, end='\n' if aligned else '', file=sys.stderr)
+        terminal.print_text(aligned, end='\n' if aligned else '', file=sys.stderr)
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
-    with progress_bar(total, 'images') as advance:
+    with terminal.progress_bar(total, 'images') as advance:
         found = inspect.inspect(args.bags, _asked(args), setup, on_image=advance)
     if found.chosen and found.images and sum(r.count for r in found.refused) == found.images:
-        from starcal_ros.cli.commands import diagnosis
-        from starcal_ros.diagnosis.refusals import of_refusals
+        from starcal_ros.pipeline.diagnosis.bags import of_a_failure, of_refusals
 
         why = of_refusals(found.refused, found.images)
         if setup and not found.chosen.observations:
-            why = diagnosis.of_a_failure(args.bags, _asked(args), setup, found.refused)
+            why = of_a_failure(args.bags, _asked(args), setup, found.refused)
         if why:
             problems = (*found.problems, why.in_a_sentence())
             found = dataclasses.replace(found, problems=problems)
     if args.json:
-        print_text(json.dumps(inspect.content(found), indent=1, allow_nan=False))
+        _print_json(found)
     else:
         output.print_inspection(found)
-    return EXIT_REFUSED if found.problems else EXIT_ACCEPTED
+    return arguments.EXIT_REFUSED if found.problems else arguments.EXIT_ACCEPTED
+
+
+def _print_json(record: object) -> None:
+    from starcal_ros.record_codec import json_object
+
+    terminal.print_text(json.dumps(json_object(record), indent=1))
 
 
 def _diagnose(args: argparse.Namespace) -> int:
     """Print the reason why the images of a bag match no stars."""
-    from starcal_ros.cli.commands import diagnosis
-    from starcal_ros.diagnosis.bags import diagnose_bags
+    from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
     from starcal_ros.pipeline.setup import read_setup
 
     found = diagnose_bags(args.bags, _asked(args), read_setup(args.params))
     if args.json:
-        print_text(json.dumps(diagnosis.content(found), indent=1, allow_nan=False))
+        _print_json(found)
     else:
-        print_text(diagnosis.text(found))
-    return EXIT_ACCEPTED if found.cause == 'none' else EXIT_REFUSED
+        terminal.print_text('\n'.join(found.in_lines()))
+    return arguments.EXIT_ACCEPTED if found.cause == 'none' else arguments.EXIT_REFUSED
 
 
 def _compare(args: argparse.Namespace) -> int:
     """Compare two calibrations."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli import output
-    from starcal_ros.cli.commands.truth import is_truth
-    from starcal_ros.products.calibration_json import read_calibration
-    from starcal_ros.products.folder import calibration_file
+    from starcal_ros.cli.commands.demo import is_truth
+    from starcal_ros.formats.products.calibration_json import read_calibration
+    from starcal_ros.formats.products.product_folder import calibration_file
 
     files = [calibration_file(path) for path in (args.a, args.b)]
     if files[1].suffix == '.json' and is_truth(files[1]):
@@ -191,30 +197,33 @@ def _compare(args: argparse.Namespace) -> int:
     found = comparison.compare(*map(read_calibration, files))
     if args.output:
         from starcal_ros.cli.output_places import check_no_product
-        from starcal_ros.report.comparison_figure import write_comparison
+        from starcal_ros.report.detector_figures import write_comparison
 
         check_no_product(args.output, files)
         write_comparison(found, args.output)
     if args.json:
-        print_text(json.dumps(comparison.content(found), indent=1, allow_nan=False))
+        terminal.print_text(json.dumps(comparison.content(found), indent=1, allow_nan=False))
     else:
         output.print_comparison(found)
         if args.output:
-            print_text(f'figure written to {args.output}')
-    return EXIT_ACCEPTED
+            terminal.print_text(f'figure written to {args.output}')
+    return arguments.EXIT_ACCEPTED
 
 
 def _compare_with_truth(args: argparse.Namespace) -> int:
     """Compare a calibration with the truth of a simulated bag."""
-    from starcal_ros.cli.commands import truth
-    from starcal_ros.products.calibration_json import read_calibration
-    from starcal_ros.products.folder import calibration_file
+    from starcal_ros.cli.commands import demo
+    from starcal_ros.formats.products.calibration_json import read_calibration
+    from starcal_ros.formats.products.product_folder import calibration_file
 
     if args.output:
         raise OptionError('--output: a plot needs two calibrations')
-    found = truth.compare_with(read_calibration(calibration_file(args.a)), args.b)
-    print_text(json.dumps(truth.content(found), indent=1) if args.json else '\n'.join(found.lines))
-    return EXIT_ACCEPTED
+    found = demo.compare_with(read_calibration(calibration_file(args.a)), args.b)
+    if args.json:
+        _print_json(found)
+    else:
+        terminal.print_text('\n'.join(found.lines))
+    return arguments.EXIT_ACCEPTED
 
 
 def _lookup(args: argparse.Namespace) -> int:
@@ -222,76 +231,62 @@ def _lookup(args: argparse.Namespace) -> int:
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
     from starcal_ros.cli.output_places import check_no_product
-    from starcal_ros.products.calibration_json import read_calibration
-    from starcal_ros.products.folder import calibration_file
-    from starcal_ros.products.lookup_table import write_lookup_table
+    from starcal_ros.formats.products.calibration_json import read_calibration
+    from starcal_ros.formats.products.lookup_table import write_lookup_table
+    from starcal_ros.formats.products.product_folder import calibration_file
 
     file = calibration_file(args.calibration)
     check_no_product(args.output, [file])
     calibration = read_calibration(file)
     camera = calibration.geometry.camera
+    pixels = pixel_grid(camera, args.points, args.points)
     if args.step is not None:
         if not 0 < args.step <= max(camera.width, camera.height):
             raise OptionError(f'--step: {args.step:g} px is not within the detector')
         pixels = pixels_every(camera, args.step)
-    else:
-        if not 2 <= args.points <= 2000:
-            raise OptionError(f'--points: {args.points} is not in the range 2 to 2000')
-        pixels = pixel_grid(camera, args.points, args.points)
-    table = line_of_sight_table(camera, calibration.joint_covariance, pixels)
+    table = line_of_sight_table(camera, calibration.map_covariance, pixels)
     write_lookup_table(table, args.output)
-    print_text(f'{len(pixels)} lines of sight written to {args.output}')
-    return EXIT_ACCEPTED
+    terminal.print_text(f'{len(pixels)} lines of sight written to {args.output}')
+    return arguments.EXIT_ACCEPTED
 
 
 def _play(args: argparse.Namespace) -> int:
     """Replace this process by the bag player."""
-    from starcal_ros.bag import reader
     from starcal_ros.cli.commands import demo
+    from starcal_ros.formats.bag import reader
 
     reader.mcap_files([args.bag])
-    if not 0 <= args.rate <= 1e6:
-        raise OptionError(f'--rate: {args.rate} is not within 0 to 1e6')
-    _check_remaps(args.remap)
     return demo.become(demo.player_command(args.bag, args.rate, args.remap))
-
-
-def _check_remaps(remaps: Sequence[str]) -> None:
-    for remap in remaps:
-        if not all(remap.partition(':=')[::2]):
-            raise OptionError(f'--remap: {remap!r} is not of the form A:=B')
 
 
 def _monitor(args: argparse.Namespace) -> int:
     """Replace this process by the monitor of running nodes."""
     from starcal_ros.cli.commands import demo
 
-    _check_remaps(args.remap)
-    if args.once is not None and not 0 <= args.once <= 3600:
-        raise OptionError(f'--once: {args.once:g} s is not within 0 to 3600')
     if args.once is None and not sys.stdout.isatty():
         raise OptionError('--once: needed where the output is not a terminal, e.g. --once 5')
     return demo.become(demo.monitor_command(args.once, args.remap))
 
 
+def _request(args: argparse.Namespace) -> int:
+    """Replace this process by a client of one service of the calibrator."""
+    from starcal_ros.cli.commands import demo
+
+    if (args.dry_run or args.force) and args.service != 'solve':
+        raise OptionError(f'--dry-run, --force: only solve has them, not {args.service}')
+    if (args.service == 'lookup') != (args.output is not None):
+        raise OptionError('-o: the file for the table of lookup (.csv, .npz, .fits), of it alone')
+    options = [f'--{name}' for name in ('dry-run', 'force') if vars(args)[name.replace('-', '_')]]
+    options += [] if args.output is None else ['--output', str(args.output)]
+    return demo.become(demo.request_command(args.service, options, args.timeout, args.remap))
+
+
 def _simulate(args: argparse.Namespace) -> int:
     """Render a named scenario."""
-    from starcal_ros.options import nearest
-    from starcal_ros.simulation import bag as simulated_bag
-    from starcal_ros.simulation import scenario as synthetic
+    from starcal_ros.studies.simulation import scenario as synthetic
+    from starcal_ros.studies.simulation import simulated_bag
 
-    if args.scenario not in synthetic.SCENARIOS:
-        known = ', '.join(synthetic.SCENARIOS) + nearest(args.scenario, synthetic.SCENARIOS)
-        raise OptionError(f'--scenario: {args.scenario!r} is not one of {known}')
-    if args.seed < 0:
-        raise OptionError(f'--seed: {args.seed} is negative')
-    if args.images is not None and args.images < 1:
-        raise OptionError(f'--images: {args.images} is not 1 or more')
-    if args.stars_per_image is not None and args.stars_per_image < 1:
-        raise OptionError(f'--stars-per-image: {args.stars_per_image} is not 1 or more')
     camera_seed = args.seed if args.camera_seed is None else args.camera_seed
-    if camera_seed < 0:
-        raise OptionError(f'--camera-seed: {camera_seed} is negative')
     scenario = synthetic.scenario(args.scenario, camera_seed)
     scenario = dataclasses.replace(
         scenario,
@@ -300,26 +295,22 @@ def _simulate(args: argparse.Namespace) -> int:
         stars_per_image=args.stars_per_image,
     )
     mistakes = _mistakes(args)
-    with progress_bar(scenario.image_count, 'images') as advance:
+    with terminal.progress_bar(scenario.image_count, 'images') as advance:
         made = simulated_bag.write_bag(
             scenario, args.output, on_image=lambda _: advance(), mistakes=mistakes
         )
-    print_text(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
-    print_text(f'truth {made.truth}')
-    print_text(f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR')
-    return EXIT_ACCEPTED
+    terminal.print_text(f'bag {made.bag}, {scenario.image_count} images, seed {args.seed}')
+    terminal.print_text(f'truth {made.truth}')
+    terminal.print_text(
+        f'calibrate with: starcal calibrate {made.bag} --params {made.params} -o DIR'
+    )
+    return arguments.EXIT_ACCEPTED
 
 
 def _mistakes(args: argparse.Namespace) -> Mistakes:
-    from starcal_ros.simulation.mistakes import Mistakes
-    from starcal_ros.simulation.scenario import ATTITUDE_OFFSETS_S
+    from starcal_ros.studies.simulation.mistakes import Mistakes
+    from starcal_ros.studies.simulation.scenario import ATTITUDE_OFFSETS_S
 
-    if not 1 <= args.smear <= 200:
-        raise OptionError(f'--smear: {args.smear} px is not within 1 to 200')
-    if not 0.2 <= args.gamma <= 5.0:
-        raise OptionError(f'--gamma: {args.gamma:g} is not within 0.2 to 5')
-    if not -90.0 < args.focal_error < 400.0:
-        raise OptionError(f'--focal-error: {args.focal_error:g} % is not within -90 to 400')
     still_s = max(ATTITUDE_OFFSETS_S)
     if 0 < abs(args.clock_error) <= still_s:
         raise OptionError(
@@ -343,27 +334,27 @@ def _demo(args: argparse.Namespace) -> int:
     """Calibrate the small bag with the real nodes and compare the result with the truth."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli.commands import demo
-    from starcal_ros.cli.commands.calibrate import calibrate_into
+    from starcal_ros.cli.commands.calibrate import calibrate_into, Drawings
     from starcal_ros.cli.output_places import check_folder
+    from starcal_ros.formats.products.product_folder import write_products
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
-    from starcal_ros.products.folder import write_products
     from starcal_ros.report import page
 
     demo.check_ros()
     make_folder(args.output)
     bag = demo.tiny_bag(args.output)
     check_folder(args.output, [bag.bag], ())
-    print_text(f'bag {bag.bag}; log files and products in {args.output}')
-    with progress_bar(bag.image_count, 'images') as advance:
+    terminal.print_text(f'bag {bag.bag}; log files and products in {args.output}')
+    with terminal.progress_bar(bag.image_count, 'images') as advance:
         calibration, verdict = demo.run(bag, args.output, on_image=advance)
-    print_text(verdict)
+    terminal.print_text(verdict)
     if calibration is None:
-        return EXIT_REFUSED
+        return arguments.EXIT_REFUSED
     beside_truth = demo.compare(calibration, bag.truth, bag.prior)
-    print_text('\n'.join(beside_truth.lines))
+    terminal.print_text('\n'.join(beside_truth.lines))
     good = beside_truth.worst_sigmas <= _DEMO_SIGMAS
-    print_verdict(
+    terminal.print_verdict(
         good,
         f'largest error {beside_truth.worst_sigmas:.1f} sigma, '
         f'{"within" if good else "over"} the limit of {_DEMO_SIGMAS:g} sigma',
@@ -374,34 +365,28 @@ def _demo(args: argparse.Namespace) -> int:
     write_products(calibration, args.output)
     apart_px = float(comparison.compare(calibration, again).before.length_px.max())
     same = apart_px <= _DEMO_SAME_PX
-    print_verdict(
+    terminal.print_verdict(
         same,
         'starcal calibrate gives the same calibration from the bag'
         if same
         else f'starcal calibrate gives another calibration from the bag: {apart_px:.2g} px apart',
     )
     with Drawings().kind('report'):
-        print_text(f'open {page.write_report(args.output)}')
+        terminal.print_text(f'open {page.write_report(args.output)}')
     good = good and same
-    return EXIT_ACCEPTED if good else EXIT_REFUSED
+    return arguments.EXIT_ACCEPTED if good else arguments.EXIT_REFUSED
 
 
 def _campaign(args: argparse.Namespace) -> int:
     """Run a Monte Carlo study."""
-    import dataclasses
     import time
 
-    from starcal_ros.options import nearest
-    from starcal_ros.products.files import write_atomically
-    from starcal_ros.studies import figures, monte_carlo, summary
+    from starcal_ros.formats.products.product_files import write_atomically
+    from starcal_ros.studies import monte_carlo, study_figures, summary
     from starcal_ros.studies.workers import run_trials
 
     if args.study == 'paper':
         return _paper(args)
-    if args.study not in monte_carlo.STUDIES:
-        studies = (*monte_carlo.STUDIES, 'paper')
-        known = ', '.join(studies) + nearest(args.study, studies)
-        raise OptionError(f'STUDY: {args.study!r} is not one of {known}')
     what, default = monte_carlo.STUDIES[args.study]
     design = dataclasses.replace(
         default,
@@ -417,38 +402,34 @@ def _campaign(args: argparse.Namespace) -> int:
     workers = _workers(args)
     make_folder(args.output)
     start = time.monotonic()
-    with progress_bar(design.trials, 'trials') as advance:
+    with terminal.progress_bar(design.trials, 'trials') as advance:
         rows = run_trials(design, workers, args.scheduler, advance)
     seconds = time.monotonic() - start
     found = summary.conclude(design, rows)
     path = args.output / f'{design.study}.json'
     write_atomically(path, summary.content(found, _software()))
-    write_atomically(path.with_suffix('.png'), figures.png(found))
-    print_text(
+    write_atomically(path.with_suffix('.svg'), study_figures.svg(found))
+    terminal.print_text(
         f'{design.study}: {what}; {design.trials} trials, seed {design.seed}, {seconds:.1f} s'
     )
-    print_text('\n'.join(summary.table(found)))
-    print_text(f'written to {path} and {path.with_suffix(".png").name}')
-    return EXIT_ACCEPTED
+    terminal.print_table(*summary.table(found), left=0)
+    terminal.print_text(f'written to {path} and {path.with_suffix(".svg").name}')
+    return arguments.EXIT_ACCEPTED
 
 
 def _workers(args: argparse.Namespace) -> int:
     from starcal_ros.studies.workers import processors
 
-    workers: int = processors() if args.workers is None else args.workers
-    if not 0 <= workers <= 1024:
-        raise OptionError(f'--workers: {workers} is not within 0 to 1024')
-    return workers
+    return processors() if args.workers is None else int(args.workers)
 
 
 def _paper(args: argparse.Namespace) -> int:
     """Reproduce the paper."""
-    import dataclasses
     import functools
 
-    from starcal_ros.products.files import write_atomically
-    from starcal_ros.simulation.scenario import scenario
-    from starcal_ros.studies import monte_carlo, paper, paper_figures, summary
+    from starcal_ros.formats.products.product_files import write_atomically
+    from starcal_ros.studies import monte_carlo, paper, summary
+    from starcal_ros.studies.simulation.scenario import scenario
     from starcal_ros.studies.workers import run_each, run_trials
 
     workers = _workers(args)
@@ -461,21 +442,21 @@ def _paper(args: argparse.Namespace) -> int:
         raise OptionError(f'--images: {args.images} is not one number of 6 to {night}')
     images = args.images[0] if args.images else night
     make_folder(args.output / 'images')
-    with progress_bar(images, 'frames') as advance:
+    with terminal.progress_bar(images, 'frames') as advance:
         frame = functools.partial(paper.observe_frame_of, args.seed, images)
         frames = run_each(frame, images, workers, args.scheduler, advance)
-    with progress_bar(table1.trials, 'trials') as advance:
+    with terminal.progress_bar(table1.trials, 'trials') as advance:
         rows = run_trials(table1, workers, args.scheduler, advance)
     observations = [observed for _, observed in sorted(frames, key=lambda item: item[0])]
     found = paper.study(observations, summary.conclude(table1, rows), args.seed)
-    for name, png in paper_figures.pngs(found).items():
-        write_atomically(args.output / 'images' / f'paper_{name}.png', png)
+    for name, svg in paper.svgs(found).items():
+        write_atomically(args.output / 'images' / f'paper_{name}.svg', svg)
     path = args.output / 'paper.md'
     write_atomically(path, paper.page(found, _software()))
     content = {'software': _software(), **paper.numbers(found)}
     write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
-    print_text(f'written to {path}, with figures in {args.output / "images"}')
-    return EXIT_ACCEPTED
+    terminal.print_text(f'written to {path}, with figures in {args.output / "images"}')
+    return arguments.EXIT_ACCEPTED
 
 
 def _software() -> str:
@@ -486,14 +467,17 @@ def _software() -> str:
 
 _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     'demo': _demo,
+    'init': _init,
     'inspect': _inspect,
     'diagnose': _diagnose,
     'calibrate': _calibrate,
+    'plan': _plan,
     'report': _report,
     'compare': _compare,
     'lookup': _lookup,
     'play': _play,
     'monitor': _monitor,
+    'request': _request,
     'simulate': _simulate,
     'campaign': _campaign,
     **mission.COMMANDS,

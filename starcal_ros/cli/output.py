@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     """Print parameters, statistics and verdict; changes are relative to the prior."""
     from starcal_ros.assessment.agreement import alignment_difference_rad
-    from starcal_ros.estimation import star_trackers
-    from starcal_ros.model_errors import temperature
+    from starcal_ros.estimation import mountings, temperature
 
     camera, sigma = calibration.geometry.camera, calibration.sigma
     rows = []
@@ -42,6 +41,8 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
         )
     angles = alignment_difference_rad(calibration.geometry, prior) / ARCSECOND_RAD
     for axis, angle, error in zip('xyz', angles, sigma[-3:] / ARCSECOND_RAD, strict=True):
+        if not calibration.has_alignment:
+            break
         rows.append(
             (
                 f'alignment {axis}', '', 'arcsec', f'{error:.2f}', f'{angle:+.2f}',
@@ -49,8 +50,12 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
             )
         )  # fmt: skip
     print_table(('parameter', 'value', 'unit', '1-sigma', 'from prior', 'in sigmas'), rows)
+    _print_budget(calibration)
     quaternion = calibration.geometry.star_tracker_from_camera_xyzw
-    print_text(f'alignment xyzw  {np.array2string(quaternion, precision=9, separator=", ")}')
+    aligned = np.array2string(quaternion, precision=9, separator=', ')
+    if not calibration.has_alignment:
+        aligned = 'none: attitudes from the stars, the camera alone'
+    print_text(f'alignment xyzw  {aligned}')
     print_text(f'images          {calibration.images_used} used, refused: ', end='')
     print_text(_counted(calibration.images_refused))
     print_text(
@@ -62,11 +67,23 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     if calibration.temperature is not None:
         print_text(f'temperature     {temperature.summary(calibration.temperature)}')
     for one in calibration.star_trackers:
-        print_text(f'star tracker    {star_trackers.summary(one)}')
+        print_text(f'star tracker    {mountings.summary(one)}')
     if calibration.accepted:
         print_verdict(True, 'verdict         accepted')
     else:
         print_verdict(False, f'verdict         refused: {"; ".join(calibration.reasons)}')
+
+
+def _print_budget(calibration: Calibration) -> None:
+    from starcal_ros.records import parts_that_matter
+
+    rows = [
+        (part.cause, part.assumption, f'{part.map_arcsec:.3g}"', f'{part.pointing_arcsec:.3g}"')
+        for part in parts_that_matter(calibration.sigma_budget)
+    ]
+    if rows:
+        header = ('1-sigma of lines of sight', '', 'camera alone', 'with alignment')
+        print_table(header, rows, left=2)
 
 
 def print_inspection(inspection: Inspection) -> None:

@@ -6,13 +6,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from starcal_ros.bag import reader
 from starcal_ros.errors import OptionError
 from starcal_ros.files import same_as_one_of
-from starcal_ros.products.calibration_json import CALIBRATION_FILE
-from starcal_ros.products.files import check_not_inputs
-from starcal_ros.products.folder import PRODUCT_FILES
-from starcal_ros.products.not_calibrated import NOT_CALIBRATED_FILE
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE
+from starcal_ros.formats.products.product_files import check_not_inputs
+from starcal_ros.formats.products.product_folder import NOT_CALIBRATED_FILE, PRODUCT_FILES
 from starcal_ros.report.pictures.thumbnails import THUMBNAILS_FOLDER
 
 
@@ -20,10 +19,7 @@ def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> N
     """
     Check that the products of a calibration replace no input and do not become part of a bag.
 
-    Raises
-    ------
-    OptionError, ProductError
-        Naming the folder or the file.
+    Raises OptionError or ProductError naming the folder or the file.
     """
     bag_files = reader.files_of_bags(bags)
     if same_as_one_of(folder, [file.parent for file in bag_files]):
@@ -40,10 +36,7 @@ def check_no_product(output: Path, calibrations: Sequence[Path]) -> None:
     """
     Check that an output is neither a calibration that is read nor another product beside it.
 
-    Raises
-    ------
-    ProductError
-        Naming the file.
+    Raises ProductError naming the file.
     """
     beside = [file.with_name(name) for file in calibrations for name in PRODUCT_FILES]
     check_not_inputs([output], [*calibrations, *beside])

@@ -21,20 +21,13 @@ def open_missing_streams() -> None:
     Otherwise the next file that is opened would take the place of one, and what a library prints
     would go into that file.
     """
-    for number, name in enumerate(('stdin', 'stdout', 'stderr')):
-        try:
-            os.fstat(number)
-        except OSError:
-            opened = os.open(os.devnull, os.O_RDWR)
-            if opened != number:
-                os.dup2(opened, number)
-                os.close(opened)
-        if getattr(sys, name) is None:
-            setattr(sys, name, os.fdopen(number, 'r' if number == 0 else 'w', closefd=False))
+    for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
+        if getattr(sys, name) is None:  # a new file takes the lowest number that is free
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
 
 
 def discard(*names: str) -> None:
-    """Discard what is still to be written to standard streams: their reader has ended."""
+    """Discard unwritten output of standard streams whose reader has ended."""
     for name in names:
         with contextlib.suppress(OSError, ValueError):  # in tests they are no files
             devnull = os.open(os.devnull, os.O_WRONLY)

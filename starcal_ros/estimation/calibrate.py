@@ -1,93 +1,143 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""From an ensemble of observed images to camera, alignment and covariance."""
+"""
+From an ensemble of observed images to camera, alignment and covariance.
+
+A robust search from the prior; then, in turns, the posterior of all unknowns at the state, a step
+to its mean, and the variances of centroids and star trackers, the errors that observations share
+and the outliers from what is left, until nothing changes.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import NamedTuple
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Mask
+from starcal_ros.camera import CameraModel, project_parameters
+from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
-from starcal_ros.estimation.options import (
+from starcal_ros.estimation.calibration_options import (
     assumed_tracker_sigma_rad,
     CalibrationOptions,
     check_enough,
     check_options,
     estimated_parameters,
-    tracker_sigma_is_given,
 )
-from starcal_ros.estimation.search import Found, search
-from starcal_ros.estimation.star_trackers import (
+from starcal_ros.estimation.centroid_noise import CentroidVariance
+from starcal_ros.estimation.equations import star_sums, StarSums
+from starcal_ros.estimation.levenberg_marquardt import NotObservable
+from starcal_ros.estimation.minimise import minimise, Minimum
+from starcal_ros.estimation.mountings import (
     AttitudeErrors,
     canonical_xyzw,
     star_tracker_alignments,
     star_tracker_names,
 )
-from starcal_ros.estimation.verdict import all_residuals_px, dropped_stars, free_share
-from starcal_ros.least_squares.levenberg_marquardt import NotObservable
-from starcal_ros.least_squares.linear_terms import LinearTerms
-from starcal_ros.least_squares.normal_equations import squared_sigmas, star_table, StarTable
-from starcal_ros.methods.assembly import reduced_information
-from starcal_ros.methods.covariance import shared_covariance, shared_names
-from starcal_ros.methods.image_unknowns import attitudes_of_stars_alone
-from starcal_ros.methods.problem import image_field, Problem, State
-from starcal_ros.model_errors.attitude_correlation import attitude_correlation, AttitudeCorrelation
-from starcal_ros.model_errors.image_variation import ImageVariation
-from starcal_ros.model_errors.repeated_pointings import pointing_groups
-from starcal_ros.model_errors.residual_field import FieldPrior
-from starcal_ros.model_errors.temperature import weakest_term, why_unsupported
-from starcal_ros.model_errors.variance_components import CentroidVariance
+from starcal_ros.estimation.posterior import Posterior, posterior, Weights, with_shared_errors
+from starcal_ros.estimation.problem import image_parameters, Problem, State
+from starcal_ros.estimation.refraction import Refraction
+from starcal_ros.estimation.reweighting import dropped_stars
+from starcal_ros.estimation.shared_errors import (
+    observation_groups,
+    pixel_variance_px2,
+    SharedError,
+)
+from starcal_ros.estimation.star_equations import (
+    arrange,
+    Measurements,
+    squared_sigmas,
+    star_table,
+    StarTable,
+)
+from starcal_ros.estimation.start import moved_to_stars
+from starcal_ros.estimation.temperature import why_unsupported
+from starcal_ros.estimation.tracker_errors import TrackerErrors
+from starcal_ros.estimation.unknowns import (
+    Assumptions,
+    FIELD_OCTAVES,
+    FOCAL_PARAMETERS,
+    IMAGE_ROTATION,
+    Layout,
+    moved,
+    SHAPE_MODES,
+    unknowns_of,
+)
+from starcal_ros.estimation.working_weights import (
+    agree,
+    Attitudes,
+    Data,
+    degrees_of_freedom,
+    FREE_FACTOR,
+    judge,
+    Judged,
+    sky_rotations,
+    tracker_attitudes,
+    tracker_covariances,
+    weighted_attitudes,
+)
 from starcal_ros.records import (
     CameraGeometry,
     Ensemble,
+    MapCovariance,
     StarTrackerAlignment,
     TemperatureTerms,
 )
 
-_TRACKER_EXCESS = 1.3  # found over assumed sigma from which the scatter is suspect
+_START_FLOOR_PX = 0.05  # until the residuals show it: of the order of what is left in good images
+_ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
+_ROBUST_GAIN = 1e-3  # a step of 0.04 sigma: the posterior goes on from there
+_ROUNDS = 8  # the set of rejected stars settles in three or four
+_STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
+_FIRST_SHAPE_PX = 1e-4
+_SPACE_VELOCITY_M_S = 8000.0  # an orbit about the Earth
+_UNKNOWN_READOUT_S = 0.02  # of a rolling shutter: 5 to 50 ms a frame are usual
+_READOUT_ERROR = 0.01  # of the time by a data sheet: the tolerance of a clock, and rounding
 
 
 @dataclass(frozen=True)
 class Estimate:
     """
-    A solved calibration, before products; m images, n stars.
+    A solved calibration, before products; m images, n observations of stars.
 
     Attributes
     ----------
     geometry : CameraGeometry
     covariance : (p + 3, p + 3)
         Of the p camera parameters and the alignment angles.
+    joint_covariance : (p + 3 + 2 t, p + 3 + 2 t)
+        Of these and of the coefficients of the field of the camera, those of u, then those of v.
+    pixel_sigma_px : float
+        1-sigma per axis of structure finer than the field: it is part of any line of sight.
     information : (k, k)
-        On the estimated camera parameters and focal terms, then the alignment where the method
-        has one, and its rate; the rotations of the images eliminated.
-    information_names : tuple of k str
+        On the estimated camera parameters, focal terms, alignment and its rate, the images
+        eliminated; ``information_names`` are their names.
     shared_covariance : (s, s)
-        Of the camera parameters, focal terms, alignment and its rate.
-    shared_names : tuple of s str
-    problem : Problem
-        The one whose minimum the state is.
-    state : State
-    blocks : (m, p + 4, p + 4)
-        Its `image_blocks`, with the stars that were used and their final covariances.
-    field_terms : LinearTerms or None
-        Its `problem.field_terms`; None where no field is estimated.
+        Of camera parameters, focal terms, alignment, rate and mountings: ``shared_names``.
+    problem, state, layout, posterior
+        At the last linearisation: the state is the one before the last step.
+    sums : StarSums
+    measurements : Measurements
+        The stars that were used, with the working weights.
+    weights : Weights
     table : StarTable
     kept : (n,) bool
-        Stars used.
+        Observations used.
     residual_px : (n, 2)
-        Of all stars.
+        Of all observations, all unknowns at their means.
+    covariance_px2 : (n, 3)
+        Of each observation: noise, and the errors it shares with others.
     variance : CentroidVariance
         How the centroid covariances were corrected.
     variance_factor : float
         chi^2 per degree of freedom of the centroid covariances as given.
     star_tracker_sigma_rad : (3,)
-        As given, or as estimated again.
+        Noise of the star trackers, estimated.
     misfit_image : (m,) bool
         Images whose attitude does not fit, or that lost their stars.
     dropped_catalog_id : (d,) int64
@@ -95,23 +145,13 @@ class Estimate:
     alignment_scatter_arcsec : float
         RMS per axis of the alignments that the images show, about their mean.
     attitude_error_rad, attitude_covariance_rad2, attitude_seen : (m, 3), (m, 3, 3), (m,) bool
-        Star tracker errors by the stars alone, of `attitudes_of_stars_alone`.
+        Star-tracker errors as the stars show them.
     iterations, termination
     thermal : TemperatureTerms or None
         None where no change with temperature was asked for.
-    joint_covariance : (p + 3 + 2 t, p + 3 + 2 t)
-        Of ``covariance``'s numbers and the coefficients of the field of the camera, those of u,
-        then those of v; t is 0 where there is no field.
-    field_test : FieldPrior or None
-        Of the test whether the lens model needs a field beside it; None where it was not made.
-    repetition : (n,)
-        Factor on the centroid covariances of stars that images of one pointing repeat.
-    pointings : int
-        Number of different pointings of the images.
-    variation : ImageVariation
-        Of the camera from image to image; where there is one, each image has a shape of its own.
-    correlation : AttitudeCorrelation
-        Of the star-tracker errors in time, of the first one; carried in the covariances.
+    shared_errors : tuple of SharedError
+    tracker_errors : tuple of TrackerErrors
+        One for each star tracker with images.
     star_trackers : tuple of StarTrackerAlignment
         Empty where there is one only.
     """
@@ -119,17 +159,22 @@ class Estimate:
     geometry: CameraGeometry
     covariance: Floats
     joint_covariance: Floats
+    pixel_sigma_px: float
     information: Floats
     information_names: tuple[str, ...]
     shared_covariance: Floats
     shared_names: tuple[str, ...]
     problem: Problem
     state: State
-    blocks: Floats
-    field_terms: LinearTerms | None
+    layout: Layout
+    posterior: Posterior
+    sums: StarSums
+    measurements: Measurements
+    weights: Weights
     table: StarTable
     kept: Mask
     residual_px: Floats
+    covariance_px2: Floats
     variance: CentroidVariance
     variance_factor: float
     star_tracker_sigma_rad: Floats
@@ -142,12 +187,14 @@ class Estimate:
     iterations: int
     termination: str
     thermal: TemperatureTerms | None
-    field_test: FieldPrior | None
-    repetition: Floats
-    pointings: int
-    variation: ImageVariation
-    correlation: AttitudeCorrelation
+    shared_errors: tuple[SharedError, ...]
+    tracker_errors: tuple[TrackerErrors, ...]
     star_trackers: tuple[StarTrackerAlignment, ...]
+
+    @property
+    def map_covariance(self) -> MapCovariance:
+        """Covariance of lines of sight."""
+        return MapCovariance(self.joint_covariance, self.pixel_sigma_px)
 
 
 def estimate_calibration(
@@ -156,61 +203,53 @@ def estimate_calibration(
     """
     Estimate of the camera parameters and the alignment from an ensemble.
 
-    Terms of temperature that the images do not carry, or that are no more than chance, are left
-    out one by one; the note of ``thermal`` says which.
-
     Raises
     ------
     TooFewObservations
-        When there are too few images or stars, or they do not determine what is to be estimated.
+        When there are too few images or stars, they do not determine what is to be estimated, or
+        the images are mirrored.
     OptionError
         For options that do not go together.
     """
     check_options(options, prior.camera.model)
     check_enough(ensemble, options)
     table = star_table(ensemble.images)
-    time_ns = np.array([image.time_ns for image in ensemble.images], np.int64)
     problem = problem_of(ensemble, prior, options)
-    names = star_tracker_names(ensemble)
     order, with_rate = options.focal_temperature_order, options.alignment_temperature
-    left_out = []
-    unsupported = (order or with_rate) and why_unsupported(
+    note = (order or with_rate) and why_unsupported(
         np.array([image.temperature_degc for image in ensemble.images]), order
     )
-    if unsupported:
+    if note:
         order, with_rate = 0, False
-        left_out.append(unsupported)
-    while True:
+    data = Data(
+        table,
+        np.array([image.time_ns for image in ensemble.images], np.int64),
+        assumed_tracker_sigma_rad(options),
+        prior,
+        options,
+        np.array([image.star_tracker_rate_rad_s for image in ensemble.images]),
+        np.array([image.velocity_sigma_m_s for image in ensemble.images]),
+        _refraction(ensemble),
+        observation_groups(table.measured_px, table.star, prior.camera.width),
+    )
+    try:
         start = start_of(problem, prior, order, with_rate)
-        try:
-            found = search(problem, start, table, prior.camera, options)
-            estimate, weakest = _estimate(found, table, time_ns, names, prior, options)
-            why = 'within chance'
-        except (NotObservable, np.linalg.LinAlgError) as error:
-            if not (order or with_rate):
-                asked = ', '.join(estimated_parameters(options, problem.model))
-                raise TooFewObservations(
-                    f'the stars do not determine all of {asked} and the alignment: {error}; '
-                    'more images, or stars over more of the detector, or fewer parameters are '
-                    'needed'
-                ) from error
-            weakest, why = 'focal' if order else 'rate', 'not determined by the images'
-        if weakest == 'focal':
-            left_out.append(f'focal term of degree {order} is {why}')
-            order -= 1
-        elif weakest == 'rate':
-            left_out.append(f'alignment rate is {why}')
-            with_rate = False
-        else:
-            break
-    if estimate.thermal is None or not left_out:
-        return estimate
-    note = 'left out: ' + ', '.join(left_out)
-    return dataclasses.replace(estimate, thermal=dataclasses.replace(estimate.thermal, note=note))
+        start = moved_to_stars(problem, start, table, prior.camera)
+        result = _estimate(data, problem, start, ensemble)
+    except (NotObservable, np.linalg.LinAlgError) as error:
+        asked = ', '.join(estimated_parameters(options, problem.model))
+        raise TooFewObservations(
+            f'the stars do not determine all of {asked} and the alignment: {error}; more images, '
+            'or stars over more of the detector, or fewer parameters are needed'
+        ) from error
+    if result.thermal is None or not note:
+        return result
+    thermal = dataclasses.replace(result.thermal, note=f'left out: {note}')
+    return dataclasses.replace(result, thermal=thermal)
 
 
 def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Problem:
-    """What a search is given of an ensemble."""
+    """Problem of a search over an ensemble."""
     model, names = prior.camera.model, prior.camera.parameter_names
     prior_sigma = np.array(np.broadcast_to(options.prior_sigma, len(names)))
     weak_px = options.principal_point_prior * max(prior.camera.width, prior.camera.height)
@@ -265,206 +304,298 @@ def start_of(problem: Problem, prior: CameraGeometry, order: int, with_rate: boo
     )
 
 
-def _estimate(
-    found: Found,
-    table: StarTable,
-    time_ns: NDArray[np.int64],
-    star_trackers: tuple[str, ...],
-    prior: CameraGeometry,
-    options: CalibrationOptions,
-) -> tuple[Estimate, str]:
-    """What a search has found, and the term of temperature to leave out, if any."""
-    problem, solution, verdict = found.problem, found.solution, found.verdict
-    state = solution.state
-    blocks, terms = solution.normal.blocks, solution.normal.terms
-    residual_px = all_residuals_px(problem, state, table)
-    kept = verdict.kept
-    freedom = free_share(problem, state, blocks, terms, kept, verdict.tracker_sigma_rad)
-    chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()
-    lost = np.bincount(table.image[kept], minlength=table.image_count) == 0
-    geometry, full, scatter_arcsec = _result(
-        problem, state, blocks, terms, prior, verdict.tracker_sigma_rad
+def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) -> Estimate:
+    """Return the estimate from a start."""
+    table, camera = data.table, data.prior.camera
+    judged = Judged(CentroidVariance(1.0, _START_FLOOR_PX**2), (), np.ones(len(table), bool), None)
+    measurements = arrange(table, judged.kept, judged.covariance_px2(table))
+    solution = _robust_search(problem, start, measurements)
+    state, iterations = solution.state, solution.iterations
+    _check_not_mirrored(state)
+    residual_px = _residuals_px(problem, state, table, None, None, camera)
+    from_sky = sky_rotations(state, table, camera)
+    judged = judge(data, from_sky, residual_px, np.full(len(table), 2.0), judged, None)
+    shape_px: Floats = np.full(3, _FIRST_SHAPE_PX)
+    near: Posterior | None = None
+    termination = 'iteration_limit'
+    for k in range(_ROUNDS):
+        whole = k > 0
+        if not judged.kept.any():
+            raise NotObservable('no image has three stars that fit')
+        problem = weighted_attitudes(problem, data, judged.attitudes)
+        rates_rad_s = state.camera_from_star_tracker.apply(data.rates_rad_s)
+        size = camera.width, camera.height
+        layout = unknowns_of(problem, state, rates_rad_s, size, _assumed(data), whole)
+        inflation_px2 = judged.inflation_px2(table)
+        measurements = arrange(table, judged.kept, judged.working_px2(table))
+        predicted_px = table.measured_px - residual_px
+        sums = star_sums(measurements, problem, state, layout, predicted_px)
+        found = posterior(sums, problem, state, layout, shape_px, whole, near)
+        near = found if whole else None
+        after_step = moved(problem, state, layout, found.mean, found.of_images[:, IMAGE_ROTATION])
+        residual_px = _residuals_px(problem, after_step, table, layout, found, camera)
+        freedom = degrees_of_freedom(
+            found, measurements, problem, state, layout, table, judged.kept
+        )
+        attitudes = tracker_attitudes(data, problem, state, after_step, sums, layout, found)
+        after = judge(data, from_sky, residual_px, freedom, judged, found, attitudes)
+        shape_px = np.maximum(found.shape_sigma_px, _FIRST_SHAPE_PX)
+        iterations += 1
+        if whole and _step_sigma(layout, found) < _STEP_SIGMA and agree(judged, after, table):
+            termination = 'converged'
+            break
+        if k < _ROUNDS - 1:
+            state, judged = after_step, after
+    weights = Weights(
+        judged.covariance_px2(table)[:, [0, 2]].mean(axis=1),
+        inflation_px2,
+        from_sky,
+        predicted_px,
+        judged.errors,
+        tracker_covariances(problem, data, attitudes),
     )
-    alignment = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).inv()
-    attitude_error_rad, attitude_covariance_rad2, attitude_seen = attitudes_of_stars_alone(
-        problem, dataclasses.replace(state, camera_from_star_tracker=alignment), blocks
-    )
-    errors = AttitudeErrors(
-        time_ns,
-        attitude_error_rad,
-        np.einsum('mii->mi', attitude_covariance_rad2),
-        verdict.tracker_sigma_rad,
-        attitude_seen & ~verdict.misfit,
-    )
-    # The errors of one star tracker say nothing of those of another.
-    correlations = [
-        _correlation(found, errors, problem.star_tracker == k, options)
-        for k in range(len(star_trackers))
-    ]
-    covariances = _covariances(found, full, alignment, correlations[0])
-    names = shared_names(
-        problem.model, len(state.focal), len(state.rate) > 0, len(state.mountings) // 3
-    )
-    information = reduced_information(problem, state, blocks, terms)
-    shared = np.r_[problem.free, problem.camera_count : len(information) - len(state.modes)]
-    thermal = _thermal(state, covariances.shared, options)
-    k = problem.camera_count + len(state.focal) + 3
-    rate = slice(k, k + len(state.rate))
-    weakest = weakest_term(thermal, covariances.shared[rate, rate]) if thermal else ''
-    estimate = Estimate(
-        geometry=geometry,
-        covariance=covariances.at_reference,
-        joint_covariance=covariances.joint,
-        information=information[np.ix_(shared, shared)],
-        information_names=tuple(names[i] for i in shared),
-        shared_covariance=covariances.shared,
-        shared_names=names,
-        problem=problem,
-        state=state,
-        blocks=blocks,
-        field_terms=terms,
-        table=table,
-        kept=kept,
-        residual_px=residual_px,
-        variance=verdict.variance,
-        variance_factor=float(chi2_given / (2 * np.count_nonzero(kept) * freedom)),
-        star_tracker_sigma_rad=verdict.tracker_sigma_rad,
-        misfit_image=verdict.misfit | lost,
-        dropped_catalog_id=dropped_stars(table, kept),
-        alignment_scatter_arcsec=scatter_arcsec,
-        attitude_error_rad=attitude_error_rad,
-        attitude_covariance_rad2=attitude_covariance_rad2,
-        attitude_seen=attitude_seen,
-        iterations=found.iterations,
-        termination=solution.termination,
-        thermal=thermal,
-        field_test=found.field_test,
-        repetition=verdict.repetition,
-        pointings=len(
-            np.unique(pointing_groups(state.camera_from_icrf, float(state.parameters[0])))
-        ),
-        variation=verdict.variation,
-        correlation=correlations[0],
-        star_trackers=star_tracker_alignments(
-            star_trackers,
-            problem,
-            state,
-            covariances.star_trackers,
-            errors,
-            [one.added_variance_rad2 for one in correlations],
-        ),
-    )
-    return estimate, weakest
-
-
-class _Covariances(NamedTuple):
-    """Parts of the covariance of a solution, with what its images do not show each by itself."""
-
-    at_reference: Floats  # of camera parameters and alignment
-    joint: Floats  # of these, then of the coefficients of the field
-    shared: Floats  # of all that is shared but the field
-    star_trackers: Floats  # of alignment and mountings, errors independent in time
-
-
-def _covariances(
-    found: Found, of_noise: Floats, alignment: Rotation, correlated: AttitudeCorrelation
-) -> _Covariances:
-    """
-    Covariances of a solution from that of its noise.
-
-    Added are the correlation in time of the errors of the first star tracker, and the difference
-    of the camera of one image from the mean.
-    """
-    problem, state = found.problem, found.solution.state
-    full = of_noise.copy()
-    p = problem.camera_count
-    k = p + len(state.focal)
-    A = alignment.as_matrix()
-    full[k : k + 3, k : k + 3] += A @ np.diag(correlated.added_variance_rad2) @ A.T
-    free = np.ix_(problem.free, problem.free)
-    full[free] += found.verdict.variation.covariance_of_one_image(p)[free]
-    at_reference = np.r_[0:p, k : k + 3]
-    without_modes = len(full) - len(state.modes)
-    with_modes = np.r_[at_reference, without_modes : len(full)]
-    aligned = k + np.r_[0:3, 3 + len(state.rate) : state.alignment_count]
-    return _Covariances(
-        full[np.ix_(at_reference, at_reference)],
-        _in_coefficients(problem, full, with_modes),
-        full[:without_modes, :without_modes],
-        of_noise[np.ix_(aligned, aligned)],
+    found = with_shared_errors(found, sums, measurements, problem, state, layout, weights)
+    return _result(
+        data,
+        ensemble,
+        problem,
+        state,
+        after_step,
+        layout,
+        found,
+        sums,
+        measurements,
+        weights,
+        judged,
+        attitudes,
+        residual_px,
+        freedom,
+        iterations,
+        termination,
     )
 
 
-def _correlation(
-    found: Found, errors: AttitudeErrors, here: Mask, options: CalibrationOptions
-) -> AttitudeCorrelation:
-    """Correlation in time of the errors of a star tracker, in the images that fit."""
-    good = errors.seen & here
-    assumed_rad = assumed_tracker_sigma_rad(options)
-    is_given = tracker_sigma_is_given(options)
-    excess = is_given and bool(
-        (found.verdict.tracker_sigma_rad > _TRACKER_EXCESS * assumed_rad).any()
-    )
-    largest_rad = assumed_rad if is_given and not excess else np.full(3, np.inf)
-    return attitude_correlation(
-        errors.time_ns[good],
-        errors.error_rad[good],
-        errors.variance_rad2[good],
-        excess,
-        largest_rad,
-    )
+def _assumed(data: Data) -> Assumptions:
+    """Return the priors of velocity, read-out and stamps by the options and the observations."""
+    options = data.options
+    velocity_m_s = options.velocity_sigma_m_s
+    if velocity_m_s < 0:
+        stated = float(data.velocity_sigma_m_s.max())
+        velocity_m_s = stated if math.isfinite(stated) else _SPACE_VELOCITY_M_S
+    readout_s = {
+        'global': (0.0, 0.0),
+        'rolling': (options.readout_s, _READOUT_ERROR * abs(options.readout_s)),
+        'unknown': (0.0, _UNKNOWN_READOUT_S),
+    }
+    readout = readout_s[options.shutter]
+    return Assumptions(velocity_m_s, readout, options.stamp_sigma_s, data.refraction)
 
 
-def _thermal(state: State, full: Floats, options: CalibrationOptions) -> TemperatureTerms | None:
-    """Terms of temperature of a state; None where none was asked for."""
-    if not (options.focal_temperature_order or options.alignment_temperature):
+def _refraction(ensemble: Ensemble) -> Refraction | None:
+    """Return the refraction that all images of an ensemble state."""
+    zenith = np.array([image.zenith_icrf for image in ensemble.images])
+    if not np.isfinite(zenith).all():
         return None
-    p = len(state.parameters)
-    k = p + len(state.focal)
-    sigma = np.sqrt(np.diag(full))
-    return TemperatureTerms(
-        reference_degc=options.reference_temperature_degc,
-        focal_per_degc=tuple(state.focal.tolist()),
-        focal_per_degc_sigma=tuple(sigma[p:k].tolist()),
-        alignment_rate_rad_per_degc=tuple(state.rate.tolist()),
-        alignment_rate_rad_per_degc_sigma=tuple(sigma[k + 3 : k + 3 + len(state.rate)].tolist()),
-    )
+    size, sigma = np.array([image.refraction_arcsec for image in ensemble.images]).max(axis=0)
+    stamps = np.array([image.time_ns for image in ensemble.images], np.int64)
+    return Refraction(stamps, zenith, float(size), float(sigma))
 
 
-def _in_coefficients(problem: Problem, covariance: Floats, rows: NDArray[np.int64]) -> Floats:
-    """Some rows of a covariance, the modes of a field at its end turned into coefficients."""
-    chosen = covariance[np.ix_(rows, rows)]
-    if problem.field_prior is None:
-        return chosen
-    modes = problem.field_prior.modes
-    k = len(rows) - modes.shape[1]
-    to_coefficients = np.zeros((k + len(modes), len(rows)))
-    to_coefficients[:k, :k] = np.eye(k)
-    to_coefficients[k:, k:] = modes
-    return np.asarray(to_coefficients @ chosen @ to_coefficients.T)
+def _step_sigma(layout: Layout, found: Posterior) -> float:
+    """Return the largest step of a shared unknown of the state, in its sigma."""
+    in_state = layout.of(['camera', 'focal', 'alignment', 'rate', 'mountings'])
+    sigma = np.sqrt(np.diag(found.covariance)[in_state])
+    free = sigma > 0
+    return float(np.abs(found.mean[in_state][free] / sigma[free]).max(initial=0.0))
+
+
+def _check_not_mirrored(state: State) -> None:
+    focal_px = state.parameters[[0, 2]]
+    if not (focal_px > 0).all():
+        raise TooFewObservations(
+            'the stars are those of a mirrored image: fx and fy would be '
+            f'{focal_px.round(1).tolist()} px; flip the images along one axis, or set up the '
+            'driver of the camera not to'
+        )
+
+
+def field_of(layout: Layout, found: Posterior, size: tuple[int, int]) -> DetectorField:
+    """Return the field of a posterior on a detector (width, height)."""
+    coefficients = found.mean[layout.places['field']].reshape(2, -1)
+    return DetectorField(*size, FIELD_OCTAVES, coefficients, 'cosine')
+
+
+def _residuals_px(
+    problem: Problem,
+    state: State,
+    table: StarTable,
+    layout: Layout | None,
+    found: Posterior | None,
+    camera: CameraModel,
+) -> Floats:
+    """Measured minus predicted pixels (n, 2) of all observations at a state."""
+    own = image_parameters(problem, state)
+    measured = table.measured_px
+    rotations = state.camera_from_icrf.as_matrix()
+    e = np.einsum('nij,nj->ni', rotations[table.image], table.direction_icrf)
+    if layout is not None and found is not None:
+        own = np.broadcast_to(own, (table.image_count, problem.camera_count)).copy()
+        shapes_px = found.of_images[:, layout.places['shape']]
+        own[:, FOCAL_PARAMETERS] += shapes_px @ SHAPE_MODES.T
+        size = camera.width, camera.height
+        if 'field' in layout:
+            measured = measured - field_of(layout, found, size).displacement_px(measured)
+        turned = np.zeros((3, len(table)))
+        for entry in layout.shared:
+            if entry.turn is not None:
+                by = entry.turn(table.measured_px.T, e.T, table.image)
+                turned += np.einsum('aqn,q->an', by, found.mean[layout.places[entry.name]])
+        e = e - np.cross(turned.T, e)
+    own_of_star = own if own.ndim == 1 else own[table.image].T
+    return np.asarray(measured - project_parameters(problem.model, own_of_star, e))
 
 
 def _result(
+    data: Data,
+    ensemble: Ensemble,
     problem: Problem,
     state: State,
-    blocks: Floats,
-    terms: LinearTerms | None,
-    prior: CameraGeometry,
-    tracker_sigma_rad: Floats,
-) -> tuple[CameraGeometry, Floats, float]:
-    """
-    Geometry, covariance of all that is shared, and the scatter of the images' alignments, arcsec.
-
-    The covariance is of camera, focal terms, alignment and its rate.
-    """
-    scatter_arcsec, good = 0.0, np.zeros(len(blocks), bool)
-    if problem.method != 'single':
-        eta_rad, _, seen = attitudes_of_stars_alone(problem, state, blocks)
-        good = seen & np.isfinite(problem.star_tracker_sigma_rad[:, 0])
-        if good.any():
-            scatter_arcsec = float(np.sqrt(eta_rad[good].var(axis=0).mean())) / ARCSECOND_RAD
-    alignment, full = shared_covariance(problem, state, blocks, good, tracker_sigma_rad, terms)
-    camera = dataclasses.replace(prior.camera, field=image_field(problem, state)).replace(
-        **{problem.parameter_names[i]: float(state.parameters[i]) for i in problem.free}
+    after: State,
+    layout: Layout,
+    found: Posterior,
+    sums: StarSums,
+    measurements: Measurements,
+    weights: Weights,
+    judged: Judged,
+    attitudes: Attitudes,
+    residual_px: Floats,
+    freedom: Floats,
+    iterations: int,
+    termination: str,
+) -> Estimate:
+    """Return the estimate of the last round."""
+    table, options, prior = data.table, data.options, data.prior
+    size = prior.camera.width, prior.camera.height
+    kept = judged.kept
+    camera = dataclasses.replace(prior.camera, field=field_of(layout, found, size)).replace(
+        **{problem.parameter_names[i]: float(after.parameters[i]) for i in problem.free}
     )
-    return CameraGeometry(camera, canonical_xyzw(alignment.inv())), full, scatter_arcsec
+    alignment = after.camera_from_star_tracker
+    geometry = CameraGeometry(camera, canonical_xyzw(alignment.inv()))
+    covariance = _considered(found, problem, layout)
+    basic = layout.of(['camera', 'alignment'])
+    joint = layout.of(['camera', 'alignment', 'field'])
+    shared = layout.of(['camera', 'focal', 'alignment', 'rate', 'mountings'])
+    names = tuple(layout.labels[k] for k in shared)
+    asked = np.intersect1d(shared, found.estimated)
+    chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()
+    trackers = attitudes.trackers
+    noise = math.sqrt(np.mean([t.noise**2 for t in trackers])) if trackers else 1.0
+    shown = attitudes.seen & ~attitudes.misfit
+    scatter_rad = (
+        float(np.sqrt(attitudes.error_rad[shown].var(axis=0).mean())) if shown.any() else 0.0
+    )
+    lost = np.bincount(table.image[kept], minlength=table.image_count) == 0
+    star_trackers = star_tracker_names(ensemble)
+    errors = AttitudeErrors(
+        data.time_ns,
+        attitudes.error_rad,
+        np.einsum('mii->mi', attitudes.covariance_rad2),
+        noise * data.stated_rad,
+        attitudes.seen,
+    )
+    mountings = layout.of(['alignment', 'mountings'])
+    return Estimate(
+        geometry=geometry,
+        covariance=covariance[np.ix_(basic, basic)],
+        joint_covariance=covariance[np.ix_(joint, joint)],
+        pixel_sigma_px=math.sqrt(pixel_variance_px2(judged.errors)),
+        information=found.information[np.ix_(asked, asked)],
+        information_names=tuple(layout.labels[k] for k in asked),
+        shared_covariance=covariance[np.ix_(shared, shared)],
+        shared_names=names,
+        problem=problem,
+        state=state,
+        layout=layout,
+        posterior=found,
+        sums=sums,
+        measurements=measurements,
+        weights=weights,
+        table=table,
+        kept=kept,
+        residual_px=residual_px,
+        covariance_px2=judged.covariance_px2(table),
+        variance=judged.variance,
+        variance_factor=float(chi2_given / max(float(freedom[kept].sum()), 1e-9)),
+        star_tracker_sigma_rad=noise * data.stated_rad,
+        misfit_image=attitudes.misfit | lost,
+        dropped_catalog_id=dropped_stars(table, kept),
+        alignment_scatter_arcsec=scatter_rad / ARCSECOND_RAD,
+        attitude_error_rad=attitudes.error_rad,
+        attitude_covariance_rad2=attitudes.covariance_rad2,
+        attitude_seen=attitudes.seen,
+        iterations=iterations,
+        termination=termination,
+        thermal=_thermal(after, layout, covariance, options),
+        shared_errors=judged.errors,
+        tracker_errors=trackers,
+        star_trackers=star_tracker_alignments(
+            star_trackers, problem, after, covariance[np.ix_(mountings, mountings)], errors
+        ),
+    )
+
+
+def _considered(found: Posterior, problem: Problem, layout: Layout) -> Floats:
+    """
+    Covariance (P, P) with that of camera parameters that are held.
+
+    A held parameter with a prior sigma is a consider parameter: it keeps its prior variance, whose
+    effect on the estimated unknowns is added.  Without a prior sigma its variance is zero.
+    """
+    sigma = np.zeros(layout.count)
+    sigma[layout.places['camera']] = np.where(
+        np.isfinite(problem.prior_sigma), problem.prior_sigma, 0.0
+    )
+    held = np.setdiff1d(np.flatnonzero(sigma), found.estimated)
+    if len(held) == 0:
+        return found.covariance
+    by_held = np.zeros((layout.count, len(held)))
+    by_held[held] = np.diag(sigma[held])
+    by_held -= found.working @ found.information[:, held] * sigma[held]
+    return np.asarray(found.covariance + by_held @ by_held.T)
+
+
+def _thermal(
+    state: State, layout: Layout, covariance: Floats, options: CalibrationOptions
+) -> TemperatureTerms | None:
+    """Terms of temperature of a state; None where none was asked for."""
+    if not (options.focal_temperature_order or options.alignment_temperature):
+        return None
+    sigma = np.sqrt(np.diag(covariance))
+    return TemperatureTerms(
+        reference_degc=options.reference_temperature_degc,
+        focal_per_degc=tuple(state.focal.tolist()),
+        focal_per_degc_sigma=tuple(sigma[layout.of(['focal'])].tolist()),
+        alignment_rate_rad_per_degc=tuple(state.rate.tolist()),
+        alignment_rate_rad_per_degc_sigma=tuple(sigma[layout.of(['rate'])].tolist()),
+    )
+
+
+def _robust_search(problem: Problem, start: State, measurements: Measurements) -> Minimum:
+    """
+    Search with the robust loss, every image nearly free of the star tracker.
+
+    A star tracker that is better by its data sheet than it is would bend the camera to its
+    attitudes, and then seem to be right; a wrong mounting would cost its images all their stars.
+    """
+    if problem.method == 'hierarchical':
+        free = dataclasses.replace(
+            problem,
+            star_tracker_sigma_rad=FREE_FACTOR * problem.star_tracker_sigma_rad,
+            mounting_sigma_rad=FREE_FACTOR * problem.mounting_sigma_rad,
+        )
+        try:
+            return minimise(free, start, measurements, _ROBUST_SCALE, least_gain=_ROBUST_GAIN)
+        except NotObservable:
+            pass  # so few stars that they need the star tracker
+    return minimise(problem, start, measurements, _ROBUST_SCALE, least_gain=_ROBUST_GAIN)

@@ -6,12 +6,15 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from starcal_ros.camera_conversion import convert
+from starcal_ros.camera.conversion import convert
+from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.lens import COEFFICIENTS
+from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import CameraGeometry, Ensemble
+
+# Twice the log likelihood of a field that is not there: the 1 % level of three amplitudes.
+_CHANCE = 9.0
 
 
 def estimate_with_smallest_lens(
@@ -21,10 +24,9 @@ def estimate_with_smallest_lens(
     Return the estimate with the smallest lens model that needs no field, and the prior with it.
 
     The model of the prior camera comes first, then those with more coefficients, ascending, then
-    those with fewer.  A model is accepted where the test of a residual field (`residual_field`)
-    has a p-value of at least ``max_field_p_value``: the test asks the residuals for structure over
-    the detector, which a model does not lose by having more coefficients alone.  Where none is
-    accepted, the model with the least evidence for a field is estimated with its field.
+    those with fewer.  A model is accepted where the likelihood of a field beside it is not larger
+    than chance makes it: structure over the detector, which a model does not lose by having more
+    coefficients alone.  Where none is accepted, the model with the least evidence for a field is.
 
     Raises
     ------
@@ -33,12 +35,8 @@ def estimate_with_smallest_lens(
     OptionError
         For options that do not go together.
     """
-    # Every p-value is above it: a model gets no field, but what its stars do not exclude.
-    is_tested = options.max_field_p_value > 0.0
-    bare = options
-    if is_tested:
-        bare = dataclasses.replace(options, max_field_p_value=math.ulp(0.0))
-    least, best = math.inf, prior
+    least = math.inf
+    best: tuple[Estimate, CameraGeometry] | None = None
     own = len(COEFFICIENTS[prior.camera.model])
     for model in sorted(
         COEFFICIENTS,
@@ -53,16 +51,18 @@ def estimate_with_smallest_lens(
             continue
         started = dataclasses.replace(prior, camera=camera)
         try:
-            estimate = estimate_calibration(ensemble, started, bare)
+            estimate = estimate_calibration(ensemble, started, options)
         except TooFewObservations:
             if model == prior.camera.model:
                 raise
             continue  # the stars do not determine a model that large
-        test = estimate.field_test
-        passes = test is not None and test.p_value >= options.max_field_p_value
-        if passes or not is_tested:
+        if estimate.termination != 'converged' and best is not None:
+            continue  # lost on the way: its lack of a field means nothing
+        ratio = estimate.posterior.field.likelihood_ratio
+        if ratio < _CHANCE:
             return estimate, started
-        ratio = math.inf if test is None else test.log_likelihood_ratio
         if ratio < least:
-            least, best = ratio, started
-    return estimate_calibration(ensemble, best, options), best
+            least, best = ratio, (estimate, started)
+    if best is None:
+        raise TooFewObservations('no lens model describes the prior camera')
+    return best

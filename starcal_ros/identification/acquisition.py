@@ -22,9 +22,9 @@ from starcal_ros.camera import line_of_sight, project, rotation_jacobian
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.polynomial_warp import fit_warp, warp_powers
 from starcal_ros.identification.prediction import in_image, Prediction
-from starcal_ros.image.detection import Sources
 from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import median, medians
+from starcal_ros.stars.detection import Sources
 
 # Number of the brightest predictions and sources that vote; all pairs fill one histogram.
 _VOTERS = 100
@@ -54,10 +54,8 @@ def acquire(
 
     The prediction error is at most ``reach_px`` and a roll of ``roll_rad``.
 
-    Raises
-    ------
-    ImageRefused
-        ``no_match`` if the number of matched predictions is consistent with chance.
+    Raises ImageRefused ``no_match`` if the number of matched predictions is consistent with
+    chance.
     """
     best_px, most, refused = None, -1, None
     for depth in (len(sources.snr), *_DEPTHS):
@@ -104,10 +102,7 @@ def _vote(
     For each roll within the limit, the pixel offsets of all pairs of bright sources and bright
     predictions are counted in cells; true pairs share one cell, false ones are spread.
 
-    Raises
-    ------
-    ImageRefused
-        ``no_match`` if the count of the best cell is consistent with chance.
+    Raises ImageRefused ``no_match`` if the count of the best cell is consistent with chance.
     """
     camera = geometry.camera
     half_diagonal_px = 0.5 * np.hypot(camera.width, camera.height)
@@ -243,10 +238,8 @@ def _match(
     """
     Predicted pixels (n, 2) refined to match the sources.
 
-    Raises
-    ------
-    ImageRefused
-        ``no_match`` if the number of matched predictions is consistent with chance.
+    Raises ImageRefused ``no_match`` if the number of matched predictions is consistent with
+    chance.
     """
     camera = geometry.camera
     # Equal numbers of predictions and sources: the fainter surplus has no counterpart.
@@ -282,10 +275,7 @@ def _check_beyond_chance(
 
     ``fitted_pairs`` is the number of false pairs that the fit itself can make.
 
-    Raises
-    ------
-    ImageRefused
-        ``no_match``.
+    Raises ImageRefused ``no_match``.
     """
     inside = in_image(predicted_px, width, height)
     radius_px = _MET_PX

@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.identification.prediction import Prediction
-from starcal_ros.image.centroiding import Centroids, SWAMPED_SIGMA
-from starcal_ros.image.image_model import ImageModel
-from starcal_ros.image.psf_fit import neighbour_pull_px, stamp_radius_px
 from starcal_ros.records import StarRefusal
 from starcal_ros.sky.catalog import CLOSE_PAIR_RAD, StarCatalog
+from starcal_ros.stars.centroiding import Centroids, SWAMPED_SIGMA
+from starcal_ros.stars.image_model import ImageModel
+from starcal_ros.stars.psf_fit import neighbour_pull_px, stamp_radius_px
 
 _PULL_UNCERTAINTY = 0.25  # relative, of a neighbour's flux from its V magnitude: colours differ
 _MODELLED_UNCERTAINTY = 0.05  # relative, of a measured neighbour's flux: the PSF is not Gaussian

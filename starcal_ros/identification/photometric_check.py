@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import best_share, missed_parts, part_of, PARTS
-from starcal_ros.image.centroiding import Centroids
-from starcal_ros.image.image_model import ImageModel
-from starcal_ros.image.pixel_noise import expected_snr
 from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
+from starcal_ros.stars.centroiding import Centroids
+from starcal_ros.stars.image_model import ImageModel
+from starcal_ros.stars.pixel_noise import expected_snr
 
-_FEWEST = 4  # stars whose scatter, or the share of which, means anything
+_FEWEST = 4  # stars: fewer give no meaningful scatter or share
 # A camera's band is not V: stars of a real sky scatter by 0.15 to 0.3 mag, none of 2000 was off
 # by 1.5; a lens may dim its corners by 1.  Stars met by chance scatter by 1.0 to 1.7 mag.
 _BRIGHTEST = 20  # good stars, brightest in the catalog, that give a first zero point
-_FAR_MAG = 0.0  # a star so much brighter than the catalog has it would still not be seen
 _MOST_OFF = 2.0  # of one star, in the largest scatter of all
 
 
@@ -44,6 +43,8 @@ def refuse_by_brightness(
     be bright enough becomes ``not_detected``.  If one part of the image lacks almost all expected
     stars while another part has them, the few stars found in such parts become ``ambiguous`` too.
 
+    Raises ImageRefused ``no_match`` if the brightnesses of most stars contradict the match.
+
     Parameters
     ----------
     magnitude, predicted_px : (n,), (n, 2)
@@ -54,11 +55,6 @@ def refuse_by_brightness(
         Largest scatter of a true match.
     shape : (int, int)
         Height and width of the image.
-
-    Raises
-    ------
-    ImageRefused
-        ``no_match`` if the brightnesses of most stars contradict the match.
     """
     refusal = centroids.refusal.copy()
     good = np.flatnonzero(refusal == StarRefusal.NONE)
@@ -69,7 +65,7 @@ def refuse_by_brightness(
     # Peaks of noise lie near faint catalog stars by chance. The zero point of the brightest stars
     # shows which stars are too faint to be detected: their measurements are noise.
     brightest = np.argsort(magnitude[good], kind='stable')[:_BRIGHTEST]
-    highest = median(zero_point[brightest]) + _FAR_MAG
+    highest = median(zero_point[brightest])
     most_dn = 10.0 ** (0.4 * (highest - magnitude[good].astype(np.float64)))
     unseen = expected_snr(most_dn, psf_sigma_px, noise_dn, model.pixel_noise) < min_snr
     refusal[good[unseen]] = StarRefusal.FAINT

@@ -10,7 +10,7 @@ from starcal_ros.robust_statistics import median, medians, RAYLEIGH_TO_SIGMA
 
 
 def warp_powers(n: int) -> list[tuple[int, int]]:
-    """Powers of u and v in the correction; n stars determine the degree."""
+    """Exponents (i, j) of u^i v^j in the correction for n stars."""
     degree = 5 if n >= 150 else 3 if n >= 36 else 1 if n >= 12 else 0
     return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
 
@@ -21,8 +21,8 @@ def fit_warp(
     """
     Smooth correction (k, 2) at ``at_px`` from predicted to measured pixels, and robust scatter.
 
-    Robust fit of a polynomial in u and v; the number of stars determines its degree (at most 5,
-    because the prior distortion may be unknown).  It corrects predictions only.
+    Robust fit of a polynomial in u and v, of degree 0 to 5 by the number of stars: the prior may
+    lack the distortion.  The correction serves the search only and enters no observation.
     """
     n = len(predicted_px)
     powers = warp_powers(n)
@@ -48,8 +48,8 @@ def fit_warp(
         weight = 1.0 / spread2 / (1.0 + size**2 / (9.0 * spread2)) ** 2
         weighted = A * weight
         normal = weighted @ A.T
-        # Powers up to 5 on -1 to 1 leave the normal matrix ten digits; the damping bounds the
-        # correction in a corner without stars.
+        # Powers up to 5 on -1 to 1 keep ten digits of the normal matrix; the damping bounds the
+        # correction in corners without stars.
         normal.flat[:: len(normal) + 1] *= 1.0 + 1e-9
         coefficients = np.linalg.solve(normal, weighted @ residual)
         if abs(scatter - before) < 0.03 * scatter:

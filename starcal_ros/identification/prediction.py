@@ -13,7 +13,12 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import field_radius_rad, line_of_sight, project
 from starcal_ros.records import CameraGeometry
-from starcal_ros.sky.astrometry import apparent_directions, SiteOptions, through_the_air
+from starcal_ros.sky.astrometry import (
+    apparent_directions,
+    MIN_ELEVATION_DEG,
+    SiteOptions,
+    through_the_air,
+)
 from starcal_ros.sky.catalog import cone, StarCatalog
 
 SPACE = SiteOptions()
@@ -58,9 +63,9 @@ def predict(
     """
     Predicted catalog stars for an attitude, an alignment and a camera.
 
-    Stars fainter than the magnitude limit or below the elevation limit of a site are omitted;
-    stars up to ``margin_rad`` outside the image are included, because acquisition may move them
-    into it.
+    Omits stars fainter than the magnitude limit and, on the ground, those below the elevation
+    limit.  Includes stars up to ``margin_rad`` outside the image: acquisition may move them into
+    it.
     """
     camera = geometry.camera
     icrf_from_camera = Rotation.from_quat(icrf_from_star_tracker_xyzw) * Rotation.from_quat(
@@ -75,7 +80,8 @@ def predict(
     direction_camera = icrf_from_camera.inv().apply(direction_icrf)
     xy_px = project(camera, direction_camera)
     with np.errstate(invalid='ignore'):
-        # A distortion polynomial folds over far outside: keep stars that the inverse maps back.
+        # Far outside the image the distortion polynomial folds over: keep only the stars whose
+        # pixel maps back to their direction.
         near = in_image(xy_px, camera.width, camera.height, margin_px)
     near[near] &= np.einsum(
         'ij,ij->i', line_of_sight(camera, xy_px[near]), direction_camera[near]
@@ -91,13 +97,13 @@ def visible(
     velocity_m_s: Floats | None,
     site: SiteOptions,
 ) -> tuple[NDArray[np.intp], Floats]:
-    """Rows (m,) of the catalog above the horizon, and their apparent ICRF directions (m, 3)."""
+    """Catalog rows (m,) above the elevation limit, and apparent ICRF directions (m, 3)."""
     if site.observer != 'ground':
         return index, apparent_directions(catalog.select(index), time_ns, velocity_m_s)
     direction_icrf, elevation_rad = through_the_air(
         apparent_directions(catalog.select(index), time_ns), time_ns, site
     )
-    high = elevation_rad >= math.radians(site.min_elevation_deg)
+    high = elevation_rad >= math.radians(MIN_ELEVATION_DEG)
     return index[high], direction_icrf[high]
 
 

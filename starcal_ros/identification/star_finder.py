@@ -2,9 +2,9 @@
 """
 Stars of one image without a track: prediction, acquisition and measurement.
 
-Sources near the predictions correct the prediction; if they do not match, the whole image is
-searched (`acquisition`).  Centroids are corrected for neighbours (`blending`), and stars displaced
-from the position that the other stars predict are refused.
+Sources near the predicted pixels correct the prediction; if they do not match it, `acquisition`
+searches the whole image.  `blending` corrects the centroids for neighbours, and a star that is
+displaced from the position predicted by the others is refused.
 """
 
 from __future__ import annotations
@@ -32,60 +32,46 @@ from starcal_ros.identification.prediction import (
     SPACE,
     within_image,
 )
-from starcal_ros.image.centroiding import Centroids, measure_stars, with_faint
-from starcal_ros.image.detection import (
+from starcal_ros.options import option
+from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
+from starcal_ros.sky.astrometry import EARTH, SiteOptions, Velocity
+from starcal_ros.sky.catalog import StarCatalog
+from starcal_ros.stars.centroiding import Centroids, measure_stars, with_faint
+from starcal_ros.stars.detection import (
     Background,
     detect,
     detect_near,
     measure_background,
     Sources,
 )
-from starcal_ros.image.faint_end import detectable_count
-from starcal_ros.image.hot_pixels import NO_HOT_PIXELS, refuse_on_hot_pixels
-from starcal_ros.image.image_model import CentroidOptions, ImageModel, model_image
-from starcal_ros.image.psf_field import Instrument, learn, MeasuredStars
-from starcal_ros.image.psf_fit import stamp_radius_px
-from starcal_ros.options import option
-from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
-from starcal_ros.sky.astrometry import SiteOptions
-from starcal_ros.sky.catalog import StarCatalog
+from starcal_ros.stars.faint_end import detectable_count
+from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS, refuse_on_hot_pixels
+from starcal_ros.stars.image_model import CentroidOptions, ImageModel, model_image
+from starcal_ros.stars.psf_field import Instrument, learn, MeasuredStars
+from starcal_ros.stars.psf_fit import stamp_radius_px
 
+# Errors of a mounting and of a launch.  docs/performance.md has the fraction of fields that such a
+# search finds, and of false matches; a larger error needs the search without an alignment.
+ACQUISITION_RADIUS_RAD = math.radians(1.5)
+ACQUISITION_ROLL_RAD = math.radians(5.0)
+SEARCH_RADIUS_PX = 12  # half width of the window around a predicted star, with a known alignment
+MAX_BLEND_SIGMA = 3.0  # of the centroid; a larger uncertainty of a blend refuses the star
+_MIN_STARS = 8  # in an image; fewer stars cannot confirm its attitude
 _NEAREST = 200  # brightest predictions, searched in windows first
 _NEAREST_ROLL_RAD = 0.01  # an aligned star tracker has smaller errors about any axis
 
 
 @dataclass(frozen=True)
 class IdentificationOptions:
-    """Options for the prediction and identification of stars."""
+    """Prediction and identification of stars."""
 
     magnitude_limit: float = option(
-        9.0, 'faintest catalog star to search for, V magnitude', low=0.0, high=20.0
-    )
-    acquisition_radius_deg: float = option(
-        1.5, 'largest alignment error in the search, degrees', low=0.05, high=5.0
-    )
-    acquisition_roll_deg: float = option(
-        5.0, 'largest roll error in the search, degrees', low=0.0, high=20.0
-    )
-    search_radius_px: int = option(
-        12,
-        'half width of the window for the first search of a predicted star, px',
-        low=3,
-        high=100,
-    )
-    min_stars_per_image: int = option(
-        8, 'fewest measured stars for an image to be used', low=3, high=1000
-    )
-    max_blend_sigma: float = option(
-        3.0,
-        'largest uncertainty of the correction for catalog neighbours, in sigma of the centroid',
-        low=0.0,
-        high=100.0,
+        9.0, 'faintest catalog star to search for, V magnitude', low=0.0, high=20.0, basic=True
     )
     max_brightness_scatter_mag: float = option(
         0.75,
-        'largest scatter of measured brightnesses about the catalog, mag; a larger one is a false'
-        ' match; raise it for a camera with a band far from V; 100: no check',
+        'largest scatter of measured against catalog magnitudes, mag; beyond it the match is'
+        ' rejected as false; raise it for a band far from V; 100: no check',
         low=0.3,
         high=100.0,
     )
@@ -113,7 +99,7 @@ class Exposure:
     image: Image
     icrf_from_star_tracker_xyzw: Floats
     attitude_gap_s: float
-    velocity_m_s: Floats | None = None
+    velocity: Velocity = EARTH
     site: SiteOptions = SPACE
     hot_pixels: Indices = dataclasses.field(default_factory=lambda: NO_HOT_PIXELS.index)
     temperature_degc: float = math.nan
@@ -130,10 +116,7 @@ def observe_stars(
     With too few measured stars the observations have the refusal ``too_few_stars`` and still list
     the refusal reason of each star.
 
-    Raises
-    ------
-    ImageRefused
-        ``no_stars``, ``no_match`` or ``incomplete``.
+    Raises ImageRefused ``no_stars``, ``no_match`` or ``incomplete``.
     """
     image, options = exposure.image, search.identification
     background = measure_background(image.pixels)
@@ -143,19 +126,19 @@ def observe_stars(
         image.time_ns,
         search.catalog,
         options.magnitude_limit,
-        math.radians(options.acquisition_radius_deg),
-        exposure.velocity_m_s,
+        ACQUISITION_RADIUS_RAD,
+        exposure.velocity.m_s,
         exposure.site,
     )
     if len(prediction.catalog_index) < 4:
         raise ImageRefused(
             'no_match', f'{len(prediction.catalog_index)} catalog stars in the field'
         )
-    predicted_px, sources = _find(image.pixels, background, prediction, geometry, search)
+    predicted_px, sources = _find(image.pixels, background, prediction, geometry)
     model = model_image(image.pixels, background, sources, search.centroid)
     if model.psf is None:
         # The brightest stars may all be saturated: fit the PSF to fainter ones.
-        sources = detect(image.pixels, background, search.centroid.detection_sigma)
+        sources = detect(image.pixels, background)
         model = model_image(image.pixels, background, sources, search.centroid)
     prediction = dataclasses.replace(prediction, xy_px=predicted_px)
     return measure_predicted(exposure, prediction, model, None, search)
@@ -174,11 +157,8 @@ def measure_predicted(
     ``instrument`` is the PSF and gain of earlier images, None at the first image.  With too few
     measured stars the observations have the refusal ``too_few_stars``.
 
-    Raises
-    ------
-    ImageRefused
-        ``incomplete`` if image lines are lost, ``no_match`` if the brightnesses contradict the
-        catalog.
+    Raises ImageRefused ``incomplete`` if image lines are lost, ``no_match`` if the brightnesses
+    contradict the catalog.
     """
     catalog, options = search.catalog, search.identification
     height, width = exposure.image.pixels.shape
@@ -189,9 +169,9 @@ def measure_predicted(
     measured = measure_stars(
         exposure.image.pixels, shown.xy_px[:count], model, search.centroid, exposure.hot_pixels
     )
-    # The faint ones, too, may pull the others, and are listed as refused.
+    # Faint stars are refused, but their light may pull the centroids of the others.
     centroids, alone = separate(
-        shown, catalog, with_faint(measured, shown.xy_px), model, options.max_blend_sigma
+        shown, catalog, with_faint(measured, shown.xy_px), model, MAX_BLEND_SIGMA
     )
     _refuse_line_loss(shown.xy_px, centroids, (height, width))
     psf_sigma_px = model.psf_sigma_px or 1.0
@@ -215,9 +195,7 @@ def measure_predicted(
         (height, width),
     )
     centroids = dataclasses.replace(centroids, refusal=refusal)
-    observations = _observations(
-        exposure, shown, catalog, centroids, model, options.min_stars_per_image
-    )
+    observations = _observations(exposure, shown, catalog, centroids, model)
     if observations.refusal or measured.fit is None:
         return observations, instrument
     stars = MeasuredStars(
@@ -237,7 +215,6 @@ def _observations(
     catalog: StarCatalog,
     centroids: Centroids,
     model: ImageModel,
-    fewest: int,
 ) -> StarObservations:
     """Observations with used and refused stars; refused as a whole with too few stars."""
     height, width = exposure.image.pixels.shape
@@ -249,7 +226,7 @@ def _observations(
     )
     names = [StarRefusal(code).label for code in refusals]
     measured = np.count_nonzero(good)
-    few = measured < fewest
+    few = measured < _MIN_STARS
     if few:
         good = np.zeros_like(good)
     return StarObservations(
@@ -257,7 +234,7 @@ def _observations(
         width=width,
         height=height,
         refusal='too_few_stars' if few else '',
-        detail=f'{measured} stars measured, {fewest} needed' if few else '',
+        detail=f'{measured} stars measured, {_MIN_STARS} needed' if few else '',
         icrf_from_star_tracker_xyzw=exposure.icrf_from_star_tracker_xyzw,
         attitude_gap_s=exposure.attitude_gap_s,
         catalog_id=catalog.id[index][good],
@@ -276,6 +253,7 @@ def _observations(
         psf_sigma_px=model.psf_sigma_px,
         catalog_digest=catalog.digest,
         temperature_degc=exposure.temperature_degc,
+        velocity_sigma_m_s=exposure.velocity.sigma_m_s,
     )
 
 
@@ -283,8 +261,7 @@ def realigned(geometry: CameraGeometry, observations: StarObservations) -> Camer
     """
     Geometry with the alignment measured in an image, for the prediction of the next one.
 
-    The search of a whole image then happens once only.  A refused image returns the geometry
-    unchanged.
+    It avoids a second search of a whole image.  A refused image leaves the geometry unchanged.
     """
     if observations.refusal:
         return geometry
@@ -303,7 +280,6 @@ def _find(
     background: Background,
     prediction: Prediction,
     geometry: CameraGeometry,
-    search: StarSearch,
 ) -> tuple[Floats, Sources]:
     """
     Predicted pixels (n, 2) corrected to match the sources of the image, and those sources.
@@ -311,31 +287,26 @@ def _find(
     The brighter stars are searched near their predictions first; without a match, the whole image
     is searched over the full range of alignment errors.
 
-    Raises
-    ------
-    ImageRefused
-        ``no_stars`` or ``no_match``.
+    Raises ImageRefused ``no_stars`` or ``no_match``.
     """
-    camera, options = geometry.camera, search.identification
+    camera = geometry.camera
     inside = in_image(prediction.xy_px, camera.width, camera.height)
     near = detect_near(
         pixels,
         background,
         prediction.xy_px[inside][:_NEAREST],
-        options.search_radius_px,
-        search.centroid.detection_sigma,
+        SEARCH_RADIUS_PX,
     )
     try:
-        reach_px = float(options.search_radius_px)
+        reach_px = float(SEARCH_RADIUS_PX)
         return acquire(prediction, near, geometry, reach_px, _NEAREST_ROLL_RAD), near
     except ImageRefused:
         pass
-    sources = detect(pixels, background, search.centroid.detection_sigma)
+    sources = detect(pixels, background)
     if len(sources.snr) < 4:
         raise ImageRefused('no_stars', f'{len(sources.snr)} star-like sources')
-    reach_px = math.radians(options.acquisition_radius_deg) * float(camera.parameters[0])
-    roll_rad = math.radians(options.acquisition_roll_deg)
-    return acquire(prediction, sources, geometry, reach_px, roll_rad), sources
+    reach_px = ACQUISITION_RADIUS_RAD * float(camera.parameters[0])
+    return acquire(prediction, sources, geometry, reach_px, ACQUISITION_ROLL_RAD), sources
 
 
 def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.uint8]:
@@ -363,10 +334,7 @@ def _refuse_line_loss(predicted_px: Floats, centroids: Centroids, shape: tuple[i
     """
     Refuse an image with lost lines.
 
-    Raises
-    ------
-    ImageRefused
-        ``incomplete``.
+    Raises ImageRefused ``incomplete``.
     """
     good = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
     variance_px2 = 0.5 * (centroids.covariance_px2[good, 0] + centroids.covariance_px2[good, 2])

@@ -31,19 +31,20 @@ from starcal_ros.identification.prediction import Prediction, visible
 from starcal_ros.identification.star_finder import (
     Exposure,
     measure_predicted,
+    SEARCH_RADIUS_PX,
     StarSearch,
 )
-from starcal_ros.image.detection import (
+from starcal_ros.records import CameraGeometry, StarObservations
+from starcal_ros.robust_statistics import median
+from starcal_ros.sky.catalog import cone
+from starcal_ros.stars.detection import (
     Background,
     brightest_near,
     measure_background,
     sample_background,
 )
-from starcal_ros.image.image_model import known_model
-from starcal_ros.image.psf_field import Instrument
-from starcal_ros.records import CameraGeometry, StarObservations
-from starcal_ros.robust_statistics import median
-from starcal_ros.sky.catalog import cone
+from starcal_ros.stars.image_model import known_model
+from starcal_ros.stars.psf_field import Instrument
 
 _GUIDES = 24  # brightest predictions, searched in windows
 _NEIGHBOUR_PX = 3.0  # offsets of all guides agree to this under a roll of 0.1 degrees
@@ -94,10 +95,7 @@ def track_stars(
     """
     Observations of the next image, and the updated track.
 
-    Raises
-    ------
-    ImageRefused
-        ``no_match`` if the track is lost, ``too_few_stars`` or ``incomplete``.
+    Raises ImageRefused ``no_match`` if the track is lost, ``too_few_stars`` or ``incomplete``.
     """
     pixels = exposure.image.pixels
     prediction = _predict(exposure, before, search)
@@ -140,7 +138,7 @@ def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> P
     catalog, limit = search.catalog, search.identification.magnitude_limit
     index = cone(catalog, icrf_from_camera[:, 2], before.field_radius_rad, limit)
     index, direction_icrf = visible(
-        catalog, index, exposure.image.time_ns, exposure.velocity_m_s, exposure.site
+        catalog, index, exposure.image.time_ns, exposure.velocity.m_s, exposure.site
     )
     direction_camera = direction_icrf @ icrf_from_camera
     # Outside the field the distortion polynomial may fold back into the image.
@@ -164,19 +162,14 @@ def _find_rotation(
     """
     Small passive rotation (3,) of the camera, rad, from the predictions to the stars.
 
-    Raises
-    ------
-    ImageRefused
-        ``no_match``.
+    Raises ImageRefused ``no_match``.
     """
-    reach_px = search.identification.search_radius_px
+    reach_px = SEARCH_RADIUS_PX
     xy = prediction.xy_px
     rim = reach_px + 4.0
     inside = ((xy > rim) & (xy < [camera.width - 1 - rim, camera.height - 1 - rim])).all(axis=1)
     guides = np.nonzero(inside)[0][:_GUIDES]
-    place_px, found = brightest_near(
-        pixels, background, xy[guides], reach_px, search.centroid.detection_sigma
-    )
+    place_px, found = brightest_near(pixels, background, xy[guides], reach_px)
     guides, place_px = guides[found], place_px[found]
     lost = ImageRefused('no_match', f'{len(guides)} of the brightest stars match a source')
     if len(guides) < 4:

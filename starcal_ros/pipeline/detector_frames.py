@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Flat field and bad pixels of a detector, beside its dark frame."""
+"""Dark frame, flat field and bad pixels of a detector."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats, Indices
-from starcal_ros.errors import OptionError
-from starcal_ros.image.detection import detect, measure_background
-from starcal_ros.image.hot_pixels import HotPixels
-from starcal_ros.ingest.images import read_values
-from starcal_ros.ingest.records import IngestError
+from starcal_ros.arrays import Floats, Indices, Pixels
+from starcal_ros.errors import IngestError, OptionError
+from starcal_ros.formats.images.image_files import read_values
 from starcal_ros.records import Image
+from starcal_ros.stars.detection import detect, measure_background
+from starcal_ros.stars.hot_pixels import HotPixels
 
 _UNIT_DN = 30000  # of a response of 1, where it is searched for stars
 _STAR_SIGMA = 8.0  # of a star in a flat field: five megapixels of noise have none
@@ -25,17 +24,25 @@ _MOST_BAD = 0.5  # part of the pixels from which a map is taken to be inverted
 _LEAST = 0.1  # response over the median below which a pixel is bad: its noise is ten times larger
 
 
+def read_dark(path: str, width: int, height: int) -> Pixels | None:
+    """Pixels (height, width) of a dark frame; None without a path; raises as `read_flat`."""
+    if not path:
+        return None
+    values = _read('dark_frame', path, width, height)
+    if values.dtype not in (np.uint8, np.uint16):
+        raise OptionError(
+            f'dark_frame: {path} is {values.dtype}, expected unsigned 8 or 16 bit, one channel of'
+            f' {width} x {height}'
+        )
+    return values
+
+
 def read_flat(path: str, width: int, height: int) -> Floats | None:
     """
     Response (height, width) of the pixels, median 1; NaN where it is under a tenth of that.
 
-    None without a path.
-
-    Raises
-    ------
-    OptionError
-        When the file is missing, damaged or of another size, or holds no positive number or
-        stars.
+    None without a path. Raises OptionError when the file is missing, damaged or of another size,
+    or holds no positive number or stars.
     """
     if not path:
         return None
@@ -113,12 +120,11 @@ def flattened(image: Image, flat: Floats | None, pedestal_dn: int) -> Image:
 
 
 def _read(name: str, path: str, width: int, height: int) -> NDArray[Any]:
+    expected = f'expected one channel of {width} x {height}'
     try:
         values = read_values(Path(path.removeprefix('file://')))
     except IngestError as error:
-        raise OptionError(f'{name}: {error}') from error
+        raise OptionError(f'{name}: {error}; {expected}') from error
     if values.shape != (height, width):
-        raise OptionError(
-            f'{name}: {path} is of shape {values.shape}, expected {width} x {height} pixels'
-        )
+        raise OptionError(f'{name}: {path} is of shape {values.shape}, {expected}')
     return values

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-import dataclasses
 from dataclasses import dataclass
 import math
 from pathlib import Path
@@ -13,40 +12,32 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_ros.bag import reader
-from starcal_ros.bag.frames import check_order, FrameTopics, read_ahead, read_frames
-from starcal_ros.bag.mcap_reader import Damage
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
-from starcal_ros.messages import fields as message_fields
-from starcal_ros.messages.images import decode_png
-from starcal_ros.messages.telemetry import attitude_from_message
-from starcal_ros.messages.types import (
-    ATTITUDE_TYPE,
-    COMPRESSED_TYPE,
-    IMAGE_TYPE,
-    Message,
-    OBSERVATIONS_TYPE,
-    TEMPERATURE_TYPE,
-    VELOCITY_TYPE,
-)
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.frames import read_ahead, read_frames
+from starcal_ros.formats.bag.mcap_reader import Damage
+from starcal_ros.formats.messages import message_fields, types
+from starcal_ros.formats.messages.image_messages import decode_png
+from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.pipeline import topics as bag_topics
+from starcal_ros.pipeline.observe import check_order
 from starcal_ros.pipeline.topics import Topics
-from starcal_ros.records import (
-    Ensemble,
-    EnsembleStatus,
-    IMAGE_REFUSALS,
-    refused_image,
-    StarObservations,
-)
+from starcal_ros.records import EnsembleStatus, IMAGE_REFUSALS, refused_image, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
 
 # What measures and solves takes most of the start: imported only with a setup.
 if TYPE_CHECKING:
     from starcal_ros.pipeline.setup import Setup
 
-_IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
-_STAMPED = (*_IMAGES, ATTITUDE_TYPE, VELOCITY_TYPE, TEMPERATURE_TYPE, OBSERVATIONS_TYPE)
+_IMAGES = (types.IMAGE_TYPE, types.COMPRESSED_TYPE)
+_STAMPED = (
+    *_IMAGES,
+    types.ATTITUDE_TYPE,
+    types.VELOCITY_TYPE,
+    types.TEMPERATURE_TYPE,
+    types.OBSERVATIONS_TYPE,
+)
 
 
 @dataclass(frozen=True)
@@ -137,12 +128,8 @@ def inspect(
     Contents of bags and the images that a calibration would refuse.
 
     With a setup, stars are measured as for a calibration; without one, images are only checked
-    against the attitudes, at the default limits.
-
-    Raises
-    ------
-    BagError
-        When a bag is missing or not a bag.
+    against the attitudes, at the default limits. Raises BagError when a bag is missing or not a
+    bag.
     """
     damage: dict[str, None] = {}  # an ordered set
     topics = _contents(paths, lambda text: damage.setdefault(text))
@@ -168,10 +155,7 @@ def inspect(
     if setup and chosen:
         from starcal_ros.pipeline import solve
 
-        ensemble = Ensemble()
-        for observations in seen:
-            ensemble = solve.add_to_ensemble(ensemble, observations, setup)
-        status = solve.ensemble_status(ensemble, setup)
+        status = solve.ensemble_status(solve.ensemble_of(seen, setup), setup)
     if chosen and not problems:
         problems += _shortages(used, status)
     return Inspection(
@@ -192,28 +176,14 @@ def inspect(
     )
 
 
-def content(inspection: Inspection) -> dict[str, object]:
-    """JSON object of an inspection; a number that is not finite is null."""
-    made = dataclasses.asdict(inspection)
-    if not math.isfinite(inspection.longest_attitude_gap_s):
-        made['longest_attitude_gap_s'] = None
-    if inspection.status is not None:
-        status = made['status']
-        status['coverage'] = inspection.status.coverage.tolist()
-        status['predicted_sigma'] = [
-            float(s) if np.isfinite(s) else None for s in inspection.status.predicted_sigma
-        ]
-    return made
-
-
 def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, ...]:
     """Statistics of every topic, sorted by name, from one pass over the files."""
-    types: dict[str, str] = {}
+    type_names: dict[str, str] = {}
     stamps: defaultdict[str, list[int]] = defaultdict(list)
     kinds: defaultdict[str, Counter[str]] = defaultdict(Counter)
     bad: Counter[str] = Counter()
     for raw in read_ahead(reader.read_raw(paths, on_damage=on_damage)):
-        types[raw.topic] = raw.type_name
+        type_names[raw.topic] = raw.type_name
         stamp_ns = raw.log_time_ns
         if raw.type_name in _STAMPED:
             try:
@@ -224,13 +194,13 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
                 stamp_ns = message_fields.stamp_ns(message.header.stamp)
                 if raw.type_name in _IMAGES:
                     kinds[raw.topic][_kind(message)] += 1
-                elif raw.type_name == ATTITUDE_TYPE:
+                elif raw.type_name == types.ATTITUDE_TYPE:
                     sample = attitude_sample(*attitude_from_message(message), '')
                     bad[raw.topic] += sample is None
         stamps[raw.topic].append(stamp_ns)
     return tuple(
-        _topic_content(name, types[name], stamps[name], kinds[name], bad[name])
-        for name in sorted(types)
+        _topic_content(name, type_names[name], stamps[name], kinds[name], bad[name])
+        for name in sorted(type_names)
     )
 
 
@@ -253,7 +223,7 @@ def _topic_content(
     )
 
 
-def _kind(message: Message) -> str:
+def _kind(message: types.Message) -> str:
     """Encoding and size of an image message as text."""
     if hasattr(message, 'encoding'):
         return f'{message.encoding} {message.width} x {message.height}'
@@ -269,8 +239,9 @@ def placed(
 ) -> Iterator[StarObservations]:
     """Images without their stars, refused for bad encoding, order or attitude."""
     latest_ns = None
-    frame_topics = FrameTopics(topics.image, topics.attitude)
-    for frame in read_frames(paths, frame_topics, options, channel=channel):
+    for frame in read_frames(
+        paths, Topics(topics.image, topics.attitude), options, channel=channel
+    ):
         if isinstance(frame, StarObservations):
             yield frame
             continue

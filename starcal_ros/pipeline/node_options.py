@@ -30,59 +30,34 @@ class ObserverOptions:
         ' image/compressed',
         choices=('raw', 'compressed'),
     )
-    image_reliability: str = option(
-        'auto',
-        'reliability of the image subscription; auto: best_effort from a publisher that offers no'
-        ' more, else reliable (best_effort loses large images)',
-        choices=('auto', 'reliable', 'best_effort'),
-    )
     image_queue: int = option(
-        20, 'capacity of the queue of images that wait to be measured', low=1, high=1000
+        20, 'depth of the queue of images that wait to be measured', low=1, high=1000
     )
     attitude_timeout_s: float = option(
-        10.0, 'timeout of an image that waits for the attitude after it, wall clock, s', low=0.0
-    )
-    attitude_history_s: float = option(
-        3600.0, 'time span of attitude samples kept for later images, s', low=1.0
-    )
-    camera_info_per_image: bool = option(
-        False,
-        'publish the active calibration on image_camera_info once per image, with the header of'
-        ' the image',
+        10.0, 'longest wait of an image for the next attitude sample, wall clock, s', low=0.0
     )
 
 
 @dataclass(frozen=True)
 class CalibratorOptions:
-    """State of the calibrator and hand-over of new calibrations."""
+    """State of the calibrator and transfer of new calibrations."""
 
     state_dir: str = option(
         '',
-        'folder in which the ensemble and the calibrations survive a restart; empty: memory only',
+        'folder that keeps images and calibrations across restarts; empty: memory only',
+        basic=True,
     )
     state_key_file: str = option(
         '',
-        'file with a secret key of at least 16 bytes: state files carry an HMAC by it, and one'
-        ' without is set aside; empty: checksums alone, which show damage but no forgery',
-    )
-    calibration_history: int = option(
-        20,
-        'maximum number of calibrations kept for roll-back, including the active one',
-        low=2,
-        high=10000,
+        'file with a secret key of at least 16 bytes; state files then carry an HMAC, and files'
+        ' without a valid one are set aside; empty: checksums only, which detect damage but not'
+        ' forgery',
     )
     state_report: bool = option(
-        True,
-        'write reports of the active calibration and of the last refused candidate to state_dir',
+        True, 'write reports of the active and the last refused calibration to state_dir'
     )
     set_camera_info_service: str = option(
-        '', 'sensor_msgs/SetCameraInfo service called with each new calibration; empty: none'
-    )
-    set_camera_info_timeout_s: float = option(
-        5.0,
-        'timeout of that service, and again of its response, before the call counts as failed, s',
-        low=0.1,
-        high=3600.0,
+        '', 'sensor_msgs/SetCameraInfo service that receives each new calibration; empty: none'
     )
 
 

@@ -1,52 +1,49 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Star observations of an image sequence; each image is predicted from those before it."""
+"""Star observations of an image sequence; each image is predicted from the previous ones."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import math
-from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.bag.frames import check_order, FrameTopics, read_frames
 from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ImageRefused
-from starcal_ros.estimation.options import assumed_tracker_sigma_rad
+from starcal_ros.estimation.calibration_options import assumed_tracker_sigma_rad
 from starcal_ros.identification.star_finder import Exposure, observe_stars, realigned
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
-from starcal_ros.image.frame_checks import Fingerprint, fingerprint, sample_rows, screen
-from starcal_ros.image.hot_pixels import HotPixels, learn_hot_pixels
-from starcal_ros.image.image_model import saturation_level
 from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.sky.astrometry import velocity_of
 from starcal_ros.sky.attitude import AttitudeHistory
-from starcal_ros.sky.star_trackers import Attitude, attitudes_at
-
-Wanted = Callable[[int], bool]
-OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
+from starcal_ros.sky.tracker_alignments import Attitude, attitudes_at
+from starcal_ros.stars.frame_checks import Fingerprint, fingerprint, sample_rows, screen
+from starcal_ros.stars.hot_pixels import HotPixels, learn_hot_pixels
+from starcal_ros.stars.image_model import saturation_level
 
 _SAME_ATTITUDE = 1e-12  # of a component; interpolation between equal samples rounds at 1e-16
 _TURN_SIGMAS = 2.0  # of the star tracker: a coarse output may repeat itself within its noise
 _TURN_PX = 0.1  # noise of the turn between two images, of their centroids and the prior camera
 _IMAGES_OF_A_RESTART = 3  # two images may be swapped in transit, three are not
-_IMAGES_OF_AN_UNFIT = 10  # an attitude in vain counts as so many: a search takes as long as five
+_IMAGES_OF_AN_UNFIT = 10  # cost of an unfit attitude: its search takes as long as five images
 
 
 @dataclass(frozen=True)
 class Unfit:
-    """Images for which the attitude of a star tracker was unfit, and why the last one was."""
+    """Number of images for which a star tracker's attitude was unfit, and the last reason."""
 
     images: int = 0
-    why: str = ''  # empty: it has been used since
+    why: str = ''  # empty: its attitude was used since
 
 
 @dataclass(frozen=True)
@@ -54,14 +51,14 @@ class Track:
     """
     State of an image sequence.
 
-    ``geometry`` predicts the stars of a searched image; ``latest_ns`` stamps the last one used.
-    ``tracked_camera`` measures the next image without a search; None before the first image.
-    ``behind`` images in a row, the last of them at ``behind_ns``, were stamped before the last one
-    used.  ``seen`` is the last frame of all, used or not, which a stuck camera shows again;
-    ``hot`` the hot pixels found so far.  ``held`` is the first image used at the attitude that the
-    last one has.  ``taken`` counts the images by star tracker, and ``others`` have the state of
-    the sequence by the further ones, whose mountings are not exact.  ``unfit`` is about the star
-    trackers whose attitude led to a refusal where that of another one did not.
+    ``geometry`` predicts the stars of a searched image; ``latest_ns`` is the stamp of the last
+    image used.  ``tracked_camera`` measures the next image without a search; None before the first
+    image.  ``behind`` counts images in a row with stamps before the last one used, ``behind_ns``
+    is the stamp of the latest of them.  ``seen`` is the previous frame, used or not, which a stuck
+    camera repeats; ``hot`` are the hot pixels detected so far.  ``held`` is the first image used
+    with the attitude of the last one.  ``taken`` counts the images of each star tracker;
+    ``others`` holds a state for each additional one, because mountings are not exact.  ``unfit``
+    lists star trackers whose attitude was refused while another one was accepted.
     """
 
     geometry: CameraGeometry
@@ -90,18 +87,22 @@ def observe_next(
     """
     Observations of the next image of a sequence, and the state of the sequence after it.
 
-    ``more_attitudes`` are those of the further star trackers of the setup.  The one that has given
-    the fewest images is taken; where its attitude leads to a refusal, the next one.  Such a
-    refusal costs the image nothing: ``detail`` has it, and the star tracker is tried seldom.
+    ``more_attitudes`` belong to the additional star trackers of the setup.  The star tracker with
+    the fewest images is tried first; if its attitude leads to a refusal, the next one is tried.
+    ``detail`` records that refusal, and the star tracker is then tried less often.
 
     A sequence starts with the prior or the active calibration.  An image stamped at or before the
     last one used is refused and does not change the state, so that one wrong stamp costs one
     image.  After the third such image in a row, in order among themselves, the sequence restarts
-    with that image: a clock was set back, or a recording is played again.  An image with the
-    pixels of the image before, used or not, and another stamp is refused.
+    with that image: a clock was set back, or a recording is played again.  An image that repeats
+    the pixels of the previous image, used or not, with another stamp is refused.
     """
     track = _after_order(track, image.time_ns)
-    known: dict[str, object] = {'temperature_degc': temperature_degc}
+    velocity = velocity_of(setup.site, velocity_m_s)
+    known: dict[str, object] = {
+        'temperature_degc': temperature_degc,
+        'velocity_sigma_m_s': velocity.sigma_m_s,
+    }
     remembered = track
     try:
         check_order(image, track.latest_ns)
@@ -125,7 +126,7 @@ def observe_next(
             flattened(_without_dark(image, setup), setup.flat, setup.dark_pedestal_dn),
             found[0].icrf_from_star_tracker_xyzw,
             found[0].gap_s,
-            velocity_m_s,
+            velocity,
             setup.site,
             hot,
             temperature_degc,
@@ -139,13 +140,14 @@ def observe_next(
         return observations, remembered
 
 
-def _known_of(attitude: Attitude) -> dict[str, object]:
+def _known_of(attitude: Attitude) -> dict[str, Any]:
     """Fields of observations that an attitude gives."""
     return {
         'icrf_from_star_tracker_xyzw': attitude.icrf_from_star_tracker_xyzw,
         'attitude_gap_s': attitude.gap_s,
         'star_tracker': attitude.star_tracker,
         'first_from_star_tracker_xyzw': attitude.first_from_star_tracker_xyzw,
+        'star_tracker_rate_rad_s': attitude.rate_rad_s,
     }
 
 
@@ -190,12 +192,12 @@ def _with_fitness(track: Track, used: str, unfit: Mapping[str, str]) -> Track:
 def _with_one(
     attitude: Attitude, exposure: Exposure, setup: Setup, track: Track
 ) -> tuple[StarObservations, Track]:
-    """Observations with an attitude; the state keeps what is known of each star tracker apart."""
+    """Observations with an attitude; the new state updates that star tracker only."""
     name = attitude.star_tracker
     own = track.others.get(name) if name else track
     before = track
     if name:
-        # The mounting is wrong by more than the images before leave open.
+        # The error of the mounting exceeds the uncertainty of a tracked camera.
         before = dataclasses.replace(
             track,
             geometry=own.geometry if own else track.geometry,
@@ -208,11 +210,7 @@ def _with_one(
         attitude_gap_s=attitude.gap_s,
     )
     observations, after = _stars(exposure, setup, before)
-    observations = dataclasses.replace(
-        observations,
-        star_tracker=name,
-        first_from_star_tracker_xyzw=attitude.first_from_star_tracker_xyzw,
-    )
+    observations = dataclasses.replace(observations, **_known_of(attitude))
     if observations.refusal:
         return observations, track
     after = dataclasses.replace(after, held=_first_at_attitude(observations, before.held, setup))
@@ -239,7 +237,7 @@ def observe(
     Observations of one image, or the record of its refusal; never raises for a bad image.
 
     ``geometry`` predicts the stars: the prior or the active calibration.  ``velocity_m_s`` (3,) is
-    the observer's barycentric velocity, ICRF axes; None: the Earth's.
+    the observer's barycentric velocity, ICRF axes; None: that of the options, else the Earth's.
     """
     return observe_next(image, attitudes, setup, Track(geometry), velocity_m_s)[0]
 
@@ -308,18 +306,16 @@ def _first_at_attitude(
     observations: StarObservations, held: StarObservations | None, setup: Setup
 ) -> StarObservations:
     """
-    The first image at the attitude of this one, of which ``held`` is the one before.
+    First image with the attitude of this image; ``held`` is that of the previous image.
 
-    Raises
-    ------
-    ImageRefused
-        ``frozen_attitude`` where the attitude is that image's to the last digit, which the noise
-        of a working star tracker never gives, and the stars have turned by more than its sigma.
+    Raises ImageRefused ``frozen_attitude`` if the attitude equals that of ``held`` to the last
+    digit, which a working star tracker's noise rules out, and the stars have turned by more than
+    its sigma.
     """
     attitude = observations.icrf_from_star_tracker_xyzw
     if held is None or np.abs(attitude - held.icrf_from_star_tracker_xyzw).max() > _SAME_ATTITUDE:
         return observations
-    # Both by the prior camera, so that they can be compared.
+    # Comparable, since both use the prior camera.
     before, now = (
         Rotation.from_quat(realigned(setup.prior, image).star_tracker_from_camera_xyzw)
         for image in (held, observations)
@@ -354,7 +350,6 @@ def _with_hot_pixels(
         observations.noise_dn,
         icrf_from_star_tracker * Rotation.from_quat(track.geometry.star_tracker_from_camera_xyzw),
         float(track.geometry.camera.parameters[0]),
-        setup.fixed_pattern,
     )
     return dataclasses.replace(track, hot=hot)
 
@@ -368,50 +363,12 @@ def _check_size(image: Image, camera: CameraModel) -> None:
         )
 
 
-def observe_bag(
-    paths: Sequence[Path],
-    image_topic: str,
-    attitude_topic: str,
-    setup: Setup,
-    velocity_topic: str = '',
-    temperature_topic: str = '',
-    on_image: OnImage | None = None,
-    wanted: Wanted | None = None,
-    more_attitude_topics: tuple[str, ...] = (),
-) -> Iterator[StarObservations]:
+def check_order(image: Image, latest_ns: int | None) -> None:
     """
-    Observations of every image of a bag, in bag order, with few images in memory at a time.
+    Check that an image is stamped after the last one used (None: no image used yet).
 
-    ``on_image`` is called with each decoded image, its observations and the geometry that
-    predicted its stars.  Images whose stamp is not ``wanted`` are passed over.
-
-    Raises
-    ------
-    BagError
-        When the bag cannot be read or a topic is not in it.
+    Raises ImageRefused ``out_of_order``.
     """
-    topics = FrameTopics(
-        image_topic, attitude_topic, velocity_topic, temperature_topic, more_attitude_topics
-    )
-    track = Track(setup.prior)
-    size = (setup.prior.camera.width, setup.prior.camera.height)
-    channel = setup.frames.image_channel
-    for frame in read_frames(paths, topics, setup.attitude, size=size, channel=channel):
-        if isinstance(frame, StarObservations):
-            yield frame
-            continue
-        if wanted is not None and not wanted(frame.image.time_ns):
-            continue
-        predicted_with = track.geometry
-        observations, track = observe_next(
-            frame.image,
-            frame.attitudes,
-            setup,
-            track,
-            frame.velocity_m_s,
-            frame.temperature_degc,
-            frame.more_attitudes,
-        )
-        if on_image is not None:
-            on_image(frame.image, observations, predicted_with)
-        yield observations
+    if latest_ns is not None and image.time_ns <= latest_ns:
+        late_s = (latest_ns - image.time_ns) * 1e-9
+        raise ImageRefused('out_of_order', f'{late_s:.6f} s before the last image used')

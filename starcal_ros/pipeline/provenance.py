@@ -41,8 +41,8 @@ def inputs_of(
     """
     SHA-256 of the files that a calibration is made from, by their paths.
 
-    ``is_stopped`` is asked between blocks of 1 MB, so that another thread can end it early; the
-    digests are then of no use.
+    ``is_stopped`` is polled between blocks of 1 MB, so that another thread can stop it early; the
+    digests are then invalid.
     """
     digests = {}
     for path in files:
@@ -58,7 +58,7 @@ def inputs_of(
 
 def _digest(ensemble: Ensemble) -> str:
     """
-    SHA-256 of everything that an estimate reads from its images, in their order.
+    SHA-256 of all input that an estimate reads from its images, in their order.
 
     For each image, little-endian: stamp (int64, ns), number of stars (int64), attitude, then by
     column catalog numbers (int64), directions, pixels and covariances, last the temperature if

@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Options that no camera, star tracker or site has: the likely mistake, and its remedy.
+Checks for implausible options; each error names the likely mistake and its remedy.
 
 Each check raises `OptionError` in one line, wherever a setup is loaded: by a node at its start,
 by `starcal calibrate`, `inspect` and `diagnose`.
@@ -23,14 +23,7 @@ _FEWEST_STARS = 2.0  # in a mean field: the densest fields have three times as m
 
 
 def check_tracker_sigma(sigma_arcsec: Sequence[float]) -> None:
-    """
-    Raise `OptionError` for a star tracker sigma in radians or degrees.
-
-    Raises
-    ------
-    OptionError
-        With the values in arcseconds.
-    """
+    """Raise `OptionError` for a star tracker sigma in radians or degrees."""
     largest = max(sigma_arcsec)
     if not 0.0 < largest < _DEGREES_BELOW:
         return
@@ -45,14 +38,7 @@ def check_tracker_sigma(sigma_arcsec: Sequence[float]) -> None:
 
 
 def check_site(site: SiteOptions) -> None:
-    """
-    Raise `OptionError` for a camera on the ground without a site.
-
-    Raises
-    ------
-    OptionError
-        Naming the options of the site.
-    """
+    """Raise `OptionError` for a camera on the ground without a site."""
     if site.observer == 'ground' and site.latitude_deg == site.longitude_deg == 0.0:
         raise OptionError(
             'observer: ground needs the site: set latitude_deg, longitude_deg (east positive) and'
@@ -61,14 +47,7 @@ def check_site(site: SiteOptions) -> None:
 
 
 def check_field_of_stars(stars: int, magnitude_limit: float, camera: CameraModel) -> None:
-    """
-    Raise `OptionError` for a magnitude limit that leaves the field of a camera without stars.
-
-    Raises
-    ------
-    OptionError
-        With the mean number of stars in the field.
-    """
+    """Raise `OptionError` for a magnitude limit that leaves a camera without stars."""
     fx, _, fy = (float(value) for value in camera.intrinsics[:3])
     field_sr = min(camera.width * camera.height / (fx * fy), 4.0 * math.pi)
     in_field = stars * field_sr / (4.0 * math.pi)
@@ -80,14 +59,7 @@ def check_field_of_stars(stars: int, magnitude_limit: float, camera: CameraModel
 
 
 def check_prior_camera(camera: CameraModel, location: str) -> None:
-    """
-    Raise `OptionError` for a camera that no lens makes, beyond `camera.check_plausible`.
-
-    Raises
-    ------
-    OptionError
-        Naming the file, the value and the unit that it may have been given in.
-    """
+    """Raise `OptionError` for an implausible camera that `camera.check_plausible` accepts."""
     width, height = camera.width, camera.height
     fx, _, fy, cx, cy = (float(value) for value in camera.intrinsics[:5])
     if not 0.5 < fx / fy < 2.0:

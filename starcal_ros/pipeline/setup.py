@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-import contextlib
 import dataclasses
 from dataclasses import dataclass
 import math
@@ -12,58 +11,46 @@ from pathlib import Path
 import re
 from typing import Any, get_type_hints
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.camera_conversion import convert
+from starcal_ros.assessment.gate_options import GateOptions
+from starcal_ros.camera.conversion import convert
+from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import OptionError
-from starcal_ros.estimation.options import CalibrationOptions, check_options
-from starcal_ros.gate.options import check_gate_options, GateOptions
+from starcal_ros.estimation.calibration_options import CalibrationOptions, check_options
+from starcal_ros.formats.messages.image_messages import CHANNELS
+from starcal_ros.formats.products import camera_yaml
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
-from starcal_ros.image.file_header import most_bytes, png_header, tiff_header
-from starcal_ros.image.frame_checks import ScreeningOptions
-from starcal_ros.image.hot_pixels import (
-    FixedPatternOptions,
-    hot_in_dark,
-    HotPixels,
-    NO_HOT_PIXELS,
-)
-from starcal_ros.image.image_model import CentroidOptions
-from starcal_ros.lens import COEFFICIENTS
-from starcal_ros.messages.colour import CHANNELS
 from starcal_ros.options import (
     from_mapping,
     holds_options,
     is_of_ros,
     names_of,
-    nearest,
     option,
+    option_fields,
     OptionValue,
     read_parameter_file,
+    unknown_option,
 )
-from starcal_ros.pipeline.detector_frames import read_bad_pixels, read_flat, with_bad_pixels
+from starcal_ros.pipeline import set_up_checks
+from starcal_ros.pipeline.detector_frames import (
+    read_bad_pixels,
+    read_dark,
+    read_flat,
+    with_bad_pixels,
+)
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.pipeline.set_up_checks import (
-    check_field_of_stars,
-    check_prior_camera,
-    check_site,
-    check_tracker_sigma,
-)
-from starcal_ros.products.camera_yaml import (
-    DEFAULT_CAMERA_NAME,
-    read_camera_info,
-    read_camera_name,
-    resolve_url,
-    with_camera_url_from,
-)
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
-from starcal_ros.sky.star_trackers import Mounting
-from starcal_ros.untrusted import read_bytes, shown
+from starcal_ros.sky.tracker_alignments import Mounting
+from starcal_ros.stars.frame_checks import ScreeningOptions
+from starcal_ros.stars.hot_pixels import hot_in_dark, HotPixels, NO_HOT_PIXELS
+from starcal_ros.stars.image_model import CentroidOptions
+from starcal_ros.untrusted import shown
 
 NODES = ('star_observer', 'calibrator')
 
@@ -73,41 +60,49 @@ class SetupOptions:
     """Prior camera and alignment, frames, catalog and detector frames."""
 
     camera_info_url: str = option(
-        '', 'ROS camera YAML of the prior camera: file:// or package:// URL, or a path'
+        '',
+        'prior camera, a ROS camera YAML or a .cameramodel of mrcal: a path, or a file:// or'
+        ' package:// URL',
+        basic=True,
     )
     lens_model: str = option(
         'prior',
-        'lens model that is estimated; prior: that of the prior camera; auto: the smallest that'
-        ' leaves no field beside it; else the prior camera is converted to it',
+        'lens model to estimate; prior: the model of the prior camera; auto: the smallest model'
+        ' that leaves no significant residual field; other models start from a fit to the prior'
+        ' camera',
         choices=('prior', 'auto', *COEFFICIENTS),
     )
     prior_alignment: tuple[float, ...] = option(
         (0.0, 0.0, 0.0, 0.0),
-        'prior orientation of the camera in the star tracker frame, quaternion (x, y, z, w);'
-        ' zeros: found from the first images',
+        'prior orientation of the camera in the star tracker frame, a quaternion (x, y, z, w)'
+        ' within 1.5 degrees, and 5 degrees in roll; zeros: determined from the first images',
         length=4,
+        basic=True,
     )
-    star_tracker_frame: str = option('star_tracker', 'name of the star tracker frame')
-    camera_frame: str = option('camera_optical_frame', 'name of the camera optical frame')
+    star_tracker_frame: str = option('star_tracker', 'name of the star tracker frame', basic=True)
+    camera_frame: str = option(
+        'camera_optical_frame', 'name of the camera optical frame', basic=True
+    )
     image_channel: str = option(
         '',
-        'colour that is taken of rgb, bgr and bayer images; of bayer ones the camera has half the'
-        ' width and height; empty: colour images are refused',
+        'channel used from rgb, bgr and bayer images (bayer: at half the width and height);'
+        ' empty: colour images are refused',
         choices=('', *CHANNELS),
     )
-    catalog: str = option('', 'star catalog file; empty: the bundled one')
+    catalog: str = option('', 'star catalog file; empty: the bundled catalog')
     dark_frame: str = option(
-        '', 'dark frame to subtract, a PNG or TIFF of image size and depth; empty: none'
+        '',
+        'dark frame to subtract, a FITS, TIFF or PNG of the image size and depth; empty: none',
     )
     flat_field: str = option(
         '',
-        'flat field to divide by, a FITS, TIFF or PNG of image size; its median counts as 1;'
-        ' empty: none',
+        'flat field to divide by, a FITS, TIFF or PNG of the image size, normalised to its'
+        ' median; empty: none',
     )
     bad_pixel_map: str = option(
         '',
-        'map of bad pixels, a FITS, TIFF or PNG of image size: those that are not 0 are left out'
-        ' of stars like hot pixels; empty: none',
+        'map of bad pixels, a FITS, TIFF or PNG of the image size; nonzero pixels are'
+        ' treated as hot pixels; empty: none',
     )
 
 
@@ -116,14 +111,14 @@ class Setup:
     """
     Options of every stage, with prior camera, catalog and detector frames loaded.
 
-    Where no prior alignment ``is_aligned``, that of ``prior`` is the identity, until one is found.
+    Without a prior alignment ``is_aligned`` is false and ``prior`` has the identity, until one is
+    determined.
     """
 
     frames: SetupOptions
     attitude: AttitudeOptions
     site: SiteOptions
     screening: ScreeningOptions
-    fixed_pattern: FixedPatternOptions
     centroid: CentroidOptions
     identification: IdentificationOptions
     calibration: CalibrationOptions
@@ -134,7 +129,7 @@ class Setup:
     dark_pedestal_dn: int = 0
     hot: HotPixels = NO_HOT_PIXELS
     is_aligned: bool = True
-    camera_name: str = DEFAULT_CAMERA_NAME
+    camera_name: str = camera_yaml.DEFAULT_CAMERA_NAME
     flat: Floats | None = None
     mountings: tuple[Mounting, ...] = ()
 
@@ -146,9 +141,9 @@ class Setup:
     def options(self) -> dict[str, OptionValue]:
         """Every option of every stage, by name."""
         return {
-            name: value
-            for group in _OPTION_GROUPS
-            for name, value in dataclasses.asdict(getattr(self, group)).items()
+            field.name: getattr(getattr(self, group), field.name)
+            for group, kind in _OPTION_GROUPS.items()
+            for field in option_fields(kind)
         }
 
 
@@ -160,33 +155,37 @@ OPTION_CLASSES = tuple(_OPTION_GROUPS.values())
 
 def read_setup(params: Path) -> Setup:
     """
-    The setup of a ROS parameter file, in which the nodes' own parameters may stand as well.
+    Setup of a ROS parameter file, which may also set parameters of the nodes.
 
-    Raises
-    ------
-    OptionError
-        For an unknown name or a bad value; the text begins with the file.
-    ProductError, CatalogError
-        When the prior camera or the catalog cannot be read.
+    Raises OptionError for an unknown name or a bad value; the message begins with the file. Raises
+    ProductError or CatalogError when the prior camera or the catalog cannot be read.
     """
-    values = with_camera_url_from(read_parameter_file(params, NODES), params)
+    values = read_values(params)
     try:
         return load_setup(values, others=NODE_OPTION_CLASSES)
     except OptionError as error:
         raise OptionError(f'{params}: {error}') from error
 
 
+def read_values(params: Path) -> dict[str, object]:
+    """
+    Options of a ROS parameter file by name, the camera file relative to it.
+
+    Raises OptionError when it is not one.
+    """
+    return dict(camera_yaml.with_camera_url_from(read_parameter_file(params, NODES), params))
+
+
 def files_of(frames: SetupOptions) -> dict[str, Path]:
     """
     The files that options name, by option: prior camera, catalog and detector frames.
 
-    Raises
-    ------
-    ProductError
-        For a camera URL that names no file.
+    Raises ProductError for a camera URL that names no file.
     """
     files = (
-        {'camera_info_url': resolve_url(frames.camera_info_url)} if frames.camera_info_url else {}
+        {'camera_info_url': camera_yaml.resolve_url(frames.camera_info_url)}
+        if frames.camera_info_url
+        else {}
     )
     for name in ('catalog', 'dark_frame', 'flat_field', 'bad_pixel_map'):
         if path := getattr(frames, name):
@@ -205,42 +204,33 @@ def _check_relative(files: Mapping[str, Path]) -> None:
 
 
 def load_setup(
-    values: Mapping[str, object],
-    others: Sequence[type] = (),
-    prior: CameraGeometry | None = None,
+    values: Mapping[str, object], others: Sequence[type] = (), prior: CameraGeometry | None = None
 ) -> Setup:
     """
     Setup from a mapping of option names to values, all checked.
 
     ``others`` are option classes of the caller whose names the mapping may also hold; ``prior``
-    replaces the camera file and alignment of the options.
-
-    Raises
-    ------
-    OptionError
-        For an unknown name or a bad value.
-    ProductError, CatalogError
-        When the prior camera or the catalog cannot be read.
+    replaces the camera file and alignment of the options. Raises OptionError for an unknown name
+    or a bad value. Raises ProductError or CatalogError when the prior camera or the catalog cannot
+    be read.
     """
     known = names_of(*OPTION_CLASSES, *others)
     for name in values:
         if name not in known and not is_of_ros(name):
-            said = name if name.isidentifier() and len(name) < 60 else shown(name)
-            raise OptionError(f'{said}: no such parameter{nearest(name, known)}')
+            raise OptionError(unknown_option(name, known))
     groups = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS.items()}
     frames: SetupOptions = groups['frames']
     _check_relative(files_of(frames))
     is_aligned = prior is not None or any(frames.prior_alignment)
     prior = prior or _prior(frames)
-    check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
-    check_site(groups['site'])
+    set_up_checks.check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
+    set_up_checks.check_site(groups['site'])
     check_options(groups['calibration'], prior.camera.model)
-    check_gate_options(groups['gate'], prior.camera)
     path = Path(frames.catalog) if frames.catalog else None
     magnitude_limit = groups['identification'].magnitude_limit
     catalog = load_catalog(path, magnitude_limit)
-    check_field_of_stars(len(catalog), magnitude_limit, prior.camera)
-    dark = _read_dark(frames.dark_frame, prior.camera.width, prior.camera.height)
+    set_up_checks.check_field_of_stars(len(catalog), magnitude_limit, prior.camera)
+    dark = read_dark(frames.dark_frame, prior.camera.width, prior.camera.height)
     flat = read_flat(frames.flat_field, prior.camera.width, prior.camera.height)
     return Setup(
         **groups,
@@ -249,14 +239,14 @@ def load_setup(
         dark=dark,
         dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
         hot=with_bad_pixels(
-            hot_in_dark(dark, groups['fixed_pattern']),
+            hot_in_dark(dark),
             read_bad_pixels(frames.bad_pixel_map, prior.camera.width, prior.camera.height),
             flat,
         ),
         is_aligned=is_aligned,
-        camera_name=read_camera_name(frames.camera_info_url)
+        camera_name=camera_yaml.read_camera_name(frames.camera_info_url)
         if frames.camera_info_url
-        else DEFAULT_CAMERA_NAME,
+        else camera_yaml.DEFAULT_CAMERA_NAME,
         flat=flat,
         mountings=_mountings(groups['attitude'], frames, prior, is_aligned),
     )
@@ -279,12 +269,12 @@ def _mountings(
     for k, frame in enumerate(frames):
         if frame.lstrip('/') in (name.lstrip('/') for name in [*others, *frames[:k]]):
             raise OptionError(
-                f'more_star_trackers: {shown(frame)} comes twice: each of them, star_tracker_frame'
-                ' and camera_frame need a name of their own'
+                f'more_star_trackers: {shown(frame)} is given twice: each of them,'
+                ' star_tracker_frame and camera_frame need a name of their own'
             )
     for frame in frames:
         if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', frame):
-            raise OptionError(f'more_star_trackers: {shown(frame)} is no name of a frame')
+            raise OptionError(f'more_star_trackers: {shown(frame)} is not a valid frame name')
     if not is_aligned:
         raise OptionError(
             'more_star_trackers: prior_alignment is needed beside more_alignments: one of them'
@@ -321,7 +311,7 @@ def _unit_quaternion(option: str, values: Sequence[float]) -> Floats:
 def _prior(frames: SetupOptions) -> CameraGeometry:
     if not frames.camera_info_url:
         raise OptionError('camera_info_url: not set; give the camera YAML of the prior camera')
-    camera = read_camera_info(frames.camera_info_url)
+    camera = camera_yaml.read_camera_info(frames.camera_info_url)
     if frames.lens_model not in ('prior', 'auto', camera.model):
         camera, worst_px = convert(camera, frames.lens_model)
         if not math.isfinite(worst_px):
@@ -329,40 +319,7 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
                 f'lens_model: {frames.lens_model} cannot see all of the field of the prior camera,'
                 f' {frames.camera_info_url}'
             )
-    check_prior_camera(camera, frames.camera_info_url)
+    set_up_checks.check_prior_camera(camera, frames.camera_info_url)
     if not any(frames.prior_alignment):
         return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
     return CameraGeometry(camera, _unit_quaternion('prior_alignment', frames.prior_alignment))
-
-
-def _read_dark(path: str, width: int, height: int) -> Pixels | None:
-    if not path:
-        return None
-    file = Path(path.removeprefix('file://'))
-    try:
-        content = read_bytes(file, most_bytes(width, height))
-    except OSError as error:
-        raise OptionError(f'dark_frame: {path} cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise OptionError(f'dark_frame: {path}: {error}') from error
-    header = png_header(content) or tiff_header(content)
-    if header is None:
-        raise OptionError(f'dark_frame: {path} is no PNG or TIFF')
-    # A small file can claim gigabytes of pixels: none is decoded before the size is known.
-    dark = None
-    if (header.width, header.height) == (width, height):
-        with contextlib.suppress(cv2.error):
-            dark = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    else:
-        raise OptionError(
-            f'dark_frame: {path} is {header.width} x {header.height}, '
-            f'expected 8 or 16 bit, one channel of {width} x {height}'
-        )
-    if dark is None:
-        raise OptionError(f'dark_frame: {path} is damaged')
-    if dark.shape != (height, width) or dark.dtype not in (np.uint8, np.uint16):
-        raise OptionError(
-            f'dark_frame: {path} is {dark.dtype} of shape {dark.shape}, '
-            f'expected 8 or 16 bit, one channel of {width} x {height}'
-        )
-    return dark.astype(np.uint8) if dark.dtype == np.uint8 else dark.astype(np.uint16)

@@ -3,16 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
+import functools
 import math
 import warnings
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.assessment.agreement import compare_halves
-from starcal_ros.assessment.model_checks import model_checks
+from starcal_ros.assessment.amplitude_checks import model_checks
+from starcal_ros.assessment.budget import sigma_budget
+from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.observability import (
     correlation,
     detector_maps,
@@ -24,24 +26,20 @@ from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.camera_conversion import ros_fit
+from starcal_ros.camera.conversion import ros_fit
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.detector_field import DetectorField
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.lens_choice import estimate_with_smallest_lens
-from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.gate.judgement import judge, reasons_of
 from starcal_ros.identification.star_finder import realigned
 from starcal_ros.options import check_value
 from starcal_ros.pipeline.provenance import provenance_of
 from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.records import (
     Calibration,
-    CameraGeometry,
     Ensemble,
     EnsembleStatus,
-    HalvesComparison,
-    ResidualField,
+    factored_field,
     StarObservations,
     StarTrackerAlignment,
 )
@@ -49,6 +47,13 @@ from starcal_ros.records import (
 _FEWEST_STARS = 3  # two fit their mirror image
 _MOST_OFF = 0.5  # of the RMS size of a constellation; mirrored along an axis it is off by 1.4
 _ALIGNING = 20  # images, of whose alignments the middle one is taken
+
+
+def ensemble_of(observations: Iterable[StarObservations], setup: Setup) -> Ensemble:
+    """The ensemble of some images, each added by `add_to_ensemble`."""
+    return functools.reduce(
+        lambda ensemble, one: add_to_ensemble(ensemble, one, setup), observations, Ensemble()
+    )
 
 
 def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:
@@ -68,7 +73,7 @@ def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: S
 
 def _shows_its_stars(observations: StarObservations, camera: CameraModel) -> bool:
     """
-    Whether a rotation brings the directions of the stars near the lines of sight of their pixels.
+    True if a rotation brings the directions of the stars near the lines of sight of their pixels.
 
     Near compared with the size of the constellation: any prior camera is good enough, but a
     mirrored or mixed-up constellation stays off by its own size.
@@ -128,14 +133,8 @@ def solve(
 
     ``method`` and ``estimate`` override the options where not empty; ``inputs`` names the sources
     of the observations, for the provenance; the gate limits the change from ``active``, the
-    calibration that this one would replace.
-
-    Raises
-    ------
-    TooFewObservations
-        When the ensemble is too small; the text names the shortage.
-    OptionError
-        For an unknown method or parameter name.
+    calibration that this one would replace. Raises TooFewObservations when the ensemble is too
+    small; the text names the shortage. Raises OptionError for an unknown method or parameter name.
     """
     return solve_with_residuals(ensemble, setup, method, estimate, inputs, active)[0]
 
@@ -151,17 +150,9 @@ def solve_with_residuals(
 ) -> tuple[Calibration, Residuals]:
     """The calibration of `solve`, and its residuals by star and image."""
     setup = aligned_by(ensemble, _as_asked_for(setup, method, estimate))
-    result, prior = _estimate(ensemble, setup)
-    halves = HalvesComparison(note='min_halves_p_value is 0')
-    if setup.gate.min_halves_p_value > 0:
-        # A field is common to both halves: each would show less of it, at twice the time.
-        options = dataclasses.replace(
-            setup.calibration, residual_field=False, max_field_p_value=0.0
-        )
-        bare = _without_field(ensemble, result.geometry.camera.field)
-        halves = compare_halves(bare, prior, options)
+    result = estimated(ensemble, setup)
     provenance = provenance_of(setup, ensemble, inputs or {})
-    calibration = _not_judged(result, ensemble, setup, halves, provenance)
+    calibration = _not_judged(result, ensemble, setup, provenance)
     checks = judge(calibration, setup.prior, active, setup.gate, setup.calibration)
     reasons = reasons_of(checks)
     calibration = dataclasses.replace(
@@ -171,24 +162,11 @@ def solve_with_residuals(
     return calibration, residuals_of(result, ensemble, colour_bp_rp)
 
 
-def _estimate(ensemble: Ensemble, setup: Setup) -> tuple[Estimate, CameraGeometry]:
-    """The estimate with the lens model that was asked for, and the prior in that model."""
+def estimated(ensemble: Ensemble, setup: Setup) -> Estimate:
+    """The estimate with the lens model that was asked for."""
     if setup.frames.lens_model == 'auto':
-        return estimate_with_smallest_lens(ensemble, setup.prior, setup.calibration)
-    return estimate_calibration(ensemble, setup.prior, setup.calibration), setup.prior
-
-
-def _without_field(ensemble: Ensemble, field: DetectorField | None) -> Ensemble:
-    """The ensemble with the displacements of a field taken off its stars."""
-    if field is None:
-        return ensemble
-    images = tuple(
-        dataclasses.replace(
-            image, measured_px=image.measured_px - field.displacement_px(image.measured_px)
-        )
-        for image in ensemble.images
-    )
-    return dataclasses.replace(ensemble, images=images)
+        return estimate_with_smallest_lens(ensemble, setup.prior, setup.calibration)[0]
+    return estimate_calibration(ensemble, setup.prior, setup.calibration)
 
 
 def _named(
@@ -196,20 +174,6 @@ def _named(
 ) -> tuple[StarTrackerAlignment, ...]:
     """The star trackers, the first one with the name of its frame."""
     return tuple(dataclasses.replace(one, frame=one.frame or first_frame) for one in found)
-
-
-def _field_record(result: Estimate) -> ResidualField | None:
-    """The field of an estimate with its covariance; None where there is none."""
-    field, prior = result.geometry.camera.field, result.problem.field_prior
-    if field is None or prior is None:
-        return None
-    return ResidualField(
-        field.degree,
-        field.coefficients,
-        result.joint_covariance,
-        prior.length,
-        prior.amplitude_px,
-    )
 
 
 def _as_asked_for(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:
@@ -227,14 +191,11 @@ def _as_asked_for(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:
 
 
 def _not_judged(
-    result: Estimate,
-    ensemble: Ensemble,
-    setup: Setup,
-    halves: HalvesComparison,
-    provenance: Mapping[str, str],
+    result: Estimate, ensemble: Ensemble, setup: Setup, provenance: Mapping[str, str]
 ) -> Calibration:
     """An estimate with its statistics, before the gate."""
     kept, camera = result.kept, result.geometry.camera
+    field = camera.field
     singular_values, weakest = weakest_direction(result.information, result.information_names)
     stamps_ns = [image.time_ns for image in ensemble.images]
     return Calibration(
@@ -269,11 +230,11 @@ def _not_judged(
         child_frame=setup.frames.camera_frame,
         provenance=provenance,
         temperature=result.thermal,
-        maps=detector_maps(camera, result.joint_covariance, result.table.measured_px[kept]),
+        maps=detector_maps(camera, result.map_covariance, result.table.measured_px[kept]),
         correlation=correlation(result.shared_covariance, result.shared_names),
         removals=removal_study(result),
-        halves=halves,
         star_trackers=_named(result.star_trackers, setup.frames.star_tracker_frame),
         model_checks=model_checks(result),
-        field=_field_record(result),
+        field=factored_field(field, result.map_covariance) if field else None,
+        sigma_budget=sigma_budget(result, setup.calibration),
     )

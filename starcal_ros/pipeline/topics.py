@@ -4,26 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcal_ros.bag import reader
 from starcal_ros.errors import BagError
-from starcal_ros.messages.types import (
-    ATTITUDE_TYPE,
-    ATTITUDE_TYPES,
-    COMPRESSED_TYPE,
-    IMAGE_TYPE,
-    OBSERVATIONS_TYPE,
-    TEMPERATURE_TYPE,
-    VELOCITY_TYPE,
-)
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.reader import Topics as Topics
+from starcal_ros.formats.messages import types
 from starcal_ros.records import StarObservations
 
 # A choice of topics needs no measurement, which is slow to import.
 if TYPE_CHECKING:
-    from starcal_ros.pipeline.observe import OnImage, Wanted
+    from starcal_ros.pipeline.observe_bags import OnImage, Wanted
     from starcal_ros.pipeline.setup import Setup
 
 
@@ -36,58 +28,48 @@ _WITHOUT = {
 }
 
 
-@dataclass(frozen=True)
-class Topics:
-    """
-    Topic of each kind of message; empty: not requested, or not in the bag.
-
-    ``more_attitudes`` are those of the further star trackers, in the order of the setup; empty
-    where the bag has none of one.
-    """
-
-    image: str = ''
-    attitude: str = ''
-    velocity: str = ''
-    temperature: str = ''
-    observations: str = ''
-    more_attitudes: tuple[str, ...] = ()
-
-
 def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = None) -> Topics:
     """
     Topics that a calibration of bags reads: images and telemetry, or recorded observations.
 
     A topic that was not requested must be the only one of its type.  Recorded observations are
-    read if they are requested or the bags hold no images.
-
-    Raises
-    ------
-    BagError
-        When a topic is missing, or several have its type.
+    read if they are requested or the bags hold no images.  Raises BagError when a topic is
+    missing, or several have its type.
     """
     there = reader.topics(paths)
-    types = {topic.type_name for topic in there}
-    image_types = [t for t in (IMAGE_TYPE, COMPRESSED_TYPE) if t in types]
-    only_recorded = not image_types and OBSERVATIONS_TYPE in types
+    kinds = {topic.type_name for topic in there}
+    image_types = [t for t in (types.IMAGE_TYPE, types.COMPRESSED_TYPE) if t in kinds]
+    only_recorded = not image_types and types.OBSERVATIONS_TYPE in kinds
     if asked.observations or (only_recorded and not asked.image):
-        kind = OBSERVATIONS_TYPE
+        kind = types.OBSERVATIONS_TYPE
         return Topics(observations=_choose(paths, kind, asked.observations, 'observations'))
-    image_type = next(iter(image_types), IMAGE_TYPE)
+    image = choose_image_topic(paths, asked)
+    attitude, more = _choose_attitudes(paths, there, asked.attitude, setup)
+    velocity, temperature = asked.velocity, asked.temperature
+    if velocity or types.VELOCITY_TYPE in kinds:
+        velocity = _choose(paths, types.VELOCITY_TYPE, velocity, 'velocity')
+    options = setup.calibration if setup else None
+    used = options and (options.focal_temperature_order or options.alignment_temperature)
+    thermometers = sum(topic.type_name == types.TEMPERATURE_TYPE for topic in there)
+    # A spacecraft has many: the topic must be unique only if the calibration uses it.
+    if temperature or thermometers == 1 or (thermometers and used):
+        temperature = _choose(paths, types.TEMPERATURE_TYPE, temperature, 'temperature')
+    return Topics(image, attitude, velocity, temperature, more_attitudes=more)
+
+
+def choose_image_topic(paths: Sequence[Path], asked: Topics) -> str:
+    """Topic of the images of bags; raises BagError when it is missing, or there are several."""
+    there = reader.topics(paths)
+    image_types = [
+        t
+        for t in (types.IMAGE_TYPE, types.COMPRESSED_TYPE)
+        if any(x.type_name == t for x in there)
+    ]
+    image_type = next(iter(image_types), types.IMAGE_TYPE)
     for kind in image_types:
         if any(t.type_name == kind and t.name == f'/{asked.image.lstrip("/")}' for t in there):
             image_type = kind
-    image = _choose(paths, image_type, asked.image, 'image')
-    attitude, more = _choose_attitudes(paths, there, asked.attitude, setup)
-    velocity, temperature = asked.velocity, asked.temperature
-    if velocity or VELOCITY_TYPE in types:
-        velocity = _choose(paths, VELOCITY_TYPE, velocity, 'velocity')
-    options = setup.calibration if setup else None
-    used = options and (options.focal_temperature_order or options.alignment_temperature)
-    thermometers = sum(topic.type_name == TEMPERATURE_TYPE for topic in there)
-    # A spacecraft has many: the topic must be unique only if the calibration uses it.
-    if temperature or thermometers == 1 or (thermometers and used):
-        temperature = _choose(paths, TEMPERATURE_TYPE, temperature, 'temperature')
-    return Topics(image, attitude, velocity, temperature, more_attitudes=more)
+    return _choose(paths, image_type, asked.image, 'image')
 
 
 def _choose_attitudes(
@@ -98,7 +80,7 @@ def _choose_attitudes(
 
     A star tracker may drop out, but not all of them.
     """
-    kind = ATTITUDE_TYPES[setup.attitude.attitude_message] if setup else ATTITUDE_TYPE
+    kind = types.ATTITUDE_TYPES[setup.attitude.attitude_message] if setup else types.ATTITUDE_TYPE
     fitting = [topic.name for topic in there if topic.type_name == kind]
     named = more_attitude_topics(setup)
     more = tuple(name if name in fitting else '' for name in named)
@@ -125,7 +107,7 @@ def _choose_attitudes(
 
 def _other_attitudes(there: Sequence[reader.Topic], asked: str) -> str:
     """Return which topics may hold the attitudes in messages of another type."""
-    names = {kind: name for name, kind in ATTITUDE_TYPES.items()}
+    names = {kind: name for name, kind in types.ATTITUDE_TYPES.items()}
     return ''.join(
         f'; {topic.name} is a {topic.type_name.rpartition("/")[2]}: if it holds the attitudes, set'
         f' attitude_message: {names[topic.type_name]}'
@@ -159,18 +141,19 @@ def read(
     if topics.observations:
         recorded = reader.read_observations(paths, topics.observations)
         return (record for record in recorded if wanted is None or wanted(record.time_ns))
-    from starcal_ros.pipeline import observe
+    from starcal_ros.pipeline import observe_bags
 
-    return observe.observe_bag(
-        paths,
-        topics.image,
-        topics.attitude,
-        setup,
-        topics.velocity,
-        topics.temperature,
-        on_image,
-        wanted,
-        topics.more_attitudes,
+    return observe_bags.observe_bag(paths, topics, setup, on_image, wanted)
+
+
+def without_attitudes(bags: Sequence[Path], asked: Topics) -> bool:
+    """Return True if bags hold images, but neither attitudes nor observations."""
+    kinds = {topic.type_name for topic in reader.topics(bags)}
+    others = {*types.ATTITUDE_TYPES.values(), types.OBSERVATIONS_TYPE}
+    return (
+        bool(kinds & {types.IMAGE_TYPE, types.COMPRESSED_TYPE})
+        and not kinds & others
+        and not asked.attitude
     )
 
 

@@ -3,8 +3,8 @@
 The frozen records that pass between the stages: images -> observations -> calibration.
 
 Arrays in records are never changed after construction.  The types of the fields, with their marks
-(`arrays`), are the one description of a record: ``products/json_codec.py`` and
-``messages/codec.py`` write and read JSON and messages from them.
+(`record_fields`), are the one description of a record, by which `record_codec` reads and writes
+JSON and messages.
 """
 
 from starcal_ros.records.calibration import (
@@ -17,12 +17,22 @@ from starcal_ros.records.calibration import (
     Correlation,
     DetectorMaps,
     GateCheck,
-    HalvesComparison,
-    ResidualField,
     TemperatureTerms,
     TermRemoval,
 )
-from starcal_ros.records.model_checks import DetectorStep, HeldTerm, ModelChecks, ResidualBin
+from starcal_ros.records.calibration_parts import (
+    Amplitude,
+    BUDGET_COLUMNS,
+    BUDGET_ROWS,
+    DetectorStep,
+    HeldTerm,
+    ModelChecks,
+    parts_that_matter,
+    ResidualBin,
+    SigmaPart,
+    StarTrackerAlignment,
+    TOTAL,
+)
 from starcal_ros.records.observations import (
     AttitudeSample,
     counted_refusal,
@@ -36,13 +46,17 @@ from starcal_ros.records.observations import (
     StarObservations,
     StarRefusal,
 )
-from starcal_ros.records.star_trackers import StarTrackerAlignment
+from starcal_ros.records.residual_field import factored_field, MapCovariance, ResidualField
 
 __all__ = [
     'ALIGNMENT_NAMES',
+    'BUDGET_COLUMNS',
+    'BUDGET_ROWS',
     'IMAGE_REFUSALS',
     'STAR_COLUMNS',
     'STAR_REFUSALS',
+    'TOTAL',
+    'Amplitude',
     'AttitudeSample',
     'Calibration',
     'CameraGeometry',
@@ -52,12 +66,13 @@ __all__ = [
     'Ensemble',
     'EnsembleStatus',
     'GateCheck',
-    'HalvesComparison',
     'HeldTerm',
     'Image',
+    'MapCovariance',
     'ModelChecks',
     'ResidualBin',
     'ResidualField',
+    'SigmaPart',
     'StarObservations',
     'StarRefusal',
     'StarTrackerAlignment',
@@ -67,5 +82,7 @@ __all__ = [
     'check_calibration',
     'check_drawable',
     'counted_refusal',
+    'factored_field',
+    'parts_that_matter',
     'refused_image',
 ]

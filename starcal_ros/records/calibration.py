@@ -12,12 +12,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import Count, Finite, Floats, Shape
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, check_plausible
-from starcal_ros.constants import MAX_STAMP_NS
-from starcal_ros.detector_field import degrees, DetectorField
-from starcal_ros.records.model_checks import ModelChecks
-from starcal_ros.records.star_trackers import StarTrackerAlignment
+from starcal_ros.record_fields import Count, Finite, Named, Quaternion, Shape, Stamp
+from starcal_ros.records.calibration_parts import ModelChecks, SigmaPart, StarTrackerAlignment
+from starcal_ros.records.residual_field import MapCovariance, ResidualField
 
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
 
@@ -37,13 +36,15 @@ class CameraGeometry:
     """
 
     camera: CameraModel
-    star_tracker_from_camera_xyzw: Annotated[Floats, Finite(), Shape((4,))]
+    star_tracker_from_camera_xyzw: Quaternion
 
 
 @dataclass(frozen=True)
 class TemperatureTerms:
     """
     Change of camera and alignment with temperature; `estimation.temperature` has the equations.
+
+    Raises ValueError for another number of terms.
 
     Attributes
     ----------
@@ -55,11 +56,6 @@ class TemperatureTerms:
         Passive small rotation in the camera frame per degree, and its 1-sigma.
     note : str
         Requested terms that were left out, with the reason; may be empty.
-
-    Raises
-    ------
-    ValueError
-        For another number of terms.
     """
 
     reference_degc: Annotated[float, Finite()]
@@ -81,12 +77,12 @@ class TemperatureTerms:
 @dataclass(frozen=True)
 class DetectorMaps:
     """
-    Precision of a calibration over the detector; the first row is that of the smallest v.
+    Precision of a calibration over the detector; v increases with the row.
 
     Attributes
     ----------
     stars : (coverage_rows, coverage_cols) int64
-        Star observations used, in equal cells that cover the detector.
+        Number of star observations used in each of equal cells of the detector.
     line_of_sight_sigma_arcsec : (map_rows, map_cols)
         1-sigma of the line of sight of a pixel in the star tracker frame, camera and alignment
         together, at a regular grid of pixels from corner to corner.
@@ -143,76 +139,10 @@ class TermRemoval:
     significance: float
     wald: float
     chi2_rise: float
-    negligible: bool
+    negligible: Annotated[bool, Named(formerly='within_chance')]
     residual_rms_px: float
     residual_std_px: Annotated[tuple[float, ...], Shape((2,))]
     map_change_px: float
-
-
-@dataclass(frozen=True)
-class HalvesComparison:
-    """
-    Difference of the calibrations of the earlier and the later half of the images.
-
-    Attributes
-    ----------
-    shape_px, shape_p_value : float
-        Largest change of a line of sight, common rotation removed, px at the focal length; and the
-        p-value of the difference of the camera parameters.
-    rotation_arcsec, p_value : float
-        The common rotation; and the p-value of the difference of camera and alignment together.
-    note : str
-        Why the halves were not compared; empty where they were.  The numbers are NaN then.
-    """
-
-    shape_px: float = math.nan
-    shape_p_value: float = math.nan
-    rotation_arcsec: float = math.nan
-    p_value: float = math.nan
-    note: str = ''
-
-
-@dataclass(frozen=True)
-class ResidualField:
-    """
-    Field over the detector beside the lens model.
-
-    With coefficients of zero none was found; its covariance is that of what no star excludes.
-
-    Attributes
-    ----------
-    degree : int
-        Of its polynomials (`detector_field.degrees`).
-    coefficients : (2, t)
-        px, for u and for v; a star that the lens model places at u is measured at u + f(u).
-    joint_covariance : (p + 2 t, p + 2 t)
-        Of the parameters of the calibration and the coefficients of u, then of v.
-    length : float
-        Length of the field, in half lengths of the longer side of the detector.
-    amplitude_px : float
-        Its prior 1-sigma per axis.
-    """
-
-    degree: Count
-    coefficients: Annotated[Floats, Finite(), Shape((2, 'terms'))]
-    joint_covariance: Annotated[Floats, Finite(), Shape(('joint', 'joint'))]
-    length: float
-    amplitude_px: float
-
-    def on(self, width: int, height: int) -> DetectorField:
-        """
-        Return the field on a detector of a size.
-
-        Raises
-        ------
-        ValueError
-            When the coefficients are not those of the degree.
-        """
-        expected = len(degrees(self.degree))
-        if self.coefficients.shape[1] != expected:
-            found = self.coefficients.shape[1]
-            raise ValueError(f'field.coefficients: {found} for an axis, not {expected}')
-        return DetectorField(width, height, self.degree, self.coefficients)
 
 
 @dataclass(frozen=True)
@@ -228,7 +158,7 @@ class GateCheck:
         The parameter that sets the limit: a lower limit where its name begins with ``min_``, else
         an upper limit.  Empty for a check without a number.
     found, limit : float
-        In ``unit``; ``found`` is NaN where it was not checked, both where there is no number.
+        In ``unit``; ``found`` is NaN if not checked, both are NaN for a check without a number.
     unit : str
         Empty for pure numbers.
     passed : bool or None
@@ -242,7 +172,7 @@ class GateCheck:
     found: float
     limit: float
     unit: str
-    passed: bool | None
+    passed: Annotated[bool | None, Named(formerly='kept')]
     note: str = ''
 
     @property
@@ -272,6 +202,8 @@ class Calibration:
     """
     One calibration with its covariance, statistics and provenance.
 
+    Raises ValueError when the covariance does not fit the camera.
+
     Attributes
     ----------
     time_ns : int
@@ -279,8 +211,8 @@ class Calibration:
     geometry : CameraGeometry
         The estimated camera and alignment.
     covariance : (p, p)
-        Of `parameter_names`; the alignment angles (rad) are passive small rotations in the camera
-        frame; zero rows where a parameter was held.
+        Covariance of `parameter_names`: zero rows for held parameters; the alignment angles (rad)
+        are passive small rotations in the camera frame.
     method : str
     estimated : tuple of str
         The camera parameters that were estimated.
@@ -294,17 +226,18 @@ class Calibration:
     alignment_scatter_arcsec : float
         RMS per axis of the alignments of the single images around their mean; 0 for ``single``.
     star_tracker_sigma_arcsec : tuple of 3 float
-        Around the axes of the star tracker, as given or as estimated again.
+        1-sigma about the axes of the star tracker, as assumed or as estimated.
     centroid_scale, centroid_floor_px : float
         The centroid covariances C were used as ``scale C + floor^2 I``.
     dropped_catalog_ids : tuple of int
-        Stars that do not fit in several images and were left out of all.
+        Stars that do not fit in several images, excluded from all.
     misfit_images_ns : tuple of int
         Stamps of images whose attitude does not fit, or that lost their stars.
     singular_values : tuple of float
-        Of the information on the estimated parameters, scaled to a unit diagonal, largest first.
+        Singular values of the information matrix of the estimated parameters, scaled to a unit
+        diagonal, in descending order.
     weakest_direction : str
-        The direction of the smallest, in words.
+        The parameters of the smallest singular value, in words.
     zero_skew_cost_px : float
         Largest pixel error of the zero-skew fit that ``camera_info`` carries.
     iterations, termination
@@ -312,7 +245,8 @@ class Calibration:
     accepted, reasons
         The verdict of the gate.
     parent_frame, child_frame : str
-        Names of the star tracker frame and of the camera frame.
+        Names of the star tracker frame and of the camera frame.  The first is empty where the
+        attitudes are those of the stars: there is no alignment.
     provenance : mapping of str to str
     temperature : TemperatureTerms or None
         None if no change with temperature was requested.
@@ -324,25 +258,20 @@ class Calibration:
     first_image_ns : int
         Stamp of the first image used.
     number : int
-        Counts the calibrations activated on one calibrator; 0 for a candidate.
+        Sequence number of the activation on its calibrator; 0 for a candidate.
     active_since_ns : int
-        When it was activated, or activated again by a roll-back; 0 for a candidate.
+        Time of the activation, or of a roll-back to it; 0 for a candidate.
     forced : bool
         Activated by request despite the gate.
-    halves : HalvesComparison or None
-        None where not recorded.
     star_trackers : tuple of StarTrackerAlignment
-        The first one, that of ``geometry``, and the others; empty where there is one only.
+        The star tracker of ``geometry``, then the others; empty if there is only one.
     gate : tuple of GateCheck
         The checks of the gate; empty where not recorded.
-
-    Raises
-    ------
-    ValueError
-        When the covariance does not fit the camera.
+    sigma_budget : tuple of SigmaPart
+        The total, then the causes; empty where not recorded.
     """
 
-    time_ns: int
+    time_ns: Stamp
     geometry: CameraGeometry
     covariance: Annotated[Floats, Shape(('p', 'p'))]
     method: str
@@ -373,15 +302,15 @@ class Calibration:
     maps: DetectorMaps | None = None
     correlation: Correlation | None = None
     removals: tuple[TermRemoval, ...] = ()
-    first_image_ns: int = 0
+    first_image_ns: Stamp = 0
     number: Count = 0
-    active_since_ns: int = 0
+    active_since_ns: Annotated[Stamp, Named(formerly='in_force_since_ns')] = 0
     forced: bool = False
-    halves: HalvesComparison | None = None
     star_trackers: tuple[StarTrackerAlignment, ...] = ()
     model_checks: ModelChecks | None = None
     field: ResidualField | None = None
     gate: tuple[GateCheck, ...] = ()
+    sigma_budget: tuple[SigmaPart, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the size of the covariance."""
@@ -394,9 +323,8 @@ class Calibration:
             camera = self.geometry.camera
             detector_field = self.field.on(camera.width, camera.height)
             count = p + detector_field.coefficients.size
-            if len(self.field.joint_covariance) != count:
-                rows = len(self.field.joint_covariance)
-                raise ValueError(f'field.joint_covariance: {rows} rows, not {count}')
+            if self.field.rows != count:
+                raise ValueError(f'field: covariance of {self.field.rows} rows, not {count}')
             camera = dataclasses.replace(camera, field=detector_field)
             geometry = dataclasses.replace(self.geometry, camera=camera)
             object.__setattr__(self, 'geometry', geometry)
@@ -407,9 +335,21 @@ class Calibration:
         return self.geometry.camera.parameter_names + ALIGNMENT_NAMES
 
     @property
+    def has_alignment(self) -> bool:
+        """False where the attitudes are those of the stars: ``parent_frame`` is empty then."""
+        return bool(self.parent_frame)
+
+    @property
+    def map_covariance(self) -> MapCovariance:
+        """Covariance of lines of sight, by `parameter_names` and the coefficients of a field."""
+        if self.field is None:
+            return MapCovariance(self.covariance)
+        return MapCovariance(self.field.covariance, self.field.unresolved_px)
+
+    @property
     def joint_covariance(self) -> Floats:
         """Covariance of `parameter_names`, then of the coefficients of a field."""
-        return self.covariance if self.field is None else self.field.joint_covariance
+        return self.map_covariance.matrix
 
     @property
     def sigma(self) -> Floats:
@@ -417,39 +357,28 @@ class Calibration:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-_MOST = 1e15  # of a camera parameter, whose square and cube must stay finite
-_UNIT_TOLERANCE = 1e-6  # of the length of a quaternion: rounding to a text leaves less
+_MOST = 1e15  # largest camera parameter: its cube must be finite
+_UNIT_TOLERANCE = 1e-6  # of the norm of a quaternion: rounded decimals change it by less
 
 
 def check_calibration(calibration: Calibration) -> None:
     """
-    Check the geometry and the stamps of a calibration from a file or a message.
+    Check the geometry of a calibration from a file or a message.
 
-    The camera of one that the gate refused may be any that a report can show.
+    The camera of a refused calibration may be implausible, as long as a report can show it.
 
-    Raises
-    ------
-    ValueError
-        Naming the field and its value.
+    Raises ValueError naming the field and its value.
     """
     if calibration.accepted or calibration.forced:
         check_plausible(calibration.geometry.camera)
-    check_drawable(
-        calibration.geometry,
-        time_ns=calibration.time_ns,
-        first_image_ns=calibration.first_image_ns,
-        active_since_ns=calibration.active_since_ns,
-    )
+    check_drawable(calibration.geometry)
 
 
-def check_drawable(geometry: CameraGeometry, **stamps_ns: int) -> None:
+def check_drawable(geometry: CameraGeometry) -> None:
     """
-    Check that a report can show a geometry and stamps.
+    Check that a report can show a geometry.
 
-    Raises
-    ------
-    ValueError
-        Naming the field and its value.
+    Raises ValueError naming the field and its value.
     """
     camera = geometry.camera
     largest, shortest_px = np.abs(camera.parameters).max(), camera.parameters[[0, 2]].min()
@@ -460,6 +389,3 @@ def check_drawable(geometry: CameraGeometry, **stamps_ns: int) -> None:
     rotation = geometry.star_tracker_from_camera_xyzw
     if not abs(np.linalg.norm(rotation) - 1.0) < _UNIT_TOLERANCE:
         raise ValueError(f'alignment.rotation: {rotation.tolist()} is not a unit quaternion')
-    for name, stamp_ns in stamps_ns.items():
-        if not 0 <= stamp_ns <= MAX_STAMP_NS:
-            raise ValueError(f'{name}: {stamp_ns} ns is not within the range of ROS stamps')

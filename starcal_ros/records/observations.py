@@ -13,7 +13,20 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import Count, Finite, Floats, Pixels, Shape
+from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.camera import MAX_SIDE_PX
+from starcal_ros.record_fields import (
+    Count,
+    Finite,
+    Most,
+    Named,
+    OneOf,
+    Quaternion,
+    Shape,
+    Stamp,
+    Unit,
+    Within,
+)
 
 IMAGE_REFUSALS: Mapping[str, str] = {
     'bad_encoding': 'the pixel encoding is not one of mono8, mono16, 8UC1, 16UC1',
@@ -116,6 +129,14 @@ class AttitudeSample:
     icrf_from_star_tracker_xyzw: Floats
 
 
+_Name = Annotated[str, Most(most_characters=100)]
+_Side = Annotated[int, Within(0, MAX_SIDE_PX)]
+_REFUSAL = OneOf(('', *IMAGE_REFUSALS))
+_Attitude = Annotated[Quaternion, Unit(1e-3)]  # single precision and rounding leave less
+_FiniteOrNaN = Annotated[float, Within()]
+_FloatsOrNaN = Annotated[NDArray[np.float32], Within(), Shape(('n',))]
+
+
 @dataclass(frozen=True)
 class StarObservations:
     """
@@ -163,40 +184,61 @@ class StarObservations:
         Which catalog the identifiers refer to.
     temperature_degc : float
         Temperature of the camera; NaN if unknown.
+    star_tracker_rate_rad_s : (3,)
+        Angular rate at ``time_ns`` by the attitude samples, in the frame of the first star
+        tracker; NaN if unknown.
+    velocity_sigma_m_s : float
+        1-sigma of each component of the observer's velocity in ``direction_icrf``; 0 for a site on
+        the ground, NaN where none was given and the Earth's was taken.
+    zenith_icrf : (3,)
+        Zenith about which ``direction_icrf`` is refracted, where the stars showed it; NaN: in
+        space, or of a known site.
+    refraction_arcsec : (2,)
+        Refraction at a zenith distance of 45 degrees then, and its 1-sigma; else zeros.
     """
 
-    time_ns: int
-    width: Count
-    height: Count
-    refusal: str
+    time_ns: Stamp
+    width: _Side
+    height: _Side
+    refusal: Annotated[str, _REFUSAL]
     detail: str
-    icrf_from_star_tracker_xyzw: Annotated[Floats, Finite(), Shape((4,))]
-    attitude_gap_s: float
+    icrf_from_star_tracker_xyzw: Annotated[_Attitude, Named('attitude')]
+    attitude_gap_s: _FiniteOrNaN
     catalog_id: Annotated[NDArray[np.int64], Shape(('n',))]
-    direction_icrf: Annotated[Floats, Finite(), Shape(('n', 3))]
-    magnitude: Annotated[NDArray[np.float32], Shape(('n',))]
+    direction_icrf: Annotated[Floats, Finite(), Shape(('n', 3)), Unit(1e-6)]
+    magnitude: _FloatsOrNaN
     measured_px: Annotated[Floats, Finite(), Shape(('n', 2))]
     covariance_px2: Annotated[Floats, Finite(), Shape(('n', 3))]
-    flux_dn: Annotated[NDArray[np.float32], Shape(('n',))]
-    snr: Annotated[NDArray[np.float32], Shape(('n',))]
-    refused_stars: Mapping[str, Count]
-    background_dn: float
-    noise_dn: float
-    psf_sigma_px: float
-    catalog_digest: str
-    temperature_degc: float = math.nan
-    star_tracker: str = ''
-    first_from_star_tracker_xyzw: Annotated[Floats, Finite(), Shape((4,))] = dataclasses.field(
-        default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0])
+    flux_dn: _FloatsOrNaN
+    snr: _FloatsOrNaN
+    refused_stars: Annotated[Mapping[str, Count], Most(100, most_items=50)]
+    background_dn: _FiniteOrNaN
+    noise_dn: _FiniteOrNaN
+    psf_sigma_px: _FiniteOrNaN
+    catalog_digest: _Name
+    temperature_degc: Annotated[float, Within(-273.15, 1000.0)] = math.nan
+    star_tracker: _Name = ''
+    first_from_star_tracker_xyzw: Annotated[_Attitude, Named('first_from_star_tracker')] = (
+        dataclasses.field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))
     )
-    refused_catalog_id: Annotated[NDArray[np.int64], Shape(('m',))] = dataclasses.field(
-        default_factory=lambda: np.empty(0, np.int64)
+    refused_catalog_id: Annotated[NDArray[np.int64], Shape(('m',)), Named('refused_star_id')] = (
+        dataclasses.field(default_factory=lambda: np.empty(0, np.int64))
     )
-    refused_px: Annotated[NDArray[np.float32], Finite(), Shape(('m', 2))] = dataclasses.field(
-        default_factory=lambda: np.empty((0, 2), np.float32)
+    refused_px: Annotated[
+        NDArray[np.float32], Finite(), Shape(('m', 2)), Named('refused_star_px')
+    ] = dataclasses.field(default_factory=lambda: np.empty((0, 2), np.float32))
+    refused_reason: Annotated[NDArray[np.uint8], Shape(('m',)), Named('refused_star_reason')] = (
+        dataclasses.field(default_factory=lambda: np.empty(0, np.uint8))
     )
-    refused_reason: Annotated[NDArray[np.uint8], Shape(('m',))] = dataclasses.field(
-        default_factory=lambda: np.empty(0, np.uint8)
+    star_tracker_rate_rad_s: Annotated[Floats, Within(), Shape((3,))] = dataclasses.field(
+        default_factory=lambda: np.full(3, math.nan)
+    )
+    velocity_sigma_m_s: Annotated[float, Within(0)] = math.nan
+    zenith_icrf: Annotated[Floats, Within(), Shape((3,)), Unit(1e-6)] = dataclasses.field(
+        default_factory=lambda: np.full(3, math.nan)
+    )
+    refraction_arcsec: Annotated[Floats, Finite(), Shape((2,))] = dataclasses.field(
+        default_factory=lambda: np.zeros(2)
     )
 
     def __len__(self) -> int:
@@ -296,7 +338,7 @@ class EnsembleStatus:
     ``images_saved`` counts the images on disk, which survive a crash or a power loss.
     """
 
-    time_ns: int
+    time_ns: Stamp
     images: Count
     stars: Count
     min_images: Count

@@ -1,240 +1,337 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Figures of the report over the detector and over the sky, as SVG."""
+"""Figures over the detector and over the sky."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 import functools
+from pathlib import Path
 from typing import Any
 
 import contourpy
 import cv2
-from markupsafe import Markup
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import movement
+from starcal_ros.assessment.comparison import Comparison, DifferenceMap
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid
-from starcal_ros.detector_field import DetectorField
-from starcal_ros.records import CameraGeometry, DetectorMaps, StarObservations
+from starcal_ros.camera.detector_field import DetectorField
+from starcal_ros.errors import OptionError
+from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.records import (
+    BUDGET_COLUMNS,
+    BUDGET_ROWS,
+    CameraGeometry,
+    DetectorMaps,
+    SigmaPart,
+    StarObservations,
+)
 from starcal_ros.report import svg
-from starcal_ros.report.svg import BAD, GRID, in_digits, INK, MUTED, Panel, Scale, SERIES
+from starcal_ros.report.svg import (
+    Chart,
+    Curve,
+    Drawing,
+    GRID,
+    in_digits,
+    MUTED,
+    Panel,
+    Scale,
+    SERIES,
+    sheet,
+)
 
 FLAT = 0.02  # relative range below which a map is called flat
 _MOST_HEIGHT = 400.0
-_ROUNDING_PX = 1e-9  # displacements below are of the arithmetic
-_LEVELS = 8
-_LABELS_APART = 30.0  # units of the view box
+_ROUNDING_PX = 1e-9  # smaller displacements (px) and sigmas (arcsec) are rounding errors
+_LEVELS = 5
+_BAR = 84.0  # units of the view box beside a map, for the bar of its colours
+_TOP, _BELOW = 26.0, 40.0
+_DARK, _BRIGHT, _BAD = '#16202b', '#ffffff', '#a8251c'  # on maps, alike on a dark page
+_BUDGET_MAPS = 6
+_BUDGET_SHARE = 0.1  # of the sigma: a cause of less is dark everywhere
+_GAP = 10.0
 _FOOTPRINTS = 200  # drawn on the sky
 
 
-def _detector(camera: CameraModel, right: float = 12.0, top: float = 26.0) -> tuple[Panel, float]:
-    """Panel with the aspect ratio of the detector and the height of its chart."""
-    left, below = 54.0, 40.0
+def over_detector(camera: CameraModel, right: float = 12.0) -> Panel:
+    """Panel with the aspect ratio of the detector and its axes."""
+    left = 54.0
     wide = svg.WIDTH - left - right
     high = wide * camera.height / camera.width
     if high > _MOST_HEIGHT:
         wide, high = wide * _MOST_HEIGHT / high, _MOST_HEIGHT
-    panel = Panel(
-        Scale(-0.5, camera.width - 0.5, left, left + wide),
-        Scale(-0.5, camera.height - 0.5, top, top + high),
-    )
-    return panel, top + high + below
+    x = Scale(-0.5, camera.width - 0.5, left, left + wide)
+    y = Scale(-0.5, camera.height - 0.5, _TOP, _TOP + high)
+    panel = Panel(x, y)
+    panel.axes('column u (px)', 'row v (px)', svg.named(x), svg.named(y), is_framed=True)
+    return panel
 
 
-def _framed(panel: Panel) -> None:
-    panel.axes('column u (px)', 'row v (px)', is_framed=True)
+def _drawn(panel: Panel, *others: Panel) -> Drawing:
+    return panel.drawing(panel.y.end + _BELOW, *others)
 
 
-def star_coverage(residuals: Residuals, camera: CameraModel) -> Markup:
+def star_cloud(measured_px: Floats, camera: CameraModel) -> Drawing:
+    """Positions (n, 2) of stars on the detector."""
+    panel = over_detector(camera)
+    radius = float(np.clip(60.0 / np.sqrt(max(len(measured_px), 1)), 0.7, 1.8))
+    panel.cloud(measured_px, radius, 0.8)
+    return _drawn(panel)
+
+
+def star_coverage(residuals: Residuals, camera: CameraModel) -> Chart:
     """Positions of all used stars on the detector (paper, Fig. 5)."""
-    panel, height = _detector(camera)
-    u, v = residuals.measured_px[residuals.used].T
-    radius = float(np.clip(40.0 / np.sqrt(max(len(u), 1)), 0.5, 1.6))
-    panel.cloud(u, v, radius, 0.8)
-    _framed(panel)
-    return svg.chart([panel], height)
+    measured_px = residuals.measured_px[residuals.used]
+    text = f'All {len(measured_px):,} used star observations of all images.'
+    return Chart('Star positions', star_cloud(measured_px, camera), text)
 
 
-def cell_counts(maps: DetectorMaps, camera: CameraModel) -> Markup:
-    """Star counts in equal cells of the detector; empty cells have a red edge."""
-    panel, height = _detector(camera)
-    rows, columns = maps.stars.shape
-    edges_u = panel.x(np.linspace(-0.5, camera.width - 0.5, columns + 1))
-    edges_v = panel.y(np.linspace(-0.5, camera.height - 0.5, rows + 1))
-    share = maps.stars / max(int(maps.stars.max()), 1)
-    size = min(svg.LETTER, 124.0 / columns)
-    for (row, column), count in np.ndenumerate(maps.stars):
-        x, y = edges_u[column], edges_v[row]
-        wide, high = edges_u[column + 1] - x, edges_v[row + 1] - y
-        edge = BAD if count == 0 else svg.PAPER
-        panel.parts.append(
-            f'<rect x="{x + 0.7:.1f}" y="{y + 0.7:.1f}" width="{wide - 1.4:.1f}"'
-            f' height="{high - 1.4:.1f}" fill="{SERIES[0]}"'
-            f' fill-opacity="{0.06 + 0.5 * share[row, column]:.2f}" stroke="{edge}"/>'
-        )
-        colour = BAD if count == 0 else INK
-        panel.parts.append(
-            f'<text x="{x + wide / 2:.1f}" y="{y + high / 2 + 0.35 * size:.1f}"'
-            f' text-anchor="middle" font-size="{size:.1f}" fill="{colour}">{count}</text>'
-        )
-    _framed(panel)
-    return svg.chart([panel], height)
+def cell_counts(stars: NDArray[np.int64], camera: CameraModel) -> Chart:
+    """Star counts (rows, columns) in equal cells of the detector; those of empty cells are red."""
+    panel = over_detector(camera, right=_BAR)
+    rows, columns = stars.shape
+    most = max(int(stars.max()), 1)
+    panel.picture(_coloured(np.kron(255 * stars / most, np.ones((16, 16)))))
+    for (row, column), count in np.ndenumerate(stars):
+        u = (column + 0.5) / columns * camera.width - 0.5
+        v = (row + 0.5) / rows * camera.height - 0.5
+        size = min(svg.LETTER, 124.0 / columns)
+        panel.text(u, v, str(count), _DARK if count else _BAD, _BRIGHT, size)
+    return Chart(
+        'Stars per cell',
+        _drawn(panel, _bar(panel, float(most), '')),
+        f'Used star observations in {stars.size} equal cells: {int(stars.min())} to '
+        f'{int(stars.max())} per cell, {int((stars == 0).sum())} cells empty.',
+    )
 
 
-def distortion_vectors(camera: CameraModel) -> Markup:
+def distortion_vectors(camera: CameraModel) -> Chart:
     """Distortion as arrows (paper, Fig. 6 left)."""
     places = pixel_grid(camera, 17, 13)
-    return _arrows(camera, places, distortion_px(camera, places))
+    return Chart(
+        'Distortion vectors',
+        arrows(camera, places, distortion_px(camera, places)),
+        'Displacement of a star from its position with an ideal lens (dot). Arrows are '
+        'enlarged; the arrow above the figure is their scale.',
+    )
 
 
-def distortion_contours(camera: CameraModel) -> Markup:
+def distortion_contours(camera: CameraModel) -> Chart:
     """Length of the distortion in pixels (paper, Fig. 6 right)."""
     shift = distortion_px(camera, pixel_grid(camera, 60, 48))
-    return _contours(camera, np.hypot(*shift.T))
+    return Chart(
+        'Distortion magnitude',
+        detector_map(np.hypot(*shift.T).reshape(48, 60), camera, ' px'),
+        'Contours of the length of the distortion vectors; a longer one has a thicker line.',
+    )
 
 
-def change_contours(before: CameraGeometry, after: CameraGeometry) -> Markup:
+def change_contours(before: CameraGeometry, after: CameraGeometry) -> Chart:
     """Change of the lines of sight in pixels, common rotation removed."""
     _, moved_px = movement(before, after, 60, 48)
-    return _contours(after.camera, moved_px)
+    return Chart(
+        'Change relative to the prior',
+        detector_map(moved_px.reshape(48, 60), after.camera, ' px'),
+        'Change of the line of sight of each pixel relative to the prior, in pixels, with the '
+        'common rotation removed.',
+    )
 
 
-def mean_residuals(residuals: Residuals, camera: CameraModel) -> Markup:
+def mean_residuals(residuals: Residuals, camera: CameraModel) -> Chart:
     """Mean residual in cells of the detector, which shows unmodelled distortion."""
     u, v = residuals.measured_px[residuals.used].T
     edges_u = np.linspace(-0.5, camera.width - 0.5, 13)
     edges_v = np.linspace(-0.5, camera.height - 0.5, 11)
-    mean = [
-        np.histogram2d(u, v, (edges_u, edges_v), weights=component)[0]
-        for component in residuals.residual_px[residuals.used].T
-    ]
-    count = np.histogram2d(u, v, (edges_u, edges_v))[0]
+    count, *sums = (
+        np.histogram2d(u, v, (edges_u, edges_v), weights=weights)[0]
+        for weights in (None, *residuals.residual_px[residuals.used].T)
+    )
     enough = count >= 5
     centre_u, centre_v = (0.5 * (e[1:] + e[:-1]) for e in (edges_u, edges_v))
     places = np.stack(np.meshgrid(centre_u, centre_v, indexing='ij'), axis=-1)[enough]
-    return _arrows(camera, places, np.stack([m[enough] / count[enough] for m in mean], axis=-1))
+    mean = np.stack([one[enough] / count[enough] for one in sums], axis=-1)
+    return Chart(
+        'Mean residuals over the detector',
+        arrows(camera, places, mean),
+        'Mean residual of the stars in each cell, enlarged to the scale of the arrow above. A '
+        'regular pattern indicates distortion that the lens model does not describe; noise has '
+        'no pattern.',
+    )
 
 
-def field_vectors(field: DetectorField, camera: CameraModel) -> Markup:
+def field_vectors(field: DetectorField, camera: CameraModel) -> Chart:
     """The residual field beside the lens model as arrows."""
     places = pixel_grid(camera, 17, 13)
-    return _arrows(camera, places, field.displacement_px(places))
+    return Chart(
+        'Residual field beside the lens model',
+        arrows(camera, places, field.displacement_px(places)),
+        'Displacement of a star from its place by the lens model, enlarged to the scale of '
+        'the arrow above the figure.',
+    )
 
 
-def _arrows(camera: CameraModel, places: Floats, shift_px: Floats) -> Markup:
+def arrows(camera: CameraModel, places: Floats, shift_px: Floats) -> Drawing:
     """Enlarged displacements (n, 2) at places (n, 2), with an arrow of a round length as scale."""
-    panel, height = _detector(camera)
-    _framed(panel)
+    panel = over_detector(camera)
+    _draw_arrows(panel, places, shift_px, [SERIES[0]] * len(places), 16)
+    return _drawn(panel)
+
+
+def _draw_arrows(
+    panel: Panel, places: Floats, shift_px: Floats, colours: Sequence[str], columns: int
+) -> None:
+    """Draw displacements, the longest as one of the columns of its places, and their scale."""
     longest_px = float(np.nanmax(np.hypot(*shift_px.T), initial=0.0))
     if not longest_px > _ROUNDING_PX:
         panel.note('no displacement')
-        return svg.chart([panel], height)
-    wide = abs(panel.x.end - panel.x.start)
-    # The longest arrow spans one step of a grid of seventeen columns.
-    units_per_px = 0.95 * wide / 16 / longest_px
-    panel.arrows(places, units_per_px * shift_px, SERIES[0])
-    key_px = 10.0 ** np.floor(np.log10(longest_px))
-    key_px = max(k * key_px for k in (1.0, 2.0, 5.0) if k * key_px <= longest_px)
-    end = panel.x.end
+        return
+    units_per_px = 0.95 * abs(panel.x.end - panel.x.start) / columns / longest_px
+    starts = np.stack([panel.x(places[:, 0]), panel.y(places[:, 1])], axis=-1)
+    for start, shift, colour in zip(starts, shift_px, colours, strict=True):
+        panel.outside.append(svg.arrow(start, units_per_px * shift, colour))
+    key_px = svg.round_step(longest_px / 2.5)
     along = np.array([units_per_px * key_px, 0.0])
-    panel.parts.append(svg.arrow(np.array([end - along[0], 13.0]), along, SERIES[1]))
-    label = f'scale: {in_digits(key_px)} px'
-    panel.parts.append(svg.words_at(end - along[0] - 7, 17, label, 'end'))
-    return svg.chart([panel], height)
+    start = panel.x.end - along[0]
+    panel.outside.append(svg.arrow(np.array([start, 13.0]), along, SERIES[1]))
+    panel.outside.append(svg.words(start - 7, 17, f'scale: {in_digits(key_px)} px', 'end'))
 
 
-def _contours(camera: CameraModel, length_px: Floats) -> Markup:
-    """Labelled contours of a grid (48 * 60) of lengths in pixels."""
-    panel, height = _detector(camera)
-    u, v = (a.reshape(48, 60) for a in pixel_grid(camera, 60, 48).T)
-    length = length_px.reshape(48, 60)
-    low, high = float(np.nanmin(length)), float(np.nanmax(length))
-    if not high - low > _ROUNDING_PX:
-        panel.note(f'{in_digits(round(high, 9))} px everywhere')
-        _framed(panel)
-        return svg.chart([panel], height)
-    levels = [level for level in Scale(low, high, 0, 1).ticks(_LEVELS) if low < level < high]
-    _draw_contours(panel, u, v, length, levels, ' px')
-    _framed(panel)
-    return svg.chart([panel], height)
+def line_of_sight_sigma(maps: DetectorMaps, camera: CameraModel, is_alone: bool) -> Chart:
+    """1-sigma of the lines of sight, of the camera alone or with its alignment."""
+    sigma = maps.shape_sigma_arcsec if is_alone else maps.line_of_sight_sigma_arcsec
+    title, text = (
+        ('camera alone', 'with the rotation common to all pixels removed')
+        if is_alone
+        else ('camera and alignment', 'in the star tracker frame')
+    )
+    return Chart(
+        f'Line of sight, {title}',
+        detector_map(sigma, camera, '″'),
+        f'1-sigma of the line of sight of each pixel, {text}: {sigma.min():.4g}″ to '
+        f'{sigma.max():.4g}″. The colours start at zero.',
+    )
+
+
+def budget_over_detector(parts: Sequence[SigmaPart], camera: CameraModel) -> Chart | None:
+    """1-sigma of the camera alone over the detector, whole and by cause, in one scale."""
+    shown = [part for part in parts if part.map_over_detector_arcsec]
+    least = _BUDGET_SHARE * max((part.map_arcsec for part in shown), default=0.0)
+    shown = [part for part in shown if part.map_arcsec > least][:_BUDGET_MAPS]
+    if not shown or not shown[0].map_arcsec > _ROUNDING_PX:
+        return None
+    top = max(shown[0].map_over_detector_arcsec)
+    across = 2 if len(shown) <= 4 else 3
+    wide = (svg.WIDTH - _BAR - 4.0 - _GAP * (across - 1)) / across
+    high = wide * camera.height / camera.width
+    panels = []
+    for k, part in enumerate(shown):
+        row, column = divmod(k, across)
+        left, upper = 4.0 + column * (wide + _GAP), _TOP + row * (high + _TOP)
+        panel = Panel(Scale(0.0, 1.0, left, left + wide), Scale(0.0, 1.0, upper, upper + high))
+        sigma = np.reshape(part.map_over_detector_arcsec, (BUDGET_ROWS, BUDGET_COLUMNS))
+        panel.picture(_coloured(cv2.resize(255 * sigma / top, (90, 70))))
+        panel.outside.append(svg.words(left, upper - 7, part.cause, 'start'))
+        panels.append(panel)
+    last = panels[min(len(panels), across) - 1]
+    height = panels[-1].y.end + 8.0
+    sizes = ', '.join(f'{max(part.map_over_detector_arcsec):.2g}″ {part.cause}' for part in shown)
+    return Chart(
+        'Causes over the detector',
+        panels[0].drawing(height, *panels[1:], _bar(last, top, '″')),
+        f'1-sigma of the line of sight of each pixel, camera alone; the largest: {sizes}.',
+    )
+
+
+def detector_map(
+    values: Floats, camera: CameraModel, unit: str, shift_px: Floats | None = None
+) -> Drawing:
+    """
+    Colours and labelled contours of a grid from corner to corner; the colours start at zero.
+
+    ``shift_px`` (rows, columns, 2) is drawn at the places of the grid, as arrows.
+    """
+    panel = over_detector(camera, right=_BAR)
+    finite = values[np.isfinite(values)]
+    low, top = (float(end) for end in (finite.min(initial=np.inf), finite.max(initial=0.0)))
+    if not top > _ROUNDING_PX:
+        panel.note(f'0{unit} everywhere' if len(finite) else 'unknown')
+        return _drawn(panel)
+    known = np.where(np.isfinite(values), values, 0.0)
+    panel.picture(_coloured(cv2.resize(255 * known / top, (240, 192))))
+    rows, columns = values.shape
+    u, v = np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
+    if shift_px is not None:
+        places = np.stack(np.meshgrid(u, v), axis=-1)
+        colours = np.where(values.ravel() > 0.6 * top, _DARK, _BRIGHT).tolist()
+        _draw_arrows(panel, places.reshape(-1, 2), shift_px.reshape(-1, 2), colours, columns)
+    elif top - low > FLAT * top:
+        levels = [x for x in Scale(low, top, 0, 1).ticks(_LEVELS) if low < x < top]
+        _draw_contours(panel, contourpy.contour_generator(u, v, values), levels, top, unit)
+    else:
+        percent = 100 * (top - low) / top
+        panel.note(f'flat within {in_digits(round(percent, 2))} %', _BRIGHT, _DARK)
+    return _drawn(panel, _bar(panel, top, unit))
 
 
 def _draw_contours(
     panel: Panel,
-    u: Floats,
-    v: Floats,
-    values: Floats,
+    generator: contourpy.ContourGenerator,
     levels: Sequence[float],
+    top: float,
     unit: str,
-    colour: str = SERIES[0],
 ) -> None:
-    """Contours, thicker for higher levels, each with one label if there is room for it."""
-    generator = contourpy.contour_generator(u, v, values)
-    labels: list[tuple[Floats, str]] = []
-    middle = np.array([panel.x.end + panel.x.start, panel.y.end + panel.y.start]) / 2
+    """Contours, thicker for higher levels, with one label each where there is room."""
+    lines = [
+        # contourpy's types allow other forms of a line as well.
+        [np.stack([panel.x(x), panel.y(y)], axis=-1)
+         for x, y in (np.asarray(line, np.float64).T for line in generator.lines(level))]
+        for level in levels
+    ]  # fmt: skip
+    for k, of_level in enumerate(lines):
+        colour = _DARK if levels[k] > 0.6 * top else _BRIGHT
+        for line in of_level:
+            panel.path(line, colour, 1.0 + 1.4 * k / max(len(levels) - 1, 1))
+    taken: list[Floats] = []
     for k, level in enumerate(levels):
-        width = 1.0 + 1.4 * k / max(len(levels) - 1, 1)
-        drawn = []
-        for line in _lines_at(generator, level):
-            panel.line(line[:, 0], line[:, 1], colour, width)
-            drawn.append(np.stack([panel.x(line[:, 0]), panel.y(line[:, 1])], axis=-1))
-        places = np.concatenate(drawn or [np.empty((0, 2))])
-        inner = abs(places - middle) < 0.46 * np.abs(
-            [panel.x.end - panel.x.start, panel.y.end - panel.y.start]
-        )
-        places = places[inner.all(axis=1)]
-        if len(places):
-            others = np.array([place for place, _ in labels] or [np.full(2, -1e4)])
-            apart = np.linalg.norm(places[:, None] - others, axis=-1).min(axis=1)
-            if apart.max() > _LABELS_APART:
-                labels.append((places[int(np.argmax(apart))], f'{in_digits(level)}{unit}'))
-    for (x, y), words in labels:
-        panel.parts.append(
-            f'<text x="{x:.1f}" y="{y + 4:.1f}" text-anchor="middle" fill="{INK}"'
-            f' stroke="{svg.PAPER}" stroke-width="3" paint-order="stroke">{words}</text>'
-        )
+        text = f'{in_digits(level)}{unit}'
+        half = np.array([0.3 * len(text) + 0.5, 0.8]) * svg.LETTER
+        others = [line for other in (*lines[:k], *lines[k + 1 :]) for line in other]
+        place = _label_place(panel, lines[k], [*others, *taken], half)
+        if place is not None:
+            taken.append(place[None])
+            x, y = place.tolist()
+            panel.outside.append(svg.words(x, y + 4, text, colour=_BRIGHT, edge=_DARK))
 
 
-def _lines_at(generator: contourpy.ContourGenerator, level: float) -> list[Floats]:
-    """Lines (n, 2) of a level; contourpy's types allow other forms as well."""
-    return [np.asarray(line, np.float64) for line in generator.lines(level)]
+def _label_place(
+    panel: Panel, lines: Sequence[Floats], others: Sequence[Floats], half: Floats
+) -> Floats | None:
+    """Place on the lines of a level, within the frame and farthest from all others, or None."""
+    low, high = np.sort([[panel.x.start, panel.y.start], [panel.x.end, panel.y.end]], axis=0)
+    places = np.concatenate([*lines, np.empty((0, 2))])
+    places = places[((places > low + half) & (places < high - half)).all(axis=1)]
+    if not len(places):
+        return None
+    crossing = np.concatenate([*others, np.full((1, 2), -1e4)])
+    # In units of the label: under 1 along both axes they overlap.
+    apart = (abs(places[:, None] - crossing) / half).max(axis=-1).min(axis=1)
+    best = int(np.argmax(apart))
+    return np.asarray(places[best]) if apart[best] > 1.0 else None
 
 
-def line_of_sight_sigma(sigma_arcsec: Floats, camera: CameraModel) -> Markup:
-    """1-sigma of the lines of sight from corner to corner, on a scale that starts at zero."""
-    panel, height = _detector(camera, right=74.0)
-    top_arcsec = float(sigma_arcsec.max())
-    if not (np.isfinite(top_arcsec) and top_arcsec > 0):
-        panel.note('unknown')
-        _framed(panel)
-        return svg.chart([panel], height)
-    panel.picture(_coloured(cv2.resize(255 * sigma_arcsec / top_arcsec, (240, 192))))
-    rows, columns = sigma_arcsec.shape
-    u, v = np.meshgrid(
-        np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
-    )
-    low = float(sigma_arcsec.min())
-    if top_arcsec - low > FLAT * top_arcsec:
-        levels = [x for x in Scale(low, top_arcsec, 0, 1).ticks(4) if low < x < top_arcsec]
-        _draw_contours(panel, u, v, sigma_arcsec, levels, '″', svg.PAPER)
-    else:
-        percent = 100 * (top_arcsec - low) / top_arcsec
-        panel.note(f'flat within {in_digits(round(percent, 2))} %')
-    _framed(panel)
-    bar = Panel(Scale(0, 1, panel.x.end + 12, panel.x.end + 26), _upright(panel, top_arcsec))
+def _bar(panel: Panel, top: float, unit: str) -> Panel:
+    """Bar of the colours beside a panel, from zero to the largest value."""
+    upright = Scale(0.0, top, panel.y.end, panel.y.start)
+    bar = Panel(Scale(0, 1, panel.x.end + 12, panel.x.end + 26), upright)
     bar.picture(_coloured(np.linspace(255, 0, 128)[:, None]))
-    for value in bar.y.ticks(5):
-        y = float(bar.y(value))
-        bar.parts.append(svg.words_at(bar.x.end + 5, y + 4, f'{in_digits(value)}″', 'start'))
-    return svg.chart([panel, bar], height)
-
-
-def _upright(panel: Panel, top: float) -> Scale:
-    return Scale(0.0, top, panel.y.end, panel.y.start)
+    for value in upright.ticks(_LEVELS):
+        name, y = f'{in_digits(value)}{unit}', float(upright(value))
+        bar.outside.append(svg.words(bar.x.end + 5, y + 4, name, 'start'))
+    return bar
 
 
 def _coloured(levels: NDArray[Any]) -> NDArray[np.uint8]:
@@ -249,43 +346,43 @@ def _viridis() -> NDArray[np.uint8]:
     return np.asarray(cv2.applyColorMap(shades, cv2.COLORMAP_VIRIDIS)[:, 0], np.uint8)
 
 
-def pointings(
-    observations: Sequence[StarObservations], geometry: CameraGeometry
-) -> tuple[Markup, int]:
+def pointings(observations: Sequence[StarObservations], geometry: CameraGeometry) -> Chart | None:
     """
-    Footprints of the images on the whole sky, and their number.
+    Footprints of the images on the whole sky; None without an image that has an attitude.
 
     A Hammer projection of the ICRS, right ascension 0 in the middle and increasing to the left.
     Refused images that have an attitude are drawn too.
     """
     placed = [o for o in observations if not o.refusal or np.isfinite(o.attitude_gap_s)]
-    left, right, top, high = 8.0, svg.WIDTH - 8.0, 8.0, (svg.WIDTH - 16.0) / 2
+    if not placed:
+        return None
+    top, bottom = 8.0, 8.0 + (svg.WIDTH - 16.0) / 2
+    root2 = np.sqrt(2)
     panel = Panel(
-        Scale(-2 * np.sqrt(2), 2 * np.sqrt(2), left, right),
-        Scale(-np.sqrt(2), np.sqrt(2), top + high, top),
+        Scale(-2 * root2, 2 * root2, 8.0, svg.WIDTH - 8.0), Scale(-root2, root2, bottom, top)
     )
     _draw_graticule(panel)
     camera = geometry.camera
-    edge = np.linspace(-0.5, 0.5, 9)
-    border = np.concatenate(
-        [np.c_[edge, edge * 0 - 0.5], np.c_[edge * 0 + 0.5, edge],
-         np.c_[edge[::-1], edge * 0 + 0.5], np.c_[edge * 0 - 0.5, edge[::-1]]]
-    )  # fmt: skip
-    size = np.array([camera.width, camera.height])
-    in_camera = line_of_sight(camera, (border + 0.5) * size - 0.5)
+    edge, end = np.linspace(-0.5, 0.5, 9), np.full(9, 0.5)
+    sides = [(edge, -end), (end, edge), (edge[::-1], end), (-end, edge[::-1])]
+    border = np.concatenate([np.stack(side, axis=-1) for side in sides])
+    in_camera = line_of_sight(camera, (border + 0.5) * [camera.width, camera.height] - 0.5)
     in_tracker = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).apply(in_camera)
     every = -(-len(placed) // _FOOTPRINTS) or 1
     for one in placed[::every]:
-        on_sky = Rotation.from_quat(one.icrf_from_star_tracker_xyzw).apply(in_tracker)
-        x, y = hammer(on_sky)
+        x, y = hammer(Rotation.from_quat(one.icrf_from_star_tracker_xyzw).apply(in_tracker))
         # Across the edge of the map a line would run through all of it.
         x = np.where(np.abs(np.diff(x, prepend=x[:1])) > 2.0, np.nan, x)
-        panel.line(x, y, SERIES[1] if one.refusal else SERIES[0], 1.2)
-    below = Panel(panel.x, Scale(0.0, 1.0, top + high + 32.0, top + high + 6.0))
-    below.legend(('used', SERIES[0], 'line'), is_left=True)
+        panel.curve(Curve(x, y, SERIES[1 if one.refusal else 0], width=1.2))
+    below = Panel(panel.x, Scale(0.0, 1.0, bottom + 32.0, bottom + 6.0))
+    below.legend([Curve([], [], SERIES[0], 'used')], is_left=True)
     if any(one.refusal for one in placed):
-        below.legend(('refused', SERIES[1], 'line'))
-    return svg.chart([panel, below], top + high + 32.0), len(placed)
+        below.legend([Curve([], [], SERIES[1], 'refused')])
+    text = (
+        f'Footprints of {len(placed)} images on the whole sky (ICRS, Hammer projection, right '
+        'ascension to the left).'
+    )
+    return Chart('Pointings', panel.drawing(bottom + 32.0, below), text)
 
 
 def hammer(directions: Floats) -> tuple[Floats, Floats]:
@@ -299,19 +396,47 @@ def hammer(directions: Floats) -> tuple[Floats, Floats]:
 def _draw_graticule(panel: Panel) -> None:
     along = np.linspace(-np.pi, np.pi, 73, dtype=np.float64)
     for hours in range(-12, 13, 3):
-        longitude, latitude = np.radians(15.0 * hours * 0.99999), along / 2
-        panel.line(*_lines(longitude, latitude), GRID, 1.0)
+        x, y = _projected(np.radians(15.0 * hours * 0.99999), along / 2)
+        panel.curve(Curve(x, y, GRID, width=1.0))
         if hours % 6 == 0 and abs(hours) < 12:
-            place = _lines(longitude, np.zeros(1))
-            panel.text(place[0][0], place[1][0], f'{hours % 24} h', colour=MUTED)
+            panel.text(x[36], y[36], f'{hours % 24} h', MUTED)
     for degrees in (-60, -30, 0, 30, 60):
-        panel.line(*_lines(along * 0.99999, np.radians(degrees)), GRID, 1.0)
+        x, y = _projected(along * 0.99999, np.radians(degrees))
+        panel.curve(Curve(x, y, GRID, width=1.0))
         if degrees:
-            place = _lines(np.zeros(1), np.radians(degrees))
-            panel.text(place[0][0], place[1][0], f'{in_digits(degrees)}°', colour=MUTED)
+            panel.text(x[36], y[36], f'{in_digits(degrees)}°', MUTED)
 
 
-def _lines(longitude: Floats | float, latitude: Floats | float) -> tuple[Floats, Floats]:
+def _projected(longitude: Floats | float, latitude: Floats | float) -> tuple[Floats, Floats]:
     longitude, latitude = np.broadcast_arrays(longitude, latitude)
     x, y = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude)
     return hammer(np.stack([x, y, np.sin(latitude)], axis=-1))
+
+
+def write_comparison(found: Comparison, path: Path) -> None:
+    """
+    Draw the difference of two calibrations over the detector, with and without common rotation.
+
+    Colours and arrows are in pixels; the title has the largest length, in sigmas too if estimated.
+
+    Raises OptionError for an ending that is not .svg. Raises ProductError when the file cannot be
+    written.
+    """
+    if path.suffix != '.svg':
+        raise OptionError(f'{path}: the name must end in .svg')
+    camera = found.a.geometry.camera
+    maps = [
+        _difference(camera, found.before, 'lines of sight, B minus A'),
+        _difference(camera, found.after, 'common rotation removed'),
+    ]
+    write_atomically(path, sheet([maps]).document())
+
+
+def _difference(camera: CameraModel, found: DifferenceMap, title: str) -> Drawing:
+    """Length in pixels as colours from zero, direction as arrows with a scale."""
+    known = found.sigmas[np.isfinite(found.sigmas)]
+    in_sigmas = f', {known.max():.2g} sigma' if known.size else ''
+    drawn = detector_map(
+        found.length_px[::2, ::2], camera, ' px', shift_px=found.difference_px[::2, ::2]
+    )
+    return sheet([[drawn]], f'{title}: at most {found.length_px.max():.3g} px{in_sigmas}')

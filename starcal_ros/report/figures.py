@@ -1,70 +1,66 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Figures of the report about residuals and terms, as SVG."""
+"""Figures of the report about residuals and terms."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+import functools
 import math
 
-from markupsafe import Markup
 import numpy as np
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.least_squares.normal_equations import whitening
-from starcal_ros.records import CameraGeometry, StarObservations, TermRemoval
-from starcal_ros.report import svg
+from starcal_ros.estimation.star_equations import whitening
+from starcal_ros.records import CameraGeometry, SigmaPart, StarObservations, TermRemoval
 from starcal_ros.report.pictures.annotation import predicted_px
-from starcal_ros.report.svg import INK, MUTED, Panel, Scale, SERIES
+from starcal_ros.report.plots import plot
+from starcal_ros.report.svg import Chart, Curve, Drawing, INK, MUTED, Panel, SERIES, sheet
 
-_LEFT, _RIGHT, _TOP, _BELOW = 62.0, 468.0, 10.0, 42.0
-_HEIGHT = 340.0
 _LEAST_IN_BIN = 10
 _WAVES = 16  # highest spatial frequency of the spectrum, waves over the longer side
 
 
-def _panel(x: tuple[float, float], y: tuple[float, float], is_log: bool = False) -> Panel:
-    return Panel(Scale(*x, _LEFT, _RIGHT), Scale(*y, _HEIGHT - _BELOW, _TOP, is_log))
-
-
-def residuals_of_images(residuals: Residuals) -> Markup:
+def residuals_of_images(residuals: Residuals) -> Chart:
     """RMS residual of the used stars of each image, in time order."""
     rms = residuals.image_rms_px()
     number = np.arange(1, len(rms) + 1)
     stars = np.bincount(residuals.image[residuals.used], minlength=len(rms))
-    top = 1.15 * float(np.nanmax(rms, initial=0.0)) or 1.0
-    panel = _panel((0.5 - 0.02 * len(rms), len(rms) + 0.5 + 0.02 * len(rms)), (0.0, top))
-    panel.axes('image', 'residual, rms per axis (px)')
     titles = [
         f'image {n}: {r:.4f} px rms, {s} stars' for n, r, s in zip(number, rms, stars, strict=True)
     ]
-    panel.marks(number, rms, SERIES[0], titles=titles)
-    return svg.chart([panel], _HEIGHT)
-
-
-def histogram(residuals: Residuals) -> Markup:
-    """Normalised residuals and the normal distribution (paper, Fig. 7)."""
-    edges = np.linspace(-5, 5, 51)
-    x = np.linspace(-5, 5, 201)
-    normal = np.exp(-0.5 * x**2) / math.sqrt(2 * math.pi)
-    counted = []
-    for values in whitened_residuals(residuals):
-        density, _ = np.histogram(np.clip(values, -4.999, 4.999), edges, density=True)
-        counted.append((density, float(values.std())))
-    top = 1.1 * max(0.4, *(float(density.max()) for density, _ in counted))
-    panel = _panel((-5.0, 5.0), (0.0, top))
-    panel.axes('normalised residual (sigma)', 'density')
-    for (density, _), colour in zip(counted, SERIES, strict=False):
-        panel.line(np.repeat(edges, 2)[1:-1], np.repeat(density, 2), colour)
-    panel.line(x, normal, INK, 1.0, '5 3')
-    panel.legend(
-        *((f'{axis}: std {std:.2f}', colour, 'line')
-          for axis, (_, std), colour in zip('uv', counted, SERIES, strict=False)),
-        ('normal', INK, 'dash'),
+    return Chart(
+        'Residuals per image',
+        plot([Curve(number, rms, SERIES[0], mark='circle', width=0, titles=titles)],
+             'image', 'residual, rms per axis (px)', y=(0.0, None)),
+        f'RMS per axis of each image: {np.nanmin(rms):.3f} to {np.nanmax(rms):.3f} px. A high '
+        'value indicates smear or misidentified stars.',
     )  # fmt: skip
-    return svg.chart([panel], _HEIGHT)
+
+
+def outline(values: Floats, edges: Floats, colour: str, name: str, width: float = 1.5) -> Curve:
+    """Histogram of a density, as the outline of its bars; values outside are in the end bins."""
+    density, _ = np.histogram(np.clip(values, *edges[[0, -1]]), edges, density=True)
+    return Curve(np.repeat(edges, 2)[1:-1], np.repeat(density, 2), colour, name, width=width)
+
+
+def histogram(residuals: Residuals) -> Chart:
+    """Normalised residuals and the normal distribution (paper, Fig. 7)."""
+    edges, x = np.linspace(-5, 5, 51, dtype=np.float64), np.linspace(-5, 5, 201)
+    curves = [
+        outline(values, edges, colour, f'{axis}: std {values.std():.2f}')
+        for values, colour, axis in zip(whitened_residuals(residuals), SERIES, 'uv', strict=False)
+    ]
+    normal = np.exp(-0.5 * x**2) / math.sqrt(2 * math.pi)
+    curves.append(Curve(x, normal, INK, 'normal', width=1.0, dash='5 3'))
+    return Chart(
+        'Normalised residuals',
+        plot(curves, 'normalised residual (sigma)', 'density', x=(-5.0, 5.0), y=(0.0, None)),
+        'Each residual divided by its sigma. A standard deviation near 1 confirms the sigmas; '
+        'outliers are left out, which truncates the tails.',
+    )
 
 
 def whitened_residuals(residuals: Residuals) -> tuple[Floats, Floats]:
@@ -77,48 +73,49 @@ def whitened_residuals(residuals: Residuals) -> tuple[Floats, Floats]:
 
 def before_and_after(
     residuals: Residuals, observations: Sequence[StarObservations], prior: CameraGeometry
-) -> Markup:
+) -> Chart | None:
     """Share of the stars within a distance of their prediction, by the prior and now; log axis."""
-    before_px = np.concatenate(
-        [
-            np.hypot(*(image.measured_px - predicted_px(image, prior)).T)
-            for image in observations
-            if not image.refusal
-        ]
-        or [np.empty(0)]
-    )
-    after_px = np.hypot(*residuals.residual_px[residuals.used].T)
-    before_px, after_px = np.sort(before_px[np.isfinite(before_px)]), np.sort(after_px)
+    before = [
+        np.hypot(*(image.measured_px - predicted_px(image, prior)).T)
+        for image in observations
+        if not image.refusal
+    ]
+    before_px = np.concatenate(before or [np.empty(0)])
+    before_px = np.sort(before_px[np.isfinite(before_px)])
+    after_px = np.sort(np.hypot(*residuals.residual_px[residuals.used].T))
     if not (len(before_px) and len(after_px)):
-        return Markup()
+        return None
     low = max(1e-4, float(np.quantile(after_px, 0.02)))
-    high = max(2.0 * low, 1.2 * float(before_px[-1]), 1.2 * float(after_px[-1]))
-    panel = Panel(
-        Scale(low, high, _LEFT, _RIGHT, is_log=True), Scale(0.0, 100.0, _HEIGHT - _BELOW, _TOP)
-    )
-    panel.axes('distance from the prediction (px)', 'stars within it (%)')
-    for values, colour in ((before_px, SERIES[1]), (after_px, SERIES[0])):
+    curves = []
+    for name, values, colour in (('prior', before_px, SERIES[1]),
+                                 ('calibrated', after_px, SERIES[0])):  # fmt: skip
         at = np.linspace(0, len(values) - 1, min(len(values), 200)).astype(int)
-        panel.line(np.maximum(values[at], low), 100.0 * (at + 1) / len(values), colour, 1.8)
-    panel.legend(
-        (f'prior: median {np.median(before_px):.3g} px', SERIES[1], 'line'),
-        (f'calibrated: median {np.median(after_px):.3g} px', SERIES[0], 'line'),
-        is_left=True,
-    )
-    return svg.chart([panel], _HEIGHT)
+        share = 100.0 * (at + 1) / len(values)
+        name = f'{name}: median {np.median(values):.3g} px'
+        curves.append(Curve(np.maximum(values[at], low), share, colour, name, width=1.8))
+    return Chart(
+        'Residuals before and after',
+        plot(curves, 'distance from the prediction (px)', 'stars within it (%)', x=(low, None),
+             y=(0.0, 100.0), log='x', is_left=True),
+        'Distance of the stars from their prediction: by the attitude that the star tracker '
+        'reported and the prior, and after the calibration.',
+    )  # fmt: skip
 
 
-def spectrum(residuals: Residuals, camera: CameraModel) -> Markup:
+def spectrum(residuals: Residuals, camera: CameraModel) -> Chart:
     """Amplitude of waves in the residuals over the detector, with that of independent noise."""
     waves, amplitude_px, noise_px = wave_amplitudes(residuals, camera)
-    top = 1.3 * max(float(amplitude_px.max()), noise_px)
-    panel = _panel((0.5, _WAVES + 0.5), (0.0, top or 1.0))
-    panel.axes('waves over the longer side of the detector', 'amplitude, rms (px)')
-    panel.line(waves, amplitude_px, SERIES[0])
-    panel.marks(waves, amplitude_px, SERIES[0])
-    panel.line(np.array([0.5, _WAVES + 0.5]), np.full(2, noise_px), INK, 1.2, '5 3')
-    panel.legend(('measured', SERIES[0], 'circle'), ('independent noise', INK, 'dash'))
-    return svg.chart([panel], _HEIGHT)
+    curves = [
+        Curve(waves, amplitude_px, SERIES[0], 'measured', 'circle'),
+        Curve(waves[[0, -1]], [noise_px, noise_px], INK, 'independent noise', dash='5 3'),
+    ]
+    return Chart(
+        'Spectrum of the residuals',
+        plot(curves, 'waves over the longer side of the detector', 'amplitude, rms (px)',
+             y=(0.0, None)),
+        'Waves that are left in the residuals over the detector. Amplitudes over the line of '
+        'independent noise indicate a pattern that neither lens model nor field describes.',
+    )  # fmt: skip
 
 
 def wave_amplitudes(residuals: Residuals, camera: CameraModel) -> tuple[Floats, Floats, float]:
@@ -146,32 +143,34 @@ def wave_amplitudes(residuals: Residuals, camera: CameraModel) -> tuple[Floats, 
     return waves.astype(float), 2.0 / count * np.sqrt(mean[waves]), noise_px
 
 
-def residuals_against_magnitude(residuals: Residuals) -> Markup:
+def residuals_against_magnitude(residuals: Residuals) -> Chart | None:
     """Residuals against V magnitude, with the RMS in bins and the expected sigma."""
     used = residuals.used & np.isfinite(residuals.magnitude)
     V, r = residuals.magnitude[used], residuals.residual_px[used]
     if not len(V):
-        return Markup()
+        return None
     # All per axis, so that points, measured RMS and expected sigma are comparable.
     length_px = np.sqrt((r**2).mean(axis=1))
-    sigma_px = np.sqrt(residuals.covariance_px2[used][:, [0, 2]].mean(axis=1))
-    edges = np.arange(np.floor(2 * V.min()) / 2, V.max() + 0.5, 0.5)
-    panel = _panel(
-        (float(edges[0]), float(max(edges[-1], edges[0] + 0.5))),
-        (0.0, 1.15 * float(np.percentile(length_px, 99.5)) + 1e-6),
+    variance_px2 = residuals.covariance_px2[used][:, [0, 2]].mean(axis=1)
+    first = float(np.floor(2 * V.min()) / 2)
+    edges = np.arange(first, max(V.max(), first + 0.5) + 0.5, 0.5)
+    centre, measured_px2 = _in_bins(np.r_[V, V], r.T.ravel() ** 2, edges)[:2]
+    at, expected_px2 = _in_bins(V, variance_px2, edges)[:2]
+    curves = [
+        Curve(centre, np.sqrt(measured_px2), SERIES[1], 'measured rms', 'circle'),
+        Curve(at, np.sqrt(expected_px2), INK, 'expected 1-sigma', width=1.4, dash='5 3'),
+    ]
+    top = 1.15 * float(np.percentile(length_px, 99.5)) + 1e-6
+    drawn = plot(
+        curves, 'magnitude V', 'residual, rms of u and v (px)', x=(first, float(edges[-1])),
+        y=(0.0, top), is_left=True,
+        under=lambda panel: panel.cloud(np.c_[V, length_px], 1.0, 0.35),
+    )  # fmt: skip
+    return Chart(
+        'Residuals against magnitude',
+        drawn,
+        'Dots: single stars. Measured and expected noise agree where the two lines coincide.',
     )
-    panel.cloud(V, length_px, 1.0, 0.35)
-    panel.axes('magnitude V', 'residual, rms of u and v (px)')
-    if len(edges) > 1:
-        centre, measured_px = _in_bins(np.r_[V, V], r.T.ravel() ** 2, edges)[:2]
-        panel.line(centre, np.sqrt(measured_px), SERIES[1])
-        panel.marks(centre, np.sqrt(measured_px), SERIES[1])
-        centre, expected_px = _in_bins(V, sigma_px**2, edges)[:2]
-        panel.line(centre, np.sqrt(expected_px), INK, 1.4, '5 3')
-    panel.legend(
-        ('measured rms', SERIES[1], 'circle'), ('expected 1-sigma', INK, 'dash'), is_left=True
-    )
-    return svg.chart([panel], _HEIGHT)
 
 
 def _in_bins(x: Floats, values: Floats, edges: Floats) -> tuple[Floats, Floats, Floats]:
@@ -187,106 +186,145 @@ def _in_bins(x: Floats, values: Floats, edges: Floats) -> tuple[Floats, Floats, 
     return 0.5 * (edges[1:] + edges[:-1])[enough], mean, error
 
 
-def _means(x: Iterable[Floats], y: Iterable[Floats], edges: Floats, label: str,
-           names: Sequence[str]) -> Markup:  # fmt: skip
-    """Means of u and v with their standard errors in bins, about zero."""
-    found = [_in_bins(a, b, edges) for a, b in zip(x, y, strict=True)]
-    reach = [np.abs(mean) + error for _, mean, error in found]
-    top = float(max([r.max() for r in reach if len(r)], default=0.0)) or 1.0
-    panel = _panel((float(edges[0]), float(edges[-1])), (-1.1 * top, 1.45 * top))
-    panel.axes(label, 'mean residual (px), 1-sigma bars')
-    panel.line(np.array([edges[0], edges[-1]]), np.zeros(2), MUTED, 0.8)
-    step = edges[1] - edges[0]
-    for side, (centre, mean, error) in enumerate(found):
-        at = centre + (side - 0.5) * 0.12 * step
-        panel.bars(at, mean, error, SERIES[side])
-        panel.marks(at, mean, SERIES[side], ('circle', 'square')[side])
-    panel.legend(*zip(names, SERIES[:2], ('circle', 'square'), strict=True))
-    return svg.chart([panel], _HEIGHT)
+def _means(x: Sequence[Floats], y: Floats, edges: Floats, label: str,
+           names: Sequence[str]) -> Drawing:  # fmt: skip
+    """Means of u and v, y (2, n), with their standard errors in bins of x, about zero."""
+    curves = [Curve(edges[[0, -1]], [0.0, 0.0], MUTED, width=0.8)]
+    for side, mark in enumerate(('circle', 'square')):
+        centre, mean, error = _in_bins(x[side], y[side], edges)
+        at = centre + (side - 0.5) * 0.12 * (edges[1] - edges[0])
+        curves.append(Curve(at, mean, SERIES[side], names[side], mark, width=0, sigma=error))
+    ends = float(edges[0]), float(edges[-1])
+    return plot(curves, label, 'mean residual (px), 1-sigma bars', x=ends)
 
 
-def residuals_against_colour(residuals: Residuals) -> Markup:
-    """Mean residual against BP - RP, which shows lateral colour; '' if too few colours."""
+def residuals_against_colour(residuals: Residuals) -> Chart | None:
+    """Mean residual against BP - RP, which shows lateral colour; None if too few colours."""
     used = residuals.used & np.isfinite(residuals.colour_bp_rp)
     if np.count_nonzero(used) < 30:
-        return Markup()
+        return None
     colour = residuals.colour_bp_rp[used]
     low, high = np.percentile(colour, [1.0, 99.0]).tolist()
     if not high > low:
-        return Markup()
-    edges = np.linspace(low, high, 9, dtype=np.float64)
-    residual_px = residuals.residual_px[used].T
-    return _means([colour, colour], residual_px, edges, 'colour BP \N{MINUS SIGN} RP (mag)', 'uv')
+        return None
+    edges, residual_px = np.linspace(low, high, 9, dtype=np.float64), residuals.residual_px[used].T
+    return Chart(
+        'Residuals against star colour',
+        _means([colour, colour], residual_px, edges, 'colour BP \N{MINUS SIGN} RP (mag)', 'uv'),
+        'A trend indicates lateral colour of the lens, which displaces red from blue stars.',
+    )
 
 
-def residuals_against_pixel_phase(residuals: Residuals) -> Markup:
+def residuals_against_pixel_phase(residuals: Residuals) -> Chart:
     """Mean residual in u and v against the position of the centroid within its pixel."""
     place = residuals.measured_px[residuals.used].T
     edges = np.linspace(-0.5, 0.5, 11, dtype=np.float64)
+    residual_px, label = residuals.residual_px[residuals.used].T, 'position within the pixel (px)'
     names = [f'{letter} against {letter}' for letter in 'uv']
-    label = 'centroid position within its pixel (px)'
-    residual_px = residuals.residual_px[residuals.used].T
-    return _means(place - np.rint(place), residual_px, edges, label, names)
+    return Chart(
+        'Residuals against pixel phase',
+        _means([*(place - np.rint(place))], residual_px, edges, f'centroid {label}', names),
+        'A wave indicates a centroid error: the star model does not fit.',
+    )
 
 
-def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Markup:
+def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Chart:
     """Star tracker error of each image from its stars, about the three tracker axes."""
     minutes = (residuals.image_time_ns - residuals.image_time_ns.min()) / (
         60.0 * NANOSECONDS_PER_SECOND
     )
-    last, high = float(minutes.max()) or 1.0, 112.0
     misfit = residuals.image_misfit
     panels = []
     for k, axis in enumerate('xyz'):
-        error, sigma = residuals.attitude_error_arcsec[:, k], residuals.attitude_sigma_arcsec[:, k]
-        top = max(float(np.nanmax(np.abs(error[~misfit]), initial=0.0)), sigma_arcsec[k]) * 1.25
-        upper = _TOP + k * (high + 14)
-        panel = Panel(
-            Scale(-0.03 * last, 1.03 * last, _LEFT, _RIGHT),
-            Scale(-top or -1.0, top or 1.0, upper + high, upper),
-        )
-        label = 'time since the first image (min)' if axis == 'z' else ''
-        panel.band(-sigma_arcsec[k], sigma_arcsec[k])
-        panel.axes(label, f'{axis} (arcsec)', most=4)
-        panel.bars(minutes, error, sigma, SERIES[0])
-        panel.marks(minutes[~misfit], error[~misfit], SERIES[0])
-        panel.marks(minutes[misfit], error[misfit], SERIES[1], 'cross', 4.0)
-        panels.append(panel)
-    return svg.chart(panels, _TOP + 3 * high + 28 + _BELOW)
+        error, sigma = residuals.attitude_error_arcsec[:, k], sigma_arcsec[k]
+        fitting = np.where(misfit, np.nan, error)
+        top = 1.25 * max(float(np.nanmax(np.abs(fitting), initial=0.0)), sigma) or 1.0
+        curves = [
+            Curve(minutes, fitting, SERIES[0], mark='circle', width=0,
+                  sigma=residuals.attitude_sigma_arcsec[:, k]),
+            Curve(minutes, np.where(misfit, error, np.nan), SERIES[1], mark='cross', width=0),
+        ]  # fmt: skip
+        panels.append(
+            plot(curves, 'time since the first image (min)' * (axis == 'z'), f'{axis} (arcsec)',
+                 y=(-top, top), height=128.0 + 36.0 * (axis == 'z'),
+                 under=functools.partial(Panel.band, low=-sigma, high=sigma))
+        )  # fmt: skip
+    return Chart(
+        'Star tracker errors per image',
+        sheet([[panel] for panel in panels]),
+        'Difference between reported attitude and stars about the star tracker axes, at the '
+        'common alignment; the band is the assumed 1-sigma. A drift indicates a moving mount; '
+        'a cross is an image whose attitude does not fit and was not used.',
+    )
 
 
-def term_worth(removals: Sequence[TermRemoval]) -> Markup:
+def sigma_budget(parts: Sequence[SigmaPart]) -> Chart:
+    """Share of the variance by cause as horizontal bars; the first part is the total."""
+    total, causes = parts[0], parts[1:]
+    curves = []
+    for k, part in enumerate(causes):
+        for name, colour, sigma, whole, shift in (
+            ('camera alone', SERIES[0], part.map_arcsec, total.map_arcsec, -0.14),
+            ('with alignment', SERIES[1], part.pointing_arcsec, total.pointing_arcsec, 0.14),
+        ):
+            end = 100.0 * (sigma / whole) ** 2
+            at = -k - shift
+            curves.append(Curve([0.0, end], [at, at], colour, '' if k else name, width=8.0))
+    names = [(-float(k), part.cause) for k, part in enumerate(causes)]
+    height = max(340.0, 100.0 + 34.0 * len(causes))
+    return Chart(
+        'Causes of the uncertainty',
+        plot(curves, 'share of the variance (%)', '', x=(0.0, 100.0), y=(0.5 - len(causes), 1.2),
+             y_ticks=names, height=height),
+        'Share of the variance of a line of sight, over the detector, that would be gone if '
+        'the cause were known exactly.',
+    )  # fmt: skip
+
+
+def term_worth(removals: Sequence[TermRemoval]) -> Chart:
     """Residuals and map as terms are removed one after the other (paper, Fig. 8)."""
-    steps = np.arange(len(removals), dtype=float)
-    std_px = np.array([removal.residual_std_px for removal in removals])
-    change_px = np.array([removal.map_change_px for removal in removals])
-    change_px[0] = np.nan  # no term was removed: no change
-    positive = np.concatenate([std_px.ravel(), change_px])
-    positive = positive[np.isfinite(positive) & (positive > 0)]
-    low, high = (positive.min() / 1.5, positive.max() * 4) if len(positive) else (0.1, 1.0)
-    panel = Panel(
-        Scale(-0.5, len(removals) - 0.5, _LEFT, _RIGHT),
-        Scale(float(low), float(high), _HEIGHT - _BELOW - 20, _TOP, is_log=True),
+    negligible = [removal.negligible for removal in removals]
+    names = ['none', *(f'\N{MINUS SIGN}{removal.removed}' for removal in removals[1:])]
+    insignificant = [r.removed for r in removals[1:] if r.negligible]
+    last = max((k for k, one in enumerate(negligible) if one), default=0)
+    drawn = removal_curves(
+        np.array([removal.residual_std_px for removal in removals]),
+        np.array([removal.map_change_px for removal in removals]),
+        names,
+        last,
     )
-    negligible = [k for k, removal in enumerate(removals) if removal.negligible]
-    if len(negligible) > 1:
-        panel.band(-0.5, max(negligible) + 0.5, is_vertical=True)
-    panel.axes('', 'px')
-    for k, removal in enumerate(removals):
-        name = f'\N{MINUS SIGN}{removal.removed}' if k else 'none'
-        x, y = float(panel.x(float(k))), panel.y.start + 14
-        panel.parts.append(
-            f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="end" fill="{INK}"'
-            f' transform="rotate(-45 {x:.1f} {y:.1f})">{Markup.escape(name)}</text>'
-        )
-    panel.parts.append(svg.words_at((_LEFT + _RIGHT) / 2, _HEIGHT - 5, 'removed, one by one'))
-    curves = (
-        (std_px[:, 0], 'residual, std of u', SERIES[0], 'circle'),
-        (std_px[:, 1], 'residual, std of v', SERIES[1], 'square'),
-        (change_px, 'change of the map, rms', SERIES[2], 'triangle'),
+    return Chart(
+        'Significance of each term',
+        drawn,
+        'Terms removed one after another, the least significant first, with all others '
+        f'estimated again. Not significant (shaded): {", ".join(insignificant) or "none"}.',
     )
-    for values, _, colour, shape in curves:
-        panel.line(steps, np.where(values > 0, values, np.nan), colour)
-        panel.marks(steps, np.where(values > 0, values, np.nan), colour, shape)
-    panel.legend(*((label, colour, shape) for _, label, colour, shape in curves), is_left=True)
-    return svg.chart([panel], _HEIGHT)
+
+
+def removal_curves(
+    std_px: Floats, map_change_px: Floats, names: Sequence[str], insignificant: int = 0
+) -> Drawing:
+    """
+    Residuals and change of the map after each removal of a term.
+
+    ``std_px`` (n, 2) are the standard deviations of the residuals along u and v, first with all
+    terms; ``map_change_px`` (n,) the RMS change of the distortion map, of which the first is not
+    shown; ``names`` (n,) the terms.  Up to the removal ``insignificant`` the background is shaded.
+    """
+    steps = np.arange(len(names), dtype=float)
+    values = np.c_[std_px, np.r_[np.nan, map_change_px[1:]]].T
+    labels = ('residual, std of u', 'residual, std of v', 'change of the map, rms')
+    marks = ('circle', 'square', 'triangle')
+    curves = [
+        Curve(steps, np.where(one > 0, one, np.nan), colour, label, mark)
+        for one, label, colour, mark in zip(values, labels, SERIES, marks, strict=True)
+    ]
+
+    def shade(panel: Panel) -> None:
+        if insignificant:
+            panel.band(-0.5, insignificant + 0.5, is_vertical=True)
+
+    ends = -0.5, len(names) - 0.5
+    ticks = list(zip(steps.tolist(), names, strict=True))
+    return plot(curves, 'removed, one by one', 'px', x=ends, log='y', x_ticks=ticks,
+                is_left=True, under=shade)  # fmt: skip

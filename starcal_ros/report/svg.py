@@ -1,22 +1,22 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Charts as SVG text.
+Drawings as SVG text.
 
 Colours are variables of report.css, so one drawing serves light, dark and print; letters are those
-of the page.  Lengths are in units of the view box, `WIDTH` across a chart, y down.
+of the page.  Lengths are in units of the view box, `WIDTH` across a drawing, y down.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 import html
 import math
+from pathlib import Path
 import re
 
 import cv2
-from markupsafe import Markup
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -24,21 +24,79 @@ from starcal_ros.arrays import Floats
 
 WIDTH = 480.0
 LETTER = 12.4  # at least 9 px on a screen of 400 px
-INK, MUTED, GRID, PAPER, BAD = (
-    f'var(--{name})' for name in ('ink', 'muted', 'grid', 'paper', 'bad')
-)
+INK, MUTED, GRID, PAPER = (f'var(--{name})' for name in ('ink', 'muted', 'grid', 'paper'))
 SERIES = tuple(f'var(--series-{k})' for k in (1, 2, 3))
 
+CHARACTER = 0.6 * LETTER  # width
 _POINTS_BGR = (212, 139, 61)  # of clouds, which are bitmaps: readable on white and on black
-_TICK_CHARACTERS = 5  # beside the axis; more reach its label
-_UNIT = re.compile(r'\(([^\s()]+)\)')
 _PER_UNIT = 2  # pixels of a bitmap
 _MARKS = {
     'circle': 'M{r},0A{r},{r} 0 1 1 -{r},0A{r},{r} 0 1 1 {r},0Z',
     'square': 'M-{r},-{r}H{r}V{r}H-{r}Z',
     'triangle': 'M0,-{r}L{r},{r}H-{r}Z',
     'cross': 'M-{r},-{r}L{r},{r}M-{r},{r}L{r},-{r}',
+    'ring': 'M{r},0A{r},{r} 0 1 1 -{r},0A{r},{r} 0 1 1 {r},0Z',
 }
+_OPEN = ('cross', 'ring')
+_PALETTE = re.compile(r':root \{(.*?)\}', re.DOTALL)
+_VARIABLE = re.compile(r'--([\w-]+): (#[0-9a-f]+)')
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Elements of SVG in a view box of a height."""
+
+    body: str
+    height: float
+    width: float = WIDTH
+
+    def __html__(self) -> str:
+        """SVG element in a page; hidden from screen readers, which get a caption."""
+        return (
+            f'<svg viewBox="0 0 {self.width:g} {self.height:g}" aria-hidden="true"'
+            f' font-size="{LETTER:g}" fill="{INK}">{self.body}</svg>'
+        )
+
+    def document(self) -> str:
+        """Text of an SVG file: the light palette on paper."""
+        size = f'{self.width:g} {self.height:g}'
+        wide, high = size.split()
+        return light(
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{wide}" height="{high}"'
+            f' viewBox="0 0 {size}" font-family="DejaVu Sans, Arial, sans-serif"'
+            f' font-size="{LETTER:g}" fill="{INK}"><rect width="{wide}" height="{high}"'
+            f' fill="{PAPER}"/>{self.body}</svg>\n'
+        )
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A drawing with title and caption; the caption also describes it to screen readers."""
+
+    title: str
+    svg: Drawing
+    text: str
+
+
+@dataclass(frozen=True)
+class Curve:
+    """
+    Points (n,) of a plot: joined by a line of a width unless 0, marked if it has a mark.
+
+    With a name it is in the legend.  ``sigma`` (n,) is drawn as bars; ``titles`` (n,) are shown by
+    a browser on hover.
+    """
+
+    x: ArrayLike
+    y: ArrayLike
+    colour: str = INK
+    name: str = ''
+    mark: str = ''
+    width: float = 1.5
+    dash: str = ''
+    size: float = 3.2
+    sigma: Floats | None = None
+    titles: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -59,12 +117,16 @@ class Scale:
             x, low, high = np.log10(np.maximum(x, 1e-300)), math.log10(low), math.log10(high)
         return np.asarray(self.start + (x - low) / (high - low) * (self.end - self.start))
 
-    def ticks(self, most: int) -> list[float]:
+    def ticks(self, most: int = 6) -> list[float]:
         """Round values within the scale."""
         if self.is_log:
-            powers = range(math.ceil(math.log10(self.low)), math.floor(math.log10(self.high)) + 1)
-            every = -(-len(powers) // most)
-            return [10.0**power for power in powers[::every]]
+            first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
+            for digits in ((1.0, 2.0, 5.0), (1.0,)):
+                values = [k * 10.0**power for power in range(first, last + 1) for k in digits]
+                values = [x for x in values if self.low <= x <= self.high]
+                if len(values) <= most:
+                    return values
+            return values[:: -(-len(values) // most)]
         step = round_step((self.high - self.low) / most)
         first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
         return [k * step for k in range(first, last + 1)]
@@ -81,121 +143,133 @@ def in_digits(value: float) -> str:
     return f'{0.0 if abs(value) < 1e-12 else value:.6g}'.replace('-', '\N{MINUS SIGN}')
 
 
-def chart(panels: Iterable[Panel], height: float) -> Markup:
-    """SVG element of panels below each other; hidden from screen readers, which get a caption."""
-    # Safe as markup: all text in it has been escaped.
-    return Markup(
-        f'<svg viewBox="0 0 {WIDTH:g} {height:g}" aria-hidden="true" font-size="{LETTER:g}"'
-        f' fill="{INK}">{"".join(part for panel in panels for part in panel.parts)}</svg>'
-    )
+def named(scale: Scale, most: int = 6) -> list[tuple[float, str]]:
+    """Round values within a scale and their names."""
+    return [(value, in_digits(value)) for value in scale.ticks(most)]
+
+
+def light(text: str) -> str:
+    """Text with the colours of the light palette in place of the variables of its drawings."""
+    css = (Path(__file__).parent / 'templates' / 'report.css').read_text()
+    found = _PALETTE.search(css)
+    palette = dict(_VARIABLE.findall(found[1])) if found else {}
+    return re.sub(r'(?<=")var\(--([\w-]+)\)(?=")', lambda name: palette[name[1]], text)
+
+
+def sheet(rows: Sequence[Sequence[Drawing]], title: str = '') -> Drawing:
+    """Drawings beside and below each other as one, under a title."""
+    top, parts = (26.0 if title else 0.0), [words(8, 18, title, 'start')]
+    for row in rows:
+        left = 0.0
+        for one in row:
+            parts.append(
+                f'<svg x="{left:g}" y="{top:g}" width="{one.width:g}" height="{one.height:g}"'
+                f' viewBox="0 0 {one.width:g} {one.height:g}">{one.body}</svg>'
+            )
+            left += one.width
+        top += max(one.height for one in row)
+    width = max(sum(one.width for one in row) for row in rows)
+    return Drawing(''.join(parts), top, width)
 
 
 class Panel:
-    """A rectangle of a chart with two scales; its methods draw in the units of its data."""
+    """A rectangle of a drawing with two scales; its methods draw in the units of its data."""
 
     def __init__(self, x: Scale, y: Scale) -> None:
         self.x, self.y = x, y
-        self.parts: list[str] = []
+        self.grid: list[str] = []
+        self.inside: list[str] = []  # shown within the panel alone
+        self.outside: list[str] = []
         self._left, self._right = sorted((x.start, x.end))
         self._top, self._bottom = sorted((y.start, y.end))
+
+    def drawing(self, height: float, *others: Panel) -> Drawing:
+        """The drawing of a panel and of others beside it."""
+        return Drawing(''.join(panel._elements() for panel in (self, *others)), height)
+
+    def _elements(self) -> str:
+        left, top = self._left - 4, self._top - 4  # marks on an end are whole
+        size = f'{self._right - left + 4:.1f} {self._bottom - top + 4:.1f}'
+        wide, high = size.split()
+        clipped = (
+            f'<svg x="{left:.1f}" y="{top:.1f}" width="{wide}" height="{high}"'
+            f' viewBox="{left:.1f} {top:.1f} {size}">{"".join(self.inside)}</svg>'
+        )
+        return f'{"".join(self.grid)}{clipped}{"".join(self.outside)}'
 
     def axes(
         self,
         x_label: str,
         y_label: str,
+        x_ticks: Sequence[tuple[float, str]],
+        y_ticks: Sequence[tuple[float, str]],
         is_framed: bool = False,
-        most: int = 6,
-        x_ticks: Sequence[tuple[float, str]] | None = None,
+        is_turned: bool = False,
     ) -> None:
-        """
-        Lines, ticks and labels of the axes; a grid unless framed.  Without a label no axis.
-
-        ``x_ticks`` are values and their names; None: round numbers.
-        """
-        draw = self.parts.append
+        """Ticks, values with their names, and labels of the axes; a grid unless framed."""
         left, right, top, bottom = self._left, self._right, self._top, self._bottom
-        if x_ticks is None:
-            x_ticks = [(value, in_digits(value)) for value in self.x.ticks(6) if x_label]
+        write, draw = self.outside.append, self.grid.append
         for value, name in x_ticks:
             x = float(self.x(value))
-            if not is_framed:
-                draw(_line(x, top, x, bottom, GRID, 0.7))
-            draw(_text(x, bottom + 15, name, 'middle'))
-        y_ticks = self.y.ticks(most) if y_label else []
-        names, y_label = _short(y_ticks, y_label)
-        for name, y in zip(names, self.y(np.array(y_ticks)), strict=True):
-            if not is_framed:
-                draw(_line(left, y, right, y, GRID, 0.7))
-            draw(_text(left - 6, y + 4, name, 'end'))
-        if is_framed:
-            draw(
-                f'<rect x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}"'
-                f' height="{bottom - top:.1f}" fill="none" stroke="{MUTED}" stroke-width=".8"/>'
-            )
-        else:
-            draw(_line(left, top, left, bottom, MUTED, 0.8))
-            draw(_line(left, bottom, right, bottom, MUTED, 0.8))
-        draw(_text((left + right) / 2, bottom + 32, x_label, 'middle'))
-        middle = (top + bottom) / 2
-        draw(_text(13, middle, y_label, 'middle', turn_deg=-90))
+            draw('' if is_framed else _line(x, top, x, bottom, GRID, 0.7))
+            write(words(x, bottom + 15, name, 'end' if is_turned else 'middle',
+                        turn_deg=-40.0 * is_turned))  # fmt: skip
+        for value, name in y_ticks:
+            y = float(self.y(value))
+            draw('' if is_framed else _line(left, y, right, y, GRID, 0.7))
+            write(words(left - 6, y + 4, name, 'end'))
+        frame = f'M{left:.1f},{top:.1f}V{bottom:.1f}H{right:.1f}'
+        frame += f'V{top:.1f}Z' if is_framed else ''
+        write(f'<path d="{frame}" fill="none" stroke="{MUTED}" stroke-width=".8"/>')
+        write(words((left + right) / 2, bottom + (58 if is_turned else 32), x_label))
+        write(words(13, (top + bottom) / 2, y_label, turn_deg=-90))
 
-    def line(
-        self, x: ArrayLike, y: ArrayLike, colour: str, width: float = 1.5, dash: str = ''
-    ) -> None:
-        """A line through points (n,); it is broken where a number is not finite."""
-        places = np.stack([self.x(x), self.y(y)], axis=-1)
-        steps, pen = [], 'M'
-        for u, v in places:
-            if not (math.isfinite(u) and math.isfinite(v)):
-                pen = 'M'
-                continue
-            steps.append(f'{pen}{u:.1f},{v:.1f}')
-            pen = 'L'
-        self._clipped(
-            f'<path d="{"".join(steps)}" fill="none" stroke="{colour}" stroke-width="{width:g}"'
-            f' stroke-dasharray="{dash}" stroke-linejoin="round"/>'
-        )
+    def curve(self, curve: Curve) -> None:
+        """Line, bars and marks of a curve; it is broken where a number is not finite."""
+        places = np.stack([self.x(curve.x), self.y(curve.y)], axis=-1)
+        if curve.sigma is not None:
+            y, sigma = np.asarray(curve.y), curve.sigma
+            ends = np.c_[places[:, 0], self.y(y - sigma), self.y(y + sigma)]
+            bars = [f'M{u:.1f},{a:.1f}V{b:.1f}M{u - 2:.1f},{a:.1f}h4M{u - 2:.1f},{b:.1f}h4'
+                    for u, a, b in ends[np.isfinite(ends).all(axis=1)]]  # fmt: skip
+            self.inside.append(_stroke(''.join(bars), curve.colour, 1.2))
+        if curve.width:
+            self.path(places, curve.colour, curve.width, curve.dash)
+        if curve.mark:
+            for k, (u, v) in enumerate(places):
+                if math.isfinite(u) and math.isfinite(v):
+                    title = curve.titles[k] if curve.titles else ''
+                    self.inside.append(_mark(u, v, curve.colour, curve.mark, curve.size, title))
 
-    def marks(
-        self,
-        x: ArrayLike,
-        y: ArrayLike,
-        colour: str,
-        shape: str = 'circle',
-        size: float = 3.2,
-        titles: Sequence[str] = (),
-    ) -> None:
-        """Marks at points (n,), with titles (n,) that a browser shows on hover."""
-        for k, (u, v) in enumerate(zip(self.x(x), self.y(y), strict=True)):
-            if math.isfinite(u) and math.isfinite(v):
-                self._clipped(_mark(u, v, colour, shape, size, titles[k] if titles else ''))
-
-    def bars(self, x: Floats, y: Floats, sigma: Floats, colour: str) -> None:
-        """Vertical bars (n,) of 1-sigma about points."""
-        ends = zip(self.x(x), self.y(y - sigma), self.y(y + sigma), strict=True)
-        for u, low, high in ends:
-            if math.isfinite(low) and math.isfinite(high):
-                self._clipped(
-                    _line(u, low, u, high, colour, 1.2)
-                    + _line(u - 2, low, u + 2, low, colour, 1.2)
-                    + _line(u - 2, high, u + 2, high, colour, 1.2)
-                )
+    def path(self, places: Floats, colour: str, width: float = 1.5, dash: str = '') -> None:
+        """A line through places (n, 2) of the view box, broken where one is not finite."""
+        known = np.asarray(np.isfinite(places).all(axis=1))
+        pens = np.where(np.r_[False, known[:-1]], 'L', 'M')
+        steps = [f'{pen}{u:.1f},{v:.1f}' for pen, (u, v) in zip(pens[known], places[known])]  # noqa: B905
+        self.inside.append(_stroke(''.join(steps), colour, width, dash))
 
     def band(self, low: float, high: float, is_vertical: bool = False) -> None:
         """A pale band between two values."""
         a, b = sorted((self.x if is_vertical else self.y)(np.array([low, high])).tolist())
         box = (a, self._top, b, self._bottom) if is_vertical else (self._left, a, self._right, b)
-        self._clipped(
-            f'<rect x="{box[0]:.1f}" y="{box[1]:.1f}" width="{box[2] - box[0]:.1f}"'
-            f' height="{box[3] - box[1]:.1f}" fill="{GRID}" fill-opacity=".6"/>'
-        )
+        self.inside.append(_rectangle(box, GRID, 0.6))
 
-    def cloud(self, x: Floats, y: Floats, radius: float, opacity: float) -> None:
-        """Many points (n,) as a bitmap; where they overlap they add up."""
+    def upright(self, x: float, colour: str = GRID, width: float = 1.5, dash: str = '') -> None:
+        """A line at a value of x, from bottom to top."""
+        self.curve(Curve([x, x], [self.y.low, self.y.high], colour, width=width, dash=dash))
+
+    def box(self, x: tuple[float, float], y: tuple[float, float], colour: str,
+            opacity: float) -> None:  # fmt: skip
+        """A rectangle between values."""
+        corners = np.sort([self.x(x), self.y(y)]).T.ravel()
+        self.inside.append(_rectangle(corners.tolist(), colour, opacity))
+
+    def cloud(self, points: Floats, radius: float, opacity: float) -> None:
+        """Many points (n, 2) as a bitmap; where they overlap they add up."""
         columns = round((self._right - self._left) * _PER_UNIT)
         rows = round((self._bottom - self._top) * _PER_UNIT)
-        u = np.floor((self.x(x) - self._left) * _PER_UNIT)
-        v = np.floor((self.y(y) - self._top) * _PER_UNIT)
+        u = np.floor((self.x(points[:, 0]) - self._left) * _PER_UNIT)
+        v = np.floor((self.y(points[:, 1]) - self._top) * _PER_UNIT)
         inside = (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
         index = (v[inside] * columns + u[inside]).astype(np.int64)
         hits = np.bincount(index, minlength=rows * columns).reshape(rows, columns)
@@ -216,58 +290,35 @@ class Panel:
         """A picture, BGR or BGRA, that fills the panel."""
         _, encoded = cv2.imencode('.png', pixels)
         data = base64.b64encode(encoded.tobytes()).decode('ascii')
-        self.parts.append(
+        self.inside.append(
             f'<image x="{self._left:.1f}" y="{self._top:.1f}"'
             f' width="{self._right - self._left:.1f}" height="{self._bottom - self._top:.1f}"'
             f' preserveAspectRatio="none" href="data:image/png;base64,{data}"/>'
         )
 
-    def arrows(self, places: Floats, units: Floats, colour: str) -> None:
-        """Arrows (n, 2) from places (n, 2), their lengths in units of the view box."""
-        starts = np.stack([self.x(places[:, 0]), self.y(places[:, 1])], axis=-1)
-        for start, along in zip(starts, units, strict=True):
-            self.parts.append(arrow(start, along, colour))
+    def text(self, x: float, y: float, text: str, colour: str = INK, edge: str = PAPER,
+             size: float = LETTER) -> None:  # fmt: skip
+        """Words in the middle of a place of the data, on an edge of another colour."""
+        u, v = float(self.x(x)), float(self.y(y)) + 0.35 * size
+        self.outside.append(words(u, v, text, colour=colour, edge=edge, size=size))
 
-    def text(
-        self, x: float, y: float, words: str, anchor: str = 'middle', colour: str = INK,
-        size: float = LETTER,
-    ) -> None:  # fmt: skip
-        """Words at a place of the data, on an edge of the colour of the page."""
-        u, v = float(self.x(x)), float(self.y(y))
-        self.parts.append(_text(u, v + 0.35 * size, words, anchor, colour, size, has_edge=True))
-
-    def legend(self, *entries: tuple[str, str, str], is_left: bool = False) -> None:
-        """Entries of label, colour and mark ('line', 'dash' or a shape) in an upper corner."""
-        widest = max(len(label) for label, _, _ in entries) * 0.53 * LETTER
-        left = self._left + 10 if is_left else self._right - widest - 30
-        for k, (label, colour, shape) in enumerate(entries):
-            y = self._top + 12 + 16 * k
-            if shape in ('line', 'dash'):
-                dash = '5 3' if shape == 'dash' else ''
-                self.parts.append(_line(left, y, left + 20, y, colour, 1.8, dash))
-            else:
-                self.parts.append(_mark(left + 10, y, colour, shape, 3.2, ''))
-            self.parts.append(_text(left + 26, y + 4, label, 'start', has_edge=True))
-
-    def note(self, words: str) -> None:
+    def note(self, text: str, colour: str = MUTED, edge: str = PAPER) -> None:
         """Words in the middle of the panel, where there is nothing to draw."""
-        x, y = (self._left + self._right) / 2, (self._top + self._bottom) / 2
-        self.parts.append(_text(x, y, words, 'middle', MUTED, has_edge=True))
+        middle = (self._left + self._right) / 2, (self._top + self._bottom) / 2
+        self.outside.append(words(*middle, text, colour=colour, edge=edge))
 
-    def _clipped(self, part: str) -> None:
-        """Draw without what reaches out of the panel."""
-        left, top = self._left - 4, self._top - 4
-        wide, high = self._right - left + 4, self._bottom - top + 4
-        box = f'{left:.1f} {top:.1f} {wide:.1f} {high:.1f}'
-        opening = (
-            f'<svg x="{left:.1f}" y="{top:.1f}" width="{wide:.1f}" height="{high:.1f}"'
-            f' viewBox="{box}">'
-        )
-        # Neighbours share one clip.
-        if self.parts and self.parts[-1].startswith(opening):
-            self.parts[-1] = self.parts[-1].removesuffix('</svg>') + part + '</svg>'
-        else:
-            self.parts.append(f'{opening}{part}</svg>')
+    def legend(self, curves: Sequence[Curve], is_left: bool = False) -> None:
+        """Names of curves, each with its mark or line, in an upper corner."""
+        widest = max((len(curve.name) for curve in curves), default=0) * CHARACTER
+        left = self._left + 10 if is_left else self._right - widest - 28
+        for k, curve in enumerate(curves):
+            y = self._top + 12 + 16 * k
+            if curve.width:
+                ends, width = (left, y, left + 20, y), max(curve.width, 1.8)
+                self.outside.append(_line(*ends, curve.colour, width, curve.dash))
+            if curve.mark:
+                self.outside.append(_mark(left + 10, y, curve.colour, curve.mark, curve.size, ''))
+            self.outside.append(words(left + 26, y + 4, curve.name, 'start', edge=PAPER))
 
 
 def arrow(start: Floats, along: Floats, colour: str) -> str:
@@ -290,54 +341,45 @@ def arrow(start: Floats, along: Floats, colour: str) -> str:
     )
 
 
-def words_at(x: float, y: float, words: str, anchor: str = 'middle', colour: str = INK) -> str:
-    """Words at a place of the view box."""
-    return _text(x, y, words, anchor, colour)
+def words(
+    x: float, y: float, text: str, anchor: str = 'middle', colour: str = INK,
+    size: float = LETTER, turn_deg: float = 0.0, edge: str = '',
+) -> str:  # fmt: skip
+    """Words at a place of the view box, on an edge of a colour if one is given."""
+    if not text:
+        return ''
+    turned = f' transform="rotate({turn_deg:.0f} {x:.1f} {y:.1f})"' if turn_deg else ''
+    sized = f' font-size="{size:g}"' if size != LETTER else ''
+    opening = f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{sized}{turned}'
+    closing = f'>{html.escape(text)}</text>'
+    # Drawn twice: not all that draw SVG paint the edge of a letter below its face.
+    below = f'{opening} fill="none" stroke="{edge}" stroke-width="3"{closing}' if edge else ''
+    return f'{below}{opening} fill="{colour}"{closing}'
+
+
+def _stroke(path: str, colour: str, width: float, dash: str = '') -> str:
+    dashes = f' stroke-dasharray="{dash}"' if dash else ''
+    style = f'fill="none" stroke="{colour}" stroke-width="{width:g}"{dashes}'
+    return f'<path d="{path}" {style} stroke-linejoin="round"/>' if path else ''
 
 
 def _line(
     x1: float, y1: float, x2: float, y2: float, colour: str, width: float, dash: str = ''
 ) -> str:
-    dashes = f' stroke-dasharray="{dash}"' if dash else ''
+    return _stroke(f'M{x1:.1f},{y1:.1f}L{x2:.1f},{y2:.1f}', colour, width, dash)
+
+
+def _rectangle(box: Sequence[float], colour: str, opacity: float) -> str:
+    left, top, right, bottom = box
     return (
-        f'<path d="M{x1:.1f},{y1:.1f}L{x2:.1f},{y2:.1f}" stroke="{colour}"'
-        f' stroke-width="{width:g}"{dashes}/>'
+        f'<rect x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}"'
+        f' height="{bottom - top:.1f}" fill="{colour}" fill-opacity="{opacity:g}"/>'
     )
 
 
 def _mark(x: float, y: float, colour: str, shape: str, size: float, title: str) -> str:
     path = _MARKS[shape].replace('{r}', f'{size:g}')
-    style = (
-        f'fill="none" stroke="{colour}" stroke-width="1.5"'
-        if shape == 'cross'
-        else (f'fill="{colour}"')
-    )
+    is_open = shape in _OPEN
+    style = f'fill="none" stroke="{colour}" stroke-width="1.5"' if is_open else f'fill="{colour}"'
     inside = f'<title>{html.escape(title)}</title>' if title else ''
     return f'<path transform="translate({x:.1f} {y:.1f})" d="{path}" {style}>{inside}</path>'
-
-
-def _short(values: Sequence[float], label: str) -> tuple[list[str], str]:
-    """Names of the ticks of an axis and its label, in thousandths where they would meet."""
-    names = [in_digits(value) for value in values]
-    unit = _UNIT.search(label)
-    if unit is None or max(map(len, names), default=0) <= _TICK_CHARACTERS:
-        return names, label
-    thousandths = [in_digits(1000.0 * value) for value in values]
-    if max(map(len, thousandths)) > _TICK_CHARACTERS:
-        return names, label
-    return thousandths, f'{label[: unit.start(1)]}0.001 {label[unit.start(1) :]}'
-
-
-def _text(
-    x: float, y: float, words: str, anchor: str = 'middle', colour: str = INK,
-    size: float = LETTER, turn_deg: float = 0.0, has_edge: bool = False,
-) -> str:  # fmt: skip
-    if not words:
-        return ''
-    turned = f' transform="rotate({turn_deg:.0f} {x:.1f} {y:.1f})"' if turn_deg else ''
-    edge = f' stroke="{PAPER}" stroke-width="3" paint-order="stroke"' if has_edge else ''
-    sized = f' font-size="{size:g}"' if size != LETTER else ''
-    return (
-        f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}"{sized}{edge}'
-        f'{turned}>{html.escape(words)}</text>'
-    )

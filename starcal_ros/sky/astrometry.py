@@ -29,6 +29,11 @@ _TT_MINUS_TAI_S = 32.184  # IAU 1991 Resolution A4, recommendation IV
 _J2000_JD = 2451545.0  # IAU 1994, epoch J2000.0
 _JULIAN_YEAR_DAYS = 365.25  # IAU, definition
 _UTC_START_JD = 2436934.5  # 1960-01-01, where UTC and ERFA's dat begin
+# Refraction changes by under 0.1 % with the humidity, and by 1.4 % from 0.55 to 1 micrometre: 2
+# arcsec at 20 degrees of elevation, most of it common to all stars of an image.
+RELATIVE_HUMIDITY = 0.5
+WAVELENGTH_UM = 0.55
+MIN_ELEVATION_DEG = 10.0  # nearer to the horizon the refraction model is off by over 1 arcsec
 
 
 @dataclass(frozen=True)
@@ -37,8 +42,8 @@ class SiteOptions:
 
     observer: str = option(
         'space',
-        'site of the camera; on the ground, refraction and the rotation of the Earth are applied'
-        ' and the observer velocity is ignored',
+        'location of the camera; ground: refraction and the rotation of the Earth are modelled,'
+        ' and velocity inputs are ignored',
         choices=('space', 'ground'),
     )
     latitude_deg: float = option(
@@ -52,25 +57,54 @@ class SiteOptions:
     )
     air_pressure_hpa: float = option(
         0.0,
-        'air pressure at the site, not reduced to sea level, hPa; 0: standard pressure at its'
-        ' height',
+        'air pressure at the site, not reduced to sea level, hPa; 0: standard pressure at the'
+        ' height of the site',
         low=0.0,
         high=1200.0,
     )
     air_temperature_degc: float = option(
         10.0, 'air temperature at the site, degC', low=-100.0, high=60.0
     )
-    relative_humidity: float = option(0.5, 'relative humidity at the site', low=0.0, high=1.0)
-    wavelength_um: float = option(
-        0.55, 'effective wavelength of the camera, micrometres', low=0.1, high=100.0
+    observer_velocity_m_s: tuple[float, ...] = option(
+        (0.0, 0.0, 0.0),
+        'barycentric velocity of the observer along the ICRF axes, m/s, used without a velocity'
+        " message; zeros: the Earth's velocity, with the uncertainty of an orbit",
+        low=-1e6,
+        high=1e6,
+        length=3,
     )
-    min_elevation_deg: float = option(
-        10.0,
-        'lowest elevation of stars that are used, degrees; nearer to the horizon the refraction'
-        ' model is not accurate',
-        low=3.0,
-        high=90.0,
-    )
+
+
+@dataclass(frozen=True)
+class Velocity:
+    """
+    Barycentric velocity of the observer, ICRF axes.
+
+    Attributes
+    ----------
+    m_s : (3,) or None
+        Velocity; None for that of the Earth.
+    sigma_m_s : float
+        1-sigma of each component; NaN for the Earth's velocity in place of an unknown one.
+    """
+
+    m_s: Floats | None = None
+    sigma_m_s: float = math.nan
+
+
+EARTH = Velocity()
+"""Velocity of the Earth, in place of an unknown one."""
+# 1-sigma of telemetry: an orbit changes it by this much in a second, the age of the last sample.
+GIVEN_SIGMA_M_S = 10.0
+
+
+def velocity_of(site: SiteOptions, measured_m_s: Floats | None) -> Velocity:
+    """Velocity of the observer from a message (3,), or from the options without one."""
+    if site.observer == 'ground':
+        return Velocity(None, 0.0)
+    if measured_m_s is None and any(site.observer_velocity_m_s):
+        measured_m_s = np.array(site.observer_velocity_m_s)
+    return EARTH if measured_m_s is None else Velocity(measured_m_s, GIVEN_SIGMA_M_S)
 
 
 @dataclass(frozen=True)
@@ -103,17 +137,12 @@ def tt_julian_date(time_unix_ns: int) -> tuple[float, float]:
     Terrestrial time as a two-part Julian date (day at 0h, fraction), accurate to 0.1 ns.
 
     After the last leap second in ERFA's table, its TAI - UTC is used; ERFA does the same, but
-    warns for dates more than five years later.
+    warns for dates more than five years later. Raises ValueError before 1960, the start of UTC.
 
     Parameters
     ----------
     time_unix_ns : int
         UTC as in a ROS stamp: nanoseconds since 1970 without leap seconds.
-
-    Raises
-    ------
-    ValueError
-        Before 1960, the start of UTC.
     """
     day, in_day_ns = divmod(int(time_unix_ns), _DAY_S * NANOSECONDS_PER_SECOND)
     day_jd = _UNIX_EPOCH_JD + day
@@ -225,7 +254,7 @@ def through_the_air(
         site.height_m, site.air_temperature_degc
     )
     refraction = erfa.refco(
-        pressure_hpa, site.air_temperature_degc, site.relative_humidity, site.wavelength_um
+        pressure_hpa, site.air_temperature_degc, RELATIVE_HUMIDITY, WAVELENGTH_UM
     )
     local = erfa.apio(
         erfa.sp00(*tt_jd),

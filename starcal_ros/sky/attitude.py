@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from array import array
 import bisect
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 import threading
@@ -17,7 +18,7 @@ from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
 from starcal_ros.records import AttitudeSample
 
-# Single precision keeps the norm to 1e-7; a deviation over 1e-3 is not a rounding error.
+# Rounding to single precision changes the norm by 1e-7: a change of 1e-3 has another cause.
 _NORM_TOLERANCE = 1e-3
 _INVALID = [math.nan] * 4
 _RUNS = 3  # the present clock, the previous one, and a wrong stamp between
@@ -25,37 +26,39 @@ _RUNS = 3  # the present clock, the previous one, and a wrong stamp between
 
 @dataclass(frozen=True)
 class AttitudeOptions:
-    """Options for reading attitude messages and matching them to images."""
+    """Attitude messages and their match to the images."""
 
     max_attitude_gap_s: float = option(
-        2.0, 'longest time between the attitude samples before and after an image, s', low=0.0
+        2.0, 'largest gap between the attitude samples before and after an image, s', low=0.0
     )
     stamp_offset_s: float = option(
         0.0,
-        'added to image stamps to reach the middle of the exposure on the attitude clock, s',
+        'offset added to image stamps to give the middle of the exposure on the attitude clock, s',
         low=-1e9,
         high=1e9,
+        basic=True,
     )
     attitude_direction: str = option(
         'st_to_inertial',
-        'direction of the rotation in the attitude message (ROS does not define it)',
+        'direction of the rotation in the attitude messages (ROS does not define it)',
         choices=('st_to_inertial', 'inertial_to_st'),
+        basic=True,
     )
     more_star_trackers: tuple[str, ...] = option(
         ('',),
-        'frames of further star trackers; the attitudes of each are on the topic <frame>/attitude;'
-        ' empty: there is one star tracker',
+        'frames of additional star trackers, each with attitudes on the topic <frame>/attitude;'
+        ' empty: none',
     )
     more_alignments: tuple[float, ...] = option(
         (0.0,),
-        'prior orientation of the camera in the frame of each of more_star_trackers, quaternions'
-        ' (x, y, z, w), four numbers each',
+        'prior orientation of the camera in the frame of each additional star tracker, one'
+        ' quaternion (x, y, z, w) after another',
     )
     attitude_message: str = option(
         'quaternion',
         'message type of the attitudes; quaternion: geometry_msgs/QuaternionStamped, pose:'
-        ' geometry_msgs/PoseStamped, transform: geometry_msgs/TransformStamped, imu:'
-        ' sensor_msgs/Imu (its orientation)',
+        ' geometry_msgs/PoseStamped, transform: geometry_msgs/TransformStamped, imu: the'
+        ' orientation in sensor_msgs/Imu',
         choices=('quaternion', 'pose', 'transform', 'imu'),
     )
 
@@ -86,8 +89,8 @@ class AttitudeHistory:
     """
     Attitude samples in time order; they may be added in any order.
 
-    Of two samples with the same stamp the first is kept.  The stamp of an invalid sample is kept
-    too, so that the refusal of an image there can name the cause.
+    If two samples have the same stamp, the first is kept.  The stamp of an invalid sample is also
+    kept, so that the refusal of an image at that time can name the cause.
 
     Stamps may jump because a clock was set or one stamp is wrong: a sample further than
     ``jump_s`` from the newest sample of every run starts a new run.  A run that continues after a
@@ -99,7 +102,7 @@ class AttitudeHistory:
     Parameters
     ----------
     keep_s : float
-        Samples older than the newest of their run by more than this are dropped.
+        Age relative to the newest sample of the run, beyond which samples are dropped.
     jump_s : float
         Difference of stamps that counts as a jump; at least the longest gap to interpolate over.
     """
@@ -117,7 +120,7 @@ class AttitudeHistory:
 
     @property
     def latest_ns(self) -> int | None:
-        """Stamp of the newest sample; a single sample after a jump counts only without others."""
+        """Stamp of the newest sample, without a lone sample after a jump if there are others."""
         with self._lock:
             for run in reversed(self._runs):
                 if len(run) > 1:
@@ -149,16 +152,13 @@ class AttitudeHistory:
         """
         Attitude at a time by spherical interpolation, and the gap between its two samples.
 
+        Raises ImageRefused ``no_attitude``, ``bad_attitude`` or ``attitude_gap``.
+
         Returns
         -------
         icrf_from_star_tracker_xyzw : (4,)
         gap_s : float
             0 where a sample has exactly this stamp.
-
-        Raises
-        ------
-        ImageRefused
-            ``no_attitude``, ``bad_attitude`` or ``attitude_gap``.
         """
         before, after = self.around(time_ns, max_gap_s)
         if before is after:
@@ -170,16 +170,31 @@ class AttitudeHistory:
         """
         The samples that `at` interpolates between; twice the same one if it has this stamp.
 
-        Raises
-        ------
-        ImageRefused
-            ``no_attitude``, ``bad_attitude`` or ``attitude_gap``.
+        Raises ImageRefused ``no_attitude``, ``bad_attitude`` or ``attitude_gap``.
         """
+        return self._found(lambda run: run.around(time_ns, max_gap_s))
+
+    def rate_at(self, time_ns: int, max_gap_s: float) -> Floats:
+        """
+        Angular rate (3,) at a time in the star tracker frame, rad/s; NaN if unknown.
+
+        Uses the samples on both sides of the time, or a sample with exactly this stamp and the
+        previous one.
+        """
+        try:
+            return rate_between(*self._found(lambda run: run.step_to(time_ns, max_gap_s)))
+        except ImageRefused:
+            return np.full(3, math.nan)
+
+    def _found(
+        self, look_up: Callable[[_Run], tuple[AttitudeSample, AttitudeSample]]
+    ) -> tuple[AttitudeSample, AttitudeSample]:
+        """Samples of the most recently extended run that has them."""
         refusals = []
         with self._lock:
             for run in reversed(self._runs):
                 try:
-                    return run.around(time_ns, max_gap_s)
+                    return look_up(run)
                 except ImageRefused as refused:
                     refusals.append(refused)
         if not refusals:
@@ -265,8 +280,32 @@ class _Run:
         gap_s = (self._times_ns[k] - self._times_ns[k - 1]) / NANOSECONDS_PER_SECOND
         raise ImageRefused('attitude_gap', f'{gap_s:.3f} s between samples, over {max_gap_s:g} s')
 
+    def step_to(self, time_ns: int, max_gap_s: float) -> tuple[AttitudeSample, AttitudeSample]:
+        """
+        Return two adjacent samples, the second one at or after a time.
+
+        If a sample has exactly this stamp, no later one is needed: a node may not have it yet.
+        """
+        before, after = self.around(time_ns, max_gap_s)
+        if before is not after:
+            return before, after
+        low, k = self._index(time_ns - _nanoseconds(max_gap_s)), self._index(time_ns)
+        valid = self._valid(low, k).nonzero()[0]
+        if not len(valid):
+            raise ImageRefused('no_attitude', 'no attitude sample before that of the image')
+        return self._sample(low + int(valid[-1])), after
+
     def _sample(self, k: int) -> AttitudeSample:
         return AttitudeSample(self._times_ns[k], np.array(self._xyzw[4 * k : 4 * k + 4]))
+
+
+def rate_between(before: AttitudeSample, after: AttitudeSample) -> Floats:
+    """Angular rate (3,) between two samples in the star tracker frame, rad/s."""
+    from scipy.spatial.transform import Rotation  # half of the start of a short command
+
+    first, last = (Rotation.from_quat(s.icrf_from_star_tracker_xyzw) for s in (before, after))
+    step_s = (after.time_ns - before.time_ns) / NANOSECONDS_PER_SECOND
+    return np.asarray((first.inv() * last).as_rotvec() / step_s)
 
 
 def _between(before: AttitudeSample, after: AttitudeSample, time_ns: int) -> Floats:

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import ARCSECOND_RAD
@@ -89,7 +88,7 @@ class StarCatalog:
     close_pair : bool
         Another star within 20 arcsec and 5 magnitudes: the position may be that of the pair, and
         most cameras do not resolve it.  Neighbours down to V = 10 count, below the limit of the
-        catalog; for coarser pixels see `close_pairs`.
+        catalog.
     epoch_jyear : float
     digest : str
         SHA-256 of the columns of the file, also in selections: identifies the source catalog.
@@ -117,11 +116,7 @@ class StarCatalog:
         """Unit vectors (n, 3) of the positions at the catalog epoch."""
         cos_dec = np.cos(self.dec_rad)
         return np.stack(
-            [
-                cos_dec * np.cos(self.ra_rad),
-                cos_dec * np.sin(self.ra_rad),
-                np.sin(self.dec_rad),
-            ],
+            [cos_dec * np.cos(self.ra_rad), cos_dec * np.sin(self.ra_rad), np.sin(self.dec_rad)],
             axis=-1,
         )
 
@@ -189,17 +184,14 @@ def load_catalog(path: Path | None = None, magnitude_limit: float | None = None)
     """
     Read a star catalog, by default the bundled one, sorted by magnitude.
 
+    Raises CatalogError if the file is missing, not a star catalog, of another format, or damaged.
+
     Parameters
     ----------
     path : Path, optional
         File written by ``tools/build_catalog.py``.
     magnitude_limit : float, optional
         Omit stars fainter than this V.
-
-    Raises
-    ------
-    CatalogError
-        If the file is missing, not a star catalog, of another format, or damaged.
     """
     columns, digest = _read_columns(CATALOG_PATH if path is None else Path(path))
     rows = slice(None)
@@ -263,31 +255,3 @@ def cone(
     if magnitude_limit is not None:
         rows = rows[catalog.magnitude[rows] <= magnitude_limit]
     return rows
-
-
-def close_pairs(catalog: StarCatalog, separation_rad: float, delta_magnitude: float) -> Mask:
-    """
-    Mask (n,) of the stars with a neighbour in the catalog that disturbs their centroid.
-
-    A star is marked if another one lies within the separation (at the catalog epoch) and is at
-    most ``delta_magnitude`` fainter.  The separation depends on the camera: the diameter of the
-    centroiding window.  Search the whole catalog, because a neighbour may be fainter than the
-    stars in use.  Takes 0.1 s for the whole sky and 150 arcsec.
-
-    Parameters
-    ----------
-    catalog : StarCatalog
-        n stars.
-    separation_rad : float
-        Smaller than pi.
-    delta_magnitude : float
-        With 2.5, a neighbour with less than a tenth of the star's flux is ignored.
-    """
-    tree = cKDTree(catalog.direction_icrs)
-    pairs = tree.query_pairs(2 * math.sin(separation_rad / 2), output_type='ndarray')
-    first, second = pairs[:, 0], pairs[:, 1]
-    fainter_by = catalog.magnitude[second] - catalog.magnitude[first]
-    marked = np.zeros(len(catalog), np.bool_)
-    marked[first[fainter_by <= delta_magnitude]] = True
-    marked[second[-fainter_by <= delta_magnitude]] = True
-    return marked

@@ -23,7 +23,7 @@ from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.records import calibration_parameter_names, Ensemble
-from starcal_ros.simulation.centroids import true_observations
+from starcal_ros.studies.simulation.centroids import true_observations
 from starcal_ros.studies.trials import (
     bound,
     calibration_options,
@@ -31,7 +31,6 @@ from starcal_ros.studies.trials import (
     draw_star_field,
     errors,
     ESTIMATED,
-    far_prior,
     information_blocks,
     map_bound_px,
     normalised_error_squared,
@@ -45,12 +44,9 @@ from starcal_ros.studies.trials import (
 Row = dict[str, 'int | float | str']
 
 OUTLIER_SHARE = 0.02
-MANY_OUTLIERS = 0.1
-SAME_SIGMAS = 0.01  # estimates closer than this in every parameter are the same minimum
 UNUSED_IMAGES = 20
 ENOUGH = 1.01  # ratio of the residual of unused images to that with the true camera
 NIGHT_S = 3590.0  # from the first image to the last (paper: 359 at ten seconds)
-_MOST = 1000  # images, or stars of an image
 
 
 @dataclass(frozen=True)
@@ -100,47 +96,16 @@ STUDIES: Mapping[str, tuple[str, Design]] = {
         'errors relative to the reported covariance',
         Design('coverage', 200, (16,), (80,), (20.0,), ('per_image', 'hierarchical')),
     ),
-    'start': (
-        'convergence from a distant prior, with and without outliers',
-        Design('start', 100, (16,), (80,), (20.0,), _METHODS),
-    ),
 }
 """Name -> title and default design."""
 
 
 def check(design: Design) -> None:
-    """
-    Check a design.
-
-    Raises
-    ------
-    OptionError
-        Naming the bad value and the allowed ones.
-    """
-    if design.study not in STUDIES:
-        raise OptionError(f'study: {design.study!r} is not one of {", ".join(STUDIES)}')
-    if not 1 <= design.trials <= 1_000_000:
-        raise OptionError(f'--trials: {design.trials} is not within 1 to 1000000')
-    if not 0 <= design.seed < 2**63:
-        raise OptionError(f'--seed: {design.seed} is not within 0 to 2^63 - 1')
-    for images in design.images:
-        if not 2 <= images <= _MOST:
-            raise OptionError(f'--images: {images} is not within 2 to {_MOST}')
+    """Raise OptionError for lists that repeat a value or that the study does not use."""
     if design.study == 'terms' and design.stars:
         raise OptionError(
             '--stars: not applicable to the study terms, which uses the stars of the catalog'
         )
-    for stars in design.stars:
-        if not 3 <= stars <= _MOST:
-            raise OptionError(f'--stars: {stars} is not within 3 to {_MOST}')
-    assumed = () if design.assumed_arcsec is None else (design.assumed_arcsec,)
-    for option, sigmas in (('tracker', design.tracker_arcsec), ('tracker-assumed', assumed)):
-        for sigma in sigmas:
-            if not 0 <= sigma <= 3600:
-                raise OptionError(f'--{option}: {sigma} is not within 0 to 3600')
-    for method in design.methods:
-        if method not in _METHODS:
-            raise OptionError(f'--methods: {method!r} is not one of {", ".join(_METHODS)}')
     for name in ('images', 'stars', 'tracker_arcsec', 'methods'):
         values = getattr(design, name)
         if len(set(values)) < len(values):
@@ -278,7 +243,7 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
                 names = calibration_parameter_names(estimate.geometry.camera)
                 yield {
                     **row,
-                    'reported_px': map_bound_px(estimate.geometry.camera, estimate.covariance),
+                    'reported_px': map_bound_px(estimate.geometry.camera, estimate.map_covariance),
                     'bound_px': least,
                     'rejected': int((~estimate.kept).sum()),
                     **{
@@ -288,41 +253,9 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
                 }
 
 
-def _start_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
-    """Estimates of all ten parameters from the truth and from a distant prior, same stars."""
-    field = draw_star_field(rng, max(design.images), max(design.stars))
-    far = far_prior(field.truth, rng)
-    for cell, part in _cells(design, field):
-        for tracker, share in itertools.product(design.tracker_arcsec, (0.0, MANY_OUTLIERS)):
-            ensemble = observe(part, tracker, share)
-            for method in design.methods:
-                options = calibration_options(
-                    method, design.assumed(tracker), estimate=PARAMETER_NAMES
-                )
-                near, away = (
-                    estimate_calibration(ensemble, prior, options) for prior in (field.truth, far)
-                )
-                sigma = np.sqrt(np.diag(near.covariance))
-                apart = np.abs(errors(away.geometry, near.geometry)) / sigma
-                wild = (part.outlier_draw < share).ravel()
-                yield {
-                    **cell,
-                    'tracker_arcsec': tracker,
-                    'outlier_share': share,
-                    'method': method,
-                    'apart_sigmas': float(apart.max()),
-                    'map_px': map_error_px(away.geometry.camera, field.truth.camera),
-                    'outliers': int(wild.sum()),
-                    'outliers_kept': int((away.kept & wild).sum()),
-                    'iterations_near': near.iterations,
-                    'iterations_far': away.iterations,
-                }
-
-
 _TRIALS: Mapping[str, Callable[[Design, np.random.Generator], Iterable[Row]]] = {
     'table1': _table1_trial,
     'images': _images_trial,
     'terms': _terms_trial,
     'coverage': _coverage_trial,
-    'start': _start_trial,
 }

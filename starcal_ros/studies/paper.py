@@ -17,23 +17,36 @@ import jinja2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.blas_threads import one_blas_thread
-from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid, project
+from starcal_ros.camera import (
+    CameraModel,
+    distortion_px,
+    line_of_sight,
+    PARAMETER_NAMES,
+    pixel_grid,
+    project,
+)
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.least_squares.normal_equations import squared_sigmas, star_table
-from starcal_ros.methods.problem import METHODS
+from starcal_ros.estimation.problem import METHODS
+from starcal_ros.estimation.star_equations import squared_sigmas, star_table
 from starcal_ros.pipeline.observe import observe
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Ensemble, StarObservations, TermRemoval
-from starcal_ros.simulation.images import fixed_pattern, render
-from starcal_ros.simulation.scenario import attitude_samples, Scenario, scenario, scene
+from starcal_ros.report.detector_figures import distortion_contours, distortion_vectors, star_cloud
+from starcal_ros.report.figures import outline, term_worth
+from starcal_ros.report.plots import plot
+from starcal_ros.report.svg import Curve, Drawing, GRID, INK, Panel, SERIES, sheet
 from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.studies.monte_carlo import Design, Row
+from starcal_ros.studies.simulation.rendering import fixed_pattern, render
+from starcal_ros.studies.simulation.scenario import attitude_samples, Scenario, scenario, scene
+from starcal_ros.studies.study_figures import removed_terms
 from starcal_ros.studies.summary import StudyResult
 from starcal_ros.studies.trials import PAPER_ESTIMATE
 
@@ -118,11 +131,15 @@ def setup_of(seed: int) -> Setup:
     night = scenario(NIGHT, seed)
     values: dict[str, object] = {
         'estimate': PAPER_ESTIMATE,
-        'principal_point_prior': 0.0,
-        'residual_field': False,
         'star_tracker_sigma_arcsec': night.star_tracker_sigma_arcsec,
+        # Of the scenario: the directions have the velocity of the Earth.
+        'velocity_sigma_m_s': 0.0,
+        'shutter': 'global',
+        'stamp_sigma_s': 0.0,
     }
-    return load_setup(values, prior=night.prior)
+    setup = load_setup(values, prior=night.prior)
+    options = dataclasses.replace(setup.calibration, principal_point_prior=0.0)
+    return dataclasses.replace(setup, calibration=options)
 
 
 @functools.lru_cache(maxsize=1)
@@ -174,10 +191,7 @@ def study(observations: Sequence[StarObservations], table1: StudyResult, seed: i
     """
     Results of the paper's figures from the observations of a night.
 
-    Raises
-    ------
-    TooFewObservations
-        When too few images were measured.
+    Raises TooFewObservations when too few images were measured.
     """
     setup, truth = setup_of(seed), scenario(NIGHT, seed).truth
     images = [observed for observed in observations if not observed.refusal]
@@ -280,3 +294,79 @@ def page(found: PaperStudy, software: str) -> str:
         autoescape=False,  # Markdown, without external input
     )
     return environment.get_template('paper.md').render(software=software, **numbers(found))
+
+
+def svgs(found: PaperStudy) -> Mapping[str, str]:
+    """Text of the SVG file of each figure, by name."""
+    distortion = [distortion_vectors(found.camera).svg, distortion_contours(found.camera).svg]
+    stars = f'{found.stars:,} star centroids in {found.images - found.refused} images'
+    drawn = {
+        'figure_5': sheet([[star_cloud(found.judged.measured_px, found.camera)]], stars),
+        'figure_6': sheet([distortion], 'distortion: vectors, enlarged, and magnitude'),
+        'figure_7': sheet([[_images(found), _histogram(found)], [_plane(found), _counts(found)]]),
+        'figure_8': _terms(found),
+    }
+    return {name: figure.document() for name, figure in drawn.items()}
+
+
+def _images(found: PaperStudy) -> Drawing:
+    spread = found.judged.std_of_images_px()
+    number = np.arange(1, len(spread) + 1)
+    curves = [
+        Curve(number, values, colour, name, 'circle', width=0, size=1.4)
+        for values, colour, name in zip(spread.T, SERIES, 'uv', strict=False)
+    ]
+    used = f'{len(found.used)} images used'
+    curves.append(Curve([], [], GRID, used, width=4.0))
+
+    def lines(panel: Panel) -> None:
+        for at in found.used:
+            panel.upright(at + 1)
+
+    return plot(curves, 'image', 'standard deviation (px)', y=(0.0, None), under=lines)
+
+
+def _histogram(found: PaperStudy) -> Drawing:
+    residual_px = found.judged.residual_px[found.judged.fits]
+    edges = np.linspace(-1, 1, 101, dtype=np.float64)
+    curves = [
+        outline(values, edges, colour, f'{name}: std {values.std():.3f} px')
+        for values, colour, name in zip(residual_px.T, SERIES, 'uv', strict=False)
+    ]
+    normal = norm.pdf(edges, scale=float(residual_px.std()))
+    curves.append(Curve(edges, normal, INK, 'normal distribution', width=1.0, dash='5 3'))
+    return plot(curves, 'residual (px)', 'density', x=(-1.0, 1.0), y=(0.0, None))
+
+
+def _plane(found: PaperStudy) -> Drawing:
+    """Residuals of v against those of u, where dots overlap darker."""
+    residual_px = found.judged.residual_px[found.judged.fits]
+    end = 3.5 * float(residual_px.std())
+    return plot([], 'residual of u (px)', 'residual of v (px)', x=(-end, end), y=(-end, end),
+                under=lambda panel: panel.cloud(residual_px, 0.7, 0.12))  # fmt: skip
+
+
+def _counts(found: PaperStudy) -> Drawing:
+    number = [float(row['images']) for row in found.counts]
+    curves = [
+        Curve(number, [float(row[name]) for row in found.counts], colour, words, 'circle')
+        for name, colour, words in (
+            ('others_px', SERIES[0], 'residual of the other images'),
+            ('map_error_px', SERIES[1], 'map error'),
+        )
+    ]
+    noise = [found.noise_rms_px, found.noise_rms_px]
+    curves.append(
+        Curve([number[0], number[-1]], noise, INK, 'with the true camera', dash='5 3', width=1.0)
+    )
+    return plot(curves, 'images used', 'rms (px)', log='xy',
+                under=lambda panel: panel.upright(CALIBRATED_WITH, width=5.0))  # fmt: skip
+
+
+def _terms(found: PaperStudy) -> Drawing:
+    removals = found.removals
+    gone = [removal.removed for removal in removals[1:]]
+    order = [*gone, *(name for name in PARAMETER_NAMES if name not in gone)]
+    share = [[float(name in gone[:step]) for name in order] for step in range(len(removals))]
+    table = removed_terms(np.array(share), order, 'coloured: removed from the calibration')
+    return sheet([[table, term_worth(removals).svg]])

@@ -14,8 +14,8 @@ from scipy.stats import chi2
 
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.studies.monte_carlo import Design, Row, SAME_SIGMAS
-from starcal_ros.studies.trials import ESTIMATED
+from starcal_ros.studies.monte_carlo import Design, Row
+from starcal_ros.studies.trials import ESTIMATED, rms
 
 CONFIDENCE = 0.99
 
@@ -33,10 +33,7 @@ def conclude(design: Design, rows: Iterable[Row]) -> StudyResult:
     """
     Result of a study from the rows of all its trials, in any order.
 
-    Raises
-    ------
-    TooFewObservations
-        When no calibration was possible in any cell.
+    Raises TooFewObservations when no calibration was possible in any cell.
     """
     ordered = tuple(sorted(rows, key=lambda row: row['trial']))
     if not ordered:
@@ -85,10 +82,6 @@ def column(rows: Sequence[Row], name: str) -> Floats:
     return np.array([row[name] for row in rows], np.float64)
 
 
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def _relative_error_of_rms(values: Floats) -> float:
     """1-sigma of the RMS of a sample, relative to it."""
     squares = values**2
@@ -98,7 +91,7 @@ def _relative_error_of_rms(values: Floats) -> float:
 
 
 def _ratio(rows: Sequence[Row], name: str, to: str) -> float:
-    return _rms(column(rows, name)) / _rms(column(rows, to))
+    return rms(column(rows, name)) / rms(column(rows, to))
 
 
 def _interval(parameters: int, trials: int) -> tuple[float, float]:
@@ -112,8 +105,8 @@ def _common(rows: Sequence[Row]) -> Row:
     map_px = column(rows, 'map_px')
     return {
         'trials': len(rows),
-        'map_px': _rms(map_px),
-        'map_px_sigma': _sigma_or_zero(_rms(map_px) * _relative_error_of_rms(map_px)),
+        'map_px': rms(map_px),
+        'map_px_sigma': _sigma_or_zero(rms(map_px) * _relative_error_of_rms(map_px)),
     }
 
 
@@ -130,7 +123,7 @@ def _table1_summary(rows: Sequence[Row]) -> Iterable[Row]:
             'to_own_bound': _ratio(cell, 'map_px', 'own_bound_px'),
             'to_per_image_bound': _ratio(cell, 'map_px', 'per_image_bound_px'),
             'to_bound': _ratio(cell, 'map_px', 'bound_px'),
-            'pointing_arcsec': _rms(column(cell, 'pointing_arcsec')),
+            'pointing_arcsec': rms(column(cell, 'pointing_arcsec')),
             'pointing_to_bound': _ratio(cell, 'pointing_arcsec', 'pointing_bound_arcsec'),
             'normalised': float(column(cell, 'normalised').mean()),
         }
@@ -142,7 +135,7 @@ def _images_summary(rows: Sequence[Row]) -> Iterable[Row]:
             **key,
             **_common(cell),
             'to_bound': _ratio(cell, 'map_px', 'bound_px'),
-            'unused_px': _rms(column(cell, 'unused_px')),
+            'unused_px': rms(column(cell, 'unused_px')),
             'unused_to_true': _ratio(cell, 'unused_px', 'unused_true_px'),
         }
 
@@ -156,9 +149,9 @@ def _terms_summary(rows: Sequence[Row]) -> Iterable[Row]:
             'trials': len(cell),
             'usual': usual or 'none',
             'share': removed.count(usual) / len(cell),
-            'residual_std_u_px': _rms(column(cell, 'residual_std_u_px')),
-            'residual_std_v_px': _rms(column(cell, 'residual_std_v_px')),
-            'map_change_px': _rms(column(cell, 'map_change_px')),
+            'residual_std_u_px': rms(column(cell, 'residual_std_u_px')),
+            'residual_std_v_px': rms(column(cell, 'residual_std_v_px')),
+            'map_change_px': rms(column(cell, 'map_change_px')),
         }
 
 
@@ -168,7 +161,7 @@ def _coverage_summary(rows: Sequence[Row]) -> Iterable[Row]:
         low, high = _interval(len(ESTIMATED), len(cell))
         normalised = float(column(cell, 'normalised').mean())
         bias = {name: float(column(cell, name).mean()) for name in names}
-        spread = {name: _rms(column(cell, name)) for name in names}
+        spread = {name: rms(column(cell, name)) for name in names}
         worst = max(names, key=lambda name: abs(bias[name]))
         widest = max(names, key=lambda name: spread[name])
         yield {
@@ -189,39 +182,18 @@ def _coverage_summary(rows: Sequence[Row]) -> Iterable[Row]:
         }
 
 
-def _start_summary(rows: Sequence[Row]) -> Iterable[Row]:
-    for key, cell in _groups(rows, 'images', 'stars', 'tracker_arcsec', 'outlier_share', 'method'):
-        apart = column(cell, 'apart_sigmas')
-        yield {
-            **key,
-            **_common(cell),
-            'same_minimum': int((apart < SAME_SIGMAS).sum()),
-            'worst_apart_sigmas': float(apart.max()),
-            'outliers': int(column(cell, 'outliers').sum()),
-            'outliers_kept': int(column(cell, 'outliers_kept').sum()),
-            'iterations_near': float(column(cell, 'iterations_near').mean()),
-            'iterations_far': float(column(cell, 'iterations_far').mean()),
-        }
-
-
 _SUMMARIES: Mapping[str, Callable[[Sequence[Row]], Iterable[Row]]] = {
     'table1': _table1_summary,
     'images': _images_summary,
     'terms': _terms_summary,
     'coverage': _coverage_summary,
-    'start': _start_summary,
 }
 
 
-def table(result: StudyResult) -> list[str]:
-    """Summary as lines of aligned columns, without bias and spread of single parameters."""
+def table(result: StudyResult) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the summary, without bias and spread of single parameters."""
     names = [n for n in result.summary[0] if not n.startswith(('bias_', 'rms_'))]
-    cells = [[_words(row[name]) for name in names] for row in result.summary]
-    widths = [max(map(len, column)) for column in zip(names, *cells, strict=True)]
-    return [
-        '  '.join(f'{text:>{width}}' for text, width in zip(line, widths, strict=True))
-        for line in [names, *cells]
-    ]
+    return names, [[_words(row[name]) for name in names] for row in result.summary]
 
 
 def _words(value: int | float | str) -> str:

@@ -16,25 +16,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.agreement import (
-    alignment_difference_rad,
-    chi_squared,
-    lines_of_sight,
-)
+from starcal_ros.assessment.agreement import alignment_difference_rad, chi_squared, lines_of_sight
 from starcal_ros.assessment.observability import GRID, line_of_sight_sigma_arcsec, map_sigma_px
 from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.least_squares.normal_equations import arrange, normal_blocks, star_table
-from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
-from starcal_ros.simulation.scenario import Scenario, scenario
+from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
+from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, refused_image
+from starcal_ros.studies.simulation.scenario import Scenario, scenario
 
 CENTROID_SIGMA_PX = 0.1
 OUTLIER_REACH_PX = 20.0  # half side of the square over which misidentified stars scatter
-FAR_FOCAL = 0.2
-FAR_PRINCIPAL_POINT_PX = 100.0
-FAR_ALIGNMENT_RAD = math.radians(0.3)
 LEAST_TRACKER_ARCSEC = 1e-3  # assumed sigma of a perfect star tracker
 
 # The paper holds the principal point, which trades with the attitude.
@@ -115,29 +108,6 @@ def draw_star_field(rng: np.random.Generator, images: int, stars: int) -> StarFi
     )
 
 
-def far_prior(truth: CameraGeometry, rng: np.random.Generator) -> CameraGeometry:
-    """
-    Distant prior, in a random direction from the truth.
-
-    The focal lengths are off by `FAR_FOCAL`, the principal point by `FAR_PRINCIPAL_POINT_PX` and
-    the alignment by `FAR_ALIGNMENT_RAD`; distortion and skew are zero.
-    """
-    fx, _, fy, cx, cy = truth.camera.parameters[:5]
-    longer = 1.0 + FAR_FOCAL * rng.choice([-1.0, 1.0])
-    angle = rng.uniform(0.0, 2.0 * np.pi)
-    pinhole = {
-        'fx': longer * fx,
-        'fy': longer * fy,
-        'cx': cx + FAR_PRINCIPAL_POINT_PX * math.cos(angle),
-        'cy': cy + FAR_PRINCIPAL_POINT_PX * math.sin(angle),
-    }
-    camera = truth.camera.replace(**{**dict.fromkeys(PARAMETER_NAMES, 0.0), **pinhole})
-    axis = rng.normal(size=3)
-    error = Rotation.from_rotvec(FAR_ALIGNMENT_RAD * axis / np.linalg.norm(axis))
-    star_tracker_from_camera = Rotation.from_quat(truth.star_tracker_from_camera_xyzw) * error
-    return CameraGeometry(camera, star_tracker_from_camera.as_quat())
-
-
 def observe(field: StarField, tracker_arcsec: float, outlier_share: float = 0.0) -> Ensemble:
     """Observations of a star field with the given star tracker noise about each axis."""
     camera = field.truth.camera
@@ -149,14 +119,13 @@ def observe(field: StarField, tracker_arcsec: float, outlier_share: float = 0.0)
     n = measured.shape[1]
     ones = np.ones(n, np.float32)
     images = [
-        StarObservations(
-            time_ns=k,
-            width=camera.width,
-            height=camera.height,
+        refused_image(
+            k,
+            camera.width,
+            camera.height,
             refusal='',
             detail='',
             icrf_from_star_tracker_xyzw=quaternion,
-            attitude_gap_s=0.0,
             catalog_id=np.arange(k * n, (k + 1) * n),
             direction_icrf=field.direction_icrf[k],
             magnitude=6 * ones,
@@ -164,11 +133,7 @@ def observe(field: StarField, tracker_arcsec: float, outlier_share: float = 0.0)
             covariance_px2=np.tile([CENTROID_SIGMA_PX**2, 0.0, CENTROID_SIGMA_PX**2], (n, 1)),
             flux_dn=1000 * ones,
             snr=10 * ones,
-            refused_stars={},
-            background_dn=0.0,
-            noise_dn=1.0,
-            psf_sigma_px=1.0,
-            catalog_digest='',
+            velocity_sigma_m_s=0.0,
         )
         for k, quaternion in enumerate(reported.as_quat())
     ]
@@ -187,7 +152,7 @@ def information_blocks(field: StarField) -> Floats:
     return blocks[:, :13, :13]
 
 
-def bound(method: str, blocks: Floats, tracker_arcsec: float) -> Floats:
+def bound(method: str, blocks: Floats, tracker_arcsec: float) -> MapCovariance:
     """
     Cramer-Rao bound (13, 13) under the assumptions of a method.
 
@@ -201,19 +166,19 @@ def bound(method: str, blocks: Floats, tracker_arcsec: float) -> Floats:
     covariance = np.zeros((13, 13))
     if method == 'single':
         covariance[np.ix_(ESTIMATED, ESTIMATED)] = _inverse(N.sum(axis=0))
-        return covariance
+        return MapCovariance(covariance)
     A, B, C = N[:, :f, :f].sum(axis=0), N[:, f:, :f], N[:, f:, f:]
     if method == 'per_image':
         S = A - np.einsum('mqi,mqj->ij', B, np.linalg.solve(C, B))
         covariance[np.ix_(_FREE, _FREE)] = _inverse(S)
-        return covariance
+        return MapCovariance(covariance)
     tracker = np.eye(3) / (max(tracker_arcsec, LEAST_TRACKER_ARCSEC) * ARCSECOND_RAD) ** 2
     B = np.concatenate([B, np.broadcast_to(-tracker, C.shape)], axis=2)
     S = np.zeros((f + 3, f + 3))
     S[:f, :f], S[f:, f:] = A, len(blocks) * tracker
     S -= np.einsum('mqi,mqj->ij', B, np.linalg.solve(C + tracker, B))
     covariance[np.ix_(ESTIMATED, ESTIMATED)] = _inverse(S)
-    return covariance
+    return MapCovariance(covariance)
 
 
 def _inverse(information: Floats) -> Floats:
@@ -222,20 +187,20 @@ def _inverse(information: Floats) -> Floats:
     return np.asarray(scaled * np.outer(scale, scale))
 
 
-def map_bound_px(camera: CameraModel, covariance: Floats) -> float:
-    """Expected `map_error_px` for a covariance (13, 13), RMS over the detector, px."""
-    return _rms(map_sigma_px(camera, covariance, GRID))
+def map_bound_px(camera: CameraModel, covariance: MapCovariance) -> float:
+    """Expected `map_error_px` for a covariance, RMS over the detector, px."""
+    return rms(map_sigma_px(camera, covariance, GRID))
 
 
-def pointing_bound_arcsec(camera: CameraModel, covariance: Floats) -> float:
-    """Expected `pointing_error_arcsec` for a covariance (13, 13), RMS over the detector."""
-    return _rms(line_of_sight_sigma_arcsec(camera, covariance, GRID, GRID))
+def pointing_bound_arcsec(camera: CameraModel, covariance: MapCovariance) -> float:
+    """Expected `pointing_error_arcsec` for a covariance, RMS over the detector."""
+    return rms(line_of_sight_sigma_arcsec(camera, covariance, GRID, GRID))
 
 
 def pointing_error_arcsec(found: CameraGeometry, true: CameraGeometry) -> float:
     """RMS difference of the lines of sight in the star tracker frame over the detector, arcsec."""
     of_found, of_true = (lines_of_sight(geometry, GRID, GRID) for geometry in (found, true))
-    return _rms(np.linalg.norm(of_found - of_true, axis=1)) / ARCSECOND_RAD
+    return rms(np.linalg.norm(of_found - of_true, axis=1)) / ARCSECOND_RAD
 
 
 def errors(found: CameraGeometry, true: CameraGeometry) -> Floats:
@@ -269,21 +234,24 @@ def calibration_options(method: str, tracker_arcsec: float, **other: object) -> 
     """
     Options of the paper's model, for few images and stars.
 
-    Eight camera parameters, or those of ``estimate`` without a prior, and no field; the assumed
-    star tracker sigma is per axis.
+    Eight camera parameters, or those of ``estimate`` without a prior, at a known velocity and
+    without motion in an image; the assumed star tracker sigma is per axis.
     """
     assumed = max(tracker_arcsec, LEAST_TRACKER_ARCSEC)
     options = CalibrationOptions(
         method=method,
         estimate=PAPER_ESTIMATE,
         principal_point_prior=0.0,
-        residual_field=False,
         star_tracker_sigma_arcsec=(assumed, assumed, assumed),
+        velocity_sigma_m_s=0.0,
+        shutter='global',
+        stamp_sigma_s=0.0,
         min_images=2,
         min_stars=10,
     )
     return dataclasses.replace(options, **other)  # type: ignore[arg-type]
 
 
-def _rms(values: Floats) -> float:
+def rms(values: Floats) -> float:
+    """Root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))

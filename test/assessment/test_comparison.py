@@ -6,8 +6,8 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 from opencv_points import undistorted  # type: ignore[import-not-found]
 import pytest
@@ -19,9 +19,9 @@ from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.cli import main
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, ProductError
-from starcal_ros.products.calibration_json import read_calibration, write_calibration
+from starcal_ros.formats.products.calibration_json import read_calibration, write_calibration
 from starcal_ros.records import Calibration
-from starcal_ros.report.comparison_figure import write_comparison
+from starcal_ros.report.detector_figures import write_comparison
 
 
 @pytest.fixture(scope='module')
@@ -77,8 +77,8 @@ def test_the_map_is_what_opencv_says(tiny: Calibration) -> None:
         a.geometry.camera.parameters[0]
     )
     found = compare(a, b)
-    # OpenCV's iteration ends at 1e-15 or so of x, y: 1e-11 px; its own path to there costs more.
-    np.testing.assert_allclose(found.before.length_px.ravel(), expected_px, atol=1e-8)
+    # The field that both have moves the places at which they differ, by less than 1e-4 px here.
+    np.testing.assert_allclose(found.before.length_px.ravel(), expected_px, atol=1e-6)
     names = [*PARAMETER_NAMES]
     assert found.difference[names.index('fx')] == pytest.approx(1.0)
     np.testing.assert_allclose(found.difference[10:], [2e-5, -1e-5, 4e-5], atol=1e-15)
@@ -94,6 +94,7 @@ def test_a_turn_is_taken_off(tiny: Calibration) -> None:
     assert found.after.length_px.max() < 1e-9
 
 
+@pytest.mark.slow
 def test_sigmas_are_those_of_chance(tiny: Calibration) -> None:
     """B drawn from the covariance of A: chi2 has its degrees as mean, each map a square of 1."""
     rng = np.random.default_rng(3)
@@ -160,17 +161,16 @@ def test_cameras_of_other_sizes_are_refused(tiny: Calibration) -> None:
 
 
 def test_the_figure_is_drawn(tiny: Calibration, tmp_path: Path) -> None:
-    write_comparison(compare(tiny, tiny), tmp_path / 'same.png')  # and no warning
+    write_comparison(compare(tiny, tiny), tmp_path / 'same.svg')  # and no warning
     found = compare(tiny, moved(tiny, fx=1.0))
-    write_comparison(found, tmp_path / 'a.png')
-    picture = cv2.imread(str(tmp_path / 'a.png'))
-    assert picture is not None and np.ptp(picture) > 200
     write_comparison(found, tmp_path / 'a.svg')
-    assert '<svg' in (tmp_path / 'a.svg').read_text()
-    with pytest.raises(OptionError, match='a.jpg'):
-        write_comparison(found, tmp_path / 'a.jpg')
+    drawn = (tmp_path / 'a.svg').read_text()
+    ElementTree.fromstring(drawn)
+    assert f'at most {found.before.length_px.max():.3g} px' in drawn and '>no ' not in drawn
+    with pytest.raises(OptionError, match=r'a\.png: the name must end in \.svg'):
+        write_comparison(found, tmp_path / 'a.png')
     with pytest.raises(ProductError, match='cannot be written'):
-        write_comparison(found, tmp_path / 'none' / 'a.png')
+        write_comparison(found, tmp_path / 'none' / 'a.svg')
 
 
 def test_the_tool_compares(
@@ -180,12 +180,12 @@ def test_the_tool_compares(
         (tmp_path / name).mkdir()
         write_calibration(calibration, tmp_path / name / 'calibration.json')
     folders = [str(tmp_path / 'a'), str(tmp_path / 'b' / 'calibration.json')]
-    assert main.main(['compare', *folders, '-o', str(tmp_path / 'c.png')]) == 0
+    assert main.main(['compare', *folders, '-o', str(tmp_path / 'c.svg')]) == 0
     out = capsys.readouterr().out
     (row,) = (line.split() for line in out.splitlines() if line.startswith('fx '))
     sigma = np.sqrt(2) * tiny.sigma[0]
     assert row[3:] == ['+0.5', f'{sigma:.2g}', f'{0.5 / sigma:+.1f}']
-    assert (tmp_path / 'c.png').is_file() and str(tmp_path / 'c.png') in out
+    assert (tmp_path / 'c.svg').is_file() and str(tmp_path / 'c.svg') in out
     assert main.main(['compare', *folders, '--json']) == 0
     made = json.loads(capsys.readouterr().out)
     assert made['difference'][0] == pytest.approx(0.5)

@@ -11,16 +11,17 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment.lookup import (
     COLUMNS,
-    line_of_sight_jacobian,
+    Derivatives,
     line_of_sight_table,
     LineOfSightTable,
     pixels_every,
 )
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
+from starcal_ros.camera.detector_field import degrees, DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.detector_field import degrees, DetectorField
 from starcal_ros.errors import ProductError
-from starcal_ros.products.lookup_table import write_lookup_table
+from starcal_ros.formats.products.lookup_table import write_lookup_table
+from starcal_ros.records import MapCovariance
 
 LENS = CameraModel(640, 512, np.array([1800, 0.2, 1801, 320, 255, -0.045, 0.08, 0.1, 4e-4, -3e-4]))
 DEGREE = 3
@@ -71,7 +72,7 @@ def differences(camera: CameraModel, pixels: np.ndarray, change: np.ndarray) -> 
 
 @CAMERAS
 def test_directions_are_those_of_the_camera(camera: CameraModel) -> None:
-    table = line_of_sight_table(camera, covariance_of(camera), PIXELS)
+    table = line_of_sight_table(camera, MapCovariance(covariance_of(camera)), PIXELS)
     np.testing.assert_array_equal(table.pixels, PIXELS)
     np.testing.assert_array_equal(table.direction_camera, line_of_sight(camera, PIXELS))
     np.testing.assert_allclose(np.linalg.norm(table.direction_camera, axis=1), 1.0, rtol=1e-14)
@@ -81,7 +82,7 @@ def test_directions_are_those_of_the_camera(camera: CameraModel) -> None:
 
 @CAMERAS
 def test_derivatives_are_the_limits_of_differences(camera: CameraModel) -> None:
-    _, J = line_of_sight_jacobian(camera, PIXELS)
+    J = Derivatives.at(camera, PIXELS).J
     sigma = np.sqrt(np.diag(covariance_of(camera)))
     assert J.shape == (len(PIXELS), 3, len(sigma))
     for k, change in enumerate(np.diag(sigma)):
@@ -95,7 +96,7 @@ def test_derivatives_are_the_limits_of_differences(camera: CameraModel) -> None:
 def test_sigma_is_that_of_differences(camera: CameraModel) -> None:
     """Sum of the squared movements by independent changes; common rotation by least squares."""
     covariance = covariance_of(camera)
-    table = line_of_sight_table(camera, covariance, PIXELS)
+    table = line_of_sight_table(camera, MapCovariance(covariance), PIXELS)
     p = len(camera.parameters)
     both = pixel_grid(camera, 25, 25)
     at_grid, at_pixels = line_of_sight(camera, both), line_of_sight(camera, PIXELS)
@@ -119,13 +120,31 @@ def test_sigma_is_that_of_differences(camera: CameraModel) -> None:
     np.testing.assert_allclose(table.shape_sigma_arcsec, np.sqrt(shape) / ARCSECOND_RAD, rtol=1e-5)
 
 
+@CAMERAS
+def test_structure_finer_than_the_field_moves_each_pixel_by_itself(camera: CameraModel) -> None:
+    nothing = np.zeros_like(covariance_of(camera))
+    table = line_of_sight_table(camera, MapCovariance(nothing, 0.3), PIXELS)
+    square = np.zeros(len(PIXELS))
+    for step in np.eye(2):
+        ends = [line_of_sight(camera, PIXELS + sign * 0.01 * step) for sign in (1.0, -1.0)]
+        square += (((ends[0] - ends[1]) / 0.02) ** 2).sum(axis=1)
+    expected = 0.3 * np.sqrt(square) / ARCSECOND_RAD
+    # Of a field that is steep, the derivative is that without the field: to its slope.
+    rtol = 1e-6 if camera.field is None else 0.02
+    for found in (table.sigma_arcsec, table.shape_sigma_arcsec):
+        np.testing.assert_allclose(found, expected, rtol=rtol)
+    both = line_of_sight_table(camera, MapCovariance(covariance_of(camera), 0.3), PIXELS)
+    alone = line_of_sight_table(camera, MapCovariance(covariance_of(camera)), PIXELS)
+    np.testing.assert_allclose(both.sigma_arcsec, np.hypot(alone.sigma_arcsec, table.sigma_arcsec))
+
+
 def test_many_pixels_are_as_each_alone() -> None:
     covariance = covariance_of(LENS)
     pixels = pixels_every(LENS, 8.0)
     assert len(pixels) > 4096  # more than are taken at a time
-    table = line_of_sight_table(LENS, covariance, pixels)
+    table = line_of_sight_table(LENS, MapCovariance(covariance), pixels)
     for k in (0, 4095, 4096, len(pixels) - 1):
-        alone = line_of_sight_table(LENS, covariance, pixels[k : k + 1])
+        alone = line_of_sight_table(LENS, MapCovariance(covariance), pixels[k : k + 1])
         for name in ('direction_camera', 'sigma_arcsec', 'shape_sigma_arcsec'):
             # Sums in another order.
             one, other = getattr(table, name)[k], getattr(alone, name)[0]
@@ -136,7 +155,7 @@ def test_an_alignment_alone_has_no_shape() -> None:
     covariance = np.zeros((13, 13))
     covariance[11, 11] = (50 * ARCSECOND_RAD) ** 2
     centre = LENS.parameters[3:5][None]
-    table = line_of_sight_table(LENS, covariance, centre)
+    table = line_of_sight_table(LENS, MapCovariance(covariance), centre)
     assert table.shape_sigma_arcsec[0] == 0.0
     # A rotation about y moves what lies along z by its whole angle.
     assert table.sigma_arcsec[0] == pytest.approx(50.0, rel=1e-5)
@@ -144,7 +163,7 @@ def test_an_alignment_alone_has_no_shape() -> None:
 
 def test_a_pixel_without_a_line_of_sight_is_nan() -> None:
     folded = LENS.replace(k1=-12.0, k2=0.0, k3=0.0)
-    table = line_of_sight_table(folded, covariance_of(LENS), PIXELS)
+    table = line_of_sight_table(folded, MapCovariance(covariance_of(LENS)), PIXELS)
     folds = np.isnan(line_of_sight(folded, PIXELS)).any(axis=1)
     assert folds.any() and not folds.all()
     for values in (table.direction_camera[:, 0], table.sigma_arcsec, table.shape_sigma_arcsec):
@@ -167,7 +186,7 @@ def test_pixels_at_every_step(step_px: float, of_u: list[float], of_v: list[floa
 
 @pytest.fixture
 def table() -> LineOfSightTable:
-    return line_of_sight_table(LENS, covariance_of(LENS), pixels_every(LENS, 200.0))
+    return line_of_sight_table(LENS, MapCovariance(covariance_of(LENS)), pixels_every(LENS, 200.0))
 
 
 def columns_of(table: LineOfSightTable) -> dict[str, np.ndarray]:

@@ -22,19 +22,21 @@ from starcal_ros.assessment.observability import (
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.methods.problem import METHODS
-from starcal_ros.records import CameraGeometry, Ensemble, refused_image
-from starcal_ros.simulation.centroids import cramer_rao_covariance, true_observations
-from starcal_ros.simulation.scenario import scenario
+from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
+from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, refused_image
+from starcal_ros.studies.simulation.centroids import cramer_rao_covariance, true_observations
+from starcal_ros.studies.simulation.scenario import scenario
 
 SCENARIO = scenario('tiny', seed=4)
 PRIOR, TRUTH = SCENARIO.prior, SCENARIO.truth
-DEFAULT = CalibrationOptions(star_tracker_sigma_arcsec=SCENARIO.star_tracker_sigma_arcsec)
-# Eight parameters without a prior, those of the Cramer-Rao bound.
-OPTIONS = dataclasses.replace(
-    DEFAULT, estimate=('fx', 'skew', 'fy', 'distortion'), residual_field=False
+# A prediction has neither slow errors of the star tracker nor an unknown velocity.
+DEFAULT = CalibrationOptions(
+    star_tracker_sigma_arcsec=SCENARIO.star_tracker_sigma_arcsec,
+    star_tracker_slow_arcsec=0.1,
+    velocity_sigma_m_s=10.0,
 )
+# Eight parameters without a prior, those of the Cramer-Rao bound.
+OPTIONS = dataclasses.replace(DEFAULT, estimate=('fx', 'skew', 'fy', 'distortion'))
 NAMES = estimated_parameters(OPTIONS, 'plumb_bob')
 FREE = [k for k, name in enumerate(PARAMETER_NAMES) if name in NAMES]
 
@@ -63,17 +65,17 @@ def test_predicted_sigma_is_that_of_the_solve(options: CalibrationOptions) -> No
     np.testing.assert_allclose(found, np.sqrt(np.diag(covariance(options)))[estimated], rtol=0.20)
 
 
-@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('method', ['hierarchical', 'per_image'])
 def test_priors_and_considered_parameters_are_in_the_prediction(method: str) -> None:
     sigma = dict.fromkeys(PARAMETER_NAMES, 0.0) | {'k3': 0.1, 'cx': 2.0}
     options = dataclasses.replace(
         OPTIONS, method=method, prior_sigma=tuple(sigma.values()), variance_components=False
     )
-    solved = estimate_calibration(without_noise(), TRUTH, options).covariance
+    solved = estimate_calibration(ensemble(), TRUTH, options).covariance
     expected = np.sqrt(np.diag(solved))[[*FREE, 10, 11, 12]]
-    # Both at the truth: sums of products of like numbers, of which ten digits are the same.
-    found = predicted_sigma(without_noise(), TRUTH, options)
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    # The field, changes from image to image and finer structure, which are not in a prediction,
+    # take a part; the sigma of the star tracker is that of ten images.
+    np.testing.assert_allclose(predicted_sigma(ensemble(), TRUTH, options), expected, rtol=0.25)
 
 
 def test_predicted_sigma_at_the_truth_is_the_cramer_rao_bound() -> None:
@@ -118,15 +120,18 @@ def test_images_of_fewer_than_three_stars_tell_nothing() -> None:
     np.testing.assert_allclose(information[3], alone, rtol=1e-9, atol=1e-9 * np.abs(alone).max())
 
 
-@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('method', ['hierarchical', 'per_image'])
 def test_the_information_of_the_images_adds_up_to_that_of_the_solve(method: str) -> None:
     options = dataclasses.replace(OPTIONS, method=method, variance_components=False)
-    solved = estimate_calibration(without_noise(), TRUTH, options)
-    total = image_information(without_noise().images, TRUTH, options).sum(axis=0)
-    scale = np.sqrt(np.diag(solved.information))
-    # As above.
+    solved = estimate_calibration(ensemble(), TRUTH, options)
+    total = image_information(ensemble().images, TRUTH, options).sum(axis=0)
+    of_camera = np.ix_(range(len(FREE)), range(len(FREE)))
+    scale = np.sqrt(np.diag(solved.information))[: len(FREE)]
+    # Changes from image to image of 1e-4 px, a field, and centroid variances of 3900 stars.
     np.testing.assert_allclose(
-        total / np.outer(scale, scale), solved.information / np.outer(scale, scale), atol=1e-6
+        total[of_camera] / np.outer(scale, scale),
+        solved.information[of_camera] / np.outer(scale, scale),
+        atol=0.1,
     )
 
 
@@ -200,10 +205,11 @@ def sampled_directions(samples: int, rows: int) -> tuple[np.ndarray, np.ndarray]
     return np.array(found), mounting.apply(line_of_sight(TRUTH.camera, pixels))
 
 
+@pytest.mark.slow
 def test_the_line_of_sight_map_is_what_the_covariance_scatters() -> None:
     found, mean = sampled_directions(2000, 4)
     scatter_rad = np.sqrt(((found - mean) ** 2).sum(axis=2).mean(axis=0))
-    expected = line_of_sight_sigma_arcsec(TRUTH.camera, covariance(), 5, 4)
+    expected = line_of_sight_sigma_arcsec(TRUTH.camera, MapCovariance(covariance()), 5, 4)
     assert expected.shape == (4, 5)
     # 2000 draws of two angles: 1.6 % each; the worst of 20 pixels within four of those.
     np.testing.assert_allclose(scatter_rad / ARCSECOND_RAD, expected.ravel(), rtol=0.065)
@@ -218,7 +224,7 @@ def test_the_map_sigma_is_the_scatter_that_a_common_turn_leaves() -> None:
     fx = TRUTH.camera.parameters[0]
     scatter_px = fx * np.sqrt(np.mean(left))
     # Eight modes of unlike strength in 500 draws: 3 % or so.
-    expected_px = np.sqrt(np.mean(map_sigma_px(TRUTH.camera, covariance(), 5) ** 2))
+    expected_px = np.sqrt(np.mean(map_sigma_px(TRUTH.camera, MapCovariance(covariance()), 5) ** 2))
     assert scatter_px == pytest.approx(expected_px, rel=0.10)
 
 
@@ -227,23 +233,23 @@ def test_the_map_does_not_mind_what_the_alignment_takes_up() -> None:
     C = np.zeros((13, 13))
     C[3, 3] = 20.0**2
     fx = TRUTH.camera.parameters[0]
-    left_px = map_sigma_px(TRUTH.camera, C)
+    left_px = map_sigma_px(TRUTH.camera, MapCovariance(C))
     # Off the axis by r a turn shears by r^2: what 20 px leave at the corner (r = 0.23) is 1 px.
     assert left_px.max() < 20.0 * 0.23**2 * 1.5
     C[11, 11] = (20.0 / fx) ** 2
     C[3, 11] = C[11, 3] = 20.0 * 20.0 / fx
-    np.testing.assert_array_equal(map_sigma_px(TRUTH.camera, C), left_px)
+    np.testing.assert_array_equal(map_sigma_px(TRUTH.camera, MapCovariance(C)), left_px)
     # The whole line of sight does mind, one way or the other: 20 px are 2300 arcsec.
     C[3, 11] = C[11, 3] = 0.0
     C[11, 11] = 0.0
-    whole = line_of_sight_sigma_arcsec(TRUTH.camera, C)
+    whole = line_of_sight_sigma_arcsec(TRUTH.camera, MapCovariance(C))
     np.testing.assert_allclose(whole, 20 / fx / ARCSECOND_RAD, rtol=0.1)
 
 
 def test_an_alignment_alone_is_seen_by_each_line_of_sight_but_its_own_axis() -> None:
     C = np.zeros((13, 13))
     C[12, 12] = (100 * ARCSECOND_RAD) ** 2  # roll
-    found = line_of_sight_sigma_arcsec(TRUTH.camera, C, 3, 3)
+    found = line_of_sight_sigma_arcsec(TRUTH.camera, MapCovariance(C), 3, 3)
     e = line_of_sight(TRUTH.camera, pixel_grid(TRUTH.camera, 3, 3))
     expected = 100 * np.hypot(e[:, 0], e[:, 1]).reshape(3, 3)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)

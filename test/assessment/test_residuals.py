@@ -14,10 +14,10 @@ from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.products.residuals_npz import read_residuals, write_residuals
-from starcal_ros.simulation import centroids as simulated_centroids
-from starcal_ros.simulation import scenario
+from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.formats.products.product_folder import read_residuals, write_residuals
+from starcal_ros.studies.simulation import centroids as simulated_centroids
+from starcal_ros.studies.simulation import scenario
 
 SCENARIO = dataclasses.replace(scenario.scenario('small', seed=4), image_count=8)
 
@@ -28,6 +28,7 @@ def left(request: pytest.FixtureRequest) -> Residuals:
     options = CalibrationOptions(
         method=request.param,
         star_tracker_sigma_arcsec=SCENARIO.star_tracker_sigma_arcsec,
+        velocity_sigma_m_s=10.0,
     )
     estimate = estimate_calibration(ensemble, SCENARIO.prior, options)
     return residuals_of(estimate, ensemble, np.full(len(estimate.table), np.nan))
@@ -92,8 +93,9 @@ def test_bad_files_are_named(left: Residuals, tmp_path: Path) -> None:
     write_residuals(dataclasses.replace(left, measured_px=left.measured_px[1:]), path)
     with pytest.raises(ProductError, match='measured_px'):
         read_residuals(path)
+    write_residuals(left, path)
     with np.load(path) as archive:
         columns = {name: archive[name] for name in archive.files if name != 'used'}
     np.savez(path, **columns)
-    with pytest.raises(ProductError, match='no array used'):
+    with pytest.raises(ProductError, match="key 'used' is missing"):
         read_residuals(path)

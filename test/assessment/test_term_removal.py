@@ -14,11 +14,11 @@ from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.estimation.options import estimated_parameters
-from starcal_ros.methods.problem import METHODS
+from starcal_ros.estimation.calibration_options import estimated_parameters
+from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry
-from starcal_ros.simulation.centroids import true_observations
 from starcal_ros.studies import trials
+from starcal_ros.studies.simulation.centroids import true_observations
 
 TRACKER_ARCSEC = 20.0
 
@@ -85,12 +85,14 @@ def test_a_removal_is_a_calibration_that_never_had_the_terms() -> None:
         dataclasses.replace(options, estimate=remaining, outlier_sigma=20.0),
     )
     rms_px = np.sqrt(np.mean(other.residual_px**2))
-    # One minimum, from two starts: both within 1e-9 sigma of it, and a residual is flat there.
-    assert removals[3].residual_rms_px == pytest.approx(rms_px, rel=1e-9)
-    change_px = map_error_px(other.geometry.camera, estimate.geometry.camera)
-    assert removals[3].map_change_px == pytest.approx(change_px, rel=1e-5)
+    # The field and the shapes of the images are those of the calibration with all terms, here
+    # those of the one without: they take 1e-5 of the residuals, and some of what is removed.
+    assert removals[3].residual_rms_px == pytest.approx(rms_px, rel=1e-4)
+    plain = [dataclasses.replace(one.geometry.camera, field=None) for one in (other, estimate)]
+    assert removals[3].map_change_px == pytest.approx(map_error_px(*plain), rel=0.2, abs=0.01)
 
 
+@pytest.mark.slow
 def test_terms_that_are_none_are_negligible_and_others_are_not() -> None:
     said = []
     for seed in range(30):
@@ -123,14 +125,14 @@ def test_terms_that_are_none_are_negligible_and_others_are_not() -> None:
 
 
 def test_terms_that_matter_stay_to_the_last() -> None:
-    """On a night like the paper's: principal point and k3 go first, k1 or a focal length last."""
+    """On a night like the paper's: principal point, skew and k3 first, k1 or fx last."""
     night = dataclasses.replace(
         trials.draw_scenario(np.random.default_rng(6)), image_count=15, cadence_s=250.0
     )
     options = trials.calibration_options('per_image', 20.0, estimate=PARAMETER_NAMES)
     removals = removal_study(estimate_calibration(true_observations(night), night.prior, options))
     assert sorted(removal.removed for removal in removals) == sorted(['', *PARAMETER_NAMES])
-    assert {removal.removed for removal in removals[1:4]} == {'cx', 'cy', 'k3'}
+    assert {removal.removed for removal in removals[1:5]} == {'cx', 'cy', 'k3', 'skew'}
     assert removals[-1].removed in ('fx', 'fy', 'k1')
     # (paper: only 5-6 of the ten matter)
     residual = [removal.residual_rms_px for removal in removals]

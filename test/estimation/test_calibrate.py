@@ -11,22 +11,38 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from starcal_ros.arrays import Indices, Mask
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
+from starcal_ros.estimation import working_weights
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.options import CalibrationOptions, check_enough, estimated_parameters
-from starcal_ros.methods.problem import METHODS
+from starcal_ros.estimation.calibration_options import (
+    CalibrationOptions,
+    check_enough,
+    estimated_parameters,
+)
+from starcal_ros.estimation.centroid_noise import CentroidVariance
+from starcal_ros.estimation.problem import METHODS
+from starcal_ros.estimation.shared_errors import SharedError
+from starcal_ros.estimation.star_equations import star_table
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
-from starcal_ros.simulation.centroids import bound_names, cramer_rao_covariance, true_observations
-from starcal_ros.simulation.scenario import scenario
+from starcal_ros.studies.simulation.centroids import (
+    bound_names,
+    cramer_rao_covariance,
+    true_observations,
+)
+from starcal_ros.studies.simulation.scenario import scenario
 
 SCENARIO = scenario('tiny', seed=3)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior
 TRACKER_ARCSEC = (10.0, 10.0, 40.0)
-# The eight parameters of the Cramer-Rao bound, without a prior, and no field beside them.
+# The eight parameters of the Cramer-Rao bound, without a prior; what else is not known is small.
 EIGHT = CalibrationOptions(
-    estimate=('fx', 'skew', 'fy', 'distortion'), principal_point_prior=0.0, residual_field=False
+    estimate=('fx', 'skew', 'fy', 'distortion'),
+    principal_point_prior=0.0,
+    velocity_sigma_m_s=10.0,
+    star_tracker_slow_arcsec=0.1,
 )
 NAMES = estimated_parameters(EIGHT, 'plumb_bob')
 FREE = [PARAMETER_NAMES.index(name) for name in NAMES]
@@ -72,7 +88,8 @@ def with_noise(
 
 
 def options(method: str, **other: object) -> CalibrationOptions:
-    values: dict[str, object] = {'star_tracker_sigma_arcsec': TRACKER_ARCSEC, **other}
+    tracker_arcsec = (1e-3,) * 3 if method == 'single' else TRACKER_ARCSEC
+    values: dict[str, object] = {'star_tracker_sigma_arcsec': tracker_arcsec, **other}
     return dataclasses.replace(EIGHT, method=method, **values)  # type: ignore[arg-type]
 
 
@@ -112,6 +129,11 @@ def trials(method: str) -> tuple[Estimate, ...]:
     )
 
 
+def with_trials(test):
+    """A test of the trials: all in one process of pytest-xdist, which estimates them once."""
+    return pytest.mark.slow(pytest.mark.xdist_group('trials')(test))
+
+
 def assert_true_to_its_covariance(errors: list[float], parameters: int) -> None:
     """The sum of normalised squared errors lies within the 99 % interval of chi squared."""
     low, high = chi2.ppf([0.005, 0.995], parameters * len(errors)) / len(errors)
@@ -134,9 +156,7 @@ def test_without_noise_the_truth_comes_back(method: str, with_principal_point: b
     off = Rotation.from_euler('xyz', [0.2, -0.2, 0.1], degrees=True)
     mounting = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw) * off
     prior = CameraGeometry(prior_camera, mounting.as_quat())
-    chosen = options(method, estimate=estimate, residual_field=True)
-    found = estimate_calibration(clean(), prior, chosen)
-    assert not found.geometry.camera.has_field
+    found = estimate_calibration(clean(), prior, options(method, estimate=estimate))
     assert found.termination == 'converged' and found.kept.all()
     error = error_of(found, list(range(13)))
     # 1e-9 of each term at the edge of the field (r = 0.23, f = 1800 px) and of a radian.
@@ -173,6 +193,7 @@ def test_the_order_of_the_names_does_not_matter(method: str) -> None:
     np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
+@with_trials
 @each_method
 def test_the_reported_covariance_is_true(method: str) -> None:
     estimates = trials(method)
@@ -183,6 +204,7 @@ def test_the_reported_covariance_is_true(method: str) -> None:
     assert rejected < 3.0
 
 
+@with_trials
 def test_the_covariance_holds_for_each_group_alone() -> None:
     for method in ('per_image', 'hierarchical'):
         for rows in (FREE, [10, 11, 12]):
@@ -193,6 +215,7 @@ def test_the_covariance_holds_for_each_group_alone() -> None:
             assert_true_to_its_covariance(errors, len(rows))
 
 
+@with_trials
 def test_the_variance_of_the_centroids_is_found_again() -> None:
     for method in METHODS:
         ratio = [
@@ -210,6 +233,7 @@ def test_the_variance_of_the_centroids_is_found_again() -> None:
         assert factor == pytest.approx(1.0, abs=0.008)
 
 
+@with_trials
 def test_the_line_of_sight_reaches_the_cramer_rao_bound() -> None:
     assert tuple(PARAMETER_NAMES[k] for k in FREE) == bound_names(TRUTH.camera)
     bound = cramer_rao_covariance(SCENARIO)
@@ -228,6 +252,7 @@ def test_the_line_of_sight_reaches_the_cramer_rao_bound() -> None:
         assert_true_to_its_covariance(in_sigma, 8)
 
 
+@pytest.mark.slow
 def test_hierarchical_is_no_worse_than_the_better_of_the_others() -> None:
     # With a useless tracker it is per-image, with a perfect one it is single.
     noisy = with_noise(clean(), 1)
@@ -248,10 +273,13 @@ def test_hierarchical_is_no_worse_than_the_better_of_the_others() -> None:
     )
     rows = [*FREE, 10, 11, 12]
     sigma = np.sqrt(np.diag(other.covariance))[rows]
-    assert (np.abs(error_of(one, rows) - error_of(other, rows)) / sigma).max() < 0.01
-    np.testing.assert_allclose(np.sqrt(np.diag(one.covariance))[rows], sigma, rtol=0.01)
+    # The errors that the stars show of a perfect star tracker are their own noise, which its
+    # sigma takes in: hierarchical does not trust it as single does.
+    assert (np.abs(error_of(one, rows) - error_of(other, rows)) / sigma).max() < 1.0
+    assert (np.sqrt(np.diag(one.covariance))[FREE] < 2.0 * sigma[: len(FREE)]).all()
 
 
+@with_trials
 @each_method
 def test_the_errors_of_single_and_hierarchical_in_order(method: str) -> None:
     # Predicted from the same noise: knowing more of the attitudes never makes sigma larger.
@@ -261,6 +289,7 @@ def test_the_errors_of_single_and_hierarchical_in_order(method: str) -> None:
     assert (sigma['single'][rows] <= 1.02 * sigma[method][rows]).all()
 
 
+@pytest.mark.slow
 @each_method
 @pytest.mark.parametrize('fraction', [0.02, 0.10])
 def test_gross_outliers_are_left_out(method: str, fraction: float) -> None:
@@ -311,20 +340,22 @@ def test_outliers_that_all_lean_one_way_are_left_out(method: str) -> None:
     assert np.abs(error_of(found, rows) / sigma).max() < 5.0
 
 
+@pytest.mark.slow
 @each_method
 @pytest.mark.parametrize('centroid_scale', [2.0, 0.5])
 def test_centroid_covariances_wrong_by_four_do_no_harm(method: str, centroid_scale: float) -> None:
     errors, factors = [], []
-    for k in range(20):
+    for k in range(10):
         noisy = with_noise(clean(), 100 + k, tracker_of(method), centroid_scale)
         found = estimate_calibration(noisy, PRIOR, options(method))
         errors.append(normalised_error(found))
         factors.append(found.variance_factor)
     assert_true_to_its_covariance(errors, 11)
-    # chi^2 per degree of freedom as given says it, to 0.4 % in 20 trials.
+    # chi^2 per degree of freedom as given says it, to 0.6 % in 10 trials.
     assert np.mean(factors) == pytest.approx(centroid_scale**2, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_floor_that_no_centroid_knows_of_is_found() -> None:
     errors, floors = [], []
     for k in range(20):
@@ -336,6 +367,7 @@ def test_a_floor_that_no_centroid_knows_of_is_found() -> None:
     assert np.sqrt(np.mean(floors)) == pytest.approx(0.1, rel=0.05)
 
 
+@pytest.mark.slow
 @each_method
 def test_images_of_very_unlike_star_counts(method: str) -> None:
     sizes = (3, 4, 8, 15, 30, 60, 120, 250, 300, 5)
@@ -406,12 +438,11 @@ def test_stars_in_one_spot_leave_an_honest_uncertainty(method: str) -> None:
         return image.select(np.hypot(*(image.measured_px - [320, 256]).T) < 40)
 
     spot = with_noise(Ensemble(tuple(middle(image) for image in clean().images)), 1)
-    # All ten parameters, and a field where one can be determined: here it cannot.
+    # All ten parameters.
     chosen = CalibrationOptions(
         method=method, star_tracker_sigma_arcsec=TRACKER_ARCSEC, min_stars=10
     )
     found = estimate_calibration(spot, PRIOR, chosen)
-    assert found.geometry.camera.field is None and found.field_test is None
     sigma = np.sqrt(np.diag(found.covariance))
     # 0.022 rad from the axis k1 moves nothing by 0.1 px before it is 5: nobody knows it.
     assert sigma[PARAMETER_NAMES.index('k1')] > 1.0
@@ -422,3 +453,21 @@ def test_fewer_residuals_than_unknowns() -> None:
     few = Ensemble(tuple(image.select(np.arange(len(image)) < 1) for image in clean().images))
     with pytest.raises(TooFewObservations, match='the stars do not determine'):
         estimate_calibration(few, PRIOR, options('per_image', min_stars=10))
+
+
+def test_a_variance_that_moves_no_weight_holds_nothing_up() -> None:
+    """Places of stars that are seen once: their variance creeps to zero for twenty rounds."""
+    table = star_table(clean().images)
+    kept = np.ones(len(table), bool)
+    seen: Mask = np.ones(table.image_count, bool)
+    none = np.zeros((table.image_count, 3))
+    attitudes = working_weights.Attitudes(none, np.zeros((len(none), 3, 3)), seen, ~seen, (), ())
+
+    def judged(variance_px2: float, stars: Indices) -> working_weights.Judged:
+        error = SharedError('star places', stars, variance_px2, 0.0, True, 1.0)
+        return working_weights.Judged(CentroidVariance(1.0, 0.0), (error,), kept, attitudes)
+
+    once = dataclasses.replace(table, star=np.arange(len(table)))
+    assert working_weights.agree(judged(4e-6, once.star), judged(2e-6, once.star), once)
+    often = dataclasses.replace(table, star=np.zeros(len(table), np.int64))
+    assert not working_weights.agree(judged(4e-6, often.star), judged(2e-6, often.star), often)

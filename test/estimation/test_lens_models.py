@@ -7,25 +7,20 @@ import dataclasses
 
 import numpy as np
 import pytest
-from random_pointings import (  # type: ignore[import-not-found]
-    displaced,
-    estimated,
-    of_random_pointings,
-    WIDTH,
-)
+from random_pointings import displaced, estimated, of_random_pointings, WIDTH  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import line_of_sight_sigma_arcsec, map_error_px
 from starcal_ros.camera import CameraModel, project_jacobians
+from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.least_squares.normal_equations import arrange, normal_blocks, star_table
-from starcal_ros.lens import COEFFICIENTS
+from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
+from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble
-from starcal_ros.simulation.centroids import true_observations
-from starcal_ros.simulation.scenario import Scenario, scenario
+from starcal_ros.studies.simulation.centroids import true_observations
+from starcal_ros.studies.simulation.scenario import Scenario, scenario
 
 #           k1   k2    k3    p1     p2     k4    k5   k6
 RATIONAL = [0.1, 0.05, 0.01, 1e-3, -7e-4, 0.35, 0.1, 0.02]
@@ -97,6 +92,7 @@ def test_without_noise_the_truth_comes_back(model: str) -> None:
     np.testing.assert_array_equal(after[held], before[held])
 
 
+@pytest.mark.slow
 @each_model
 def test_errors_are_those_of_the_reported_covariance(model: str) -> None:
     squares, count = 0.0, 0
@@ -119,7 +115,7 @@ def test_errors_are_those_of_the_reported_covariance(model: str) -> None:
         )
         squares, count = squares + float(whitened @ whitened), count + len(free)
         camera = found.geometry.camera
-        assert (line_of_sight_sigma_arcsec(camera, found.joint_covariance) > 0).all()
+        assert (line_of_sight_sigma_arcsec(camera, found.map_covariance) > 0).all()
     # Chi^2 with `count` degrees of freedom, 5 sigma on either side.
     assert abs(squares / count - 1.0) < 5 * np.sqrt(2 / count)
 
@@ -179,9 +175,12 @@ def test_options_of_another_model_are_refused(options: dict[str, object], says: 
 def test_a_prior_sigma_of_every_parameter() -> None:
     made = wide('equidistant')
     tight = (1e-3, 1e-3, 1e-3, 0.0, 0.0, 1e-6, 1e-6, 1e-6, 1e-6)
-    found = estimate_of(made, 'equidistant', true_observations(made), prior_sigma=tight)
-    sigma = np.sqrt(np.diag(found.covariance))[[0, 1, 2, 5, 6, 7, 8]]
-    assert (sigma <= np.array(tight)[[0, 1, 2, 5, 6, 7, 8]]).all()
+    chosen = CalibrationOptions(prior_sigma=tight, velocity_sigma_m_s=10.0)
+    found = estimate_calibration(true_observations(made), made.truth, chosen)
+    sigma = np.sqrt(np.diag(found.covariance))[[1, 5, 6, 7, 8]]
+    assert (sigma <= np.array(tight)[[1, 5, 6, 7, 8]]).all()
+    # A change that lasts over all images may be in the focal length: 0.01 px at most here.
+    assert (np.sqrt(np.diag(found.covariance))[[0, 2]] < 0.01).all()
 
 
 def test_mirrored_images_are_named() -> None:

@@ -11,15 +11,14 @@ import pytest
 
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.identification.blending import neighbour_pulls, Pulls, unlisted_pull_px
-from starcal_ros.identification.star_finder import IdentificationOptions
-from starcal_ros.image.detection import Background
-from starcal_ros.image.image_model import ImageModel
-from starcal_ros.image.pixel_noise import PixelNoise
-from starcal_ros.image.psf_field import uniform_width
-from starcal_ros.image.psf_fit import fit_psf, stamp_radius_px
-from starcal_ros.simulation.images import star_electrons
+from starcal_ros.identification.star_finder import MAX_BLEND_SIGMA
+from starcal_ros.stars.detection import Background
+from starcal_ros.stars.image_model import ImageModel
+from starcal_ros.stars.pixel_noise import PixelNoise
+from starcal_ros.stars.psf_field import uniform_width
+from starcal_ros.stars.psf_fit import fit_psf, stamp_radius_px
+from starcal_ros.studies.simulation.rendering import star_electrons
 
-OPTIONS = IdentificationOptions()
 SIGMA_PX = 0.95
 
 
@@ -85,7 +84,7 @@ def test_what_is_left_of_a_pull_that_is_let_pass_is_under_its_sigma() -> None:
                     flux_dn, ratio, distance_px, noise_dn
                 )
                 found, uncertain, swamped = pulls(measured_dn, ratio, distance_px, noise_dn)
-                if not (swamped[0] or uncertain[0, 0] > OPTIONS.max_blend_sigma * sigma_px):
+                if not (swamped[0] or uncertain[0, 0] > MAX_BLEND_SIGMA * sigma_px):
                     told_px = np.hypot(sigma_px, uncertain[0, 0])
                     worst = max(worst, abs(pull_px - found[0, 0]) / told_px)
     # The colour of the neighbour, which the uncertainty is for, is not in this.

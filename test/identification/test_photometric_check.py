@@ -16,15 +16,15 @@ from starcal_ros.identification.star_finder import (
     observe_stars,
     StarSearch,
 )
-from starcal_ros.image.centroiding import Centroids
-from starcal_ros.image.detection import Background
-from starcal_ros.image.image_model import ImageModel
-from starcal_ros.image.pixel_noise import PixelNoise
-from starcal_ros.image.psf_field import uniform_width
 from starcal_ros.records import StarRefusal
-from starcal_ros.simulation import images as simulated_images
-from starcal_ros.simulation import scenario as synthetic
 from starcal_ros.sky.catalog import load_catalog
+from starcal_ros.stars.centroiding import Centroids
+from starcal_ros.stars.detection import Background
+from starcal_ros.stars.image_model import ImageModel
+from starcal_ros.stars.pixel_noise import PixelNoise
+from starcal_ros.stars.psf_field import uniform_width
+from starcal_ros.studies.simulation import rendering
+from starcal_ros.studies.simulation import scenario as synthetic
 
 SHAPE = (512, 640)
 MIN_SNR = 5.0
@@ -145,7 +145,7 @@ def test_no_star_of_a_field_that_is_there_in_part_is_wrong(attitude_xyzw: list[f
     field = synthetic.Inertial((MILKY_WAY_DEG,) * 12)
     scenario = dataclasses.replace(base, pointing=field, image_count=12)
     drawn = synthetic.scene(scenario, 11)
-    image = simulated_images.render(scenario, drawn, 11)
+    image = rendering.render(scenario, drawn, 11)
     shot = Exposure(image, np.array(attitude_xyzw), 0.0)
     catalog = load_catalog(None, IdentificationOptions().magnitude_limit)
     try:

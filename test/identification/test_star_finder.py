@@ -20,7 +20,6 @@ from starcal_ros.identification.star_finder import (
     realigned,
     StarSearch,
 )
-from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.records import (
     CameraGeometry,
     Image,
@@ -28,9 +27,10 @@ from starcal_ros.records import (
     STAR_REFUSALS,
     StarObservations,
 )
-from starcal_ros.simulation.images import render
-from starcal_ros.simulation.scenario import Detector, scenario, Scene, scene
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
+from starcal_ros.stars.image_model import CentroidOptions
+from starcal_ros.studies.simulation.rendering import render
+from starcal_ros.studies.simulation.scenario import Detector, scenario, Scene, scene
 
 SCENARIO = scenario('tiny', seed=6)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior
@@ -118,6 +118,7 @@ def test_a_focal_length_two_percent_off_is_acquired(scale: float) -> None:
         assert_right(observed(image, one.icrf_from_star_tracker_xyzw, prior), one)
 
 
+@pytest.mark.slow
 def test_a_wrong_attitude_never_matches() -> None:
     # Anywhere in the sky: that one of 100 comes within 1.5 degrees is a chance of 0.02.
     refused = 0
@@ -261,11 +262,11 @@ def test_a_mirrored_image_matches_nothing() -> None:
         observed(mirrored, one.icrf_from_star_tracker_xyzw)
 
 
-def test_too_few_stars_are_refused() -> None:
+def test_too_few_stars_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     one, image = shown(0)
     used = observed(image, one.icrf_from_star_tracker_xyzw)
-    greedy = dataclasses.replace(OPTIONS, min_stars_per_image=1000)
-    refused = observed(image, one.icrf_from_star_tracker_xyzw, options=greedy)
+    monkeypatch.setattr('starcal_ros.identification.star_finder._MIN_STARS', 1000)
+    refused = observed(image, one.icrf_from_star_tracker_xyzw)
     assert (refused.refusal, len(refused)) == ('too_few_stars', 0)
     assert f'{len(used)} stars measured, 1000 needed' in refused.detail
     # What became of the others is told all the same.
@@ -301,14 +302,16 @@ def test_the_geometry_is_tracked_from_image_to_image() -> None:
     assert realigned(off, lost) is off
 
 
-def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure() -> None:
+def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     one, image = shown(2)
     marked = dataclasses.replace(catalog(), close_pair=np.ones(len(catalog()), bool))
     before = observed(image, one.icrf_from_star_tracker_xyzw)
     exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
     after, _ = observe_stars(exposure, PRIOR, StarSearch(marked, CENTROIDS))
-    strict = dataclasses.replace(OPTIONS, max_blend_sigma=0.1)
-    fewer, _ = observe_stars(exposure, PRIOR, StarSearch(marked, CENTROIDS, strict))
+    monkeypatch.setattr('starcal_ros.identification.star_finder.MAX_BLEND_SIGMA', 0.1)
+    fewer, _ = observe_stars(exposure, PRIOR, StarSearch(marked, CENTROIDS))
     assert fewer.refused_stars['blend'] > after.refused_stars['blend']
     both, i, j = np.intersect1d(before.catalog_id, after.catalog_id, return_indices=True)
     more_px2 = after.covariance_px2[j] - before.covariance_px2[i]

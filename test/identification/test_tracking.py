@@ -24,11 +24,11 @@ from starcal_ros.identification.star_finder import (
     StarSearch,
 )
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
-from starcal_ros.image.image_model import CentroidOptions
 from starcal_ros.records import CameraGeometry, Image, StarObservations
-from starcal_ros.simulation.images import render
-from starcal_ros.simulation.scenario import scenario, Scene, scene
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
+from starcal_ros.stars.image_model import CentroidOptions
+from starcal_ros.studies.simulation.rendering import render
+from starcal_ros.studies.simulation.scenario import scenario, Scene, scene
 
 SCENARIO = scenario('tiny', seed=8)
 PRIOR = SCENARIO.prior
@@ -123,6 +123,7 @@ def test_an_ensemble_knows_its_light_better_than_an_image() -> None:
     assert not width.coefficients[1:].any()  # the same all over the field
 
 
+@pytest.mark.slow
 def test_a_background_cut_off_at_zero_makes_no_star_look_certain() -> None:
     errors = []
     for seed in (8, 9, 10, 11):
@@ -225,6 +226,7 @@ def test_noise_of_the_star_tracker_is_tracked() -> None:
     assert (one.inv() * other).magnitude() == pytest.approx(np.radians(0.5), rel=0.001)
 
 
+@pytest.mark.slow
 def test_a_drifting_alignment_is_tracked() -> None:
     _, known = searched(0)
     first = Rotation.from_quat(known.geometry.star_tracker_from_camera_xyzw)

@@ -13,10 +13,10 @@ import pytest
 from tiny_campaign import attitudes, image, SCENARIO, values  # type: ignore[import-not-found]
 
 from starcal_ros.errors import OptionError
+from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.products.camera_yaml import write_camera_info
 from starcal_ros.records import Image, StarObservations
 
 HEIGHT, WIDTH = 512, 640
@@ -117,10 +117,14 @@ def test_saturated_pixels_stay_at_the_peak() -> None:
 @pytest.mark.parametrize(
     ('name', 'content', 'words'),
     [
-        ('flat_field', np.ones((HEIGHT, WIDTH - 1), np.uint8), 'expected 640 x 512 pixels'),
+        (
+            'flat_field',
+            np.ones((HEIGHT, WIDTH - 1), np.uint8),
+            'one channel of 640 x 512',
+        ),
         ('flat_field', np.zeros((HEIGHT, WIDTH), np.uint8), 'median is .*not positive'),
         ('flat_field', image().pixels, 'shows [0-9]+ stars: it is a frame of the sky'),
-        ('bad_pixel_map', np.zeros((3, 4), np.uint8), 'expected 640 x 512 pixels'),
+        ('bad_pixel_map', np.zeros((3, 4), np.uint8), 'one channel of 640 x 512'),
         ('bad_pixel_map', np.ones((HEIGHT, WIDTH), np.uint8), 'marks 100% .* 0 for good pixels'),
         ('bad_pixel_map', None, 'bad_pixel_map: .*map.png: cannot be read: No such file'),
     ],

@@ -12,19 +12,19 @@ import cv2
 import numpy as np
 import pytest
 
-from starcal_ros.bag import reader
-from starcal_ros.bag.typestore import make_message
-from starcal_ros.bag.writer import BagWriter
 from starcal_ros.cli import main
 from starcal_ros.cli.arguments import EXIT_REFUSED
-from starcal_ros.messages.fields import make_header
-from starcal_ros.messages.telemetry import attitude_from_message
-from starcal_ros.messages.types import COMPRESSED_TYPE
-from starcal_ros.pipeline import inspect, observe
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.messages.message_fields import make_header
+from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.formats.messages.types import COMPRESSED_TYPE
+from starcal_ros.pipeline import inspect, observe_bags
 from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Image
-from starcal_ros.simulation import bag as simulated_bag
+from starcal_ros.studies.simulation import simulated_bag
 
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 PARAMS = TINY / 'params.yaml'
@@ -75,6 +75,7 @@ def write_spoilt(path: Path, images: list[Image]) -> None:
         writer.write_image(IMAGE, Image(stamps[-1] + 10**10, images[-1].pixels), 'camera')
 
 
+@pytest.mark.slow
 def test_verdicts_are_those_of_the_calibration(
     tmp_path: Path, setup: Setup, tiny_images: list[Image]
 ) -> None:
@@ -95,7 +96,7 @@ def test_verdicts_are_those_of_the_calibration(
     expected = {r.reason: r.count for r in quick.refused} | {'blank': 1, 'wrong_size': 1}
     assert by_reason == expected
     assert len(seen) == full.images == 12
-    observed = list(observe.observe_bag([path], IMAGE, ATTITUDE, setup))
+    observed = list(observe_bags.observe_bag([path], Topics(IMAGE, ATTITUDE), setup))
     assert by_reason == Counter(o.refusal for o in observed if o.refusal)
     assert full.stars_per_image == tuple(len(o) for o in observed if not o.refusal)
     gap = next(r for r in full.refused if r.reason == 'attitude_gap')

@@ -13,7 +13,10 @@ import pytest
 from sample_records import plain  # type: ignore[import-not-found]
 from tiny_campaign import ensemble, values  # type: ignore[import-not-found]
 
-from starcal_ros.messages.observations import observations_from_message, observations_to_message
+from starcal_ros.formats.messages.observation_messages import (
+    observations_from_message,
+    observations_to_message,
+)
 from starcal_ros.options import names_of
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.provenance import inputs_of, provenance_of
@@ -26,6 +29,7 @@ def setup(camera_yaml: Path) -> Setup:
     return load_setup(values(camera_yaml))
 
 
+@pytest.mark.slow
 def test_provenance_tells_all_that_went_in(setup: Setup, camera_yaml: Path) -> None:
     first = solve.solve(ensemble(), setup, inputs={'bag': 'abc'}).provenance
     assert first['software'].startswith('starcal ')

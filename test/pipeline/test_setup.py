@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,10 @@ from tiny_campaign import SCENARIO, values, write_png  # type: ignore[import-not
 
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import CatalogError, OptionError, ProductError
-from starcal_ros.options import holds_options
+from starcal_ros.formats.products.camera_yaml import write_camera_info
+from starcal_ros.options import holds_options, names_of, REMOVED
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
-from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, Setup
-from starcal_ros.products.camera_yaml import write_camera_info
+from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, read_setup, Setup
 
 
 @pytest.fixture(scope='module')
@@ -51,9 +50,9 @@ def test_a_setup_holds_what_the_parameters_say(camera_yaml: Path) -> None:
 def test_a_setup_holds_the_options_of_every_stage(setup: Setup) -> None:
     """None that one of its fields has is missing where parameters are declared and told."""
     held = [value for value in vars(setup).values() if holds_options(type(value))]
-    assert tuple(map(type, held)) == OPTION_CLASSES and len(held) == 9
+    assert tuple(map(type, held)) == OPTION_CLASSES and len(held) == 8
     for group in held:
-        assert dataclasses.asdict(group).items() <= setup.options().items()
+        assert names_of(type(group)) <= setup.options().keys()
 
 
 def test_another_lens_model_starts_from_the_prior_camera(
@@ -66,10 +65,6 @@ def test_another_lens_model_starts_from_the_prior_camera(
     for name, value in (('estimate', ['fx', 's1']), ('prior_sigma', [0.0] * 10)):
         with pytest.raises(OptionError, match=f'{name}: .* the lens model rational_polynomial'):
             load_setup(values(camera_yaml, lens_model='rational_polynomial', **{name: value}))
-    with pytest.raises(OptionError, match='max_parameter_sigma: 12 numbers, .* 16 parameters'):
-        load_setup(
-            values(camera_yaml, lens_model='rational_polynomial', max_parameter_sigma=[1.0] * 12)
-        )
     fisheye = CameraModel(
         640, 480, np.array([160, 0, 155, 322, 236, -0.02, 0.01, -0.004, 5e-4]), 'equidistant'
     )
@@ -91,9 +86,47 @@ def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> 
         load_setup(both)
 
 
+def test_an_option_that_was_removed_is_named_with_what_replaces_it(camera_yaml: Path) -> None:
+    """As in a parameter file of an older version."""
+    assert not REMOVED.keys() & names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
+    text = 'residual_field: not an option any more: .* always estimated, .*; take it out'
+    with pytest.raises(OptionError, match=text):
+        load_setup(values(camera_yaml, residual_field=True))
+    words = ' '.join(REMOVED.values()).replace(',', ' ').replace(';', ' ').split()
+    kinds = ('max_', 'min_', 'prior_', 'velocity_sigma')
+    named = {word for word in words if word.startswith(kinds)}
+    assert len(named) > 8 and named <= names_of(*OPTION_CLASSES)
+
+
+@pytest.mark.parametrize('name', REMOVED)
+def test_each_removed_option_is_refused_in_one_line(camera_yaml: Path, name: str) -> None:
+    """With every kind of value that it may have had."""
+    with pytest.raises(OptionError) as refused:
+        load_setup(values(camera_yaml, **{name: 1.0}), NODE_OPTION_CLASSES)
+    text = str(refused.value)
+    assert text == f'{name}: not an option any more: {REMOVED[name]}; take it out'
+    assert len(text) < 200 and '\n' not in text
+
+
+def test_an_override_of_ros_in_a_parameter_file_is_not_an_option(
+    camera_yaml: Path, tmp_path: Path
+) -> None:
+    """The nodes' QoS override, nested as ROS reads it, in the file that the tool reads too."""
+    params = tmp_path / 'params.yaml'
+    params.write_text(
+        f'/**:\n  ros__parameters:\n    camera_info_url: {camera_yaml}\n'
+        '    qos_overrides: {/image: {subscription: {reliability: best_effort}}}\n'
+    )
+    assert read_setup(params).prior.camera.width > 0
+
+
 @pytest.mark.parametrize(
     ('wrong', 'says'),
     [
+        ({'shutter': 'rolling'}, 'readout_s: not set, which shutter: rolling needs'),
+        ({'readout_s': 0.03}, 'readout_s: 0.03 s, but shutter is unknown; set rolling'),
+        ({'observer_velocity_m_s': [0.0, 3e4]}, 'observer_velocity_m_s: 2 numbers, not 3'),
+        ({'observer_velocity_m_s': [0, 0, 3e8]}, r'observer_velocity_m_s\[2\]: .* is not within'),
         ({'max_residual_rms': 1.0}, 'max_residual_rms: no such parameter'),
         ({'camera_info_url': ''}, 'camera_info_url: not set'),
         (
@@ -104,13 +137,13 @@ def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> 
             {'prior_alignment': [0.0, 0.0, 0.0, 1e-4]},
             'prior_alignment: .* is not a unit quaternion',
         ),
-        ({'prior_alignment': [0.0, 0.0, 1.0]}, 'prior_alignment: .* is not a list of 4'),
+        ({'prior_alignment': [0.0, 0.0, 1.0]}, 'prior_alignment: 3 numbers, not 4'),
         ({'method': 'best'}, "method: 'best' is not one of hierarchical, per_image, single"),
-        ({'estimate': ['fx', 'fz']}, 'estimate: .* is not one of fx, skew'),
-        ({'min_images': 2.5}, 'min_images: 2.5 is not an integer'),
+        ({'estimate': ['fx', 'fz']}, r'estimate\[1\]: .fz. is not one of fx, skew'),
+        ({'min_images': 2.5}, 'min_images: 2.5 is not a whole number'),
         (
             {'dark_frame': '/no/such/dark.png'},
-            'dark_frame: /no/such/dark.png cannot be read: No such file',
+            'dark_frame: /no/such/dark.png: cannot be read: No such file',
         ),
     ],
 )

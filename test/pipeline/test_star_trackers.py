@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.bag.reader import log_damage
-from starcal_ros.bag.writer import BagWriter
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import BagError, OptionError
+from starcal_ros.formats.bag.reader import log_damage
+from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import solve, topics
 from starcal_ros.pipeline.setup import load_setup, NODES, Setup
@@ -71,6 +71,7 @@ def used(records: list[StarObservations]) -> Counter[str]:
     return Counter(record.star_tracker for record in records if not record.refusal)
 
 
+@pytest.mark.slow
 def test_both_star_trackers_are_used_and_aligned(tmp_path: Path) -> None:
     setup = setup_with()
     records = observed(bag_of(tmp_path / 'two'), setup)
@@ -90,6 +91,7 @@ def test_both_star_trackers_are_used_and_aligned(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('until', [-1.0, 0.0])
 @pytest.mark.parametrize('which', ['first', 'other'])
 def test_one_that_falls_silent_or_repeats_itself_costs_no_image(
@@ -103,6 +105,7 @@ def test_one_that_falls_silent_or_repeats_itself_costs_no_image(
     assert used(records)[lost] < 5 < used(records)[kept]
 
 
+@pytest.mark.slow
 def test_a_wrong_one_is_tried_seldom_and_costs_no_image(tmp_path: Path) -> None:
     """The alignment to the other star tracker is off by 5 degrees."""
     off = Rotation.from_euler('x', 5.0, degrees=True) * Rotation.from_quat(other_alignment())
@@ -146,17 +149,17 @@ def test_a_bag_without_any_attitude_is_refused(tmp_path: Path) -> None:
     [
         ({'more_alignments': [0.0]}, 'more_alignments: 1 numbers, but 1 further .* need 4'),
         ({'more_alignments': [1.0, 1.0, 0.0, 0.0]}, 'more_alignments: .* is not a unit'),
-        ({'more_star_trackers': ['a b']}, "more_star_trackers: 'a b' is no name of a frame"),
+        ({'more_star_trackers': ['a b']}, "more_star_trackers: 'a b' is not a valid frame name"),
         (
             {'more_star_trackers': ['a', 'a'], 'more_alignments': 8 * [0.0]},
-            "more_star_trackers: 'a' comes twice",
+            "more_star_trackers: 'a' is given twice",
         ),
         # As star_tracker_frame and camera_frame, whose attitudes and transforms they would be.
         (
             {'more_star_trackers': ['/star_tracker']},
-            "'/star_tracker' comes twice: .* a name of th",
+            "'/star_tracker' is given twice: .* a name of th",
         ),
-        ({'more_star_trackers': ['camera'], 'camera_frame': '/camera'}, "'camera' comes twice"),
+        ({'more_star_trackers': ['camera'], 'camera_frame': '/camera'}, "'camera' is given twice"),
         ({'prior_alignment': 4 * [0.0]}, 'more_star_trackers: prior_alignment is needed'),
     ],
 )

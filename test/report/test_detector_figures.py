@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.camera import CameraModel
-from starcal_ros.detector_field import DetectorField
+from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.records import CameraGeometry, refused_image
 from starcal_ros.report import detector_figures as figures
 from starcal_ros.report import svg
@@ -22,7 +22,7 @@ def test_arrows_have_a_scale_inside_the_canvas(width: int, height: int) -> None:
     camera = CameraModel(
         width, height, np.array([1800.0, 0, 1800, width / 2, height / 2, -0.05, 0, 0, 0, 0])
     )
-    drawn = str(figures.distortion_vectors(camera))
+    drawn = figures.distortion_vectors(camera).svg.__html__()
     assert re.search(r'>scale: [\d.]+ px<', drawn)
     wide, high = map(float, re.findall(r'viewBox="0 0 (\d+) ([\d.]+)"', drawn)[0])
     tips = re.findall(rf'd="M([\d.]+),([\d.]+)L[^"]*Z" fill="{re.escape(svg.SERIES[1])}"', drawn)
@@ -33,11 +33,9 @@ def test_arrows_have_a_scale_inside_the_canvas(width: int, height: int) -> None:
 def test_the_scale_is_that_of_the_arrows() -> None:
     """Arrows of a field that is 0.3 px along u have 1.5 times the length of 0.2 px."""
     field = DetectorField(640, 512, 0, np.array([[0.3], [0.0]]))
-    drawn = str(figures.field_vectors(field, CAMERA))
+    drawn = figures.field_vectors(field, CAMERA).svg.body
     assert '>scale: 0.2 px<' in drawn
-    arrow = (
-        r'd="M([\d.]+),[\d.]+L[\d.]+,[\d.]+" stroke="{}" stroke-width="1.3"/><path d="M([\d.]+),'
-    )
+    arrow = r'd="M([\d.]+),[\d.]+L[\d.]+,[\d.]+" fill="none" stroke="{}"[^>]*/><path d="M([\d.]+),'
     lengths = {}
     for colour in svg.SERIES[:2]:
         first = re.findall(arrow.format(re.escape(colour)), drawn)[0]
@@ -48,18 +46,18 @@ def test_the_scale_is_that_of_the_arrows() -> None:
 
 def test_no_displacement_is_said() -> None:
     ideal = CAMERA.replace(k1=0.0)
-    assert '>no displacement<' in str(figures.distortion_vectors(ideal))
-    assert '>0 px everywhere<' in str(figures.distortion_contours(ideal))
+    assert '>no displacement<' in figures.distortion_vectors(ideal).svg.body
+    assert '>0 px everywhere<' in figures.distortion_contours(ideal).svg.body
 
 
 def test_a_flat_map_says_so_and_others_start_at_zero() -> None:
     flat = np.full((25, 25), 5.774)
     flat[0, 0] = 5.802
-    assert '>flat within 0.48 %<' in str(figures.line_of_sight_sigma(flat, CAMERA))
+    assert '>flat within 0.48 %<' in figures.detector_map(flat, CAMERA, '″').body
     steep = np.linspace(1.0, 8.0, 625, dtype=np.float64).reshape(25, 25)
-    drawn = str(figures.line_of_sight_sigma(steep, CAMERA))
+    drawn = figures.detector_map(steep, CAMERA, '″').body
     assert 'flat' not in drawn and '>0″<' in drawn and '>8″<' in drawn
-    assert '>unknown<' in str(figures.line_of_sight_sigma(np.full((3, 3), np.nan), CAMERA))
+    assert '>unknown<' in figures.detector_map(np.full((3, 3), np.nan), CAMERA, '″').body
 
 
 def test_the_projection_of_the_sky() -> None:
@@ -82,7 +80,29 @@ def test_pointings_count_images_with_an_attitude() -> None:
         ),
         refused_image(3, 640, 512, 'no_attitude', ''),
     ]
-    drawn, count = figures.pointings(seen, geometry)
-    assert count == 2
+    chart = figures.pointings(seen, geometry)
+    assert chart is not None and 'Footprints of 2 images' in chart.text
     # A footprint and its line in the legend.
-    assert str(drawn).count(svg.SERIES[0]) == 2 and str(drawn).count(svg.SERIES[1]) == 2
+    assert [chart.svg.body.count(colour) for colour in svg.SERIES[:2]] == [2, 2]
+    assert figures.pointings(seen[2:], geometry) is None
+
+
+def test_labels_of_contours_are_inside_the_frame_and_on_no_other_line() -> None:
+    drawn = figures.distortion_contours(CAMERA.replace(k1=-0.4, k2=0.3)).svg.body
+    x, bottom, right, y = map(
+        float, re.findall(r'"M([\d.]+),[\d.]+V([\d.]+)H([\d.]+)V([\d.]+)Z"', drawn)[0]
+    )
+    labels = re.findall(r'<text x="([\d.]+)" y="([\d.]+)"[^>]* fill="#ffffff">([\d.]+ px)<', drawn)
+    assert len(labels) >= 2
+    lines = re.findall(r'<path d="([ML\d.,]+)" fill="none" stroke="#(?:ffffff|16202b)"', drawn)
+    places = [
+        np.array([tuple(map(float, p.split(','))) for p in re.split('[ML]', line)[1:]])
+        for line in lines
+    ]
+    assert sum(map(len, places)) > 100
+    for left, base, words in labels:
+        at = np.array([float(left), float(base) - 4])
+        half = np.array([0.3 * len(words), 0.5]) * svg.LETTER
+        assert (at - half > [x, y]).all() and (at + half < [right, bottom]).all()
+        # Its own line alone passes below it.
+        assert sum((abs(line - at) < half).all(axis=1).any() for line in places) == 1, words

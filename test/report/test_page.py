@@ -11,19 +11,20 @@ import shutil
 import subprocess
 from typing import Any
 
+from markupsafe import Markup
 import numpy as np
 import pytest
 
 from starcal_ros.cli import main
 from starcal_ros.cli.arguments import EXIT_ACCEPTED, EXIT_BAD_INPUT
-from starcal_ros.products import residuals_npz
-from starcal_ros.products.calibration_json import (
+from starcal_ros.formats.products import product_folder
+from starcal_ros.formats.products.calibration_json import (
     CALIBRATION_FILE,
     prior_of,
     read_calibration,
     write_calibration,
 )
-from starcal_ros.products.files import REPORT_FILE
+from starcal_ros.formats.products.product_files import REPORT_FILE
 from starcal_ros.report import page as report
 
 BROWSER = next(
@@ -39,11 +40,14 @@ FIGURES = (
     'before',
     'images',
     'histogram',
+    'lens_field',
     'field',
     'spectrum',
     'magnitude',
     'colour',
     'phase',
+    'budget',
+    'causes',
     'line_of_sight',
     'shape',
     'terms',
@@ -81,9 +85,17 @@ def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> N
     assert f'{calibration.residual_rms_px:.3f} px' in page
     assert f'{calibration.stars_used:,}' in page
     assert calibration.weakest_direction in page
+    total, *causes = calibration.sigma_budget
+    assert f'<th scope="row">total</th><td>{total.map_arcsec:.3g}</td>' in page
+    for part in causes:
+        assert str(Markup.escape(part.assumption)) in page
     for name in FIGURES:
         assert page.count(f'id="figure-{name}"') == 1
     assert calibration.provenance['observations_sha256'] in page
+    checks = calibration.model_checks
+    assert checks is not None and len(checks.amplitudes) >= 3
+    for one in checks.amplitudes:
+        assert f'<th scope="row">{one.name}</th><td>{one.value:.2g}</td>' in page
 
 
 def test_the_page_needs_nothing_else(page: str) -> None:
@@ -130,7 +142,9 @@ def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: P
     not_checked = next(check for check in calibration.gate if check.passed is None)
     shown = dataclasses.replace(calibration, gate=(failed, not_checked))
     write_calibration(shown, tmp_path / CALIBRATION_FILE)
-    table = re.findall(r'<table class="limits">.*?</table>', page_of(tmp_path), re.DOTALL)[0]
+    table = re.findall(
+        r'<section id="gate">.*?<table class="limits">.*?</table>', page_of(tmp_path), re.DOTALL
+    )[0]
     rows = [re.findall(r'<t[hd][^>]*>(.*?)</t[hd]>', row) for row in table.split('<tr>')[2:]]
     limit = f'at most {not_checked.limit_text}'
     names = [f'{check.name} <code>{check.option}</code>' for check in shown.gate]
@@ -145,7 +159,7 @@ def test_a_calibration_of_before_the_gate_told_says_so(folder: Path, tmp_path: P
     write_calibration(dataclasses.replace(calibration, gate=()), tmp_path / CALIBRATION_FILE)
     text = page_of(tmp_path)
     assert 'does not record the gate checks' in text
-    assert 'Gate checks' not in text
+    assert 'The gate checks are not recorded' in text
 
 
 def test_names_are_text_and_never_markup(folder: Path, tmp_path: Path) -> None:
@@ -159,7 +173,7 @@ def test_names_are_text_and_never_markup(folder: Path, tmp_path: Path) -> None:
         images_refused={evil: 1},
     )
     write_calibration(calibration, tmp_path / CALIBRATION_FILE)
-    shutil.copy(folder / residuals_npz.RESIDUALS_FILE, tmp_path)
+    shutil.copy(folder / product_folder.RESIDUALS_FILE, tmp_path)
     text = page_of(tmp_path)
     assert '<script>alert' not in text and '<img src=x' not in text
 
@@ -178,13 +192,13 @@ def test_numbers_that_are_none_do_no_harm(folder: Path, tmp_path: Path) -> None:
         time_ns=0,
     )
     write_calibration(calibration, tmp_path / CALIBRATION_FILE)
-    left = residuals_npz.read_residuals(folder / residuals_npz.RESIDUALS_FILE)
+    left = product_folder.read_residuals(folder / product_folder.RESIDUALS_FILE)
     nothing = dataclasses.replace(
         left,
         used=np.zeros_like(left.used),
         attitude_error_arcsec=np.full_like(left.attitude_error_arcsec, np.nan),
     )
-    residuals_npz.write_residuals(nothing, tmp_path / residuals_npz.RESIDUALS_FILE)
+    product_folder.write_residuals(nothing, tmp_path / product_folder.RESIDUALS_FILE)
     assert '<html' in page_of(tmp_path)
 
 
@@ -266,6 +280,7 @@ def shown(page: str, folder: Path, width: int, dark: bool) -> tuple[dict[str, An
     return json.loads(found[1].replace('&quot;', '"')), console
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason='no Chromium on this machine')
 @pytest.mark.parametrize(('width', 'dark'), [(400, False), (1600, True)])
 def test_a_browser_shows_it(page: str, tmp_path: Path, width: int, dark: bool) -> None:

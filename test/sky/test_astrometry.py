@@ -211,7 +211,7 @@ def zenith(site):
 
 @pytest.mark.parametrize('apparent_deg', [30.0, 45.0, 70.0])
 def test_refraction_is_that_of_the_almanac(apparent_deg):
-    site = SiteOptions('ground', 51.5, 0.0, 0.0, 1010.0, 10.0, 0.0, 0.57)
+    site = SiteOptions('ground', 51.5, 0.0, 0.0, 1010.0, 10.0)
     _, directions, elevation_rad = zenith(site)
     near = np.abs(np.degrees(elevation_rad) - apparent_deg) < 0.5
     seen, seen_rad = through_the_air(directions[near], TIME_NS, site)

@@ -275,6 +275,7 @@ def test_a_clock_set_back_is_believed(back_s: int) -> None:
         assert angle_between(held.at(time_ns, 2.0)[0], turned(time_ns)) < 1e-14
 
 
+@pytest.mark.slow
 def test_memory_of_a_fast_tracker_is_bounded() -> None:
     """Five minutes at 100 Hz, 20 s kept: 2000 samples of 40 bytes, at most four times that."""
     held = AttitudeHistory(keep_s=20.0, jump_s=10.0)
@@ -287,3 +288,32 @@ def test_memory_of_a_fast_tracker_is_bounded() -> None:
     assert len(held) == 2001
     # Twice for what is forgotten but not yet moved, twice for the copy that moves the rest.
     assert peak_bytes < 2000 * 40 * 4
+
+
+def turning(rate_rad_s: np.ndarray, at_s: tuple[float, ...]) -> AttitudeHistory:
+    """Samples of a star tracker that turns at a constant rate about axes of its own."""
+    start = Rotation.from_quat(random_quaternions(3, 1)[0])
+    return history(
+        [
+            (START_NS + round(t * S), (start * Rotation.from_rotvec(t * rate_rad_s)).as_quat())
+            for t in at_s
+        ]
+    )
+
+
+def test_the_rate_is_that_about_the_own_axes() -> None:
+    """Also at a sample's own stamp, where a node has no later one yet."""
+    rate_rad_s = np.array([0.01, -0.03, 0.02])
+    held = turning(rate_rad_s, (0.0, 0.5, 1.0))
+    for t in (0.1, 0.5, 0.9, 1.0):
+        found = held.rate_at(START_NS + round(t * S), 2.0)
+        np.testing.assert_allclose(found, rate_rad_s, atol=1e-9)
+
+
+def test_a_rate_that_no_two_samples_show_is_not_known() -> None:
+    held = turning(np.array([0.0, 0.0, 0.1]), (0.0, 3.0))
+    for t, why in ((0.0, 'no sample before'), (1.0, 'too far apart'), (3.0, 'too far before')):
+        assert np.isnan(held.rate_at(START_NS + round(t * S), 2.0)).all(), why
+    held.add(START_NS + 2 * S, None)
+    assert np.isnan(held.rate_at(START_NS + 2 * S, 2.0)).all()
+    assert np.isnan(AttitudeHistory().rate_at(START_NS, 2.0)).all()

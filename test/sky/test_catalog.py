@@ -15,7 +15,6 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError
 from starcal_ros.sky.catalog import (
     CATALOG_PATH,
-    close_pairs,
     cone,
     CONE_MARGIN_RAD,
     load_catalog,
@@ -230,23 +229,6 @@ def test_cone_refuses_nonsense(catalog, axis, radius_rad, match):
         cone(catalog, np.array(axis), radius_rad)
 
 
-@pytest.mark.parametrize('delta_magnitude', [0.0, 2.5])
-def test_close_pairs_finds_what_brute_force_finds(catalog, delta_magnitude):
-    stars = catalog.select(cone(catalog, unit(56.75, 24.12), math.radians(6)))  # the Pleiades
-    separation_rad = 150 * ARCSECOND_RAD
-    chord = np.linalg.norm(stars.direction_icrs[:, None] - stars.direction_icrs[None, :], axis=-1)
-    near = (chord < 2 * math.sin(separation_rad / 2)) & ~np.eye(len(stars), dtype=bool)
-    fainter_by = stars.magnitude[None, :] - stars.magnitude[:, None]
-    disturbed = (near & (fainter_by <= delta_magnitude)).any(axis=1)
-    assert disturbed.sum() > 3
-    assert np.array_equal(close_pairs(stars, separation_rad, delta_magnitude), disturbed)
-
-
-def test_close_pairs_of_few_stars(catalog):
-    assert not close_pairs(catalog.select(slice(1)), 1e-3, 2.5).any()
-    assert close_pairs(catalog.select(slice(0)), 1e-3, 2.5).shape == (0,)
-
-
 def test_bad_files_are_refused(tmp_path: Path):
     good = CATALOG_PATH.read_bytes()
     path = tmp_path / 'stars.npz'
@@ -284,6 +266,7 @@ def test_altered_contents_are_refused(tmp_path: Path):
             load_catalog(path)
 
 
+@pytest.mark.slow
 def test_flipped_bits_are_noticed(tmp_path: Path):
     good, digest = CATALOG_PATH.read_bytes(), load_catalog(magnitude_limit=3).digest
     path = tmp_path / 'stars.npz'

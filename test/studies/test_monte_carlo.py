@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 import dataclasses
 import functools
+import itertools
 import json
 import os
 from pathlib import Path
@@ -13,22 +14,24 @@ import signal
 import subprocess
 import sys
 import time
+from xml.etree import ElementTree
 
-import cv2
 from distributed import LocalCluster
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from starcal_ros.assessment.observability import map_error_px
-from starcal_ros.camera import line_of_sight, pixel_grid
-from starcal_ros.cli import main
+from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
+from starcal_ros.cli import arguments, main
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
-from starcal_ros.studies import figures as study_figures
-from starcal_ros.studies import monte_carlo, summary, trials, workers
+from starcal_ros.errors import StarcalError, TooFewObservations
+from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.records import CameraGeometry
+from starcal_ros.studies import monte_carlo, study_figures, summary, trials, workers
 from starcal_ros.studies.monte_carlo import Design, Row
 from starcal_ros.studies.summary import StudyResult
 
@@ -41,7 +44,6 @@ SMALL = {
     'images': {'trials': 2, 'images': (2, 5), 'stars': (30,)},
     'terms': {'trials': 2, 'images': (4,)},
     'coverage': {'trials': 4, 'images': (4,), 'stars': (20,), 'seed': 5},
-    'start': {'trials': 3},
 }
 each_study = pytest.mark.parametrize('study', SMALL)
 
@@ -199,17 +201,17 @@ def test_results_and_figure(study: str) -> None:
     assert content['study'] == study and content['parameters']['trials'] == found.design.trials
     assert {len(column) for column in content['trials'].values()} == {len(found.rows)}
     assert len(content['summary']) == len(found.summary)
-    lines = summary.table(found)
-    assert len(lines) == 1 + len(found.summary) and len({len(line) for line in lines}) == 1
-    picture = cv2.imdecode(np.frombuffer(study_figures.png(found), np.uint8), 0)
-    assert picture is not None and picture.shape[0] > 300 and picture.shape[1] > 600
-    assert np.mean(np.less(picture, 100)) > 0.005  # more than a frame
+    header, rows = summary.table(found)
+    assert len(rows) == len(found.summary) and {len(row) for row in rows} == {len(header)}
+    drawn = study_figures.svg(found)
+    ElementTree.fromstring(drawn)
+    assert 'nan' not in drawn and all(method in drawn for method in found.design.methods)
 
 
 def test_per_image_beats_single_where_the_star_tracker_is_bad() -> None:
     """Table 1 of the paper; and hierarchical is as good as the better of the two."""
     found = here(
-        Design('table1', 12, (16,), (8, 80), tracker_arcsec=(0.0, 5.0, 40.0), methods=METHODS)
+        Design('table1', 12, (8,), (8, 80), tracker_arcsec=(0.0, 5.0, 40.0), methods=METHODS)
     )
     for stars in (8, 80):
         cell = functools.partial(only, found.summary, stars=stars)
@@ -219,46 +221,63 @@ def test_per_image_beats_single_where_the_star_tracker_is_bad() -> None:
         assert float(noisy['single']['map_px']) > 8 * float(noisy['per_image']['map_px'])
         for tracker in (0.0, 5.0, 40.0):
             of = {m: float(cell(tracker_arcsec=tracker, method=m)['map_px']) for m in METHODS}
-            # The errors are paired (same stars, same noise): what differs is far under their
-            # scatter.  Measured over 200 trials: 0.5 % at most.
-            assert of['hierarchical'] < 1.02 * min(of['per_image'], of['single'])
+            # The errors are paired (same stars, same noise), but each method has its own
+            # estimated errors: what differs is under the scatter of 12 trials.
+            assert of['hierarchical'] < 1.05 * min(of['per_image'], of['single'])
 
 
 def test_hierarchical_gains_where_stars_are_few_and_the_star_tracker_good() -> None:
     """Eight stars place an image to some 4 arcsec: a star tracker of 1 arcsec knows better."""
-    found = here(Design('table1', 20, (16,), (8,), tracker_arcsec=(1.0,), methods=METHODS))
-    per_image, _, hierarchical = (only(found.summary, method=m) for m in METHODS)
+    methods = ('per_image', 'hierarchical')
+    found = here(Design('table1', 20, (16,), (8,), tracker_arcsec=(1.0,), methods=methods))
+    per_image, hierarchical = (only(found.summary, method=m) for m in methods)
     gain = float(per_image['to_bound']) / float(hierarchical['to_bound'])
     bounds = float(per_image['to_bound']) / float(per_image['to_per_image_bound'])
     # Three sigma of the ratio of paired errors over 20 trials.
     assert gain == pytest.approx(bounds, abs=0.10) and gain > 1.0
 
 
-@pytest.mark.parametrize('method', ['per_image', 'hierarchical'])
-def test_errors_are_as_large_as_the_covariance_says(method: str) -> None:
-    found = here(Design('coverage', 60, (16,), (80,), (20.0,), ('per_image', 'hierarchical')))
-    for share in (0.0, monte_carlo.OUTLIER_SHARE):
+def test_errors_are_as_large_as_the_covariance_says() -> None:
+    methods, shares = ('per_image', 'hierarchical'), (0.0, monte_carlo.OUTLIER_SHARE)
+    found = here(Design('coverage', 40, (16,), (80,), (20.0,), methods))
+    for method, share in itertools.product(methods, shares):
         row = only(found.summary, method=method, outlier_share=share)
-        low, high = chi2.ppf([0.005, 0.995], 11 * 60) / 60
+        low, high = chi2.ppf([0.005, 0.995], 11 * 40) / 40
         assert (row['low'], row['high']) == pytest.approx((low, high))
-        assert low < float(row['normalised']) < high
-        # Of 60 trials the rms of the map is known to 4 %; three of those.
-        assert float(row['to_reported']) == pytest.approx(1.0, abs=0.12)
-        assert float(row['to_bound']) == pytest.approx(1.0, abs=0.12)
-        # The mean of 60 errors of one sigma: four of its own sigmas, for 11 of them.
-        assert abs(float(row['worst_bias_sigmas'])) < 4 / np.sqrt(60)
+        # The field that stars cannot show and a slow error of the star tracker are in the sigma
+        # and not in these trials: it is up to 15 % too large.
+        assert low / 1.15**2 < float(row['normalised']) < high
+        # Of 40 trials the rms of the map is known to 5 %; three of those.
+        assert float(row['to_reported']) == pytest.approx(1.0, abs=0.15)
+        assert float(row['to_bound']) == pytest.approx(1.0, abs=0.15)
+        # The mean of 40 errors of one sigma: four of its own sigmas, for 11 of them.
+        assert abs(float(row['worst_bias_sigmas'])) < 4 / np.sqrt(40)
 
 
-def test_a_prior_far_off_leads_to_the_same_minimum() -> None:
-    """Alignment 0.3 degrees, focal length 20 %, principal point 100 px off; 10 % outliers too."""
-    for row in here(small('start')).summary:
-        assert row['same_minimum'] == row['trials']
-        if row['outlier_share']:
-            assert int(row['outliers']) > 300
-        if row['method'] != 'single':
-            # Of outliers within 20 px, one in 4000 is within 3.5 sigma of 0.1 px by chance.
-            # `single` takes the star tracker's 20 arcsec for noise of 0.7 px: more stay in.
-            assert int(row['outliers_kept']) <= 3
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('outlier_share', [0.0, 0.1])
+def test_a_prior_far_off_leads_to_the_same_minimum(method: str, outlier_share: float) -> None:
+    """Alignment 0.3 degrees, focal length 20 %, principal point 100 px off; no distortion."""
+    field = trials.draw_star_field(np.random.default_rng(4), 16, 80)
+    ensemble, truth = trials.observe(field, 20.0, outlier_share), field.truth
+    fx, _, fy, cx, cy = truth.camera.parameters[:5]
+    pinhole = {'fx': 1.2 * fx, 'fy': 1.2 * fy, 'cx': cx + 60.0, 'cy': cy - 80.0}
+    camera = truth.camera.replace(**{**dict.fromkeys(PARAMETER_NAMES, 0.0), **pinhole})
+    turned = Rotation.from_quat(truth.star_tracker_from_camera_xyzw)
+    turned *= Rotation.from_rotvec(np.radians(0.3) * np.array([0.6, 0.0, 0.8]))
+    options = trials.calibration_options(method, 20.0, estimate=PARAMETER_NAMES)
+    near, far = (
+        estimate_calibration(ensemble, prior, options)
+        for prior in (truth, CameraGeometry(camera, turned.as_quat()))
+    )
+    apart = trials.errors(far.geometry, near.geometry) / np.sqrt(np.diag(near.covariance))
+    assert np.abs(apart).max() < 0.01
+    wild = (field.outlier_draw < outlier_share).ravel()
+    assert wild.any() == bool(outlier_share)
+    if method != 'single':
+        # Of outliers within 20 px, one in 4000 is within 3.5 sigma of 0.1 px by chance.
+        # `single` takes the star tracker's 20 arcsec for noise of 0.7 px: more stay in.
+        assert int((far.kept & wild).sum()) <= 1
 
 
 def test_unused_images_fit_better_the_more_are_used() -> None:
@@ -287,7 +306,7 @@ def test_bound_is_the_inverse_of_the_whole_normal_matrix() -> None:
         dense[f : f + 3, f : f + 3] += G
     scale = 1 / np.sqrt(np.diag(dense))
     expected = (np.linalg.inv(dense * np.outer(scale, scale)) * np.outer(scale, scale))[:11, :11]
-    found = trials.bound('hierarchical', N, tracker_arcsec)
+    found = trials.bound('hierarchical', N, tracker_arcsec).matrix
     estimated = np.ix_(trials.ESTIMATED, trials.ESTIMATED)
     sigma = np.sqrt(np.diag(expected))
     # Condition 1e6 of the scaled matrix times a rounding.
@@ -301,8 +320,8 @@ def test_per_image_and_single_bound_the_hierarchical() -> None:
     field = trials.draw_star_field(np.random.default_rng(2), 5, 20)
     blocks = trials.information_blocks(field)
     for method, tracker_arcsec in (('per_image', 3e5), ('single', 0.0)):
-        limit = trials.bound('hierarchical', blocks, tracker_arcsec)
-        own = trials.bound(method, blocks, tracker_arcsec)
+        limit = trials.bound('hierarchical', blocks, tracker_arcsec).matrix
+        own = trials.bound(method, blocks, tracker_arcsec).matrix
         # 0.001 arcsec, which stands for none, against the 1 arcsec that the stars know: squared.
         np.testing.assert_allclose(
             np.diag(limit)[:10], np.diag(own)[:10], rtol=1e-5, err_msg=method
@@ -340,7 +359,7 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [
-        (['table2'], "'table2' is not one of table1, images, terms, coverage"),
+        (['table2'], "invalid choice: 'table2'"),
         (['table1', '--trials', '0'], '--trials: 0 is not within 1 to'),
         (['table1', '--trials', 'many'], "--trials: invalid int value: 'many'"),
         (['table1', '--seed', '-1'], '--seed: -1'),
@@ -348,10 +367,10 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
         (['table1', '--images', '5', '5'], '--images: duplicate values: 5 5'),
         (['table1', '--stars', '2'], '--stars: 2'),
         (['terms', '--stars', '20'], '--stars: not applicable to the study terms'),
-        (['table1', '--tracker', '-3'], '-3.0 is not within 0 to 3600'),
+        (['table1', '--tracker', '-3'], '-3 is not within 0 to 3600'),
         (['table1', '--tracker', 'nan'], 'nan is not within 0 to 3600'),
-        (['table1', '--tracker-assumed', '4000'], '4000.0 is not within'),
-        (['table1', '--methods', 'all'], "--methods: 'all' is not one of per_image, single"),
+        (['table1', '--tracker-assumed', '4000'], '4000 is not within'),
+        (['table1', '--methods', 'all'], "--methods: invalid choice: 'all'"),
         (['table1', '--workers', '-1'], '--workers: -1 is not within 0'),
         (['table1', '--workers', '1', '--scheduler', 'x'], 'not allowed with'),
         (['table1', '--scheduler', 'tcp://127.0.0.1:1'], '--scheduler: tcp://127.0.0.1:1: '),
@@ -379,8 +398,7 @@ def test_bad_arguments_are_one_line(
 
 
 def test_check_takes_every_study_as_it_stands() -> None:
+    assert (*monte_carlo.STUDIES, 'paper') == arguments.STUDIES
     for name, (_, design) in monte_carlo.STUDIES.items():
         assert design.study == name
         monte_carlo.check(design)
-    with pytest.raises(OptionError, match='study'):
-        monte_carlo.check(dataclasses.replace(design, study='none'))

@@ -7,16 +7,17 @@ import dataclasses
 import json
 from pathlib import Path
 import re
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from starcal_ros.cli import main
 from starcal_ros.records import Ensemble
-from starcal_ros.simulation import centroids as simulated_centroids
-from starcal_ros.simulation import scenario
-from starcal_ros.studies import monte_carlo, paper, paper_figures, summary, workers
+from starcal_ros.studies import monte_carlo, paper, summary, workers
 from starcal_ros.studies.paper import judge, PaperStudy, spread
+from starcal_ros.studies.simulation import centroids as simulated_centroids
+from starcal_ros.studies.simulation import scenario
 
 pytestmark = pytest.mark.slow
 
@@ -81,9 +82,10 @@ def test_the_study_shows_what_the_paper_concludes(found: PaperStudy) -> None:
 
 def test_the_page_and_its_figures(found: PaperStudy) -> None:
     text = paper.page(found, 'starcal 0')
-    figures = paper_figures.pngs(found)
-    assert set(re.findall(r'\(images/paper_(\w+)\.png\)', text)) == set(figures)
-    assert all(png.startswith(b'\x89PNG') for png in figures.values())
+    figures = paper.svgs(found)
+    assert set(re.findall(r'\(images/paper_(\w+)\.svg\)', text)) == set(figures)
+    for figure in figures.values():
+        assert ElementTree.fromstring(figure).tag.endswith('svg') and 'nan' not in figure
     assert 'nan' not in text
 
 
@@ -99,5 +101,5 @@ def test_one_command_makes_it_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     numbers = json.loads((tmp_path / 'paper.json').read_text())
     assert (numbers['images'], numbers['used'], numbers['others']) == (5, 4, 1)
     text = (tmp_path / 'paper.md').read_text()
-    linked = re.findall(r'\((images/paper_\w+\.png)\)', text)
-    assert linked and all((tmp_path / name).read_bytes()[:4] == b'\x89PNG' for name in linked)
+    linked = re.findall(r'\((images/paper_\w+\.svg)\)', text)
+    assert linked and all((tmp_path / name).read_text().startswith('<svg ') for name in linked)

@@ -15,11 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from bench import acquisition
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.star_finder import (
-    Exposure,
-    observe_stars,
-    StarSearch,
-)
+from starcal_ros.identification.star_finder import Exposure, observe_stars, StarSearch
 from starcal_ros.sky.catalog import load_catalog
 
 pytestmark = pytest.mark.slow

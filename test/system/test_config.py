@@ -3,17 +3,20 @@
 
 from __future__ import annotations
 
-import dataclasses
+import os
 from pathlib import Path
+import shutil
+import subprocess
+import sys
 
 import pytest
 from tool_modules import tool  # type: ignore[import-not-found]
 import yaml
 
-from starcal_ros.options import check_value, read_parameter_file
+from starcal_ros.formats.products.camera_yaml import read_camera_info, with_camera_url_from
+from starcal_ros.options import check_value, option_fields, read_parameter_file
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES
-from starcal_ros.products.camera_yaml import read_camera_info, with_camera_url_from
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / 'config'
@@ -28,11 +31,7 @@ def test_every_parameter_stands_with_its_default() -> None:
     content = yaml.safe_load((CONFIG / 'starcal.yaml').read_text())
     sections = {name: body['ros__parameters'] for name, body in content.items()}
     listed = {name: value for body in sections.values() for name, value in body.items()}
-    fields = [
-        field
-        for options in (*OPTION_CLASSES, *NODE_OPTION_CLASSES)
-        for field in dataclasses.fields(options)
-    ]
+    fields = option_fields(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
     assert sorted(listed) == sorted(field.name for field in fields)
     for field in fields:
         assert check_value(field, listed[field.name]) == field.default, field.name
@@ -41,23 +40,25 @@ def test_every_parameter_stands_with_its_default() -> None:
 # Packages of requirements/runtime.txt by their key in rosdep.
 ROSDEP = {
     'argcomplete': 'python3-argcomplete',
+    'contourpy': 'python3-matplotlib',  # which depends on python3-contourpy
     'Jinja2': 'python3-jinja2',
-    'matplotlib': 'python3-matplotlib',
     'numpy': 'python3-numpy',
+    'pillow': 'python3-pil',
     'opencv-python-headless': 'python3-opencv',
+    'pyerfa': 'python3-astropy',  # which depends on python3-erfa
     'PyYAML': 'python3-yaml',
     'rich': 'python3-rich',
-    'rosbags': 'python3-rosbags-pip',
     'scipy': 'python3-scipy',
 }
 
 
 def test_a_vehicle_gets_every_package() -> None:
-    """Each one that the code needs has a rosdep key in package.xml, or a pin in the README."""
+    """Each has a rosdep key of apt in package.xml, or a pin among the optional ones."""
     runtime = (ROOT / 'requirements/runtime.txt').read_text().partition('# What these need')[0]
     needed = {line for line in runtime.splitlines() if '==' in line}
     package = (ROOT / 'package.xml').read_text()
-    section = (ROOT / 'README.md').read_text().partition('## On a vehicle')[2]
+    assert '-pip<' not in package  # not to be released by rosdistro
+    section = (ROOT / 'docs/tutorial.md').read_text().partition('Run in the vehicle')[2]
     for pin in needed - {line for line in needed if line.startswith('setuptools')}:
         name = pin.partition('==')[0]
         if name in ROSDEP:
@@ -76,3 +77,24 @@ def test_examples_load(path: Path) -> None:
     values = read_parameter_file(path, ('star_observer', 'calibrator'))
     setup = load_setup(with_camera_url_from(values, path), others=NODE_OPTION_CLASSES)
     assert setup.prior.camera.width > 0
+
+
+@pytest.mark.slow
+def test_the_minimal_file_has_ten_lines_and_calibrates_a_bag(tmp_path: Path) -> None:
+    """Copied beside the prior camera, as its first line instructs: parameters are all basic."""
+    text = (CONFIG / 'minimal.yaml').read_text()
+    assert len(text.splitlines()) == 10
+    fields = option_fields(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
+    basic = {field.name for field in fields if field.metadata['basic']}
+    bag = ROOT / 'bags' / 'tiny'
+    shutil.copy(bag / 'camera.yaml', tmp_path)
+    params = shutil.copy(CONFIG / 'minimal.yaml', tmp_path)
+    assert read_parameter_file(Path(params), ('star_observer', 'calibrator')).keys() <= basic
+    done = subprocess.run(
+        ['starcal', 'calibrate', bag, '--params', params, '-o', tmp_path / 'out'],
+        capture_output=True,
+        text=True,
+        env=os.environ | {'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}'},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / 'out' / 'calibration.json').exists()

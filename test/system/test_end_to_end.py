@@ -18,17 +18,17 @@ from scipy.spatial.transform import Rotation
 import yaml
 
 from starcal_ros.assessment import agreement
-from starcal_ros.bag.frames import FrameTopics, read_telemetry
-from starcal_ros.bag.reader import read_images
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project
 from starcal_ros.cli import main
 from starcal_ros.cli.commands import demo
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.products.calibration_json import read_calibration
-from starcal_ros.products.camera_yaml import read_camera_info
+from starcal_ros.formats.bag.frames import read_telemetry
+from starcal_ros.formats.bag.reader import read_images, Topics
+from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.records import Calibration, CameraGeometry, Image
-from starcal_ros.simulation import bag as simulated_bag
-from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.studies.simulation import scenario as synthetic
+from starcal_ros.studies.simulation import simulated_bag
 
 pytestmark = pytest.mark.slow
 
@@ -183,7 +183,7 @@ def test_bright_stars_of_the_bag_stand_where_truth_and_attitude_say() -> None:
     fx, skew, fy, cx, cy = truth['k_true']
     k1, k2, k3, p1, p2 = truth['d_true']
     made = synthetic.scenario('tiny', truth['seed'])
-    attitudes = read_telemetry([TINY], FrameTopics('', simulated_bag.ATTITUDE_TOPIC)).attitudes
+    attitudes = read_telemetry([TINY], Topics('', simulated_bag.ATTITUDE_TOPIC)).attitudes
     for index, image in enumerate(read_images([TINY], simulated_bag.IMAGE_TOPIC)):
         assert isinstance(image, Image)
         shown = synthetic.scene(made, index)

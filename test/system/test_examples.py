@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from starcal_ros.products.calibration_json import read_calibration
+from starcal_ros.formats.products.calibration_json import read_calibration
 
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
 TINY = EXAMPLES.parent / 'bags' / 'tiny'
@@ -22,6 +22,7 @@ def run(cwd: Path, *command: str | Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_from_arrays(tmp_path: Path) -> None:
     done = run(tmp_path, EXAMPLES / 'from_arrays.py')
     assert (done.returncode, done.stderr) == (0, '')
@@ -34,6 +35,7 @@ def test_from_arrays(tmp_path: Path) -> None:
     assert sight.startswith('line of sight of pixel (0, 0)')
 
 
+@pytest.mark.slow
 def test_from_bag(tmp_path: Path) -> None:
     written = tmp_path / 'calibration.json'
     done = run(tmp_path, EXAMPLES / 'from_bag.py', TINY, TINY / 'params.yaml', written)
@@ -48,6 +50,7 @@ def test_from_a_bag_that_is_not_there(tmp_path: Path) -> None:
     assert done.stderr == 'none: no such bag\n'
 
 
+@pytest.mark.slow
 def test_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each code cell in turn, in one namespace: what Jupyter does, without Jupyter."""
     cells = json.loads((EXAMPLES / 'calibrate.ipynb').read_text())['cells']
@@ -66,6 +69,7 @@ def test_the_notebook_is_kept_without_outputs() -> None:
         assert not cell.get('outputs') and cell.get('execution_count') is None
 
 
+@pytest.mark.slow
 def test_mission(tmp_path: Path) -> None:
     """FITS and AEM to kernels that spiceypy loads, with the boresight of the calibration."""
     params = TINY / 'params.yaml'

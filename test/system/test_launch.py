@@ -120,5 +120,5 @@ def test_replay_hands_on_what_starcal_takes() -> None:
     assert 'starcal.launch.py' in constants(include)
     (handed,) = (node for node in ast.walk(include) if isinstance(node, ast.ListComp))
     names = set(constants(handed.generators[0].iter))
-    assert 'params' in names
+    assert 'params_file' in names
     assert names <= declared(ROOT / 'launch' / 'starcal.launch.py') & declared(path)

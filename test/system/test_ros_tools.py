@@ -27,10 +27,11 @@ pytest.importorskip('starcal.msg')
 from diagnostic_msgs.msg import DiagnosticArray
 from ros_tools import find_tools, RosTools  # type: ignore[import-not-found]
 
-from starcal_ros.bag import reader
-from starcal_ros.calibrator.archive import Activation, Archive
-from starcal_ros.products.calibration_json import CALIBRATION_FILE, read_calibration
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Ensemble
+from starcal_ros.ros.kept.archive import Archive
+from starcal_ros.ros.kept.stored import Activation
 
 pytestmark = [pytest.mark.nodes, pytest.mark.timeout(600)]  # tens of processes of 2 s and more
 
@@ -93,7 +94,7 @@ def test_launch_replay_calibrate_and_record(
         pytest.skip('ros2 bag record does not load here')
     recorded = tmp_path / 'recorded'
     launch = ros2.start(
-        *('launch', 'starcal', 'starcal.launch.py', f'params:={tiny_bag}/params.yaml'),
+        *('launch', 'starcal', 'starcal.launch.py', f'params_file:={tiny_bag}/params.yaml'),
         *('namespace:=opnav', 'log_level:=info', 'autostart:=true', 'use_sim_time:=false'),
         *('respawn:=false', 'image:=/opnav/image_raw', 'attitude:=/star_tracker/attitude'),
         *('velocity:=/velocity', 'temperature:=/temperature'),
@@ -125,7 +126,7 @@ def test_launch_replay_calibrate_and_record(
 def test_launch_arguments_are_shown(make: Make) -> None:
     for file in ('starcal.launch.py', 'replay.launch.py'):
         shown = make(FAST).run('launch', 'starcal', file, '--show-args')
-        assert shown.returncode == 0 and "'params':" in shown.stdout, shown.stderr
+        assert shown.returncode == 0 and "'params_file':" in shown.stdout, shown.stderr
     row(FAST, 'launch', 'ros2 launch starcal replay.launch.py --show-args', 'every argument')
 
 
@@ -165,14 +166,18 @@ def test_a_wrong_launch_argument_leaves_no_process(
     values['/**']['ros__parameters']['state_dir'] = str(tmp_path / 'state')
     params = tmp_path / 'params.yaml'
     params.write_text(yaml.safe_dump(values))
-    launch = ros2.start(
-        'launch', 'starcal', 'replay.launch.py', f'params:={params}', f'bag:={tiny_bag}', argument
-    )
+    files = (f'params_file:={params}', f'bag:={tiny_bag}')
+    launch = ros2.start('launch', 'starcal', 'replay.launch.py', *files, argument)
     launch.wait()
     assert says in launch.said()
     with pytest.raises(ProcessLookupError):
         os.killpg(launch.process.pid, 0)
     Archive(tmp_path / 'state', 'camera').close()
+
+
+def test_a_launch_without_a_parameter_file_names_what_to_set(make: Make) -> None:
+    launch = make(FAST).start('launch', 'starcal', 'starcal.launch.py')
+    launch.until_said('camera_info_url')
 
 
 def test_two_cameras_with_one_frame_are_named(
@@ -281,7 +286,8 @@ def test_policies_are_enforced(make: Make, tiny_bag: Path, tmp_path: Path) -> No
     calibrator = nodes.start_node('calibrator', '--enclave', '/calibrator', *params)
     for node in (observer, calibrator):
         node.until_said('active, listening to ')
-    remaps = ('-r', '/opnav/image_raw:=/image', '-r', '/star_tracker/attitude:=/attitude')
+    topics = ('/opnav/image_raw:=/image', '/star_tracker/attitude:=/attitude')
+    remaps = [a for one in (*topics, '/spacecraft/velocity:=/velocity') for a in ('-r', one)]
     bag = ('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0', *remaps)
     player = nodes.start_node('bag_player', '--enclave', '/bag_player', *bag)
     assert player.wait() == 0, player.said()

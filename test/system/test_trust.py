@@ -19,6 +19,7 @@ REFUSED = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('world', ACCEPTED, ids=lambda world: world.name)
 def test_an_accepted_camera_errs_by_less_than_two_sigma(world: trust.World) -> None:
     # `bench trust` finds 0.8 to 1.5 in these worlds, version 0.1.0 was at 7 to 45.
@@ -27,6 +28,7 @@ def test_an_accepted_camera_errs_by_less_than_two_sigma(world: trust.World) -> N
     assert outcome.shape < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('world', REFUSED, ids=lambda world: f'{world.name} {world.size:g}')
 def test_a_fault_that_the_stars_show_is_refused_by_its_name(world: trust.World) -> None:
     outcome = trust.trial(world, 1)

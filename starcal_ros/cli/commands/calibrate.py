@@ -4,61 +4,67 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import dataclasses
+import glob
 from pathlib import Path
 import sys
+import tempfile
 import threading
 
 from starcal_ros.assessment import comparison
 from starcal_ros.assessment.residuals import Residuals
-from starcal_ros.bag import reader
 from starcal_ros.cli import output
-from starcal_ros.cli.arguments import EXIT_ACCEPTED, EXIT_REFUSED
+from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_REFUSED, is_interrupt
 from starcal_ros.cli.commands.selection import Selection, selection
-from starcal_ros.cli.drawings import Drawings
 from starcal_ros.cli.folders import make_folder, missing_extra
 from starcal_ros.cli.output_places import check_folder
 from starcal_ros.cli.terminal import print_text, with_progress
-from starcal_ros.errors import OptionError, TooFewObservations
-from starcal_ros.estimation.options import tracker_sigma_is_given
+from starcal_ros.errors import NotFromStars, OptionError, StarcalError, TooFewObservations
+from starcal_ros.estimation.calibration_options import tracker_sigma_is_given
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.products.product_files import REPORT_FILE, write_atomically
+from starcal_ros.formats.products.product_folder import (
+    NotCalibrated,
+    write_not_calibrated,
+    write_observations,
+    write_products,
+)
 from starcal_ros.pipeline import inspect, solve
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.observe import Wanted
+from starcal_ros.pipeline.observe_bags import measured_again, Wanted
 from starcal_ros.pipeline.provenance import inputs_of, software_version
-from starcal_ros.pipeline.retry import measured_again
-from starcal_ros.pipeline.setup import files_of, read_setup, Setup
-from starcal_ros.pipeline.topics import Topics
-from starcal_ros.products.files import REPORT_FILE, write_atomically
-from starcal_ros.products.folder import write_observations, write_products
-from starcal_ros.products.not_calibrated import NotCalibrated, write_not_calibrated
-from starcal_ros.records import (
-    Calibration,
-    CameraGeometry,
-    Ensemble,
-    Image,
-    StarObservations,
-)
+from starcal_ros.pipeline.setup import files_of, read_setup, read_values, Setup
+from starcal_ros.pipeline.topics import Topics, without_attitudes
+from starcal_ros.records import Calibration, CameraGeometry, Image, StarObservations
 from starcal_ros.report.pictures import thumbnails
-from starcal_ros.report.pictures.expected import ExpectedAlbum
 
 HALVES = ('odd', 'even')
+ThroughAir = Callable[[Sequence[StarObservations]], tuple[list[StarObservations], str]]
 
 
 def calibrate(args: argparse.Namespace, asked: Topics) -> int:
-    """Calibrate from bags in one process, as the two nodes do on the graph."""
+    """Calibrate from bags in one process, as the two nodes do on the graph, or from images."""
+    from starcal_ros.formats.images.photographs import image_paths
+
+    photographs = image_paths(args.bags)
+    if not photographs and any(glob.has_magic(str(path)) for path in args.bags):
+        raise OptionError(f'{args.bags[0]}: no such files')
+    if photographs or without_attitudes(args.bags, asked):
+        return _calibrate_by_stars(args, asked, photographs)
+    if args.params is None:
+        raise OptionError('--params: needed for a bag with attitudes')
     setup = read_setup(args.params)
-    wanted = selection(args.from_time, args.to_time, args.first, args.every)
-    if args.output.exists() and not args.output.is_dir():
-        raise OptionError(f'{args.output}: not a folder')
     check_folder(args.output, args.bags, (args.params, *files_of(setup.frames).values()))
     files = (*reader.mcap_files(args.bags), args.params)
     found = ''
     try:
         if not setup.is_aligned:
-            from starcal_ros.diagnosis.bags import aligned_by_bags  # seldom needed, slow to load
+            from starcal_ros.pipeline.diagnosis.bags import (
+                aligned_by_bags,  # seldom needed, slow to load
+            )
 
             setup, found = aligned_by_bags(args.bags, asked, setup)
     except OptionError as error:
@@ -67,18 +73,68 @@ def calibrate(args: argparse.Namespace, asked: Topics) -> int:
         raise
     if found:
         print_text(found, file=sys.stderr)
+    return _calibrate(args, asked, setup, args.bags, files)
+
+
+def _calibrate_by_stars(args: argparse.Namespace, asked: Topics, photographs: list[Path]) -> int:
+    """Calibrate from photographs or bags whose attitudes are those of their stars."""
+    from starcal_ros.pipeline import night_sky  # seldom needed, slow to load
+
+    bags = [] if photographs else args.bags
+    check_folder(args.output, bags, (*photographs, *filter(None, [args.params])))
+    values = read_values(args.params) if args.params else {}
+    make_folder(args.output)
+    with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
+        try:
+            if photographs:
+                chosen, notes = night_sky.photographs_of(
+                    photographs, args.focal_length_mm, args.pixel_size_um
+                )
+                for note in notes:
+                    print_text(note, file=sys.stderr)
+                found = night_sky.from_photographs(chosen, values, Path(folder))
+            else:
+                found = night_sky.from_bags(bags, asked, values, Path(folder))
+        except NotFromStars as error:
+            _write_failure(args.output, NotCalibrated(str(error), tuple(map(str, args.bags)), {}))
+            raise
+        for note in found.notes:
+            print_text(note, file=sys.stderr)
+        files = [*(photographs or reader.mcap_files(bags)), *filter(None, [args.params])]
+        return _calibrate(args, asked, found.setup, found.bags, files, found.through_air)
+
+
+def _calibrate(
+    args: argparse.Namespace,
+    asked: Topics,
+    setup: Setup,
+    bags: Sequence[Path],
+    files: Sequence[Path],
+    through_air: ThroughAir | None = None,
+) -> int:
+    """Calibrate with a set-up, write the products and print the result."""
+    wanted = selection(args.from_time, args.to_time, args.first, args.every)
+    if args.output.exists() and not args.output.is_dir():
+        raise OptionError(f'{args.output}: not a folder')
     with ThreadPoolExecutor(1, 'digests') as thread:
         # While the images are read; an error or Ctrl-C ends it at once.
         stopped = threading.Event()
         inputs = thread.submit(inputs_of, files, stopped.is_set)
         try:
             calibration, observations, report = calibrate_into(
-                args.output, args.bags, asked, setup, inputs.result, wanted, not args.no_report
+                args.output,
+                bags,
+                asked,
+                setup,
+                inputs.result,
+                wanted,
+                not args.no_report,
+                through_air,
             )
         finally:
             stopped.set()
     output.print_calibration(calibration, setup.prior)
-    if not tracker_sigma_is_given(setup.calibration):
+    if calibration.has_alignment and not tracker_sigma_is_given(setup.calibration):
         sigma = ', '.join(f'{arcsec:.1f}' for arcsec in calibration.star_tracker_sigma_arcsec)
         print_text(
             f'star tracker    {sigma}" (x, y, z) from the scatter: star_tracker_sigma_arcsec'
@@ -98,26 +154,34 @@ def calibrate_into(
     inputs: Callable[[], Mapping[str, str]],
     wanted: Wanted | None = None,
     with_report: bool = False,
+    through_air: ThroughAir | None = None,
 ) -> tuple[Calibration, list[StarObservations], str]:
     """
     Calibrate from bags and write the products, with or without a report.
 
-    Also returns the observations and where the report is, or why there is none.
+    ``through_air`` gives the observations as they are solved, and what was found in words.  Also
+    returns the observations and where the report is, or why there is none.
     """
     topics = bag_topics.choose_topics(bags, asked, setup)
     count = bag_topics.count(bags, topics)
-    album, expected = thumbnails.Album(count), ExpectedAlbum(setup)
+    album, expected = thumbnails.Album(count), thumbnails.ExpectedAlbum(setup)
     drawings = Drawings()
 
     def show(image: Image, observed: StarObservations, geometry: CameraGeometry) -> None:
         with drawings.kind('pictures of images'):
             album.show(image, observed, geometry)
-            expected.show(image, observed, geometry)
+            expected.add(image, observed, geometry)
 
     records = bag_topics.read(bags, topics, setup, show, wanted)
     observations = list(with_progress(records, count, 'images'))
     if not observations and isinstance(wanted, Selection):
         raise OptionError(wanted.without_images())
+    if through_air is not None:
+        observations, text = through_air(observations)
+        if text:
+            print_text(text, file=sys.stderr)
+    # Each image was identified by itself: what matched nothing does not by the others either.
+    again = topics if through_air is None else Topics()
     make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     write_observations(observations, folder, setup.frames.camera_frame)
@@ -127,7 +191,7 @@ def calibrate_into(
             thread.submit(_load_report)
         try:
             calibration, left, observations = _solve_twice(
-                folder, bags, topics, setup, inputs(), observations
+                folder, bags, again, setup, inputs(), observations
             )
         except TooFewObservations as error:
             failure = _failure(str(error), bags, asked, setup, observations, bool(topics.image))
@@ -147,7 +211,10 @@ def calibrate_into(
             if not page:  # one that is there is of the products that were replaced
                 (folder / REPORT_FILE).unlink(missing_ok=True)
     if page:
-        write_atomically(folder / REPORT_FILE, page)  # after the products that it is of
+        from starcal_ros.report.page import with_digests
+
+        # After the products that it is of.
+        write_atomically(folder / REPORT_FILE, with_digests(page, folder))
     return calibration, observations, report
 
 
@@ -213,9 +280,7 @@ def _solve_twice(
 def _solve(
     observations: Sequence[StarObservations], setup: Setup, inputs: Mapping[str, str]
 ) -> tuple[Calibration, Residuals]:
-    ensemble = Ensemble()
-    for record in observations:
-        ensemble = solve.add_to_ensemble(ensemble, record, setup)
+    ensemble = solve.ensemble_of(observations, setup)
     return solve.solve_with_residuals(ensemble, setup, inputs=inputs)
 
 
@@ -224,10 +289,7 @@ def _used(observations: Sequence[StarObservations]) -> int:
 
 
 def _split(
-    folder: Path,
-    observations: Sequence[StarObservations],
-    setup: Setup,
-    inputs: Mapping[str, str],
+    folder: Path, observations: Sequence[StarObservations], setup: Setup, inputs: Mapping[str, str]
 ) -> None:
     """Calibrate each half of the images into a folder of its own, and print their comparison."""
     used = [record for record in observations if not record.refusal]
@@ -254,8 +316,7 @@ def _failure(
     has_images: bool,
 ) -> NotCalibrated:
     """The record of a failure, with the cause for which most images are refused."""
-    from starcal_ros.cli.commands import diagnosis  # seldom needed, slow to load
-    from starcal_ros.diagnosis.refusals import of_refusals
+    from starcal_ros.pipeline.diagnosis.bags import of_a_failure, of_refusals
 
     groups = inspect.refusals(observations)
     refused = {group.reason: group.count for group in groups}
@@ -266,7 +327,7 @@ def _failure(
     named = tuple(map(str, bags))
     found = of_refusals(groups, len(observations))
     if has_images and not _used(observations):
-        found = diagnosis.of_a_failure(bags, asked, setup, groups)
+        found = of_a_failure(bags, asked, setup, groups)
     if found is None:
         return NotCalibrated(words, named, refused)
     words += f'. {found.in_a_sentence()}'
@@ -287,3 +348,24 @@ def _write_failure(
             missing_extra(error, 'report')  # raises where another module is missing
         else:
             page.write_report(folder)
+
+
+class Drawings:
+    """Drawings of one result; one that fails costs a line on stderr, once for each kind."""
+
+    def __init__(self) -> None:
+        self._failed: set[str] = set()
+
+    @contextlib.contextmanager
+    def kind(self, name: str) -> Iterator[None]:
+        """End the block quietly where drawing fails; writing belongs outside of it."""
+        try:
+            yield
+        # Other versions of contourpy, Jinja2 and OpenCV fail in their own ways.
+        except Exception as error:
+            if is_interrupt(error):
+                raise
+            if name not in self._failed:
+                self._failed.add(name)
+                kind = '' if isinstance(error, StarcalError) else f'{type(error).__name__}: '
+                complain(f'warning: no {name}, the other results are complete: {kind}{error}')

@@ -22,16 +22,17 @@ import numpy as np
 import yaml
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
+from starcal_ros.child_process import module_command
 from starcal_ros.cli.terminal import table_lines
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import StarcalError
-from starcal_ros.products.calibration_json import read_calibration
-from starcal_ros.products.camera_yaml import read_camera_info
-from starcal_ros.products.files import write_atomically
+from starcal_ros.errors import ProductError, StarcalError
+from starcal_ros.formats.products.calibration_json import prior_of, read_calibration
+from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.formats.products.product_files import read_text, write_atomically
 from starcal_ros.records import Calibration, CameraGeometry
-from starcal_ros.safe_path import module_command
-from starcal_ros.simulation import bag as simulated_bag
-from starcal_ros.simulation import scenario
+from starcal_ros.studies.simulation import scenario, simulated_bag
+from starcal_ros.studies.simulation.simulated_bag import true_geometry
+from starcal_ros.untrusted import json_value, PRODUCT_BYTES
 
 Process = subprocess.Popen[bytes]
 
@@ -47,10 +48,7 @@ def check_ros() -> None:
     """
     Check that nodes can run.
 
-    Raises
-    ------
-    NodeError
-        Where ROS, or the generated messages, cannot be imported.
+    Raises NodeError where ROS, or the generated messages, cannot be imported.
     """
     for name in ('rclpy', 'starcal.msg'):
         try:
@@ -60,7 +58,8 @@ def check_ros() -> None:
         if not is_there:
             raise NodeError(
                 f'no ROS nodes here: {name} is not installed; source a ROS 2 workspace with'
-                ' starcal (README, "On a vehicle"), or calibrate without ROS: starcal calibrate'
+                ' starcal (docs/tutorial.md, "Run in the vehicle"), or calibrate without ROS:'
+                ' starcal calibrate'
             )
 
 
@@ -108,12 +107,8 @@ def run(
     Calibration of the nodes, None if refused, and the answer of their service.
 
     Starts the nodes, plays the bag and calls the service.  Log files go to the folder.  All
-    processes have ended when this returns.
-
-    Raises
-    ------
-    NodeError
-        When a node does not start, or ends before the calibration.
+    processes have ended when this returns.  Raises NodeError when a node does not start, or ends
+    before the calibration.
     """
     params = folder / 'demo_params.yaml'  # not params.yaml: a user's may be there
     content = {'/**': {'ros__parameters': bag.parameters}}
@@ -163,10 +158,7 @@ def become(command: list[str]) -> NoReturn:
     """
     Replace this process by a node; a Ctrl-C waits until that answers it without a traceback.
 
-    Raises
-    ------
-    NodeError
-        Where nodes cannot run.
+    Raises NodeError where nodes cannot run.
     """
     check_ros()
     sys.stdout.flush()
@@ -187,13 +179,29 @@ def player_command(path: Path, rate: float, remaps: Sequence[str]) -> list[str]:
 def monitor_command(once_after_s: float | None, remaps: Sequence[str]) -> list[str]:
     """Command line that shows running nodes in the terminal."""
     once = [] if once_after_s is None else ['--once', repr(once_after_s)]
+    return [*_module_command('monitor_client'), *once, *_renamed(remaps)]
+
+
+def request_command(
+    service: str, options: Sequence[str], timeout_s: float, remaps: Sequence[str]
+) -> list[str]:
+    """Command line that calls a service of a running calibrator."""
+    asked = [service, *options, '--timeout', repr(timeout_s)]
+    return [*_module_command('request_client'), *asked, *_renamed(remaps)]
+
+
+def _renamed(remaps: Sequence[str]) -> list[str]:
     renamed = [part for remap in remaps for part in ('-r', remap)]
-    return [*_module_command('monitor'), *once, *(['--ros-args', *renamed] if renamed else [])]
+    return ['--ros-args', *renamed] if renamed else []
 
 
 def _nodes_command(name: str, params: Path) -> list[str]:
-    topics = (f'image:={simulated_bag.IMAGE_TOPIC}', f'attitude:={simulated_bag.ATTITUDE_TOPIC}')
-    remaps = [part for topic in topics for part in ('-r', topic)]
+    topics = {
+        'image': simulated_bag.IMAGE_TOPIC,
+        'attitude': simulated_bag.ATTITUDE_TOPIC,
+        'velocity': simulated_bag.VELOCITY_TOPIC,
+    }
+    remaps = [part for name, topic in topics.items() for part in ('-r', f'{name}:={topic}')]
     return [*_module_command(name), '--ros-args', '--params-file', str(params), *remaps]
 
 
@@ -308,3 +316,28 @@ def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeomet
     ]
     header = ('parameter', 'prior', 'estimate', '1-sigma', 'truth', 'error')
     return TruthTable(tuple(table_lines(header, table)), float(np.abs([*off, *angles_off]).max()))
+
+
+def is_truth(path: Path) -> bool:
+    """True if a file is the truth of a simulated bag, as ``starcal simulate`` writes it."""
+    try:
+        content = json_value(read_text(path, PRODUCT_BYTES))
+    except (ProductError, ValueError):
+        return False
+    return isinstance(content, dict) and 'k_true' in content
+
+
+def compare_with(calibration: Calibration, path: Path) -> TruthTable:
+    """
+    The table of a calibration beside the truth.
+
+    Raises ProductError when the truth is of another lens model or damaged.
+    """
+    try:
+        truth = true_geometry(json_value(read_text(path, PRODUCT_BYTES)))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProductError(f'{path}: not the truth of a simulated bag: {error}') from error
+    model = calibration.geometry.camera.model
+    if truth.camera.model != model:
+        raise ProductError(f'{path}: of lens model {truth.camera.model}, calibrated was {model}')
+    return compare(calibration, truth, prior_of(calibration) or calibration.geometry)

@@ -4,26 +4,31 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
 import glob
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED
 from starcal_ros.cli.folders import make_folder
 from starcal_ros.cli.terminal import print_text, progress_bar
 from starcal_ros.errors import OptionError
 
+if TYPE_CHECKING:
+    from starcal_ros.records import StarObservations
+
 _FAILURES_SHOWN = 5
 
 
 def _export(args: argparse.Namespace) -> int:
     """Write a calibration in the format of another tool."""
-    from starcal_ros.export.formats import export
-    from starcal_ros.export.spice import SpiceNames
-    from starcal_ros.products.calibration_json import read_calibration
-    from starcal_ros.products.folder import calibration_file
+    from starcal_ros.formats.bag.reader import read_observations
+    from starcal_ros.formats.products.calibration_json import read_calibration
+    from starcal_ros.formats.products.product_folder import calibration_file, OBSERVATIONS_TOPIC
+    from starcal_ros.mission.export.export_formats import export
+    from starcal_ros.mission.export.spice import SpiceNames
 
     calibration = read_calibration(calibration_file(args.calibration))
     names = None
@@ -37,7 +42,13 @@ def _export(args: argparse.Namespace) -> int:
             args.pixel_size_um,
         )
     make_folder(args.output)
-    done = export(calibration, args.to, args.output, names, args.image_topic)
+    observations: Iterable[StarObservations] = ()
+    if args.to == 'ck':
+        observations = read_observations([_observations_of(args.calibration)], OBSERVATIONS_TOPIC)
+    done = export(
+        *(calibration, args.to, args.output, names, args.image_topic, args.table),
+        *(observations, args.kernels),
+    )
     print_text(f'written: {", ".join(map(str, done.files))}')
     if not calibration.accepted:
         complain(f'warning: the gate refused this calibration: {"; ".join(calibration.reasons)}')
@@ -50,11 +61,21 @@ def _export(args: argparse.Namespace) -> int:
     return EXIT_ACCEPTED
 
 
+def _observations_of(calibration: Path) -> Path:
+    from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE
+    from starcal_ros.formats.products.product_folder import calibration_file
+
+    path = calibration_file(calibration).with_name(OBSERVATIONS_FILE)
+    if not path.exists():
+        raise OptionError(f'--to ck: needs {path} with the stars of the images')
+    return path
+
+
 def _import(args: argparse.Namespace) -> int:
     """Make a bag from the files of a mission."""
-    from starcal_ros.ingest import recording, sources, tables
-    from starcal_ros.ingest.guard import Guard
-    from starcal_ros.ingest.images import ImageOptions
+    from starcal_ros.formats.images.image_files import ImageOptions
+    from starcal_ros.mission.ingest import recording, sources, tables
+    from starcal_ros.mission.ingest.guard import Guard
 
     options = ImageOptions(
         time_key=args.time_key,
@@ -64,8 +85,11 @@ def _import(args: argparse.Namespace) -> int:
         value_range=None if args.value_range is None else tuple(args.value_range),
         temperature_key=args.temperature_key,
     )
-    paths = _expanded(args.images)
-    inputs = [args.times, args.camera, *args.attitude, *(args.velocity or ())]
+    needed = 4 * (1 + len(args.more_star_trackers))
+    if args.camera and len(args.alignment) != needed:
+        raise OptionError(f'--alignment: {len(args.alignment)} numbers, {needed} are needed')
+    paths, solved = _expanded(args.images), _expanded(args.attitude, '--attitude')
+    inputs = [args.times, args.camera, *solved, *(args.velocity or ())]
     recording.check_place(args.output, [*paths, *filter(None, inputs)], args.camera)
     with Guard() as guard, progress_bar(2 * len(paths), 'images') as advance:
         if args.times:
@@ -78,14 +102,20 @@ def _import(args: argparse.Namespace) -> int:
             return EXIT_BAD_INPUT
         stamps = [file.time_ns for file in files]
         attitudes = guard.call(
-            _names(args.attitude), sources.attitudes, args.attitude, args.star_tracker, stamps
+            _names(solved), sources.attitudes, solved, args.star_tracker, stamps, files
         )
+        others = {
+            recording.frame_name(frame): guard.call(
+                _names(solved), sources.attitudes, solved, frame, stamps, files
+            )
+            for frame in args.more_star_trackers
+        }
         velocities = args.velocity and guard.call(
             _names(args.velocity), sources.velocities, args.velocity, args.spacecraft, stamps
         )
         prior = args.camera and recording.Prior(args.camera, tuple(args.alignment))
         made = recording.write_bag(
-            args.output, files, options, guard, attitudes, velocities, prior, advance
+            args.output, files, options, guard, attitudes, velocities, prior, advance, others
         )
     print_text(f'bag {made.bag}: {len(files)} images')
     for note in made.notes:
@@ -99,31 +129,54 @@ def _names(paths: Sequence[Path]) -> str:
     return ', '.join(map(str, paths))
 
 
-def _expanded(patterns: Sequence[str]) -> list[Path]:
+def _expanded(patterns: Sequence[str], option: str = '--images') -> list[Path]:
     """Files of patterns, each once, in order of their names."""
     found: dict[Path, None] = {}
     for pattern in patterns:
         names = sorted(glob.glob(pattern)) if glob.has_magic(pattern) else [pattern]
         if not names:
-            raise OptionError(f'--images: no file matches {pattern}')
+            raise OptionError(f'{option}: no file matches {pattern}')
         found |= dict.fromkeys(map(Path, names))
     return list(found)
 
 
+def _catalog(args: argparse.Namespace) -> int:
+    """Make a catalog file from a table of Gaia."""
+    from starcal_ros.mission.ingest.gaia_catalog import write_deep_catalog
+
+    output = args.output if args.output.suffix == '.npz' else Path(f'{args.output}.npz')
+    if output.exists():
+        raise OptionError(f'{output}: exists; choose another file (-o)')
+    made = write_deep_catalog(args.table, output)
+    print_text(
+        f'{made.added} stars of {args.table} to V = {made.faintest:.1f}, with the bundled ones'
+        f' {len(made.columns["id"])}, written to {output}'
+    )
+    print_text(
+        f'in the parameter file: catalog: {output.absolute()}, magnitude_limit:'
+        f' {made.faintest:.1f}'
+    )
+    return EXIT_ACCEPTED
+
+
 def _trend(args: argparse.Namespace) -> int:
     """Follow calibrations over years."""
-    from starcal_ros.trend import fleet, page, tasks
-    from starcal_ros.trend.table import Table
+    from starcal_ros.mission.trend import fleet, places, trend_page
+    from starcal_ros.mission.trend.tasks import find, read_cameras
+    from starcal_ros.mission.trend.trend_table import Table
 
-    if not args.root.is_dir():
-        raise OptionError(f'{args.root}: no such folder')
-    if not 0 <= args.workers <= 1024:
-        raise OptionError(f'--workers: {args.workers} is not within 0 to 1024')
-    make_folder(args.output)
+    root = places.absolute(args.root)
+    try:
+        if not places.exists(root):
+            raise OptionError(f'{args.root}: no such folder')
+        found = list(find(root, read_cameras(args.cameras, args.params)))
+    except OSError as error:
+        raise OptionError(f'{args.root}: cannot be read: {error.strerror or error}') from error
+    if not places.is_remote(args.output):
+        make_folder(Path(args.output))
     table = Table(args.output)
-    found = list(tasks.find(args.root, args.params))
     # A file that was repaired or removed is no longer among the tasks.
-    table.forget_failed(() if args.retry else {task.key for task in found})
+    table.forget_failed(() if args.retry else {task.stamp for task in found})
     if not found:
         raise OptionError(
             f'{args.root}: no calibration.json below it, and no bag to calibrate with --params'
@@ -131,17 +184,18 @@ def _trend(args: argparse.Namespace) -> int:
     with progress_bar(len(found), 'calibrations') as advance:
         done = fleet.update(table, found, args.workers, args.scheduler, advance)
     rows = table.rows()
-    path = page.write_page(rows, args.output, str(args.root))
+    path = trend_page.write_page(rows, args.output, args.root)
     copies = f', {done.repeated} the same as another' if done.repeated else ''
     print_text(f'{done.computed} new, {done.known} known before, {done.failed} failed{copies}')
     for row in [row for row in rows if row.error][:_FAILURES_SHOWN]:
         print_text(f'failed: {row.path}: {row.error}')
-    print_text(f'{page.span_years(rows):.2f} years; look at {path}')
+    print_text(f'{trend_page.span_years(rows):.2f} years; look at {path}')
     return EXIT_ACCEPTED if any(not row.error for row in rows) else EXIT_REFUSED
 
 
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], int]] = {
     'export': _export,
     'import': _import,
+    'catalog': _catalog,
     'trend': _trend,
 }

@@ -17,19 +17,27 @@ from rich.table import Table
 from rich.text import Text
 
 from starcal_ros.arrays import Floats
+from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.records import Calibration, EnsembleStatus, GateCheck, StarObservations
 from starcal_ros.text import printable
 
 _HEALTH = {0: ('ok', 'green'), 1: ('warning', 'yellow'), 2: ('error', 'bold red')}
 _STALE = ('stale', 'yellow')
+_UNITS = dict.fromkeys(INTRINSIC_NAMES, ' px') | {
+    'focal_temperature_1': ' /degC',
+    'focal_temperature_2': ' /degC²',
+    'tau_x': ' rad',
+    'tau_y': ' rad',
+}
+"""By parameter; the coefficients of the lens have none."""
 _SHADES = ' ░▒▓█'
 _TIGHTEST = 6  # gate checks shown of a calibration that passed
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What has been received; None or empty where nothing has been."""
+    """Newest messages of each topic; None or empty before the first."""
 
     images: int = 0
     refused: Mapping[str, int] = field(default_factory=dict)
@@ -65,9 +73,10 @@ def _lines(lines: Iterable[Text]) -> Text:
     return Text('\n').join(lines)
 
 
-def view(seen: Seen) -> Group:
-    """All panels below each other; they fit in 80 columns."""
+def view(seen: Seen, keys: str = '') -> Group:
+    """All panels below each other, keys on top if any; they fit in 80 columns."""
     return Group(
+        *(Line(line, 'dim') for line in keys.splitlines()),
         Panel(_images(seen), title='images', title_align='left'),
         Panel(_ensemble(seen), title='ensemble', title_align='left'),
         Panel(_calibration(seen), title='calibration', title_align='left'),
@@ -147,8 +156,9 @@ def _sigma_text(name: str, sigma: float) -> str:
     if not np.isfinite(sigma):
         return 'unobservable'
     if name.startswith('alignment'):
-        return f'{sigma / ARCSECOND_RAD:.2f} arcsec'
-    return f'{sigma:.2g}'
+        per = '/degC' if name.endswith('_temperature') else ''
+        return f'{sigma / ARCSECOND_RAD:.2f} arcsec{per}'
+    return f'{sigma:.2g}{_UNITS.get(name, "")}'
 
 
 def _calibration(seen: Seen) -> Group | Text:

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 import math
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.errors import OptionError
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Selection:
     _answers: dict[int, bool] = field(default_factory=dict)
 
     def __call__(self, time_ns: int) -> bool:
-        """Whether the image of a stamp is taken."""
+        """True if the image of a stamp is taken."""
         if time_ns not in self._answers:  # a stamp asked again has its answer
             self._answers[time_ns] = self._takes(time_ns)
         return self._answers[time_ns]
@@ -73,14 +73,11 @@ class Selection:
         return origin_ns + round(time.seconds * NANOSECONDS_PER_SECOND)
 
 
-def parse_time(text: str, option: str) -> Time:
+def parse_time(text: str) -> Time:
     """
     A time as it is typed: UTC in ISO 8601, seconds since 1970, or +seconds since the first image.
 
-    Raises
-    ------
-    OptionError
-        Naming the option.
+    Raises argparse.ArgumentTypeError for another text.
     """
     try:
         seconds = float(text)
@@ -88,37 +85,21 @@ def parse_time(text: str, option: str) -> Time:
         try:
             read = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
         except ValueError as error:
-            raise OptionError(
-                f'--{option}: {text!r} is no time: give 2026-05-15T07:20:00, seconds since 1970,'
-                ' or +seconds after the first image'
+            raise argparse.ArgumentTypeError(
+                f'{text!r} is no time: give 2026-05-15T07:20:00, seconds since 1970, or +seconds'
+                ' after the first image'
             ) from error
         with_zone = read if read.tzinfo else read.replace(tzinfo=timezone.utc)
         return Time(with_zone.timestamp(), False)
     if not math.isfinite(seconds):
-        raise OptionError(f'--{option}: {text!r} is not a finite number of seconds')
+        raise argparse.ArgumentTypeError(f'{text!r} is not a finite number of seconds')
     return Time(seconds, text.strip().startswith('+'))
 
 
 def selection(
-    start: str | None, end: str | None, first: int | None, every: int | None
+    start: Time | None, end: Time | None, first: int | None, every: int | None
 ) -> Selection | None:
-    """
-    The images that options choose; None: all.
-
-    Raises
-    ------
-    OptionError
-        For a value without a meaning.
-    """
-    if first is not None and first < 1:
-        raise OptionError(f'--first: {first} is not a number of images')
-    if every is not None and every < 1:
-        raise OptionError(f'--every: {every} is not 1 or more')
-    if start is None and end is None and first is None and every is None:
+    """The images that options choose; None: all."""
+    if not (start or end or first or every):
         return None
-    return Selection(
-        None if start is None else parse_time(start, 'from'),
-        None if end is None else parse_time(end, 'to'),
-        first,
-        every or 1,
-    )
+    return Selection(start, end, first, every or 1)

@@ -54,15 +54,14 @@ _UNKNOWN = Mark(cv2.MARKER_STAR, _TEXT)  # a reason from another version
 
 def annotate(image: Image, observations: StarObservations, geometry: CameraGeometry) -> Picture:
     """
-    Picture (height, width, 3) BGR of an image with its stars marked.
+    Picture (height, width, 3) BGR of an image, which may be reduced, with its stars marked.
 
     Crosses mark the predicted and circles the measured positions of the used stars; refused stars
     carry the mark of their reason, which the legend lists with its count.  A banner names the
     reason of a refused image.  ``geometry`` predicts the stars.
     """
-    picture = _in_grey(image.pixels)
+    picture = annotate_reduced(image.pixels, observations, geometry)
     size = _mark_size(picture)
-    _draw_stars(picture, observations, geometry, 1.0)
     top = _draw_banner(picture, observations, size)
     _draw_legend(picture, observations, size, top)
     return picture
@@ -72,13 +71,9 @@ def annotate_reduced(
     pixels: Pixels, observations: StarObservations, geometry: CameraGeometry
 ) -> Picture:
     """Picture of an image that was reduced to ``pixels``, with its stars marked, no legend."""
-    picture = _in_grey(pixels)
-    _draw_stars(picture, observations, geometry, pixels.shape[1] / observations.width)
+    picture = np.asarray(cv2.cvtColor(stretch(pixels), cv2.COLOR_GRAY2BGR), np.uint8)
+    _draw_stars(picture, observations, geometry, pixels.shape[1] / max(observations.width, 1))
     return picture
-
-
-def _in_grey(pixels: Pixels) -> Picture:
-    return np.asarray(cv2.cvtColor(stretch(pixels), cv2.COLOR_GRAY2BGR), np.uint8)
 
 
 def _mark_size(picture: Picture) -> float:

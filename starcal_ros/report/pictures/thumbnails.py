@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import ProductError
-from starcal_ros.products.files import write_atomically
+from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.identification.blind.bright_sources import bright_sources
+from starcal_ros.identification.prediction import in_image, predict
+from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.report.pictures.annotation import annotate_reduced, stretch
 from starcal_ros.untrusted import read_bytes
@@ -33,6 +36,11 @@ _NAME = re.compile(
 _MAGIC = {'.jpg': b'\xff\xd8\xff', '.png': b'\x89PNG\r\n\x1a\n'}
 _MOST_BYTES = 1 << 20  # of a picture: one of 480 x 480 pixels has a quarter
 _MOST_FILES = 1000  # in a folder: a calibration writes under 200
+EXPECTED = 'no_match_expected'  # in the names of these pictures
+_EXPECTED_PICTURES = 3
+_EXPECTED_STARS = 40  # brightest stars and sources
+_EXPECTED_WIDTH_PX = 900
+_EXPECTED_BGR, _SEEN_BGR = (80, 200, 255), (120, 255, 120)
 
 
 @dataclass(frozen=True)
@@ -129,10 +137,7 @@ def write_thumbnails(thumbnails: Iterable[Thumbnail], folder: Path) -> None:
     """
     Write thumbnails to a folder and delete those of an earlier calibration.
 
-    Raises
-    ------
-    ProductError
-        When a file cannot be written, or the folder is a link.
+    Raises ProductError when a file cannot be written, or the folder is a link.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -205,5 +210,51 @@ def _cut_out(pixels: Pixels, place_px: NDArray[np.float32]) -> bytes:
         part = pixels[low[0] : high[0], low[1] : high[1]]
         inside = tuple(slice(a, b) for a, b in zip(low - first, high - first, strict=True))
         picture[inside] = stretch(part)
+    _, encoded = cv2.imencode('.png', picture)
+    return encoded.tobytes()
+
+
+@dataclass
+class ExpectedAlbum:
+    """The first images of a set that match no star, drawn as they are shown."""
+
+    setup: Setup
+    pictures: list[Thumbnail] = field(default_factory=list)
+
+    def add(self, image: Image, observations: StarObservations, geometry: CameraGeometry) -> None:
+        """Add an image if it matched no star; ``geometry`` predicts the stars."""
+        if observations.refusal == 'no_match' and len(self.pictures) < _EXPECTED_PICTURES:
+            picture = _expected_picture(image, observations, geometry, self.setup)
+            number = len(self.pictures)
+            self.pictures.append(Thumbnail(image.time_ns, EXPECTED, number, picture))
+
+
+def _expected_picture(
+    image: Image, observations: StarObservations, geometry: CameraGeometry, setup: Setup
+) -> bytes:
+    """PNG with crosses where the brightest stars are expected and circles about the sources."""
+    camera = geometry.camera
+    prediction = predict(
+        geometry,
+        observations.icrf_from_star_tracker_xyzw,
+        image.time_ns,
+        setup.catalog,
+        setup.identification.magnitude_limit,
+        0.0,
+    )
+    inside = in_image(prediction.xy_px, camera.width, camera.height)
+    magnitude = setup.catalog.magnitude[prediction.catalog_index]
+    order = np.argsort(np.where(inside, magnitude, np.inf), kind='stable')
+    scale = min(1.0, _EXPECTED_WIDTH_PX / image.pixels.shape[1])
+    grey = cv2.resize(
+        stretch(image.pixels), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
+    )
+    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    for u, v in prediction.xy_px[order[: min(_EXPECTED_STARS, int(inside.sum()))]]:
+        place = (round(float(u) * scale), round(float(v) * scale))
+        cv2.drawMarker(picture, place, _EXPECTED_BGR, cv2.MARKER_CROSS, 13, 1, cv2.LINE_AA)
+    for u, v in bright_sources(image.pixels).xy_px[:_EXPECTED_STARS]:
+        place = (round(float(u) * scale), round(float(v) * scale))
+        cv2.circle(picture, place, 8, _SEEN_BGR, 1, cv2.LINE_AA)
     _, encoded = cv2.imencode('.png', picture)
     return encoded.tobytes()

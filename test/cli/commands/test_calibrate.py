@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from starcal_ros.cli import main
-from starcal_ros.products.not_calibrated import NOT_CALIBRATED_FILE
+from starcal_ros.formats.products.product_folder import NOT_CALIBRATED_FILE
 
 TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 
@@ -31,6 +31,7 @@ def params_with(folder: Path, **changes: Any) -> str:
     return str(path)
 
 
+@pytest.mark.slow
 def test_a_failure_replaces_an_older_calibration(
     tiny_products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -62,6 +63,7 @@ def broken(*_: object) -> None:
     raise TypeError('another version')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('place', 'missing'),
     [
@@ -86,9 +88,10 @@ def test_a_drawing_that_fails_costs_the_drawing_only(
     assert json.loads((out / 'calibration.json').read_text())['accepted']
 
 
+@pytest.mark.slow
 def test_a_failure_page_that_fails_hides_no_failure(tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setattr('starcal_ros.report.page.write_failure_page', broken)
-    monkeypatch.setattr('starcal_ros.report.pictures.expected._picture', broken)
+    monkeypatch.setattr('starcal_ros.report.pictures.thumbnails._expected_picture', broken)
     params = params_with(tmp_path, attitude_direction='inertial_to_st')
     out = tmp_path / 'out'
     assert main.main(['calibrate', str(TINY), '--params', params, '-o', str(out)]) == 2
@@ -98,6 +101,7 @@ def test_a_failure_page_that_fails_hides_no_failure(tmp_path: Path, capsys, monk
     assert (out / NOT_CALIBRATED_FILE).exists() and not (out / 'report.html').exists()
 
 
+@pytest.mark.slow
 def test_alignment_and_tracker_sigma_are_found_and_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -119,6 +123,7 @@ def test_alignment_and_tracker_sigma_are_found_and_said(
     assert camera['camera_name'] != 'camera'
 
 
+@pytest.mark.slow
 def test_halves_of_a_part(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / 'out'
     command = ['calibrate', str(TINY), '--params', str(TINY / 'params.yaml'), '-o', str(out)]

@@ -11,7 +11,7 @@ import pytest
 import spiceypy
 
 from starcal_ros.cli.main import main
-from starcal_ros.products.calibration_json import write_calibration
+from starcal_ros.formats.products.calibration_json import write_calibration
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_export_states_the_cost_of_each_part(folder: Path, tmp_path: Path, capsy
     ('line', 'words'),
     [
         ('--to spice', '--spacecraft-id'),
-        ('--to matlab', "'matlab' is not one of spice, opencv"),
+        ('--to matlab', "'matlab' is not one of spice, ck, isd, opencv"),
         ('--to spice --spacecraft-id 5', 'not a negative NAIF ID'),
     ],
 )

@@ -55,7 +55,7 @@ def test_forecast_sigmas_stand_beside_the_active_ones() -> None:
     )
     lines = shown(Seen(status=collected, active=active)).splitlines()
     (fx,) = (line for line in lines if ' fx ' in line)
-    assert '0.25' in fx and f'{active.sigma[0]:.2g}' in fx
+    assert '0.25 px' in fx and f'{active.sigma[0]:.2g}' in fx
     (turn,) = (line for line in lines if ' alignment_x ' in line)
     assert '1.00 arcsec' in turn
     (unknown,) = (line for line in lines if ' k3 ' in line)

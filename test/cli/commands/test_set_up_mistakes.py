@@ -13,15 +13,17 @@ import numpy as np
 import pytest
 import yaml
 
-from starcal_ros.bag import reader
-from starcal_ros.bag.typestore import make_message
-from starcal_ros.bag.writer import BagWriter
 from starcal_ros.cli import main
-from starcal_ros.messages.fields import make_header
-from starcal_ros.messages.telemetry import attitude_from_message
-from starcal_ros.messages.types import COMPRESSED_TYPE, IMAGE_TYPE
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.messages.message_fields import make_header
+from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.formats.messages.types import COMPRESSED_TYPE, IMAGE_TYPE
 from starcal_ros.records import Image
-from starcal_ros.simulation.bag import ATTITUDE_TOPIC, IMAGE_TOPIC
+from starcal_ros.studies.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
+
+pytestmark = pytest.mark.slow
 
 TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 IMAGES = 4
@@ -135,7 +137,6 @@ def said(
         (_jpeg, 0.0, ['is a JPEG', 'raw or as PNG']),
         (_raw, 18000.0, ['18000.0', 'stamp_offset_s: 18000.0']),
         (_raw, -946727935.0, ['stamp_offset_s: -946727934', 'the date of the attitudes']),
-        (_raw, None, ['attitudes of the star tracker', 'starcal import']),
         (_half_lost, 0.0, ['incomplete', 'constant', 'max_lost_fraction']),
     ],
 )  # fmt: skip
@@ -216,9 +217,21 @@ def test_a_folder_of_image_files_is_imported(
 ) -> None:
     (tmp_path / '001.fits').write_bytes(b'SIMPLE  =                    T')
     for path in (tmp_path, tmp_path / '001.fits'):
-        command = ['calibrate', str(path), '--params', str(TINY / 'params.yaml'), '-o', 'x']
-        assert main.main(command) == 2
+        assert main.main(['inspect', str(path), '--params', str(TINY / 'params.yaml')]) == 2
         assert f"starcal import --images '{tmp_path}/*.fits'" in capsys.readouterr().err
+    # Calibrated without a bag, by the stars alone: a file that is none is named.
+    assert main.main(['calibrate', str(tmp_path), '-o', str(tmp_path / 'out')]) == 2
+    assert '001.fits: not readable as FITS' in capsys.readouterr().err
+
+
+def test_a_bag_without_attitudes_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = bag(tmp_path / 'bag.mcap', _raw, None)
+    for command in ('inspect', 'diagnose'):
+        main.main([command, str(path), '--params', str(params(tmp_path))])
+        text = ' '.join(capsys.readouterr())
+        assert 'attitudes of the star tracker' in text and 'starcal import' in text
 
 
 @pytest.mark.parametrize('top', [False, True])

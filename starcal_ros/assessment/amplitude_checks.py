@@ -1,0 +1,168 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Where the data contradict the model of a calibration.
+
+What is unknown is estimated with a prior; here is what goes beyond it: unknowns far from their
+priors, amplitudes with their likelihood ratios, a step of the detector, and the predictions of
+what was left out.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.special import ndtr
+
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.predictions import predictions
+from starcal_ros.camera import CameraModel, pixel_grid
+from starcal_ros.estimation.calibrate import Estimate
+from starcal_ros.estimation.posterior import without_prior
+from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks
+
+_GRID = 25
+_STATED = ('camera', 'mountings', 'velocity', 'readout', 'stamps')  # entries with a prior
+_INNER = (0.1, 0.9)  # of the detector: beyond, too few stars lie on one side
+_STEPS = 97  # places along each axis at which a step is looked for
+_STRIP = 1 / 24  # of the width: a quarter of the shortest wave of the field
+
+
+def model_checks(estimate: Estimate) -> ModelChecks:
+    """Return what the stars of an estimate show of the model that it assumes."""
+    camera = estimate.geometry.camera
+    rms_px, worst_px = _field_px(camera)
+    return ModelChecks(
+        amplitudes=_amplitudes(estimate),
+        field_rms_px=rms_px,
+        field_worst_px=worst_px,
+        held=_held_terms(estimate),
+        step=detector_step(estimate),
+        image_variation_px=_image_variation_px(estimate),
+        predictions=predictions(estimate),
+    )
+
+
+def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
+    """Return the estimated amplitudes, each with twice its log likelihood against none."""
+    found = estimate.posterior
+    octaves = float(np.sqrt((np.exp(found.field.log_px) ** 2).sum()))
+    shape = float(np.sqrt((np.exp(found.shape.log_px) ** 2).sum()))
+    return (
+        Amplitude('field', octaves, 'px', found.field.likelihood_ratio),
+        Amplitude('change from image to image', shape, 'px', found.shape.likelihood_ratio),
+        *(
+            Amplitude(error.name, math.sqrt(error.variance_px2), 'px', error.likelihood_ratio)
+            for error in estimate.shared_errors
+        ),
+        *(
+            Amplitude(
+                f'slow error of star tracker {k + 1}, {one.correlation}',
+                one.slow,
+                'sigma',
+                one.likelihood_ratio,
+            )
+            for k, one in enumerate(estimate.tracker_errors)
+        ),
+    )
+
+
+def _image_variation_px(estimate: Estimate) -> float:
+    """1-sigma change of the camera from image to image in a corner, px."""
+    camera = estimate.geometry.camera
+    corner_px = 0.5 * math.hypot(camera.width, camera.height)
+    sigma_px = float(np.linalg.norm(np.exp(estimate.posterior.shape.log_px)))
+    return sigma_px * corner_px / float(camera.parameters[0])
+
+
+def _field_px(camera: CameraModel) -> tuple[float, float]:
+    """RMS per axis and largest length of the field over the detector, px."""
+    if camera.field is None:
+        return 0.0, 0.0
+    moved = camera.field.displacement_px(pixel_grid(camera, _GRID, _GRID))
+    return float(np.sqrt((moved**2).mean())), float(np.linalg.norm(moved, axis=1).max())
+
+
+def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
+    """
+    Return unknowns that are held or have a stated prior, with what the stars ask for.
+
+    A held parameter is tested by one more Newton step with it free; an unknown with a prior by its
+    estimate without the prior: what contradicts a narrow prior moves other unknowns, first the
+    field and the shapes of the images, and hardly its own.
+    """
+    found, layout, problem = estimate.posterior, estimate.layout, estimate.problem
+    terms = []
+    camera = np.arange(layout.count)[layout.places['camera']]
+    for k in np.setdiff1d(camera, found.estimated):
+        cross = found.information[k]
+        information = float(cross[k] - cross @ found.working @ cross)
+        if information <= 1e-9 * cross[k]:
+            continue
+        step = float(found.gradient[k] - cross @ found.mean) / information
+        held = float(estimate.state.parameters[k - camera[0]])
+        terms.append(HeldTerm(layout.labels[k], held, held + step, information**-0.5))
+    total, working = np.diag(found.covariance), found.working_variance
+    first = layout.places['mountings'].start if 'mountings' in layout else layout.count
+    for entry in layout.shared:
+        at = layout.of([entry.name])
+        tested = np.isin(at, found.estimated) & (layout.prior_precision[at] > 0)
+        if entry.name not in _STATED or not tested.any():
+            continue
+        means, variances = without_prior(
+            estimate.sums, problem, estimate.state, layout, entry.name
+        )
+        for k, mean, variance in zip(at[tested], means[tested], variances[tested], strict=True):
+            if not np.isfinite(variance):
+                continue
+            off = float(layout.prior_offset[k] + mean)
+            # Errors that observations share are in both variances.
+            apart2 = 1.0 / layout.prior_precision[k] + variance * total[k] / working[k]
+            prior = float(problem.prior_parameters[k - camera[0]]) if k in camera else 0.0
+            name, unit = layout.labels[k], 1.0
+            head = (k - first) // 3 + 1
+            if 1 <= head < len(estimate.star_trackers):
+                frame = estimate.star_trackers[head].frame
+                name, unit = f'mounting of {frame} {name[-1]}_deg', math.degrees(1.0)
+            terms.append(HeldTerm(name, prior, prior + unit * off, unit * math.sqrt(apart2)))
+    return tuple(terms)
+
+
+def detector_step(estimate: Estimate) -> DetectorStep:
+    """Return the most significant step between two parts of the detector."""
+    kept = estimate.kept
+    camera, strip_px = estimate.geometry.camera, _STRIP * estimate.geometry.camera.width
+    residual_px = estimate.residual_px[kept]
+    weight = 2.0 / (estimate.covariance_px2[kept, 0] + estimate.covariance_px2[kept, 2])
+    best, best_significance = ('u', 0.0, 'u', 0.0), 0.0
+    for axis, size in enumerate((camera.width, camera.height)):
+        place_px: Floats = np.asarray(np.linspace(*_INNER, _STEPS), np.float64) * size - 0.5
+        pixels = estimate.table.measured_px[kept, axis]
+        before, variance_before = _means(
+            pixels, residual_px, weight, place_px - strip_px, place_px
+        )
+        after, variance_after = _means(pixels, residual_px, weight, place_px, place_px + strip_px)
+        step, sigma = after - before, np.sqrt(variance_before + variance_after)[:, None]
+        significance = np.abs(step) / sigma
+        k, moved = np.unravel_index(int(np.argmax(significance)), significance.shape)
+        if significance[k, moved] > best_significance:
+            best_significance = float(significance[k, moved])
+            best = ('uv'[axis], float(place_px[k]), 'uv'[moved], float(step[k, moved]))
+    # Twice two axes, and places that do not overlap.
+    trials = 4 * min(_STEPS, round((_INNER[1] - _INNER[0]) / _STRIP))
+    p_value = min(1.0, 2.0 * trials * float(ndtr(-best_significance)))
+    return DetectorStep(*best, p_value)
+
+
+def _means(
+    pixels: Floats, residual_px: Floats, weight: Floats, low_px: Floats, high_px: Floats
+) -> tuple[Floats, Floats]:
+    """Weighted means (k, 2) of residuals between pixels (k,) and (k,), and their variances."""
+    order = np.argsort(pixels)
+    ends = np.searchsorted(pixels[order], np.stack([low_px, high_px]))
+    columns = np.column_stack([weight, weight[:, None] * residual_px])[order]
+    summed = np.concatenate([np.zeros((1, 3)), np.cumsum(columns, axis=0)])
+    total = summed[ends[1]] - summed[ends[0]]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        means = np.nan_to_num(total[:, 1:] / total[:, :1])
+        return means, 1.0 / total[:, 0]

@@ -1,0 +1,292 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Budget of the sigma of lines of sight by cause.
+
+The part of a cause is the root of the variance that would be gone if it were known exactly, or
+absent.  With L the root of the covariance under the working weights, all errors have the
+covariance ``L (1 + A) L'`` (`posterior.ErrorParts`).  An estimator that is given some unknowns has
+the root ``L T``: the columns of T are orthonormal and orthogonal to the rows of L of these
+unknowns, which is their Schur complement; that of an estimator that is given the shapes of the
+images has ``T = (1 + L' D L)^-1/2``, where D is the information that the shapes hide.  Both have
+the covariance ``L T (1 + T' A T) T' L'``.  An error that observations share is absent without its
+own term of A, the weights as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import itertools
+import math
+
+import numpy as np
+from scipy.linalg import null_space
+
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.assessment.lookup import Derivatives, GRID
+from starcal_ros.camera import pixel_grid
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.estimation.calibrate import Estimate
+from starcal_ros.estimation.calibration_options import CalibrationOptions, tracker_sigma_is_given
+from starcal_ros.estimation.equations import equations
+from starcal_ros.estimation.posterior import common_shape, ErrorParts, TRACKER_NOISE, TRACKER_SLOW
+from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart, TOTAL
+
+_KNOWN_SHAPE_PX = 1e-7  # moves no pixel by a measurable amount
+_UNKNOWNS = {
+    'velocity': ('velocity',),
+    'refraction': ('refraction', 'site'),
+    'read-out': ('readout',),
+    'stamps': ('stamps',),
+    'field': ('field',),
+    'mountings': ('mountings',),
+    'temperature': ('focal', 'rate'),
+}
+"""Entries of the list of unknowns by cause."""
+
+
+@dataclass(frozen=True)
+class _Cause:
+    """
+    A cause: the variances that would be gone, rad^2.
+
+    The mean over the detector of the map and of the pointing, then of the map at each pixel of the
+    budget.
+    """
+
+    name: str
+    variance_rad2: Floats  # (k,)
+    assumption: str
+
+
+def sigma_budget(estimate: Estimate, options: CalibrationOptions) -> tuple[SigmaPart, ...]:
+    """Return the 1-sigma of lines of sight over the detector: the total, and by cause."""
+    errors = estimate.posterior.errors
+    assert errors is not None
+    seen, of_pixel = _squares(estimate)
+    in_root = np.asarray(errors.root.T @ seen @ errors.root)
+    unresolved = of_pixel * estimate.pixel_sigma_px**2
+    rows = _rows(estimate)
+    part = np.ix_(rows, rows)
+    covariance = estimate.joint_covariance
+    held = _traces(seen[:, rows][:, :, rows], covariance - estimate.posterior.covariance[part])
+    shapes = _known_shapes(estimate, errors)
+    common = common_shape(estimate.layout, estimate.posterior.common_shape_px2)
+    causes = [
+        _Cause('stars', _noise(estimate, errors, shapes, in_root), _of_stars(estimate)),
+        *_unknowns(estimate, options, errors, in_root),
+        _Cause(
+            'change from image to image',
+            _gain(errors, shapes, in_root) + _traces(seen, common),
+            _estimated(
+                float(np.linalg.norm(estimate.posterior.shape_sigma_px)),
+                estimate.posterior.shape.likelihood_ratio,
+            ),
+        ),
+        *_shared(estimate, options, errors, in_root, unresolved),
+        _Cause('held parameters', held, _of_held(estimate)),
+    ]
+    total = _traces(seen[:, rows][:, :, rows], covariance) + unresolved
+    parts = [_Cause(TOTAL, total, ''), *(cause for cause in causes if cause.assumption)]
+    return tuple(_part(cause) for cause in parts)
+
+
+def _part(cause: _Cause) -> SigmaPart:
+    sigma = np.sqrt(np.maximum(cause.variance_rad2, 0.0)) / ARCSECOND_RAD
+    of_map, of_pointing, *over_detector = sigma.tolist()
+    return SigmaPart(cause.name, of_map, of_pointing, cause.assumption, tuple(over_detector))
+
+
+def _squares(estimate: Estimate) -> tuple[Floats, Floats]:
+    """
+    Return ``J' J`` (k, P, P) of `mean_squares`, then of the map at each pixel of the budget.
+
+    With those (k,) of a displacement of the pixel along both axes.
+    """
+    means, of_pixel = mean_squares(estimate)
+    camera = estimate.geometry.camera
+    found = Derivatives.at(camera, pixel_grid(camera, BUDGET_COLUMNS, BUDGET_ROWS))
+    J = np.zeros((len(found.J), 3, estimate.layout.count))
+    J[:, :, _rows(estimate)] = np.nan_to_num(found.of_shape(camera))
+    by_pixel = np.nan_to_num((found.by_pixel**2).sum(axis=(1, 2)))
+    squares = np.concatenate([means, J.transpose(0, 2, 1) @ J])
+    return squares, np.concatenate([[of_pixel, of_pixel], by_pixel])
+
+
+def mean_squares(estimate: Estimate) -> tuple[Floats, float]:
+    """
+    Return the mean of ``J' J`` over the detector for map and pointing, (2, P, P).
+
+    By the shared unknowns; with that of a displacement of the pixel along both axes.
+    """
+    camera, layout = estimate.geometry.camera, estimate.layout
+    found = Derivatives.at(camera, pixel_grid(camera, GRID, GRID))
+    seen = np.isfinite(found.directions[:, 0])
+    squares = np.zeros((2, layout.count, layout.count))
+    rows = _rows(estimate)
+    for k, J in enumerate((found.of_shape(camera), found.J)):
+        flat = J[seen].reshape(-1, len(rows))
+        squares[k][np.ix_(rows, rows)] = flat.T @ flat / np.count_nonzero(seen)
+    return squares, float((found.by_pixel[seen] ** 2).sum() / np.count_nonzero(seen))
+
+
+def _rows(estimate: Estimate) -> Indices:
+    """Return the places of the numbers of `lookup.Derivatives` among the shared unknowns."""
+    return estimate.layout.of(['camera', 'alignment', 'field'])
+
+
+def _traces(squares: Floats, covariance: Floats) -> Floats:
+    """Return the variances (k,) by the squares (k, P, P)."""
+    return np.asarray(np.einsum('kij,ji->k', squares, covariance))
+
+
+def _with(errors: ErrorParts, T: Floats, squares: Floats) -> Floats:
+    """Return the variances (k,) of the estimator of the root ``L T``."""
+    inner = np.eye(T.shape[1]) + T.T @ errors.excess @ T
+    return _traces(squares, T @ inner @ T.T)
+
+
+def _gain(errors: ErrorParts, T: Floats, squares: Floats) -> Floats:
+    """Return the variances (k,) that the estimator of the root ``L T`` does not have."""
+    return _with(errors, np.eye(len(T)), squares) - _with(errors, T, squares)
+
+
+def _known(errors: ErrorParts, estimate: Estimate, names: Sequence[str]) -> Floats:
+    """Return T (r, s) of an estimator that is given some shared unknowns."""
+    rows = errors.root[estimate.layout.of(names)]
+    size = np.linalg.norm(rows, axis=1, keepdims=True)
+    rows = (rows / np.where(size > 0, size, 1.0))[size[:, 0] > 0]
+    return np.asarray(null_space(rows)) if len(rows) else np.eye(errors.root.shape[1])
+
+
+def _known_shapes(estimate: Estimate, errors: ErrorParts) -> Floats:
+    """Return T (r, r) of an estimator that is given the shapes of the images."""
+    given = (estimate.sums, estimate.problem, estimate.state, estimate.layout)
+    without = equations(*given, np.full(3, _KNOWN_SHAPE_PX))
+    hidden = errors.root.T @ (without.information - estimate.posterior.information) @ errors.root
+    values, vectors = np.linalg.eigh(hidden)
+    return np.asarray((vectors * (1.0 + values.clip(0.0)) ** -0.5) @ vectors.T)
+
+
+def _noise(estimate: Estimate, errors: ErrorParts, shapes: Floats, squares: Floats) -> Floats:
+    """Return the variances (k,) by the noise of the centroids, all other causes absent."""
+    N = _known(errors, estimate, list(itertools.chain(*_UNKNOWNS.values())))
+    # An estimator that is given both: the information of the shapes adds up within what is left.
+    held = N.T @ np.linalg.inv(shapes @ shapes) @ N
+    values, vectors = np.linalg.eigh(held)
+    T = N @ (vectors * values.clip(1.0) ** -0.5) @ vectors.T
+    noise = np.eye(T.shape[1]) + T.T @ (errors.excess - sum(errors.shared.values())) @ T
+    return _traces(squares, T @ noise @ T.T)
+
+
+def _unknowns(
+    estimate: Estimate, options: CalibrationOptions, errors: ErrorParts, squares: Floats
+) -> list[_Cause]:
+    """Return the causes that are unknowns with a prior, or without one."""
+    layout, field = estimate.layout, estimate.posterior.field
+
+    def text(name: str) -> str:
+        sigma = float(layout[name].sigma[0])
+        return {
+            'velocity': _of_velocity(sigma, options),
+            'refraction': f'site not given: {sigma:.3g} arcsec at 45 degrees assumed',
+            'readout': _of_readout(layout[name].labels[0], sigma, options),
+            'stamps': f'{1e3 * sigma:.3g} ms assumed',
+            'field': _estimated(_field_px(estimate), field.likelihood_ratio),
+            'mountings': f'{sigma / ARCSECOND_RAD:.3g}″ per angle assumed',
+        }.get(name, 'estimated, no prior')
+
+    causes = []
+    for cause, entries in _UNKNOWNS.items():
+        given = [name for name in entries if name in layout]
+        if given:
+            gained = _gain(errors, _known(errors, estimate, given), squares)
+            causes.append(_Cause(cause, gained, text(given[0])))
+    return causes
+
+
+def _shared(
+    estimate: Estimate,
+    options: CalibrationOptions,
+    errors: ErrorParts,
+    squares: Floats,
+    unresolved: Floats,
+) -> list[_Cause]:
+    """Return the causes that are errors which observations or attitudes share."""
+
+    def absent(names: Sequence[str]) -> Floats:
+        found = [errors.shared[name] for name in names if name in errors.shared]
+        return np.asarray(sum((_traces(squares, one) for one in found), np.zeros(len(squares))))
+
+    causes = []
+    for name, of_star in (('star places', True), ('fine structure', False)):
+        group = [error for error in estimate.shared_errors if error.of_star == of_star]
+        if group:
+            text = _estimated(
+                math.sqrt(sum(error.variance_px2 for error in group)),
+                max(error.likelihood_ratio for error in group),
+            )
+            variance = absent([error.name for error in group])
+            causes.append(_Cause(name, variance + (0.0 if of_star else unresolved), text))
+    noise = _of_noise(estimate, options)
+    causes.append(_Cause(TRACKER_NOISE, absent([TRACKER_NOISE]), noise))
+    slow = _of_slow(estimate, options)
+    causes.append(_Cause(TRACKER_SLOW, absent([TRACKER_SLOW]), slow))
+    return causes
+
+
+def _estimated(rms_px: float, likelihood_ratio: float) -> str:
+    ratio = max(likelihood_ratio, 0.0)
+    return f'estimated: {rms_px:.2g} px rms per axis, 2 log L {ratio:.1f}'
+
+
+def _field_px(estimate: Estimate) -> float:
+    """Return the RMS of the field over the detector, what is not known of it included."""
+    place = estimate.layout.places['field']
+    square = estimate.posterior.mean[place] ** 2 + np.diag(estimate.posterior.covariance)[place]
+    return math.sqrt(0.5 * float(square.sum()))
+
+
+def _of_stars(estimate: Estimate) -> str:
+    variance = estimate.covariance_px2[estimate.kept][:, [0, 2]].mean()
+    return f'estimated: {math.sqrt(variance):.2g} px rms of {int(estimate.kept.sum())} centroids'
+
+
+def _of_velocity(sigma_m_s: float, options: CalibrationOptions) -> str:
+    size = f'{sigma_m_s / 1e3:.3g} km/s' if sigma_m_s >= 1e3 else f'{sigma_m_s:.3g} m/s'
+    if options.velocity_sigma_m_s >= 0:
+        return f'{size} per axis stated'
+    return f'not given: {size} per axis assumed'
+
+
+def _of_readout(label: str, sigma: float, options: CalibrationOptions) -> str:
+    if label.endswith('_rad'):  # of a rate that is not known
+        return f'rate not known: {sigma / ARCSECOND_RAD:.3g}″ per axis within an image assumed'
+    size = f'{1e3 * sigma:.3g} ms'
+    return f'shutter unknown: {size} assumed' if options.shutter == 'unknown' else f'{size} stated'
+
+
+def _of_noise(estimate: Estimate, options: CalibrationOptions) -> str:
+    noise = ', '.join(f'{s / ARCSECOND_RAD:.3g}' for s in estimate.star_tracker_sigma_rad)
+    given = 'stated sigmas, ' if tracker_sigma_is_given(options) else ''
+    return f'{given}estimated: {noise}″ about x, y, z'
+
+
+def _of_slow(estimate: Estimate, options: CalibrationOptions) -> str:
+    if not estimate.tracker_errors:
+        return ''
+    stated = options.star_tracker_slow_arcsec
+    assumed = f'{stated:.3g}″ stated' if stated else 'not given: as the noise assumed'
+    noise = float(np.mean([one.noise for one in estimate.tracker_errors]))
+    slow = float(np.mean([one.slow for one in estimate.tracker_errors]))
+    unit = float(estimate.star_tracker_sigma_rad.mean()) / max(noise, 1e-12) / ARCSECOND_RAD
+    ratio = max(one.likelihood_ratio for one in estimate.tracker_errors)
+    return f'{assumed}; estimated: {slow * unit:.3g}″, 2 log L {max(ratio, 0.0):.1f}'
+
+
+def _of_held(estimate: Estimate) -> str:
+    """Return the parameters that are held and have a sigma; empty if there are none."""
+    problem = estimate.problem
+    held = np.setdiff1d(np.flatnonzero(np.isfinite(problem.prior_sigma)), problem.free)
+    names = [f'{problem.parameter_names[k]} {problem.prior_sigma[k]:.3g}' for k in held]
+    return f'1-sigma of the prior: {", ".join(names)}' if names else ''

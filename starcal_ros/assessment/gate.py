@@ -1,0 +1,339 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The gate: the limits that a calibration must meet to become active, and the checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import dataclasses
+import math
+
+import numpy as np
+
+from starcal_ros.assessment.agreement import Difference, difference, movement
+from starcal_ros.assessment.gate_options import GateOptions, limit_check
+from starcal_ros.assessment.observability import map_sigma_px
+from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.records import (
+    Calibration,
+    CameraGeometry,
+    GateCheck,
+    ModelChecks,
+    ResidualBin,
+    StarTrackerAlignment,
+)
+
+_DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
+_STEP_P_VALUE = 1e-6  # of a step of the detector among all places
+# What to do where the stars contradict what is assumed of an unknown, by the start of its label.
+_REMEDIES = {
+    'velocity': 'the velocity or the clock is wrong, or air bends the light: check the velocity'
+    ' topic, the stamps and the site',
+    'readout': 'check shutter and readout_s',
+    'stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
+    'mounting': 'check more_alignments, or widen star_tracker_mounting_sigma_arcsec',
+}
+_PART_TOLERANCE = 0.05  # of a normalised residual, within which a part of the data is as predicted
+_PART_SIGMAS = 3.5  # one of twelve parts exceeds it by noise in 1 of 200 calibrations
+
+
+def judge(
+    calibration: Calibration,
+    prior: CameraGeometry,
+    active: Calibration | None,
+    options: GateOptions,
+    estimation: CalibrationOptions,
+) -> tuple[GateCheck, ...]:
+    """
+    The checks of the gate on a calibration, each with the value found and whether it passed.
+
+    Raises ValueError when the calibration has no maps.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        With its `DetectorMaps`; its verdict is not used.
+    prior : CameraGeometry
+        Camera and alignment before the calibration.
+    active : Calibration or None
+        The calibration that this one would replace.
+    estimation : CalibrationOptions
+        The options of the calibration; they hold some of the limits.
+
+    Returns
+    -------
+    tuple of GateCheck
+        Only the first two where a parameter or a variance is not finite: all others use them.
+    """
+    checks = (_solver(calibration), _numbers(calibration))
+    if not checks[-1].passed:
+        return checks
+    return (
+        *checks,
+        *_fit(calibration, options, estimation),
+        *model_gate(calibration.model_checks, options),
+        *star_tracker_gate(calibration.star_trackers, options),
+        *_precision(calibration, options),
+        *_changes(calibration, prior, active, options),
+    )
+
+
+def reasons_of(checks: Iterable[GateCheck]) -> tuple[str, ...]:
+    """A sentence for each check that failed; empty where none did."""
+    return tuple(_reason(check) for check in checks if check.passed is False)
+
+
+def _reason(check: GateCheck) -> str:
+    if not check.option:
+        return check.note
+    side = 'under' if check.is_least else 'over'
+    note = f'; {check.note}' if check.note else ''
+    return (
+        f'{check.name} is {check.found_text}, {side} the limit of {check.limit_text} '
+        f'({check.option}){note}'
+    )
+
+
+def _solver(calibration: Calibration) -> GateCheck:
+    passed = calibration.termination == 'converged'
+    note = '' if passed else f'the solver did not converge ({calibration.termination})'
+    return GateCheck('solver converged', '', math.nan, math.nan, '', passed, note)
+
+
+def _numbers(calibration: Calibration) -> GateCheck:
+    values = np.concatenate(
+        [
+            calibration.geometry.camera.parameters,
+            calibration.geometry.star_tracker_from_camera_xyzw,
+            calibration.covariance.ravel(),
+        ]
+    )
+    note = ''
+    if not np.isfinite(values).all():
+        note = 'a parameter or its covariance is not a finite number'
+    elif (np.diag(calibration.covariance) < 0).any():
+        note = 'a variance is negative'
+    name = 'numbers finite, variances positive'
+    return GateCheck(name, '', math.nan, math.nan, '', not note, note)
+
+
+def _fit(
+    calibration: Calibration, options: GateOptions, estimation: CalibrationOptions
+) -> Iterator[GateCheck]:
+    """Residuals, outliers, and the number of images and stars that fit."""
+    stars = max(calibration.stars_used + calibration.stars_rejected, 1)
+    yield limit_check(
+        options, 'max_residual_rms_px', 'residual per axis', calibration.residual_rms_px, 'px'
+    )
+    images, misfits = calibration.images_used, len(calibration.misfit_images_ns)
+    yield limit_check(
+        options,
+        'max_rejected_fraction',
+        'fraction of stars left out as outliers',
+        calibration.stars_rejected / stars,
+    )
+    yield limit_check(
+        options,
+        'max_misfit_fraction',
+        'fraction of images whose attitude does not fit',
+        misfits / max(images, 1),
+    )
+    yield limit_check(estimation, 'min_images', 'number of images that fit', images - misfits)
+    yield limit_check(estimation, 'min_stars', 'number of stars that fit', calibration.stars_used)
+
+
+def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateCheck]:
+    """Coverage of the detector and precision of the result."""
+    maps = calibration.maps
+    if maps is None:
+        raise ValueError('calibration: the gate needs its detector maps')
+    yield limit_check(
+        options,
+        'min_coverage',
+        'fraction of the detector with stars that fit',
+        float((maps.stars > 0).mean()) if maps.stars.size else 0.0,
+    )
+    yield limit_check(
+        options,
+        'max_map_sigma_px',
+        'largest 1-sigma of the distortion map',
+        _map_sigma_px(calibration),
+        'px',
+    )
+    aligned = calibration.has_alignment  # else the common rotation has no meaning
+    sigma_arcsec = maps.line_of_sight_sigma_arcsec if aligned else maps.shape_sigma_arcsec
+    yield limit_check(
+        options,
+        'max_line_of_sight_sigma_arcsec',
+        'largest 1-sigma of a line of sight',
+        float(sigma_arcsec.max()),
+        'arcsec',
+    )
+
+
+def _map_sigma_px(calibration: Calibration) -> float:
+    """Largest 1-sigma of the distortion map; NaN where a pixel has no line of sight."""
+    try:
+        return float(map_sigma_px(calibration.geometry.camera, calibration.map_covariance).max())
+    except np.linalg.LinAlgError:
+        return math.nan
+
+
+def _changes(
+    calibration: Calibration,
+    prior: CameraGeometry,
+    active: Calibration | None,
+    options: GateOptions,
+) -> Iterator[GateCheck]:
+    """Changes against the prior and against the active calibration."""
+    rotation_rad, left_px = movement(prior, calibration.geometry)
+    step = _step(active, calibration)
+    of_map, of_sight = 'change of the distortion map', 'rotation of the lines of sight'
+    for parameter, name, found, unit in (
+        ('max_change_px', f'largest {of_map} from the prior', left_px.max(), 'px'),
+        ('max_rotation_deg', f'{of_sight} from the prior', math.degrees(rotation_rad), 'deg'),
+        (
+            'max_step_px',
+            f'largest {of_map} from the active calibration',
+            step if isinstance(step, str) else step.shape_px,
+            'px',
+        ),
+        (
+            'max_step_rotation_deg',
+            f'{of_sight} from the active calibration',
+            step if isinstance(step, str) else math.degrees(step.rotation_rad),
+            'deg',
+        ),
+    ):
+        check = limit_check(options, parameter, name, found, unit)
+        if parameter == 'max_change_px' and check.passed is False:
+            note = 'the prior camera or its lens model is not of this lens (lens_model)'
+            check = dataclasses.replace(check, note=note)
+        yield check
+
+
+def _step(active: Calibration | None, calibration: Calibration) -> Difference | str:
+    """Difference from the active calibration over the parameters that both estimate."""
+    if active is None:
+        return 'no calibration was active'
+    if active.geometry.camera.model != calibration.geometry.camera.model:
+        return f'the active calibration has the lens model {active.geometry.camera.model}'
+    return difference(
+        active.geometry,
+        active.covariance,
+        calibration.geometry,
+        calibration.covariance,
+        tuple(name for name in calibration.estimated if name in active.estimated),
+    )
+
+
+def star_tracker_gate(
+    found: tuple[StarTrackerAlignment, ...], options: GateOptions
+) -> Iterator[GateCheck]:
+    """The drift of each of several star trackers."""
+    for one in found:
+        if math.isfinite(one.drift_p_value):
+            yield _significant(
+                options,
+                'max_star_tracker_drift_arcsec',
+                f'drift of the attitude of {one.frame} against the stars',
+                one.drift_arcsec,
+                'arcsec',
+                one.drift_p_value,
+                'that star tracker or its mounting moves: leave it out of more_star_trackers, or'
+                ' collect images over a shorter time',
+                _DRIFT_P_VALUE,
+            )
+
+
+def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[GateCheck]:
+    """Contradictions between the stars and the model with its priors, each with the remedy."""
+    if found is None:
+        return
+    for term in found.held:
+        check = limit_check(
+            options,
+            'max_held_term_sigma',
+            f'distance of {term.name} from its assumed value',
+            term.significance,
+            'sigma',
+        )
+        note = f'the stars put {term.name} at {term.asked:.6g}, assumed is {term.assumed:.6g}'
+        if not check.passed:
+            note += '; ' + _REMEDIES.get(
+                term.name.replace(' ', '_').partition('_')[0],
+                f'estimate {term.name}, or widen its prior (estimate, prior_sigma)',
+            )
+        yield dataclasses.replace(check, note=note)
+    step = found.step
+    yield _significant(
+        options,
+        'max_detector_step_px',
+        f'step of the detector in {step.moved} at {step.across} = {step.place_px:.0f}',
+        abs(step.size_px),
+        'px',
+        step.p_value,
+        'columns or rows are lost or shifted there: check the read-out',
+        _STEP_P_VALUE,
+    )
+    check = limit_check(
+        options,
+        'max_image_variation_px',
+        'change of the camera from image to image in a corner',
+        found.image_variation_px,
+        'px',
+    )
+    if not check.passed:
+        note = (
+            'focal length or lens changes between images: estimate with temperature, or calibrate'
+            ' each state by itself'
+        )
+        check = dataclasses.replace(check, note=note)
+    yield check
+    yield from _predicted(found.predictions, options)
+
+
+def _predicted(bins: tuple[ResidualBin, ...], options: GateOptions) -> Iterator[GateCheck]:
+    """The part of the data whose residuals exceed their predicted sigma the most."""
+    if not bins:
+        return
+
+    def excess(part: ResidualBin) -> float:
+        # No part fails for the noise of its few stars.
+        return part.normalised - _PART_SIGMAS * part.sigma
+
+    worst = max(bins, key=excess)
+    doubtful = [
+        f'{part.by} {part.low:.4g} to {part.high:.4g}: {part.normalised:.3f}'
+        for part in bins
+        if abs(part.normalised - 1.0) > max(_PART_TOLERANCE, _PART_SIGMAS * part.sigma)
+    ]
+    check = limit_check(
+        options,
+        'max_cross_validated_residual',
+        f'residual over predicted sigma at {worst.by} {worst.low:.4g} to {worst.high:.4g}',
+        worst.normalised,
+    )
+    passed = bool(check.passed) or excess(worst) <= options.max_cross_validated_residual
+    note = f'not within {_PART_TOLERANCE:.0%} of 1: {", ".join(doubtful)}' if doubtful else ''
+    if not passed:
+        note += '; the sigma does not hold there: look at the PSF, the lens model or those images'
+    yield dataclasses.replace(check, passed=passed, note=note)
+
+
+def _significant(
+    options: GateOptions,
+    option: str,
+    name: str,
+    found: float,
+    unit: str,
+    p_value: float,
+    remedy: str,
+    least_p_value: float,
+) -> GateCheck:
+    """A check that fails where the value exceeds its limit and noise does not explain it."""
+    check = limit_check(options, option, name, found, unit)
+    likely = not p_value < least_p_value
+    note = f'the p-value is {p_value:.1g}'
+    if not check.passed and not likely:
+        note += f'; {remedy}'
+    return dataclasses.replace(check, passed=bool(check.passed) or likely, note=note)

@@ -1,0 +1,329 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Lens models: from the ideal image plane to the distorted one, and the derivatives.
+
+A direction (X, Y, Z) in the camera frame meets the ideal plane of its model at
+
+- perspective models: ``(x, y) = (X/Z, Y/Z)``, Z > 0;
+- ``equidistant``: ``(x, y) = theta (cos phi, sin phi)``, theta the angle from the optical axis,
+  phi the azimuth; 0 <= theta < 180 degrees.
+
+With r2 = x^2 + y^2 the distorted point of the OpenCV models is::
+
+    g  = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)
+    xd = g x + 2 p1 x y + p2 (r2 + 2 x^2) + s1 r2 + s2 r2^2
+    yd = g y + p1 (r2 + 2 y^2) + 2 p2 x y + s3 r2 + s4 r2^2
+
+``plumb_bob`` has k1 k2 k3 p1 p2; ``rational_polynomial`` adds k4 k5 k6, ``thin_prism`` s1 to s4,
+``tilted`` the angles tau_x, tau_y (rad) of the detector, with c and s their cosine and sine::
+
+    w  = s_y xd - c_y s_x yd + c_y c_x
+    x' = c_x xd / w          y' = (c_y yd - s_x s_y xd) / w
+
+``equidistant`` (Kannala and Brandt 2006; OpenCV ``cv::fisheye``)::
+
+    (x', y') = (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) (x, y)
+
+Sources: OpenCV 4 documentation, "Camera Calibration and 3D Reconstruction" and its ``fisheye``;
+ROS ``sensor_msgs/distortion_models.hpp``.  Coefficients are (c,) in the order of `COEFFICIENTS`,
+or (c, n) for n points.  Complex numbers pass through, for complex-step derivatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from starcal_ros.arrays import Floats
+
+_PLUMB_BOB = ('k1', 'k2', 'k3', 'p1', 'p2')
+_RATIONAL = (*_PLUMB_BOB, 'k4', 'k5', 'k6')
+_THIN_PRISM = (*_RATIONAL, 's1', 's2', 's3', 's4')
+
+COEFFICIENTS: Mapping[str, tuple[str, ...]] = {
+    'plumb_bob': _PLUMB_BOB,
+    'rational_polynomial': _RATIONAL,
+    'thin_prism': _THIN_PRISM,
+    'tilted': (*_THIN_PRISM, 'tau_x', 'tau_y'),
+    'equidistant': ('k1', 'k2', 'k3', 'k4'),
+}
+"""Name of a lens model -> names of its coefficients, in order."""
+
+_EQUIDISTANT = 'equidistant'
+# Below this angle 1 - t / tan(t) loses digits; the terms left out of the series are under 1e-14.
+_SERIES_RAD = 0.2
+_NO_ROOT = 1e-100  # reciprocal of a squared radius: no detector reaches so far
+
+
+def ideal_points(model: str, directions_camera: Floats) -> Floats:
+    """
+    Points (..., 2) of the ideal plane of directions (..., 3) in the camera frame, any length.
+
+    NaN where the model has none: Z <= 0 of a perspective model, the backward axis of
+    ``equidistant``.
+    """
+    z = directions_camera[..., 2]
+    if model != _EQUIDISTANT:
+        z = np.where(z.real > 0, z, np.nan)
+        return np.asarray(directions_camera[..., :2] / z[..., None])
+    x, y = directions_camera[..., 0], directions_camera[..., 1]
+    rho = np.sqrt(x * x + y * y)
+    length = np.sqrt(x * x + y * y + z * z)
+    forward = z.real > 0
+    on_axis = rho == 0
+    with np.errstate(all='ignore'):
+        # Tangent of half the angle, in the form without cancellation.
+        half = np.where(forward, rho / (length + z), (length - z) / rho)
+        scale = np.where(on_axis, 1.0 / z, 2.0 * np.arctan(half) / rho)
+    scale = np.where(on_axis & ~forward, np.nan, scale)
+    return np.asarray(directions_camera[..., :2] * scale[..., None])
+
+
+def directions_of(model: str, ideal: Floats) -> Floats:
+    """Unit directions (..., 3) in the camera frame of ideal points (..., 2)."""
+    if model != _EQUIDISTANT:
+        directions = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1)
+        return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
+    theta = np.hypot(ideal[..., 0], ideal[..., 1])
+    sine = np.sinc(theta / np.pi)
+    return np.concatenate([ideal * sine[..., None], np.cos(theta)[..., None]], axis=-1)
+
+
+def ideal_by_rotation(model: str, ideal: Floats) -> Floats:
+    """
+    Derivatives (2, ..., 3) of ideal points (..., 2) by a passive small rotation, rad.
+
+    Of x, then of y, by the three angles (Eqs. 34, 35 for the perspective models).
+    """
+    x, y = ideal[..., 0], ideal[..., 1]
+    theta = np.empty((2, *x.shape, 3))
+    if model == _EQUIDISTANT:
+        m = _bend(x * x + y * y)
+        theta[0, ..., 0] = m * x * y
+        theta[0, ..., 1] = m * y * y - 1.0
+        theta[1, ..., 0] = 1.0 - m * x * x
+    else:
+        theta[0, ..., 0] = x * y
+        theta[0, ..., 1] = -1.0 - x * x
+        theta[1, ..., 0] = 1.0 + y * y
+    theta[0, ..., 2] = y
+    theta[1, ..., 1] = -theta[0, ..., 0]
+    theta[1, ..., 2] = -x
+    return theta
+
+
+def _bend(r2: Floats) -> Floats:
+    """``(1 - theta / tan(theta)) / theta^2`` of squared angles: 1/3 on the axis."""
+    near = r2 < _SERIES_RAD**2
+    far2 = np.where(near, 1.0, r2)
+    far = np.sqrt(far2)
+    # Bernoulli numbers: B_2n 2^2n / (2n)! with alternating sign.
+    series = 1 / 3 + r2 * (
+        1 / 45 + r2 * (2 / 945 + r2 * (1 / 4725 + r2 * (2 / 93555 + r2 * 1382 / 638512875)))
+    )
+    return np.where(near, series, (1.0 - far / np.tan(far)) / far2)
+
+
+def distort(model: str, ideal: Floats, coefficients: Floats) -> Floats:
+    """
+    Distorted points (..., 2) of ideal ones (..., 2) (Eq. 6 for ``plumb_bob``).
+
+    NaN where ``tilted`` would look at the detector from behind.
+    """
+    x, y = ideal[..., 0], ideal[..., 1]
+    r2 = x * x + y * y
+    if model == 'plumb_bob':
+        k1, k2, k3, p1, p2 = coefficients
+        g = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        xd = g * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        yd = g * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    elif model == _EQUIDISTANT:
+        k1, k2, k3, k4 = coefficients
+        g = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+        xd, yd = g * x, g * y
+    else:
+        k1, k2, k3, p1, p2, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y = _opencv(coefficients)
+        g = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        xd = g * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2)
+        yd = g * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4)
+        if model == 'tilted':
+            xd, yd = _tilt(xd, yd, tau_x, tau_y)[:2]
+    return np.stack([xd, yd], axis=-1)
+
+
+def distort_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
+    """Derivatives (..., 2, 2) of `distort` by the ideal points (Eqs. 36, 37)."""
+    x, y = ideal[..., 0], ideal[..., 1]
+    r2 = x * x + y * y
+    J = np.empty((*np.broadcast(x, y).shape, 2, 2), dtype=np.result_type(ideal, coefficients))
+    if model == 'plumb_bob':
+        k1, k2, k3, p1, p2 = coefficients
+        g = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        g_r2 = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+        cross = 2 * x * y * g_r2 + 2 * p1 * x + 2 * p2 * y
+        J[..., 0, 0] = g + 2 * x * x * g_r2 + 2 * p1 * y + 6 * p2 * x
+        J[..., 0, 1] = cross
+        J[..., 1, 0] = cross
+        J[..., 1, 1] = g + 2 * y * y * g_r2 + 6 * p1 * y + 2 * p2 * x
+        return J
+    if model == _EQUIDISTANT:
+        k1, k2, k3, k4 = coefficients
+        g = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+        g_r2 = k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4))
+        J[..., 0, 0] = g + 2 * x * x * g_r2
+        J[..., 0, 1] = J[..., 1, 0] = 2 * x * y * g_r2
+        J[..., 1, 1] = g + 2 * y * y * g_r2
+        return J
+    k1, k2, k3, p1, p2, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y = _opencv(coefficients)
+    D = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    g = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / D
+    g_r2 = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - g * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / D
+    cross = 2 * x * y * g_r2 + 2 * p1 * x + 2 * p2 * y
+    prism_x, prism_y = 2 * (s1 + 2 * s2 * r2), 2 * (s3 + 2 * s4 * r2)
+    J[..., 0, 0] = g + 2 * x * x * g_r2 + 2 * p1 * y + 6 * p2 * x + x * prism_x
+    J[..., 0, 1] = cross + y * prism_x
+    J[..., 1, 0] = cross + x * prism_y
+    J[..., 1, 1] = g + 2 * y * y * g_r2 + 6 * p1 * y + 2 * p2 * x + y * prism_y
+    if model == 'tilted':
+        untilted = np.concatenate([coefficients[:12], np.zeros_like(coefficients[12:])])
+        xd, yd = np.moveaxis(distort('thin_prism', ideal, untilted[:12]), -1, 0)
+        J = _tilt_jacobian(xd, yd, tau_x, tau_y) @ J
+    return J
+
+
+def coefficient_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
+    """Derivatives (2, c, ...) of `distort` at ideal points (..., 2) by the c coefficients."""
+    x, y = ideal[..., 0], ideal[..., 1]
+    r2 = x * x + y * y
+    J = np.zeros((2, len(COEFFICIENTS[model]), *x.shape))
+    if model == _EQUIDISTANT:
+        for k in range(4):
+            J[0, k], J[1, k] = x * r2 ** (k + 1), y * r2 ** (k + 1)
+        return J
+    for k, column in enumerate((x * r2, x * r2**2, x * r2**3, 2 * x * y, r2 + 2 * x * x)):
+        J[0, k] = column
+    for k, column in enumerate((y * r2, y * r2**2, y * r2**3, r2 + 2 * y * y, 2 * x * y)):
+        J[1, k] = column
+    if model == 'plumb_bob':
+        return J
+    k1, k2, k3, _, _, k4, k5, k6, *_, tau_x, tau_y = _opencv(coefficients)
+    D = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    J[:, :3] /= D
+    g = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / D
+    J[:, 5:8] = -g * J[:, :3]
+    if model == 'rational_polynomial':
+        return J
+    J[0, 8] = J[1, 10] = r2
+    J[0, 9] = J[1, 11] = r2 * r2
+    if model == 'thin_prism':
+        return J
+    xd, yd = np.moveaxis(distort('thin_prism', ideal, coefficients[:12]), -1, 0)
+    J[:, :12] = np.einsum('...ij,jk...->ik...', _tilt_jacobian(xd, yd, tau_x, tau_y), J[:, :12])
+    sx, cx, sy, cy = np.sin(tau_x), np.cos(tau_x), np.sin(tau_y), np.cos(tau_y)
+    xt, yt, w = _tilt(xd, yd, tau_x, tau_y)
+    w_by_x = -cy * (cx * yd + sx)
+    w_by_y = cy * xd + sy * (sx * yd - cx)
+    J[0, 12] = (-sx * xd - xt * w_by_x) / w
+    J[1, 12] = (-cx * sy * xd - yt * w_by_x) / w
+    J[0, 13] = -xt * w_by_y / w
+    J[1, 13] = (-sy * yd - sx * cy * xd - yt * w_by_y) / w
+    return J
+
+
+def _opencv(coefficients: Floats) -> list[Floats]:
+    """Return the 14 coefficients of the OpenCV models; those that the model lacks are zero."""
+    return [*coefficients, *[np.zeros(())] * (14 - len(coefficients))]
+
+
+def _tilt(x: Floats, y: Floats, tau_x: Floats, tau_y: Floats) -> tuple[Floats, Floats, Floats]:
+    """Points on the tilted detector, and the divisor w; NaN where w <= 0."""
+    sx, cx, sy, cy = np.sin(tau_x), np.cos(tau_x), np.sin(tau_y), np.cos(tau_y)
+    w = sy * x - cy * sx * y + cy * cx
+    w = np.where(w.real > 0, w, np.nan)
+    return cx * x / w, (cy * y - sx * sy * x) / w, w
+
+
+def _tilt_jacobian(x: Floats, y: Floats, tau_x: Floats, tau_y: Floats) -> Floats:
+    """Derivatives (..., 2, 2) of the points of `_tilt` by x and y."""
+    sx, cx, sy, cy = np.sin(tau_x), np.cos(tau_x), np.sin(tau_y), np.cos(tau_y)
+    xt, yt, w = _tilt(x, y, tau_x, tau_y)
+    rows = [
+        [cx - xt * sy, xt * cy * sx],
+        [-sx * sy - yt * sy, cy + yt * cy * sx],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2) / w[..., None, None]
+
+
+def fold_radius2(model: str, coefficients: Floats) -> float:
+    """
+    Squared radius of the ideal plane from which the radial distortion has no inverse.
+
+    There the distorted radius stops growing, or a rational polynomial has its pole; infinite
+    where it grows without end.  180 degrees at most for ``equidistant``.
+    """
+    if model == _EQUIDISTANT:
+        k1, k2, k3, k4 = coefficients
+        # The odd polynomial's derivative by the radius.
+        return min(_least_positive_root([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0]), np.pi**2)
+    k1, k2, k3 = coefficients[:3]
+    if model == 'plumb_bob':
+        return _least_positive_root([7 * k3, 5 * k2, 3 * k1, 1.0])
+    numerator = np.poly1d([k3, k2, k1, 1.0])
+    denominator = np.poly1d([*coefficients[7:4:-1], 1.0])
+    growth = numerator * denominator + np.poly1d([2.0, 0.0]) * (
+        numerator.deriv() * denominator - numerator * denominator.deriv()
+    )
+    return min(_least_positive_root(growth.coeffs), _least_positive_root(denominator.coeffs))
+
+
+def _least_positive_root(polynomial: object) -> float:
+    """Least positive root of a polynomial with the constant 1, highest power first."""
+    # By the reciprocals of the roots: a first coefficient of 1e-313 would overflow as a divisor.
+    reciprocals = np.roots(np.asarray(polynomial, np.float64)[::-1])
+    roots = 1.0 / reciprocals[np.abs(reciprocals) > _NO_ROOT]
+    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    return float(real.min(initial=np.inf))
+
+
+# Number of coefficients in ROS -> lens model, for `rational_polynomial` and its OpenCV extensions.
+_BY_COUNT = {8: 'rational_polynomial', 12: 'thin_prism', 14: 'tilted'}
+
+
+def ros_distortion(model: str, coefficients: Floats) -> tuple[str, Floats]:
+    """
+    ``distortion_model`` and ``D`` (c,) of a ``CameraInfo``.
+
+    ROS has k3 after p1 and p2, and the name ``rational_polynomial`` for OpenCV's models of 8, 12
+    and 14 coefficients, which its readers hand on to OpenCV.
+    """
+    if model == _EQUIDISTANT:
+        return model, np.array(coefficients)
+    ros_model = 'plumb_bob' if model == 'plumb_bob' else 'rational_polynomial'
+    return ros_model, np.asarray(coefficients)[[0, 1, 3, 4, 2, *range(5, len(coefficients))]]
+
+
+def from_ros_distortion(distortion_model: str, D: Sequence[float]) -> tuple[str, Floats]:
+    """
+    Lens model and coefficients (c,) of a ``CameraInfo``.
+
+    Raises ValueError for an unknown model or a wrong number of coefficients.
+    """
+    if distortion_model in (_EQUIDISTANT, 'fisheye'):
+        if len(D) != 4:
+            raise ValueError(f'{len(D)} coefficients of {distortion_model}, which has 4')
+        return _EQUIDISTANT, np.array(D, np.float64)
+    if distortion_model == 'plumb_bob':
+        if len(D) not in (4, 5):
+            raise ValueError(f'{len(D)} coefficients of plumb_bob, which has 4 or 5')
+        model, D = distortion_model, [*D, 0.0][:5]
+    elif distortion_model == 'rational_polynomial' or distortion_model.startswith('thin_prism'):
+        if len(D) not in _BY_COUNT:
+            raise ValueError(f'{len(D)} coefficients of {distortion_model}, not 8, 12 or 14')
+        model = _BY_COUNT[len(D)]
+    else:
+        raise ValueError(
+            f'{distortion_model!r} is not plumb_bob, rational_polynomial, thin_prism, equidistant '
+            'or fisheye'
+        )
+    return model, np.array(D, np.float64)[[0, 1, 4, 2, 3, *range(5, len(D))]]

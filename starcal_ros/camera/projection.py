@@ -1,0 +1,405 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+The camera: an ideal image plane, a lens model, skew; its inverse and derivatives.
+
+The parameters are one vector, in this order everywhere::
+
+    fx skew fy cx cy  then the coefficients of the lens model (`lens.COEFFICIENTS`)
+
+With (x', y') the distorted point of the image plane (`lens.distort`)::
+
+    u = fx x' + skew y' + cx
+    v = fy y' + cy
+
+For ``plumb_bob`` that is Eqs. 1, 6 and 7: k1 k2 k3 p1 p2 follow the intrinsics (paper: dx alpha
+dy up vp, k1 k2 k3 p1 p2); note that ROS orders D as k1 k2 p1 p2 k3.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from starcal_ros.arrays import Floats
+from starcal_ros.camera.detector_field import DetectorField
+from starcal_ros.camera.lens import (
+    coefficient_jacobian,
+    COEFFICIENTS,
+    directions_of,
+    distort,
+    distort_jacobian,
+    fold_radius2,
+    ideal_by_rotation,
+    ideal_points,
+)
+
+MAX_SIDE_PX = 65536
+_MAX_FOCAL_PX = 1e8  # 0.002 arcsec per pixel
+_MIN_FOCAL_OF_SIDE = 0.15  # of a perspective lens: 147 degrees from side to side
+_MAX_COEFFICIENT = 1e15
+_SEEN = 0.5  # part of the detector that must have a line of sight
+
+INTRINSIC_NAMES = ('fx', 'skew', 'fy', 'cx', 'cy')
+
+
+def parameter_names(model: str) -> tuple[str, ...]:
+    """Names of the parameters of a lens model, in order."""
+    return INTRINSIC_NAMES + COEFFICIENTS[model]
+
+
+def model_of(names: tuple[str, ...]) -> str:
+    """
+    Lens model whose parameters have these names, in this order.
+
+    Raises ValueError when no model has them.
+    """
+    for model in COEFFICIENTS:
+        if names == parameter_names(model):
+            return model
+    raise ValueError(f'{", ".join(names) or "none"} are not the parameters of a lens model')
+
+
+PARAMETER_NAMES = parameter_names('plumb_bob')
+# Those of `tilted` are those of all.
+ALL_PARAMETER_NAMES = parameter_names('tilted')
+"""Every name that a parameter of any lens model has."""
+
+_INVERSE_STEPS = (
+    50  # Newton squares the error at each step: 6 do in the field, the rest is for far corners
+)
+# A field changes by under 0.1 px from pixel to pixel: each step takes off nine tenths and more.
+_FIELD_STEPS = 12
+_INVERSE_TOLERANCE = 1e-14  # of the ideal image plane: 4e-11 px at a focal length of 4000 px
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """
+    A camera: image size in pixels, parameters and lens model.
+
+    ``parameters`` is (p,) in the order of `parameter_names`; ``model`` a key of
+    `lens.COEFFICIENTS`; ``field`` what the detector shows beyond the lens model. Raises ValueError
+    for an unknown model, when the parameters are not p finite numbers, or when a focal length is
+    not positive.
+    """
+
+    width: int
+    height: int
+    parameters: Floats
+    model: str = 'plumb_bob'
+    field: DetectorField | None = None
+
+    def __post_init__(self) -> None:
+        """Freeze a float copy of the parameters."""
+        if self.model not in COEFFICIENTS:
+            raise ValueError(f'lens model: {self.model!r} is not one of {", ".join(COEFFICIENTS)}')
+        parameters = np.array(self.parameters, np.float64)
+        count = len(self.parameter_names)
+        if parameters.shape != (count,) or not np.isfinite(parameters).all():
+            raise ValueError(
+                f'parameters: {self.parameters!r} is not {count} finite numbers ({self.model})'
+            )
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f'image size: {self.width} x {self.height} is not an image')
+        if parameters[0] <= 0 or parameters[2] <= 0:
+            raise ValueError(f'fx, fy: {parameters[0]}, {parameters[2]} are not positive')
+        parameters.setflags(write=False)
+        object.__setattr__(self, 'parameters', parameters)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of `parameters`, in order."""
+        return parameter_names(self.model)
+
+    @property
+    def intrinsics(self) -> Floats:
+        """(5,): fx, skew, fy, cx, cy."""
+        return self.parameters[:5]
+
+    @property
+    def distortion(self) -> Floats:
+        """Coefficients (c,) of the lens model, in the order of `lens.COEFFICIENTS`."""
+        return self.parameters[5:]
+
+    @property
+    def moving_field(self) -> DetectorField | None:
+        """The field if it moves pixels, else None: a field of zeros only carries a covariance."""
+        return self.field if self.has_field else None
+
+    @property
+    def has_field(self) -> bool:
+        """True where a field moves pixels."""
+        return self.field is not None and bool(self.field.coefficients.any())
+
+    @property
+    def matrix(self) -> Floats:
+        """The (3, 3) camera matrix K with skew (Eq. 7)."""
+        fx, skew, fy, cx, cy = self.intrinsics
+        return np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def replace(self, **parameters: float) -> CameraModel:
+        """Return the camera with some named parameters changed; ValueError for other names."""
+        changed = self.parameters.copy()
+        for name, value in parameters.items():
+            changed[self.parameter_names.index(name)] = value
+        return dataclasses.replace(self, parameters=changed)
+
+
+def check_plausible(camera: CameraModel) -> None:
+    """
+    Check a camera from a file or a message: a real one is far inside these limits.
+
+    Raises ValueError naming the parameter, its value and the likely cause.
+    """
+    width, height = camera.width, camera.height
+    if max(width, height) > MAX_SIDE_PX:
+        raise ValueError(f'image size: {width} x {height} is over {MAX_SIDE_PX} px')
+    fx, skew, fy, cx, cy = camera.intrinsics.tolist()
+    side_px = max(width, height)
+    if camera.model == 'equidistant':
+        least_px = float(np.hypot(width, height)) / (2 * np.pi)
+    else:
+        least_px = _MIN_FOCAL_OF_SIDE * side_px
+    for name, focal_px in (('fx', fx), ('fy', fy)):
+        if focal_px < least_px:
+            raise ValueError(
+                f'{name}: {focal_px:.6g} px is under {least_px:.4g} px, the shortest focal length'
+                f' for an image of {width} x {height}; is it in mm? divide by the pixel size in mm'
+            )
+        if focal_px > _MAX_FOCAL_PX:
+            raise ValueError(f'{name}: {focal_px:.6g} px is over {_MAX_FOCAL_PX:.6g} px')
+    if not 0.1 <= fx / fy <= 10.0:
+        raise ValueError(f'fx, fy: {fx:.6g}, {fy:.6g} px differ by more than a factor of ten')
+    if abs(skew) > 0.1 * fx:
+        raise ValueError(f'skew: {skew:.6g} px is over a tenth of fx')
+    for name, centre_px, size in (('cx', cx, width), ('cy', cy, height)):
+        if not -size <= centre_px <= 2 * size:
+            raise ValueError(f'{name}: {centre_px:.6g} px is far outside of the {size} px')
+    coefficients = camera.distortion
+    if (np.abs(coefficients) > _MAX_COEFFICIENT).any() or _part_seen(camera) < _SEEN:
+        raise ValueError(
+            f'distortion: {", ".join(f"{value:.4g}" for value in coefficients)}: the lens model'
+            ' has no line of sight over most of the detector; check the coefficients'
+        )
+
+
+def _part_seen(camera: CameraModel) -> float:
+    """Part of a grid of pixels that have a line of sight, displaced by less than an image."""
+    grid = pixel_grid(camera, 9, 9)
+    with np.errstate(all='ignore'):
+        try:
+            direction = line_of_sight(camera, grid)
+            moved_px = np.abs(distortion_px(camera, grid)).max(axis=1)
+        except (ArithmeticError, np.linalg.LinAlgError):
+            return 0.0
+    near = moved_px <= max(camera.width, camera.height)
+    return float((np.isfinite(direction).all(axis=1) & near).mean())
+
+
+def distortion_px(camera: CameraModel, pixels: Floats) -> Floats:
+    """
+    Displacement (n, 2) by the distortion of points that an ideal lens images at pixels (n, 2).
+
+    The ideal lens is a pinhole; for ``equidistant`` the radius is proportional to the angle.
+    """
+    fx, skew, fy, cx, cy = camera.intrinsics
+    y = (pixels[:, 1] - cy) / fy
+    x = (pixels[:, 0] - cx - skew * y) / fx
+    xd, yd = distort(camera.model, np.stack([x, y], axis=-1), camera.distortion).T
+    return np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1) - pixels
+
+
+def project_parameters(model: str, parameters: Floats, directions_camera: Floats) -> Floats:
+    """
+    Pixels (..., 2) of directions (..., 3) in the camera frame, any length (Eqs. 1, 6, 7).
+
+    Parameters (p,) of the lens model, or (p, n) for n directions.  NaN where a perspective model
+    is given a direction at or behind the plane of the lens (Z <= 0).  Complex parameters or
+    directions pass through, for complex-step derivatives.
+    """
+    distorted = distort(model, ideal_points(model, directions_camera), parameters[5:])
+    fx, skew, fy, cx, cy = parameters[:5]
+    u = fx * distorted[..., 0] + skew * distorted[..., 1] + cx
+    v = fy * distorted[..., 1] + cy
+    return np.stack([u, v], axis=-1)
+
+
+def project(camera: CameraModel, directions_camera: Floats) -> Floats:
+    """
+    Pixels (..., 2) of directions (..., 3) in the camera frame; NaN where there is none.
+
+    The field of the camera is a function of the pixel that comes out, so it is iterated.
+    """
+    directions = np.asarray(directions_camera, np.float64)
+    ideal = project_parameters(camera.model, camera.parameters, directions)
+    field = camera.moving_field
+    if field is None:
+        return ideal
+    pixels = ideal
+    for _ in range(_FIELD_STEPS):
+        pixels = ideal + field.displacement_px(pixels)
+    return pixels
+
+
+def project_jacobians(
+    camera: CameraModel, directions_camera: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """
+    Pixels of the lens model, without the field, and their derivatives.
+
+    By the camera parameters and by a small rotation.
+
+    Parameters
+    ----------
+    directions_camera : (..., 3)
+        Directions in the camera frame; Z > 0 for a perspective model.
+
+    Returns
+    -------
+    pixels : (..., 2)
+    J_parameters : (..., 2, p)
+        By the camera parameters (Eqs. 29, 30, 32, 33).
+    J_rotation : (..., 2, 3)
+        By the passive small rotation ``dtheta`` of the camera frame, rad (Eqs. 31, 34-37).
+    """
+    xy = _image_plane(camera.model, directions_camera)
+    fx, skew, fy, cx, cy = camera.intrinsics
+    distorted = distort(camera.model, xy, camera.distortion)
+    xd, yd = distorted[..., 0], distorted[..., 1]
+    pixels = np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1)
+
+    J_parameters = np.zeros((*xd.shape, 2, len(camera.parameters)))
+    J_parameters[..., 0, 0] = xd
+    J_parameters[..., 0, 1] = yd
+    J_parameters[..., 0, 3] = 1.0
+    J_parameters[..., 1, 2] = yd
+    J_parameters[..., 1, 4] = 1.0
+    columns = coefficient_jacobian(camera.model, xy, camera.distortion)
+    for k, (column_x, column_y) in enumerate(zip(*columns, strict=True), start=5):
+        J_parameters[..., 0, k] = fx * column_x + skew * column_y
+        J_parameters[..., 1, k] = fy * column_y
+
+    return pixels, J_parameters, _rotation_jacobian(camera, xy)
+
+
+def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
+    """
+    Derivatives (..., 2, 3) of pixels by a small rotation, as of `project_jacobians`.
+
+    Directions (..., 3) in the camera frame; Z > 0 for a perspective model.
+    """
+    return _rotation_jacobian(camera, _image_plane(camera.model, directions_camera))
+
+
+def _image_plane(model: str, directions_camera: Floats) -> Floats:
+    """Ideal points (..., 2) of directions (..., 3)."""
+    e = np.asarray(directions_camera, np.float64)
+    if model == 'equidistant':
+        return ideal_points(model, e)
+    z_inverse = 1.0 / e[..., 2]
+    return np.asarray(e[..., :2] * z_inverse[..., None])
+
+
+def _rotation_jacobian(camera: CameraModel, xy: Floats) -> Floats:
+    """Derivative (..., 2, 3) of pixels by a small rotation, at ideal points (..., 2)."""
+    fx, skew, fy, _, _ = camera.intrinsics
+    J_xy = distort_jacobian(camera.model, xy, camera.distortion)
+    J_u = fx * J_xy[..., 0, :] + skew * J_xy[..., 1, :]
+    J_v = fy * J_xy[..., 1, :]
+    x_theta, y_theta = ideal_by_rotation(camera.model, xy)
+    J = np.empty((*xy.shape[:-1], 2, 3))
+    J[..., 0, :] = J_u[..., 0, None] * x_theta + J_u[..., 1, None] * y_theta
+    J[..., 1, :] = J_v[..., 0, None] * x_theta + J_v[..., 1, None] * y_theta
+    return J
+
+
+def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
+    """
+    Unit directions (..., 3) in the camera frame of pixels (..., 2): the inverse of `project`.
+
+    Newton iteration on the distortion with its analytic Jacobian.  NaN where it does not converge
+    to the branch that holds the optical axis: there the model folds over and has no inverse.
+    """
+    model, distortion = camera.model, camera.distortion
+    fold2 = fold_radius2(model, distortion)
+    pixels = np.asarray(pixels, np.float64)
+    if (field := camera.moving_field) is not None:
+        pixels = pixels - field.displacement_px(pixels)
+    fx, skew, fy, cx, cy = camera.intrinsics
+    yd = (pixels[..., 1] - cy) / fy
+    xd = (pixels[..., 0] - cx - skew * yd) / fx
+    target = np.stack([xd, yd], axis=-1)
+    # Newton squares no error beyond a fold or a pole; a start and steps inside stay inside.
+    guarded = model != 'plumb_bob'
+    xy = _inside(0.0 * target, target, fold2) if guarded else target.copy()
+    error = np.full(target.shape, np.inf)
+    for _ in range(_INVERSE_STEPS):
+        error = distort(model, xy, distortion) - target
+        if np.abs(error).max(initial=0.0) < _INVERSE_TOLERANCE:
+            break
+        J = distort_jacobian(model, xy, distortion)
+        a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
+        with np.errstate(all='ignore'):
+            determinant = a * d - b * c
+            step = np.stack(
+                [
+                    (d * error[..., 0] - b * error[..., 1]) / determinant,
+                    (a * error[..., 1] - c * error[..., 0]) / determinant,
+                ],
+                axis=-1,
+            )
+            # A step longer than the radius itself has left the branch: halve its way out.
+            reach = 0.5 + np.hypot(xy[..., 0], xy[..., 1])
+            length = np.hypot(step[..., 0], step[..., 1])
+            step *= np.minimum(1.0, reach / np.maximum(length, 1e-300))[..., None]
+        moved = xy - np.nan_to_num(step)
+        xy = _inside(xy, moved, fold2) if guarded else moved
+    J = distort_jacobian(model, xy, distortion)
+    determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+    # Past its summit the distorted radius falls: what lies there is another branch.
+    r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
+    found = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
+    xy[~found | (determinant <= 0) | (r2 > fold2)] = np.nan
+    return directions_of(model, xy)
+
+
+def _inside(before: Floats, after: Floats, fold2: float) -> Floats:
+    """Points (..., 2) after a step; a step beyond the fold stops halfway to it in radius."""
+    radius = np.hypot(after[..., 0], after[..., 1])
+    beyond = radius**2 >= fold2
+    if not beyond.any():
+        return np.array(after)
+    halfway = 0.5 * (np.hypot(before[..., 0], before[..., 1])[beyond] + np.sqrt(fold2))
+    after = after.copy()
+    after[beyond] *= (halfway / radius[beyond])[:, None]
+    return np.asarray(after)
+
+
+def pixel_grid(camera: CameraModel, columns: int, rows: int) -> Floats:
+    """Pixels (rows * columns, 2) of a regular grid from corner to corner of the detector."""
+    u, v = np.meshgrid(
+        np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
+    )
+    return np.stack([u.ravel(), v.ravel()], axis=-1)
+
+
+def field_radius_rad(camera: CameraModel, margin_px: float = 0.0) -> float:
+    """
+    Largest angle between the optical axis and the edge of the detector plus a margin, rad.
+
+    The larger of two, with and without distortion: the second replaces the first where the model
+    has no inverse, and an estimated distortion may lie between them.
+    """
+    w, h, m = camera.width - 1, camera.height - 1, margin_px
+    edge = np.concatenate(
+        [
+            [[u, v] for u in np.linspace(-m, w + m, 9) for v in (-m, h + m)],
+            [[u, v] for v in np.linspace(-m, h + m, 9) for u in (-m, w + m)],
+        ]
+    )
+    undistorted = np.r_[camera.intrinsics, np.zeros(len(camera.distortion))]
+    pinhole = dataclasses.replace(camera, parameters=undistorted)
+    z = np.r_[line_of_sight(camera, edge)[:, 2], line_of_sight(pinhole, edge)[:, 2]]
+    return float(np.arccos(np.nanmin(z)))

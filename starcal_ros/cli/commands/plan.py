@@ -1,0 +1,93 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""`starcal plan`: the pointings to take next."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import csv
+import io
+import json
+from pathlib import Path
+
+from starcal_ros.cli.arguments import EXIT_ACCEPTED
+from starcal_ros.cli.output_places import check_no_product
+from starcal_ros.cli.terminal import print_table, print_text
+from starcal_ros.errors import OptionError
+from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.pipeline import solve
+from starcal_ros.pipeline import topics as bag_topics
+from starcal_ros.pipeline.plan import Plan, plan_pointings, request_of
+from starcal_ros.pipeline.setup import files_of, read_setup
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.record_codec import json_object
+
+_COLUMNS = ('ra_deg', 'dec_deg', 'roll_deg')
+
+
+def plan(args: argparse.Namespace, asked: Topics) -> int:
+    """Print the pointings that lower a sigma most, and write them if asked."""
+    setup = read_setup(args.params)
+    if args.output:
+        check_no_product(args.output, [*args.bags, args.params, *files_of(setup.frames).values()])
+    request = request_of(
+        args.images,
+        args.minimise,
+        _pointings(args.pointings) if args.pointings else (),
+        tuple(zip(*args.avoid, strict=True)),
+        args.slew,
+        args.within or (0.0, 0.0, 180.0),
+    )
+    images = bag_topics.read(args.bags, bag_topics.choose_topics(args.bags, asked, setup), setup)
+    found = plan_pointings(solve.ensemble_of(images, setup), setup, request)
+    if args.output:
+        write_atomically(args.output, _csv(found))
+    if args.json:
+        print_text(json.dumps(json_object(found), indent=1, allow_nan=False))
+        return EXIT_ACCEPTED
+    print_table(*_table(found), left=0)
+    if found.enough is not None:
+        print_text(f'after image {found.enough} another lowers the sigma by less than 1 %')
+    print_text(found.in_a_sentence())
+    if len(found.steps) < args.images:
+        print_text(f'no other pointing can be reached after image {len(found.steps)}')
+    if args.output:
+        print_text(f'pointings written to {args.output}')
+    return EXIT_ACCEPTED
+
+
+def _pointings(path: Path) -> tuple[Sequence[float], ...]:
+    """Return the columns of a file of pointings."""
+    with path.open(newline='', encoding='utf-8', errors='replace') as file:
+        rows = csv.DictReader(file)
+        lacking = [name for name in _COLUMNS[:2] if name not in (rows.fieldnames or ())]
+        if lacking:
+            raise OptionError(f'{path}: no column {" and ".join(lacking)}')
+        try:
+            found = [[float(row.get(name) or 0.0) for name in _COLUMNS] for row in rows]
+        except (TypeError, ValueError) as error:
+            raise OptionError(f'{path}: line {rows.line_num}: {error}') from error
+    if not found:
+        raise OptionError(f'{path}: no pointings')
+    return tuple(zip(*found, strict=True))
+
+
+def _csv(found: Plan) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow([*_COLUMNS, 'stars', found.name])
+    for step in found.steps:
+        place = step.pointing
+        angles = [f'{a:.4f}' for a in (place.ra_deg, place.dec_deg, place.roll_deg)]
+        writer.writerow([*angles, step.stars, f'{step.sigma:.6g}'])
+    return text.getvalue()
+
+
+def _table(found: Plan) -> tuple[list[str], list[list[str]]]:
+    header = ['image', 'ra', 'dec', 'roll', 'stars', found.name]
+    rows = [['now', '', '', '', '', f'{found.sigma:.4g}']]
+    for k, step in enumerate(found.steps, 1):
+        place = step.pointing
+        angles = [f'{deg:.3f}' for deg in (place.ra_deg, place.dec_deg, place.roll_deg)]
+        rows.append([str(k), *angles, str(step.stars), f'{step.sigma:.4g}'])
+    return header, rows

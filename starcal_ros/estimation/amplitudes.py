@@ -1,0 +1,390 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Amplitudes of the priors of the field and of the shapes of the images, by restricted likelihood.
+
+An amplitude is the 1-sigma of a group of unknowns: of an octave of the field, of the scale, the
+stretch or the shear of the images.  With all other unknowns eliminated, the information S and the
+gradient h of a group have the restricted log likelihood (Patterson & Thompson 1971; Harville
+1977; for fields Rasmussen & Williams 2006, ch. 5)::
+
+    log L = -1/2 log |1 + s S s| + 1/2 (s h)' (1 + s S s)^-1 (s h)
+
+where s is the diagonal matrix of the prior sigmas.  It is formed from sums: no pass over the stars
+is needed.  Each amplitude has a weak prior on its logarithm.  Results are averaged over a common
+factor of the amplitudes, so that an amplitude that few images determine gives wide tails, and zero
+is never a decision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from scipy.linalg import eigh, solve_triangular
+from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.special import erf
+
+from starcal_ros.arrays import Floats, Indices
+
+# Prior of the logarithm of an amplitude: a lens or a detector departs from its model by a
+# micropixel as likely as by a tenth of a pixel.  A narrower prior, or one that is centred where
+# departures matter, costs a sound camera up to 30 % of its sigma.
+LOG_CENTRE, LOG_SIGMA = math.log(1e-5), 4.0
+# An octave of the field is smaller than the one before, within a factor of e.
+OCTAVE_STEP, OCTAVE_SIGMA = -0.7, 1.0
+# Beyond it field and camera are collinear, and the likelihood is rounding.
+LARGEST_FIELD_PX = 0.5
+LARGEST_SHAPE_PX = 30.0
+# The gradient vanishes near zero: the search starts from several amplitudes, px.
+_STARTS_PX = (1e-4, 1e-2, 1e-1)
+_MOST_STEPS = 12
+_SETTLED = 1e-3  # change of the log likelihood that moves no sigma by a thousandth
+_NO_EFFECT = 1e-6  # information on an unknown times its prior variance
+_NONE = -25.0  # log amplitude without any effect
+# Common factors of the amplitudes over which results are averaged, in logarithms.
+_SHIFTS = np.linspace(-8.0, 6.0, 57)
+
+
+@dataclass(frozen=True)
+class Amplitudes:
+    """
+    Amplitudes at the maximum of their posterior.
+
+    ``log_px`` (g,); ``likelihood_ratio``: twice the log likelihood against none of them.
+    """
+
+    log_px: Floats
+    likelihood_ratio: float
+
+
+@dataclass(frozen=True)
+class Averaged:
+    """
+    Unknowns averaged over a common factor of their amplitudes.
+
+    ``mean`` (q,), ``covariance`` (q, q); ``log_px`` (s,) of the last group with ``weight`` (s,):
+    the posterior of its amplitude.
+    """
+
+    mean: Floats
+    covariance: Floats
+    log_px: Floats
+    weight: Floats
+
+
+def octave_prior(count: int) -> tuple[Floats, Floats]:
+    """Mean (count,) and precision (count, count) of the logarithms of octaves in a chain."""
+    mean: Floats = LOG_CENTRE + OCTAVE_STEP * np.arange(count, dtype=np.float64)
+    precision = np.zeros((count, count))
+    precision[0, 0] = LOG_SIGMA**-2
+    for k in range(1, count):
+        precision[k - 1 : k + 1, k - 1 : k + 1] += np.array([[1, -1], [-1, 1]]) / OCTAVE_SIGMA**2
+    return mean, precision
+
+
+def prior_of_last_octave(count: int) -> tuple[Floats, Floats]:
+    """Logarithms (s,) of the amplitude of the last of some octaves with their prior weights."""
+    sigma = math.hypot(LOG_SIGMA, OCTAVE_SIGMA * math.sqrt(count - 1))
+    off: Floats = np.asarray(np.linspace(-3.0, 3.0, 61), np.float64)
+    weight = np.exp(-0.5 * off**2)
+    mean = LOG_CENTRE + OCTAVE_STEP * (count - 1)
+    return mean + sigma * off, weight / weight.sum()
+
+
+def field_amplitudes(
+    information: Floats, gradient: Floats, octave: Indices, near: Amplitudes | None = None
+) -> Amplitudes:
+    """
+    Amplitudes of the octaves of a field by Fisher scoring.
+
+    Parameters
+    ----------
+    information, gradient : (q, q), (q,)
+        On the coefficients, scaled to a prior of 1 px for each octave, all else eliminated.
+    octave : (q,)
+    near : Amplitudes, optional
+        Of the round before: the search starts there and from one other place.
+    """
+    count = int(octave.max()) + 1
+    mean, precision = octave_prior(count)
+    starts = [math.log(one) - 0.3 * np.arange(count, dtype=np.float64) for one in _STARTS_PX]
+    if near is not None:
+        starts = [near.log_px, starts[1]]
+    member = np.equal.outer(np.arange(count), octave).astype(float)
+    cap = math.log(LARGEST_FIELD_PX)
+
+    def evaluate(log_px: Floats) -> tuple[float, Floats, Floats]:
+        s = np.exp(log_px)[octave]
+        # Coefficients without an effect: their tiny numbers slow a processor down tenfold.
+        shown = np.flatnonzero(s**2 * np.diag(information) > _NO_EFFECT)
+        s, own = s[shown], member[:, shown]
+        scaled = information[np.ix_(shown, shown)] * np.outer(s, s)
+        scaled[np.abs(scaled) < _NO_EFFECT**2] = 0.0
+        scaled[np.diag_indices(len(s))] += 1.0
+        lower, inverse = _cholesky_and_inverse(scaled)
+        mode = inverse @ (s * gradient[shown])
+        resolved = np.eye(len(s)) - inverse
+        off = log_px - mean
+        value = -np.log(np.diag(lower)).sum() + 0.5 * mode @ (s * gradient[shown])
+        slope = own @ (mode**2 - np.diag(resolved)) - precision @ off
+        fisher = 2.0 * own @ (resolved * resolved.T) @ own.T + precision
+        return float(value - 0.5 * off @ precision @ off), slope, fisher
+
+    best, best_value = mean, -np.inf
+    for log_px in starts:
+        value, slope, fisher = evaluate(log_px)
+        for _ in range(_MOST_STEPS):
+            step = np.linalg.solve(fisher, slope)
+            step *= 2.0 / max(2.0, float(np.abs(step).max()))
+            before = value
+            for share in (1.0, 0.4, 0.16, 0.06):
+                trial = np.minimum(log_px + share * step, cap)
+                found = evaluate(trial)
+                if found[0] > value - 1e-9:
+                    log_px, (value, slope, fisher) = trial, found
+                    break
+            if abs(value - before) < _SETTLED:
+                break
+        if value > best_value + 1e-6:
+            best, best_value = log_px, value
+    ratio = best_value + 0.5 * (best - mean) @ precision @ (best - mean)
+    return Amplitudes(best, 2.0 * float(ratio))
+
+
+def _cholesky_and_inverse(matrix: Floats) -> tuple[Floats, Floats]:
+    """Return the lower factor and the inverse of a positive definite matrix."""
+    if len(matrix) == 0:  # of a field that nothing shows
+        return matrix, matrix
+    lower, failed = dpotrf(matrix, lower=True, clean=True)
+    if failed:
+        raise np.linalg.LinAlgError('the information on the field is not positive definite')
+    below, _ = dpotri(lower, lower=True)
+    return lower, below + np.tril(below, -1).T
+
+
+def averaged_field(
+    information: Floats, gradient: Floats, octave: Indices, amplitudes: Amplitudes
+) -> Averaged:
+    """Return the coefficients averaged over a common factor of the amplitudes of the octaves."""
+    mean, precision = octave_prior(len(amplitudes.log_px))
+    s = np.exp(amplitudes.log_px)[octave]
+    values, vectors = eigh(information * np.outer(s, s), check_finite=False)
+    values = np.maximum(values, 0.0)
+    along = vectors.T @ (s * gradient)
+    room = math.log(LARGEST_FIELD_PX) - amplitudes.log_px.max()
+    shift = _SHIFTS[room + 1e-9 >= _SHIFTS]
+    factor = np.exp(2.0 * shift)[:, None]
+    held = 1.0 + values * factor
+    off = (amplitudes.log_px - mean)[None] + shift[:, None]
+    log_weight = -0.5 * np.log(held).sum(axis=1) + 0.5 * (factor * along**2 / held).sum(axis=1)
+    log_weight -= 0.5 * np.einsum('sa,ab,sb->s', off, precision, off)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    means = factor * along / held
+    centre = weight @ means
+    spread = weight @ (factor / held)
+    apart = (means - centre) * np.sqrt(weight)[:, None]
+    back = s[:, None] * vectors
+    scatter = back @ apart.T
+    return Averaged(
+        back @ centre,
+        (back * spread) @ back.T + scatter @ scatter.T,
+        amplitudes.log_px[-1] + shift,
+        weight,
+    )
+
+
+@dataclass(frozen=True)
+class ShapeSums:
+    """
+    Sums of each image for its shape, its rotation eliminated.
+
+    ``information`` (m, 3, 3), ``gradient`` (m, 3), ``cross`` (m, 3, P) with the shared unknowns;
+    ``shared_information`` (P, P) with their priors and ``shared_gradient`` (P,).
+    """
+
+    information: Floats
+    gradient: Floats
+    cross: Floats
+    shared_information: Floats
+    shared_gradient: Floats
+
+
+# Correlations of the shapes of images k steps apart, with their weights before the data: none; one
+# that decays, as heat does; and one that lasts, as the air flattens every image, which no scatter
+# shows.
+_CORRELATIONS: tuple[tuple[float, Callable[[Floats], Floats]], ...] = (
+    (0.50, lambda k: np.equal(k, 0).astype(np.float64)),
+    (0.45, lambda k: 0.9**k),
+    (0.05, lambda k: 0.5 + 0.5 * np.equal(k, 0)),
+)
+_MOST_CORRELATED = 100  # images from which the correlation is found; more change nothing
+_SHAPE_STARTS_PX = (1e-5, 1e-3, 1e-2, 1e-1, 1.0)
+_SHAPE_SHIFTS = np.linspace(-8.0, 6.0, 43)
+_LOG_SHAPE = np.linspace(math.log(1e-6), math.log(LARGEST_SHAPE_PX), 70)
+_NO_WEIGHT = 1e-9  # of the largest: what has less moves no interval by a millionth
+_HALVINGS = 36  # of the interval that has the answer, in logarithms: to 1e-9 of it
+_TWO_SIGMA = math.erf(math.sqrt(2.0))
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """
+    Amplitudes of the shapes of the images.
+
+    ``sigma_px`` (3,): those that stand for the posterior (`interval_factor`); ``amplitudes`` has
+    its maximum; ``common_px2`` (3,) is the variance that all images share if the shapes are
+    correlated in time.
+    """
+
+    sigma_px: Floats
+    amplitudes: Amplitudes
+    common_px2: Floats
+
+
+def shapes(sums: ShapeSums, near: Amplitudes | None = None) -> Shapes:
+    """Return the amplitudes of scale, stretch and shear; ``near``: those of the round before."""
+    likelihood = _shape_likelihood(sums)
+    best, value = _climb(likelihood, near)
+    none = np.full(3, _NONE)
+    prior = ((best - LOG_CENTRE) ** 2 - (none - LOG_CENTRE) ** 2).sum() / LOG_SIGMA**2
+    ratio = 2.0 * (value - likelihood(none)) + float(prior)
+    shift = _SHAPE_SHIFTS[math.log(LARGEST_SHAPE_PX) - best.max() >= _SHAPE_SHIFTS]
+    weight = np.exp(np.array([likelihood(best + one) for one in shift]) - value)
+    sigma_px = np.exp(best) * interval_factor(np.exp(shift), weight)
+    return Shapes(sigma_px, Amplitudes(best, ratio), _common_part(sums, sigma_px))
+
+
+def interval_factor(sigma: Floats, weight: Floats) -> float:
+    """
+    Return half of the 95.4 % interval of normal errors whose sigma (s,) has weights (s,).
+
+    Errors of an uncertain sigma have long tails, as Student's t has: few images determine no
+    variance.  A normal error of this sigma has the same 2-sigma interval.
+    """
+    some = weight > _NO_WEIGHT * weight.max()
+    sigma, weight = sigma[some], weight[some] / weight[some].sum()
+    low, high = float(sigma.min()), float(sigma.max())
+    for _ in range(_HALVINGS):
+        middle = math.sqrt(low * high)
+        if weight @ erf(math.sqrt(2.0) * middle / sigma) < _TWO_SIGMA:
+            low = middle
+        else:
+            high = middle
+    return math.sqrt(low * high)
+
+
+def _shape_likelihood(sums: ShapeSums) -> Callable[[Floats], float]:
+    """Return the restricted log likelihood as a function of log amplitudes (3,), with priors."""
+    m, _, P = sums.cross.shape
+    # Shared unknowns and gradient side by side: the same products eliminate both.
+    right = np.concatenate([sums.cross, sums.gradient[:, :, None]], axis=2)
+    flat = right.reshape(3 * m, P + 1).T.copy()
+    whole = np.zeros((P + 1, P + 1))
+    whole[:P, :P], whole[:P, P] = sums.shared_information, sums.shared_gradient
+
+    def likelihood(log_px: Floats) -> float:
+        s = np.exp(log_px)
+        covariance, log_det = _inverse(np.eye(3) + sums.information * np.outer(s, s))
+        covariance *= np.outer(s, s)
+        left = whole - flat @ (covariance @ right).reshape(3 * m, P + 1)
+        try:
+            lower = np.linalg.cholesky(left[:P, :P])
+        except np.linalg.LinAlgError:
+            return -math.inf
+        shared = solve_triangular(lower, left[:P, P], lower=True, check_finite=False)
+        log_det += 2.0 * float(np.log(np.diag(lower)).sum())
+        prior = ((log_px - LOG_CENTRE) ** 2).sum() / LOG_SIGMA**2
+        return float(0.5 * (shared @ shared - left[P, P] - log_det - prior))
+
+    return likelihood
+
+
+def _inverse(matrices: Floats) -> tuple[Floats, float]:
+    """
+    Return the inverses of symmetric matrices (m, 3, 3), and the sum of the logarithms of |M|.
+
+    By cofactors: for thousands of images a tenth of the time of `numpy.linalg.inv`.
+    """
+    a, b, c, d, e, f = matrices.reshape(-1, 9).T[[0, 1, 2, 4, 5, 8]]
+    found = np.empty_like(matrices)
+    found[:, 0, 0], found[:, 0, 1], found[:, 0, 2] = d * f - e * e, c * e - b * f, b * e - c * d
+    found[:, 1, 1], found[:, 1, 2], found[:, 2, 2] = a * f - c * c, b * c - a * e, a * d - b * b
+    found[:, 1, 0], found[:, 2, 0], found[:, 2, 1] = found[:, 0, 1], found[:, 0, 2], found[:, 1, 2]
+    size = (matrices[:, 0] * found[:, 0]).sum(axis=1)
+    return found / size[:, None, None], float(np.log(size).sum())
+
+
+def _climb(likelihood: Callable[[Floats], float], near: Amplitudes | None) -> tuple[Floats, float]:
+    """
+    Return the log amplitudes (3,) of the largest posterior, and its logarithm.
+
+    One amplitude at a time: to each of several values, then by shrinking steps.  The posterior is
+    flat where an amplitude has no effect, so that steps alone do not leave zero.
+    """
+    coarse = np.log(_SHAPE_STARTS_PX if near is None else _SHAPE_STARTS_PX[1:-1:2])
+    starts = [np.full(3, start) for start in coarse] if near is None else [near.log_px]
+    values = [likelihood(start) for start in starts]
+    best, value = starts[int(np.argmax(values))], max(values)
+    for step in (0.0, 1.0, 0.3, 0.1):
+        improved = True
+        while improved:
+            improved = False
+            for k in range(3):
+                for there in (best[k] - step, best[k] + step) if step else coarse:
+                    trial = best.copy()
+                    trial[k] = there
+                    if _NONE < there < math.log(LARGEST_SHAPE_PX) and there != best[k]:
+                        found = likelihood(trial)
+                        if found > value + _SETTLED:
+                            best, value, improved = trial, found, True
+    return best, value
+
+
+def _shared_mean(sums: ShapeSums, sigma_px: Floats) -> Floats:
+    """Return the shared unknowns (P,) at amplitudes (3,) of the shapes."""
+    P = len(sums.shared_gradient)
+    right = np.concatenate([sums.cross, sums.gradient[:, :, None]], axis=2)
+    flat = right.reshape(-1, P + 1)
+    covariance, _ = _inverse(np.diag(sigma_px**-2.0) + sums.information)
+    hidden = flat[:, :P].T @ (covariance @ right).reshape(-1, P + 1)
+    return np.linalg.solve(
+        sums.shared_information - hidden[:, :P], sums.shared_gradient - hidden[:, P]
+    )
+
+
+def _common_part(sums: ShapeSums, sigma_px: Floats) -> Floats:
+    """
+    Return the variance (3,) that all images share: that of the camera, which shows in no image.
+
+    With a correlation, images of a campaign share the part c of the variance, the mean
+    correlation, and differ by 1 - c.  Correlations are averaged over by their evidence, the
+    amplitude integrated over and the mean of the images eliminated.
+    """
+    information = np.einsum('mii->mi', sums.information)
+    used = np.flatnonzero((information > 0).all(axis=1))[:_MOST_CORRELATED]
+    if len(used) < 2:
+        return np.zeros(3)
+    left = sums.gradient[used] - sums.cross[used] @ _shared_mean(sums, sigma_px)
+    root = np.sqrt(information[used])
+    steps = np.abs(np.subtract.outer(used, used))
+    variance = np.exp(2.0 * _LOG_SHAPE)
+    prior = -0.5 * ((_LOG_SHAPE - LOG_CENTRE) / LOG_SIGMA) ** 2
+    evidence = np.empty((3, len(_CORRELATIONS)))
+    ratio = np.empty(len(_CORRELATIONS))
+    for j, (odds, kernel) in enumerate(_CORRELATIONS):
+        K = kernel(steps)
+        ratio[j] = (K.sum() - len(K)) / (len(K) ** 2 - K.sum())
+        for k in range(3):  # the shapes in units of their noise
+            values, vectors = eigh(K * np.outer(root[:, k], root[:, k]), check_finite=False)
+            ones, along = root[:, k] @ vectors, (left[:, k] / root[:, k]) @ vectors
+            inverse = 1.0 / (1.0 + variance[:, None] * np.maximum(values, 0.0))
+            of_ones, mean = inverse @ ones**2, inverse @ (ones * along)
+            squared = inverse @ along**2 - mean**2 / of_ones
+            log_det = np.log(of_ones) - np.log(inverse).sum(axis=1)
+            likelihood = prior - 0.5 * (log_det + squared)
+            evidence[k, j] = math.log(odds) + float(np.logaddexp.reduce(likelihood))
+    weight = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+    return np.asarray(weight @ ratio / weight.sum(axis=1) * sigma_px**2)

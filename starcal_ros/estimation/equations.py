@@ -1,0 +1,329 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Normal equations of the whole list of unknowns at a state, image by image.
+
+One pass over the stars gives the sums of each image: products of the derivatives by the camera
+parameters, by the turns (velocity of the observer and others), by the rotation of the image, and
+of the residual; and their products with the functions of the field.  Everything that follows
+(amplitudes, solution, covariance, predictions) is linear algebra on these sums.
+
+With x the shared unknowns and y_k the rotation and the shape of image k, the equations are an
+arrow: ``N = [A, B_k'; B_k, C_k]``, right-hand side ``[a; c_k]``.  The images are eliminated:
+``S = A - sum B_k' C_k^-1 B_k``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.estimation.attitude_errors import whitened_attitude_errors
+from starcal_ros.estimation.levenberg_marquardt import inverse, NormalEquations, NotObservable
+from starcal_ros.estimation.problem import image_parameters, Problem, State
+from starcal_ros.estimation.star_equations import Chunk, Measurements, whitened_chunks
+from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout, Unknown
+
+
+@dataclass(frozen=True)
+class StarSums:
+    """
+    Sums over the stars of m images.
+
+    ``blocks`` (m, c, c): columns are the p camera parameters, the turns, the rotation of the image
+    and the residual; ``field_information`` (2 t, 2 t) and ``field_cross`` (m, 2 t, c) have the
+    functions of the field for u, then for v.
+    """
+
+    blocks: Floats
+    field_information: Floats
+    field_cross: Floats
+
+
+def stars_alone(blocks: Floats) -> StarSums:
+    """Return the sums of a list without turns and field, from `problem.image_blocks`."""
+    none: Floats = np.empty((0, 0))
+    return StarSums(blocks, none, np.empty((len(blocks), 0, blocks.shape[2])))
+
+
+@dataclass(frozen=True)
+class Equations:
+    """
+    Arrow of normal equations with the images eliminated.
+
+    Attributes
+    ----------
+    information : (P, P)
+        S on the shared unknowns without their priors.
+    gradient : (P,)
+    back : (m, b, P)
+        ``C_k^-1 B_k``: an image's unknowns follow the shared ones by ``y = own - back x``.
+    own : (m, b)
+        ``C_k^-1 c_k``.
+    covariance : (m, b, b)
+        ``C_k^-1``: of the unknowns of an image, the shared ones known.
+    """
+
+    information: Floats
+    gradient: Floats
+    back: Floats
+    own: Floats
+    covariance: Floats
+
+
+def star_columns(
+    measurements: Measurements,
+    problem: Problem,
+    state: State,
+    layout: Layout,
+) -> Iterator[tuple[Chunk, Floats]]:
+    """
+    Yield each chunk with the whitened columns (2, c, m n) of `StarSums`.
+
+    The residual is that of the camera parameters and the rotations of the state alone.
+
+    Raises
+    ------
+    NotObservable
+        If the camera model has no image of a star.
+    """
+    p = problem.camera_count
+    own = image_parameters(problem, state)
+    rotations = state.camera_from_icrf.as_matrix()
+    turning = [entry for entry in layout.shared if entry.turn is not None]
+    for chunk, J in whitened_chunks(measurements, problem.model, own, rotations):
+        if J is None:
+            raise NotObservable('a star has no image')
+        n = chunk.direction_icrf.shape[2]
+        rotation = J[:, p : p + 3]
+        turned = []
+        if turning:
+            e = (rotations[chunk.image] @ chunk.direction_icrf).transpose(1, 0, 2).reshape(3, -1)
+            image = np.repeat(chunk.image, n)
+            predicted_px = _predicted_px(chunk, J[:, p + 3])
+            for entry in turning:
+                assert entry.turn is not None
+                columns = np.einsum('abn,bqn->aqn', rotation, entry.turn(predicted_px, e, image))
+                turned.append(columns)
+        yield chunk, np.concatenate([J[:, :p], *turned, J[:, p : p + 4]], axis=1)
+
+
+def _predicted_px(chunk: Chunk, residual: Floats) -> Floats:
+    """
+    Return the predicted pixels (2, m n) of a chunk from its whitened residuals (2, m n).
+
+    Derivatives at measured pixels would correlate with the noise of the residuals: a time of
+    read-out that only its small curvature shows was off by 1.6 of its sigma.
+    """
+    wuu, wuv, wvv = (np.where(chunk.whitener[0] > 0, w, 1.0) for w in chunk.whitener)
+    v = residual[1] / wvv
+    return np.asarray(chunk.measured_px - np.stack([(residual[0] - wuv * v) / wuu, v]))
+
+
+def star_sums(
+    measurements: Measurements,
+    problem: Problem,
+    state: State,
+    layout: Layout,
+    predicted_px: Floats,
+) -> StarSums:
+    """
+    Return the sums over the stars at a state.
+
+    ``predicted_px`` (n, 2) are the places of all observations without their noise, where the
+    functions of the field are taken: at the measured places they would correlate with the
+    residuals, by more than the stars show of a field that is nearly a change of the camera.
+    """
+    functions = layout['field'].functions if 'field' in layout else None
+    t = len(layout['field']) // 2 if functions is not None else 0
+    blocks: Floats = np.empty((0, 0, 0))
+    cross = blocks
+    uu, uv, vv = np.zeros((3, t, t))
+    for chunk, Z in star_columns(measurements, problem, state, layout):
+        c = Z.shape[1]
+        m, _, n = chunk.direction_icrf.shape
+        if not blocks.size:
+            blocks = np.zeros((measurements.image_count, c, c))
+            cross = np.zeros((measurements.image_count, 2 * t, c))
+        by_image = Z.reshape(2, c, m, n).transpose(0, 2, 1, 3)
+        blocks[chunk.image] = (by_image @ by_image.transpose(0, 1, 3, 2)).sum(axis=0)
+        if functions is None:
+            continue
+        phi = functions(predicted_px[chunk.row].T)
+        wuu, wuv, wvv = chunk.whitener
+        of_image = phi.reshape(t, m, n).transpose(1, 0, 2)
+        for part, columns in (
+            (slice(0, t), wuu * Z[0]),
+            (slice(t, 2 * t), wuv * Z[0] + wvv * Z[1]),
+        ):
+            cross[chunk.image, part] = of_image @ columns.reshape(c, m, n).transpose(1, 2, 0)
+        of_u, of_v = phi * wuu, phi * wvv
+        uu += of_u @ of_u.T
+        vv += of_v @ of_v.T
+        if wuv.any():
+            mixed = phi * wuv
+            uv += of_u @ mixed.T
+            vv += mixed @ mixed.T
+    return StarSums(blocks, np.block([[uu, uv], [uv.T, vv]]), cross)
+
+
+def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> NormalEquations:
+    """Return the normal equations without priors of what stars see; the cost is zero."""
+    at = seen_by_stars(layout)
+    E = chain(problem, layout, len(sums.blocks))
+    blocks = E.transpose(0, 2, 1) @ sums.blocks @ E
+    m, P = len(blocks), layout.count
+    stars, own, _ = chain_columns(layout)
+    total = blocks.sum(axis=0)
+    A, a = np.zeros((P, P)), np.zeros(P)
+    A[np.ix_(at, at)], a[at] = total[stars, stars], total[stars, -1]
+    C, c = blocks[:, own, own].copy(), blocks[:, own, -1].copy()
+    B: Floats = np.zeros((m, C.shape[1], P))
+    B[:, :, at] = blocks[:, own, stars]
+    if 'field' in layout:
+        field = np.arange(P)[layout.places['field']]
+        cross = sums.field_cross @ E
+        A[np.ix_(field, field)] = sums.field_information
+        A[np.ix_(field, at)] = cross[:, :, stars].sum(axis=0)
+        A[np.ix_(at, field)] = A[np.ix_(field, at)].T
+        a[field] = cross[:, :, -1].sum(axis=0)
+        B[:, :, field] = cross[:, :, own].transpose(0, 2, 1)
+    _add_star_tracker(A, a, B, C, c, problem, state, layout)
+    # A rotation on which nothing pulls stays.
+    still = ~C[:, IMAGE_ROTATION, IMAGE_ROTATION].any(axis=(1, 2))
+    C[still, IMAGE_ROTATION, IMAGE_ROTATION] += np.eye(3)
+    return NormalEquations(0.0, A, a, B, C, c)
+
+
+def equations(
+    sums: StarSums, problem: Problem, state: State, layout: Layout, shape_sigma_px: Floats
+) -> Equations:
+    """Return the normal equations of `arrow` with the images eliminated."""
+    return eliminated(arrow(sums, problem, state, layout), layout, shape_sigma_px)
+
+
+def eliminated(normal: NormalEquations, layout: Layout, shape_sigma_px: Floats) -> Equations:
+    """Return the same; ``shape_sigma_px`` (3,) is the prior of the shapes of the images."""
+    m, b, P = normal.B.shape
+    C = normal.C
+    if 'shape' in layout:
+        shape = np.arange(b)[layout.places['shape']]
+        C = C.copy()
+        C[:, shape, shape] += 1.0 / shape_sigma_px**2
+    covariance = inverse(C)
+    back = covariance @ normal.B
+    flat = normal.B.reshape(m * b, P)
+    information = normal.A - flat.T @ back.reshape(m * b, P)
+    own = np.einsum('mij,mj->mi', covariance, normal.c)
+    return Equations(
+        0.5 * (information + information.T), normal.a - flat.T @ own.ravel(), back, own, covariance
+    )
+
+
+def information_of_images(
+    sums: StarSums, problem: Problem, state: State, layout: Layout
+) -> Floats:
+    """
+    Return the information (m, P, P) of each image on the shared unknowns, without their priors.
+
+    The list has neither field nor shapes; the rotation of the image is eliminated.
+    """
+    at = seen_by_stars(layout)
+    E = chain(problem, layout, len(sums.blocks))
+    blocks = E.transpose(0, 2, 1) @ sums.blocks @ E
+    m = len(blocks)
+    stars, own, _ = chain_columns(layout)
+    A = np.zeros((m, layout.count, layout.count))
+    A[np.ix_(np.arange(m), at, at)] = blocks[:, stars, stars]
+    B: Floats = np.zeros((m, 3, layout.count))
+    B[:, :, at] = blocks[:, own, stars]
+    C = blocks[:, own, own].copy()
+    _, J = whitened_attitude_errors(problem, state)
+    turning, turns = tracker_turns(layout)
+    by_tracker = J @ turns
+    A[:, turning[:, None], turning] += by_tracker.transpose(0, 2, 1) @ by_tracker
+    B[:, :, turning] -= J.transpose(0, 2, 1) @ by_tracker
+    C += J.transpose(0, 2, 1) @ J
+    C[~C.any(axis=(1, 2))] += np.eye(3)
+    return np.asarray(A - B.transpose(0, 2, 1) @ np.linalg.solve(C, B))
+
+
+def seen_by_stars(layout: Layout) -> Indices:
+    """Return the places of the shared unknowns that stars see, the field aside; as `chain`."""
+    seen = [e.name for e in layout.shared if e.camera is not None or e.turn is not None]
+    return layout.of(seen)
+
+
+def _columns(layout: Layout) -> tuple[list[Unknown], list[Unknown], list[Unknown]]:
+    """Return the shared entries by camera, those by turn, and the image entries by camera."""
+    by_camera = [e for e in layout.shared if e.camera is not None]
+    by_turn = [e for e in layout.shared if e.turn is not None]
+    return by_camera, by_turn, [e for e in layout.of_image if e.camera is not None]
+
+
+def chain(problem: Problem, layout: Layout, m: int) -> Floats:
+    """
+    Return the derivatives (m, c, d) of the columns of `StarSums` by the unknowns.
+
+    In the order: shared ones by camera, by turn; the rotation of the image, its shape; residual.
+    """
+    by_camera, by_turn, of_image = _columns(layout)
+    p = problem.camera_count
+    turns = sum(map(len, by_turn))
+    first = sum(map(len, by_camera))
+    own = sum(map(len, of_image))
+    E = np.zeros((m, p + turns + 4, first + turns + 3 + own + 1))
+    at = 0
+    for entry in by_camera:
+        E[:, :p, at : at + len(entry)] = entry.camera
+        at += len(entry)
+    E[:, p:-1, at : at + turns + 3] = np.eye(turns + 3)
+    at += turns + 3
+    for entry in of_image:
+        E[:, :p, at : at + len(entry)] = entry.camera
+        at += len(entry)
+    E[:, -1, -1] = 1.0
+    return E
+
+
+def chain_columns(layout: Layout) -> tuple[slice, slice, slice]:
+    """Return the columns of `chain` of shared unknowns, of those of an image, of its rotation."""
+    first = len(seen_by_stars(layout))
+    rotation = slice(first + IMAGE_ROTATION.start, first + IMAGE_ROTATION.stop)
+    return slice(0, first), slice(first, -1), rotation
+
+
+def tracker_turns(layout: Layout) -> tuple[Indices, Floats]:
+    """
+    Return how shared unknowns turn the camera that the star trackers predict.
+
+    The places (q,) of those that do, and the rotations (m, 3, q) by them.
+    """
+    turning = [entry for entry in layout.shared if entry.tracker is not None]
+    by = [entry.tracker for entry in turning if entry.tracker is not None]
+    return layout.of([entry.name for entry in turning]), np.concatenate(by, axis=2)
+
+
+def _add_star_tracker(
+    A: Floats,
+    a: Floats,
+    B: Floats,
+    C: Floats,
+    c: Floats,
+    problem: Problem,
+    state: State,
+    layout: Layout,
+) -> None:
+    """Add the star-tracker attitudes: prior of the rotations about what the trackers predict."""
+    whitened, J = whitened_attitude_errors(problem, state)
+    at, turns = tracker_turns(layout)
+    information = J.transpose(0, 2, 1) @ J
+    gradient = np.einsum('mji,mj->mi', J, whitened)
+    to_shared = information @ turns
+    A[np.ix_(at, at)] += np.tensordot(turns, to_shared, axes=((0, 1), (0, 1)))
+    a[at] += np.tensordot(turns, gradient, axes=((0, 1), (0, 1)))
+    B[:, IMAGE_ROTATION, at] -= to_shared
+    C[:, IMAGE_ROTATION, IMAGE_ROTATION] += information
+    c[:, IMAGE_ROTATION] -= gradient

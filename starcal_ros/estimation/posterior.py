@@ -1,0 +1,515 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Posterior of all unknowns given the data: mean and covariance, averaged over the amplitudes.
+
+The estimator is linear at the minimum: weighted least squares with the priors of the unknowns.
+Errors that observations share (`shared_errors`, `tracker_errors`) lower the weights to those that
+give the same precision, and enter the covariance exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.estimation.amplitudes import (
+    Amplitudes,
+    averaged_field,
+    field_amplitudes,
+    prior_of_last_octave,
+    Shapes,
+    shapes,
+    ShapeSums,
+)
+from starcal_ros.estimation.attitude_errors import whitened_attitude_errors
+from starcal_ros.estimation.equations import (
+    arrow,
+    chain,
+    chain_columns,
+    eliminated,
+    Equations,
+    seen_by_stars,
+    star_columns,
+    StarSums,
+    tracker_turns,
+)
+from starcal_ros.estimation.levenberg_marquardt import inverse
+from starcal_ros.estimation.problem import Problem, State
+from starcal_ros.estimation.shared_errors import GroupSums, SharedError
+from starcal_ros.estimation.star_equations import Measurements
+from starcal_ros.estimation.unknowns import (
+    FIELD_OCTAVES,
+    FOCAL_PARAMETERS,
+    IMAGE_ROTATION,
+    Layout,
+    SHAPE_MODES,
+    Unknown,
+)
+
+TRACKER_NOISE, TRACKER_SLOW = 'star tracker noise', 'star tracker slow error'
+_WITHOUT = 1e3  # times the sigma of a prior: far more than a wrong data sheet is off
+_SMALL_SHAPE_PX = 1e-4  # to begin with
+_HELD = 0.05  # information on a mode times its variance, below which its prior holds it
+
+
+@dataclass(frozen=True)
+class ErrorParts:
+    """
+    Covariance of the shared unknowns by its causes: ``root (1 + excess) root'``.
+
+    Attributes
+    ----------
+    root : (P, r)
+        Of the covariance under the working weights, that of `common_shape` aside.
+    excess : (r, r)
+        Of the errors as they are, less that of the working weights.
+    shared : mapping of (r, r)
+        Whole variance of each error that observations share, and of the star trackers.
+    """
+
+    root: Floats
+    excess: Floats
+    shared: Mapping[str, Floats]
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """
+    Posterior of P shared unknowns and of the b unknowns of each of m images.
+
+    Attributes
+    ----------
+    mean : (P,)
+    covariance : (P, P)
+        Under the errors that observations share, after `with_shared_errors`.
+    working : (P, P)
+        Under independent errors of the working weights, `common_shape_px2` aside.
+    own, back : (m, b), (m, b, P)
+        The unknowns of an image are ``own - back mean``.
+    image_covariance : (m, b, b)
+        Of them, the shared ones known.
+    estimated : (e,) int
+        Shared unknowns that are estimated; the others are held.
+    field, shape : Amplitudes
+    last_octave : (s,), (s,)
+        Posterior of the logarithm of the finest amplitude of the field, with weights.
+    shape_sigma_px : (3,)
+        Of scale, stretch and shear of an image: those that stand for their posterior.
+    resolved : float
+        Number of unknowns that the data determine, those of images aside.
+    common_shape_px2 : (3,)
+        Part of ``covariance``: of scale, stretch and shear that all images share.
+    information, gradient : (P, P), (P,)
+        Of the stars and the star trackers, without priors, the images eliminated.
+    errors : ErrorParts or None
+        None before `with_shared_errors`.
+    """
+
+    mean: Floats
+    covariance: Floats
+    working: Floats
+    own: Floats
+    back: Floats
+    image_covariance: Floats
+    estimated: Indices
+    field: Amplitudes
+    shape: Amplitudes
+    last_octave: tuple[Floats, Floats]
+    shape_sigma_px: Floats
+    resolved: float
+    common_shape_px2: Floats
+    information: Floats
+    gradient: Floats
+    errors: ErrorParts | None = None
+
+    @property
+    def working_variance(self) -> Floats:
+        """Variances (P,) under independent errors of the working weights."""
+        return np.asarray(np.diag(self.working))
+
+    @property
+    def of_images(self) -> Floats:
+        """Mean (m, b) of the unknowns of the images."""
+        return np.asarray(self.own - self.back @ self.mean)
+
+
+def posterior(
+    sums: StarSums,
+    problem: Problem,
+    state: State,
+    layout: Layout,
+    before: Floats,
+    whole: bool,
+    near: Posterior | None = None,
+) -> Posterior:
+    """
+    Return the posterior from sums at a state.
+
+    Parameters
+    ----------
+    before : (3,)
+        Amplitudes px of the shapes of the images to begin with.
+    whole : bool
+        False: the field and the shapes are zero; the list need not have a field.
+    near : Posterior, optional
+        A whole one at a state near this one: the search of amplitudes begins with its own.
+    """
+    normal = arrow(sums, problem, state, layout)
+    start = eliminated(normal, layout, before)
+    solver = _Solver(layout, whole)
+    base = solver.amplitudes(start, near.field if near else None)
+    none = Amplitudes(np.full(3, -25.0), 0.0)
+    found, last = Shapes(before, none, np.zeros(3)), start
+    if whole and len(sums.blocks) > 1:
+        field_px = solver.solve(start, base)[0][layout.places['field']]
+        by_image = _shape_sums(sums, problem, layout, solver, field_px)
+        found = shapes(by_image, near.shape if near else None)
+        last = eliminated(normal, layout, found.sigma_px)
+    mean, covariance, last_octave = solver.solve(last, base)
+    resolved = solver.resolved(last, covariance)
+    return Posterior(
+        mean=mean,
+        covariance=covariance + common_shape(layout, found.common_px2),
+        working=covariance,
+        own=last.own,
+        back=last.back,
+        image_covariance=last.covariance,
+        estimated=solver.estimated,
+        field=base,
+        shape=found.amplitudes,
+        last_octave=last_octave,
+        shape_sigma_px=found.sigma_px,
+        resolved=resolved,
+        common_shape_px2=found.common_px2,
+        information=last.information,
+        gradient=last.gradient,
+    )
+
+
+def without_prior(
+    sums: StarSums, problem: Problem, state: State, layout: Layout, name: str
+) -> tuple[Floats, Floats]:
+    """
+    Return mean and variance (q,) of the unknowns of an entry without its prior.
+
+    The amplitudes are found again: field and shapes may hide that a prior is wrong.  The variance
+    is that of the working weights; infinite where stars show less than what is possible at all.
+    """
+    wide = Layout(
+        tuple(
+            dataclasses.replace(one, sigma=_without_prior(one)) if one.name == name else one
+            for one in layout.entries
+        )
+    )
+    found = posterior(sums, problem, state, wide, np.full(3, _SMALL_SHAPE_PX), True)
+    at = layout.of([name])
+    precision, off = wide.prior_precision[at], wide.prior_offset[at]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        shown = 1.0 / found.working_variance[at] - precision
+        seen = np.isfinite(shown) & (shown > precision)
+        variance = np.where(seen, 1.0 / shown, np.inf)
+        # The wide prior pulls a little: off + mean is the sum of both by their information.
+        alone = (off + found.mean[at]) * (1.0 + precision * variance) - off
+    return np.where(seen, alone, 0.0), variance
+
+
+def _without_prior(entry: Unknown) -> Floats:
+    """Return the sigma (q,) of an entry without its prior: of what is possible at all."""
+    widest = np.minimum(_WITHOUT * entry.sigma, entry.widest)
+    return np.asarray(np.maximum(entry.sigma, widest))
+
+
+class _Solver:
+    """Solution of the shared unknowns: the field by its amplitudes, the others by their priors."""
+
+    def __init__(self, layout: Layout, with_field: bool) -> None:
+        self.layout = layout
+        self.with_field = with_field
+        self.precision = layout.prior_precision
+        self.field = layout.of(['field'])
+        self.free = np.setdiff1d(np.flatnonzero(np.isfinite(self.precision)), self.field)
+        self.estimated = np.concatenate([self.free, self.field]) if with_field else self.free
+        self.unit: Floats = np.empty(0)
+        self.octave: Indices = np.arange(FIELD_OCTAVES)
+        if with_field:
+            octave = layout['field'].octave
+            assert octave is not None
+            self.unit, self.octave = layout['field'].sigma, octave
+
+    def _of_free(self, arrow: Equations) -> tuple[Floats, Floats]:
+        """Return the covariance of all but the field, the field known, and their gradient."""
+        information = arrow.information[np.ix_(self.free, self.free)]
+        information = information + np.diag(self.precision[self.free])
+        offset = self.precision[self.free] * self.layout.prior_offset[self.free]
+        return inverse(information), arrow.gradient[self.free] - offset
+
+    def _of_field(self, arrow: Equations) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """Return information and gradient of the field in its unit, and what eliminated it."""
+        free, gradient = self._of_free(arrow)
+        cross = arrow.information[np.ix_(self.free, self.field)] * self.unit
+        back = free @ cross
+        own = arrow.information[np.ix_(self.field, self.field)] * np.outer(self.unit, self.unit)
+        information = own - cross.T @ back
+        left = arrow.gradient[self.field] * self.unit - back.T @ gradient
+        return 0.5 * (information + information.T), left, free, gradient, back
+
+    def amplitudes(self, arrow: Equations, near: Amplitudes | None) -> Amplitudes:
+        """Return the amplitudes of the octaves of the field."""
+        if not self.with_field:
+            return Amplitudes(np.full(int(self.octave.max()) + 1, -25.0), 0.0)
+        information, gradient, *_ = self._of_field(arrow)
+        return field_amplitudes(information, gradient, self.octave, near)
+
+    def solve(
+        self, arrow: Equations, amplitudes: Amplitudes
+    ) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
+        """Return mean (P,), covariance (P, P) and the posterior of the last amplitude."""
+        count = self.layout.count
+        mean, covariance = np.zeros(count), np.zeros((count, count))
+        if not self.with_field:
+            free, gradient = self._of_free(arrow)
+            mean[self.free] = free @ gradient
+            covariance[np.ix_(self.free, self.free)] = free
+            return mean, covariance, prior_of_last_octave(len(amplitudes.log_px))
+        information, left, free, gradient, back = self._of_field(arrow)
+        field = averaged_field(information, left, self.octave, amplitudes)
+        mean[self.field] = self.unit * field.mean
+        mean[self.free] = free @ gradient - back @ field.mean
+        to_free = -back @ field.covariance
+        covariance[np.ix_(self.field, self.field)] = field.covariance * np.outer(
+            self.unit, self.unit
+        )
+        covariance[np.ix_(self.free, self.field)] = to_free * self.unit
+        covariance[np.ix_(self.field, self.free)] = (to_free * self.unit).T
+        covariance[np.ix_(self.free, self.free)] = free - to_free @ back.T
+        return mean, covariance, (field.log_px, field.weight)
+
+    def resolved(self, arrow: Equations, covariance: Floats) -> float:
+        """Return the number of shared unknowns that the data determine."""
+        part = np.ix_(self.estimated, self.estimated)
+        return float(np.einsum('ij,ji->', arrow.information[part], covariance[part]))
+
+
+def _shape_sums(
+    sums: StarSums, problem: Problem, layout: Layout, solver: _Solver, field_px: Floats
+) -> ShapeSums:
+    """
+    Return what each image shows of its shape, the field known.
+
+    The images are alike in the field; each has stars in other parts of it.
+    """
+    information, gradient, cross, shared, right = _without_rotation(
+        sums, problem, layout, field_px
+    )
+    at = seen_by_stars(layout)
+    precision = solver.precision[at]
+    free = np.flatnonzero(np.isfinite(precision))
+    return ShapeSums(
+        information,
+        gradient,
+        cross[:, :, free],
+        shared[np.ix_(free, free)] + np.diag(precision[free]),
+        right[free] - precision[free] * layout.prior_offset[at][free],
+    )
+
+
+def _without_rotation(
+    sums: StarSums, problem: Problem, layout: Layout, field_px: Floats
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Return the sums of shapes and shared unknowns, the rotations free."""
+    E = chain(problem, layout, len(sums.blocks))
+    blocks = E.transpose(0, 2, 1) @ sums.blocks @ E
+    explained = ((field_px @ sums.field_cross)[:, None] @ E)[:, 0]
+    blocks[:, :-1, -1] -= explained[:, :-1]
+    stars, own, rotation = chain_columns(layout)
+    C = blocks[:, rotation, rotation].copy()
+    size = np.einsum('mii->mi', C).max(axis=1)
+    C += np.eye(3) * np.where(size > 0, 1e-9 * size, 1.0)[:, None, None]
+    back = np.linalg.solve(C, blocks[:, rotation])
+    left = blocks - blocks[:, rotation].transpose(0, 2, 1) @ back
+    shape = slice(rotation.stop, own.stop)
+    total = left.sum(axis=0)
+    return (
+        left[:, shape, shape],
+        left[:, shape, -1],
+        left[:, shape, stars],
+        total[stars, stars],
+        total[stars, -1],
+    )
+
+
+def common_shape(layout: Layout, common_px2: Floats) -> Floats:
+    """Return the covariance (P, P) of the shapes that all images share, by fx, skew and fy."""
+    camera = layout.of(['camera'])[FOCAL_PARAMETERS]
+    free = np.isfinite(layout.prior_precision[camera])
+    added = (SHAPE_MODES * common_px2) @ SHAPE_MODES.T
+    covariance = np.zeros((layout.count, layout.count))
+    covariance[np.ix_(camera, camera)] = added * np.outer(free, free)
+    return covariance
+
+
+@dataclass(frozen=True)
+class Weights:
+    """
+    Covariances of the observations as they are weighted, and the errors that they share.
+
+    Attributes
+    ----------
+    variance_px2 : (n,)
+        Of each observation per axis.
+    inflation_px2 : (n,)
+        Variance per axis that the working weights have beyond that of each observation.
+    from_sky : (n, 2, 2)
+    predicted_px : (n, 2)
+        Of `equations.star_sums`.
+    errors : tuple of SharedError
+    attitudes : tuple of (images, groups, covariance, independent)
+        Images (k,) of each star tracker, their groups (k,) and the covariance (g, g) of errors of
+        images of these groups in working sigmas, with the part of its diagonal that images do not
+        share.
+    """
+
+    variance_px2: Floats
+    inflation_px2: Floats
+    from_sky: Floats
+    predicted_px: Floats
+    errors: tuple[SharedError, ...]
+    attitudes: tuple[tuple[Indices, Indices, Floats, float], ...]
+
+
+def with_shared_errors(
+    found: Posterior,
+    sums: StarSums,
+    measurements: Measurements,
+    problem: Problem,
+    state: State,
+    layout: Layout,
+    weights: Weights,
+) -> Posterior:
+    """Return the posterior with the covariance under the errors that observations share."""
+    covariance = found.covariance - common_shape(layout, found.common_shape_px2)
+    root, held = _root(covariance, found.estimated, sums, layout)
+    excess, shared = _of_observations(found, measurements, problem, state, layout, weights, root)
+    of_attitudes, by_tracker = _of_attitudes(found, problem, state, layout, weights, root)
+    excess += of_attitudes
+    none = (0, held.shape[1])  # errors of the modes that priors hold
+    return dataclasses.replace(
+        found,
+        covariance=found.covariance + root @ excess @ root.T,
+        errors=ErrorParts(
+            np.concatenate([root, held], axis=1),
+            np.pad(excess, none),
+            {name: np.pad(one, none) for name, one in {**shared, **by_tracker}.items()},
+        ),
+    )
+
+
+def _root(
+    covariance: Floats, estimated: Indices, sums: StarSums, layout: Layout
+) -> tuple[Floats, Floats]:
+    """
+    Return L (P, r) and M (P, h), where ``L L' + M M'`` is a covariance.
+
+    M has the modes of the field that priors hold: errors of the observations move no mode that
+    the observations do not determine.
+    """
+    field = np.arange(layout.count)[layout.places['field']]
+    others = np.setdiff1d(estimated, field)
+    values, vectors = np.linalg.eigh(covariance[np.ix_(field, field)])
+    values, vectors = values[values > 0], vectors[:, values > 0]
+    size = np.sqrt(values)
+    modes = np.zeros((layout.count, len(values)))
+    modes[field] = vectors * size
+    # The others follow the modes of the field, and have a part of their own.
+    modes[others] = covariance[np.ix_(others, field)] @ vectors / size
+    left = covariance[np.ix_(others, others)] - modes[others] @ modes[others].T
+    size = np.sqrt(np.diag(left).clip(1e-300))
+    own_values, own_vectors = np.linalg.eigh(left / np.outer(size, size))
+    own = np.zeros((layout.count, len(others)))
+    own[others] = size[:, None] * own_vectors * np.sqrt(own_values.clip(0.0))
+    shown = np.einsum('im,ij,jm->m', vectors, sums.field_information, vectors, optimize=True)
+    moved = values * shown > _HELD
+    return np.concatenate([own, modes[:, moved]], axis=1), modes[:, ~moved]
+
+
+def _of_observations(
+    found: Posterior,
+    measurements: Measurements,
+    problem: Problem,
+    state: State,
+    layout: Layout,
+    weights: Weights,
+    root: Floats,
+) -> tuple[Floats, dict[str, Floats]]:
+    """
+    Return ``L' X' W (V - 1/W) W X L`` (r, r) of the observations, the images eliminated.
+
+    With the whole variance of each error that they share.
+    """
+    r = root.shape[1]
+    groups = GroupSums(
+        weights.errors, weights.variance_px2, weights.inflation_px2, weights.from_sky, r
+    )
+    if not groups.own_px2.any():  # the errors are those of the working weights
+        return groups.own, {}
+    at = seen_by_stars(layout)
+    field = layout.places['field']
+    t = (field.stop - field.start) // 2
+    functions = layout['field'].functions
+    assert functions is not None
+    with_field = bool(root[field].any())
+    E = chain(problem, layout, measurements.image_count)
+    stars, own_columns, _ = chain_columns(layout)
+    to_images = found.back @ root
+    # In the columns of the sums: camera, turns, rotation; the shapes are the camera's.
+    by_columns = np.einsum('mcd,dr->mcr', E[:, :-1, stars], root[at]) - np.einsum(
+        'mcd,mdr->mcr', E[:, :-1, own_columns], to_images
+    )
+    for chunk, Z in star_columns(measurements, problem, state, layout):
+        m, _, n = chunk.direction_icrf.shape
+        c = Z.shape[1] - 1
+        own = Z[:, :c].reshape(2, c, m, n).transpose(2, 0, 3, 1).reshape(m, 2 * n, c)
+        X = (own @ by_columns[chunk.image]).reshape(m, 2, n, r).transpose(1, 0, 2, 3)
+        X = X.reshape(2, m * n, r)
+        wuu, wuv, wvv = (one[:, None] for one in chunk.whitener)
+        if with_field:
+            phi = functions(weights.predicted_px[chunk.row].T).T
+            u, v = phi @ root[field][:t], phi @ root[field][t:]
+            X = X + np.stack([wuu * u + wuv * v, wvv * v])
+        Y = np.stack([wuu * X[0], wuv * X[0] + wvv * X[1]], axis=1)
+        real = chunk.whitener[0] > 0
+        groups.add(chunk.row[real], Y[real])
+    whole = groups.whole()
+    return sum(whole.values(), -groups.own), whole
+
+
+def _of_attitudes(
+    found: Posterior,
+    problem: Problem,
+    state: State,
+    layout: Layout,
+    weights: Weights,
+    root: Floats,
+) -> tuple[Floats, dict[str, Floats]]:
+    """Return the same (r, r) of the star-tracker attitudes, by noise and slow errors."""
+    _, J = whitened_attitude_errors(problem, state)
+    at, turns = tracker_turns(layout)
+    rows = J @ (-(turns @ root[at]) - found.back[:, IMAGE_ROTATION] @ root)
+    r = root.shape[1]
+    working, noise, slow = np.zeros((3, r, r))
+    for images, group, covariance, independent in weights.attitudes:
+        shared = covariance - independent * np.eye(len(covariance))
+        member = csr_array((np.ones(len(group)), (group, np.arange(len(group)))))
+        for axis in range(3):
+            part = rows[images, axis]
+            square = part.T @ part
+            working += square
+            noise += independent * square
+            summed = member @ part
+            slow += summed.T @ shared @ summed
+    return noise + slow - working, {TRACKER_NOISE: noise, TRACKER_SLOW: slow}

@@ -1,0 +1,141 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+The three methods of calibration as least-squares problems (Eqs. 10-19, 25).
+
+- ``per_image`` (the paper's Method 1): every image has its own rotation.
+- ``single`` (Method 2): one rotation for all images, the star tracker taken as perfect.
+- ``hierarchical`` (beyond the paper): one common alignment, and for each image an attitude error
+  of the star tracker's covariance.  The other two are its limits.
+
+With R_k = camera_from_icrf of image k, the attitude error of the star tracker in it is
+``eta_k = -Log(A' R_k T_k')``, a small rotation in the star tracker frame, where A =
+camera_from_star_tracker and T_k = star_tracker_from_icrf as measured.
+
+Where terms of temperature are estimated (`thermal`), parameters and A are those of the image, and
+the derivatives by what is shared follow by the chain rule, one small matrix for each image.
+
+Of several star trackers, each has axes of its own: T_k is that of the one that gave the attitude,
+and A that of the first, turned by its mounting M (first from this one) and by the small rotation h
+of the camera frame by which the mounting is wrong: ``exp(-[h x]) A M``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import parameter_names
+from starcal_ros.estimation.star_equations import Measurements, normal_blocks
+from starcal_ros.estimation.temperature import parameters_at, turns
+
+METHODS = ('hierarchical', 'per_image', 'single')
+
+
+@dataclass(frozen=True)
+class State:
+    """Where the search stands: camera parameters, alignment and the rotation of every image."""
+
+    parameters: Floats  # (p,)
+    camera_from_star_tracker: Rotation
+    camera_from_icrf: Rotation  # (m,)
+    focal: Floats = field(default_factory=lambda: np.empty(0))  # (q,) terms of temperature
+    rate: Floats = field(default_factory=lambda: np.empty(0))  # (3,) of the alignment, or (0,)
+    # (3 s,) h of the further star trackers, rad
+    mountings: Floats = field(default_factory=lambda: np.empty(0))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """
+    Inputs of one search, for m images.
+
+    Attributes
+    ----------
+    method : str
+    model : str
+        Lens model, of `lens.COEFFICIENTS`; it has p camera parameters.
+    free : (f,) int
+        Camera parameters that are estimated, ascending.
+    prior_parameters, prior_sigma : (p,)
+        Gaussian prior of the camera parameters; infinite sigma: none.
+    star_tracker_from_icrf : Rotation (m,)
+        As measured.
+    star_tracker_sigma_rad : (m, 3)
+        1-sigma of each attitude about the star tracker's axes; infinite: not to be trusted.
+    above_reference_k : (m,)
+        Temperature of each image less the reference; (0,) where no term is estimated.
+    star_tracker : (m,) int
+        Which star tracker gave the attitude of each image: 0 is the first.
+    first_from_star_tracker : Rotation (m,) or None
+        Its mounting as assumed; None where there is one star tracker only.
+    mounting_sigma_rad : float
+        1-sigma of each angle of the mountings as assumed.
+    """
+
+    method: str
+    model: str
+    free: NDArray[np.int64]
+    prior_parameters: Floats
+    prior_sigma: Floats
+    star_tracker_from_icrf: Rotation
+    star_tracker_sigma_rad: Floats
+    above_reference_k: Floats = field(default_factory=lambda: np.empty(0))
+    star_tracker: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    first_from_star_tracker: Rotation | None = None
+    mounting_sigma_rad: float = np.inf
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the p camera parameters."""
+        return parameter_names(self.model)
+
+    @property
+    def camera_count(self) -> int:
+        """Number p of the camera parameters."""
+        return len(self.prior_parameters)
+
+
+def image_parameters(problem: Problem, state: State) -> Floats:
+    """Camera parameters: (p,) of all images, or (m, p) where they differ."""
+    if len(state.focal) == 0:
+        return state.parameters
+    return parameters_at(state.parameters, state.focal, problem.above_reference_k)
+
+
+def image_alignment(problem: Problem, state: State) -> Rotation:
+    """camera_from_star_tracker: of all images, or (m,) where they differ."""
+    alignment = state.camera_from_star_tracker
+    if len(state.rate):
+        alignment = turns(state.rate, problem.above_reference_k) * alignment
+    if problem.first_from_star_tracker is None:
+        return alignment
+    mounted: Rotation = mounting_turns(problem, state) * alignment
+    return mounted * problem.first_from_star_tracker
+
+
+def mounting_turns(problem: Problem, state: State) -> Rotation:
+    """Rotations (m,) of the camera frame by which the mountings of the images are wrong."""
+    return Rotation.from_rotvec(-mounting_errors_rad(problem, state))
+
+
+def mounting_errors_rad(problem: Problem, state: State) -> Floats:
+    """Errors (m, 3) of the mounting of the star tracker of each image, rad; 0 of the first."""
+    errors = np.concatenate([np.zeros((1, 3)), state.mountings.reshape(-1, 3)])
+    return np.asarray(errors[problem.star_tracker])
+
+
+def image_blocks(
+    problem: Problem, state: State, measurements: Measurements, loss_scale: float = np.inf
+) -> tuple[float, Floats]:
+    """Cost and the matrices of `normal_equations.normal_blocks` at a state."""
+    return normal_blocks(
+        measurements,
+        problem.model,
+        image_parameters(problem, state),
+        state.camera_from_icrf.as_matrix(),
+        loss_scale,
+    )

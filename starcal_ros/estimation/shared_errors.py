@@ -1,0 +1,315 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Errors that stars of different images share: places of stars, and patterns of the detector.
+
+The observations of a group share one random displacement: those of a catalog star its error of
+place, those of a cell, a row or a column of the detector the structure of the lens and the sensor
+that is finer than the field.  Such errors need no coefficients.  Their variance is what residuals
+of different members of a group have in common::
+
+    s^2 = [sum_g |sum w r|^2 - sum_i |w r|^2] / [2 (sum_g (sum w)^2 - sum_i w^2)],
+
+with the posterior mean of s^2 under the prior of amplitudes in place of an estimate.  A linear
+estimator with weights W has the exact covariance ``S^-1 (X' W V W X) S^-1`` under errors of
+covariance V (consider analysis, Schmidt 1966); groups are the off-diagonal part of V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.estimation.amplitudes import (
+    LARGEST_FIELD_PX,
+    LOG_CENTRE,
+    LOG_SIGMA,
+    OCTAVE_SIGMA,
+    OCTAVE_STEP,
+)
+
+# Wavelengths below those of the field, as fractions of the width: each octave is seen in cells of
+# a sixth of its longest wave, over which it keeps nine tenths of its correlation.
+_FINE_OCTAVES = (1 / 4, 1 / 8, 1 / 16)
+_CELLS_PER_WAVE = 6.0
+_STRIPS = (1 / 48, 1 / 192)  # of the width: height of groups of rows, width of groups of columns
+_NO_EFFECT = 0.01  # of the variance of the mean of a group
+_LOG_GRID: Floats = np.asarray(
+    np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
+)
+
+
+@dataclass(frozen=True)
+class SharedError:
+    """
+    One kind of groups and the error that its members share.
+
+    Attributes
+    ----------
+    name : str
+    group : (n,) int
+        Of each observation.
+    variance_px2 : float
+        Posterior mean, per axis.
+    likelihood_ratio : float
+        Twice the log likelihood of the best variance against none.
+    of_star : bool
+        Displacements keep their direction on the sky, not on the detector; they move no pixel.
+    effect : float
+        Variance of the mean of a group by the shared error, over that by noise.
+    """
+
+    name: str
+    group: Indices
+    variance_px2: float
+    likelihood_ratio: float
+    of_star: bool
+    effect: float
+
+    @property
+    def matters(self) -> bool:
+        """True if the precision of an estimate changes by the error."""
+        return self.effect > _NO_EFFECT
+
+
+@dataclass(frozen=True)
+class Groups:
+    """
+    One kind of groups of n observations.
+
+    ``group`` (n,): the number of the group of each; ``of_one_star`` (n,): a number for the members
+    of a group that are of one star, whose common error is of the star; None if all are.
+    """
+
+    name: str
+    group: Indices
+    of_one_star: Indices | None
+
+
+def observation_groups(pixels: Floats, star: Indices, width: int) -> tuple[Groups, ...]:
+    """
+    Return the groups of observations at pixels (n, 2) of stars (n,) on a detector of a width, px.
+
+    The stars, the cells of the fine octaves, from the coarsest, and strips of rows and columns.
+    """
+    found = [Groups('star places', star, None)]
+    for wave in _FINE_OCTAVES:
+        cells = _cells(pixels, wave * width / _CELLS_PER_WAVE, (0, 1))
+        name = f'field at 1/{round(1 / wave)} of the width'
+        found.append(Groups(name, cells, pairs_of(cells, star)))
+    for axis, kind in ((1, 'rows'), (0, 'columns')):
+        for share in _STRIPS:
+            strips = _cells(pixels, share * width, (axis,))
+            name = f'{kind} at 1/{round(1 / share)} of the width'
+            found.append(Groups(name, strips, pairs_of(strips, star)))
+    return tuple(found)
+
+
+def coarsest_cells(groups: Sequence[Groups]) -> Groups:
+    """Return the cells of the first of the fine octaves: of a 24th of the width."""
+    return groups[1]
+
+
+def pairs_of(group: Indices, star: Indices) -> Indices:
+    """Return a number (n,) for each pair of group and star."""
+    key = group.astype(np.int64) * (int(star.max(initial=0)) + 1) + star
+    return np.asarray(np.unique(key, return_inverse=True)[1], np.int64)
+
+
+def shared_errors(
+    residual_px: Floats,
+    weight: Floats,
+    groups: Sequence[Groups],
+    from_sky: Floats,
+    last_octave: tuple[Floats, Floats],
+) -> tuple[SharedError, ...]:
+    """
+    Return the errors that observations share.
+
+    Parameters
+    ----------
+    residual_px : (n, 2)
+    weight : (n,)
+        Reciprocal variance of each residual per axis, 1/px^2; 0: not used.
+    groups : sequence of Groups
+        Of `observation_groups`.
+    from_sky : (n, 2, 2)
+        Rotation of a displacement fixed to the star into pixel axes.
+    last_octave : (s,), (s,)
+        Posterior of the logarithm of the finest amplitude of the field, with weights.
+    """
+    on_sky = np.einsum('nba,nb->na', from_sky, residual_px)
+    moments = []
+    for one in groups:
+        residual = on_sky if one.of_one_star is None else residual_px
+        moments.append(pair_moment(residual, weight, one.group, one.of_one_star))
+    variances = [posterior_mean(*moment) for moment in moments]
+    octaves = slice(1, 1 + len(_FINE_OCTAVES))
+    variances[octaves] = _chain_means(last_octave, moments[octaves])
+    used = weight > 0
+    return tuple(
+        SharedError(
+            one.name,
+            np.where(used, one.group, -1),
+            variance,
+            _ratio(*moment),
+            one.of_one_star is None,
+            variance * float((np.bincount(one.group, weight) ** 2).sum() / weight.sum()),
+        )
+        for one, moment, variance in zip(groups, moments, variances, strict=True)
+    )
+
+
+def _cells(pixels: Floats, size_px: float, axes: Sequence[int]) -> Indices:
+    """Return the number (n,) of the cell of a size along some axes of each pixel (n, 2)."""
+    index = np.floor((pixels[:, list(axes)] + 0.5) / size_px).astype(np.int64)
+    index -= index.min(axis=0, initial=0)
+    if len(axes) == 1:
+        return index[:, 0]
+    return np.asarray(index[:, 0] * (int(index[:, 1].max(initial=0)) + 1) + index[:, 1])
+
+
+def pair_moment(
+    residual_px: Floats, weight: Floats, group: Indices, of_one_star: Indices | None = None
+) -> tuple[float, float]:
+    """
+    Return the mean product of residuals of members of a group per axis, and its 1-sigma, px^2.
+
+    Members with the same number in ``of_one_star`` are not multiplied.
+    """
+    apart = np.arange(len(group)) if of_one_star is None else of_one_star
+    products = pairs = 0.0
+    for index, sign in ((group, 1.0), (apart, -1.0)):
+        pairs += sign * float((np.bincount(index, weight) ** 2).sum())
+        for axis in (0, 1):
+            summed = np.bincount(index, weight * residual_px[:, axis])
+            products += sign * float((summed**2).sum())
+    # Without pairs rounding is left.
+    if pairs <= 1e-9 * float((weight**2).sum()):
+        return 0.0, math.inf
+    return products / (2.0 * pairs), 1.0 / math.sqrt(pairs)
+
+
+def posterior_mean(estimate_px2: float, sigma_px2: float) -> float:
+    """Posterior mean of a variance from an unbiased estimate, under the prior of amplitudes."""
+    log_weight = _log_likelihood(estimate_px2, sigma_px2)
+    log_weight = log_weight - 0.5 * ((_LOG_GRID - LOG_CENTRE) / LOG_SIGMA) ** 2
+    weight = np.exp(log_weight - log_weight.max())
+    return float(weight @ np.exp(2.0 * _LOG_GRID) / weight.sum())
+
+
+def _log_likelihood(estimate_px2: float, sigma_px2: float) -> Floats:
+    """Log likelihood of amplitudes on the grid."""
+    return np.asarray(-0.5 * ((estimate_px2 - np.exp(2.0 * _LOG_GRID)) / sigma_px2) ** 2)
+
+
+def _ratio(estimate_px2: float, sigma_px2: float) -> float:
+    """Twice the log likelihood ratio of the best variance against none."""
+    return max(estimate_px2 / sigma_px2, 0.0) ** 2
+
+
+def _chain_means(
+    last_octave: tuple[Floats, Floats], moments: Sequence[tuple[float, float]]
+) -> list[float]:
+    """
+    Return the posterior mean variance of octaves in a chain that begins at the field's last one.
+
+    Each octave is tied to the one before as those of the field are; sums over a grid of the
+    logarithms, forward and backward.
+    """
+
+    def step(log_px: Floats) -> Floats:
+        off = _LOG_GRID[None, :] - log_px[:, None] - OCTAVE_STEP
+        kernel = np.exp(-0.5 * (off / OCTAVE_SIGMA) ** 2)
+        return np.asarray(kernel / kernel.sum(axis=1, keepdims=True).clip(1e-300))
+
+    transition = step(_LOG_GRID)
+    forward = last_octave[1] @ step(last_octave[0])
+    likelihoods, before = [], []
+    for estimate, sigma in moments:
+        log_likelihood = _log_likelihood(estimate, sigma)
+        likelihoods.append(np.exp(log_likelihood - log_likelihood.max()))
+        before.append(forward)
+        forward = forward * likelihoods[-1]
+        forward = (forward / forward.sum()) @ transition
+    after = np.ones(len(_LOG_GRID))
+    means = []
+    for likelihood, prior in zip(reversed(likelihoods), reversed(before), strict=True):
+        weight = prior * likelihood * after
+        means.append(float(weight @ np.exp(2.0 * _LOG_GRID) / weight.sum()))
+        after = transition @ (likelihood * after)
+        after /= after.max()
+    return means[::-1]
+
+
+def pixel_variance_px2(errors: Sequence[SharedError]) -> float:
+    """Variance per axis of the structure that is finer than the field, of any pixel."""
+    return sum(error.variance_px2 for error in errors if not error.of_star)
+
+
+def place_variance_px2(errors: Sequence[SharedError]) -> float:
+    """Variance per axis of the places of stars; 0 where it changes no precision."""
+    return sum(error.variance_px2 for error in errors if error.of_star and error.matters)
+
+
+class GroupSums:
+    """
+    Sums of weighted derivatives (n, 2, r) over groups, part by part of the observations.
+
+    `whole` is ``sum_g s^2 |sum_i Y_i|^2`` of each error, and `own` ``sum_i s^2 |Y_i|^2`` of all
+    with the inflation of the weights: their difference is the part of V beyond the working one.
+    A group of one observation has only noise.  Observations of a variance below the sum of s^2, as
+    of bright stars, share no more than that.
+    """
+
+    def __init__(
+        self,
+        errors: Sequence[SharedError],
+        variance_px2: Floats,
+        inflation_px2: Floats,
+        from_sky: Floats,
+        columns: int,
+    ) -> None:
+        """Begin with sums of zero; errors without an effect are left out."""
+        self.errors = [error for error in errors if error.matters]
+        self.from_sky = from_sky
+        self.sums: Mapping[str, Floats] = {
+            error.name: np.zeros((int(error.group.max(initial=-1)) + 1, 2 * columns))
+            for error in self.errors
+        }
+        self.own = np.zeros((columns, columns))
+        self.is_shared = {}
+        total: Floats = np.zeros(len(variance_px2))
+        for error in self.errors:
+            members = np.bincount(error.group + 1)
+            members[0] = 0  # not used
+            self.is_shared[error.name] = members[error.group + 1] > 1
+            total += error.variance_px2 * self.is_shared[error.name]
+        self.share = np.minimum(variance_px2 / np.maximum(total, 1e-300), 1.0)
+        self.own_px2 = self.share * total + inflation_px2
+
+    def add(self, rows: Indices, Y: Floats) -> None:
+        """Add the observations ``rows`` (k,) with Y (k, 2, r)."""
+        k = len(rows)
+        for error in self.errors:
+            values = Y
+            if error.of_star:
+                values = self.from_sky[rows].transpose(0, 2, 1) @ Y
+            shape = (self.sums[error.name].shape[0], k)
+            part = np.sqrt(self.share[rows]) * self.is_shared[error.name][rows]
+            member = csr_array((part, (error.group[rows], np.arange(k))), shape=shape)
+            self.sums[error.name][...] += member @ values.reshape(k, -1)
+        flat = (Y * np.sqrt(self.own_px2[rows])[:, None, None]).reshape(2 * k, -1)
+        self.own += flat.T @ flat
+
+    def whole(self) -> dict[str, Floats]:
+        """Return the matrix (r, r) of each error by its name."""
+        flat = {name: one.reshape(-1, len(self.own)) for name, one in self.sums.items()}
+        return {
+            error.name: error.variance_px2 * (flat[error.name].T @ flat[error.name])
+            for error in self.errors
+        }

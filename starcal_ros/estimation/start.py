@@ -1,0 +1,70 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Start of the search where the stars of each image put it.
+
+An attitude, an alignment or a mounting may be wrong by more than a search can cross: a robust loss
+has no slope far from the stars, and none behind the camera.  Each image has its rotation from its
+own stars (Wahba's problem by singular values, Markley 1988); these give alignment and mountings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Mask
+from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.estimation.problem import Problem, State
+from starcal_ros.estimation.reweighting import FEWEST_STARS
+from starcal_ros.estimation.star_equations import StarTable
+
+
+def moved_to_stars(problem: Problem, start: State, table: StarTable, camera: CameraModel) -> State:
+    """Return a start with alignment, mountings and rotations by the stars, the camera as given."""
+    rotations, by_stars = _rotations(start.camera_from_icrf, table, camera)
+    # The alignment to the first star tracker that each image shows, the mountings as assumed.
+    shown = rotations * problem.star_tracker_from_icrf.inv()
+    if problem.first_from_star_tracker is not None:
+        shown = shown * problem.first_from_star_tracker.inv()
+    alignment, mountings = None, start.mountings.copy()
+    for k in np.unique(problem.star_tracker[by_stars]):
+        own = shown[by_stars & (problem.star_tracker == k)].mean()
+        if alignment is None:
+            alignment = own
+        elif k:
+            mountings[3 * k - 3 : 3 * k] = -(own * alignment.inv()).as_rotvec()
+    return dataclasses.replace(
+        start,
+        camera_from_star_tracker=alignment or start.camera_from_star_tracker,
+        camera_from_icrf=rotations,
+        mountings=mountings,
+    )
+
+
+def _rotations(
+    predicted: Rotation, table: StarTable, camera: CameraModel
+) -> tuple[Rotation, Mask]:
+    """Return the rotations (m,) that fit the stars better, and which are those of the stars."""
+    seen = line_of_sight(camera, table.measured_px)
+    real = np.isfinite(seen).all(axis=1)
+    seen, e, image = seen[real], table.direction_icrf[real], table.image[real]
+    m = table.image_count
+    products = np.zeros((m, 3, 3))
+    np.add.at(products, image, seen[:, :, None] * e[:, None, :])
+    u, _, vt = np.linalg.svd(products)
+    fitted, before = u @ vt, predicted.as_matrix()
+    # A mirrored image has an improper one: the search finds its negative focal length.
+    good = (np.linalg.det(fitted) > 0) & (np.bincount(image, minlength=m) >= FEWEST_STARS)
+    count = np.bincount(image, minlength=m)
+    middle = np.cumsum(count) - count + count // 2
+    off, off_before = (
+        np.append(length[np.lexsort((length, image))], np.inf)[middle]
+        for length in (
+            np.linalg.norm(seen - np.einsum('nij,nj->ni', one[image], e), axis=1)
+            for one in (fitted, before)
+        )
+    )
+    good &= off < off_before
+    return Rotation.from_matrix(np.where(good[:, None, None], fitted, before)), good

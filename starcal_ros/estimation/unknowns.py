@@ -1,0 +1,432 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+The unknowns of a calibration, in one list.
+
+Whatever is not known exactly is an entry: its name, its labels, the derivative of a star's pixel
+by it, and a Gaussian prior.  A shared unknown has one value for all images; an image unknown has
+one for each.  There are three forms of derivative:
+
+- ``camera``: it changes the parameters of the camera of image k by the matrix ``camera[k]``;
+- ``turn``: it turns the direction of each star by a small rotation in the camera frame;
+- ``functions``: it displaces pixels along u and along v by functions of the pixel.
+
+An unknown may also turn the camera relative to the star tracker of an image (``tracker``): the
+alignment does, and the rotation of an image.
+
+To add an unknown, add its entry in `unknowns_of`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import dataclasses
+from dataclasses import dataclass
+import functools
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.camera.detector_field import basis, cosine_terms
+from starcal_ros.constants import SPEED_OF_LIGHT_M_S
+from starcal_ros.estimation.attitude_errors import turn_derivatives
+from starcal_ros.estimation.problem import (
+    image_alignment,
+    mounting_errors_rad,
+    mounting_turns,
+    Problem,
+    State,
+)
+from starcal_ros.estimation.refraction import Refraction, ZENITH_SIGMA_RAD
+from starcal_ros.estimation.temperature import parameters_chain, turns_chain
+from starcal_ros.records import ALIGNMENT_NAMES
+
+Turn = Callable[[Floats, Floats, Indices], Floats]
+"""Small rotations (3, q, n) of stars by q unit unknowns, from pixels (2, n), directions in the
+camera frame (3, n) and image numbers (n,)."""
+Scalars = Callable[[Floats], Floats]
+"""Values (t, n) of t functions at pixels (2, n)."""
+
+IMAGE_ROTATION = slice(0, 3)
+"""Place of the rotation among the unknowns of an image; it moves as `moved` says."""
+FOCAL_PARAMETERS = slice(0, 3)
+"""Place of fx, skew and fy among the camera parameters."""
+SHAPE_MODES = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, -1.0], [0.0, 1.0, 0.0]]).T
+"""Scale, stretch and shear of an image as changes of fx, skew and fy: (3, 3)."""
+_UNKNOWN_RATE_RAD_S = 1e-3  # of a camera that looks at the Earth from a low orbit
+_FASTEST_M_S = 300e3  # no spacecraft has reached 200 km/s
+FIELD_OCTAVES = 3  # of the field: wavelengths down to a quarter of the width
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """
+    One entry of the list: q numbers.
+
+    Attributes
+    ----------
+    name : str
+    labels : tuple of q str
+        With the unit as suffix where there is one.
+    sigma : (q,)
+        1-sigma of the prior; infinite: none.  The amplitude of a group of priors that is
+        estimated multiplies it.
+    offset : (q,)
+        Value at the state, less the prior mean.  What displaces stars in proportion to its value
+        stays zero in the state: the equations are linear in it.
+    of_image : bool
+        True if each image has a value of its own.
+    camera : (m, p, q) or None
+        Change of the camera parameters of each image.
+    turn : Turn or None
+    functions : Scalars or None
+        q is twice their number: those of u, then those of v.
+    octave : (q,) or None
+        Of each coefficient of those functions.
+    tracker : (m, 3, q) or None
+        Rotation of the camera, as the star tracker of each image predicts it.
+    widest : float
+        Largest 1-sigma that is possible at all, whatever a data sheet says.
+    """
+
+    name: str
+    labels: tuple[str, ...]
+    sigma: Floats
+    offset: Floats
+    of_image: bool = False
+    camera: Floats | None = None
+    turn: Turn | None = None
+    functions: Scalars | None = None
+    octave: Indices | None = None
+    tracker: Floats | None = None
+    widest: float = np.inf
+
+    def __len__(self) -> int:
+        """Return the number of unknowns of the entry."""
+        return len(self.labels)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The list of unknowns, and where each stands among those that are shared."""
+
+    entries: tuple[Unknown, ...]
+
+    @functools.cached_property
+    def shared(self) -> tuple[Unknown, ...]:
+        """Entries with one value for all images; the field last."""
+        return tuple(entry for entry in self.entries if not entry.of_image)
+
+    @functools.cached_property
+    def of_image(self) -> tuple[Unknown, ...]:
+        """Entries with a value for each image, after its rotation."""
+        return tuple(entry for entry in self.entries if entry.of_image)
+
+    @functools.cached_property
+    def places(self) -> dict[str, slice]:
+        """Place of each shared entry by name, and of each image entry among those of an image."""
+        found = {}
+        for group, first in ((self.shared, 0), (self.of_image, IMAGE_ROTATION.stop)):
+            for entry in group:
+                found[entry.name] = slice(first, first + len(entry))
+                first += len(entry)
+        return found
+
+    @functools.cached_property
+    def count(self) -> int:
+        """Number of shared unknowns."""
+        return sum(map(len, self.shared))
+
+    @functools.cached_property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the shared unknowns."""
+        return tuple(label for entry in self.shared for label in entry.labels)
+
+    def __getitem__(self, name: str) -> Unknown:
+        """Return the entry of a name."""
+        return next(entry for entry in self.entries if entry.name == name)
+
+    def __contains__(self, name: str) -> bool:
+        """Return True if the list has an entry of a name."""
+        return name in self.places
+
+    def of(self, names: Sequence[str]) -> Indices:
+        """Return the places of the shared entries of these names, in their order."""
+        places = [np.arange(self.count)[self.places[name]] for name in names if name in self]
+        return np.concatenate([np.empty(0, np.int64), *places])
+
+    @functools.cached_property
+    def prior_precision(self) -> Floats:
+        """Diagonal (count,) of the prior's information on the shared unknowns."""
+        sigma = np.concatenate([entry.sigma for entry in self.shared])
+        with np.errstate(divide='ignore'):  # held: infinite
+            return np.asarray(sigma**-2.0)
+
+    @functools.cached_property
+    def prior_offset(self) -> Floats:
+        """Values (count,) of the shared unknowns at the state, less their prior means."""
+        return np.concatenate([entry.offset for entry in self.shared])
+
+
+@dataclass(frozen=True)
+class Assumptions:
+    """
+    Priors of what an ensemble does not state, from the options: 1-sigma.
+
+    Attributes
+    ----------
+    velocity_m_s : float
+        Of each component of the velocity of the observer.
+    readout_s : float, float
+        Of the time from the first to the last row: its mean and 1-sigma.
+    stamp_s : float
+        Of the offset of all stamps against the attitudes.
+    refraction : Refraction or None
+        About a zenith that is not known exactly; None: in space, or corrected.
+    """
+
+    velocity_m_s: float
+    readout_s: tuple[float, float]
+    stamp_s: float
+    refraction: Refraction | None = None
+
+
+def unknowns_in_state(problem: Problem, state: State) -> Layout:
+    """Return the list of the unknowns that the search moves: those of camera and alignment."""
+    p, q = problem.camera_count, len(state.focal)
+    m = len(state.camera_from_icrf)
+    chain = (
+        parameters_chain(state.parameters, state.focal, problem.above_reference_k)
+        if q
+        else np.broadcast_to(np.eye(p), (m, p, p))
+    )
+    sigma = np.zeros(p)  # of parameters that are held
+    sigma[problem.free] = problem.prior_sigma[problem.free]
+    offset = state.parameters - problem.prior_parameters
+    focal = tuple(f'focal_temperature_{i}' for i in range(1, q + 1))
+    entries = [
+        Unknown('camera', problem.parameter_names, sigma, offset, camera=chain[:, :, :p]),
+        Unknown('focal', focal, np.full(q, np.inf), state.focal, camera=chain[:, :, p:]),
+        *_turns_of_camera(problem, state),
+    ]
+    return Layout(tuple(entry for entry in entries if len(entry)))
+
+
+def _turns_of_camera(problem: Problem, state: State) -> list[Unknown]:
+    """Return alignment, its rate and the mountings: what turns the camera by the star tracker."""
+    turns = _turn_chain(problem, state)
+    rate = len(state.rate)
+    mountings = tuple(
+        f'star_tracker_{k}_{axis}'
+        for k in range(2, len(state.mountings) // 3 + 2)
+        for axis in ('x', 'y', 'z')
+    )
+    return [
+        Unknown(
+            'alignment', ALIGNMENT_NAMES, np.full(3, np.inf), np.zeros(3), tracker=turns[:, :, :3]
+        ),
+        Unknown(
+            'rate',
+            tuple(f'{name}_temperature' for name in ALIGNMENT_NAMES[:rate]),
+            np.full(rate, np.inf),
+            state.rate,
+            tracker=turns[:, :, 3 : 3 + rate],
+        ),
+        Unknown(
+            'mountings',
+            mountings,
+            np.full(len(mountings), problem.mounting_sigma_rad),
+            state.mountings,
+            tracker=turns[:, :, 3 + rate :],
+        ),
+    ]
+
+
+def _turn_chain(problem: Problem, state: State) -> Floats:
+    """Return how alignment angles, rate and mountings turn the camera of each image: (m, 3, a)."""
+    m = len(state.camera_from_icrf)
+    chain: Floats = np.tile(np.eye(3), (m, 1, 1))
+    if len(state.rate):
+        chain = turns_chain(state.rate, problem.above_reference_k)
+    if problem.first_from_star_tracker is None:
+        return chain
+    own = turn_derivatives(mounting_errors_rad(problem, state))
+    of_mountings = np.zeros((m, 3, len(state.mountings)))
+    for k in range(len(state.mountings) // 3):
+        here = problem.star_tracker == k + 1
+        of_mountings[here, :, 3 * k : 3 * k + 3] = own[here]
+    turned = mounting_turns(problem, state).as_matrix() @ chain
+    return np.concatenate([turned, of_mountings], axis=-1)
+
+
+def moved(
+    problem: Problem, state: State, layout: Layout, shared: Floats, rotations: Floats
+) -> State:
+    """
+    Return the state after a step: parameters add, rotations turn (Eq. 11).
+
+    Parameters
+    ----------
+    shared : (P,)
+        Step of the shared unknowns.
+    rotations : (m, 3)
+        Small rotations of the images.
+    """
+    places = layout.places
+
+    def step(name: str, value: Floats) -> Floats:
+        return value + shared[places[name]] if name in layout else value
+
+    turn = Rotation.from_rotvec(-shared[places['alignment']])
+    after = State(
+        parameters=step('camera', state.parameters),
+        camera_from_star_tracker=turn * state.camera_from_star_tracker,
+        camera_from_icrf=state.camera_from_icrf,
+        focal=step('focal', state.focal),
+        rate=step('rate', state.rate),
+        mountings=step('mountings', state.mountings),
+    )
+    # The camera follows what the star tracker predicts, by large angles too.
+    by = np.zeros_like(rotations)
+    for entry in layout.shared:
+        if entry.tracker is not None and entry.name in ('alignment', 'rate', 'mountings'):
+            by += np.einsum('mij,j->mi', entry.tracker, shared[places[entry.name]])
+    predicted = image_alignment(problem, after) * image_alignment(problem, state).inv()
+    own = Rotation.from_rotvec(by - rotations) * predicted * state.camera_from_icrf
+    return dataclasses.replace(after, camera_from_icrf=own)
+
+
+def unknowns_of(
+    problem: Problem,
+    state: State,
+    rates_rad_s: Floats,
+    size: tuple[int, int],
+    assumed: Assumptions,
+    with_field: bool = True,
+) -> Layout:
+    """
+    Return the list of unknowns of a calibration at a state.
+
+    Parameters
+    ----------
+    rates_rad_s : (m, 3)
+        Angular rate of the camera in its frame; NaN where it is not known.
+    size : (width, height)
+        Of the detector, px.
+    with_field : bool
+        False for a first estimate, of what does not depend on the field.
+    """
+    m = len(state.camera_from_icrf)
+    width, height = size
+    p = problem.camera_count
+    entries = list(unknowns_in_state(problem, state).entries)
+    if assumed.velocity_m_s > 0:
+        entries.append(
+            Unknown(
+                'velocity',
+                ('velocity_x_m_s', 'velocity_y_m_s', 'velocity_z_m_s'),
+                np.full(3, assumed.velocity_m_s),
+                np.zeros(3),
+                turn=functools.partial(_by_velocity, state.camera_from_icrf.as_matrix()),
+                widest=_FASTEST_M_S,
+            )
+        )
+    if assumed.refraction is not None:
+        entries += _refraction(assumed.refraction, state.camera_from_icrf.as_matrix())
+    entries += _of_timing(rates_rad_s, height, assumed)
+    if with_field:
+        entries.append(_field(width, height))
+    modes = np.zeros((p, 3))
+    modes[FOCAL_PARAMETERS] = SHAPE_MODES
+    shape = ('scale_px', 'stretch_px', 'shear_px')
+    entries.append(
+        Unknown(
+            'shape',
+            shape,
+            np.ones(3),
+            np.zeros(3),
+            of_image=True,
+            camera=np.broadcast_to(modes, (m, p, 3)),
+        )
+    )
+    return Layout(tuple(entry for entry in entries if len(entry)))
+
+
+def _refraction(air: Refraction, camera_from_icrf: Floats) -> list[Unknown]:
+    """Return the entries of the size of refraction and of the site."""
+    sizes, q = np.array([air.sigma_arcsec]), len(air.labels)
+    by_size = functools.partial(air.by_size, camera_from_icrf)
+    by_site = functools.partial(air.by_site, camera_from_icrf)
+    site = np.full(q, ZENITH_SIGMA_RAD)
+    return [
+        Unknown('refraction', ('refraction_arcsec',), sizes, np.zeros(1), turn=by_size),
+        Unknown('site', air.labels, site, np.zeros(q), turn=by_site),
+    ]
+
+
+def _of_timing(rates_rad_s: Floats, height: int, assumed: Assumptions) -> list[Unknown]:
+    """Return the entries of the read-out and of the stamps: what a camera that turns shows."""
+    mean_s, sigma_s = assumed.readout_s
+    if not np.isfinite(rates_rad_s).all():
+        # Of a rolling shutter by its data sheet, at a rate that is not known.
+        turn_rad = abs(mean_s) * _UNKNOWN_RATE_RAD_S
+        axes: Floats = np.broadcast_to(np.eye(3), (len(rates_rad_s), 3, 3))
+        labels = ('readout_x_rad', 'readout_y_rad', 'readout_z_rad')
+        readout = Unknown('readout', labels, np.full(3, turn_rad), np.zeros(3))
+        readout = dataclasses.replace(readout, turn=functools.partial(_by_readout, axes, height))
+        return [readout] if turn_rad else []
+    if not rates_rad_s.any():
+        return []
+    entries = []
+    rates = rates_rad_s[:, :, None]
+    if sigma_s > 0:
+        turn = functools.partial(_by_readout, rates, height)
+        value = np.array([-mean_s])
+        entries.append(Unknown('readout', ('readout_s',), np.array([sigma_s]), value, turn=turn))
+    if assumed.stamp_s > 0:
+        sigma = np.array([assumed.stamp_s])
+        entries.append(Unknown('stamps', ('stamp_offset_s',), sigma, np.zeros(1), tracker=rates))
+    return entries
+
+
+def _by_velocity(
+    camera_from_icrf: Floats, pixels: Floats, directions: Floats, image: Indices
+) -> Floats:
+    """
+    Small rotations (3, 3, n) of stars by the velocity of the observer, per m/s.
+
+    Stars move towards it: ``d e = (v - e (e . v)) / c`` (aberration to first order), which the
+    passive rotation ``d e x e = v x e / c`` gives.
+    """
+    del pixels
+    axes = camera_from_icrf[image].transpose(1, 2, 0)  # columns: ICRF axes in the camera frame
+    e = directions[:, None, :]
+    return np.asarray(np.cross(axes, e, axisa=0, axisb=0, axisc=0) / SPEED_OF_LIGHT_M_S)
+
+
+def _by_readout(
+    turns: Floats, height: int, pixels: Floats, directions: Floats, image: Indices
+) -> Floats:
+    """Small rotations (3, q, n) of stars by turns (m, 3, q) from the first to the last row."""
+    del directions
+    late = (pixels[1] + 0.5) / height - 0.5
+    return np.asarray(turns[image].transpose(1, 2, 0) * late)
+
+
+def _field(width: int, height: int) -> Unknown:
+    """
+    Return the entry of the field over the detector: coefficients of cosines.
+
+    An amplitude of 1 px of an octave is its RMS over the detector along each axis.
+    """
+    terms, octave = cosine_terms(width, height, FIELD_OCTAVES)
+
+    def functions(pixels: Floats) -> Floats:
+        return basis(pixels.T, width, height, FIELD_OCTAVES, 'cosine').T
+
+    labels = tuple(f'field_{i}_{j}_{axis}_px' for axis in 'uv' for i, j in terms)
+    sigma = 1.0 / np.sqrt(np.bincount(octave)[octave])
+    sigma = np.concatenate([sigma, sigma])
+    octave = np.concatenate([octave, octave])
+    value = np.zeros(len(labels))
+    return Unknown('field', labels, sigma, value, functions=functions, octave=octave)

@@ -1,0 +1,345 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+MCAP bags to records, without ROS.
+
+One chunk of the file is in memory at a time.  Intact chunks of a damaged bag are still read; the
+place of the damage and the lost messages are reported once, to ``on_damage``.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+import functools
+import logging
+from pathlib import Path
+import re
+
+from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.formats.bag.mcap_reader import (
+    Damage,
+    MAGIC,
+    RawMessage,
+    read_messages,
+    read_summary,
+)
+from starcal_ros.formats.bag.typestore import typestore_of
+from starcal_ros.formats.messages.image_messages import image_from_message, refused_from_message
+from starcal_ros.formats.messages.message_fields import nearest_stamp_ns
+from starcal_ros.formats.messages.observation_messages import checked_observations
+from starcal_ros.formats.messages.types import Message
+from starcal_ros.records import Image, refused_image, StarObservations
+from starcal_ros.text import printable
+from starcal_ros.untrusted import METADATA_BYTES, read_text, yaml_value
+
+_SQLITE, _ROS_1 = b'SQLite format 3', b'#ROSBAG V'  # how bags of other kinds begin
+_MAGIC_BYTES = 16
+_IMAGE_SUFFIXES = frozenset(['.fits', '.fit', '.fts', '.tif', '.tiff', '.png'])
+_LONGEST_NAME = 4096  # of a path on Linux
+
+
+@functools.lru_cache(maxsize=256)
+def log_damage(text: str) -> None:
+    """Log damage of a bag as a warning of the logger ``starcal``, each text once."""
+    logging.getLogger('starcal').warning('%s', printable(text))
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Topic of a bag with its message count; ``type_name`` is ``'pkg/msg/Name'``."""
+
+    name: str
+    type_name: str
+    count: int
+
+
+@dataclass(frozen=True)
+class Topics:
+    """
+    Topic of each kind of message that is read; empty: not requested, or not in the bag.
+
+    ``more_attitudes`` are those of the further star trackers, in the order of the setup; empty
+    where the bag has none of one.
+    """
+
+    image: str = ''
+    attitude: str = ''
+    velocity: str = ''
+    temperature: str = ''
+    observations: str = ''
+    more_attitudes: tuple[str, ...] = ()
+
+    @property
+    def telemetry(self) -> tuple[str, ...]:
+        """Topics of attitudes, velocity and temperature."""
+        single = (self.attitude, self.velocity, self.temperature)
+        return tuple(filter(None, (*single, *self.more_attitudes)))
+
+
+def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
+    """
+    MCAP files of bags, in recording order.
+
+    Raises BagError if a path is neither an .mcap file nor a folder that holds some.
+    """
+    files = []
+    for path in map(Path, paths):
+        if path.is_dir():
+            files += _files_of_folder(path)
+        elif path.exists():  # opening a pipe would wait for whoever writes to it
+            if not path.is_file():
+                raise BagError(f'{path}: not a regular file')
+            files.append(path)
+        else:
+            raise BagError(f'{path}: no such bag')
+    for file in files:
+        try:
+            with file.open('rb') as stream:
+                magic = stream.read(_MAGIC_BYTES)
+        except OSError as error:
+            raise BagError(f'{file}: cannot be read: {error.strerror}') from error
+        if not magic.startswith(MAGIC):
+            other = _how_to_convert(file, magic) or _how_to_import(file.parent, file)
+            raise BagError(f'{file}: not an MCAP bag{other}')
+    return files
+
+
+def files_of_bags(paths: Iterable[Path | str]) -> tuple[Path, ...]:
+    """
+    The files that bags are read from, ``metadata.yaml`` of a folder included.
+
+    Raises BagError if a path is neither an .mcap file nor a folder that holds some.
+    """
+    bags = [Path(path) for path in paths]
+    return (*mcap_files(bags), *(bag / 'metadata.yaml' for bag in bags if bag.is_dir()))
+
+
+def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple[Topic, ...]:
+    """
+    Topics with messages, by name.
+
+    The summaries of the files list them; a file without one is read completely.
+    """
+    types: dict[str, str] = {}
+    counts: Counter[str] = Counter()
+    for file in mcap_files(paths):
+        status = file.stat()
+        listed, damage = _listed(file, status.st_size, status.st_mtime_ns)
+        for text in damage:
+            on_damage(text)
+        for topic in listed:
+            types[topic.name] = topic.type_name
+            counts[topic.name] += topic.count
+    return tuple(Topic(name, types[name], counts[name]) for name in sorted(counts))
+
+
+@functools.lru_cache(maxsize=64)
+def _listed(file: Path, size: int, modified_ns: int) -> tuple[list[Topic], list[str]]:
+    """Topics of a file and its damage; kept, as a file without summary is read for them."""
+    damage: list[str] = []
+    return _summary(file) or _counted(file, damage.append), damage
+
+
+def _summary(file: Path) -> list[Topic]:
+    """Topics in the summary of a file; none if it is damaged or has no counts."""
+    summary = read_summary(file)
+    if summary is None or summary.statistics is None:
+        return []
+    found = []
+    for number, count in summary.statistics.channel_message_counts.items():
+        channel = summary.channels.get(number)
+        schema = summary.schemas.get(channel.schema_id) if channel else None
+        # Without a schema a message has no type: it is not of ROS 2.
+        if count and channel and schema and channel.message_encoding == 'cdr':
+            found.append(Topic(channel.topic, schema.name, count))
+    return found
+
+
+def _counted(file: Path, on_damage: Damage) -> list[Topic]:
+    counts = Counter((raw.topic, raw.type_name) for raw in read_messages(file, None, on_damage))
+    return [Topic(name, type_name, count) for (name, type_name), count in counts.items()]
+
+
+def choose_topic(paths: Iterable[Path | str], type_name: str, asked: str = '') -> str:
+    """
+    The requested topic, or the only one of a type.
+
+    Raises BagError with the list of the topics of the type.
+    """
+    paths = list(paths)
+    where = ', '.join(map(str, paths))
+    there = topics(paths)
+    fitting = [topic.name for topic in there if topic.type_name == type_name]
+    listed = ', '.join(fitting) or 'none'
+    if asked:
+        # Bags hold resolved names; the leading slash may be omitted in the request.
+        for name in fitting:
+            if name.lstrip('/') == asked.lstrip('/'):
+                return name
+        raise BagError(f'{where}: no topic {asked} of type {type_name} (available: {listed})')
+    if len(fitting) == 1:
+        return fitting[0]
+    if not fitting:
+        listed = ', '.join(topic.name for topic in there) or 'none'
+        raise BagError(f'{where}: no topic of type {type_name} (topics: {listed})')
+    raise BagError(f'{where}: several topics of type {type_name}, choose one: {listed}')
+
+
+def read_raw(
+    paths: Iterable[Path | str], only: Iterable[str] | None = None, on_damage: Damage = log_damage
+) -> Iterator[RawMessage]:
+    """Serialised messages of the given topics (None: all), in file order."""
+    wanted = None if only is None else frozenset(only)
+    for file in mcap_files(paths):
+        yield from read_messages(file, wanted, on_damage)
+
+
+def read_images(
+    paths: Iterable[Path | str],
+    topic: str,
+    stamp_offset_s: float = 0.0,
+    on_damage: Damage = log_damage,
+    size: tuple[int, int] | None = None,
+    channel: str = '',
+) -> Iterator[Image | StarObservations]:
+    """
+    Images of a topic; an image that cannot be decoded becomes refused observations.
+
+    So does a compressed image of another ``size`` (width, height), where one is given.
+    ``channel`` is the colour that is taken of colour images (`image_from_message`).
+    """
+    for raw in read_raw(paths, [topic], on_damage):
+        yield image_of(raw, stamp_offset_s, size, channel)
+
+
+def image_of(
+    raw: RawMessage,
+    stamp_offset_s: float = 0.0,
+    size: tuple[int, int] | None = None,
+    channel: str = '',
+) -> Image | StarObservations:
+    """
+    Image of a message; refused observations if it cannot be decoded.
+
+    So is a compressed image of another ``size`` (width, height), where one is given.
+    ``channel`` is the colour that is taken of colour images (`image_from_message`).
+    """
+    try:
+        message = decode(raw)
+    except BagError as error:
+        log_time_ns = nearest_stamp_ns(raw.log_time_ns)
+        return refused_image(log_time_ns, 0, 0, 'bad_layout', str(error))
+    try:
+        return image_from_message(message, stamp_offset_s, size, channel)
+    except ImageRefused as refused:
+        return refused_from_message(message, stamp_offset_s, refused)
+
+
+def read_observations(
+    paths: Iterable[Path | str], topic: str, on_damage: Damage = log_damage
+) -> Iterator[StarObservations]:
+    """
+    Recorded observations of a topic; an image with impossible values becomes a refused one.
+
+    Raises BagError if this version cannot convert a message to observations.
+    """
+    for raw in read_raw(paths, [topic], on_damage):
+        try:
+            message = decode(raw)
+            yield checked_observations(message)
+        except (AttributeError, ValueError) as error:
+            raise BagError(f'{topic}: not readable as observations: {error}') from error
+
+
+def decode(raw: RawMessage) -> Message:
+    """
+    Decoded message: by the definition in the bag, else by the one of ROS 2.
+
+    Raises BagError if the bytes are not a message of the type.
+    """
+    try:
+        store = typestore_of(raw.type_name, raw.definition)
+        return store.deserialize_cdr(raw.view, raw.type_name)
+    # The exceptions of wrong bytes depend on the field and have no common base class.
+    except Exception as error:
+        raise BagError(
+            f'{raw.topic}: cannot decode {len(raw.view)} bytes as {raw.type_name}'
+        ) from error
+
+
+def _files_of_folder(folder: Path) -> list[Path]:
+    """MCAP files of a bag folder: those listed in metadata.yaml, else all in the folder."""
+    names, compression = _metadata(folder / 'metadata.yaml')
+    if compression:
+        raise BagError(
+            f'{folder}: compressed by {compression.lower()}; decompress it with ros2 bag convert'
+        )
+    listed = [folder / name for name in names if (folder / name).is_file()]
+    here = (path for path in folder.glob('*.mcap') if path.is_file())
+    found = listed or sorted(here, key=_natural)
+    if not found:
+        other = _how_to_convert(folder, _SQLITE) if any(folder.glob('*.db3')) else ''
+        inside = next(folder.glob('*/*.mcap'), None)
+        near = f' (did you mean {inside.parent}?)' if inside and not other else ''
+        other = other or near or _how_to_import(folder)
+        raise BagError(f'{folder}: no .mcap files in the folder{other}')
+    missing = [name for name in names if not (folder / name).is_file()]
+    if missing and listed:
+        raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing')
+    return found
+
+
+def _metadata(path: Path) -> tuple[list[str], str]:
+    """Names of the files of a bag and its compression, both empty without valid metadata."""
+    try:
+        metadata = yaml_value(read_text(path, METADATA_BYTES))
+        information = metadata['rosbag2_bagfile_information']
+        names = information['relative_file_paths']
+        compression = information.get('compression_mode')
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return [], ''  # a recorder that was killed leaves no valid metadata
+    if not isinstance(names, list) or not all(map(_is_inside, names)):
+        names = []
+    known = isinstance(compression, str) and re.fullmatch(r'\w{1,20}', compression)
+    return names, compression if known and compression.lower() != 'none' else ''
+
+
+def _is_inside(name: object) -> bool:
+    """True if a value of metadata.yaml names a file below the folder of its bag."""
+    if not isinstance(name, str) or len(name) > _LONGEST_NAME:
+        return False
+    return not Path(name).is_absolute() and '..' not in Path(name).parts
+
+
+def _how_to_convert(path: Path, magic: bytes) -> str:
+    """End of an error message: the command that converts a bag of another kind to MCAP."""
+    if magic.startswith(_SQLITE):
+        # rosbags converts the folder with its metadata.yaml, not the file in it.
+        kind, source = 'an SQLite bag', path.parent if path.suffix == '.db3' else path
+    elif magic.startswith(_ROS_1):
+        kind, source = 'a ROS 1 bag', path
+    else:
+        return ''
+    destination = source.with_name(f'{source.stem}_mcap')
+    return (
+        f' but {kind}: rosbags-convert --src {source} --dst {destination} --dst-storage mcap'
+        ' makes one'
+    )
+
+
+def _how_to_import(folder: Path, file: Path | None = None) -> str:
+    """End of an error message: the command that makes a bag of image files, if there are some."""
+    files = sorted(folder.iterdir()) if file is None else [file]
+    found = next((one.suffix for one in files if one.suffix.lower() in _IMAGE_SUFFIXES), '')
+    if not found:
+        return ''
+    return (
+        f' but {found.lstrip(".").upper()} images: starcal import --images'
+        f" '{folder / '*'}{found}' --attitude FILE -o BAG makes one"
+    )
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    # rosbag2 numbers files without leading zeros: bag_10 follows bag_9.
+    return [(int(part) if part.isdigit() else -1, part) for part in re.split(r'(\d+)', path.name)]

@@ -1,0 +1,311 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Records to MCAP bags, without ROS; equal records give equal bytes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+import contextlib
+from dataclasses import dataclass
+import io
+import json
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any, IO, NamedTuple, TYPE_CHECKING
+
+from mcap.writer import CompressionType, Writer
+import yaml
+
+from starcal_ros.arrays import Floats
+from starcal_ros.errors import BagError
+from starcal_ros.files import replacing
+from starcal_ros.formats.bag.typestore import described, make_message, typestore
+from starcal_ros.formats.messages import telemetry, types
+from starcal_ros.formats.messages.calibration_messages import calibration_to_message
+from starcal_ros.formats.messages.image_messages import image_to_message
+from starcal_ros.formats.messages.observation_messages import observations_to_message
+from starcal_ros.records import Calibration, Image, StarObservations
+from starcal_ros.untrusted import PRODUCT_BYTES, read_text
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+_OF_BAGS = ('metadata.yaml', '*.mcap', '*.db3')
+_CHUNK_BYTES = 4 << 20  # an image or two: lost in a crash, and held in memory by a reader
+
+
+class _Channel(NamedTuple):
+    number: int
+    type_name: str
+    latched: bool
+
+
+class BagWriter:
+    """
+    Writes records to a bag folder, or to a single file if the path ends in ``.mcap``.
+
+    Use it in a ``with`` statement: its end replaces the file whole.  After an exception in the
+    block the file that was there before is unchanged.  A folder gets a ``metadata.yaml``, a single
+    file none: the one beside it may belong to another bag.
+
+    Parameters
+    ----------
+    path : Path or str
+        The folder is created if missing.
+    compression : {'zstd', 'lz4', ''}
+    """
+
+    def __init__(self, path: Path | str, compression: str = 'zstd') -> None:
+        path = Path(path)
+        is_file = path.suffix == '.mcap'
+        self.file = path if is_file else path / f'{path.name}_0.mcap'
+        self._metadata_file = None if is_file else path / 'metadata.yaml'
+        self._compression = CompressionType[(compression or 'none').upper()]
+        self._channels: dict[str, _Channel] = {}
+        self._counts: Counter[str] = Counter()
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._replacing: contextlib.AbstractContextManager[IO[bytes]] | None = None
+        self._writer: Any = None
+
+    def __enter__(self) -> Self:
+        """Open a file beside the place of the bag."""
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            self._replacing = replacing(self.file)
+            stream = self._replacing.__enter__()
+        except OSError as error:
+            raise BagError(f'{self.file}: cannot be written: {error.strerror}') from error
+        self._start(stream)
+        return self
+
+    def _start(self, stream: IO[bytes]) -> None:
+        self._writer = Writer(stream, _CHUNK_BYTES, self._compression)
+        self._writer.start('ros2', library='starcal')
+
+    @classmethod
+    def one_observation(cls, topic: str, record: StarObservations, frame_id: str) -> bytes:
+        """Bytes of a complete bag with a single starcal/StarObservations."""
+        stream = io.BytesIO()
+        writer = cls('one.mcap')
+        writer._start(stream)
+        writer.write_observations(topic, record, frame_id)
+        writer._writer.finish()
+        return stream.getvalue()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Complete the bag and put it in its place; drop it after an exception."""
+        assert self._replacing is not None  # __enter__ has set it
+        if kind is not None:
+            self._replacing.__exit__(kind, error, traceback)
+            return
+        try:
+            with contextlib.ExitStack() as stack:
+                stack.push(self._replacing)
+                self._writer.finish()
+            if self._metadata_file is not None:
+                with replacing(self._metadata_file) as file:
+                    file.write(self._metadata().encode())
+        except OSError as failure:
+            raise BagError(f'{self.file}: cannot be written: {failure.strerror}') from failure
+
+    def write_image(self, topic: str, image: Image, frame_id: str) -> None:
+        """Write a sensor_msgs/Image."""
+        message = image_to_message(image, frame_id, make_message)
+        self._write(topic, types.IMAGE_TYPE, image.time_ns, message)
+
+    def write_attitude(self, topic: str, time_ns: int, xyzw: Floats, frame_id: str) -> None:
+        """Write a geometry_msgs/QuaternionStamped in the inertial frame ``frame_id``."""
+        message = telemetry.attitude_to_message(time_ns, xyzw, frame_id, make_message)
+        self._write(topic, types.ATTITUDE_TYPE, time_ns, message)
+
+    def write_velocity(
+        self, topic: str, time_ns: int, velocity_m_s: Floats, frame_id: str
+    ) -> None:
+        """Write a geometry_msgs/TwistStamped."""
+        message = telemetry.velocity_to_message(time_ns, velocity_m_s, frame_id, make_message)
+        self._write(topic, types.VELOCITY_TYPE, time_ns, message)
+
+    def write_temperature(
+        self, topic: str, time_ns: int, temperature_degc: float, frame_id: str
+    ) -> None:
+        """Write a sensor_msgs/Temperature."""
+        message = telemetry.temperature_to_message(
+            time_ns, temperature_degc, frame_id, make_message
+        )
+        self._write(topic, types.TEMPERATURE_TYPE, time_ns, message)
+
+    def write_observations(self, topic: str, record: StarObservations, frame_id: str) -> None:
+        """Write a starcal/StarObservations."""
+        message = observations_to_message(record, frame_id, make_message)
+        self._write(topic, types.OBSERVATIONS_TYPE, record.time_ns, message)
+
+    def write_calibration(self, topic: str, calibration: Calibration) -> None:
+        """Write a starcal/Calibration."""
+        message = calibration_to_message(calibration, make_message)
+        self._write(topic, types.CALIBRATION_TYPE, calibration.time_ns, message, latched=True)
+
+    def _write(
+        self, topic: str, type_name: str, time_ns: int, message: object, latched: bool = False
+    ) -> None:
+        channel = self._channels.get(topic) or self._open(topic, type_name, latched)
+        if channel.type_name != type_name:
+            raise ValueError(f'topic: {topic} holds {channel.type_name}, not {type_name}')
+        try:
+            data = bytes(typestore().serialize_cdr(message, type_name))
+        # The exceptions of a value that its field cannot hold have no common base class.
+        except Exception as error:
+            raise BagError(f'{topic}: a {type_name} cannot be written: {error}') from error
+        # A recording time is not negative; the stamp in the message is written as it is.
+        time_ns = max(time_ns, 0)
+        try:
+            self._writer.add_message(
+                channel.number, time_ns, data, publish_time=time_ns, sequence=self._counts[topic]
+            )
+        except OSError as error:
+            raise BagError(f'{self.file}: cannot be written: {error.strerror}') from error
+        self._counts[topic] += 1
+        self._first_ns = time_ns if self._first_ns is None else min(self._first_ns, time_ns)
+        self._last_ns = max(self._last_ns, time_ns)
+
+    def _open(self, topic: str, type_name: str, latched: bool) -> _Channel:
+        definition, type_hash = described(type_name)
+        schema_id = self._writer.register_schema(type_name, 'ros2msg', definition.encode())
+        metadata = {
+            'offered_qos_profiles': yaml.safe_dump([qos_profile(latched)], sort_keys=False),
+            'topic_type_hash': type_hash,
+        }
+        number = self._writer.register_channel(topic, 'cdr', schema_id, metadata)
+        self._channels[topic] = _Channel(number, type_name, latched)
+        return self._channels[topic]
+
+    def _metadata(self) -> str:
+        messages = sum(self._counts.values())
+        file = FileSpan(self.file.name, self._first_ns or 0, self._last_ns, messages)
+        return metadata_text(
+            [file],
+            [
+                TopicSummary(topic, channel.type_name, channel.latched, self._counts[topic])
+                for topic, channel in self._channels.items()
+            ],
+        )
+
+
+def check_replaceable(
+    bag: Path, record: Path, others: Iterable[Path], mark: str, kind: str
+) -> None:
+    """
+    Check that a bag and the files beside it replace nothing but an earlier bag of their kind.
+
+    Raises BagError naming a file of another origin.
+
+    Parameters
+    ----------
+    record : Path
+        JSON object beside the bag; ``bag`` in it names the file of the bag.
+    others : iterable of Path
+        Further files to write.
+    mark : str
+        Key that only records of this kind have.
+    kind : str
+        Description for the error message, as 'a simulated bag'.
+    """
+    file = BagWriter(bag).file
+    there = [path for path in (file, record, *others) if os.path.lexists(path)]
+    if bag != file:
+        there += [path for end in _OF_BAGS for path in bag.glob(end)]
+    if there and not _is_record_of(file.name, record, mark):
+        raise BagError(f'{there[0]}: is not of {kind} and would be replaced; choose another place')
+
+
+def _is_record_of(bag_name: str, record: Path, mark: str) -> bool:
+    try:
+        content = json.loads(read_text(record, PRODUCT_BYTES))
+        return bool(content['bag'] == bag_name and content[mark])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
+
+
+@dataclass(frozen=True)
+class FileSpan:
+    """A file of a bag: name, stamps of its first and last message, number of messages."""
+
+    name: str
+    first_ns: int
+    last_ns: int
+    messages: int
+
+
+@dataclass(frozen=True)
+class TopicSummary:
+    """A topic of a bag; ``latched``: offered as transient local."""
+
+    name: str
+    type_name: str
+    latched: bool
+    messages: int
+
+
+def metadata_text(files: Sequence[FileSpan], topics: Sequence[TopicSummary]) -> str:
+    """Return the content of the metadata.yaml of at least one file."""
+    first_ns, last_ns = min(file.first_ns for file in files), max(file.last_ns for file in files)
+    whole = FileSpan('', first_ns, last_ns, sum(file.messages for file in files))
+    topic_list = [
+        {
+            'topic_metadata': {
+                'name': topic.name,
+                'type': topic.type_name,
+                'serialization_format': 'cdr',
+                'offered_qos_profiles': [qos_profile(topic.latched)],
+                'type_description_hash': typestore().hash_rihs01(topic.type_name),
+            },
+            'message_count': topic.messages,
+        }
+        for topic in topics
+    ]
+    information = {
+        'version': 9,
+        'storage_identifier': 'mcap',
+        'relative_file_paths': [file.name for file in files],
+        **_span(whole),
+        'topics_with_message_count': topic_list,
+        'compression_format': '',
+        'compression_mode': '',
+        'files': [{'path': file.name, **_span(file)} for file in files],
+        'custom_data': None,
+        'ros_distro': 'jazzy',
+    }
+    return yaml.safe_dump({'rosbag2_bagfile_information': information}, sort_keys=True)
+
+
+def _span(file: FileSpan) -> dict[str, object]:
+    return {
+        'starting_time': {'nanoseconds_since_epoch': file.first_ns},
+        'duration': {'nanoseconds': max(file.last_ns - file.first_ns, 0)},
+        'message_count': file.messages,
+    }
+
+
+def qos_profile(latched: bool) -> dict[str, object]:
+    """Return the QoS in the notation of rosbag2: reliable, and transient local if latched."""
+
+    def forever() -> dict[str, int]:
+        return {'sec': 9223372036, 'nsec': 854775807}
+
+    return {
+        'history': 'keep_last',
+        'depth': 1 if latched else 10,
+        'reliability': 'reliable',
+        'durability': 'transient_local' if latched else 'volatile',
+        'deadline': forever(),
+        'lifespan': forever(),
+        'liveliness': 'automatic',
+        'liveliness_lease_duration': forever(),
+        'avoid_ros_namespace_conventions': False,
+    }

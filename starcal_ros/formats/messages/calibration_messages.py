@@ -1,0 +1,176 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Calibration and ensemble status to messages and back; standard messages for a camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel
+from starcal_ros.camera.conversion import ros_fit
+from starcal_ros.camera.lens import ros_distortion
+from starcal_ros.formats.messages.message_codec import (
+    message_fields,
+    plain_message,
+    record_from_message,
+    record_to_message,
+)
+from starcal_ros.formats.messages.message_fields import (
+    make_header,
+    quaternion_to_message,
+    vector_to_message,
+)
+from starcal_ros.formats.messages.types import (
+    ALIGNMENT_TYPE,
+    CALIBRATION_TYPE,
+    CAMERA_INFO_TYPE,
+    Make,
+    Message,
+    STATUS_TYPE,
+)
+from starcal_ros.record_codec import plain_record, read_record
+from starcal_ros.record_fields import Named, Quaternion
+from starcal_ros.records import (
+    ALIGNMENT_NAMES,
+    Calibration,
+    CameraGeometry,
+    check_calibration,
+    EnsembleStatus,
+)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The message of the alignment."""
+
+    parent_frame: str
+    child_frame: str
+    star_tracker_from_camera_xyzw: Annotated[Quaternion, Named('rotation')]
+
+
+def calibration_to_message(calibration: Calibration, make: Make) -> Message:
+    """Return a starcal/Calibration with every number of the record."""
+    values = plain_record(calibration)
+    geometry = values.pop('geometry')
+    frames = values.pop('parent_frame'), values.pop('child_frame')
+    camera = calibration.geometry.camera
+    del geometry['camera']['field']  # the calibration holds it with its covariance
+    return make(
+        CALIBRATION_TYPE,
+        **message_fields(Calibration, values, make, calibration.child_frame),
+        camera=make(
+            'starcal/msg/CameraModel',
+            parameter_names=list(camera.parameter_names),
+            **message_fields(CameraModel, geometry['camera'], make),
+        ),
+        alignment=record_to_message(
+            Alignment(*frames, geometry['star_tracker_from_camera_xyzw']), make
+        ),
+        parameter_names=list(calibration.parameter_names),
+    )
+
+
+def calibration_from_message(message: Message) -> Calibration:
+    """
+    Calibration of a starcal/Calibration.
+
+    Raises ValueError when the message does not hold a camera (an empty one does not), or its
+    fields do not fit each other.
+    """
+    camera = record_from_message(CameraModel, message.camera, 'camera')
+    for field, found, expected in (
+        ('camera.parameter_names', message.camera.parameter_names, camera.parameter_names),
+        ('parameter_names', message.parameter_names, camera.parameter_names + ALIGNMENT_NAMES),
+    ):
+        if tuple(found) != expected:
+            raise ValueError(f'{field}: {", ".join(found) or "none"}, not {", ".join(expected)}')
+    alignment = record_from_message(Alignment, message.alignment, 'alignment')
+    nested = {
+        'geometry': CameraGeometry(camera, alignment.star_tracker_from_camera_xyzw),
+        'parent_frame': alignment.parent_frame,
+        'child_frame': alignment.child_frame,
+    }
+    values = plain_message(Calibration, message)
+    calibration = read_record(Calibration, {**values, **nested})
+    check_calibration(calibration)
+    return calibration
+
+
+def camera_info_to_message(calibration: Calibration, make: Make) -> Message:
+    """
+    Return a sensor_msgs/CameraInfo: the best camera without skew.
+
+    CameraInfo cannot carry skew: its readers ignore K[0,1].
+    """
+    camera, _ = ros_fit(calibration.geometry.camera)
+    fx, _, fy, cx, cy = camera.intrinsics
+    distortion_model, D = ros_distortion(camera.model, camera.distortion)
+    return make(
+        CAMERA_INFO_TYPE,
+        header=make_header(calibration.time_ns, calibration.child_frame, make),
+        height=camera.height,
+        width=camera.width,
+        distortion_model=distortion_model,
+        d=D,
+        k=np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        r=np.eye(3).ravel(),
+        p=np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        binning_x=0,
+        binning_y=0,
+        roi=make(
+            'sensor_msgs/msg/RegionOfInterest',
+            x_offset=0,
+            y_offset=0,
+            height=0,
+            width=0,
+            do_rectify=False,
+        ),
+    )
+
+
+def mountings_to_messages(calibration: Calibration, make: Make) -> list[Message]:
+    """geometry_msgs/TransformStamped of each further star tracker in the frame of the first."""
+    return [
+        _in_star_tracker(calibration, one.frame, one.first_from_star_tracker_xyzw, make)
+        for one in calibration.star_trackers[1:]
+    ]
+
+
+def alignment_to_message(calibration: Calibration, make: Make) -> Message:
+    """Return a geometry_msgs/TransformStamped: the camera frame in the star tracker frame."""
+    rotation_xyzw = calibration.geometry.star_tracker_from_camera_xyzw
+    return _in_star_tracker(calibration, calibration.child_frame, rotation_xyzw, make)
+
+
+def _in_star_tracker(
+    calibration: Calibration, frame: str, rotation_xyzw: Floats, make: Make
+) -> Message:
+    """A frame of that orientation in the frame of the (first) star tracker."""
+    return make(
+        ALIGNMENT_TYPE,
+        header=make_header(calibration.time_ns, calibration.parent_frame, make),
+        child_frame_id=frame,
+        transform=make(
+            'geometry_msgs/msg/Transform',
+            translation=vector_to_message(np.zeros(3), make),
+            rotation=quaternion_to_message(rotation_xyzw, make),
+        ),
+    )
+
+
+def status_to_message(status: EnsembleStatus, frame_id: str, make: Make) -> Message:
+    """Return a starcal/EnsembleStatus; ``frame_id`` is the camera's."""
+    values = plain_record(status)
+    return make(STATUS_TYPE, **message_fields(EnsembleStatus, values, make, frame_id))
+
+
+def status_from_message(message: Message) -> EnsembleStatus:
+    """
+    Status of a starcal/EnsembleStatus.
+
+    Raises ValueError when the arrays of the message do not fit each other.
+    """
+    return record_from_message(EnsembleStatus, message)

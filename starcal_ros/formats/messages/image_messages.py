@@ -1,0 +1,250 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Images from messages of each supported encoding, one colour of each, and to messages."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_ros.camera import MAX_SIDE_PX
+from starcal_ros.errors import ImageRefused
+from starcal_ros.formats.images.file_header import has_surplus, png_header, PNG_HEADER_BYTES
+from starcal_ros.formats.messages.message_fields import (
+    make_header,
+    nearest_stamp_ns,
+    offset_ns,
+    stamp_ns,
+)
+from starcal_ros.formats.messages.types import IMAGE_TYPE, Make, Message
+from starcal_ros.records import Image, refused_image, StarObservations
+
+_MOST_PIXELS = 2**27  # of a camera that is not known: 256 MB of 16 bit
+_JPEG = b'\xff\xd8'  # how its files begin
+_PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
+CHANNELS = ('red', 'green', 'blue')
+
+# Encodings of sensor_msgs/image_encodings: the letters of their channels, and bytes per channel.
+RGB_ENCODINGS = {
+    f'{letters}{bits}': (letters, bits // 8)
+    for letters in ('rgb', 'bgr', 'rgba', 'bgra')
+    for bits in (8, 16)
+}
+BAYER_ENCODINGS = {
+    f'bayer_{letters}{bits}': (letters, bits // 8)
+    for letters in ('rggb', 'bggr', 'gbrg', 'grbg')
+    for bits in (8, 16)
+}
+
+
+def decode_image(
+    encoding: str,
+    width: int,
+    height: int,
+    step: int,
+    is_bigendian: bool,
+    data: Any,
+    time_ns: int,
+    channel: str = '',
+) -> Image:
+    """
+    Pixels of an image message in native byte order, without its row padding.
+
+    No copy where the message holds them so already.  Of a mosaic, the image of a colour has half
+    the width and height (`of_mosaic`).
+
+    Raises ImageRefused ``bad_encoding`` or ``bad_layout``.
+
+    Parameters
+    ----------
+    encoding, width, height, step, is_bigendian, data
+        As in sensor_msgs/Image; ``data`` is anything with a buffer of bytes.
+    time_ns : int
+        Middle of the exposure.
+    channel : str
+        Channel to read from a colour image, red, green or blue; empty refuses colour images.
+    """
+    is_colour = encoding in RGB_ENCODINGS or encoding in BAYER_ENCODINGS
+    if is_colour and not channel:
+        raise ImageRefused(
+            'bad_encoding', f'{encoding} is a colour image: set image_channel, e.g. to green'
+        )
+    letters, pixel_bytes = RGB_ENCODINGS.get(encoding, ('', 0))
+    if not letters:
+        pixel_bytes = _PIXEL_BYTES.get(encoding) or BAYER_ENCODINGS.get(encoding, ('', 0))[1]
+    if not pixel_bytes:
+        raise ImageRefused(
+            'bad_encoding', f'{encoding[:40]!r} is not one of {", ".join(_PIXEL_BYTES)}'
+        )
+    channels = max(len(letters), 1)
+    # An empty buffer has no shape that frombuffer would take.
+    flat = np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
+    row_bytes = width * pixel_bytes * channels
+    if width < 1 or height < 1:
+        raise ImageRefused('bad_layout', f'{width} x {height} is not an image')
+    if step < row_bytes:
+        raise ImageRefused('bad_layout', f'step {step} is less than a row of {row_bytes} bytes')
+    if flat.size != step * height:
+        raise ImageRefused(
+            'bad_layout', f'{flat.size} bytes of data, not {step * height} for {height} rows'
+        )
+    dtype = np.dtype(np.uint8 if pixel_bytes == 1 else '>u2' if is_bigendian else '<u2')
+    # Strides rather than a slice: a step need not be a whole number of 16-bit pixels.
+    rows: NDArray[Any] = np.ndarray(
+        (height, width, channels),
+        dtype,
+        buffer=flat,
+        strides=(step, pixel_bytes * channels, pixel_bytes),
+    )
+    rows = plane(rows, letters, channel) if letters else rows[:, :, 0]
+    if encoding in BAYER_ENCODINGS:
+        rows = of_mosaic(rows, BAYER_ENCODINGS[encoding][0], channel)
+    pixels: NDArray[Any] = np.ascontiguousarray(rows, dtype.newbyteorder('='))
+    pixels.setflags(write=False)
+    return Image(time_ns, pixels)
+
+
+def decode_png(data: Any, time_ns: int, size: tuple[int, int] | None = None) -> Image:
+    """
+    Pixels of a PNG of one channel, 8 or 16 bit.
+
+    A PNG of a few kilobytes can claim gigabytes of pixels, so its header is checked first:
+    against ``size`` (width, height) where that is known, else against a limit for any camera.
+
+    Raises ImageRefused ``bad_encoding`` for another format; ``wrong_size``; ``bad_layout`` for a
+    PNG that cannot be decoded.
+    """
+    # A JPEG would decode too, but its compression changes stars of two pixels.
+    header = png_header(bytes(data[:PNG_HEADER_BYTES]))
+    if header is None:
+        kind = 'a JPEG' if bytes(data[:2]) == _JPEG else 'not a PNG'
+        raise ImageRefused('bad_encoding', f'the compressed image is {kind}; PNG is read')
+    found = (header.width, header.height)
+    if header.channels != 1:
+        raise ImageRefused('bad_encoding', f'the PNG has {header.channels} channels, not one')
+    if size is not None and found != size:
+        raise ImageRefused(
+            'wrong_size', 'image of {} x {}, prior camera of {} x {}'.format(*found, *size)
+        )
+    if min(found) < 1 or max(found) > MAX_SIDE_PX or math.prod(found) > _MOST_PIXELS:
+        raise ImageRefused('bad_layout', 'the PNG claims {} x {} px'.format(*found))
+    if has_surplus(bytes(data), header):
+        raise ImageRefused('bad_layout', 'the PNG inflates to far more than its pixels')
+    import cv2  # slow to import, and few bags have compressed images
+
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise ImageRefused('bad_layout', f'{len(data)} bytes of PNG cannot be decoded')
+    if pixels.shape != found[::-1] or pixels.dtype not in (np.uint8, np.uint16):
+        raise ImageRefused(
+            'bad_encoding', f'the PNG is {pixels.dtype} of shape {pixels.shape}, not one channel'
+        )
+    pixels.setflags(write=False)
+    return Image(time_ns, pixels)  # type: ignore[arg-type]
+
+
+def image_from_message(
+    message: Message,
+    stamp_offset_s: float = 0.0,
+    size: tuple[int, int] | None = None,
+    channel: str = '',
+) -> Image:
+    """
+    Image of a sensor_msgs/Image or CompressedImage, its time shifted to the middle of exposure.
+
+    ``size`` (width, height), where known, is that of the prior camera: a compressed image of
+    another is not decoded.  ``channel`` as for `decode_image`.
+
+    Raises ImageRefused ``bad_stamp``, ``bad_encoding``, ``bad_layout`` or ``wrong_size``.
+    """
+    time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
+    if time_ns != nearest_stamp_ns(time_ns):
+        raise ImageRefused('bad_stamp', f'{time_ns} ns is not within the range of ROS stamps')
+    if not hasattr(message, 'encoding'):
+        return decode_png(message.data, time_ns, size)
+    return decode_image(
+        message.encoding,
+        message.width,
+        message.height,
+        message.step,
+        bool(message.is_bigendian),
+        message.data,
+        time_ns,
+        channel,
+    )
+
+
+def refused_from_message(
+    message: Message, stamp_offset_s: float, refused: ImageRefused
+) -> StarObservations:
+    """Return the observations of an image message that cannot be used."""
+    time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
+    return refused_image(
+        nearest_stamp_ns(time_ns),
+        min(int(getattr(message, 'width', 0)), MAX_SIDE_PX),  # not in a compressed image
+        min(int(getattr(message, 'height', 0)), MAX_SIDE_PX),
+        refused.reason,
+        refused.detail,
+    )
+
+
+def image_to_message(image: Image, frame_id: str, make: Make) -> Message:
+    """Return a sensor_msgs/Image, mono8 or mono16 in the byte order of this machine."""
+    pixels = np.ascontiguousarray(image.pixels)
+    height, width = pixels.shape
+    return make(
+        IMAGE_TYPE,
+        header=make_header(image.time_ns, frame_id, make),
+        height=height,
+        width=width,
+        encoding='mono8' if pixels.itemsize == 1 else 'mono16',
+        is_bigendian=int(sys.byteorder == 'big'),
+        step=width * pixels.itemsize,
+        data=pixels.reshape(-1).view(np.uint8),
+    )
+
+
+def color_image_to_message(
+    time_ns: int, bgr: NDArray[np.uint8], frame_id: str, make: Make
+) -> Message:
+    """Return a sensor_msgs/Image bgr8 of a (height, width, 3) picture."""
+    height, width, _ = bgr.shape
+    return make(
+        IMAGE_TYPE,
+        header=make_header(time_ns, frame_id, make),
+        height=height,
+        width=width,
+        encoding='bgr8',
+        is_bigendian=0,
+        step=width * 3,
+        data=np.ascontiguousarray(bgr).reshape(-1),
+    )
+
+
+def plane(pixels: NDArray[Any], letters: str, channel: str) -> NDArray[Any]:
+    """Pixels (h, w) of a channel of an image (h, w, c) whose channels have these letters."""
+    return np.ascontiguousarray(pixels[:, :, letters.index(channel[0])])
+
+
+def of_mosaic(pixels: NDArray[Any], letters: str, channel: str) -> NDArray[Any]:
+    """
+    Pixels (h // 2, w // 2) of a colour in a Bayer mosaic (h, w).
+
+    Of green, those of the first of the two sites.  Pixel (u, v) is pixel (2 u + i, 2 v + j) of the
+    mosaic with (i, j) from `site`: the prior camera must be one of this image.
+    """
+    i, j = site(letters, channel)
+    height, width = pixels.shape
+    return np.ascontiguousarray(pixels[j : height // 2 * 2 : 2, i : width // 2 * 2 : 2])
+
+
+def site(letters: str, channel: str) -> tuple[int, int]:
+    """Column and row (i, j) of the first site of a colour in a Bayer pattern, ``rggb``."""
+    j, i = divmod(letters.index(channel[0]), 2)
+    return i, j

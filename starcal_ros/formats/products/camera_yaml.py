@@ -1,0 +1,198 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The ROS camera YAML, ``camera_info.yaml``, both ways, and the URLs that name one."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import re
+from typing import Annotated
+from urllib.parse import unquote
+
+import numpy as np
+import yaml
+
+from starcal_ros.camera import CameraModel, check_plausible
+from starcal_ros.camera.conversion import ros_fit
+from starcal_ros.camera.lens import from_ros_distortion, ros_distortion
+from starcal_ros.errors import ProductError
+from starcal_ros.formats.products.product_files import read_text, write_atomically
+from starcal_ros.record_codec import read_record
+from starcal_ros.record_fields import Finite, Shape
+from starcal_ros.untrusted import PARAMETER_BYTES, yaml_value
+
+CAMERA_INFO_FILE = 'camera_info.yaml'
+DEFAULT_CAMERA_NAME = 'camera'
+_IS_MRCAL = re.compile(r'["\']lensmodel["\']\s*:')
+_OF_MRCAL = (4, 5, 8, 12)  # coefficients of OpenCV's models
+
+
+@dataclass(frozen=True)
+class _Matrix:
+    data: Annotated[tuple[float, ...], Finite(), Shape((9,))]
+
+
+@dataclass(frozen=True)
+class _Coefficients:
+    data: Annotated[tuple[float, ...], Finite()]
+
+
+@dataclass(frozen=True)
+class _CameraInfo:
+    """The keys of a camera YAML that are read."""
+
+    image_width: int
+    image_height: int
+    camera_matrix: _Matrix
+    distortion_coefficients: _Coefficients
+    distortion_model: str = 'plumb_bob'
+
+    def camera(self) -> CameraModel:
+        """
+        Return the camera; K[0,1], where a file has one, is its skew.
+
+        Raises ValueError for a matrix, a distortion model or numbers that no camera has.
+        """
+        K = self.camera_matrix.data
+        fx, skew, cx, zero, fy, cy = K[:6]
+        if zero != 0.0 or K[6:] != (0.0, 0.0, 1.0):
+            raise ValueError(f'camera_matrix.data: {list(K)} is not [fx s cx 0 fy cy 0 0 1]')
+        data = list(self.distortion_coefficients.data)
+        try:
+            model, distortion = from_ros_distortion(self.distortion_model[:60], data)
+        except ValueError as error:
+            raise ValueError(f'distortion_model: {error}') from error
+        parameters = np.r_[fx, skew, fy, cx, cy, distortion]
+        camera = CameraModel(self.image_width, self.image_height, parameters, model)
+        check_plausible(camera)
+        return camera
+
+
+def write_camera_info(
+    camera: CameraModel, path: Path, camera_name: str = DEFAULT_CAMERA_NAME
+) -> None:
+    """
+    Write a ROS camera YAML as camera_info_manager reads it: the best camera without skew.
+
+    Readers of ``CameraInfo`` ignore K[0,1] without a word, so it is 0 and the other parameters
+    make up for it as well as they can (`ros_fit`).
+
+    Raises ProductError when the file cannot be written.
+    """
+    fitted, _ = ros_fit(camera)
+    fx, _, fy, cx, cy = fitted.intrinsics.tolist()
+    distortion_model, D = ros_distortion(fitted.model, fitted.distortion)
+    content = {
+        'image_width': fitted.width,
+        'image_height': fitted.height,
+        'camera_name': camera_name,
+        'camera_matrix': _matrix(3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        'distortion_model': distortion_model,
+        'distortion_coefficients': _matrix(1, len(D), D.tolist()),
+        'rectification_matrix': _matrix(3, 3, np.eye(3).ravel().tolist()),
+        'projection_matrix': _matrix(
+            3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+        ),
+    }
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
+    write_atomically(path, text)
+
+
+def _camera_of_mrcal(text: str) -> CameraModel:
+    """Return the camera of a .cameramodel of mrcal; its extrinsics are not read."""
+    content = ast.literal_eval(text[text.index('{') :])
+    name, values = str(content['lensmodel']), [float(x) for x in content['intrinsics']]
+    width, height = content['imagersize']
+    if name not in ('LENSMODEL_PINHOLE', *(f'LENSMODEL_OPENCV{n}' for n in _OF_MRCAL)):
+        raise ValueError(f'lensmodel: {name[:60]} is not LENSMODEL_PINHOLE or LENSMODEL_OPENCVn')
+    count = int(name.removeprefix('LENSMODEL_PINHOLE').removeprefix('LENSMODEL_OPENCV') or 0)
+    if len(values) != 4 + count:
+        raise ValueError(f'intrinsics: {len(values)} numbers, {name} has {4 + count}')
+    fx, fy, cx, cy = values[:4]
+    distortion_model = 'plumb_bob' if count <= 5 else 'rational_polynomial'
+    matrix = _Matrix((fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0))
+    padded = tuple(values[4:]) + (0.0,) * max(0, 5 - count)
+    return _CameraInfo(
+        int(width), int(height), matrix, _Coefficients(padded), distortion_model
+    ).camera()
+
+
+def read_camera_info(location: str | Path) -> CameraModel:
+    """
+    The camera in a ROS camera YAML; K[0,1], where a file has one, is its skew.
+
+    A ``.cameramodel`` of mrcal is read too: its lens, not its pose.
+    Raises ProductError naming the file and the key that is missing, wrong or not supported.
+
+    Parameters
+    ----------
+    location : str or Path
+        A path, or a ``file://`` or ``package://`` URL.
+    """
+    path = resolve_url(location) if isinstance(location, str) else location
+    text = read_text(path, PARAMETER_BYTES)
+    try:
+        if _IS_MRCAL.search(text):
+            return _camera_of_mrcal(text)
+        content = yaml_value(text)
+        if not isinstance(content, dict):
+            raise ValueError('not a camera YAML (no keys)')
+        return read_record(_CameraInfo, content).camera()
+    except (ValueError, KeyError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
+        words = ' '.join(f'{error}'.split())
+        raise ProductError(f'{path}: {words}') from error
+
+
+def read_camera_name(location: str | Path) -> str:
+    """The ``camera_name`` in a ROS camera YAML that `read_camera_info` accepts."""
+    path = resolve_url(location) if isinstance(location, str) else location
+    name = yaml_value(read_text(path, PARAMETER_BYTES)).get('camera_name')
+    return name if isinstance(name, str) and name else DEFAULT_CAMERA_NAME
+
+
+def resolve_url(url: str) -> Path:
+    """
+    The path that a ``file://`` or ``package://`` URL, or a plain path, names.
+
+    Packages are looked for as ament does, in ``share/<package>`` of each prefix of
+    AMENT_PREFIX_PATH, but without ROS.
+
+    Raises ProductError for another scheme, an empty URL or a package that no prefix has.
+    """
+    scheme, separator, rest = url.partition('://')
+    if not separator:
+        if not url:
+            raise ProductError('the camera YAML is not named (empty URL)')
+        return Path(url)
+    if scheme == 'file':
+        return _as_written_or_decoded(Path(rest))
+    if scheme != 'package':
+        raise ProductError(f'{url}: only file:// and package:// URLs can be read')
+    package, _, inside = rest.partition('/')
+    if not re.fullmatch(r'\w+', package) or not inside:
+        raise ProductError(f'{url}: not package://<package>/<path>')
+    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        share = Path(prefix, 'share', package)
+        if prefix and share.is_dir():
+            return _as_written_or_decoded(share / inside)
+    raise ProductError(f'{url}: package {package} is not in AMENT_PREFIX_PATH')
+
+
+def with_camera_url_from(values: Mapping[str, object], params: Path) -> dict[str, object]:
+    """Parameters of a file; a `camera_info_url` that is no URL is relative to that file."""
+    url = values.get('camera_info_url')
+    if isinstance(url, str) and url and '://' not in url:
+        return {**values, 'camera_info_url': str(params.parent / url)}
+    return dict(values)
+
+
+def _as_written_or_decoded(path: Path) -> Path:
+    """The path; ROS does not decode %20 in its URLs but others do, so both are taken."""
+    return path if path.exists() else Path(unquote(str(path)))
+
+
+def _matrix(rows: int, cols: int, data: list[float]) -> dict[str, object]:
+    return {'rows': rows, 'cols': cols, 'data': data}

@@ -1,0 +1,170 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+The folder of products of a calibration, as the tool and the calibrator write it.
+
+It holds ``residuals.npz`` and, in place of a calibration that failed, ``not_calibrated.json``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+import io
+import json
+from pathlib import Path
+import zipfile
+
+import numpy as np
+
+from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.errors import ProductError
+from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, write_calibration
+from starcal_ros.formats.products.camera_yaml import (
+    CAMERA_INFO_FILE,
+    DEFAULT_CAMERA_NAME,
+    write_camera_info,
+)
+from starcal_ros.formats.products.product_files import (
+    OBSERVATIONS_FILE,
+    read_json,
+    REPORT_FILE,
+    write_atomically,
+)
+from starcal_ros.record_codec import json_object, plain_record, read_record
+from starcal_ros.records import Calibration, StarObservations
+
+OBSERVATIONS_TOPIC = '/observations'
+RESIDUALS_FILE, NOT_CALIBRATED_FILE = 'residuals.npz', 'not_calibrated.json'
+PRODUCT_FILES = (
+    CALIBRATION_FILE,
+    CAMERA_INFO_FILE,
+    OBSERVATIONS_FILE,
+    RESIDUALS_FILE,
+    REPORT_FILE,
+)
+"""Names of the products of a calibration, without the thumbnails."""
+_RESIDUALS_FORMAT = 1
+
+
+def write_products(
+    calibration: Calibration, folder: Path, residuals: Residuals | None = None
+) -> None:
+    """
+    Write a calibration, its camera and its residuals, if given, into a folder.
+
+    Raises ProductError when a file cannot be written.
+    """
+    write_calibration(calibration, folder / CALIBRATION_FILE)
+    name = calibration.provenance.get('camera_name', DEFAULT_CAMERA_NAME)
+    write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE, name)
+    if residuals is not None:
+        write_residuals(residuals, folder / RESIDUALS_FILE)
+    (folder / NOT_CALIBRATED_FILE).unlink(missing_ok=True)
+
+
+def write_observations(
+    observations: Iterable[StarObservations], folder: Path, frame_id: str
+) -> None:
+    """
+    Write the observations of a calibration into a folder; ``frame_id`` is the camera's.
+
+    Raises BagError when the file cannot be written.
+    """
+    from starcal_ros.formats.bag.writer import BagWriter  # a vehicle may not have mcap
+
+    with BagWriter(folder / OBSERVATIONS_FILE) as writer:
+        for record in observations:
+            writer.write_observations(OBSERVATIONS_TOPIC, record, frame_id)
+
+
+def calibration_file(path: Path) -> Path:
+    """
+    Path of the calibration in a folder, or of the file itself.
+
+    Raises ProductError if the folder has no calibration.
+    """
+    if not path.is_dir():
+        return path
+    if not (path / CALIBRATION_FILE).exists():
+        raise ProductError(f'{path}: the folder holds no {CALIBRATION_FILE}')
+    return path / CALIBRATION_FILE
+
+
+def write_residuals(residuals: Residuals, path: Path) -> None:
+    """
+    Write ``residuals.npz``: a NumPy archive with an array for each attribute of `Residuals`.
+
+    Raises ProductError when the file cannot be written.
+    """
+    memory = io.BytesIO()
+    np.savez_compressed(memory, format=_RESIDUALS_FORMAT, **plain_record(residuals))
+    write_atomically(path, memory.getvalue())
+
+
+def read_residuals(path: Path) -> Residuals:
+    """
+    The residuals in a ``residuals.npz``, equal to those that were written.
+
+    Raises ProductError naming the file and the array that is missing or wrong.
+    """
+    try:
+        # Read whole first: numpy leaves a file open that is no archive.
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+            columns = dict(archive)
+    except OSError as error:
+        raise ProductError(f'{path}: cannot be read: {error.strerror or error}') from error
+    except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+        raise ProductError(f'{path}: not a NumPy archive: {error}') from error
+    if not np.array_equal(columns.pop('format', None), _RESIDUALS_FORMAT):
+        raise ProductError(f'{path}: not of format {_RESIDUALS_FORMAT}')
+    try:
+        residuals = read_record(Residuals, columns)
+    except ValueError as error:
+        raise ProductError(f'{path}: {error}') from error
+    if (residuals.image >= len(residuals.image_time_ns)).any():
+        raise ProductError(f'{path}: image names images that are not there')
+    return residuals
+
+
+@dataclass(frozen=True)
+class NotCalibrated:
+    """Why bags gave no calibration; ``cause`` and the rest as `starcal diagnose` has them."""
+
+    reason: str
+    inputs: tuple[str, ...]
+    images_refused: Mapping[str, int]
+    cause: str = ''
+    evidence: tuple[str, ...] = ()
+    mend: tuple[str, ...] = ()
+    software: str = ''
+
+
+def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:
+    """
+    Write the record of a failure and remove the products of an earlier calibration.
+
+    Raises ProductError when the folder cannot be changed.
+    """
+    content = {'calibrated': False, **json_object(record)}
+    write_atomically(folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n')
+    try:
+        for name in (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, REPORT_FILE):
+            (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise ProductError(f'{folder / name}: cannot be removed: {error.strerror}') from error
+
+
+def read_not_calibrated(folder: Path) -> NotCalibrated | None:
+    """
+    The record of a failure in a folder; None: there is none.
+
+    Raises ProductError when it cannot be read.
+    """
+    path = folder / NOT_CALIBRATED_FILE
+    if not path.is_file():
+        return None
+    content = read_json(path)
+    try:
+        return read_record(NotCalibrated, content)
+    except ValueError as error:
+        raise ProductError(f'{path}: not a record of a failure: {error}') from error

@@ -1,0 +1,140 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Brightest star-like sources of an image by their total light, saturated ones included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.stars.detection import (
+    Background,
+    detect,
+    measure_background,
+    sample_mesh,
+    stamps_at_edges,
+)
+
+_DETECTION_SIGMA = 5.0
+_STAMP_PX = 7  # half width of a window; it holds a saturated star of 10 px
+LONGEST_STREAK_PX = 2.0 * _STAMP_PX - 1  # that a window shows whole, its ends blurred
+_APART_PX = 10.0  # the fainter of two sources nearer than this counts as a part of the other
+_MEASURED = 400  # sources measured, brightest by their peak
+_KEPT = 200
+_SMEARED = 2.0  # length over width from which a source is a streak
+_STREAKS = 8  # fewest sources for a result
+
+
+@dataclass(frozen=True)
+class BrightSources:
+    """
+    Sources of an image, brightest first.
+
+    ``xy_px`` (n, 2) centroids; ``flux_dn`` (n,); ``peak_dn`` (n,) brightest pixel, background
+    included; ``long_px``, ``wide_px`` (n,): 1-sigma extents along the longest axis and across;
+    ``along_rad`` (n,) direction of the longest axis from +u towards +v; ``background`` of the
+    image.
+    """
+
+    xy_px: Floats
+    flux_dn: Floats
+    peak_dn: Floats
+    long_px: Floats
+    wide_px: Floats
+    along_rad: Floats
+    background: Background
+
+
+def bright_sources(pixels: Pixels) -> BrightSources:
+    """
+    Sources of an image, ranked by the light in windows of 15 x 15 pixels, brightest first.
+
+    Saturated stars keep their rank, and several maxima of one star are one source.  A centroid is
+    good to a few tenths of a pixel.
+    """
+    background = measure_background(pixels)
+    found = detect(pixels, background, _DETECTION_SIGMA)
+    centre = np.rint(found.xy_px[:_MEASURED]).astype(np.int64)
+    shape = (pixels.shape[0], pixels.shape[1])
+    if min(shape) <= 2 * _STAMP_PX:
+        centre = centre[:0]
+    stamps, outside = stamps_at_edges(pixels, centre, _STAMP_PX)
+    level = sample_mesh(background.level_mesh, shape, centre.astype(np.float64))
+    noise = sample_mesh(background.noise_mesh, shape, centre.astype(np.float64))
+    light = stamps - level[:, None, None]
+    light[outside | (light < 3.0 * noise[:, None, None])] = 0.0
+    reach = np.arange(-_STAMP_PX, _STAMP_PX + 1)
+    # Two rounds: the second is centred on the first centroid, which reduces neighbours at the rim.
+    offset = np.zeros((len(centre), 2))
+    for radius_px in (4.0, 5.0):
+        u, v = (
+            reach[None, None] - offset[:, 0, None, None],
+            reach[None, :, None] - offset[:, 1, None, None],
+        )
+        weight = light * (u * u + v * v <= radius_px**2)
+        flux = np.maximum(weight.sum(axis=(1, 2)), 1e-9)
+        offset = offset + np.stack(
+            [(weight * u).sum(axis=(1, 2)) / flux, (weight * v).sum(axis=(1, 2)) / flux], axis=-1
+        )
+    long_px, wide_px, along_rad = _extents(light, reach)
+    total = light.sum(axis=(1, 2))
+    order = np.argsort(-total, kind='stable')
+    order = order[total[order] > 0]
+    xy_px = (centre + offset)[order]
+    order = order[_apart(xy_px)][:_KEPT]
+    return BrightSources(
+        (centre + offset)[order],
+        total[order],
+        stamps.max(axis=(1, 2))[order] if len(stamps) else total[order],
+        long_px[order],
+        wide_px[order],
+        along_rad[order],
+        background,
+    )
+
+
+def smear(sources: BrightSources) -> tuple[float, float] | None:
+    """
+    Length, px, and direction, rad, of smeared stars; None if the stars are points.
+
+    Only streaks with a common direction count, as in a slew; streaks of a roll are not detected.
+    """
+    bright = sources.long_px[:40] > 0
+    ratio = sources.long_px[:40][bright] / np.maximum(sources.wide_px[:40][bright], 0.3)
+    if len(ratio) < _STREAKS or np.median(ratio) < _SMEARED:
+        return None
+    double = np.exp(2j * sources.along_rad[:40][bright]).mean()  # an axis has two directions
+    if abs(double) < 0.5:
+        return None
+    # The standard deviation of a uniform line is its length over the square root of twelve.
+    length_px = math.sqrt(12.0) * float(np.median(sources.long_px[:40][bright]))
+    return length_px, 0.5 * float(np.angle(double))
+
+
+def _extents(light: Floats, reach: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
+    """Longest and shortest 1-sigma extent (n,) in windows, and the direction of the longest."""
+    flux = np.maximum(light.sum(axis=(1, 2)), 1e-9)
+    u = (light.sum(axis=1) * reach).sum(axis=1) / flux
+    v = (light.sum(axis=2) * reach).sum(axis=1) / flux
+    uu = (light.sum(axis=1) * reach**2).sum(axis=1) / flux - u * u
+    vv = (light.sum(axis=2) * reach**2).sum(axis=1) / flux - v * v
+    uv = np.einsum('nij,i,j->n', light, reach, reach) / flux - u * v
+    mean, half = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
+    return (
+        np.sqrt(np.maximum(mean + half, 0.0)),
+        np.sqrt(np.maximum(mean - half, 0.0)),
+        0.5 * np.arctan2(2 * uv, uu - vv),
+    )
+
+
+def _apart(xy_px: Floats) -> NDArray[np.int64]:
+    """Rows of the points (n, 2), brightest first, without a brighter one nearby."""
+    kept = np.ones(len(xy_px), bool)
+    if len(xy_px):
+        for first, second in cKDTree(xy_px).query_pairs(_APART_PX, output_type='ndarray'):
+            kept[max(first, second)] = False
+    return np.flatnonzero(kept)

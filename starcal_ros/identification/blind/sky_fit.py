@@ -1,0 +1,312 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Fit of a camera and its rotation to candidate stars, and the p-value of the match.
+
+Rotation, focal length, principal point and one term of radial distortion are fitted, each within
+the range of its prior.  The p-value is an upper bound of the expected number of false matches in a
+search through all rotations, focal lengths, principal points and distortions: the number of
+positions in that space that differ by the radius of matching, times the probability that as many
+of the brightest predictions fall near a source by chance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import functools
+import math
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from scipy.special import betainc
+
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.camera import CameraModel, project, project_jacobians
+from starcal_ros.sky.catalog import StarCatalog
+
+FOCAL_RANGE = 0.25  # half range of the logarithm of the focal length
+CENTRE_RANGE = 0.05  # half range of the principal point, in widths
+DISTORTION_RANGE = 0.03  # half range of the distortion in the corners, over the radius
+_CLOSING_IN = (
+    0.05,
+    0.04,
+    0.03,
+    0.022,
+    0.015,
+    0.01,
+    0.007,
+    0.005,
+)  # radii of matching, in half diagonals
+_CROWDED = 0.15  # largest probability that a source lies by chance within the radius of matching
+_TELLING = 0.08  # largest such probability at which a candidate is judged by its matches
+_MOST_STARS = 200
+_JUDGED_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5)  # radii of matching for the p-value
+_DEPTHS = (6, 8, 11, 15, 20, 30, 50, 80, 130, 200)  # numbers of brightest predictions for it
+_LOOKS = 10.0  # independent tests among them: most of their stars are common
+_ORDERED = 30  # brightest matches whose order is judged: more would not change a verdict
+_ALONE = 10.0  # radius about a star for the local density of sources, in radii of matching
+
+
+@dataclass(frozen=True)
+class SourceImage:
+    """Sources (n, 2), brightest first, of an image with a prior camera."""
+
+    xy_px: Floats
+    camera: CameraModel
+
+    @functools.cached_property
+    def half_diagonal_px(self) -> float:
+        """Half of the diagonal, px."""
+        return 0.5 * math.hypot(self.camera.width, self.camera.height)
+
+    @functools.cached_property
+    def half_diagonal_rad(self) -> float:
+        """Half of the diagonal as an angle of the prior camera."""
+        ideal = self.half_diagonal_px / float(self.camera.parameters[0])
+        return ideal if self.camera.model == 'equidistant' else math.atan(ideal)
+
+    @functools.cached_property
+    def area_px2(self) -> float:
+        """Area of the image, px^2."""
+        return float(self.camera.width * self.camera.height)
+
+    @functools.cached_property
+    def tree(self) -> cKDTree:
+        """Search tree of the sources."""
+        return cKDTree(self.xy_px)
+
+
+@dataclass(frozen=True)
+class SkyFit:
+    """Camera, rotation, and catalog rows (n,) of the brightest stars that may be in the image."""
+
+    camera_from_icrf: Rotation
+    camera: CameraModel
+    stars: Indices
+
+
+def refined(
+    image: SourceImage, catalog: StarCatalog, start: SkyFit, pairs: Indices
+) -> SkyFit | None:
+    """
+    Fit from a start with decreasing radius of matching; None once it looks like chance.
+
+    ``pairs`` (k, 2), rows of the catalog and of the sources, belong to the start.
+    """
+    fit, prior = start, image.camera
+    half_px = image.half_diagonal_px
+    fit = _step(image, catalog, fit, pairs, 0.02 * half_px)
+    for part in _CLOSING_IN:
+        radius_px = max(part * half_px, 2.0)
+        sources = int(_CROWDED * image.area_px2 / (math.pi * radius_px**2)) + 6
+        stars, xy_px = predicted(catalog, fit, 2 * sources)
+        rank, source, _ = _mutual(image, xy_px, radius_px, sources)
+        if _like_chance(image, rank, radius_px, sources):
+            return None
+        pairs = np.stack([stars[rank], source], axis=-1)
+        fit = _step(image, catalog, fit, pairs, radius_px / 3)
+        fx = float(fit.camera.parameters[0])
+        if abs(math.log(fx / float(prior.parameters[0]))) > 1.3 * FOCAL_RANGE:
+            return None
+    for _ in range(2):
+        pairs = match(image, catalog, fit, 4.5, _MOST_STARS, _MOST_STARS)
+        if len(pairs) < 5:
+            return None
+        fit = _step(image, catalog, fit, pairs, 1.0)
+    return fit
+
+
+def _like_chance(image: SourceImage, rank: Indices, radius_px: float, sources: int) -> bool:
+    """
+    True if chance puts so many sources near predictions, of which ``rank`` (k,) have one.
+
+    Told only at radii at which few places are near a source: at larger ones sources without a
+    star, such as the structure of a corona, hide those that have one.  From there on, the fits
+    accepted of six stars among twelve false sources were below the limit by a factor of two.
+    """
+    if len(rank) < 5:
+        return True
+    one = _evenly(image, radius_px, sources)
+    if one > _TELLING:
+        return False
+    hits, depth = np.arange(5, len(rank) + 1), rank[4:] + 1
+    tail = betainc(hits, depth - hits + 1, one)
+    limit = betainc(5, 12 - 5 + 1, _evenly(image, radius_px, 18))  # P(Binomial(12, q) >= 5)
+    return float(tail.min()) > float(limit)
+
+
+def _evenly(image: SourceImage, radius_px: float, sources: int) -> float:
+    """Probability that one of so many sources, spread evenly, lies within a radius."""
+    return min(1.0, min(sources, len(image.xy_px)) * math.pi * radius_px**2 / image.area_px2)
+
+
+def match(
+    image: SourceImage,
+    catalog: StarCatalog,
+    fit: SkyFit,
+    radius_px: float,
+    most_stars: int,
+    most_sources: int,
+) -> Indices:
+    """Pairs (k, 2) of catalog row and source that are mutually nearest within a radius."""
+    stars, xy_px = predicted(catalog, fit, most_stars)
+    rank, source, _ = _mutual(image, xy_px, radius_px, most_sources)
+    return np.stack([stars[rank], source], axis=-1)
+
+
+def predicted(catalog: StarCatalog, fit: SkyFit, most: int) -> tuple[Indices, Floats]:
+    """Catalog rows (n,) of the brightest stars in the image, and their pixels (n, 2)."""
+    camera = fit.camera
+    directions = fit.camera_from_icrf.apply(catalog.direction_icrs[fit.stars])
+    xy = project(camera, directions)
+    with np.errstate(invalid='ignore'):
+        inside = (xy > -0.5).all(axis=1) & (xy < [camera.width - 0.5, camera.height - 0.5]).all(
+            axis=1
+        )
+    rank = np.flatnonzero(inside)[:most]
+    return fit.stars[rank], xy[rank]
+
+
+def _mutual(
+    image: SourceImage, xy_px: Floats, radius_px: float, most_sources: int
+) -> tuple[Indices, Indices, Floats]:
+    """Rows of the mutually nearest predictions (n, 2) and sources, and their distances, px."""
+    none = np.empty(0, np.int64)
+    seen = image.xy_px[:most_sources]
+    if len(xy_px) == 0 or len(seen) == 0:
+        return none, none, np.empty(0)
+    # Along each axis by itself: the sum over an axis of two numbers takes several times as long.
+    apart = (xy_px[:, 0, None] - seen[:, 0]) ** 2
+    apart += (xy_px[:, 1, None] - seen[:, 1]) ** 2
+    source = apart.argmin(axis=1)
+    rank = np.arange(len(xy_px))
+    nearest = apart[rank, source]
+    good = (apart.argmin(axis=0)[source] == rank) & (nearest < radius_px**2)
+    return rank[good], source[good], np.sqrt(nearest[good])
+
+
+def _step(
+    image: SourceImage, catalog: StarCatalog, fit: SkyFit, pairs: Indices, scale_px: float
+) -> SkyFit:
+    """One robust Gauss-Newton step; ``scale_px`` is the expected residual of a pair."""
+    camera, prior, half_px = fit.camera, image.camera, image.half_diagonal_px
+    directions = fit.camera_from_icrf.apply(catalog.direction_icrs[pairs[:, 0]])
+    xy, J_camera, J_rotation = project_jacobians(camera, directions)
+    residual = image.xy_px[pairs[:, 1]] - xy
+    fx, fy, cx, cy = camera.parameters[[0, 2, 3, 4]]
+    # k1 as displacement in the corner over the radius there.
+    k1_per_part = (fx / half_px) ** 2
+    J = np.concatenate(
+        [
+            J_rotation,
+            (fx * J_camera[..., 0] + fy * J_camera[..., 2])[..., None],
+            J_camera[..., 3:5],
+            (k1_per_part * J_camera[..., 5])[..., None],
+        ],
+        axis=-1,
+    )
+    size2 = (residual**2).sum(axis=1)
+    root = 1.0 / np.sqrt(scale_px**2 + size2 / 4)
+    part = (camera.parameters[5] - prior.parameters[5]) / k1_per_part
+    off = np.array(
+        [
+            math.log(prior.parameters[0] / fx),
+            prior.parameters[3] - cx,
+            prior.parameters[4] - cy,
+            -part,
+        ]
+    )
+    centre_px = CENTRE_RANGE * camera.width
+    sigma = np.array([FOCAL_RANGE, centre_px, centre_px, DISTORTION_RANGE]) / 1.7
+    A = np.concatenate([(J * root[:, None, None]).reshape(-1, 7), np.zeros((4, 7))])
+    A[-4:, 3:] = np.diag(1.0 / sigma)
+    b = np.concatenate([(residual * root[:, None]).ravel(), off / sigma])
+    N = A.T @ A
+    step = np.linalg.solve(N + 1e-12 * np.diag(np.diag(N)), A.T @ b)
+    growth = math.exp(float(np.clip(step[3], -0.2, 0.2)))
+    k1 = (part + float(np.clip(step[6], -0.05, 0.05))) * (growth * fx / half_px) ** 2
+    changed = camera.replace(
+        fx=growth * fx,
+        fy=growth * fy,
+        cx=cx + float(np.clip(step[4], -centre_px, centre_px)),
+        cy=cy + float(np.clip(step[5], -centre_px, centre_px)),
+        k1=float(prior.parameters[5]) + k1,
+    )
+    return SkyFit(Rotation.from_rotvec(-step[:3]) * fit.camera_from_icrf, changed, fit.stars)
+
+
+def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tuple[float, float]:
+    """
+    Decadic logarithm of the expected number of false matches this good, and its radius, px.
+
+    Infinite with fewer than five stars near their predictions.
+    """
+    _, xy_px = predicted(catalog, fit, _MOST_STARS)
+    best, best_radius_px = math.inf, _JUDGED_PX[-1]
+    depths = [n for n in _DEPTHS if n < len(xy_px)] + [len(xy_px)]
+    for n in depths:
+        if n < 5:
+            continue
+        sources = min(len(image.xy_px), 4 * n)
+        _, source, apart_px = _mutual(image, xy_px[:n], _JUDGED_PX[-1], sources)
+        for radius_px in _JUDGED_PX:
+            near = apart_px < radius_px
+            hits = int(np.count_nonzero(near))
+            if hits < 5:
+                continue
+            q = _chance_of_one(image, xy_px[:n], radius_px, sources)
+            tail = float(betainc(hits, n - hits + 1, q))  # P(Binomial(n, q) >= hits)
+            chance = max(_LOOKS * tail * _chance_of_order(source[near]), 1e-300)
+            log10_p = math.log10(chance) + _log10_positions(image, radius_px)
+            if log10_p < best:
+                best, best_radius_px = log10_p, radius_px
+    return best, best_radius_px
+
+
+def _chance_of_one(image: SourceImage, xy_px: Floats, radius_px: float, sources: int) -> float:
+    """
+    Probability that a source lies within a radius of a star by chance.
+
+    Mean over the stars; a star among many sources, as in glare, has their local density.
+    """
+    everywhere = _evenly(image, radius_px, sources)
+    near = image.tree.query_ball_point(xy_px, _ALONE * radius_px, return_length=True)
+    crowded = np.minimum((np.maximum(near, 1) - 1) / _ALONE**2, 1.0)
+    return float(np.maximum(crowded, everywhere).mean())
+
+
+def _chance_of_order(source: Indices) -> float:
+    """
+    Probability that chance sorts sources by brightness as well as those (k,) of stars so sorted.
+
+    Sources are numbered by brightness.  The measure is the number of pairs in the wrong order, of
+    which each permutation is equally likely (Kendall 1938, Biometrika 30, 81).
+    """
+    brightest = source[:_ORDERED]
+    wrong = np.triu(brightest[:, None] > brightest[None], 1)
+    return float(_orderings(len(brightest))[np.count_nonzero(wrong)])
+
+
+@functools.lru_cache(maxsize=_ORDERED)
+def _orderings(count: int) -> Floats:
+    """Probability that a permutation of ``count`` has at most 0, 1, ... pairs in wrong order."""
+    share: Floats = np.ones(1)
+    for k in range(2, count + 1):
+        # The last of k is in the wrong order to none, one, ... or all of the others.
+        share = np.convolve(share, np.full(k, 1.0 / k))
+    return np.minimum(np.cumsum(share), 1.0)
+
+
+def _log10_positions(image: SourceImage, radius_px: float) -> float:
+    """Decadic logarithm of the number of fits that differ by the radius of matching."""
+    half_px, f_px = image.half_diagonal_px, float(image.camera.parameters[0])
+    tilts_and_roll = 8 * math.pi**2 * f_px**2 * half_px / radius_px**3
+    focal = 2 * FOCAL_RANGE * half_px / radius_px
+    distortion = 2 * DISTORTION_RANGE * half_px / radius_px
+    # A shift of the principal point equals a rotation to first order; the rest is the second
+    # order of the projection and of the distortion.
+    shape = (half_px / f_px) ** 2 + 3 * DISTORTION_RANGE
+    centre = 2 * CENTRE_RANGE * image.camera.width * shape / radius_px
+    return math.log10(
+        max(tilts_and_roll, 1.0) * max(focal, 1.0) * max(distortion, 1.0) * max(centre, 1.0) ** 2
+    )

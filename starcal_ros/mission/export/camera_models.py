@@ -1,0 +1,181 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Calibrations as camera models of OpenCV, kalibr, ROS, NASA's GIANT and mrcal; none holds a field.
+
+GIANT's ``OpenCVModel`` is OpenCV's rational model with thin prism, skew (``alpha``) and a focal
+length that depends on temperature (``giant/camera_models/opencv_model.py``, its equations).
+mrcal has OpenCV's models of 5, 8 and 12 coefficients in OpenCV's order, without skew; pixels as
+here; its reference frame stands for the star tracker.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+import yaml
+
+from starcal_ros.arrays import Floats
+from starcal_ros.camera.lens import ros_distortion
+from starcal_ros.mission.export.losses import about, Fitted, fitted, origin
+from starcal_ros.records import Calibration
+
+# kalibr's word for a lens model, and the parameters that kalibr lacks.
+_KALIBR = {'plumb_bob': ('radtan', ('skew', 'k3')), 'equidistant': ('equidistant', ('skew',))}
+_OF_GIANT = ('plumb_bob', 'rational_polynomial', 'thin_prism')  # special cases of OpenCVModel
+_GIANT_NAMES = {'fx': 'fx', 'fy': 'fy', 'skew': 'alpha', 'cx': 'px', 'cy': 'py'}
+_MRCAL = {
+    'plumb_bob': 'LENSMODEL_OPENCV5',
+    'rational_polynomial': 'LENSMODEL_OPENCV8',
+    'thin_prism': 'LENSMODEL_OPENCV12',
+}
+
+
+def opencv_yaml(calibration: Calibration) -> tuple[str, Fitted]:
+    """
+    YAML for ``cv2.FileStorage``: camera matrix, distortion, rotation; and the camera in it.
+
+    ``distortion_coefficients`` are those of ``cv2.projectPoints``, of ``cv2.fisheye`` where
+    ``lens_model`` is ``fisheye``.
+    """
+    found = fitted(calibration, calibration.geometry.camera.model, ('skew',))
+    camera = found.camera
+    _, D = ros_distortion(camera.model, camera.distortion)
+    lines = [
+        '%YAML:1.0',
+        *_commented(about(calibration, found)),
+        '# rotation: camera_from_star_tracker',
+        '---',
+        f'image_width: {camera.width}',
+        f'image_height: {camera.height}',
+        f'lens_model: {"fisheye" if camera.model == "equidistant" else "pinhole"}',
+        *_opencv_matrix('camera_matrix', camera.matrix),
+        *_opencv_matrix('distortion_coefficients', D[None, :]),
+        *_opencv_matrix('rotation', _camera_from_star_tracker(calibration).as_matrix()),
+        f'largest_error_px: {found.worst_px!r}',
+    ]
+    return '\n'.join(lines) + '\n', found
+
+
+def kalibr_yaml(calibration: Calibration, topic: str) -> tuple[str, Fitted]:
+    """
+    A camchain of kalibr with one camera, and the camera in it.
+
+    The star tracker stands for the IMU: ``T_cam_imu`` is the alignment without translation.  Of
+    ``radtan`` and ``equidistant``, the model with the smaller error.
+    """
+    candidates = [(fitted(calibration, m, zero), word) for m, (word, zero) in _KALIBR.items()]
+    found, word = min(candidates, key=lambda candidate: candidate[0].worst_px)
+    camera = found.camera
+    fx, _, fy, cx, cy = camera.intrinsics.tolist()
+    _, D = ros_distortion(camera.model, camera.distortion)
+    T = np.eye(4)
+    T[:3, :3] = _camera_from_star_tracker(calibration).as_matrix()
+    content = {
+        'cam0': {
+            'camera_model': 'pinhole',
+            'intrinsics': [fx, fy, cx, cy],
+            'distortion_model': word,
+            'distortion_coeffs': D[:4].tolist(),
+            'T_cam_imu': T.tolist(),
+            'timeshift_cam_imu': 0.0,
+            'rostopic': topic,
+            'resolution': [camera.width, camera.height],
+        }
+    }
+    note = '# T_cam_imu: camera_from_star_tracker; kalibr has no star tracker'
+    return '\n'.join([*_commented(about(calibration, found)), note, _yaml(content)]), found
+
+
+def transform_yaml(calibration: Calibration) -> str:
+    """A geometry_msgs/TransformStamped of the alignment, for a static transform publisher."""
+    x, y, z, w = calibration.geometry.star_tracker_from_camera_xyzw.tolist()
+    content = {
+        'header': {'frame_id': calibration.parent_frame},
+        'child_frame_id': calibration.child_frame,
+        'transform': {
+            'translation': {'x': 0.0, 'y': 0.0, 'z': 0.0},
+            'rotation': {'x': x, 'y': y, 'z': z, 'w': w},
+        },
+    }
+    return '\n'.join([*_commented(origin(calibration)), _yaml(content)])
+
+
+def giant_json(calibration: Calibration) -> tuple[str, Fitted]:
+    """
+    JSON whose ``OpenCVModel`` holds the keyword arguments of the model; and the camera in it.
+
+    ``star_tracker_from_camera_xyzw`` is beside them: GIANT has no alignment in a camera model.
+    """
+    own = calibration.geometry.camera.model
+    found = fitted(calibration, own if own in _OF_GIANT else 'thin_prism', ())
+    # GIANT has the change of the focal length with temperature: it is no loss.
+    losses = tuple(loss for loss in found.losses if 'focal' not in loss.part)
+    found = dataclasses.replace(found, losses=losses)
+    camera = found.camera
+    named = zip(camera.parameter_names, camera.parameters.tolist(), strict=True)
+    arguments = {_GIANT_NAMES.get(name, name): value for name, value in named}
+    arguments |= {'n_rows': camera.height, 'n_cols': camera.width}
+    terms = calibration.temperature
+    if terms is not None and terms.focal_per_degc:
+        # GIANT scales x' by 1 + a1 T + a2 T^2 with T itself: give it T - reference_degc.
+        arguments |= {f'a{k}': value for k, value in enumerate(terms.focal_per_degc, start=1)}
+    content = {
+        'about': [
+            *about(calibration, found),
+            'from giant.camera_models import OpenCVModel; OpenCVModel(**content["OpenCVModel"])',
+        ],
+        'OpenCVModel': arguments,
+        'temperature_reference_degc': None if terms is None else terms.reference_degc,
+        'star_tracker_from_camera_xyzw': (
+            calibration.geometry.star_tracker_from_camera_xyzw.tolist()
+        ),
+    }
+    return json.dumps(content, indent=1) + '\n', found
+
+
+def mrcal_cameramodel(calibration: Calibration) -> tuple[str, Fitted]:
+    """Text for ``mrcal.cameramodel``, and the camera in it; ``extrinsics`` are rt_cam_ref."""
+    own = calibration.geometry.camera.model
+    found = fitted(calibration, own if own in _MRCAL else 'thin_prism', ('skew',))
+    camera = found.camera
+    fx, _, fy, cx, cy = camera.intrinsics.tolist()
+    _, D = ros_distortion(camera.model, camera.distortion)
+    rt = [*_camera_from_star_tracker(calibration).as_rotvec().tolist(), 0.0, 0.0, 0.0]
+    lines = [
+        *_commented(about(calibration, found)),
+        '{',
+        f"    'lensmodel':  '{_MRCAL[camera.model]}',",
+        f"    'extrinsics': {rt!r},",
+        f"    'intrinsics': {[fx, fy, cx, cy, *D.tolist()]!r},",
+        f"    'imagersize': {[camera.width, camera.height]!r},",
+        '}',
+    ]
+    return '\n'.join(lines) + '\n', found
+
+
+def _camera_from_star_tracker(calibration: Calibration) -> Rotation:
+    return Rotation.from_quat(calibration.geometry.star_tracker_from_camera_xyzw).inv()
+
+
+def _commented(lines: list[str]) -> list[str]:
+    return [f'# {line}' for line in lines]
+
+
+def _yaml(content: object) -> str:
+    text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
+    return text
+
+
+def _opencv_matrix(name: str, matrix: Floats) -> list[str]:
+    rows, cols = matrix.shape
+    data = ', '.join(repr(value) for value in matrix.ravel().tolist())
+    return [
+        f'{name}: !!opencv-matrix',
+        f'   rows: {rows}',
+        f'   cols: {cols}',
+        '   dt: d',
+        f'   data: [ {data} ]',
+    ]

@@ -1,0 +1,150 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Attitudes from SPICE CK and velocities from SPK, at the times of the images, by spiceypy.
+
+SPICE's frame J2000 is the ICRF.  Times go through the leap seconds kernel that is given, so that
+they are those of the tools that made the other kernels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+import contextlib
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Floats
+from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
+from starcal_ros.errors import IngestError
+from starcal_ros.mission.ingest.mission_records import Attitudes, in_order, start_of, Velocities
+
+_MAGIC = (b'DAF/', b'NAIF/DAF', b'KPL/')
+# A CK is sampled beside each image too: a stamp offset of the camera may be applied later.
+_BESIDE_NS = (-NANOSECONDS_PER_SECOND, 0, NANOSECONDS_PER_SECOND)
+_KM = 1000.0
+
+
+def is_kernel(path: Path) -> bool:
+    """True if a file begins as a SPICE kernel."""
+    return start_of(path).startswith(_MAGIC)
+
+
+def read_ck(paths: Sequence[Path], frame: str, at_ns: Sequence[int]) -> Attitudes:
+    """
+    Attitudes of a frame at stamps and one second about them, where the kernels cover these.
+
+    Raises IngestError when a kernel cannot be read, the frame is not known, or no stamp is
+    covered.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        CK, SCLK, LSK and, for a frame with a name, the FK that defines it.
+    frame : str
+        Name of the star tracker frame, or its CK identifier.
+    """
+    where = ', '.join(map(str, paths))
+    if not frame:
+        raise IngestError(f'{where}: name the star tracker frame of the CK with --star-tracker')
+    stamps: list[int] = []
+    quaternions: list[Floats] = []
+    with loaded(paths, where) as spice:
+        for time_ns in sorted({t + beside for t in at_ns for beside in _BESIDE_NS}):
+            matrix = _icrf_from_frame(spice, frame, time_ns, where)
+            if matrix is not None:
+                stamps.append(time_ns)
+                quaternions.append(Rotation.from_matrix(matrix).as_quat())
+    if not stamps:
+        raise IngestError(
+            f'{where}: no attitude of {frame} from {utc_text(min(at_ns))} to '
+            f'{utc_text(max(at_ns))}: the CK does not cover the images'
+        )
+    return in_order(stamps, quaternions, where, ())
+
+
+def read_spk(paths: Sequence[Path], body: str, at_ns: Sequence[int]) -> Velocities:
+    """
+    Barycentric velocities of a body at stamps.
+
+    Raises IngestError when a kernel cannot be read, the body is not known or a stamp is not
+    covered.
+    """
+    where = ', '.join(map(str, paths))
+    if not body:
+        raise IngestError(f'{where}: name the spacecraft of the SPK with --spacecraft')
+    velocities = []
+    with loaded(paths, where) as spice:
+        for time_ns in at_ns:
+            try:
+                et = ephemeris_time(spice, time_ns)
+                state, _ = spice.spkezr(body, et, 'J2000', 'NONE', 'SOLAR SYSTEM BARYCENTER')
+            except spice.SpiceyError as error:
+                raise IngestError(
+                    f'{where}: no velocity of {body} about the solar system barycentre at '
+                    f'{utc_text(time_ns)}: {_short(error)}'
+                ) from error
+            velocities.append(np.array(state[3:]) * _KM)
+    return Velocities(np.array(at_ns, np.int64), np.array(velocities).reshape(-1, 3))
+
+
+@contextlib.contextmanager
+def loaded(paths: Sequence[Path], where: str) -> Iterator[Any]:
+    """SPICE with only these kernels loaded; earlier ones are loaded again afterwards."""
+    try:
+        import spiceypy
+    except ModuleNotFoundError as error:
+        raise IngestError(
+            f"{where}: SPICE kernels need spiceypy: pip install 'starcal_ros[mission]'"
+        ) from error
+    before = [spiceypy.kdata(k, 'ALL')[0] for k in range(spiceypy.ktotal('ALL'))]
+    spiceypy.kclear()
+    try:
+        for path in paths:
+            try:
+                spiceypy.furnsh(str(path))
+            except spiceypy.SpiceyError as error:
+                raise IngestError(f'{path}: not loaded by SPICE: {_short(error)}') from error
+        if not spiceypy.expool('DELTET/DELTA_AT'):
+            raise IngestError(f'{where}: no leap seconds kernel (LSK) among them: add naif*.tls')
+        yield spiceypy
+    finally:
+        spiceypy.kclear()
+        for name in before:
+            spiceypy.furnsh(name)
+
+
+def _icrf_from_frame(spice: Any, frame: str, time_ns: int, where: str) -> Floats | None:
+    """Rotation (3, 3) from a frame to the ICRF; None where the CK has none."""
+    et = ephemeris_time(spice, time_ns)
+    try:
+        if frame.lstrip('-').isdigit():
+            number = int(frame)
+            # NAIF: the clock of a spacecraft has its number, -(structure // 1000).
+            clock = -(abs(number) // 1000)
+            matrix, _ = spice.ckgp(number, spice.sce2c(clock, et), 0.0, 'J2000')
+            return np.array(matrix).T
+        return np.array(spice.pxform(frame, 'J2000', et))
+    except spice.NotFoundError:
+        return None
+    except spice.SpiceyError as error:
+        # Both stand for a CK without data at the time.
+        if error.short in ('SPICE(NOFRAMECONNECT)', 'SPICE(FRAMEDATANOTFOUND)'):
+            return None
+        raise IngestError(f'{where}: frame {frame}: {_short(error)}') from error
+
+
+def ephemeris_time(spice: Any, time_ns: int) -> float:
+    """TDB seconds past J2000 of a stamp, by the leap seconds kernel."""
+    seconds, rest_ns = divmod(time_ns, NANOSECONDS_PER_SECOND)
+    text = datetime.fromtimestamp(seconds, timezone.utc).strftime('%Y-%m-%dT%H:%M:%S')
+    return float(spice.utc2et(text)) + rest_ns / NANOSECONDS_PER_SECOND
+
+
+def _short(error: Any) -> str:
+    """The kind of a SPICE error and its explanation, in one line."""
+    words = ' '.join(f'{error.short} {error.long}'.split())
+    return words if len(words) <= 240 else words[:237] + '...'

@@ -1,0 +1,127 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Attitudes of images from their World Coordinate System: FITS headers, .wcs files of astrometry.net.
+
+The attitude is that of the camera, with its axis in the middle of the image.  The y axis of a FITS
+image usually points up, so that its rows, read as those of a camera, mirror the sky: such images
+are turned upside down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+from pathlib import Path
+from typing import Any
+import warnings
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.camera import line_of_sight
+from starcal_ros.errors import IngestError
+from starcal_ros.formats.images.image_files import FITS_ENDINGS, ImageFile
+from starcal_ros.mission.ingest.mission_records import Attitudes, EME2000_NOTE, start_of
+from starcal_ros.pipeline.from_stars import pinhole
+
+_MAGIC = b'SIMPLE  ='
+_GRID = 5  # points a side, between which the attitude balances the distortion of the solution
+
+
+def is_solution(path: Path) -> bool:
+    """True if a file is FITS: an image, or a header alone."""
+    return path.name.lower().endswith(FITS_ENDINGS) or start_of(path).startswith(_MAGIC)
+
+
+def read_wcs(paths: Sequence[Path], images: Sequence[ImageFile]) -> Attitudes:
+    """
+    Attitudes of the camera at the stamps of images, from the files with the names of these.
+
+    Raises IngestError when an image has no file of its name, or a file no celestial WCS.
+    """
+    by_name = {_name(path): path for path in paths}
+    missing = [one.path for one in images if _name(one.path) not in by_name]
+    if missing:
+        raise IngestError(
+            f'{missing[0]}: no file of its name among those of --attitude ({len(missing)} of'
+            f' {len(images)} images): solve it, or leave it out of --images'
+        )
+    solved = [_attitude(by_name[_name(one.path)], one) for one in images]
+    # Programs turn a picture upside down for FITS: only the rows of FITS files are in question.
+    upward = {up for (_, up), one in zip(solved, images, strict=True) if _is_fits(one.path)}
+    if len(upward) > 1:
+        raise IngestError('some FITS images mirror the sky and others do not: import each apart')
+    notes = ['the attitudes are by the stars of the images: no alignment is estimated']
+    if True in upward:
+        notes.append('the rows of the FITS images count from the bottom: turned upside down')
+    return Attitudes(
+        np.array([one.time_ns for one in images], np.int64),
+        np.array([attitude.as_quat() for attitude, _ in solved]),
+        (*notes, EME2000_NOTE),
+        by_stars=True,
+        rows_upward=upward == {True},
+    )
+
+
+def _name(path: Path) -> str:
+    return Path(path.name.removesuffix('.gz').removesuffix('.fz')).stem
+
+
+def _is_fits(path: Path) -> bool:
+    return path.name.lower().endswith(FITS_ENDINGS)
+
+
+def _attitude(path: Path, image: ImageFile) -> tuple[Rotation, bool]:
+    """The rotation ``icrf_from_camera``, and whether the rows of the image point up."""
+    wcs = _celestial(path)
+    across, down = np.linspace(0, image.width - 1, _GRID), np.linspace(0, image.height - 1, _GRID)
+    pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    middle = np.array([image.width - 1, image.height - 1]) / 2
+    # A pixel to the right of the middle and one below it: size of a pixel, and handedness.
+    about = _directions(wcs, middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), path)
+    sides = about[1:] - about[0]
+    turn = float(about[0] @ np.cross(*sides))
+    camera = pinhole((image.width, image.height), 1.0 / math.sqrt(max(abs(turn), 1e-30)))
+    rows_upward = turn < 0
+    directions = _directions(wcs, pixels, path)
+    lines = image.height - 1 - pixels[:, 1] if rows_upward else pixels[:, 1]
+    seen = np.stack([pixels[:, 0], lines], axis=-1)
+    rotation, _ = Rotation.align_vectors(directions, line_of_sight(camera, seen))
+    return rotation, rows_upward
+
+
+def _directions(wcs: Any, pixels: Any, path: Path) -> Any:
+    """Unit vectors (n, 3) of pixels (n, 2), the centre of the first one (0, 0)."""
+    ra, dec = np.radians(np.asarray(wcs.all_pix2world(pixels, 0)).T)
+    found = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
+    if not np.isfinite(found).all():
+        raise IngestError(f'{path}: the WCS does not reach the corners of the image')
+    return found
+
+
+def _celestial(path: Path) -> Any:
+    """The first celestial WCS of a FITS file."""
+    try:
+        from astropy.io import fits
+        from astropy.wcs import WCS
+    except ModuleNotFoundError as error:
+        raise IngestError(
+            f"{path}: FITS files need astropy: pip install 'starcal_ros[mission]'"
+        ) from error
+    try:
+        with warnings.catch_warnings(), path.open('rb') as file:
+            warnings.simplefilter('ignore')  # of keywords that astropy mends
+            with fits.open(file, memmap=False) as units:
+                found = [WCS(unit.header) for unit in units if 'CTYPE1' in unit.header]
+    except Exception as error:  # astropy raises whatever a damaged file brings about
+        words = ' '.join(str(error).split())[:160]
+        raise IngestError(f'{path}: no WCS can be read: {words}') from error
+    wcs = next((one.celestial for one in found if one.has_celestial), None)
+    if wcs is None:
+        raise IngestError(f'{path}: no celestial WCS in it: solve the image first')
+    # astropy fills in the frame: FK5 with an equinox alone, ICRS with neither.
+    axes, equinox = wcs.wcs.radesys, wcs.wcs.equinox
+    kinds = [str(kind)[:2] for kind in wcs.wcs.ctype]
+    if kinds != ['RA', 'DE'] or not (axes == 'ICRS' or (axes == 'FK5' and equinox == 2000.0)):
+        raise IngestError(f'{path}: a WCS in {kinds[0]}, {axes} {equinox:g}: ICRS or J2000 only')
+    return wcs

@@ -1,0 +1,211 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""From the rows of a table to series in time with their trends, and to what was active when."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import itertools
+import math
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Floats
+from starcal_ros.assessment.agreement import alignment_difference_rad, lines_of_sight, movement
+from starcal_ros.camera import INTRINSIC_NAMES, line_of_sight
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.mission.trend.change_points import Trend, trend_of
+from starcal_ros.mission.trend.rows import COMPUTED, Row
+from starcal_ros.records import CameraGeometry
+
+_GRID = (15, 12)  # columns and rows of pixels that changes are taken over
+
+
+@dataclass(frozen=True)
+class Series:
+    """
+    A number of n calibrations in order of time, with its trend.
+
+    ``value`` and ``sigma`` are (n,) in ``unit``; ``row`` the indices of the calibrations.
+    """
+
+    name: str
+    unit: str
+    row: tuple[int, ...]
+    value: Floats
+    sigma: Floats
+    trend: Trend
+
+
+@dataclass(frozen=True)
+class Active:
+    """
+    A calibration that was active from a stamp to another (0: still is).
+
+    ``assumed``: nothing records an activation; each accepted calibration is taken as active from
+    its last image.
+    """
+
+    row: int
+    since_ns: int
+    until_ns: int
+    assumed: bool
+
+
+@dataclass(frozen=True)
+class Change:
+    """
+    Change by a calibration against the one that was active then.
+
+    ``line_of_sight_px`` is the largest change of a line of sight in the star tracker frame,
+    ``shape_px`` that with the common rotation removed; px at the focal length.
+    """
+
+    row: int
+    against: int
+    line_of_sight_px: float
+    shape_px: float
+
+
+@dataclass(frozen=True)
+class Versions:
+    """The change of the same observations by a newer version: indices of the rows, and px."""
+
+    recorded: int
+    computed: int
+    line_of_sight_px: float
+
+
+def series_of(rows: Sequence[Row]) -> list[Series]:
+    """Series of parameters, boresight and alignment of the calibrations of one lens model."""
+    first = rows[0].geometry
+    found = []
+    for k, name in enumerate(rows[0].names):
+        values = np.array([row.values[k] for row in rows])
+        sigmas = np.array([row.sigmas[k] for row in rows])
+        found += _one(rows, name, 'px' if name in INTRINSIC_NAMES else '', values, sigmas)
+    boresight = np.array([_boresight_arcsec(first, row.geometry) for row in rows])
+    of_boresight = np.array([row.boresight_sigma_arcsec for row in rows])
+    for k, axis in enumerate('xy'):
+        name = f'boresight about {axis}'
+        found += _one(rows, name, 'arcsec', boresight[:, k], of_boresight[:, k])
+    alignment = np.array(
+        [alignment_difference_rad(row.geometry, first) / ARCSECOND_RAD for row in rows]
+    )
+    sigmas = np.array([row.sigmas[-3:] for row in rows]) / ARCSECOND_RAD
+    for k, axis in enumerate('xyz'):
+        found += _one(rows, f'alignment_{axis}', 'arcsec', alignment[:, k], sigmas[:, k])
+    return found
+
+
+def _one(rows: Sequence[Row], name: str, unit: str, value: Floats, sigma: Floats) -> list[Series]:
+    """The series of the calibrations that estimated a number; none where none did."""
+    known = np.flatnonzero(np.isfinite(sigma) & (sigma > 0) & np.isfinite(value))
+    if not len(known):
+        return []
+    time_s = np.array([rows[k].time_ns for k in known], np.float64) / NANOSECONDS_PER_SECOND
+    temperature = np.array([rows[k].temperature_degc for k in known])
+    trend = trend_of(time_s, value[known], sigma[known], temperature)
+    return [Series(name, unit, tuple(known.tolist()), value[known], sigma[known], trend)]
+
+
+def _boresight_arcsec(first: CameraGeometry, now: CameraGeometry) -> Floats:
+    """Rotation (2,) of the line of sight of the middle about x and y of the first camera."""
+    camera = first.camera
+    middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
+    tracker_from_first, tracker_from_now = (
+        Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) for geometry in (first, now)
+    )
+    before = line_of_sight(camera, middle)
+    in_tracker = tracker_from_now.apply(line_of_sight(now.camera, middle))
+    after = tracker_from_first.inv().apply(in_tracker)
+    return np.asarray(np.cross(before, after)[:2] / ARCSECOND_RAD)
+
+
+def activations(rows: Sequence[Row]) -> list[Active]:
+    """Calibrations that were active, in order; recorded activations, else assumed ones."""
+    recorded = sorted(
+        (row.active_since_ns, k) for k, row in enumerate(rows) if row.active_since_ns > 0
+    )
+    # A calibration computed from a bag was never on board.
+    on_board = [(row.last_ns, k) for k, row in enumerate(rows) if row.accepted]
+    on_board = [(since, k) for since, k in on_board if rows[k].kind != COMPUTED] or on_board
+    starts = recorded or sorted(on_board)
+    return [
+        Active(k, since, until, not recorded)
+        for (since, k), (until, _) in itertools.pairwise([*starts, (0, -1)])
+        if since != until
+    ]
+
+
+def changes(rows: Sequence[Row], active: Sequence[Active]) -> list[Change]:
+    """Change by each calibration against the one active at its last image."""
+    found = []
+    for k, row in enumerate(rows):
+        then = [one for one in active if one.since_ns <= row.last_ns and one.row != k]
+        if not then:
+            continue
+        against = then[-1].row
+        total_px, shape_px = _apart_px(rows[against].geometry, row.geometry)
+        found.append(Change(k, against, total_px, shape_px))
+    return found
+
+
+def _apart_px(before: CameraGeometry, after: CameraGeometry) -> tuple[float, float]:
+    if (before.camera.width, before.camera.height) != (after.camera.width, after.camera.height):
+        return math.inf, math.inf
+    old, new = (lines_of_sight(geometry, *_GRID) for geometry in (before, after))
+    moved_rad = np.linalg.norm(new - old, axis=1).max()
+    _, left_px = movement(before, after, *_GRID)
+    return float(moved_rad * after.camera.parameters[0]), float(left_px.max())
+
+
+def versions(rows: Sequence[Row]) -> list[Versions]:
+    """Pairs of a recorded calibration and the one of the same images by this version."""
+    recorded = {
+        (row.first_ns, row.last_ns): k for k, row in enumerate(rows) if row.kind != COMPUTED
+    }
+    found = []
+    for k, row in enumerate(rows):
+        before = recorded.get((row.first_ns, row.last_ns))
+        if row.kind == COMPUTED and before is not None:
+            total_px, _ = _apart_px(rows[before].geometry, row.geometry)
+            found.append(Versions(before, k, total_px))
+    return found
+
+
+def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """
+    Calibrations by spacecraft, camera, frame name, size and lens model; the largest group first.
+
+    Of the same images the newest version counts, so that a series has each once.
+    """
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.error:
+            continue
+        size = f'{row.width} x {row.height}'
+        parts = (row.spacecraft, row.camera, row.child_frame, size, row.lens_model)
+        name = ', '.join(filter(None, parts))
+        found.setdefault(name, []).append(row)
+    return dict(sorted(found.items(), key=lambda item: (-len(item[1]), item[0])))
+
+
+def newest_of_each(rows: Sequence[Row]) -> list[Row]:
+    """
+    Rows of different calibrations, each once.
+
+    Without the recorded ones whose images this version has calibrated again, and without copies: a
+    state folder has a calibration once more for each activation.
+    """
+    again = {_images(row) for row in rows if row.kind == COMPUTED}
+    found: dict[object, Row] = {}
+    for row in rows:
+        if row.kind == COMPUTED or _images(row) not in again:
+            found.setdefault((_images(row), row.kind, tuple(row.values)), row)
+    return list(found.values())
+
+
+def _images(row: Row) -> tuple[int, int]:
+    return row.first_ns, row.last_ns

@@ -1,0 +1,176 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The diagnosis of bags, and the prior alignment that their images show where none is given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+import dataclasses
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
+from starcal_ros.errors import BagError, ImageRefused, OptionError
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.messages.telemetry import attitude_from_message
+from starcal_ros.pipeline import topics as bag_topics
+from starcal_ros.pipeline.diagnosis.alignment import found_alignment, set_up, wire_attitudes
+from starcal_ros.pipeline.diagnosis.attitude_reading import WireAttitudes
+from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis
+from starcal_ros.pipeline.diagnosis.identified import LOOKED_AT
+from starcal_ros.pipeline.inspect import placed, refusals, Refused
+from starcal_ros.pipeline.setup import aligned, Setup
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.records import Image, StarObservations
+
+_MEASURED = 10  # images, for the reason of their refusal
+UNREADABLE = frozenset(['bad_encoding', 'bad_layout', 'bad_stamp', 'bad_attitude'])
+"""Refusals after which the sky of an image cannot be held against the set-up."""
+_REMEDIES = {
+    'bad_encoding': 'record images of one channel, 8 or 16 bit, raw or as PNG',
+    'bad_layout': 'correct width, height, step and data where the message is made',
+    'bad_stamp': 'stamp the images in UTC since 1970, and check stamp_offset_s',
+    'bad_attitude': 'send unit quaternions, and none while the star tracker has no lock',
+    'no_attitude': 'record attitudes from before the first image to after the last',
+    'attitude_gap': (
+        'record attitudes more often, or raise max_attitude_gap_s if the vehicle turns evenly'
+    ),
+    'frozen_attitude': 'record the attitudes that the star tracker measures',
+    'out_of_order': 'use one topic for each camera',
+    'overexposed': 'expose for a shorter time',
+    'blank': 'check that the camera is read out',
+    'frozen': 'check that the camera is read out',
+    'incomplete': 'if rows of the detector are dead, raise max_lost_fraction; else mend the link',
+    'glare': 'keep Sun, Moon and Earth out of the field',
+    'too_few_stars': 'expose for longer, or raise magnitude_limit; check bad_pixel_map',
+}
+
+
+def diagnose_bags(
+    paths: Sequence[Path], asked: Topics, setup: Setup, refused: Sequence[Refused] = ()
+) -> Diagnosis:
+    """
+    Why the images of bags cannot be used: by their refusals, by their stamps, by their stars.
+
+    ``refused`` are the images of a calibration in which all were refused; without them the first
+    images are measured where the sky does not name the cause. Raises BagError when a bag cannot be
+    read, or holds no images with attitudes.
+    """
+    topics = bag_topics.choose_topics(paths, asked, setup)
+    if topics.observations:
+        raise BagError(f'{paths[0]}: no images to look at, only observations')
+    channel = setup.frames.image_channel
+    first = tuple(islice(placed(paths, topics, setup.attitude, channel), LOOKED_AT))
+    unread = of_refusals(refusals(first), len(first))
+    if unread is not None and unread.cause in UNREADABLE and unread.found == len(first):
+        return unread
+    if not topics.attitude:
+        raise BagError(f'{paths[0]}: no attitudes of the first star tracker, only of others')
+    attitudes = _attitudes(paths, topics.attitude)
+    spans = _without_common_time(first, attitudes)
+    shift_ns = spans[1][0] - spans[0][0] if spans else 0
+    given = dataclasses.replace(set_up(setup), shift_s=shift_ns / NANOSECONDS_PER_SECOND)
+    images = _images(paths, topics.image, setup, shift_ns)
+    found = diagnose(images, attitudes, given, setup.catalog)
+    if spans:
+        return found if found.cause == 'clock' else of_two_clocks(*spans)
+    if found.cause not in ('none', 'unknown', 'no_stars'):
+        return found
+    if not refused and setup.is_aligned:
+        measured = tuple(islice(bag_topics.read(paths, topics, setup), _MEASURED))
+        refused = refusals(measured) if all(one.refusal for one in measured) else ()
+    count = sum(group.count for group in refused)
+    by_itself = [one for one in refused if one.reason not in ('no_match', 'no_stars')]
+    return of_refusals(by_itself, count) or found
+
+
+def of_a_failure(
+    paths: Sequence[Path], asked: Topics, setup: Setup, refused: Sequence[Refused]
+) -> Diagnosis | None:
+    """The diagnosis of bags whose images are all refused; None where it finds nothing wrong."""
+    try:
+        found = diagnose_bags(paths, asked, setup, refused)
+    except BagError:
+        return None
+    return None if found.cause == 'none' else found
+
+
+def aligned_by_bags(paths: Sequence[Path], asked: Topics, setup: Setup) -> tuple[Setup, str]:
+    """
+    A setup with the alignment that the images show where none is given, and a sentence on it.
+
+    Recorded observations need none: their stars are identified. Raises BagError when a bag cannot
+    be read. Raises OptionError when fewer than three images agree.
+    """
+    if setup.is_aligned or bag_topics.choose_topics(paths, asked, setup).observations:
+        return setup, ''
+    values, sentence = found_alignment(diagnose_bags(paths, asked, setup))
+    if values is None:
+        raise OptionError(f'prior_alignment: not given, and not found: {sentence}')
+    return aligned(setup, np.array(values)), sentence
+
+
+def _without_common_time(
+    images: Sequence[StarObservations], attitudes: WireAttitudes
+) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """First and last stamp of images and of attitudes, ns; None if the two spans overlap."""
+    if not images or not len(attitudes.time_ns):
+        return None
+    stamps = [image.time_ns for image in images]
+    spans = ((min(stamps), max(stamps)), (int(attitudes.time_ns[0]), int(attitudes.time_ns[-1])))
+    apart = spans[0][1] < spans[1][0] or spans[1][1] < spans[0][0]
+    return spans if apart else None
+
+
+def _images(paths: Sequence[Path], topic: str, setup: Setup, shift_ns: int = 0) -> Iterator[Image]:
+    offset_s, channel = setup.attitude.stamp_offset_s, setup.frames.image_channel
+    for image in reader.read_images(paths, topic, offset_s, channel=channel):
+        if isinstance(image, Image):
+            yield Image(image.time_ns + shift_ns, image.pixels)
+
+
+def _attitudes(paths: Sequence[Path], topic: str) -> WireAttitudes:
+    """Every attitude of bags that is a rotation, in time order."""
+    stamps: list[int] = []
+    numbers = []
+    for raw in reader.read_raw(paths, [topic]):
+        try:
+            time_ns, quaternion = attitude_from_message(reader.decode(raw))
+        except (BagError, ImageRefused):
+            continue
+        stamps.append(time_ns)
+        numbers.append(quaternion)
+    return wire_attitudes(stamps, numbers)
+
+
+def of_refusals(refused: Sequence[Refused], images: int) -> Diagnosis | None:
+    """The most frequent refusal of some images as their cause; None if none is refused."""
+    if not refused:
+        return None
+    most = refused[0]
+    count = 'All' if most.count == images else f'{most.count} of'
+    remedy = _REMEDIES.get(most.reason)
+    return Diagnosis(
+        most.reason,
+        most.count,
+        f'{count} {images} images are refused as {most.reason}: {most.detail or most.meaning}.',
+        (f'{most.reason}: {most.meaning}',) if most.meaning else (),
+        (f'# {remedy}',) if remedy else (),
+    )
+
+
+def of_two_clocks(images_ns: tuple[int, int], attitudes_ns: tuple[int, int]) -> Diagnosis:
+    """The cause where the stamps of images and of attitudes, first and last, do not overlap."""
+    spans = [
+        ' to '.join(utc_text(time_ns) for time_ns in span) for span in (images_ns, attitudes_ns)
+    ]
+    shift_s = (attitudes_ns[0] - images_ns[0]) / NANOSECONDS_PER_SECOND
+    return Diagnosis(
+        'clock',
+        None,
+        f'The images are of {spans[0]}, the attitudes of {spans[1]}: they have two clocks, or are'
+        ' of different times.',
+        (f'the attitudes begin {shift_s:+.1f} s after the images',),
+        ('# give both on one clock, or the difference of the clocks in stamp_offset_s',),
+    )

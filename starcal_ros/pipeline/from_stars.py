@@ -1,0 +1,343 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Camera and attitudes of a set of images by their stars alone.
+
+One image is searched over all focal lengths; the others with the camera that it gives.  A camera
+common to all of them, fitted to the stars identified, then gives each its rotation.  The result
+replaces a star tracker: the calibration that follows measures the images again, and takes nothing
+from the rotations (method ``per_image``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
+from dataclasses import dataclass
+import itertools
+import math
+from pathlib import Path
+import time
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Floats
+from starcal_ros.blas_threads import one_blas_thread
+from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.camera.conversion import convert
+from starcal_ros.errors import NotFromStars
+from starcal_ros.estimation.calibrate import estimate_calibration
+from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.identification.blind.bright_sources import bright_sources, BrightSources
+from starcal_ros.identification.blind.search import confirm_sky, find_sky, mirror, ROUNDS, SkyMatch
+from starcal_ros.records import CameraGeometry, Ensemble, Image, refused_image, StarObservations
+from starcal_ros.sky.catalog import StarCatalog
+
+ADVICE = 'take 20 frames over the whole sky, stars to the corners, 1 to 10 s each'
+FEWEST_IMAGES = 3
+ATTITUDE_TOPIC = '/stars/attitude'
+# Half diagonals that are tried, degrees, the usual ones first: each is searched to 25 % of the
+# focal length, and together they span fields of 5 to 120 degrees.  Up to 45 degrees
+# an equidistant lens is found as a pinhole with distortion.
+_PINHOLE, _EQUIDISTANT = 'plumb_bob', 'equidistant'
+_HALF_FIELDS_DEG = (
+    *((_PINHOLE, deg) for deg in (28.0, 20.0, 13.5, 38.0, 9.0, 50.0)),
+    (_EQUIDISTANT, 52.0),
+    *((_PINHOLE, deg) for deg in (6.0, 4.0, 2.7)),
+)
+_SEARCHED = 4  # images that are searched over all focal lengths
+_SEARCH_S = 150.0  # of processor time
+_CENTROID_PX = 0.3  # of a bright source
+_FEWEST_SOURCES = 6
+# Matches and residual of a lens that is better: up to 50 degrees both lenses have the same.
+_MORE, _CLOSER = 1.1, 0.7
+_SAME_CAMERA = 0.02  # spread of the focal length over images of one lens and mode
+_SIGMA_ARCSEC = 60.0  # of the rotations, above what refraction and aberration change in them
+
+
+@dataclass(frozen=True)
+class FromStars:
+    """
+    Camera and rotations of images that were identified by their stars.
+
+    ``camera`` is of the images mirrored left to right where they are ``mirrored``;
+    ``icrf_from_camera`` by stamp; ``images`` is the number of all images.
+    """
+
+    camera: CameraModel
+    mirrored: bool
+    icrf_from_camera: Mapping[int, Rotation]
+    images: int
+
+    def in_a_sentence(self) -> str:
+        """Findings as a sentence for a person."""
+        fx = float(self.camera.parameters[0])
+        width, height = self.camera.width, self.camera.height
+        u, v = (width - 1) / 2, (height - 1) / 2
+        ends = np.array([[[-0.5, v], [width - 0.5, v]], [[u, -0.5], [u, height - 0.5]]])
+        a, b = line_of_sight(self.camera, ends).transpose(1, 0, 2)
+        across_deg = np.degrees(np.arccos((a * b).sum(axis=1)))
+        field = ' x '.join(f'{deg:.1f}' for deg in across_deg)
+        flipped = '; the images are mirrored, and were mirrored back' if self.mirrored else ''
+        return (
+            f'{len(self.icrf_from_camera)} of {self.images} images identified by their stars:'
+            f' focal length {fx:.1f} px, field {field} degrees{flipped}'
+        )
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Sources of an image: all by their light, and the compact ones, without glare."""
+
+    time_ns: int
+    all: Floats
+    compact: Floats
+
+
+@one_blas_thread()
+def from_stars(
+    images: Iterable[Image],
+    catalog: StarCatalog,
+    prior: CameraModel | None = None,
+    min_images: int = FEWEST_IMAGES,
+) -> FromStars:
+    """
+    The camera and the rotations of images; ``prior`` is a camera good to 25 %, None: none known.
+
+    Raises
+    ------
+    NotFromStars
+        When the images give no camera; the text says what to photograph.
+    """
+    seen, size, copies = _sources(images)
+    if len(seen) < min_images:
+        again = f' ({copies} more are copies)' if copies else ''
+        raise NotFromStars(
+            f'{len(seen)} different images{again}, {min_images} are needed: {ADVICE}'
+        )
+    rich = [one for one in seen if len(one.all) >= _FEWEST_SOURCES]
+    if not rich:
+        counts = [len(one.all) for one in seen]
+        raise NotFromStars(
+            f'no stars: {int(np.median(counts))} star-like sources in an image; {ADVICE}, and'
+            ' focus at infinity'
+        )
+    half_px = 0.5 * math.hypot(*size)
+    usual = (_usual(size, half_px, model, math.radians(deg)) for model, deg in _HALF_FIELDS_DEG)
+    tried = [*([prior] if prior is not None else []), *usual]
+    matched = _first_match(rich, tried, catalog)
+    if matched is None:
+        raise NotFromStars(
+            f'the stars of {len(seen)} images match no part of the sky, with fields of 5 to 120'
+            f' degrees: {ADVICE}; a tripod or a still spacecraft, no clouds, no lights'
+        )
+    first, compact_first = matched
+    found = _of_one_lens(_all_matches(rich, first, compact_first, catalog))
+    if len(found) < min_images:
+        raise NotFromStars(
+            f'{len(found)} of {len(seen)} images match the sky, {min_images} are needed: {ADVICE};'
+            ' no clouds, no lights, no frames of anything else'
+        )
+    camera, rotations = _common_camera(found, catalog, first.camera)
+    return FromStars(camera, first.mirrored, rotations, len(seen))
+
+
+def _sources(images: Iterable[Image]) -> tuple[list[_Seen], tuple[int, int], int]:
+    """Sources of the images that differ, their size, and the number of copies."""
+    seen: list[_Seen] = []
+    size = (0, 0)
+    sums = set()
+    copies = 0
+    for image in images:
+        height, width = image.pixels.shape
+        if size == (0, 0):
+            size = (width, height)
+        if size != (width, height):
+            raise NotFromStars(
+                f'images of {size[0]} x {size[1]} and of {width} x {height}: give those of one'
+                ' camera and mode'
+            )
+        digest = hash(image.pixels.tobytes())
+        if digest in sums:
+            copies += 1
+            continue
+        sums.add(digest)
+        seen.append(_seen(image.time_ns, bright_sources(image.pixels)))
+    return seen, size, copies
+
+
+def _seen(time_ns: int, sources: BrightSources) -> _Seen:
+    """Sources of an image; the structure of a corona is wide along both axes, as few stars are."""
+    wide_px = sources.wide_px
+    middle_px = float(np.median(wide_px)) if len(wide_px) else 0.0
+    return _Seen(time_ns, sources.xy_px, sources.xy_px[wide_px <= middle_px])
+
+
+def pinhole(size: tuple[int, int], focal_px: float) -> CameraModel:
+    """A camera without distortion of this size (width, height), its axis in the middle."""
+    width, height = size
+    middle = (width - 1) / 2, (height - 1) / 2
+    return CameraModel(
+        width, height, np.array([focal_px, 0.0, focal_px, *middle, 0.0, 0.0, 0.0, 0.0, 0.0])
+    )
+
+
+def _usual(size: tuple[int, int], half_px: float, model: str, half_rad: float) -> CameraModel:
+    """A camera of a model without distortion, of this half diagonal."""
+    if model == _PINHOLE:
+        return pinhole(size, half_px / math.tan(half_rad))
+    camera = pinhole(size, half_px / half_rad)
+    return CameraModel(*size, camera.parameters[:9], model)
+
+
+def _first_match(
+    seen: Sequence[_Seen], cameras: Sequence[CameraModel], catalog: StarCatalog
+) -> tuple[SkyMatch, bool] | None:
+    """An image identified with one of the cameras, and whether by its compact sources."""
+    deadline_s = time.thread_time() + _SEARCH_S
+    ordered = sorted(seen, key=lambda one: -len(one.all))
+    half = ordered[: max(1, (len(ordered) + 1) // 2)]
+    for one in half[:: max(1, len(half) // _SEARCHED)][:_SEARCHED]:
+        for camera in cameras:
+            for compact, xy_px in ((True, one.compact), (False, one.all)):
+                sky = find_sky(
+                    xy_px, camera, catalog, True, rounds=ROUNDS[:1], deadline_s=deadline_s
+                )
+                if isinstance(sky, SkyMatch):
+                    return _of_better_lens(sky, xy_px, catalog), compact
+                if time.thread_time() > deadline_s:
+                    return None
+    return None
+
+
+def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMatch:
+    """A match of sources (n, 2), or the same with an equidistant lens where that shows more."""
+    if sky.camera.model == _EQUIDISTANT:
+        return sky
+    turned_px = mirror(xy_px, sky.camera.width) if sky.mirrored else xy_px
+    camera, _ = convert(sky.camera, _EQUIDISTANT)
+    other = confirm_sky(turned_px, camera, catalog, sky.camera_from_icrf)
+    if isinstance(other, SkyMatch) and (
+        len(other.xy_px) > _MORE * len(sky.xy_px) or other.residual_px < _CLOSER * sky.residual_px
+    ):
+        return dataclasses.replace(other, mirrored=sky.mirrored)
+    return sky
+
+
+def _all_matches(
+    seen: Sequence[_Seen], first: SkyMatch, compact_first: bool, catalog: StarCatalog
+) -> dict[int, SkyMatch]:
+    """The images that the camera of the first match identifies, by stamp, mirrored back."""
+    found: dict[int, SkyMatch] = {}
+    camera = first.camera
+    for one in seen:
+        rankings = (one.compact, one.all) if compact_first else (one.all, one.compact)
+        # Both rankings before either is searched further.
+        for rounds, xy_px in itertools.product((ROUNDS[:1], ROUNDS[1:]), rankings):
+            turned_px = mirror(xy_px, camera.width) if first.mirrored else xy_px
+            sky = _matched(turned_px, camera, catalog, list(found.values())[-1:], rounds)
+            if sky is not None:
+                found[one.time_ns] = sky
+                break
+    return found
+
+
+def _matched(
+    xy_px: Floats,
+    camera: CameraModel,
+    catalog: StarCatalog,
+    before: Sequence[SkyMatch],
+    rounds: Sequence[tuple[int, int]],
+) -> SkyMatch | None:
+    """An image identified near the one before, else anywhere."""
+    for known in before:
+        sky = confirm_sky(xy_px, camera, catalog, known.camera_from_icrf)
+        if isinstance(sky, SkyMatch):
+            return sky
+    sky = find_sky(xy_px, camera, catalog, rounds=rounds)
+    return sky if isinstance(sky, SkyMatch) else None
+
+
+def _of_one_lens(found: Mapping[int, SkyMatch]) -> dict[int, SkyMatch]:
+    """The matches with the focal length of most; a few others are false, or of another lens."""
+    focal_px = np.array([float(sky.camera.parameters[0]) for sky in found.values()])
+    low, high = np.percentile(focal_px, [10, 90])
+    if high > (1 + _SAME_CAMERA) * low:
+        raise NotFromStars(
+            f'focal lengths of {low:.0f} to {high:.0f} px: several lenses, a zoom or a change of'
+            f' focus; with one lens, its zoom and focus fixed, {ADVICE}'
+        )
+    alike = np.abs(focal_px / np.median(focal_px) - 1) < _SAME_CAMERA
+    return {t: sky for (t, sky), same in zip(found.items(), alike, strict=True) if same}
+
+
+def _common_camera(
+    found: Mapping[int, SkyMatch], catalog: StarCatalog, camera: CameraModel
+) -> tuple[CameraModel, dict[int, Rotation]]:
+    """The camera that fits all matches, and the rotations ``icrf_from_camera`` with it."""
+    stars = sum(len(sky.xy_px) for sky in found.values())
+    options = CalibrationOptions(
+        method='per_image', min_images=1, min_stars=10, velocity_sigma_m_s=0.0
+    )
+    parameters = np.median([sky.camera.parameters for sky in found.values()], axis=0)
+    camera = dataclasses.replace(camera, parameters=parameters)
+    if len(found) < 2 or stars < 30:
+        return camera, {t: sky.camera_from_icrf.inv() for t, sky in found.items()}
+    ensemble = Ensemble()
+    for time_ns, sky in found.items():
+        ensemble = ensemble.add(_observations(time_ns, sky, catalog, camera))
+    geometry = CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
+    fit = estimate_calibration(ensemble, geometry, options)
+    rotations = fit.state.camera_from_icrf.inv()
+    stamps = [image.time_ns for image in ensemble.images]
+    return (
+        dataclasses.replace(fit.geometry.camera, field=None),
+        {stamp: rotations[k] for k, stamp in enumerate(stamps)},
+    )
+
+
+def _observations(
+    time_ns: int, sky: SkyMatch, catalog: StarCatalog, camera: CameraModel
+) -> StarObservations:
+    """Identified sources as observations of stars; their attitude is that of the camera."""
+    rows, n = sky.catalog_index, len(sky.catalog_index)
+    return refused_image(
+        time_ns,
+        camera.width,
+        camera.height,
+        refusal='',
+        detail='',
+        icrf_from_star_tracker_xyzw=sky.camera_from_icrf.inv().as_quat(),
+        catalog_id=catalog.id[rows],
+        direction_icrf=catalog.direction_icrs[rows],
+        magnitude=catalog.magnitude[rows].astype(np.float32),
+        measured_px=sky.xy_px,
+        covariance_px2=np.tile([_CENTROID_PX**2, 0.0, _CENTROID_PX**2], (n, 1)),
+        flux_dn=np.full(n, np.nan, np.float32),
+        snr=np.full(n, np.nan, np.float32),
+    )
+
+
+def options_of(values: Mapping[str, object]) -> dict[str, object]:
+    """Options of a calibration whose attitudes are those of `from_stars`."""
+    return {
+        **values,
+        'method': 'per_image',
+        'star_tracker_sigma_arcsec': (_SIGMA_ARCSEC,) * 3,
+        'star_tracker_frame': '',
+        'attitude_direction': 'st_to_inertial',
+        'attitude_message': 'quaternion',
+        'stamp_offset_s': 0.0,
+        # Rotations of single images have no rate, with which read-out and stamps are estimated.
+        'shutter': 'global',
+        'stamp_sigma_s': 0.0,
+    }
+
+
+def write_attitudes(found: FromStars, bag: Path) -> None:
+    """Write the rotations into a bag, as those of a star tracker with the axes of the camera."""
+    with BagWriter(bag) as writer:
+        for time_ns in sorted(found.icrf_from_camera):
+            xyzw = found.icrf_from_camera[time_ns].as_quat()
+            writer.write_attitude(ATTITUDE_TOPIC, time_ns, xyzw, 'icrf')

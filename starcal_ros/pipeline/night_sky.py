@@ -1,0 +1,223 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Set-up of a calibration from images alone: photographs, or bags without attitudes.
+
+Photographs become a bag, and the rotations that `from_stars` finds another: from there on the
+calibration is that of any bag.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+import math
+from pathlib import Path
+
+import numpy as np
+
+from starcal_ros.camera import CameraModel
+from starcal_ros.errors import IngestError, NotFromStars
+from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.images.photographs import (
+    by_camera,
+    image_paths,
+    in_order,
+    look_at,
+    Photograph,
+    pixels_of_photograph,
+)
+from starcal_ros.formats.messages.types import VELOCITY_TYPE
+from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.pipeline.from_stars import (
+    from_stars,
+    FromStars,
+    options_of,
+    pinhole,
+    write_attitudes,
+)
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.pipeline.topics import choose_image_topic, Topics
+from starcal_ros.pipeline.unknown_air import EARTH_M_S, with_air
+from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.sky.catalog import load_catalog
+
+IMAGE_TOPIC = '/camera/image_raw'
+
+
+@dataclass(frozen=True)
+class NightSky:
+    """
+    Bags and set-up of a calibration by the stars alone, and lines about them.
+
+    ``is_located`` is False where neither the options nor the files state where the camera was.
+    """
+
+    bags: tuple[Path, ...]
+    setup: Setup
+    notes: tuple[str, ...]
+    is_located: bool
+
+    def through_air(
+        self, observations: Sequence[StarObservations]
+    ) -> tuple[list[StarObservations], str]:
+        """Observations as seen through the air, where nobody states it, and what was found."""
+        if self.is_located:
+            return list(observations), ''
+        return with_air(observations, self.setup.prior.camera)
+
+
+def photographs_of(
+    paths: Sequence[Path], focal_length_mm: float = 0.0, pixel_um: float = 0.0
+) -> tuple[list[Photograph], list[str]]:
+    """
+    Photographs of one camera in order of time, and lines about the files left out.
+
+    Raises
+    ------
+    NotFromStars
+        When no file can be read.
+    """
+    looked: list[Photograph] = []
+    notes = []
+    for path in image_paths(paths):
+        try:
+            looked.append(look_at(path, focal_length_mm, pixel_um))
+        except IngestError as error:
+            notes.append(str(error))
+    groups = by_camera(looked)
+    if not groups:
+        raise NotFromStars('; '.join(notes[:1]) or f'{paths[0]}: no images')
+    (name, chosen), *others = groups.items()
+    if others:
+        left = ', '.join(f'{len(group)} of {other}' for other, group in others)
+        notes.append(f'{len(chosen)} images of {name} are used; left out: {left}')
+    return in_order(chosen), notes
+
+
+def from_photographs(
+    photographs: Sequence[Photograph], values: Mapping[str, object], folder: Path
+) -> NightSky:
+    """
+    Set-up of a calibration of photographs, whose bags are written into a folder.
+
+    Raises
+    ------
+    NotFromStars
+        When the stars give no camera.
+    """
+    found = camera_of_photographs(photographs, values)
+    bag = folder / 'images.mcap'
+    with BagWriter(bag) as writer:
+        for image in _images(photographs):
+            writer.write_image(IMAGE_TOPIC, _turned_back(image, found), 'camera')
+    stated = {**site_of(photographs), **values}
+    is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
+    if is_located and not all(one.dated for one in photographs):
+        stated = {'velocity_sigma_m_s': EARTH_M_S, **stated}
+    return _set_up(found, [bag], stated, folder, is_located)
+
+
+def camera_of_photographs(
+    photographs: Sequence[Photograph], values: Mapping[str, object]
+) -> FromStars:
+    """
+    Camera and rotations of photographs, from the focal length that they state, if any.
+
+    Raises
+    ------
+    NotFromStars
+        When the stars give no camera.
+    """
+    first = photographs[0]
+    focal_px = float(np.nanmedian([one.focal_px for one in photographs] + [math.inf]))
+    hint = pinhole((first.width, first.height), focal_px) if focal_px < 1e9 else None
+    return _found(_images(photographs), values, hint)
+
+
+def _images(photographs: Sequence[Photograph]) -> Iterator[Image]:
+    for one in photographs:
+        yield Image(one.time_ns, pixels_of_photograph(one.path))
+
+
+def from_bags(
+    bags: Sequence[Path], asked: Topics, values: Mapping[str, object], folder: Path
+) -> NightSky:
+    """
+    Set-up of a calibration of bags without attitudes; those by the stars are written to a folder.
+
+    Raises
+    ------
+    NotFromStars
+        When the stars give no camera, or the images are mirrored.
+    """
+    topic = choose_image_topic(bags, asked)
+    read = reader.read_images(bags, topic, channel=str(values.get('image_channel', '')))
+    found = camera_of_images((image for image in read if isinstance(image, Image)), values)
+    types = {topic.type_name for topic in reader.topics(bags)}
+    is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
+    return _set_up(found, bags, values, folder, is_located)
+
+
+def camera_of_images(images: Iterator[Image], values: Mapping[str, object]) -> FromStars:
+    """
+    Camera and rotations of the images of a bag.
+
+    Raises
+    ------
+    NotFromStars
+        When the stars give no camera, or the images are mirrored.
+    """
+    found = _found(images, values, None)
+    if found.mirrored:
+        raise NotFromStars('the images are mirrored: mirror them where they are read out')
+    return found
+
+
+def _found(
+    images: Iterator[Image], values: Mapping[str, object], hint: CameraModel | None
+) -> FromStars:
+    """Camera and rotations; the camera file of the options goes before a hint."""
+    if url := str(values.get('camera_info_url', '')):
+        hint = read_camera_info(url)
+    path = str(values.get('catalog', ''))
+    catalog = load_catalog(Path(path) if path else None)
+    least = int(str(values.get('min_images', CalibrationOptions().min_images)))
+    return from_stars(images, catalog, hint, least)
+
+
+def _set_up(
+    found: FromStars,
+    bags: Sequence[Path],
+    values: Mapping[str, object],
+    folder: Path,
+    is_located: bool,
+) -> NightSky:
+    attitudes = folder / 'attitudes.mcap'
+    write_attitudes(found, attitudes)
+    prior = CameraGeometry(found.camera, np.array([0.0, 0.0, 0.0, 1.0]))
+    setup = load_setup(options_of(values), others=NODE_OPTION_CLASSES, prior=prior)
+    return NightSky((*bags, attitudes), setup, (found.in_a_sentence(),), is_located)
+
+
+def _turned_back(image: Image, found: FromStars) -> Image:
+    """An image as it would be without a mirror."""
+    if not found.mirrored:
+        return image
+    return Image(image.time_ns, image.pixels[:, ::-1].copy())
+
+
+def site_of(photographs: Sequence[Photograph]) -> dict[str, object]:
+    """Options of the site, where all files state it with the date."""
+    sites = [one.site for one in photographs if one.site is not None and one.dated and one.utc]
+    if len(sites) < len(photographs):
+        return {}
+    latitude, longitude, height_m = sites[0]
+    return {
+        'observer': 'ground',
+        'latitude_deg': latitude,
+        'longitude_deg': longitude,
+        'height_m': height_m,
+    }

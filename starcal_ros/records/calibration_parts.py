@@ -1,0 +1,210 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Parts of a calibration: checks of its model, its star trackers, the budget of its sigma."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+from starcal_ros.arrays import Floats
+from starcal_ros.record_fields import Count, Finite, Quaternion, Shape
+
+TOTAL = 'total'
+BUDGET_COLUMNS, BUDGET_ROWS = 9, 7
+_MATTERS = 0.05  # of the variance
+
+
+@dataclass(frozen=True)
+class HeldTerm:
+    """
+    An unknown that is held or has a stated prior, with its estimate from the stars.
+
+    ``assumed`` is the held or prior value, ``asked`` the estimate from the stars, ``sigma`` the
+    1-sigma of their difference if the assumption is true.
+    """
+
+    name: str
+    assumed: float
+    asked: float
+    sigma: float
+
+    @property
+    def significance(self) -> float:
+        """The difference in sigmas."""
+        return abs(self.asked - self.assumed) / self.sigma
+
+
+@dataclass(frozen=True)
+class DetectorStep:
+    """
+    The most significant step between two parts of the detector, as lost columns cause.
+
+    Stars beyond ``place_px`` on the axis ``across`` (u or v) are displaced by ``size_px`` along
+    the axis ``moved``; ``p_value`` accounts for the number of places tested.
+    """
+
+    across: str
+    place_px: float
+    moved: str
+    size_px: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class ResidualBin:
+    """
+    Residuals of a group of stars, each predicted from the other data.
+
+    Attributes
+    ----------
+    by : str
+        ``radius`` (px from the middle of the detector), ``magnitude`` or ``image`` (its number in
+        order of time) for images that others predict; ``star`` (its number of images) or ``cell``
+        (px from the middle) for sums over stars and cells of the detector.
+    low, high : float
+        Limits of the group.
+    stars : int
+    normalised : float
+        RMS of the residuals over their predicted sigma: 1 where the model and its sigmas hold.
+    sigma : float
+        1-sigma of ``normalised``, from the number of stars.
+    """
+
+    by: str
+    low: float
+    high: float
+    stars: Count
+    normalised: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Amplitude:
+    """
+    An estimated amplitude of errors that the model does not describe.
+
+    Attributes
+    ----------
+    name : str
+    value : float
+        1-sigma, in ``unit``.
+    unit : str
+    likelihood_ratio : float
+        Twice the log likelihood ratio against an amplitude of zero; reported only.
+    """
+
+    name: str
+    value: float
+    unit: str
+    likelihood_ratio: float
+
+
+@dataclass(frozen=True)
+class ModelChecks:
+    """
+    Deviations of the data from the model and its priors.
+
+    Attributes
+    ----------
+    field_rms_px, field_worst_px : float
+        Residual field of the lens model: RMS per axis and largest length over the detector.
+    held : tuple of HeldTerm
+        Unknowns that are held, or that have a stated prior.
+    step : DetectorStep
+    image_variation_px : float
+        1-sigma change of the camera between images at a corner, included in the covariance.
+    amplitudes : tuple of Amplitude
+    predictions : tuple of ResidualBin
+        Empty with fewer than four images, and in older calibrations.
+    """
+
+    field_rms_px: float
+    field_worst_px: float
+    held: tuple[HeldTerm, ...]
+    step: DetectorStep
+    image_variation_px: float
+    amplitudes: tuple[Amplitude, ...] = ()
+    predictions: tuple[ResidualBin, ...] = ()
+
+
+@dataclass(frozen=True)
+class StarTrackerAlignment:
+    """
+    Alignment of the camera to one of several star trackers.
+
+    Attributes
+    ----------
+    frame : str
+        Name of the frame of the star tracker.
+    images : int
+        Number of images with an attitude from this star tracker; with 0 the mounting is the prior.
+    star_tracker_from_camera_xyzw : (4,)
+        Orientation of the camera in the frame of the star tracker.
+    alignment_covariance_rad2 : (3, 3)
+        Covariance of the passive small rotation of the camera, in the camera frame.
+    first_from_star_tracker_xyzw : (4,)
+        Orientation of the star tracker in the frame of the first one.
+    mounting_covariance_rad2 : (3, 3)
+        Covariance of a small rotation of the mounting about the axes of the camera; zero for the
+        first star tracker.
+    drift_arcsec_per_hour : tuple of 3 float
+        Drift of its attitude against the stars, about its own axes.
+    drift_arcsec, drift_p_value : float
+        Length of the drift over the time span of its images, and p-value of the hypothesis of no
+        drift; NaN for fewer than four images.
+    """
+
+    frame: str
+    images: Count
+    star_tracker_from_camera_xyzw: Quaternion
+    alignment_covariance_rad2: Annotated[Floats, Finite(), Shape((3, 3))]
+    first_from_star_tracker_xyzw: Quaternion
+    mounting_covariance_rad2: Annotated[Floats, Finite(), Shape((3, 3))]
+    drift_arcsec_per_hour: Annotated[tuple[float, ...], Shape((3,))]
+    drift_arcsec: float
+    drift_p_value: float
+
+
+@dataclass(frozen=True)
+class SigmaPart:
+    """
+    Part of the 1-sigma of lines of sight that is due to one cause, RMS over the detector.
+
+    Its square is the variance that would be gone if the cause were known exactly, or absent.
+    Parts of correlated causes overlap: their squares need not sum to the total's.
+
+    Attributes
+    ----------
+    cause : str
+        `TOTAL` for all causes together.
+    map_arcsec : float
+        Of the camera alone, the common rotation removed.
+    pointing_arcsec : float
+        In the star tracker frame.
+    assumption : str
+        The value assumed or estimated for the cause.
+    map_over_detector_arcsec : tuple of 63 float
+        Of the camera alone at a grid of 9 columns and 7 rows of pixels from corner to corner, row
+        by row; empty where it was not computed.
+    """
+
+    cause: str
+    map_arcsec: float
+    pointing_arcsec: float
+    assumption: str
+    map_over_detector_arcsec: tuple[float, ...] = ()
+
+
+def parts_that_matter(budget: Sequence[SigmaPart]) -> list[SigmaPart]:
+    """Return the total, and the causes of over 5 % of a variance, the largest first."""
+    if not budget:
+        return []
+    total = next(part for part in budget if part.cause == TOTAL)
+
+    def share(part: SigmaPart) -> float:
+        of_map = part.map_arcsec**2 / max(total.map_arcsec**2, 1e-300)
+        return max(of_map, part.pointing_arcsec**2 / max(total.pointing_arcsec**2, 1e-300))
+
+    causes = [part for part in budget if part.cause != TOTAL and share(part) > _MATTERS]
+    return [total, *sorted(causes, key=share, reverse=True)]

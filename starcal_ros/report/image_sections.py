@@ -1,0 +1,154 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Sections of the report on images and stars: the single-image view, pictures, refusals."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+import math
+
+from markupsafe import Markup
+import numpy as np
+
+from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.constants import utc_text
+from starcal_ros.records import Calibration, IMAGE_REFUSALS, STAR_REFUSALS, StarObservations
+from starcal_ros.report.pictures.annotation import STAR_MARKS
+from starcal_ros.report.pictures.thumbnails import star_of, Thumbnail
+
+_SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
+_LISTED_REFUSED = 200
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """Evenly spaced indices below a count, at most ``most``."""
+    return [round(place) for place in np.linspace(0, count - 1, min(count, most)).tolist()]
+
+
+def slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str, object] | None:
+    """Data of the single-image view: positions in px, residuals in 0.001 px."""
+    if residuals is None or len(residuals.image_time_ns) == 0:
+        return None
+    camera, typical_px = calibration.geometry.camera, max(calibration.residual_rms_px, 1e-6)
+    count = len(residuals.image_time_ns)
+    mean_stars = max(1.0, len(residuals.image) / count)
+    chosen = _spread(count, max(1, min(_SLIDER_IMAGES, int(_SLIDER_STARS / mean_stars))))
+    rms = residuals.image_rms_px()
+    images = []
+    for k in chosen:
+        here = residuals.image == k
+        place = np.rint(residuals.measured_px[here]).astype(int)
+        residual = np.rint(1000 * np.clip(residuals.residual_px[here], -99, 99)).astype(int)
+        stars = np.c_[place, residual, residuals.used[here].astype(int)]
+        error = residuals.attitude_error_arcsec[k]
+        images.append(
+            {
+                'number': k + 1,
+                'time': utc_text(int(residuals.image_time_ns[k])),
+                'rms': None if math.isnan(rms[k]) else round(float(rms[k]), 4),
+                'misfit': bool(residuals.image_misfit[k]),
+                'tracker': [None if math.isnan(e) else round(float(e), 2) for e in error],
+                'stars': stars.ravel().tolist(),
+            }
+        )
+    return {
+        'width': camera.width,
+        'height': camera.height,
+        'count': count,
+        'images': images,
+        # A typical residual is drawn as long as a fiftieth of the width.
+        'enlarge': round(float(np.clip(np.log10(0.02 * camera.width / typical_px), 0, 4)), 1),
+    }
+
+
+def picture(thumbnail: Thumbnail) -> Markup:
+    """Data URL of a picture."""
+    kind = 'image/jpeg' if thumbnail.name.endswith('.jpg') else 'image/png'
+    # Safe as markup: base64 has no special characters.
+    return Markup(f'data:{kind};base64,{base64.b64encode(thumbnail.encoded).decode("ascii")}')
+
+
+def refused_images(
+    counts: Mapping[str, int],
+    observations: Sequence[StarObservations],
+    thumbnails: Sequence[Thumbnail],
+) -> list[Mapping[str, object]]:
+    """For each reason: its count, the refused images and pictures of some."""
+    pictures = {t.time_ns: t for t in thumbnails if not t.reason}
+    groups: list[Mapping[str, object]] = []
+    for reason, count in sorted(counts.items(), key=lambda i: -i[1]):
+        images = [o for o in observations if o.refusal == reason]
+        groups.append(
+            {
+                'reason': reason,
+                'meaning': IMAGE_REFUSALS.get(reason, ''),
+                'count': count,
+                'images': [(utc_text(o.time_ns), o.detail) for o in images[:_LISTED_REFUSED]],
+                'pictures': [
+                    (picture(pictures[o.time_ns]), utc_text(o.time_ns), o.detail)
+                    for o in images
+                    if o.time_ns in pictures
+                ],
+            }
+        )
+    return groups
+
+
+def _counts(observations: Sequence[StarObservations]) -> Mapping[str, int]:
+    """Refused stars of all images by reason."""
+    counts: dict[str, int] = {}
+    for observed in observations:
+        for reason, count in observed.refused_stars.items():
+            counts[reason] = counts.get(reason, 0) + count
+    return counts
+
+
+def star_marks(observations: Sequence[StarObservations]) -> list[tuple[str, str]]:
+    """Colour and reason of the marks of refused stars in the pictures."""
+    return [
+        ('#{:02x}{:02x}{:02x}'.format(*reversed(STAR_MARKS[reason].color)), reason)
+        for reason, count in _counts(observations).items()
+        if count and reason in STAR_MARKS
+    ]
+
+
+def _cut_outs(
+    reason: str, observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
+) -> list[tuple[Markup, str, str]]:
+    """Pictures of stars refused for a reason, with the stamp and the catalog number of each."""
+    by_time = {o.time_ns: o for o in observations}
+    cut_outs = []
+    for one in thumbnails:
+        if one.reason == reason:
+            number = star_of(one, by_time[one.time_ns]) if one.time_ns in by_time else None
+            label = '' if number is None else str(number)
+            cut_outs.append((picture(one), utc_text(one.time_ns), label))
+    return cut_outs
+
+
+def refused_stars(
+    observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
+) -> list[Mapping[str, object]]:
+    """For each reason: its meaning, its count and pictures of some, the most frequent first."""
+    return [
+        {
+            'reason': reason,
+            'meaning': STAR_REFUSALS.get(reason, ''),
+            'count': count,
+            'pictures': _cut_outs(reason, observations, thumbnails),
+        }
+        for reason, count in sorted(_counts(observations).items(), key=lambda item: -item[1])
+        if count
+    ]
+
+
+def used_images(
+    observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
+) -> list[tuple[Markup, str, int]]:
+    """Picture, stamp and number of stars of images that were used."""
+    stars = {o.time_ns: len(o) for o in observations if not o.refusal}
+    return [
+        (picture(t), utc_text(t.time_ns), stars[t.time_ns])
+        for t in thumbnails
+        if not t.reason and t.time_ns in stars
+    ]

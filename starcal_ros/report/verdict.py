@@ -1,0 +1,211 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Verdict of a report in words: checks, assumptions, the precision by cause and the next step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from starcal_ros.arrays import Floats
+from starcal_ros.records import (
+    Calibration,
+    GateCheck,
+    HeldTerm,
+    ModelChecks,
+    parts_that_matter,
+    SigmaPart,
+)
+
+INFORMATIVE_SIGMAS = 2.0
+"""Distance from an assumed value below which the value that the stars ask for is noise."""
+
+_MOST_OF_DETECTOR = 0.98
+_NAMED_CAUSES, _NAMED_SHARE = 3, 0.2  # most causes in a sentence; least part of the sigma
+_REMEDIES = {
+    'stars': 'more images',
+    'velocity': 'record the velocity of the spacecraft (velocity_topic, velocity_sigma_m_s)',
+    'read-out': 'state the shutter and its read-out time (shutter, readout_s)',
+    'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
+    'field': 'more images with the stars at other places of the detector',
+    'fine structure': 'more images with the stars at other places of the detector',
+    'change from image to image': 'estimate with temperature, or calibrate each state by itself',
+    'star places': 'more images of other star fields',
+    'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
+    'temperature': 'images over a wider range of temperatures',
+    'star tracker noise': 'more images',
+    'star tracker slow error': 'images in more attitudes of the star tracker, or state its size '
+    '(star_tracker_slow_arcsec)',
+    'held parameters': 'estimate the held parameters (estimate)',
+}
+"""Measures against the causes of a sigma."""
+
+
+@dataclass(frozen=True)
+class CheckRow:
+    """Row of the table of the checks of the gate."""
+
+    name: str
+    option: str
+    result: str
+    found: str
+    limit: str
+    note: str
+
+
+def check_rows(gate: Sequence[GateCheck]) -> list[CheckRow]:
+    """Rows of the checks: the failed ones first, the others in their order."""
+    return [_row(check) for check in sorted(gate, key=lambda check: check.passed is not False)]
+
+
+def _row(check: GateCheck) -> CheckRow:
+    result = {True: 'passed', False: 'failed', None: 'not checked'}[check.passed]
+    found, limit, note = check.found_text, '', check.note
+    if check.unit == 'sigma' and found and math.isfinite(check.found):
+        found = f'{check.found:.1f} sigma of the difference'
+        note = '' if check.passed and check.found < INFORMATIVE_SIGMAS else note
+    if note == 'no limit is set':
+        limit = 'none'
+    elif check.option:
+        limit = f'{"at least" if check.is_least else "at most"} {check.limit_text}'
+    return CheckRow(check.name, check.option, result, found, limit, note)
+
+
+def checks_sentence(gate: Sequence[GateCheck]) -> str:
+    """How many checks passed, failed and were not made, and why not; empty without a gate."""
+    if not gate:
+        return ''
+    groups = (('failed', False), ('passed', True), ('not checked', None))
+    counts = [(name, sum(check.passed is value for check in gate)) for name, value in groups]
+    text = ', '.join(f'{name} {count}' for name, count in counts if count or name == 'passed')
+    reasons = dict.fromkeys(check.note for check in gate if check.passed is None and check.note)
+    why = f' ({"; ".join(reasons)})' if reasons else ''
+    return f'Checks: {text}{why}.'
+
+
+def precision_sentences(calibration: Calibration) -> list[str]:
+    """1-sigma of the lines of sight over the detector, and its largest causes."""
+    maps, budget = calibration.maps, parts_that_matter(calibration.sigma_budget)
+    if maps is None:
+        return []
+    return [
+        _precision('Camera alone', maps.shape_sigma_arcsec, budget, 'map_arcsec'),
+        _precision(
+            f'In {calibration.parent_frame}',
+            maps.line_of_sight_sigma_arcsec,
+            budget,
+            'pointing_arcsec',
+        ),
+    ]
+
+
+def _precision(scope: str, sigma: Floats, budget: Sequence[SigmaPart], of: str) -> str:
+    finite = sigma[np.isfinite(sigma)]
+    if not len(finite):
+        return f'{scope}: the lines of sight have no sigma.'
+    most = float(np.quantile(finite, _MOST_OF_DETECTOR, method='inverted_cdf'))
+    text = (
+        f'{scope}: lines of sight are known to {most:.2g}″ (1-sigma) or better over '
+        f'{100 * _MOST_OF_DETECTOR:.0f} % of the detector, to {finite.max():.2g}″ at worst'
+    )
+    if not budget:
+        return f'{text}.'
+    total, *causes = [(getattr(part, of), part.cause) for part in budget]
+    named = sorted((one for one in causes if one[0] > _NAMED_SHARE * total[0]), reverse=True)
+    parts = ', '.join(f'{size:.2g}″ from {cause}' for size, cause in named[:_NAMED_CAUSES])
+    return f'{text}; {total[0]:.2g}″ rms{f": {parts}" if parts else ""}.'
+
+
+def next_step(calibration: Calibration) -> str:
+    """The measure against a refusal, or against the largest cause of the sigma."""
+    if not calibration.accepted:
+        return 'Do not use it for navigation; mend the failed checks and calibrate again.'
+    causes = parts_that_matter(calibration.sigma_budget)[1:]
+    if not causes:
+        return ''
+    steps = []
+    for scope, of in (('camera', 'map_arcsec'), ('alignment', 'pointing_arcsec')):
+        largest = max(causes, key=lambda part: getattr(part, of))
+        remedy = _REMEDIES.get(largest.cause)
+        if remedy:
+            steps.append(f'{scope}, limited by {largest.cause}: {remedy}')
+    return f'For a smaller sigma: {"; ".join(steps)}.' if steps else ''
+
+
+@dataclass(frozen=True)
+class ModelRow:
+    """An assumption, what the stars show of it, its p-value as text and the remedy if it fails."""
+
+    assumption: str
+    found: str
+    p_value: str
+    remedy: str
+
+
+def model_rows(calibration: Calibration) -> list[ModelRow]:
+    """Rows for the assumptions that a calibration tested; none of one that tested none."""
+    found = calibration.model_checks
+    if found is None:
+        return []
+    camera_info = (
+        f'camera_info carries neither field nor skew: {_px(calibration.zero_skew_cost_px)}'
+    )
+    field = f'field of {_px(found.field_rms_px)} rms per axis, at most {_px(found.field_worst_px)}'
+    return [
+        ModelRow(
+            'The lens model describes the lens',
+            f'{field}; {camera_info} at most',
+            '',
+            'choose another lens_model; for lines of sight with the field use starcal lookup',
+        ),
+        *_held(found.held),
+        *_detector_and_images(found),
+    ]
+
+
+def _held(held: Sequence[HeldTerm]) -> Iterator[ModelRow]:
+    """One row for each value that the stars contradict, and one for all others together."""
+    agreeing = [term for term in held if term.significance < INFORMATIVE_SIGMAS]
+    for term in held:
+        if term.significance >= INFORMATIVE_SIGMAS:
+            yield ModelRow(
+                f'{term.name} is {term.assumed:.6g}',
+                f'the stars put it at {term.asked:.6g}: {term.significance:.1f} sigma of the '
+                'difference',
+                _p(math.erfc(term.significance / math.sqrt(2))),
+                f'estimate {term.name} (estimate) or widen its prior (prior_sigma)',
+            )
+    if agreeing:
+        names = ', '.join(f'{term.name} is {term.assumed:.6g}' for term in agreeing)
+        worst = max(term.significance for term in agreeing)
+        found = f'the stars agree, within {worst:.1f} sigma of the difference'
+        yield ModelRow(names, found, _p(math.erfc(worst / math.sqrt(2))), '')
+
+
+def _detector_and_images(found: ModelChecks) -> Iterator[ModelRow]:
+    step = found.step
+    yield ModelRow(
+        'The detector has no step',
+        f'{_px(abs(step.size_px))} in {step.moved} at {step.across} = {step.place_px:.0f}',
+        _p(step.p_value),
+        'columns or rows are lost or shifted there: check the read-out',
+    )
+    yield ModelRow(
+        'The camera is the same in all images',
+        f'varies by {_px(found.image_variation_px)} in a corner',
+        '',
+        'estimate with temperature, or calibrate each state by itself',
+    )
+
+
+def _px(value: float) -> str:
+    return f'{value:.3g} px'
+
+
+def _p(value: float) -> str:
+    """A p-value as text; empty where nothing was tested."""
+    if math.isnan(value):
+        return ''
+    return '< 1e\N{MINUS SIGN}6' if value < 1e-6 else f'{value:.2g}'

@@ -1,0 +1,259 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Bag player node: publishes the messages of an MCAP bag unchanged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import contextlib
+import sys
+import threading
+import time
+from typing import Any
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+
+from starcal.msg import StarObservations as ObservationsMessage
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import BagError
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.messages import types
+from starcal_ros.options import from_mapping
+from starcal_ros.pipeline.node_options import PlayerOptions
+from starcal_ros.ros.lifecycle_node.inputs import LATCHED
+from starcal_ros.ros.lifecycle_node.lifecycle import end_quietly, until_told_to_end
+from starcal_ros.ros.lifecycle_node.message_factory import message_class
+from starcal_ros.ros.lifecycle_node.parameters import OptionParameters
+from starcal_ros.ros.lifecycle_node.printable_log import PrintableLog
+
+NAME = 'bag_player'
+# A writer ahead of its readers by more than its history loses messages, reliable or not.  Images
+# are acknowledged within 10 ms, small messages only with the next heartbeat, after up to 3 s.
+_IMAGE_DEPTH, _OTHER_DEPTH = 10, 20_000
+_UNACKED = {True: _IMAGE_DEPTH // 2, False: _OTHER_DEPTH // 2}
+_SMALL_PER_S = 2000.0  # rate that a Python reader sustains beside its other work
+_ACK_S = 30.0
+_POLL_S = 0.1  # longest time without a look at whether a signal has shut ROS down
+# A node is discovered subscription by subscription, and what is sent before a match is lost.
+_SETTLED_S = 0.5
+_CLOCK_S = 0.01  # wall-clock period of /clock
+_LATCHED_TYPES = (types.CALIBRATION_TYPE, types.STATUS_TYPE, types.CAMERA_INFO_TYPE)
+
+
+class BagPlayer(PrintableLog):
+    """Publishes the messages of a bag in order, with their stamps, at a given rate."""
+
+    def __init__(self) -> None:
+        super().__init__(NAME)
+        self.own = from_mapping(PlayerOptions, OptionParameters(self, [PlayerOptions]).values())
+        if not self.own.bag:
+            raise BagError('bag: path of the bag to play is missing')
+        self._topics = reader.topics([self.own.bag])
+        # A star observer reads the raw images or the compressed ones.
+        self._images = set(self._of(types.IMAGE_TYPE) or self._of(types.COMPRESSED_TYPE))
+        self._players = {}
+        for topic in self._topics:
+            if self.own.clock and topic.name == '/clock':
+                continue  # the player publishes its own
+            try:
+                kind = message_class(topic.type_name)
+            except ImportError:
+                text = f'{topic.name}: {topic.type_name} is not installed here: skipped'
+                self.get_logger().warning(text)
+                continue
+            offer = _offer(topic, topic.name in self._images)
+            self._players[topic.name] = self.create_publisher(kind, topic.name, offer)
+        if not self._players:
+            raise BagError(f'{self.own.bag}: no topic has an installed message type')
+        self._clock_publisher = (
+            self.create_publisher(Clock, '/clock', QoSProfile(depth=10))
+            if self.own.clock
+            else None
+        )
+        self._clock_due_s = 0.0
+        self._unacked = dict.fromkeys(self._players, 0)
+        self._observed = threading.Condition()
+        self._observed_count = 0
+        # Observations in the bag itself must not pace the player or count as subscribers.
+        kinds = {topic.type_name for topic in self._topics}
+        self._paced = bool(self._images) and types.OBSERVATIONS_TYPE not in kinds
+        if self._paced:
+            self._observations = self.create_subscription(
+                ObservationsMessage, 'observations', self._on_observations, QoSProfile(depth=1000)
+            )
+
+    def play(self) -> int:
+        """Play the bag; 0 if all subscribers have acknowledged all messages."""
+        self._wait_for_subscribers()
+        while True:
+            self._play_once()
+            if not self.own.loop:
+                break
+        if all(player.wait_for_all_acked(_timeout()) for player in self._players.values()):
+            return 0
+        self.get_logger().error('a subscriber did not acknowledge all messages')
+        return 1
+
+    def _play_once(self) -> None:
+        start_s, first_ns = time.monotonic(), None
+        sent_images, small_s = 0, time.monotonic()
+        with self._observed:
+            self._observed_count = 0
+        for raw in reader.read_raw([self.own.bag], self._players, self._on_damage):
+            if first_ns is None:
+                first_ns = raw.log_time_ns
+            if self.own.rate:
+                since_s = (raw.log_time_ns - first_ns) / NANOSECONDS_PER_SECOND
+                self._sleep_until(start_s + since_s / self.own.rate)
+            self._tell_time(raw.log_time_ns)
+            is_image = raw.topic in self._images
+            if is_image:
+                self._wait_for_observations(sent_images)
+                sent_images += 1
+            else:
+                small_s = max(small_s + 1.0 / _SMALL_PER_S, time.monotonic() - 0.05)
+                self._sleep_until(small_s)
+            player = self._players[raw.topic]
+            player.publish(raw.data)
+            self._unacked[raw.topic] += 1
+            if self._unacked[raw.topic] >= _UNACKED[is_image]:
+                player.wait_for_all_acked(_timeout())
+                self._unacked[raw.topic] = 0
+            self._check_shutdown()
+
+    def _wait_for_subscribers(self) -> None:
+        """Wait until the topics that matter have subscribers and no more come, or the timeout."""
+        attitudes = self._of(types.ATTITUDE_TYPE)
+        # Of other types, one holds the attitudes, and the others may be there for anything.
+        others = [] if attitudes else self._of(*types.ATTITUDE_TYPES.values())
+        needed = [*self._images, *attitudes] or list(self._players)
+        other = self.own.wait_for_topic
+        deadline_s = time.monotonic() + self.own.wait_for_subscribers_s
+
+        def is_read(name: str) -> bool:
+            return bool(self._players[name].get_subscription_count())
+
+        matches: list[int] = []
+        since_s = time.monotonic()
+        while True:
+            now_s = time.monotonic()
+            found = [player.get_subscription_count() for player in self._players.values()]
+            if found != matches:
+                matches, since_s = found, now_s
+            missing = [
+                *(name for name in needed if not is_read(name)),
+                *([] if not others or any(map(is_read, others)) else [' or '.join(others)]),
+                *([other] if other and not self._other_subscribers(other) else []),
+            ]
+            if not missing and now_s >= since_s + _SETTLED_S:
+                return
+            if now_s > deadline_s:
+                if missing:
+                    names = ', '.join(missing)
+                    self.get_logger().warning(f'no subscriber on {names}: playing anyway')
+                return
+            self._sleep_until(now_s + 0.02)  # rclpy cannot wait for a match
+
+    def _of(self, *kinds: str) -> list[str]:
+        """Topics of the bag of some types."""
+        return [topic.name for topic in self._topics if topic.type_name in kinds]
+
+    def _other_subscribers(self, topic: str) -> int:
+        name = self.resolve_topic_name(topic)
+        is_own = self._paced and name == self._observations.topic_name
+        return int(self.count_subscribers(name)) - is_own
+
+    def _wait_for_observations(self, sent: int) -> None:
+        """Wait while a star observer has too many images in its queue."""
+        if not self._paced or not self.count_publishers(self._observations.topic_name):
+            return
+        with self._observed:
+            before, since_s = self._observed_count, time.monotonic()
+            while sent - self._observed_count >= self.own.images_in_flight:
+                self._observed.wait(_POLL_S)
+                self._check_shutdown()
+                if self._observed_count != before:
+                    before, since_s = self._observed_count, time.monotonic()
+                elif time.monotonic() > since_s + _ACK_S:
+                    self.get_logger().warning(
+                        'no observations received: images are no longer paced'
+                    )
+                    self._paced = False
+                    return
+
+    def _sleep_until(self, moment_s: float) -> None:
+        while True:
+            self._check_shutdown()
+            left_s = moment_s - time.monotonic()
+            if left_s <= 0:
+                return
+            time.sleep(min(left_s, _POLL_S))
+
+    def _check_shutdown(self) -> None:
+        if not self.context.ok():
+            raise ExternalShutdownException
+
+    def _tell_time(self, time_ns: int) -> None:
+        if self._clock_publisher is None or time.monotonic() < self._clock_due_s:
+            return
+        self._clock_due_s = time.monotonic() + _CLOCK_S
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(time_ns, NANOSECONDS_PER_SECOND)
+        self._clock_publisher.publish(message)
+
+    def _on_observations(self, _message: Any) -> None:
+        with self._observed:
+            self._observed_count += 1
+            self._observed.notify()
+
+    def _on_damage(self, text: str) -> None:
+        self.get_logger().warning(text)
+
+
+def _offer(topic: reader.Topic, is_image: bool) -> QoSProfile:
+    if topic.type_name in _LATCHED_TYPES:
+        return LATCHED
+    return QoSProfile(depth=_IMAGE_DEPTH if is_image else _OTHER_DEPTH)
+
+
+def _listen(player: BagPlayer) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(player)
+    with contextlib.suppress(ExternalShutdownException):
+        executor.spin()
+
+
+def _timeout() -> Duration:
+    return Duration(seconds=_ACK_S)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """
+    Play a bag; exit status 0 if all is acknowledged, 1 if not, 2 for a bad bag or parameter.
+
+    A signal ends it with status 0.
+    """
+    player: BagPlayer | None = None
+    listener: threading.Thread | None = None
+
+    def work() -> int:
+        nonlocal player, listener
+        player = BagPlayer()
+        listener = threading.Thread(target=_listen, args=[player])
+        listener.start()
+        return player.play()
+
+    def end() -> None:
+        rclpy.try_shutdown()
+        if listener is not None:
+            listener.join()
+        end_quietly(player)
+
+    return until_told_to_end(NAME, args, work, end)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,417 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Calibrator node: subscribes to star observations, publishes calibrations."""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Sequence
+import contextlib
+from pathlib import Path
+import sys
+import threading
+from typing import Any
+
+from geometry_msgs.msg import TransformStamped
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import CameraInfo
+from std_srvs.srv import Trigger
+
+from starcal.msg import Calibration as CalibrationMessage
+from starcal.msg import EnsembleStatus as StatusMessage
+from starcal.msg import StarObservations as ObservationsMessage
+from starcal.srv import Calibrate, LineOfSightTable
+from starcal.srv import Plan as PlanService
+from starcal_ros.assessment.lookup import line_of_sight_table
+from starcal_ros.assessment.plan import LINE_OF_SIGHT
+from starcal_ros.camera import pixel_grid
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import StarcalError
+from starcal_ros.formats.messages.calibration_messages import (
+    alignment_to_message,
+    calibration_to_message,
+    camera_info_to_message,
+    mountings_to_messages,
+    status_to_message,
+)
+from starcal_ros.formats.messages.message_codec import record_to_message
+from starcal_ros.formats.messages.message_fields import make_header
+from starcal_ros.formats.messages.observation_messages import checked_observations
+from starcal_ros.options import from_mapping
+from starcal_ros.pipeline.node_options import CalibratorOptions
+from starcal_ros.pipeline.plan import plan_pointings, request_of
+from starcal_ros.pipeline.setup import load_setup
+from starcal_ros.records import IMAGE_REFUSALS
+from starcal_ros.ros.kept.report_queue import ACTIVE, CalibratorReports, CANDIDATE, Subject
+from starcal_ros.ros.kept.state import Answer, CalibratorState
+from starcal_ros.ros.kept.status_thread import StatusThread
+from starcal_ros.ros.lifecycle_node.inputs import LATCHED
+from starcal_ros.ros.lifecycle_node.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
+from starcal_ros.ros.lifecycle_node.message_factory import make_message, message_class
+from starcal_ros.ros.set_camera_info_client import CameraDriver
+from starcal_ros.ros.transforms import Transforms
+
+NAME = 'calibrator'
+_NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)
+# Deep enough to lose no image at one a second during a solve of minutes.
+_OBSERVATIONS = QoSProfile(depth=1000)
+_TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+# Of every publisher of static transforms the last message.
+_ALL_LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_RETRY_S = 1.0  # after a failed write
+_TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB
+
+
+class Calibrator(StarcalNode):
+    """
+    Collects observations and calibrates on request, in a worker thread.
+
+    `CalibratorState` holds the ensemble and the active calibration; the node publishes them.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(NAME)
+        self._made: list[tuple[Any, Any]] = []
+        self._publishing = threading.Lock()
+        self._state = CalibratorState(self._now_ns)
+        self._reports = CalibratorReports(self.guarded(self._on_report))
+        self._last_answer = Answer(True, '')
+        self._last_gate = 'none'
+        self._driver: CameraDriver | None = None
+        self._status_thread: StatusThread | None = None
+        solving, deciding = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
+        sending = MutuallyExclusiveCallbackGroup()
+        # There in every state: a caller of a service that is not there waits for ever.
+        for kind, name, answer, group in (
+            (Trigger, '~/calibrate', self._on_calibrate, solving),
+            (Calibrate, '~/solve', self._on_solve, solving),
+            (Trigger, '~/reset', self._on_reset, deciding),
+            (Trigger, '~/rollback', self._on_rollback, deciding),
+            (LineOfSightTable, '~/lookup', self._on_lookup, sending),
+            (PlanService, '~/plan', self._on_plan, solving),
+            (Trigger, '~/send_camera_info', self._on_send_camera_info, sending),
+        ):
+            self.create_service(kind, name, self._answered(answer), callback_group=group)
+
+    def configure(self) -> None:
+        """Load the prior camera, options and state folder, create the latched publishers."""
+        values = self.options.values()
+        self._own = from_mapping(CalibratorOptions, values)
+        self._setup = load_setup(values, self.options.classes)
+        self._state.open(self._setup, self._own)
+        self._reports.open(
+            self._own.state_dir if self._own.state_report else '', self._setup.frames.camera_frame
+        )
+        for text in (*self._state.damage, *self._state.withheld):
+            self.get_logger().error(text)
+        if self._state.withheld:
+            self._last_gate = f'refused: {self._state.withheld[0]}'
+
+        def latched(kind: Any, topic: str) -> Any:
+            publisher = self.create_lifecycle_publisher(kind, topic, LATCHED)
+            self._made.append((self.destroy_lifecycle_publisher, publisher))
+            return publisher
+
+        self._camera_info = latched(CameraInfo, 'camera_info')
+        self._alignment = latched(TransformStamped, 'alignment')
+        self._calibration = latched(CalibrationMessage, 'calibration')
+        self._candidate = latched(CalibrationMessage, 'candidate_calibration')
+        self._status = latched(StatusMessage, 'ensemble_status')
+        self._transforms = self._tf_static = None
+        with contextlib.suppress(ImportError):  # tf2_msgs need not be installed
+            self._tf_static = latched(message_class(_TRANSFORMS), '/tf_static')
+            frames = [self._setup.frames.camera_frame]
+            self._transforms = Transforms([*frames, *(one.frame for one in self._setup.mountings)])
+
+    def activate(self) -> None:
+        """Start to collect observations and to serve requests."""
+        self._listeners: list[tuple[Any, Any]] = []
+        collecting = MutuallyExclusiveCallbackGroup()
+        if self._own.set_camera_info_service:
+            self._driver = CameraDriver(self, self._own.set_camera_info_service)
+        self.inputs.add(
+            ObservationsMessage,
+            'observations',
+            self.taking(self._on_observations),
+            _OBSERVATIONS,
+            group=collecting,
+        )
+        if self._transforms is not None:
+            heard = self.create_subscription(
+                message_class(_TRANSFORMS),
+                '/tf_static',
+                self.guarded(self._transforms.hear),
+                _ALL_LATCHED,
+                callback_group=collecting,
+            )
+            self._listeners.append((self.destroy_subscription, heard))
+        retry = self.steady_timer(_RETRY_S, self.guarded(self._save_again), collecting)
+        self._listeners.append((self.destroy_timer, retry))
+        self._status_thread = StatusThread(self.guarded(self._publish_status))
+        self._publish_active()
+
+    def deactivate(self) -> None:
+        """Stop collecting observations and serving requests."""
+        if self._driver is not None:
+            self._driver.close()
+            self._driver = None
+        self.inputs.close()
+        listeners = getattr(self, '_listeners', [])
+        while listeners:
+            destroy, entity = listeners.pop()
+            destroy(entity)
+        thread, self._status_thread = self._status_thread, None
+        if thread is not None:
+            thread.close()
+
+    def cleanup(self) -> None:
+        """Destroy the publishers and close the state folder; the state stays in memory."""
+        while self._made:
+            destroy, entity = self._made.pop()
+            destroy(entity)
+        self._reports.close()
+        self._state.close()
+
+    def health(self) -> Health:
+        """Diagnostics: ensemble, active calibration and the result of the last request."""
+        state, last = self._state, self._last_answer
+        ensemble, active = state.ensemble, state.active
+        free = state.disk_free_bytes()
+        age_s: object = 'none'
+        if active is not None:
+            age_ns = self._now_ns() - active.active_since_ns
+            age_s = round(age_ns / NANOSECONDS_PER_SECOND, 1)
+        driver = self._driver
+        numbers: dict[str, object] = {
+            'images': len(ensemble.images),
+            'stars': ensemble.star_count,
+            **{
+                f'refused_{reason}': count
+                for reason, count in {**_NONE_REFUSED, **ensemble.refused}.items()
+            },
+            'active': 'none' if active is None else active.number,
+            'calibration_age_s': age_s,
+            'last_gate': self._last_gate,
+            'last_answer': last.message,
+            'camera_driver': 'none' if driver is None else driver.outcome,
+            'camera_driver_failures': 0 if driver is None else driver.failures,
+            'state_damaged_files': len(state.damage),
+            'state_refused_calibrations': len(state.withheld),
+            'disk_free_mb': 'none' if free is None else free // 1_000_000,
+        }
+        if state.trouble:
+            return ERROR, f'state not saved, in memory only: {state.trouble}', numbers
+        if state.withheld:
+            return WARN, '; '.join(state.withheld), numbers
+        if active is not None and active.forced:
+            return WARN, f'active despite the gate: {"; ".join(active.reasons)}', numbers
+        topic = self.resolve_topic_name('calibration')
+        if self.count_publishers(topic) > 1:
+            return WARN, f'another node publishes {topic}', numbers
+        if foreign := self._foreign_transforms():
+            return WARN, foreign, numbers
+        if state.damage:
+            return WARN, f'set aside as damaged: {"; ".join(state.damage)}', numbers
+        if driver is not None and driver.has_failed:
+            return WARN, f'camera driver not updated: {driver.outcome}', numbers
+        if not last.success:
+            return WARN, last.message, numbers
+        if self._reports.trouble:
+            return WARN, f'no report: {self._reports.trouble}', numbers
+        return OK, 'collecting' if active is None else 'calibration active', numbers
+
+    def _foreign_transforms(self) -> str:
+        """Return which transforms another node publishes as well; empty: none."""
+        if self._transforms is None or self.count_publishers('/tf_static') < 2:
+            return ''
+        names = ', '.join(self._transforms.foreign())
+        remedy = 'each camera needs frames of its own (camera_frame, more_star_trackers)'
+        return names and f'/tf_static: another node publishes {names} too: {remedy}'
+
+    def _on_observations(self, message: Any) -> None:
+        observations = checked_observations(message)
+        if observations.refusal == 'bad_observations':
+            self.get_logger().warning(f'observations refused: {observations.detail}')
+        self._state.add(observations)
+        self._on_change()
+
+    def _save_again(self) -> None:
+        if self._state.trouble:
+            self._state.save()
+            self._on_change()
+
+    def _on_change(self) -> None:
+        thread = self._status_thread
+        if thread is not None:
+            thread.changed()
+
+    def _publish_status(self) -> None:
+        frame_id = self._setup.frames.camera_frame
+        status = self._state.status()
+        self._status.publish(status_to_message(status, frame_id, make_message))
+
+    def _on_calibrate(self, _request: Any, response: Any) -> Any:
+        return self._told(self._judged(self._state.solve()), response)
+
+    def _on_solve(self, request: Any, response: Any) -> Any:
+        answer = self._judged(
+            self._state.solve(
+                request.method, tuple(request.estimate), request.dry_run, request.force
+            )
+        )
+        if answer.calibration is not None:
+            response.calibration = calibration_to_message(answer.calibration, make_message)
+        return self._told(answer, response)
+
+    def _on_reset(self, _request: Any, response: Any) -> Any:
+        answer = self._state.reset()
+        self._on_change()
+        return self._told(answer, response)
+
+    def _on_rollback(self, _request: Any, response: Any) -> Any:
+        return self._told(self._state.rollback(), response)
+
+    def _on_lookup(self, request: Any, response: Any) -> Any:
+        active = self._state.active
+        points = request.points or _TABLE_POINTS
+        response.success = False
+        if not 2 <= points <= _MAX_TABLE_POINTS:
+            response.message = f'points: {points} is not in the range 2 to {_MAX_TABLE_POINTS}'
+        elif active is None:
+            response.message = 'no calibration is active'
+        else:
+            camera = active.geometry.camera
+            pixels = pixel_grid(camera, points, points)
+            table = line_of_sight_table(camera, active.map_covariance, pixels)
+            response.header = make_header(active.active_since_ns, active.child_frame, make_message)
+            for name, column in table.columns().items():
+                setattr(response, name, array.array('d', column.tobytes()))
+            response.sigma_budget = [
+                record_to_message(part, make_message) for part in active.sigma_budget
+            ]
+            response.success = True
+            response.message = f'{len(pixels)} lines of sight of calibration {active.number}'
+        return response
+
+    def _on_plan(self, request: Any, response: Any) -> Any:
+        response.success = False
+        try:
+            wanted = request_of(
+                images=request.images or 10,
+                minimise=request.minimise or LINE_OF_SIGHT,
+                pointings=(request.ra_deg, request.dec_deg, request.roll_deg),
+                avoid=(request.avoid_ra_deg, request.avoid_dec_deg, request.avoid_radius_deg),
+                largest_slew_deg=request.largest_slew_deg or 180.0,
+            )
+            found = plan_pointings(self._state.ensemble, self._setup, wanted)
+        except StarcalError as error:
+            response.message = str(error)
+            return response
+        places = [step.pointing for step in found.steps]
+        for name in ('ra_deg', 'dec_deg', 'roll_deg'):
+            setattr(response, name, array.array('d', [getattr(one, name) for one in places]))
+        response.stars = [step.stars for step in found.steps]
+        response.sigma = [step.sigma for step in found.steps]
+        response.sigma_name, response.sigma_now = found.name, found.sigma
+        response.enough = -1 if found.enough is None else found.enough
+        response.success, response.message = True, found.in_a_sentence()
+        return response
+
+    def _on_send_camera_info(self, _request: Any, response: Any) -> Any:
+        driver = self._driver
+        if driver is None:
+            response.success, response.message = (
+                False,
+                'parameter set_camera_info_service is empty',
+            )
+        else:
+            response.success, response.message = driver.hand_over_again()
+        return response
+
+    def _now_ns(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+    def _judged(self, answer: Answer) -> Answer:
+        """Store the result of the gate for the diagnostics."""
+        if answer.calibration is not None:
+            reasons = '; '.join(answer.calibration.reasons)
+            self._last_gate = 'accepted' if answer.calibration.accepted else f'refused: {reasons}'
+        return answer
+
+    def _told(self, answer: Answer, response: Any) -> Any:
+        """Publish the active or the refused calibration; return the filled response."""
+        if not self.is_active:
+            pass  # deactivated meanwhile: activation publishes the active calibration
+        elif answer.calibration is not None and answer.active:
+            self._publish_active(answer)
+        elif answer.calibration is not None and not answer.success:
+            self._candidate.publish(calibration_to_message(answer.calibration, make_message))
+            self._show(CANDIDATE, answer)
+        self._last_answer = Answer(answer.success, answer.message)
+        response.success, response.message = answer.success, answer.message
+        return response
+
+    def _show(self, report: str, answer: Answer) -> None:
+        if answer.calibration is not None:
+            subject = Subject(answer.calibration, answer.residuals, answer.observations)
+            self._reports.show(report, subject)
+
+    def _on_report(self, page: Path, trouble: str) -> None:
+        if trouble:
+            self.get_logger().warning(f'{page}: not made: {trouble}')
+        else:
+            self.get_logger().info(f'report: {page}')
+        self.publish_health_change()
+
+    def _publish_active(self, answer: Answer | None = None) -> None:
+        """Publish the active calibration, and its report where it is that of an answer."""
+        # Two requests may activate one each: of all publishers the last is of the later one.
+        with self._publishing:
+            calibration = self._state.active_on_disk
+            if calibration is None:
+                return
+            camera_info = camera_info_to_message(calibration, make_message)
+            alignment = alignment_to_message(calibration, make_message)
+            self._camera_info.publish(camera_info)
+            self._alignment.publish(alignment)
+            self._calibration.publish(calibration_to_message(calibration, make_message))
+            if self._tf_static is not None and self._transforms is not None:
+                transforms = [alignment, *mountings_to_messages(calibration, make_message)]
+                self._transforms.own(transforms)
+                self._tf_static.publish(make_message(_TRANSFORMS, transforms=transforms))
+            if self._driver is not None:
+                self._driver.hand_over(camera_info)
+            if answer is not None and answer.calibration is calibration:
+                self._show(ACTIVE, answer)
+
+    def _answered(self, answer: Any) -> Any:
+        """Return the service callback wrapped so that errors are answered, logged and counted."""
+        # The diagnostics may fail while the node is being deactivated; the answer must not.
+        tell_health = self.guarded(self.publish_health_change)
+
+        def run_and_tell(request: Any, response: Any) -> Any:
+            if not self.is_active:
+                state = self._state_machine.current_state[1]
+                response.success, response.message = False, f'not active: {state}'
+                return response
+            try:
+                response = answer(request, response)
+            except Exception as error:
+                self.count_error(error)
+                response.success = False
+                response.message = f'internal error: {type(error).__name__}: {error}'
+                self._last_answer = Answer(False, response.message)
+            self.get_logger().info(response.message)
+            tell_health()
+            return response
+
+        return run_and_tell
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the calibrator until shutdown; exit status 2 for bad parameters."""
+    return run(Calibrator, NAME, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

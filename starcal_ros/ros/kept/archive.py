@@ -1,0 +1,447 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+State on disk: the ensemble, and the activated calibrations, safe from a crash.
+
+``ensemble/00000012.mcap`` is one image, numbered in order of arrival: a whole bag that any reader
+of MCAP opens.  ``ensemble/refused.json`` counts the refused images.  ``ensemble/metadata.yaml``
+lists the images for rosbag2 while no calibrator uses the folder, unless the last one was killed.
+``calibrations/00000007_calibration_00000003.json`` records that event 7 activated calibration 3
+(here by a roll-back): a ``calibration.json`` with two more keys.
+
+A file is written beside its place, synced, renamed, and the folder synced; it is never changed
+afterwards.  So at any instant each file is complete or absent.
+
+The folder is untrusted input.  Only regular files of limited size are opened.  A file with a wrong
+seal (`calibrator.seal`), or with content that is no image or no calibration, is renamed to
+``….damaged`` and skipped.  With a key, the name of an image carries its HMAC:
+``00000012_<64 digits>.mcap``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import contextlib
+from dataclasses import dataclass, field
+import fcntl
+import itertools
+import os
+from pathlib import Path
+import re
+import shutil
+import stat
+from typing import Any
+
+import numpy as np
+
+from starcal_ros.errors import ArchiveError, BagError, ProductError
+from starcal_ros.files import PART, sync_folder
+from starcal_ros.formats.bag.reader import read_observations
+from starcal_ros.formats.bag.typestore import make_message, typestore
+from starcal_ros.formats.bag.writer import BagWriter, FileSpan, metadata_text, TopicSummary
+from starcal_ros.formats.messages import calibration_messages
+from starcal_ros.formats.messages.types import (
+    ALIGNMENT_TYPE,
+    CALIBRATION_TYPE,
+    CAMERA_INFO_TYPE,
+    OBSERVATIONS_TYPE,
+)
+from starcal_ros.formats.products import calibration_json
+from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.record_codec import json_object, read_record
+from starcal_ros.record_fields import Count
+from starcal_ros.records import Calibration, counted_refusal, Ensemble, StarObservations
+from starcal_ros.ros.kept.seal import CHECKSUMS, Seal
+from starcal_ros.ros.kept.stored import Activation
+from starcal_ros.untrusted import read_bytes
+
+ARCHIVE_SCHEMA = 1
+TOPIC = '/observations'
+
+_ENSEMBLE, _CALIBRATIONS, _EMPTIED = 'ensemble', 'calibrations', 'ensemble.emptied'
+_REFUSED, _METADATA = 'refused.json', 'metadata.yaml'
+_EVENT_NAME = re.compile(r'(\d{8,9})_calibration_(\d{8,9})\.json')
+_IMAGE_NAME = re.compile(r'(\d{8,9})(?:_([0-9a-f]{64}))?\.mcap')
+# Numbers in the names of files that are not read count as given up to this one: a calibrator does
+# not reach it, and a file with a longer number would leave none for those after it.
+_NUMBERED = re.compile(r'\.?(\d{8})[._]')
+_LAST_NUMBER = 999_999_999
+_MOST_BYTES = 64 << 20  # of a file: an image of 10,000 stars has 1 MB
+_MOST_COUNT = 2**32 - 1  # of refused images: that of the message
+
+
+@dataclass(frozen=True)
+class _ActivationKeys:
+    """The key ``archive`` of the file of an activation."""
+
+    schema: int
+    event: Count
+    before: Count
+
+
+@dataclass(frozen=True)
+class _RefusedFile:
+    """The file of the counts of refused images, by reason."""
+
+    schema: int
+    refused: Mapping[str, Count] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """An image on disk, and its file."""
+
+    image: StarObservations
+    path: Path
+
+
+class Archive:
+    """
+    A state folder, locked by this process until `close`.
+
+    The records in memory are authoritative; `keep` writes them.  Not safe for several threads.
+    Raises ArchiveError when the folder cannot be made or read, or another process has locked it.
+
+    Attributes
+    ----------
+    damage : list of str
+        A sentence for each file that was set aside or skipped.
+    last_event : int
+        The highest number given to any file.
+    """
+
+    def __init__(self, folder: Path, frame_id: str, seal: Seal = CHECKSUMS) -> None:
+        self.folder = folder
+        self._seal = seal
+        self.damage: list[str] = []
+        self.last_event = 0
+        self._frame_id = frame_id
+        self._images: dict[int, _Kept] = {}  # by stamp: those on disk
+        self._next_image = 1
+        self._refused: dict[str, int] = {}
+        self._events: dict[int, Path] = {}  # those on disk
+        self._lock = _locked(folder)
+        self._finish_emptying()
+        # After a kill the metadata would lack the last images, and readers would skip them.
+        for stale in (*folder.glob(f'*/.*{PART}'), folder / _ENSEMBLE / _METADATA):
+            with contextlib.suppress(OSError):
+                stale.unlink()
+
+    def close(self) -> None:
+        """Describe the ensemble for rosbag2 and unlock the folder; safe to call twice."""
+        if self._lock >= 0:
+            self._describe()
+            os.close(self._lock)
+        self._lock = -1
+
+    def _describe(self) -> None:
+        kept = sorted(self._images.items(), key=lambda item: item[1].path.name)
+        if not kept:
+            return
+        files = [FileSpan(one.path.name, stamp, stamp, 1) for stamp, one in kept]
+        topic = TopicSummary(TOPIC, OBSERVATIONS_TYPE, False, len(files))
+        with contextlib.suppress(OSError, ProductError):  # the images are whole without it
+            self._write(_ENSEMBLE, _METADATA, metadata_text(files, [topic]))
+
+    def saved(self, ensemble: Ensemble) -> int:
+        """Number of images of an ensemble on disk."""
+        return sum(map(self._holds, ensemble.images))
+
+    def _holds(self, image: StarObservations) -> bool:
+        # Not by its stamp: after a reset that failed on disk, another image may have it.
+        kept = self._images.get(image.time_ns)
+        return kept is not None and kept.image is image
+
+    def free_bytes(self) -> int:
+        """Free space on the disk; 0 where it cannot be read."""
+        try:
+            return shutil.disk_usage(self.folder).free
+        except OSError:
+            return 0
+
+    def read_ensemble(self) -> Ensemble:
+        """The ensemble on disk, in order of arrival; damaged images are set aside."""
+        images = []
+        for path, name in self._files(_ENSEMBLE, _IMAGE_NAME):
+            image = self._read_image(path, name)
+            if image is not None and image.time_ns not in self._images:
+                images.append(image)
+                self._images[image.time_ns] = _Kept(image, path)
+                self._next_image = max(self._next_image, int(name[1]) + 1)
+        for path, _ in self._files(_ENSEMBLE, re.compile(re.escape(_REFUSED))):
+            self._refused = self._read_refused(path)
+        return Ensemble(tuple(images), dict(self._refused))
+
+    def set_aside_image(self, time_ns: int, why: str) -> None:
+        """Rename the file of an image that cannot be used, so that it is not read again."""
+        self._set_aside(self._images.pop(time_ns).path, why)
+
+    def read_history(self) -> tuple[Activation, ...]:
+        """
+        The activations on disk, in order, not judged by any gate.
+
+        Where the last is damaged, another file of the same calibration replaces it, else the event
+        before.
+        """
+        history: list[Activation] = []
+        last_number = 0
+        for path, name in self._files(_CALIBRATIONS, _EVENT_NAME):
+            event, last_number = int(name[1]), int(name[2])
+            record = self._read_event(path, event, last_number)
+            if record is not None:
+                history.append(record)
+                self._events[event] = path
+                self.last_event = max(self.last_event, event)
+        same = [record for record in history if record.calibration.number == last_number]
+        if same and history[-1].calibration.number != last_number:
+            history.append(Activation(self.last_event, same[-1].before, same[-1].calibration))
+        return tuple(history)
+
+    def keep(self, ensemble: Ensemble, history: tuple[Activation, ...]) -> None:
+        """
+        Make the folder hold these; returns at once where it holds them already.
+
+        A new image costs one file.  Where the ensemble has no image in common with the one on
+        disk, that one is removed first, in one step.  Raises ArchiveError when writing fails; the
+        files on disk stay intact, and the next call continues.
+        """
+        current = {image.time_ns for image in ensemble.images}
+        try:
+            for record in history:
+                self._keep_event(record)
+            if self._images and not current & self._images.keys():
+                self._empty()
+            for image in ensemble.images:
+                if not self._holds(image):
+                    self._keep_image(image)
+            if dict(ensemble.refused) != self._refused:
+                content = _RefusedFile(ARCHIVE_SCHEMA, dict(ensemble.refused))
+                self._write(_ENSEMBLE, _REFUSED, self._seal.sealed(json_object(content)))
+                self._refused = dict(ensemble.refused)
+        except ProductError as error:
+            raise ArchiveError(f'state_dir: {error}') from error
+        except OSError as error:
+            raise ArchiveError(
+                f'state_dir: {error.filename or self.folder}: {error.strerror}'
+            ) from error
+        finally:  # on a full disk, removed files make room for the next call
+            self._drop(current, {record.event for record in history})
+
+    def _keep_event(self, record: Activation) -> None:
+        if record.event in self._events:
+            return
+        content = {
+            **calibration_json.calibration_content(record.calibration),
+            'archive': json_object(_ActivationKeys(ARCHIVE_SCHEMA, record.event, record.before)),
+        }
+        name = f'{record.event:08d}_calibration_{record.calibration.number:08d}.json'
+        _check_number(record.event)
+        path = self._write(_CALIBRATIONS, name, self._seal.sealed(content))
+        self._events[record.event] = path
+        self.last_event = max(self.last_event, record.event)
+
+    def _keep_image(self, image: StarObservations) -> None:
+        stale = self._images.get(image.time_ns)
+        if stale is not None:
+            stale.path.unlink(missing_ok=True)
+            del self._images[image.time_ns]
+        number = self._next_image
+        _check_number(number)
+        try:
+            data = BagWriter.one_observation(TOPIC, image, self._frame_id)
+        except BagError as error:
+            raise ArchiveError(f'state_dir: image of {image.time_ns} ns: {error}') from error
+        mark = self._seal.mark(number, data)
+        name = f'{number:08d}_{mark}.mcap' if mark else f'{number:08d}.mcap'
+        path = self._write(_ENSEMBLE, name, data)
+        self._images[image.time_ns] = _Kept(image, path)
+        self._next_image += 1
+
+    def _write(self, folder: str, name: str, content: str | bytes) -> Path:
+        path = self.folder / folder / name
+        if not path.parent.is_dir():
+            path.parent.mkdir()
+            sync_folder(self.folder)
+        write_atomically(path, content)
+        return path
+
+    def _drop(self, images: set[int], events: set[int]) -> None:
+        for stamp in self._images.keys() - images:
+            with contextlib.suppress(OSError):
+                self._images[stamp].path.unlink(missing_ok=True)
+                del self._images[stamp]
+        for event in self._events.keys() - events:
+            with contextlib.suppress(OSError):
+                self._events[event].unlink(missing_ok=True)
+                del self._events[event]
+
+    def _empty(self) -> None:
+        self._finish_emptying()
+        (self.folder / _ENSEMBLE).rename(self.folder / _EMPTIED)
+        self._images.clear()
+        self._refused = {}
+        sync_folder(self.folder)
+        self._finish_emptying()
+
+    def _finish_emptying(self) -> None:
+        """Remove the images of an emptied ensemble; other files, those set aside too, stay."""
+        emptied = self.folder / _EMPTIED
+        with contextlib.suppress(OSError):
+            for path in list(emptied.iterdir()):
+                if (
+                    _IMAGE_NAME.fullmatch(path.name)
+                    or path.name == _REFUSED
+                    or path.name.endswith(PART)
+                ):
+                    path.unlink()
+                else:
+                    (self.folder / _ENSEMBLE).mkdir(exist_ok=True)
+                    path.rename(_free_name(self.folder / _ENSEMBLE / path.name))
+            emptied.rmdir()
+
+    def _files(
+        self, folder: str, pattern: re.Pattern[str]
+    ) -> Iterator[tuple[Path, re.Match[str]]]:
+        """Regular files with a name, in its order; the highest number of any file is kept."""
+        try:
+            names = sorted(path.name for path in (self.folder / folder).iterdir())
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise ArchiveError(f'state_dir: {error.filename}: {error.strerror}') from error
+        highest = max((int(n[1]) for n in map(_NUMBERED.match, names) if n), default=0)
+        if folder == _ENSEMBLE:
+            self._next_image = max(self._next_image, highest + 1)
+        else:
+            self.last_event = max(self.last_event, highest)
+        for name in names:
+            found = pattern.fullmatch(name)
+            if found is None:
+                continue
+            path = self.folder / folder / name
+            if stat.S_ISREG(path.lstat().st_mode):
+                yield path, found
+            else:
+                self.damage.append(f'{path}: not a regular file, skipped')
+
+    def _read_image(self, path: Path, name: re.Match[str]) -> StarObservations | None:
+        damage: list[str] = []
+        try:
+            data = read_bytes(path, _MOST_BYTES, follow_links=False)
+            self._seal.check_mark(name[2] or '', int(name[1]), data)
+            found = list(read_observations([path], TOPIC, damage.append))
+        except (BagError, OSError, ValueError) as error:
+            self._set_aside(path, str(error))
+            return None
+        if damage or len(found) != 1:
+            self._set_aside(path, damage[0] if damage else f'{len(found)} images, not one')
+            return None
+        if found[0].refusal:
+            self._set_aside(path, f'{found[0].refusal}: {found[0].detail}')
+            return None
+        return found[0]
+
+    def _read_event(self, path: Path, event: int, number: int) -> Activation | None:
+        content = self._unsealed(path, calibration_json.SCHEMA)
+        if content is None:
+            return None
+        archive = content.get('archive')
+        if not isinstance(archive, dict) or archive.get('schema') != ARCHIVE_SCHEMA:
+            self.damage.append(f'{path}: of another version, skipped')
+            return None
+        try:
+            keys = read_record(_ActivationKeys, archive, 'archive')
+            calibration = calibration_json.calibration_from_content(path, content)
+            if (keys.event, calibration.number) != (event, number):
+                raise ValueError(f'is event {keys.event} of calibration {calibration.number}')
+            if keys.before >= event:
+                raise ValueError(f'archive.before: {keys.before} is not before {event}')
+            check_publishable(calibration)
+        except (ProductError, ValueError) as error:
+            self._set_aside(path, str(error))
+            return None
+        return Activation(event, keys.before, calibration)
+
+    def _read_refused(self, path: Path) -> dict[str, int]:
+        content = self._unsealed(path, ARCHIVE_SCHEMA)
+        if content is None:
+            return {}
+        refused: dict[str, int] = {}
+        try:
+            for name, count in read_record(_RefusedFile, content).refused.items():
+                reason = counted_refusal(name)
+                refused[reason] = refused.get(reason, 0) + count
+            if sum(refused.values()) > _MOST_COUNT:
+                raise ValueError(f'refused: more than {_MOST_COUNT} images')
+        except ValueError as error:
+            self._set_aside(path, str(error))
+            return {}
+        return refused
+
+    def _unsealed(self, path: Path, schema: int) -> Mapping[str, Any] | None:
+        """The JSON object of a file with the right seals and this schema; else None."""
+        try:
+            content = self._seal.opened(read_bytes(path, _MOST_BYTES, follow_links=False))
+        except (OSError, ValueError) as error:
+            self._set_aside(path, str(error))
+            return None
+        if content.get('schema') != schema:
+            self.damage.append(f'{path}: of another version, skipped')
+            return None
+        return content
+
+    def _set_aside(self, path: Path, why: str) -> None:
+        aside = _free_name(path.with_name(f'{path.name}.damaged'))
+        with contextlib.suppress(OSError):  # on a read-only disk it is skipped where it is
+            path.rename(aside)
+        self.damage.append(f'{aside}: damaged, set aside: {" ".join(why.split())}')
+
+
+def check_publishable(calibration: Calibration) -> None:
+    """
+    Check that the messages of a calibration can hold its values.
+
+    Raises ValueError naming the message.
+    """
+    for kind, make in (
+        (CALIBRATION_TYPE, calibration_messages.calibration_to_message),
+        (CAMERA_INFO_TYPE, calibration_messages.camera_info_to_message),
+        (ALIGNMENT_TYPE, calibration_messages.alignment_to_message),
+    ):
+        try:
+            with np.errstate(all='ignore'):
+                typestore().serialize_cdr(make(calibration, make_message), kind)
+        # The exceptions of a value that its field cannot hold have no common base class.
+        except Exception as error:
+            raise ValueError(f'does not fit into a {kind}: {error}') from error
+
+
+def _free_name(path: Path) -> Path:
+    """The path, with a number after it where a file is there already."""
+    names = itertools.chain(
+        [path], (path.with_name(f'{path.name}{k}') for k in itertools.count(2))
+    )
+    return next(name for name in names if not os.path.lexists(name))
+
+
+def _check_number(number: int) -> None:
+    if number > _LAST_NUMBER:
+        raise ArchiveError(
+            f'state_dir: number {number} has too many digits; move the files with the highest '
+            'numbers to another place'
+        )
+
+
+def _locked(folder: Path) -> int:
+    """Descriptor with a lock on the folder, which the system releases when the process ends."""
+    number = -1
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if number >= 0:
+            os.close(number)
+        if isinstance(error, BlockingIOError):
+            raise ArchiveError(f'state_dir: {folder} is in use by another calibrator') from error
+        raise ArchiveError(f'state_dir: {folder}: {error.strerror}') from error
+    return number

@@ -1,0 +1,314 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The ensemble and the active calibration of a calibrator, in memory and on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+import threading
+from typing import TYPE_CHECKING
+
+from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.errors import ArchiveError, OptionError, StarcalError
+from starcal_ros.pipeline import solve as solving
+from starcal_ros.pipeline.node_options import CalibratorOptions
+from starcal_ros.pipeline.setup import Setup
+from starcal_ros.records import Calibration, Ensemble, EnsembleStatus, StarObservations
+from starcal_ros.ros.kept.seal import read_seal
+from starcal_ros.ros.kept.stored import Activation, refusals_today
+
+if TYPE_CHECKING:
+    from starcal_ros.ros.kept.archive import Archive
+
+_HISTORY = 20  # activations kept for roll-back, under 1 MB each
+
+
+@dataclass(frozen=True)
+class Answer:
+    """
+    Result of a request: ``calibration`` is the solution, where there is one.
+
+    ``active`` states whether it is now the active one.  ``observations`` are its input, and
+    ``residuals`` belong to them; a calibration activated by a roll-back has neither.
+    """
+
+    success: bool
+    message: str
+    calibration: Calibration | None = None
+    active: bool = False
+    residuals: Residuals | None = None
+    observations: tuple[StarObservations, ...] = ()
+
+
+class CalibratorState:
+    """
+    Ensemble and calibrations of one calibrator, safe to use from several threads.
+
+    Both are frozen records: a solve works on the ensemble it began with while the next grows.
+    With a state folder both are on disk before they are published; while the disk fails they are
+    in memory, `trouble` has the cause, and `save` tries again.
+
+    Parameters
+    ----------
+    now_ns : callable
+        The time, read at the moment of an activation: a solve may take minutes.
+    """
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self._now_ns = now_ns
+        self.trouble = ''  # why the last attempt to save failed
+        self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
+        self.withheld: tuple[str, ...] = ()  # why the gate of today refuses the last calibration
+        # Of the records below, never held during a solve; the activations change under both locks.
+        self._records = threading.Lock()
+        self._ensemble = Ensemble()
+        self._history: tuple[Activation, ...] = ()
+        self._active: Activation | None = None  # of the history
+        self._disk = threading.Lock()  # of the archive; taken before the other
+        self._archive: Archive | None = None
+        self._folder = ''
+
+    def open(self, setup: Setup, options: CalibratorOptions) -> None:
+        """
+        Read the state folder; without one, continue with the records in memory.
+
+        The last calibration is judged by the gate with the present setup before it is active.
+        Where it is refused, the one that a roll-back would return to is judged, and so on; refused
+        ones stay on record. Raises ArchiveError when the folder cannot be used. Raises OptionError
+        when all its records are of another camera, or the key cannot be read.
+        """
+        self._setup, self._options = setup, options
+        if not options.state_dir:
+            with self._records:
+                self._folder = ''
+                self._choose_active()
+            return
+        try:
+            from starcal_ros.ros.kept.archive import Archive
+        except ModuleNotFoundError as error:  # rosdep has no key for mcap and rosbags
+            raise ArchiveError(
+                f'state_dir: {error.name} is not installed: pip install mcap rosbags, or leave'
+                ' state_dir empty: then a restart loses the ensemble'
+            ) from error
+        seal = read_seal(options.state_key_file)
+        archive = Archive(Path(options.state_dir), setup.frames.camera_frame, seal)
+        try:
+            ensemble, history = archive.read_ensemble(), archive.read_history()
+            _check_size(options.state_dir, ensemble, history, setup)
+            ensemble = _of_size(ensemble, archive, setup)
+        except StarcalError:
+            archive.close()
+            raise
+        with self._disk, self._records:
+            if self._folder == options.state_dir:  # not written while the disk failed
+                read = {image.time_ns for image in ensemble.images}
+                for image in self._ensemble.images:
+                    if image.time_ns not in read:
+                        ensemble = ensemble.add(image)
+                history = history or self._history
+            self._ensemble = solving.within_limit(ensemble, setup)
+            self._history, self._folder = history, options.state_dir
+            self._choose_active()
+            self._archive, self.damage = archive, tuple(archive.damage)
+        self.save()
+
+    def _choose_active(self) -> None:
+        """Take the last calibration that the gate of today accepts, and record why not others."""
+        by_event = {record.event: record for record in self._history}
+        record = self._history[-1] if self._history else None
+        withheld = []
+        while record is not None:
+            refusals = refusals_today(record.calibration, self._setup)
+            if not refusals:
+                break
+            withheld.append(
+                f'calibration {record.calibration.number} is not active, the gate refuses it '
+                f'now: {"; ".join(refusals)}'
+            )
+            record = by_event.get(record.before) if record.before < record.event else None
+        self._active, self.withheld = record, tuple(withheld)
+
+    def close(self) -> None:
+        """Release the state folder; safe to call twice."""
+        with self._disk:
+            if self._archive is not None:
+                self._archive.close()
+            self._archive = None
+
+    @property
+    def ensemble(self) -> Ensemble:
+        """The images collected."""
+        with self._records:
+            return self._ensemble
+
+    @property
+    def active(self) -> Calibration | None:
+        """The active calibration."""
+        with self._records:
+            return self._active.calibration if self._active else None
+
+    @property
+    def active_on_disk(self) -> Calibration | None:
+        """The active calibration, once an activation under way is on disk."""
+        with self._disk:
+            return self.active
+
+    def add(self, observations: StarObservations) -> None:
+        """Add one image, or count the reason why it was refused."""
+        with self._records:
+            ensemble = self._ensemble
+        grown = solving.add_to_ensemble(ensemble, observations, self._setup)
+        with self._records:
+            if self._ensemble is not ensemble:  # emptied meanwhile: start with this image
+                grown = solving.add_to_ensemble(Ensemble(), observations, self._setup)
+            self._ensemble = grown
+        self.save()
+
+    def reset(self) -> Answer:
+        """Empty the ensemble."""
+        with self._records:
+            images = len(self._ensemble.images)
+            self._ensemble = Ensemble()
+        self.save()
+        return self._answer(f'{images} images dropped; the active calibration stays')
+
+    def status(self) -> EnsembleStatus:
+        """Images and stars collected, and the predicted precision of a calibration from them."""
+        ensemble = self.ensemble
+        with self._disk:
+            saved = self._archive.saved(ensemble) if self._archive else 0
+        status = solving.ensemble_status(ensemble, self._setup)
+        return dataclasses.replace(status, images_saved=saved)
+
+    def solve(
+        self,
+        method: str = '',
+        estimate: Sequence[str] = (),
+        dry_run: bool = False,
+        force: bool = False,
+    ) -> Answer:
+        """Solve, and activate a calibration that the gate accepts, or any with ``force``."""
+        ensemble = self.ensemble
+        try:
+            calibration, residuals = solving.solve_with_residuals(
+                ensemble, self._setup, method, estimate, active=self.active
+            )
+        except StarcalError as error:
+            return Answer(False, str(error))
+        if not calibration.accepted and not force:
+            refused = f'refused by the gate: {"; ".join(calibration.reasons)}'
+            return Answer(False, refused, calibration, False, residuals, ensemble.images)
+        if not calibration.accepted:
+            why = (*calibration.reasons, 'activated by request despite the gate')
+            calibration = dataclasses.replace(calibration, reasons=why, forced=True)
+        if dry_run:
+            return Answer(True, f'would be activated: {summary(calibration)}', calibration)
+        with self._disk:
+            if self._folder and self._archive is None:
+                return Answer(False, 'not activated: the node was cleaned up meanwhile')
+            before = self._active.event if self._active else 0
+            calibration = self._activate(self._next_event(), before, calibration)
+        message = self._answer(f'activated: {summary(calibration)}').message
+        return Answer(True, message, calibration, True, residuals, ensemble.images)
+
+    def rollback(self) -> Answer:
+        """Activate the calibration before the active one again."""
+        with self._disk:
+            if self._folder and self._archive is None:
+                return Answer(False, 'not activated: the node was cleaned up meanwhile')
+            if self._active is None:
+                return Answer(False, 'no calibration is active')
+            wanted = self._active.before
+            found = [record for record in self._history if record.event == wanted]
+            if not found:
+                kept = ' on record' if wanted else ''
+                return Answer(False, f'there is no calibration before the active one{kept}')
+            before = found[0].calibration
+            refusals = refusals_today(before, self._setup)
+            if refusals:
+                return Answer(
+                    False,
+                    f'calibration {before.number} is refused by the gate: {"; ".join(refusals)}',
+                )
+            calibration = self._activate(before.number, found[0].before, before)
+        answer = self._answer(f'activated again: {summary(calibration)}')
+        return dataclasses.replace(answer, calibration=calibration, active=True)
+
+    def save(self) -> None:
+        """Write the records to disk; returns at once where they are there."""
+        with self._disk:
+            self._save()
+
+    def _save(self) -> None:
+        if self._archive is None:
+            return
+        with self._records:
+            ensemble, history = self._ensemble, self._history
+        try:
+            self._archive.keep(ensemble, history)
+            self.trouble = ''
+        except ArchiveError as error:
+            self.trouble = str(error)
+        except Exception as error:  # whatever it is, the records are not on disk
+            self.trouble = f'{type(error).__name__}: {" ".join(str(error).split())}'
+
+    def disk_free_bytes(self) -> int | None:
+        """Free space for the state folder; None without one."""
+        with self._disk:
+            return self._archive.free_bytes() if self._archive else None
+
+    def _next_event(self) -> int:
+        last = self._history[-1].event if self._history else 0
+        return 1 + max(last, self._archive.last_event if self._archive else 0)
+
+    def _activate(self, number: int, before: int, calibration: Calibration) -> Calibration:
+        """Activate a calibration from now on, and save it before anyone else can activate one."""
+        active = dataclasses.replace(calibration, number=number, active_since_ns=self._now_ns())
+        record = Activation(self._next_event(), before, active)
+        with self._records:
+            self._history = (*self._history, record)[-_HISTORY:]
+            self._active, self.withheld = record, ()
+        self._save()
+        return active
+
+    def _answer(self, message: str) -> Answer:
+        unsaved = f'; not on disk: {self.trouble}' if self.trouble else ''
+        return Answer(True, message + unsaved)
+
+
+def summary(calibration: Calibration) -> str:
+    """One line on a calibration."""
+    return (
+        f'{calibration.residual_rms_px:.3f} px rms per axis over {calibration.stars_used} stars'
+        f' in {calibration.images_used} images'
+    )
+
+
+def _check_size(
+    folder: str, ensemble: Ensemble, history: tuple[Activation, ...], setup: Setup
+) -> None:
+    """Raise OptionError where every record of a folder is of another camera."""
+    prior = setup.prior.camera
+    sizes = {(image.width, image.height) for image in ensemble.images}
+    sizes |= {
+        (record.calibration.geometry.camera.width, record.calibration.geometry.camera.height)
+        for record in history
+    }
+    if sizes and (prior.width, prior.height) not in sizes:
+        width, height = min(sizes)
+        raise OptionError(
+            f'state_dir: {folder} is of a camera of {width} x {height}, '
+            f'the prior camera has {prior.width} x {prior.height}'
+        )
+
+
+def _of_size(ensemble: Ensemble, archive: Archive, setup: Setup) -> Ensemble:
+    """The ensemble without images of another size, whose files are set aside."""
+    size = (setup.prior.camera.width, setup.prior.camera.height)
+    for image in ensemble.images:
+        if (image.width, image.height) != size:
+            archive.set_aside_image(image.time_ns, f'an image of {image.width} x {image.height}')
+    kept = tuple(one for one in ensemble.images if (one.width, one.height) == size)
+    return Ensemble(kept, ensemble.refused)

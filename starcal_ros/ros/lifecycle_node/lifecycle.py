@@ -1,0 +1,421 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Lifecycle node base class: starts itself, survives callback errors, publishes diagnostics."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+import functools
+import math
+import resource
+import signal
+import sys
+import threading
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+import rclpy
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import ROSInterruptException
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
+
+from starcal_ros.errors import OptionError, StarcalError
+from starcal_ros.options import unknown_option
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
+from starcal_ros.pipeline.setup import OPTION_CLASSES, Setup
+from starcal_ros.ros.lifecycle_node.inputs import Inputs
+from starcal_ros.ros.lifecycle_node.parameters import OptionParameters, unread_sections
+from starcal_ros.ros.lifecycle_node.printable_log import PrintableLog
+from starcal_ros.text import printable
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+Health = tuple[bytes, str, dict[str, object]]
+
+_SILENT_S = 5.0
+# Images, attitudes, services, solve, driver, its answer, two spare: none waits for another.
+_THREADS = 8
+
+
+class StarcalNode(PrintableLog, LifecycleNode):
+    """
+    Base class of the lifecycle nodes.
+
+    Subclasses implement `configure`, `activate`, `deactivate`, `cleanup` and `health`.
+    """
+
+    _setup: Setup  # by `configure`
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.options = OptionParameters(self, (*OPTION_CLASSES, *NODE_OPTION_CLASSES))
+        for unknown in self.options.unknown():
+            raise OptionError(unknown_option(unknown, self.options.names()))
+        self.failure = ''  # why the last transition failed, one line
+        self.inputs = Inputs(self)
+        self._incompatible: list[str] = []  # publishers that are not received
+        self._errors = 0
+        self._taken: Counter[Callable[[Any], None]] = Counter()
+        self._counting = threading.Lock()  # of errors and messages
+        self._level: bytes | None = None
+        self._listening_since_s = math.inf
+        self._diagnostics_lock = threading.Lock()
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._diagnostics_timer = self.steady_timer(
+            1.0, self.guarded(self._each_second), MutuallyExclusiveCallbackGroup()
+        )
+        self._answer_invalid_transitions()
+        self._answer_invalid_parameters()
+
+    def configure(self) -> None:
+        """Read parameters and files, create the publishers; StarcalError if they are invalid."""
+        raise NotImplementedError
+
+    def activate(self) -> None:
+        """Create the subscriptions and services."""
+        raise NotImplementedError
+
+    def deactivate(self) -> None:
+        """Destroy the subscriptions and services; may be called twice."""
+        raise NotImplementedError
+
+    def cleanup(self) -> None:
+        """Destroy the objects created by `configure`; may be called twice."""
+        raise NotImplementedError
+
+    def health(self) -> Health:
+        """Return level, message and values of the diagnostics of the active node."""
+        raise NotImplementedError
+
+    def silent(self) -> list[str]:
+        """Return the topics that the node cannot do without and that sent nothing yet."""
+        return []
+
+    def taken(self, callback: Callable[[Any], None]) -> int:
+        """Return the number of messages that a callback, wrapped by `taking`, has had."""
+        return self._taken[callback]
+
+    @property
+    def is_active(self) -> bool:
+        """True in the lifecycle state active."""
+        return bool(self._state_machine.current_state[1] == 'active')
+
+    def steady_timer(self, period_s: float, callback: Callable[[], None], group: Any) -> Any:
+        """Return a timer that runs in simulated time too, while nobody publishes /clock."""
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        return self.create_timer(period_s, callback, group, clock)
+
+    def guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
+        """Return the callback wrapped so that its errors are logged and counted."""
+
+        @functools.wraps(callback)
+        def run(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except Exception as error:
+                self.count_error(error)
+
+        return run
+
+    def taking(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Return the guarded callback of an input, which counts messages when it has ended."""
+        guarded = self.guarded(callback)
+
+        def run(message: Any) -> None:
+            guarded(message)
+            with self._counting:
+                self._taken[callback] += 1
+
+        return run
+
+    def count_error(self, error: Exception) -> None:
+        """Log an unexpected error and count it for the diagnostics."""
+        if not self.context.ok():
+            return  # at shutdown, handles are destroyed under running callbacks
+        with self._counting:
+            self._errors += 1
+        where = error.__traceback__
+        while where is not None and where.tb_next is not None:
+            where = where.tb_next
+        code = where.tb_frame.f_code if where is not None else None
+        place = f' in {code.co_name}, line {where.tb_lineno}' if code and where else ''
+        self.get_logger().error(f'{type(error).__name__}: {one_line(error)}{place}')
+
+    def _each_second(self) -> None:
+        incompatible = self.inputs.incompatible()
+        for text in set(incompatible) - set(self._incompatible):
+            self.get_logger().warning(f'not received: {text}')
+        self._incompatible = incompatible
+        if time.monotonic() > self._listening_since_s + _SILENT_S:
+            self._listening_since_s = math.inf
+            for topic in self.silent():
+                self.get_logger().warning(
+                    f'{topic}: no message in {_SILENT_S:.0f} s, from'
+                    f' {self.count_publishers(topic)} publishers'
+                )
+        self.publish_health()
+
+    def publish_health(self) -> None:
+        """Publish the diagnostics now."""
+        if not self.context.ok():
+            return
+        level, text, numbers = self._health()
+        status = DiagnosticStatus(
+            level=level,
+            name=f'starcal: {self.get_fully_qualified_name()[1:]}',
+            message=text,
+            hardware_id=self.get_fully_qualified_name(),
+            values=[KeyValue(key=key, value=str(value)) for key, value in numbers.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        with self._diagnostics_lock:
+            self._level = level
+            self._diagnostics.publish(message)
+
+    def publish_health_change(self) -> None:
+        """Publish the diagnostics if their level has changed."""
+        if self._health()[0] != self._level:
+            self.publish_health()
+
+    def _health(self) -> Health:
+        if self.is_active:
+            level, text, numbers = self.health()
+            if self._incompatible and level == OK:
+                level, text = WARN, 'not received: ' + '; '.join(self._incompatible)
+        else:
+            state = self._state_machine.current_state[1]
+            level, text, numbers = WARN, self.failure or f'not active: {state}', {}
+            if self.failure:
+                level = ERROR
+        peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # kB on Linux
+        common = {
+            'memory_peak_mb': peak_kb // 1000,
+            'messages': sum(list(self._taken.values())),
+            'callback_errors': self._errors,
+        }
+        return level, text, {**numbers, **common}
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Configure; with a bad parameter or file the node stays unconfigured."""
+        self.options.frozen = True
+        outcome = self._transition(self.configure, state, super().on_configure)
+        if outcome == TransitionCallbackReturn.SUCCESS:
+            self.get_logger().info(f'configured, {self._prior_in_words()}')
+        else:
+            self.options.frozen = False
+        return outcome
+
+    def _prior_in_words(self) -> str:
+        values, setup = self.options.values(), self._setup
+        camera = setup.prior.camera
+        width_deg = math.degrees(2 * math.atan(camera.width / 2 / float(camera.parameters[0])))
+        alignment = 'not given: found from the images'
+        if setup.is_aligned:
+            alignment = str(
+                [round(float(q), 6) for q in setup.prior.star_tracker_from_camera_xyzw]
+            )
+        return (
+            f'prior camera {values["camera_info_url"]}: {camera.width} x {camera.height},'
+            f' {width_deg:.1f} degrees wide; prior_alignment {alignment}'
+        )
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Activate: publishers first, then subscriptions."""
+        outcome = super().on_activate(state)
+        outcome = self._transition(self.activate, state, lambda _: outcome)
+        if outcome == TransitionCallbackReturn.FAILURE:
+            self.deactivate()
+            super().on_deactivate(state)
+        elif outcome == TransitionCallbackReturn.SUCCESS:
+            self._listening_since_s = time.monotonic()
+            self.get_logger().info(f'active, listening to {", ".join(self.inputs.names())}')
+        return outcome
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Deactivate: subscriptions first, then publishers."""
+        return self._transition(self.deactivate, state, super().on_deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Clean up; parameters may be changed again."""
+        outcome = self._transition(self.cleanup, state, super().on_cleanup)
+        self.options.frozen = False
+        return outcome
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Shut down from any state."""
+        self.deactivate()
+        return self._transition(self.cleanup, state, super().on_shutdown)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Return to unconfigured after a transition that failed halfway."""
+        self.deactivate()
+        self.cleanup()
+        self.options.frozen = False
+        return TransitionCallbackReturn.SUCCESS
+
+    def _transition(
+        self, step: Callable[[], None], state: LifecycleState, base: Callable[[Any], Any]
+    ) -> TransitionCallbackReturn:
+        # Jazzy discards exceptions of a transition silently: log them here.
+        try:
+            step()
+        except StarcalError as error:
+            self.failure = one_line(error)
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self.failure = f'{type(error).__name__}: {one_line(error)}'
+            self.count_error(error)
+            return TransitionCallbackReturn.ERROR
+        self.failure = ''
+        return base(state)
+
+    def _answer_invalid_transitions(self) -> None:
+        """Answer an invalid transition with false; rclpy of Jazzy raises instead."""
+        service = self._service_change_state
+        change_state = service.callback
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                response = change_state(request, response)
+            except Exception as error:
+                self.get_logger().error(f'transition refused: {one_line(error)}')
+                response.success = False
+            if not response.success and self.failure:
+                self.get_logger().error(self.failure)
+            return response
+
+        service.callback = answer
+
+    def _answer_invalid_parameters(self) -> None:
+        """Reject a parameter of an invalid type; rclpy raises without an answer."""
+
+        def answering(set_parameters: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+            def answer(request: Any, response: Any) -> Any:
+                try:
+                    return set_parameters(request, response)
+                except Exception as error:
+                    self.get_logger().error(f'parameters refused: {one_line(error)}')
+                    refused = SetParametersResult(successful=False, reason=one_line(error))
+                if isinstance(response, SetParametersAtomically.Response):
+                    response.result = refused
+                else:
+                    # Parameters before the bad one are answered and may be set.
+                    left = len(request.parameters) - len(response.results)
+                    response.results = [*response.results, *[refused] * left]
+                return response
+
+            return answer
+
+        for service in self.services:
+            if service.srv_type in (SetParameters, SetParametersAtomically):
+                service.callback = answering(service.callback)
+
+
+def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | None) -> int:
+    """
+    Run a lifecycle node until shutdown; return its exit status.
+
+    0 after SIGINT or SIGTERM; 2 for bad parameters or files, with a one-line message.
+    """
+    node: StarcalNode | None = None
+
+    def work() -> int:
+        nonlocal node
+        node = make_node()
+        given = sys.argv if args is None else args
+        for text in unread_sections(given, node.get_fully_qualified_name(), name):
+            node.get_logger().warning(text)
+        executor = MultiThreadedExecutor(_THREADS)
+        executor.add_node(node)
+        if node.options.values()['autostart'] and not _start(node):
+            raise StarcalError(node.failure)
+        _spin(node, executor)
+        return 0
+
+    return until_told_to_end(name, args, work, lambda: _end(node))
+
+
+def until_told_to_end(
+    name: str, args: Sequence[str] | None, work: Callable[[], int], end: Callable[[], None]
+) -> int:
+    """
+    Run a function between `rclpy.init` and shutdown; return the exit status.
+
+    That of the function, or 0 after SIGINT or SIGTERM, or 2 with a one-line message after an
+    error.
+    """
+    is_up = False
+    told = _record_signals()
+    try:
+        rclpy.init(args=None if args is None else [name, *args])
+        is_up = True
+        # Before `rclpy.init` no handler of ROS was there to shut the context down.
+        return 0 if told else work()
+    except (ExternalShutdownException, ROSInterruptException):
+        return 0
+    except Exception as error:
+        # A signal shuts ROS down at once; an object under construction then fails.
+        if is_up and not rclpy.ok():
+            return 0
+        print(f'{name}: {one_line(error)}', file=sys.stderr)
+        return 2
+    finally:
+        end()
+
+
+def _record_signals() -> list[int]:
+    """
+    Handle SIGINT and SIGTERM by adding them to the list returned, and by nothing else.
+
+    The handler of rclpy calls this one and shuts the context down, which ends every loop.  A
+    KeyboardInterrupt in its place may hit the entry of a `threading.Condition` of the executor;
+    its lock is then never released, and the threads that wait for it never end
+    (python/cpython#74174).
+    """
+    told: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda number, _frame: told.append(number))
+    return told
+
+
+def end_quietly(node: Node | None) -> None:
+    """Destroy a node and leave ROS; a second signal does not interrupt it."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    if node is not None:
+        node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def _end(node: StarcalNode | None) -> None:
+    if node is not None:
+        node.deactivate()
+        node.cleanup()
+    end_quietly(node)
+
+
+def _start(node: StarcalNode) -> bool:
+    success = TransitionCallbackReturn.SUCCESS
+    return bool(node.trigger_configure() == success and node.trigger_activate() == success)
+
+
+def _spin(node: StarcalNode, executor: MultiThreadedExecutor) -> None:
+    while node.context.ok():
+        try:
+            executor.spin_once(timeout_sec=1.0)
+        except ExternalShutdownException:
+            return
+        except Exception as error:
+            node.count_error(error)
+
+
+def one_line(error: Exception) -> str:
+    """Return the text of an error in one line that is safe to print."""
+    return printable(' '.join(str(error).split()))

@@ -1,0 +1,144 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""ROS parameters declared from options dataclasses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import dataclasses
+import itertools
+from pathlib import Path
+import sys
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterValueException, ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from starcal_ros import options
+from starcal_ros.errors import OptionError
+
+
+class OptionParameters:
+    """
+    Options of dataclasses as parameters of a node, checked whenever they are set.
+
+    While ``frozen`` is set, changes are rejected. Raises OptionError if a value from the command
+    line or the parameter file is invalid.
+    """
+
+    def __init__(self, node: Node, option_classes: Sequence[type[Any]]) -> None:
+        self.frozen = False
+        self.classes = tuple(option_classes)
+        self._node = node
+        self._fields = {field.name: field for field in options.option_fields(*option_classes)}
+        node.add_on_set_parameters_callback(self._on_set)
+        for field in self._fields.values():
+            try:
+                node.declare_parameter(
+                    field.name, _as_parameter(field.default), _descriptor(field)
+                )
+            except InvalidParameterValueException as error:
+                raise OptionError(_reason(error)) from error
+            except ParameterException as error:
+                raise OptionError(f'{field.name}: {_reason(error)}') from error
+
+    def values(self) -> dict[str, object]:
+        """Return all options by name, in the types of the dataclasses."""
+        return {
+            name: options.check_value(field, self._node.get_parameter(name).value)
+            for name, field in self._fields.items()
+        }
+
+    def names(self) -> list[str]:
+        """Names of all options."""
+        return list(self._fields)
+
+    def unknown(self) -> list[str]:
+        """Names given at start that no option has: ROS itself passes over a misspelt one."""
+        given = getattr(self._node, '_parameter_overrides', {})  # rclpy has no other access to it
+        return sorted(
+            name for name in given if name not in self._fields and not options.is_of_ros(name)
+        )
+
+    def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
+        for parameter in parameters:
+            field = self._fields.get(parameter.name)
+            if field is None:
+                continue
+            if self.frozen:
+                reason = f'{field.name}: in use since configure; clean up to change it'
+                return SetParametersResult(successful=False, reason=reason)
+            try:
+                options.check_value(field, parameter.value)
+            except OptionError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+
+def unread_sections(arguments: Sequence[str], node: str, executable: str) -> list[str]:
+    """
+    One warning for each section of a parameter file that rcl passes over without a word.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        The command line; files follow ``--params-file``.
+    node : str
+        Name of the node with its namespace.
+    executable : str
+        Name of the node without a remapping.
+    """
+    own = {executable, node.rpartition('/')[2]}
+    warnings = []
+    for flag, file in itertools.pairwise(arguments):
+        sections = options.parameter_sections(Path(file)) if flag == '--params-file' else {}
+        meant = [name for name in sections if options.meant_node(name, own)]
+        if any(options.section_applies(name, node) for name in meant):
+            continue  # the others are those of the same node in other namespaces
+        warnings += [
+            f'{file}: section {name!r} does not apply to {node}: write /**/{executable}'
+            for name in meant
+        ]
+    return warnings
+
+
+def _as_parameter(default: Any) -> Any:
+    return list(default) if isinstance(default, tuple) else default
+
+
+def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
+    meta = field.metadata
+    description = meta['description']
+    if meta['choices']:
+        description += ': ' + ' | '.join(meta['choices'])
+    # Dynamic typing: check_value accepts 2 for 2.0, as the tool does, and lists may be empty.
+    descriptor = ParameterDescriptor(description=description, dynamic_typing=True)
+    low, high = meta['low'], meta['high']
+    if (low is None and high is None) or isinstance(field.default, (bool, tuple)):
+        return descriptor
+    if isinstance(field.default, int):
+        bounds = IntegerRange(
+            from_value=-(2**63) if low is None else int(low),
+            to_value=2**63 - 1 if high is None else int(high),
+        )
+        descriptor.integer_range = [bounds]
+    else:
+        most = sys.float_info.max
+        bounds = FloatingPointRange(
+            from_value=-most if low is None else float(low),
+            to_value=most if high is None else float(high),
+        )
+        descriptor.floating_point_range = [bounds]
+    return descriptor
+
+
+def _reason(error: Exception) -> str:
+    # rclpy prepends a sentence to the reason from the callback.
+    text = str(error).replace('\n', ' ')
+    return text.rpartition('Reason: ')[2] if 'Reason: ' in text else text

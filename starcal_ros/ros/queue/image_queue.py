@@ -1,0 +1,168 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Images that wait for their attitude, and the rates and latencies of the diagnostics."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+
+# A stamp this far ahead of the next image is wrong: its attitude will never arrive.
+_WRONG_NS = 10 * NANOSECONDS_PER_SECOND
+WINDOW_S = 60.0
+_MOST = 100_000  # a minute at 1.6 kHz; bounds the memory under a flood of messages
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """An image in the queue; ``message`` is None if the queue was full on its arrival."""
+
+    time_ns: int
+    width: int
+    height: int
+    message: Any
+    arrived_s: float
+
+
+class ImageQueue:
+    """
+    Queue between the subscription thread and the thread that measures stars.
+
+    Every image put in comes out, in order; if the queue is full it comes out without pixels, so
+    that its refusal can still be published.
+
+    Parameters
+    ----------
+    size : int
+        Images held with their pixels.
+    timeout_s : float
+        Longest wait for an image to be ready.
+    is_ready : callable
+        Returns True if the attitude of a stamp is available; called in the thread of `take`.
+    """
+
+    def __init__(self, size: int, timeout_s: float, is_ready: Callable[[int], bool]) -> None:
+        self._size = size
+        self._timeout_s = timeout_s
+        self._is_ready = is_ready
+        self._images: deque[Waiting] = deque()
+        self._calls: deque[Callable[[], None]] = deque()
+        self._held = 0
+        self._closed = False
+        self._changed = threading.Condition()
+
+    def __len__(self) -> int:
+        """Return the number of images waiting."""
+        return len(self._images)
+
+    def put(self, time_ns: int, width: int, height: int, message: Any) -> None:
+        """Add an image; never waits."""
+        with self._changed:
+            kept = message if self._held < self._size else None
+            self._held += kept is not None
+            self._images.append(Waiting(time_ns, width, height, kept, time.monotonic()))
+            self._changed.notify()
+
+    def call(self, function: Callable[[], None]) -> None:
+        """Have the thread of `take` call a function before the next image; never waits."""
+        with self._changed:
+            self._calls.append(function)
+            self._changed.notify()
+
+    def wake(self) -> None:
+        """Check the first image again."""
+        with self._changed:
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Close the queue: `take` returns None from now on."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def take(self) -> Waiting | None:
+        """Return the next image once it is ready or timed out; None after `close`."""
+        while callable(taken := self._next()):
+            taken()
+        return taken
+
+    def _next(self) -> Waiting | Callable[[], None] | None:
+        with self._changed:
+            while not self._closed:
+                if self._calls:
+                    return self._calls.popleft()
+                left_s = None
+                if self._images:
+                    first = self._images[0]
+                    left_s = first.arrived_s + self._timeout_s - time.monotonic()
+                    if first.message is None or left_s <= 0 or self._is_due(first):
+                        self._images.popleft()
+                        self._held -= first.message is not None
+                        return first
+                self._changed.wait(left_s)
+            return None
+
+    def _is_due(self, first: Waiting) -> bool:
+        """Return True if the first image is ready or its stamp is wrong."""
+        if self._is_ready(first.time_ns):
+            return True
+        following = self._images[1].time_ns if len(self._images) > 1 else first.time_ns
+        return first.time_ns - following > _WRONG_NS and self._is_ready(following)
+
+
+class Recent:
+    """
+    Numbers of the last `WINDOW_S` of wall clock, safe to use from several threads.
+
+    Parameters
+    ----------
+    clock_s : callable
+        Monotonic seconds.
+    """
+
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._clock_s = clock_s
+        self._start_s = clock_s()
+        self._times_s: deque[float] = deque(maxlen=_MOST)
+        self._values: deque[float] = deque(maxlen=_MOST)
+        self._lock = threading.Lock()
+
+    def add(self, value: float) -> None:
+        """Add a number that has just arrived."""
+        with self._lock:
+            self._forget()
+            self._times_s.append(self._clock_s())
+            self._values.append(value)
+
+    def rate_hz(self) -> float:
+        """Numbers per second in the window, or since the start if that is shorter."""
+        with self._lock:
+            now_s = self._forget()
+            passed_s = min(now_s - self._start_s, WINDOW_S)
+            return len(self._times_s) / passed_s if passed_s > 0 else 0.0
+
+    def median(self) -> float | None:
+        """Median; None without numbers."""
+        with self._lock:
+            self._forget()
+            return float(np.median(self._values)) if self._values else None
+
+    def largest(self) -> float | None:
+        """Largest number; None without numbers."""
+        with self._lock:
+            self._forget()
+            return max(self._values, default=None)
+
+    def _forget(self) -> float:
+        now_s = self._clock_s()
+        while self._times_s and self._times_s[0] < now_s - WINDOW_S:
+            self._times_s.popleft()
+            self._values.popleft()
+        return now_s

@@ -1,0 +1,452 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Star observer node: subscribes to images and attitudes, publishes star observations."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+import dataclasses
+import functools
+import math
+import operator
+import sys
+import threading
+import time
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, QuaternionStamped, TransformStamped, TwistStamped
+import numpy as np
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, Temperature
+from sensor_msgs.msg import Image as ImageMessage
+
+from starcal.msg import Calibration as CalibrationMessage
+from starcal.msg import StarObservations as ObservationsMessage
+from starcal_ros.camera import MAX_SIDE_PX
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.errors import ImageRefused
+from starcal_ros.formats.messages import telemetry
+from starcal_ros.formats.messages.calibration_messages import (
+    calibration_from_message,
+    camera_info_to_message,
+)
+from starcal_ros.formats.messages.image_messages import color_image_to_message, image_from_message
+from starcal_ros.formats.messages.message_fields import nearest_stamp_ns, offset_ns, stamp_ns
+from starcal_ros.formats.messages.observation_messages import observations_to_message
+from starcal_ros.formats.messages.telemetry import latest_at
+from starcal_ros.options import from_mapping
+from starcal_ros.pipeline import observe
+from starcal_ros.pipeline.diagnosis.alignment import found_alignment
+from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis
+from starcal_ros.pipeline.node_options import ObserverOptions
+from starcal_ros.pipeline.setup import aligned, load_setup
+from starcal_ros.records import (
+    CameraGeometry,
+    Image,
+    IMAGE_REFUSALS,
+    refused_image,
+    StarObservations,
+)
+from starcal_ros.report.pictures.annotation import annotate
+from starcal_ros.ros.lifecycle_node.inputs import LATCHED
+from starcal_ros.ros.lifecycle_node.lifecycle import Health, OK, run, StarcalNode, WARN
+from starcal_ros.ros.lifecycle_node.message_factory import make_message
+from starcal_ros.ros.queue.image_queue import ImageQueue, Recent, Waiting
+from starcal_ros.ros.queue.tracker_inputs import StarTrackers
+from starcal_ros.ros.unmatched import Unmatched
+from starcal_ros.sky.attitude import attitude_sample
+
+NAME = 'star_observer'
+# Values of the option `attitude_message`.
+_ATTITUDE_MESSAGES = {
+    'quaternion': QuaternionStamped,
+    'pose': PoseStamped,
+    'transform': TransformStamped,
+    'imu': Imu,
+}
+# Ten seconds of a fast star tracker; a bag played fast sends bursts.
+_SAMPLES = QoSProfile(depth=2000)
+_STAMP_NS = operator.itemgetter(0)
+_MAX_VELOCITY_M_S = 1e6
+_DISCOVERY_S = 1.5  # 15 of the 20 images that wait, at 10 Hz
+_HISTORY_S = 3600.0  # of attitudes: 2 MB at 10 Hz; images come later only from a recorder
+_JUMP_S = 10.0  # smaller steps back are late messages, not a clock change
+
+
+class StarObserver(StarcalNode):
+    """
+    Measures the stars of every image, in order of arrival, in a worker thread.
+
+    Callbacks only store their messages; the worker thread alone changes the prediction.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(NAME)
+        self._publishers_made: list[Any] = []
+        self._worker: threading.Thread | None = None
+        self._queue: ImageQueue | None = None
+        self._counts: Counter[str] = Counter()
+        self._last_refusal = ''
+        self._retried = self._retried_used = 0
+        self._unmatched: Unmatched | None = None
+        self._camera_info: Any = None  # of the active calibration, header of the last image
+
+    def configure(self) -> None:
+        """Load the prior camera and the catalog, create the publishers."""
+        values = self.options.values()
+        self._own = from_mapping(ObserverOptions, values)
+        self._setup = load_setup(values, self.options.classes)
+        self._geometry = self._setup.prior
+        self._calibration_number = 0  # of the calibration used for prediction; 0: the prior
+        self._observations = self.create_lifecycle_publisher(
+            ObservationsMessage, 'observations', QoSProfile(depth=100)
+        )
+        self._annotated = self.create_lifecycle_publisher(
+            ImageMessage, 'annotated_image', QoSProfile(depth=2)
+        )
+        self._camera_info = None
+        self._camera_infos = self.create_lifecycle_publisher(
+            CameraInfo, 'image_camera_info', QoSProfile(depth=self._own.image_queue)
+        )
+        self._publishers_made = [self._observations, self._annotated, self._camera_infos]
+
+    def activate(self) -> None:
+        """Subscribe to images and attitudes, start the worker thread."""
+        jump_s = max(_JUMP_S, self._setup.attitude.max_attitude_gap_s)
+        self._star_trackers = StarTrackers(
+            1 + len(self._setup.mountings),
+            _HISTORY_S,
+            jump_s,
+            self._setup.attitude.max_attitude_gap_s,
+            self._own.attitude_timeout_s,
+        )
+        self._track = observe.Track(self._geometry)
+        self._predicted_from = self._geometry
+        self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
+        self._temperatures: deque[tuple[int, float]] = deque(maxlen=_SAMPLES.depth)
+        self._counts.clear()
+        self._restarts = self._retried = self._retried_used = 0
+        self._last_refusal = ''
+        self._unmatched = Unmatched(
+            self._setup, functools.partial(self._in_worker, self._on_diagnosis)
+        )
+        self._image_arrivals, self._latency_s, self._attitude_step_s = Recent(), Recent(), Recent()
+        self._queue = ImageQueue(
+            self._own.image_queue, self._own.attitude_timeout_s, self._star_trackers.has_come
+        )
+        self._worker = threading.Thread(target=self._measure_all, name='measure')
+        self._worker.start()
+        attitude_message = _ATTITUDE_MESSAGES[self._setup.attitude.attitude_message]
+        images = QoSProfile(depth=self._own.image_queue)
+        for kind, topic, callback, qos, adapts in (
+            (CalibrationMessage, 'calibration', self._on_calibration, LATCHED, False),
+            (TwistStamped, 'velocity', self._on_velocity, _SAMPLES, True),
+            (Temperature, 'temperature', self._on_temperature, _SAMPLES, True),
+            (attitude_message, 'attitude', self._on_attitude, _SAMPLES, True),
+            (*self._image_input(), self._on_image, images, True),
+        ):
+            self.inputs.add(kind, topic, self.taking(callback), qos, adapts=adapts)
+        for which, mounting in enumerate(self._setup.mountings, 1):
+            callback = functools.partial(self._add_attitude, which)
+            topic = f'{mounting.frame}/attitude'
+            self.inputs.add(attitude_message, topic, self.taking(callback), _SAMPLES, adapts=True)
+
+    def _image_input(self) -> tuple[Any, str]:
+        if self._own.image_transport == 'raw':
+            return ImageMessage, 'image'
+        # Name as in image_transport, so that a remap of `image` applies.
+        return CompressedImage, self.resolve_topic_name('image') + '/compressed'
+
+    def deactivate(self) -> None:
+        """Close the inputs and drop the images in the queue."""
+        self.inputs.close()
+        if self._queue is not None and self._worker is not None:
+            if len(self._queue):
+                self.get_logger().warning(f'{len(self._queue)} images dropped from the queue')
+            self._queue.close()
+            self._worker.join()
+        self._worker = None
+        if self._unmatched is not None:
+            self._unmatched.close()
+
+    def cleanup(self) -> None:
+        """Destroy the publishers."""
+        while self._publishers_made:
+            self.destroy_lifecycle_publisher(self._publishers_made.pop())
+
+    def health(self) -> Health:
+        """Diagnostics: counts of used and refused images."""
+        why = None if self._unmatched is None else self._unmatched.diagnosis
+        counts = dict(self._counts)  # the worker thread continues counting
+        unfit, first = self._track.unfit, self._setup.frames.star_tracker_frame
+        not_used = [f'{name or first}: {one.images}' for name, one in unfit.items()]
+        numbers: dict[str, object] = {
+            'images': sum(counts.values()),
+            'images_used': counts.get('', 0),
+            'images_waiting': len(self._queue or ()),
+            'image_rate_hz': _short(self._image_arrivals.rate_hz()),
+            'latency_median_s': _short(self._latency_s.median()),
+            'latency_worst_s': _short(self._latency_s.largest()),
+            'attitudes': len(self._star_trackers.histories[0]),
+            'attitude_rate_hz': _short(self._attitude_step_s.rate_hz()),
+            'attitude_gap_s': _short(self._attitude_step_s.largest()),
+            'attitudes_not_used': ', '.join(not_used) or 'none',
+            'restarts': self._restarts,
+            'retried': self._retried,
+            'retried_used': self._retried_used,
+            'diagnosis': 'none' if why is None else why.cause,
+            'calibration': self._calibration_number or 'prior',
+            'listeners': self._observations.get_subscription_count(),
+            **{f'refused_{reason}': counts.get(reason, 0) for reason in sorted(IMAGE_REFUSALS)},
+        }
+        if why is not None:
+            return WARN, f'no image matches: {why.in_a_sentence()}', numbers
+        if self._last_refusal:
+            return WARN, f'last image refused: {self._last_refusal}', numbers
+        if why_not := [one.why for one in unfit.values() if one.why]:
+            return WARN, '; '.join(why_not), numbers
+        if not counts:
+            return OK, 'waiting for images', numbers
+        return OK, 'observing', numbers
+
+    def silent(self) -> list[str]:
+        """Return the image and attitude topics that sent nothing yet."""
+        image = self._image_input()[1]
+        inputs = ((image, self._on_image), ('attitude', self._on_attitude))
+        return [
+            self.resolve_topic_name(topic)
+            for topic, callback in inputs
+            if not self.taken(callback)
+        ] + [
+            self.resolve_topic_name(f'{mounting.frame}/attitude')
+            for mounting, history in zip(
+                self._setup.mountings, self._star_trackers.histories[1:], strict=True
+            )
+            if not len(history)
+        ]
+
+    def _on_image(self, message: Any) -> None:
+        self._image_arrivals.add(0.0)
+        self._publish_camera_info(message)
+        time_ns = stamp_ns(message.header.stamp)
+        time_ns += offset_ns(self._setup.attitude.stamp_offset_s)
+        if self._queue is not None:
+            width, height = getattr(message, 'width', 0), getattr(message, 'height', 0)
+            self._queue.put(time_ns, width, height, message)
+
+    def _publish_camera_info(self, message: Any) -> None:
+        """Publish the active calibration with the header of an image message."""
+        camera_info = self._camera_info
+        if camera_info is None:
+            return
+        # A compressed image has no size; an image of another size is from another camera.
+        size = (camera_info.width, camera_info.height)
+        if (getattr(message, 'width', size[0]), getattr(message, 'height', size[1])) == size:
+            camera_info.header = message.header
+            self._camera_infos.publish(camera_info)
+
+    def _on_attitude(self, message: Any) -> None:
+        time_ns, quaternion = telemetry.attitude_from_message(message)
+        if self._unmatched is not None:
+            self._unmatched.add_attitude(time_ns, quaternion)
+        history = self._star_trackers.histories[0]
+        before_ns = history.latest_ns
+        self._add_attitude(0, message)
+        # Late samples and steps back of the clock are not gaps.
+        latest_ns = history.latest_ns or 0
+        step_ns = 0 if before_ns is None else max(0, latest_ns - before_ns)
+        self._attitude_step_s.add(step_ns / NANOSECONDS_PER_SECOND)
+
+    def _add_attitude(self, which: int, message: Any) -> None:
+        time_ns, quaternion = telemetry.attitude_from_message(message)
+        direction = self._setup.attitude.attitude_direction
+        self._star_trackers.add(which, time_ns, attitude_sample(time_ns, quaternion, direction))
+        if self._queue is not None:
+            self._queue.wake()
+
+    def _on_velocity(self, message: Any) -> None:
+        time_ns, velocity_m_s = telemetry.velocity_from_message(message)
+        # The Earth moves at 3e4 m/s; a value beyond this limit would displace all stars.
+        if not float(abs(velocity_m_s).max()) < _MAX_VELOCITY_M_S:
+            raise ValueError(
+                f'velocity: {velocity_m_s.tolist()} m/s is not plausible for a spacecraft'
+            )
+        self._velocities.append((time_ns, velocity_m_s))
+
+    def _on_temperature(self, message: Any) -> None:
+        self._temperatures.append(telemetry.temperature_from_message(message))
+
+    def _on_calibration(self, message: Any) -> None:
+        calibration = calibration_from_message(message)
+        if not (calibration.accepted or calibration.forced):
+            raise ValueError('calibration: refused by the gate')
+        geometry = calibration.geometry
+        prior = self._setup.prior.camera
+        if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
+            raise ValueError('calibration: image size differs from the prior camera')
+        self._camera_info = camera_info_to_message(calibration, make_message)
+        self._in_worker(self._predict_with, geometry, calibration.number)
+
+    def _predict_with(self, geometry: CameraGeometry, number: int) -> None:
+        self._geometry, self._calibration_number = geometry, number
+        self.get_logger().info('predicting stars with the active calibration')
+        self._measure_again()
+
+    def _in_worker(self, function: Callable[..., None], *arguments: Any) -> None:
+        if self._queue is not None:
+            self._queue.call(functools.partial(self.guarded(function), *arguments))
+
+    def _measure_all(self) -> None:
+        assert self._queue is not None  # created before the thread
+        heard_by_s = math.inf
+        while (waiting := self._queue.take()) is not None:
+            # Where all nodes start at once, the first image may be faster than the discovery of
+            # the calibrator, and its observations would reach nobody.
+            heard_by_s = min(heard_by_s, time.monotonic() + _DISCOVERY_S)
+            while not self._is_heard() and time.monotonic() < heard_by_s:
+                time.sleep(0.02)  # rclpy cannot wait for a match
+            try:
+                self._measure(waiting)
+            except Exception as error:
+                self.count_error(error)
+                if not self.context.ok():
+                    return  # shutdown: no refusal can be published
+                detail = f'{type(error).__name__}: {error}'
+                self._publish(self._refused(waiting, 'internal_error', detail))
+            self._latency_s.add(time.monotonic() - waiting.arrived_s)
+            self.guarded(self.publish_health_change)()
+
+    def _is_heard(self) -> bool:
+        """Return True if each subscriber that the graph shows is matched, and there is one."""
+        if not self.is_active:
+            return True
+        known = self.count_subscribers(self._observations.topic_name)
+        return bool(known) and self._observations.get_subscription_count() >= known
+
+    def _measure(self, waiting: Waiting) -> None:
+        if waiting.message is None:
+            detail = f'{self._own.image_queue} images were in the queue'
+            self._publish(self._refused(waiting, 'overrun', detail))
+            return
+        offset_s, camera = self._setup.attitude.stamp_offset_s, self._setup.prior.camera
+        try:
+            image = image_from_message(
+                waiting.message,
+                offset_s,
+                (camera.width, camera.height),
+                self._setup.frames.image_channel,
+            )
+        except ImageRefused as refused:
+            self._publish(self._refused(waiting, refused.reason, refused.detail))
+            return
+        if self._geometry is not self._predicted_from:
+            self._predicted_from = self._geometry
+            self._track = dataclasses.replace(self._track, geometry=self._geometry)
+        if not self._setup.is_aligned and self._geometry is self._setup.prior:
+            self._keep(image)
+            detail = 'prior_alignment is not given: it is being found from the images'
+            self._publish(self._refused(waiting, 'no_match', detail))
+            return
+        before = self._track
+        observations, self._track = self._observe_next(image, before)
+        if before.behind and not self._track.behind and image.time_ns <= (before.latest_ns or 0):
+            self._restarts += 1
+            self.get_logger().warning('image stamps went back: restarted the sequence')
+        self._publish(observations)
+        if observations.refusal == 'no_match':
+            self._keep(image)
+        elif not observations.refusal and self._unmatched is not None:
+            self._unmatched.matched()
+        if self._annotated.get_subscription_count():
+            self._publish_annotated(image, observations, before.geometry)
+
+    def _observe_next(
+        self, image: Image, track: observe.Track
+    ) -> tuple[StarObservations, observe.Track]:
+        first, *more = self._star_trackers.histories
+        return observe.observe_next(
+            image,
+            first,
+            self._setup,
+            track,
+            latest_at(sorted(self._velocities, key=_STAMP_NS), image.time_ns, None),
+            latest_at(sorted(self._temperatures, key=_STAMP_NS), image.time_ns, math.nan),
+            more,
+        )
+
+    def _keep(self, image: Image) -> None:
+        if self._unmatched is not None:
+            self._unmatched.add(image)
+
+    def _on_diagnosis(self, found: Diagnosis) -> None:
+        """Log why images match nothing; without a prior alignment, take the one found."""
+        if self._setup.is_aligned:
+            self.get_logger().warning(f'no image matches: {found.in_a_sentence()}')
+            self.publish_health()
+            return
+        values, sentence = found_alignment(found)
+        if values is None or self._unmatched is None:
+            self.get_logger().warning(f'prior_alignment is not given, and not found: {sentence}')
+            return
+        is_prior = self._geometry is self._setup.prior
+        self._setup = aligned(self._setup, np.array(values))
+        self._unmatched.aligned(self._setup)
+        self.get_logger().info(sentence)
+        if is_prior:
+            self._geometry = self._setup.prior
+            self._measure_again()
+
+    def _measure_again(self) -> None:
+        """Measure the images that matched nothing, with the calibration or alignment found."""
+        kept = [] if self._unmatched is None else self._unmatched.take()
+        for image in kept:
+            observations, _ = self._observe_next(image, observe.Track(self._geometry))
+            self._retried += 1
+            if not observations.refusal:
+                self._retried_used += 1
+                self._counts['no_match'] -= 1
+                self._publish(observations)
+        if kept:
+            self.get_logger().info(
+                f'{len(kept)} images without a match measured again: {self._retried_used} used'
+            )
+
+    def _refused(self, waiting: Waiting, reason: str, detail: str) -> StarObservations:
+        width, height = (min(side, MAX_SIDE_PX) for side in (waiting.width, waiting.height))
+        return refused_image(nearest_stamp_ns(waiting.time_ns), width, height, reason, detail)
+
+    def _publish(self, observations: StarObservations) -> None:
+        frame_id = self._setup.frames.camera_frame
+        self._observations.publish(observations_to_message(observations, frame_id, make_message))
+        self._counts[observations.refusal] += 1
+        self._last_refusal = (
+            observations.refusal and f'{observations.refusal}: {observations.detail}'
+        )
+        text = (self._last_refusal and f'refused: {self._last_refusal}') or observations.detail
+        if text:
+            seconds = observations.time_ns / NANOSECONDS_PER_SECOND
+            self.get_logger().warning(f'image at {seconds:.3f} s: {text}')
+        else:
+            self.get_logger().debug(f'{len(observations)} stars')
+
+    def _publish_annotated(
+        self, image: Image, observations: StarObservations, geometry: CameraGeometry
+    ) -> None:
+        picture = annotate(image, observations, geometry)
+        frame_id = self._setup.frames.camera_frame
+        self._annotated.publish(
+            color_image_to_message(image.time_ns, picture, frame_id, make_message)
+        )
+
+
+def _short(number: float | None) -> str:
+    return 'none' if number is None else f'{number:.3f}'
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the star observer until shutdown; exit status 2 for bad parameters."""
+    return run(StarObserver, NAME, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

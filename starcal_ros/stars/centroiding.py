@@ -1,0 +1,400 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Star centroids with covariance, by moments (Eqs. 8, 9) or by PSF fits.
+
+The moment method is that of the paper; the fit goes beyond it.  Both use the PSF, the pixel noise
+and the saturation level of `image_model`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.records import StarRefusal
+from starcal_ros.stars import detection, psf_fit
+from starcal_ros.stars.hot_pixels import CORE_PX, hot_in_stamps, lit_alone, NO_HOT_PIXELS
+from starcal_ros.stars.image_model import CentroidOptions, ImageModel, MAX_SHAPE_CHANGE
+from starcal_ros.stars.pixel_noise import expected_snr, PixelNoise
+from starcal_ros.stars.psf_field import PsfWidth
+
+# The mask of Eqs. 8 and 9; the radius holds 99 % of the light of a star of 1 px.
+_MASK_RADIUS_PX = 3.0
+_MASK_THRESHOLD_SIGMA = 3.0  # above the background
+_MIN_MASK_PIXELS = 4
+_MODELLED_SNR = 4.0  # of stars that are modelled, to subtract their light from their neighbours
+SWAMPED_SIGMA = 3.0  # a star with a brighter one nearer than this cannot be separated from it
+_NEIGHBOUR_NOISE = 0.2  # of the pixel noise; less light of a neighbour is neglected
+_IN_PLACE_PX = 1.5  # from the brightest pixel; a fit that ends farther away is not of the star
+
+
+@dataclass(frozen=True)
+class Centroids:
+    """
+    Measured stars.
+
+    ``xy_px`` (n, 2); ``covariance_px2`` (n, 3) uu, uv, vv; ``flux_dn``, ``snr`` (n,);
+    ``refusal`` (n,) uint8 codes of `StarRefusal`, 0 where the star is good.
+    ``fit`` is None for moments; ``psf_sigma_px``, ``noise_dn`` (n,) are PSF width and noise of the
+    fit; ``modelled`` (n,) masks the stars whose light was subtracted from their neighbours.
+    """
+
+    xy_px: Floats
+    covariance_px2: Floats
+    flux_dn: Floats
+    snr: Floats
+    refusal: NDArray[np.uint8]
+    fit: psf_fit.PsfFit | None
+    psf_sigma_px: Floats
+    noise_dn: Floats
+    modelled: NDArray[np.bool_]
+
+
+def measure_stars(
+    pixels: Pixels,
+    predicted_px: Floats,
+    model: ImageModel,
+    options: CentroidOptions,
+    hot_pixels: NDArray[np.int64] = NO_HOT_PIXELS.index,
+) -> Centroids:
+    """
+    Centroids of the stars near predicted pixels (n, 2), by the method of the options.
+
+    The brighter of two neighbours must come first.  Without a PSF the moment method is used.
+    ``hot_pixels`` (k,), flat indices row by row from 0, sorted, are left out of a fit.
+    """
+    if options.centroid == 'psf' and model.psf is not None:
+        return _measure_by_psf(pixels, predicted_px, model, model.psf, options, hot_pixels)
+    return _measure_by_moments(pixels, predicted_px, model, options)
+
+
+def with_faint(measured: Centroids, predicted_px: Floats) -> Centroids:
+    """
+    Centroids of predicted stars (n, 2) of which the first were measured and the others are faint.
+
+    The PSF fit is not in the result, as the others have none.
+    """
+    more = len(predicted_px) - len(measured.refusal)
+
+    def extended(values: Floats, value: float) -> Floats:
+        return np.concatenate([values, np.full((more, *values.shape[1:]), value)])
+
+    return Centroids(
+        xy_px=np.concatenate([measured.xy_px, predicted_px[len(measured.refusal) :]]),
+        covariance_px2=extended(measured.covariance_px2, np.nan),
+        flux_dn=extended(measured.flux_dn, 0.0),
+        snr=extended(measured.snr, 0.0),
+        refusal=np.concatenate([measured.refusal, np.full(more, StarRefusal.FAINT, np.uint8)]),
+        fit=None,
+        psf_sigma_px=extended(measured.psf_sigma_px, np.nan),
+        noise_dn=extended(measured.noise_dn, np.nan),
+        modelled=np.concatenate([measured.modelled, np.zeros(more, bool)]),
+    )
+
+
+def _measure_by_psf(
+    pixels: Pixels,
+    predicted_px: Floats,
+    model: ImageModel,
+    psf: PsfWidth,
+    options: CentroidOptions,
+    hot_pixels: NDArray[np.int64],
+) -> Centroids:
+    """Centroids by `fit_psf`, in windows about the predicted pixels."""
+    centre, inside = _brightest_beside(pixels, predicted_px, hot_pixels)
+    windows = _windows(pixels, centre, model, psf, hot_pixels)
+    guess = psf_fit.first_guess(windows.stamps, windows.level_dn)
+    stamps, parameters, modelled = _without_neighbours(
+        windows.stamps,
+        psf_fit.approach(windows.stamps, guess, model.pixel_noise),
+        predicted_px,
+        centre,
+        inside & (windows.saturated_pixels == 0),
+        model.pixel_noise,
+    )
+    fit = psf_fit.fit_at(stamps, parameters, model.pixel_noise)
+    refusal = np.full(len(predicted_px), StarRefusal.NONE, np.uint8)
+    for bad, reason in (
+        (~inside, StarRefusal.BORDER),
+        (windows.saturated_pixels > options.max_saturated_pixels, StarRefusal.SATURATED),
+        ((fit.snr < options.min_snr) | ~np.isfinite(fit.snr), StarRefusal.FAINT),
+        (np.abs(fit.parameters[:, :2]).max(axis=1) > _IN_PLACE_PX, StarRefusal.NOT_DETECTED),
+        (_misshapen(fit, model, options), StarRefusal.ELONGATED),
+    ):
+        refusal[bad & (refusal == StarRefusal.NONE)] = reason
+    return Centroids(
+        xy_px=centre + fit.parameters[:, :2],
+        covariance_px2=fit.covariance[:, [0, 0, 1], [0, 1, 1]],
+        flux_dn=fit.parameters[:, 2],
+        snr=fit.snr,
+        refusal=refusal,
+        fit=fit,
+        psf_sigma_px=stamps.sigma_px,
+        noise_dn=windows.noise_dn,
+        modelled=modelled,
+    )
+
+
+def _brightest_beside(
+    pixels: Pixels, predicted_px: Floats, hot_pixels: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The brightest pixel (n, 2) next to each predicted one, and a mask (n,) of those inside."""
+    shape = (pixels.shape[0], pixels.shape[1])
+    centre = np.rint(np.where(np.isnan(predicted_px), -1e6, predicted_px)).astype(np.int64)
+    inside = detection.windows_inside(shape, centre, 1)
+    innermost = np.array([shape[1] - 2, shape[0] - 2])
+    centre = np.minimum(np.maximum(centre, 1), innermost)
+    near = detection.windows_about(pixels, centre, 1)
+    near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0
+    near = near.reshape(len(centre), 9)
+    best = near.argmax(axis=1)
+    best[near[:, 4] == near.max(axis=1)] = 4  # on a saturated plateau, the predicted pixel
+    centre = centre + np.stack([best % 3 - 1, best // 3 - 1], axis=-1)
+    return np.minimum(np.maximum(centre, 1), innermost), inside
+
+
+class _Windows(NamedTuple):
+    """Windows about stars; level of their borders, noise of the sky and saturated pixels (n,)."""
+
+    stamps: psf_fit.Stamps
+    level_dn: Floats
+    noise_dn: Floats
+    saturated_pixels: NDArray[np.int64]
+
+
+def _windows(
+    pixels: Pixels,
+    centre: NDArray[np.int64],
+    model: ImageModel,
+    psf: PsfWidth,
+    hot_pixels: NDArray[np.int64],
+) -> _Windows:
+    """Windows for a fit about pixels (n, 2), without pixels that show no light of the star."""
+    shape = (pixels.shape[0], pixels.shape[1])
+    radius = psf_fit.stamp_radius_px(psf.sigma_px)
+    stamps, outside = detection.stamps_at_edges(pixels, centre, radius)
+    saturated = (stamps >= model.saturation_dn) & ~outside
+    at_px = centre.astype(np.float64)
+    noise_dn = detection.sample_mesh(model.background.noise_mesh, shape, at_px)
+    invalid = (stamps == 0.0) & (
+        detection.sample_mesh(model.background.level_mesh, shape, at_px)
+        > detection.GAP_SIGMA * noise_dn
+    )[:, None, None]
+    # The fit has a level and no slope: a slope in the data would bias faint stars.
+    stamps -= _slopes(model.background, shape, at_px, radius)
+    hot = hot_in_stamps(hot_pixels, centre, radius, shape[1]) & ~outside
+    level_dn = psf_fit.border_level_dn(stamps)
+    hot |= _single_pixels(pixels, stamps, centre, level_dn, noise_dn, model.pixel_noise)
+    # The first guess uses all pixels; the fit leaves these out.
+    if hot.any():
+        stamps[hot] = level_dn[np.nonzero(hot)[0]]
+    out = saturated | hot | outside | invalid
+    return _Windows(
+        psf_fit.Stamps(stamps, psf.at(at_px), noise_dn[:, None] ** 2, out if out.any() else None),
+        level_dn,
+        noise_dn,
+        np.count_nonzero(saturated & ~hot, axis=(1, 2)),
+    )
+
+
+def _slopes(
+    background: detection.Background, shape: tuple[int, int], at_px: Floats, radius: int
+) -> Floats:
+    """Slope of the background in windows about pixels (n, 2), DN, zero in their middles."""
+    reach = np.arange(-radius, radius + 1).astype(np.float64)
+    down, across = (
+        detection.sample_mesh(slope, shape, at_px)[:, None, None]
+        for slope in detection.mesh_slope(background.level_mesh, shape)
+    )
+    return np.asarray(down * reach[:, None] + across * reach)
+
+
+def _misshapen(
+    fit: psf_fit.PsfFit, model: ImageModel, options: CentroidOptions
+) -> NDArray[np.bool_]:
+    """Mask (n,) of the stars whose shape differs from the common one of the image."""
+    departure = np.abs(fit.shape_change - model.shape_median)
+    limit = np.maximum(MAX_SHAPE_CHANGE, 4.0 * model.shape_scatter)
+    other = ((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1)
+    return np.asarray(other | (fit.worst_pixel_sigma > psf_fit.MISFIT_SIGMA))
+
+
+def _without_neighbours(
+    stamps: psf_fit.Stamps,
+    parameters: Floats,
+    predicted_px: Floats,
+    centre: NDArray[np.int64],
+    usable: NDArray[np.bool_],
+    noise: PixelNoise,
+) -> tuple[psf_fit.Stamps, Floats, NDArray[np.bool_]]:
+    """
+    Stamps without the light of the neighbours that can be modelled.
+
+    Also the parameters (n, 4) near the minimum of the fit, and a mask (n,) of the modelled stars.
+    """
+    flux, sigma_px = parameters[:, 2], stamps.sigma_px
+    snr = expected_snr(flux, sigma_px, np.sqrt(stamps.noise2_dn2[:, 0]), noise)
+    in_place = np.abs(parameters[:, :2]).max(axis=1) < _IN_PLACE_PX
+    modelled = usable & (snr > _MODELLED_SNR) & in_place
+    if len(stamps) < 2:
+        return stamps, parameters, modelled
+    widest_px = float(sigma_px.max())
+    # The wing of a star outside the stamp adds light to it.
+    reach_px = math.sqrt(2.0) * (stamps.width // 2) + 2.0 * widest_px
+    pairs = cKDTree(centre).query_pairs(reach_px, output_type='ndarray')
+    apart_px = np.hypot(*(predicted_px[pairs[:, 0]] - predicted_px[pairs[:, 1]]).T)
+    # Both fits would follow the light of the brighter one, which comes first.
+    modelled[pairs[apart_px < max(3.0, 3.0 * widest_px)].max(axis=1)] = False
+    # The fainter of two unresolved stars cannot be separated: `blending` refuses it.
+    pairs = pairs[apart_px >= SWAMPED_SIGMA * float(sigma_px.min())]
+    star, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    subtracted = modelled[other]
+    star, other = star[subtracted], other[subtracted]
+    if not len(star):
+        return stamps, parameters, modelled
+    away_px = (centre[other] - centre[star]).astype(np.float64)
+    separated = stamps
+    touched = np.zeros(len(stamps), bool)
+    little_dn = _NEIGHBOUR_NOISE * np.sqrt(stamps.noise2_dn2[star, 0])
+    light: Floats = np.zeros((len(star), stamps.width**2))
+    # Twice: the light of a neighbour is more accurate without that of its own neighbours.
+    for _ in range(2):
+        before = light
+        light = psf_fit.light_in_stamps(
+            away_px + parameters[other, :2], parameters[other, 2], sigma_px[other], stamps.width
+        )
+        if not (np.abs(light - before).max(axis=1, initial=0.0) > little_dn).any():
+            break
+        lit = light.max(axis=1, initial=0.0) > little_dn
+        # Includes stars to which earlier subtracted light is returned.
+        touched[star[lit]] = True
+        again = np.flatnonzero(touched)
+        neighbours = np.zeros((len(stamps), stamps.width**2))
+        np.add.at(neighbours, star[lit], light[lit])
+        # The light is subtracted, its photon noise stays.
+        separated = psf_fit.Stamps(
+            stamps.data_dn - neighbours.reshape(stamps.data_dn.shape),
+            sigma_px,
+            stamps.noise2_dn2 + neighbours / (noise.gain_e_per_dn * noise.background),
+            stamps.out,
+        )
+        parameters = parameters.copy()
+        parameters[again] = psf_fit.approach(separated.select(again), parameters[again], noise)
+    return separated, parameters, modelled
+
+
+def _single_pixels(
+    pixels: Pixels,
+    stamps: Floats,
+    centre: NDArray[np.int64],
+    level_dn: Floats,
+    noise_dn: Floats,
+    noise: PixelNoise,
+) -> NDArray[np.bool_]:
+    """
+    Mask (n, w, w) of single lit pixels of the stamps away from the core of the star.
+
+    They are cosmic rays or new hot pixels: the light of a star extends to adjacent pixels.
+    """
+    above_dn = stamps - level_dn[:, None, None]
+    radius = stamps.shape[1] // 2
+    reach = np.arange(-radius, radius + 1)
+    away = np.hypot(reach[:, None], reach) > CORE_PX
+    least_dn = psf_fit.MISFIT_SIGMA * math.sqrt(noise.background) * noise_dn
+    beyond = (above_dn > least_dn[:, None, None]) & away
+    star, row, column = np.unravel_index(np.flatnonzero(beyond), beyond.shape)
+    v, u = centre[star, 1] + row - radius, centre[star, 0] + column - radius
+    lit_dn = above_dn[star, row, column]
+    inner = (u >= 1) & (u < pixels.shape[1] - 1) & (v >= 1) & (v < pixels.shape[0] - 1)
+    inner &= (
+        lit_dn**2 > least_dn[star] ** 2 + psf_fit.MISFIT_SIGMA**2 * lit_dn / noise.gain_e_per_dn
+    )
+    star, row, column, v, u = (values[inner] for values in (star, row, column, v, u))
+    alone = lit_alone(pixels, v, u, level_dn[star])
+    single = np.zeros(stamps.shape, bool)
+    single[star[alone], row[alone], column[alone]] = True
+    return single
+
+
+def _measure_by_moments(
+    pixels: Pixels, predicted_px: Floats, model: ImageModel, options: CentroidOptions
+) -> Centroids:
+    """
+    Centroids as centres of intensity over a mask (Eqs. 8, 9).
+
+    The window is centred on the brightest pixel of the region of interest; the mask holds the
+    pixels within 3 px of it that are 3 times the noise above the background.
+    """
+    shape = (pixels.shape[0], pixels.shape[1])
+    radius = int(np.ceil(_MASK_RADIUS_PX))
+    n = len(predicted_px)
+    refusal = np.full(n, StarRefusal.NONE, np.uint8)
+    centre = np.rint(np.nan_to_num(predicted_px, nan=-1e6)).astype(np.int64)
+    inside = detection.windows_inside(shape, centre, 2 * radius)
+    refusal[~inside] = StarRefusal.BORDER
+    centre = np.clip(centre, 2 * radius, [shape[1] - 2 * radius - 1, shape[0] - 2 * radius - 1])
+    w = 2 * radius + 1
+    best = detection.stamps_about(pixels, centre, radius).reshape(n, w * w).argmax(axis=1)
+    centre = centre + np.stack([best % w - radius, best // w - radius], axis=-1)
+
+    stamps = detection.stamps_about(pixels, centre, radius)
+    level = detection.sample_mesh(model.background.level_mesh, shape, centre.astype(np.float64))
+    noise_dn = detection.sample_mesh(model.background.noise_mesh, shape, centre.astype(np.float64))
+    signal = stamps - level[:, None, None]
+    offsets = np.arange(-radius, radius + 1).astype(np.float64)
+    disc = offsets[:, None] ** 2 + offsets[None, :] ** 2 <= _MASK_RADIUS_PX**2
+    mask = disc & (signal > (_MASK_THRESHOLD_SIGMA * noise_dn)[:, None, None])
+    weight = np.where(mask, signal, 0.0)
+    flux = weight.sum(axis=(1, 2))
+    of_pixel = model.pixel_noise.variance(signal, noise_dn[:, None, None], flux[:, None, None])
+    variance = np.where(mask, of_pixel, 0.0)
+    place_px, covariance_px2, ellipticity = _moments(weight, variance, offsets)
+    snr = flux / np.sqrt(np.maximum(variance.sum(axis=(1, 2)), 1e-12))
+    # A mask of one pixel would give a covariance of zero.
+    count = mask.sum(axis=(1, 2))
+    for bad, reason in (
+        (stamps.max(axis=(1, 2)) >= model.saturation_dn, StarRefusal.SATURATED),
+        (snr < options.min_snr, StarRefusal.FAINT),
+        (count < _MIN_MASK_PIXELS, StarRefusal.TOO_FEW_PIXELS),
+        (ellipticity > MAX_SHAPE_CHANGE, StarRefusal.ELONGATED),
+    ):
+        refusal[bad & (refusal == StarRefusal.NONE)] = reason
+    return Centroids(
+        xy_px=centre + place_px,
+        covariance_px2=covariance_px2,
+        flux_dn=flux,
+        snr=snr,
+        refusal=refusal,
+        fit=None,
+        psf_sigma_px=np.zeros(n),
+        noise_dn=noise_dn,
+        modelled=np.zeros(n, bool),
+    )
+
+
+def _moments(weight: Floats, variance: Floats, offsets: Floats) -> tuple[Floats, Floats, Floats]:
+    """
+    Centres of intensity (n, 2) from the middles, their covariances (n, 3) and ellipticities (n,).
+
+    ``weight`` and ``variance`` (n, w, w) are those of the pixels, 0 outside the mask; ``offsets``
+    (w,) are the places of the pixels along each axis.
+    """
+    total = np.maximum(weight.sum(axis=(1, 2)), 1e-12)
+    x = (weight * offsets[None, None, :]).sum(axis=(1, 2)) / total
+    y = (weight * offsets[None, :, None]).sum(axis=(1, 2)) / total
+    dx = offsets[None, None, :] - x[:, None, None]
+    dy = offsets[None, :, None] - y[:, None, None]
+
+    def second(values: Floats) -> Floats:
+        pairs = ((dx, dx), (dx, dy), (dy, dy))
+        return np.stack([(values * a * b).sum(axis=(1, 2)) for a, b in pairs], axis=-1)
+
+    xx, xy, yy = (second(weight) / total[:, None]).T
+    ellipticity = np.hypot(xx - yy, 2 * xy) / np.maximum(xx + yy, 1e-12)
+    return np.stack([x, y], axis=-1), second(variance) / (total**2)[:, None], ellipticity

@@ -1,0 +1,442 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Background of an image, and the star-like sources above it.
+
+Positions of sources are good to a fifth of a pixel; `centroiding` measures the identified stars.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, map_coordinates
+
+from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.robust_statistics import median, medians
+
+DETECTION_SIGMA = 5.0  # noise alone exceeds it at 0.6 places of a megapixel
+_MESH_PX = 64  # glare and vignetting vary slowly over it
+_MESH_STEP_PX = (4, 4)  # down and across: 256 samples of a cell give its noise to 5 %
+GAP_SIGMA = 8.0  # a pixel of 0 DN this far below the rest of its cell is invalid
+_CUT_OFF = 0.3  # with more of a cell at 0 DN, its lower half no longer shows the noise
+_LEAST_CUT_OFF_DN = 0.5
+_STEEP_PART = 0.2  # a slope that adds more to the variance of a cell is corrected
+_MOSTLY_INVALID = 0.75  # a cell with more invalid pixels takes the level of its neighbour
+_SPARSE_PX = 256
+_MOST_SLOPE = 0.05  # in noise per pixel, of cells of 256 px: it pulls a star by 0.25 sigma at most
+_SPARSE_STEP_PX = (32, 8)  # memory is read row by row: few rows, many of their pixels
+_DETECTION_SIGMA_PX = (
+    1.0  # matched filter of detection; 0.7 to 1.5 px stars lose under 10 % of S/N
+)
+# A Gaussian filter of sigma s leaves white noise at 1 / (2 s sqrt(pi)) of its strength.
+_NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
+_ALONG_U, _ALONG_V = np.array([[[1], [0]], [[0], [1]]])  # a step along either axis, (2, 1)
+_RIM_PX = 4  # reach of the filter, plus one pixel to interpolate the maximum
+# Peak over filtered peak: 6.3 for a single lit pixel without noise; for a star centred on a pixel
+# 4.2 with a PSF of 0.45 px (half of the light in that pixel) and 4.65 with one of 0.4 px.
+_HOT_PEAK_RATIO = 4.7
+
+
+@dataclass(frozen=True)
+class Background:
+    """
+    Background level and 1-sigma noise, DN, on a coarse mesh and for the whole image.
+
+    ``level_mesh`` and ``noise_mesh`` are (rows, cols) float32 over equal parts of the image;
+    ``level_dn`` and ``noise_dn`` are their medians.
+    """
+
+    level_mesh: NDArray[np.float32]
+    noise_mesh: NDArray[np.float32]
+    level_dn: float
+    noise_dn: float
+
+
+@dataclass(frozen=True)
+class Sources:
+    """
+    Star-like local maxima of an image, brightest first.
+
+    ``xy_px`` (n, 2); ``snr`` (n,); ``searched_px2`` the searched area of the image.
+    """
+
+    xy_px: Floats
+    snr: Floats
+    searched_px2: float
+
+
+def measure_background(pixels: Pixels) -> Background:
+    """
+    Background level and noise of an image from the median and the clipped spread of each cell.
+
+    Reads one pixel in sixteen.  Ignores invalid pixels (0 DN far below all others, as in a masked
+    border).  The noise is at least the quantisation noise of whole DN.
+    """
+    samples, mesh_shape = _cells(pixels, _MESH_PX, _MESH_STEP_PX)
+    samples.sort(axis=1)
+    zeros = np.count_nonzero(samples == 0.0, axis=1)
+    invalid = np.where(_gap_above_zero(samples, zeros), zeros, 0)
+    level = _quantile(samples, 0.5, invalid)
+    # Stars lie above the median only: the lower quantile gives the spread.
+    spread = level - _quantile(samples, 0.1587, invalid)
+    tail = _noise_above(samples, level, np.where(invalid > 0, 0, zeros))
+    samples -= level[:, None]
+    mean, noise = _clipped(samples, spread, np.arange(samples.shape[1]) >= invalid[:, None])
+    noise = np.maximum(noise, tail)
+    has_pixels = invalid < _MOSTLY_INVALID * samples.shape[1]
+    level, noise = (_filled(values, has_pixels, mesh_shape) for values in (mean + level, noise))
+    noise = np.maximum(_without_slope(noise, level.reshape(mesh_shape), pixels), tail)
+    return _background(level, noise, mesh_shape)
+
+
+def sample_background(pixels: Pixels) -> Background:
+    """
+    Background level and noise from one pixel in 128, for fits that estimate their own level.
+
+    Differences of nearby pixels give the noise, free of the gradient over a large cell.  If the
+    sky is too steep for large cells, `measure_background` replaces the result.
+    """
+    samples, mesh_shape = _cells(pixels, _SPARSE_PX, _SPARSE_STEP_PX)
+    beside, _ = _cells(pixels[:, 2:], _SPARSE_PX, _SPARSE_STEP_PX, mesh_shape)
+    width = min(samples.shape[1], beside.shape[1])
+    noise = _difference_noise(samples[:, :width], beside[:, :width])
+    level = medians(samples[:, ::4].T).astype(np.float32)
+    zeros = np.count_nonzero(samples == 0.0, axis=1)
+    cut_off = np.flatnonzero(zeros > _CUT_OFF * samples.shape[1])
+    if len(cut_off):
+        tail = _noise_above(np.sort(samples[cut_off], axis=1), level[cut_off], zeros[cut_off])
+        noise[cut_off] = np.maximum(noise[cut_off], tail)
+    background = _background(level, noise, mesh_shape)
+    down, across = mesh_slope(background.level_mesh, pixels.shape)
+    steepest = (np.hypot(down, across) / background.noise_mesh).max()
+    return background if steepest <= _MOST_SLOPE else measure_background(pixels)
+
+
+def _noise_above(
+    ascending: NDArray[np.float32], level: NDArray[np.float32], zeros: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """
+    Noise (k,) of the sorted rows (k, n) that the converter clips at 0 DN; 0 for other rows.
+
+    Clipping removes the lower half of the noise: the 2-sigma quantile of the upper half gives it.
+    Noise below 1 DN changes too few pixels to be measured: the result is at least 0.5 DN.
+    """
+    count = ascending.shape[1]
+    above = ascending[:, int(0.9772 * count)] - level
+    noise = np.maximum(0.5 * above, np.float32(_LEAST_CUT_OFF_DN))
+    return np.where(zeros > _CUT_OFF * count, noise, np.float32(0.0))
+
+
+def _without_slope(
+    noise: NDArray[np.float32], level_mesh: NDArray[np.float32], pixels: Pixels
+) -> NDArray[np.float32]:
+    """Noise (k,) of the cells, from differences where the slope of the background exceeds it."""
+    down, across = mesh_slope(_smooth_mesh(level_mesh), pixels.shape)
+    cell_v, cell_u = np.array(pixels.shape) / level_mesh.shape
+    ramp = (((down * cell_v) ** 2 + (across * cell_u) ** 2) / 12.0).ravel()
+    steep = ramp > _STEEP_PART * noise**2
+    if not steep.any():
+        return noise
+    samples, mesh_shape = _cells(pixels, _MESH_PX, _MESH_STEP_PX)
+    beside, _ = _cells(pixels[:, 2:], _MESH_PX, _MESH_STEP_PX, mesh_shape)
+    width = min(samples.shape[1], beside.shape[1])
+    of_differences = _difference_noise(samples[:, :width], beside[:, :width])
+    return np.where(steep, np.minimum(of_differences, noise), noise)
+
+
+def _difference_noise(
+    samples: NDArray[np.float32], beside: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Noise (k,) from the differences of near pixels (k, n), almost free of slopes."""
+    apart = samples - beside
+    apart -= np.partition(apart, apart.shape[1] // 2, axis=1)[:, apart.shape[1] // 2, None]
+    rank = int(apart.shape[1] * 0.6827)
+    _, noise = _clipped(apart, np.partition(np.abs(apart), rank, axis=1)[:, rank])
+    return np.asarray(noise / math.sqrt(2.0), np.float32)
+
+
+def mesh_slope(
+    mesh: NDArray[np.float32], shape: tuple[int, ...]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Slopes (rows, cols) of a mesh over an image of ``shape``, down and across, per pixel."""
+    rows, cols = mesh.shape
+    down, across = np.zeros_like(mesh), np.zeros_like(mesh)
+    if rows > 1:
+        down = np.asarray(np.gradient(mesh, shape[0] / rows, axis=0), np.float32)
+    if cols > 1:
+        across = np.asarray(np.gradient(mesh, shape[1] / cols, axis=1), np.float32)
+    return down, across
+
+
+def _quantile(
+    ascending: NDArray[np.float32], part: float, first: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Quantiles (k,) of the sorted rows (k, n), each from its element ``first`` (k,) on."""
+    count = ascending.shape[1]
+    rank = first + ((count - first) * part).astype(np.int64)
+    row = np.arange(len(ascending))
+    return np.asarray(ascending[row, np.minimum(rank, count - 1)])
+
+
+def _gap_above_zero(ascending: NDArray[np.float32], zeros: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Mask (k,) of the sorted rows that hold 0 DN far below the noise of their other samples."""
+    level = _quantile(ascending, 0.5, zeros)
+    spread = level - _quantile(ascending, 0.1587, zeros)
+    return np.asarray((zeros > 0) & (level > GAP_SIGMA * np.maximum(spread, 1.0)))
+
+
+def _filled(
+    values: NDArray[np.float32], has_pixels: NDArray[np.bool_], mesh_shape: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Values (k,) of the cells; a cell without pixels takes that of the nearest cell with some."""
+    if has_pixels.all() or not has_pixels.any():
+        return values
+    nearest = distance_transform_edt(
+        ~has_pixels.reshape(mesh_shape), return_distances=False, return_indices=True
+    )
+    return np.asarray(values.reshape(mesh_shape)[tuple(nearest)].ravel())
+
+
+def _cells(
+    pixels: Pixels,
+    cell_px: int,
+    step_px: tuple[int, int],
+    mesh_shape: tuple[int, int] | None = None,
+) -> tuple[NDArray[np.float32], tuple[int, int]]:
+    """Thinned pixels of equal cells of an image, a row for each cell; (rows, columns) of cells."""
+    height, width = pixels.shape
+    rows, cols = mesh_shape or (max(1, height // cell_px), max(1, width // cell_px))
+    cell_v, cell_u = height // rows, width // cols
+    cells = pixels[: rows * cell_v, : cols * cell_u].reshape(rows, cell_v, cols, cell_u)
+    down, across = step_px
+    thinned = cells[:, ::down, :, ::across].transpose(0, 2, 1, 3)
+    return thinned.reshape(rows * cols, -1).astype(np.float32), (rows, cols)
+
+
+def _clipped(
+    samples: NDArray[np.float32],
+    spread: NDArray[np.float32],
+    valid: NDArray[np.bool_] | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and 1-sigma of each row of samples about zero, without values beyond three spreads."""
+    inside = np.abs(samples) <= 3.0 * np.maximum(spread, 1.0)[:, None]
+    if valid is not None:
+        inside &= valid
+    kept = np.maximum(np.count_nonzero(inside, axis=1), 1)
+    samples = samples * inside
+    mean = samples.sum(axis=1) / kept
+    variance = np.einsum('ij,ij->i', samples, samples) / kept - mean**2
+    # 0.9733 of the variance of a normal distribution lies within 3 sigma.
+    return mean, np.sqrt(np.maximum(variance, 0.0) / 0.9733)
+
+
+def _background(
+    level: NDArray[np.float32], noise: NDArray[np.float32], mesh_shape: tuple[int, int]
+) -> Background:
+    """Smoothed level and noise of the cells; the noise is at least that of rounding to DN."""
+    level_mesh = _smooth_mesh(level.reshape(mesh_shape))
+    noise_mesh = _smooth_mesh(np.maximum(noise, math.sqrt(1.0 / 12.0)).reshape(mesh_shape))
+    return Background(level_mesh, noise_mesh, median(level_mesh), median(noise_mesh))
+
+
+def _smooth_mesh(mesh: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the mesh after a 3 x 3 median, which removes cells with a bright star."""
+    mesh = np.ascontiguousarray(mesh, np.float32)
+    return np.asarray(cv2.medianBlur(mesh, 3), np.float32) if min(mesh.shape) >= 3 else mesh
+
+
+def sample_mesh(mesh: NDArray[np.float32], shape: tuple[int, int], xy_px: Floats) -> Floats:
+    """Values (n,) of a mesh over an image of ``shape`` at pixels (n, 2), bilinear."""
+    rows, cols = mesh.shape
+    row = (xy_px[:, 1] + 0.5) * rows / shape[0] - 0.5
+    column = (xy_px[:, 0] + 0.5) * cols / shape[1] - 0.5
+    # SciPy's function, because cv2.remap takes at most 32767 points.
+    return np.asarray(map_coordinates(mesh, [row, column], np.float64, order=1, mode='nearest'))
+
+
+def detect(
+    pixels: Pixels, background: Background, detection_sigma: float = DETECTION_SIGMA
+) -> Sources:
+    """
+    Star-like sources of an image above a signal-to-noise ratio, brightest first.
+
+    Local maxima of the background-free image under a Gaussian matched filter; single lit pixels
+    (hot pixels, cosmic rays) are left out by their sharpness.  Positions are good to about 0.2 px.
+    """
+    height, width = pixels.shape
+    level = cv2.resize(background.level_mesh, (width, height), interpolation=cv2.INTER_LINEAR)
+    image: NDArray[np.float32] = np.subtract(pixels, level, dtype=np.float32)
+    filtered: NDArray[np.float32] = np.asarray(
+        cv2.GaussianBlur(image, (0, 0), _DETECTION_SIGMA_PX, borderType=cv2.BORDER_REFLECT),
+        np.float32,
+    )
+    lowest = detection_sigma * _NOISE_LEFT * float(background.noise_mesh.min())
+    # Few pixels pass the lowest threshold; all later steps use only those.
+    v, u = np.nonzero(filtered > lowest)
+    inner = (u >= 2) & (u < width - 2) & (v >= 2) & (v < height - 2)
+    v, u = v[inner], u[inner]
+    centre = filtered[v, u]
+    noise = sample_mesh(
+        background.noise_mesh, (height, width), np.stack([u, v], axis=-1).astype(np.float64)
+    )
+    keep = centre > detection_sigma * _NOISE_LEFT * noise
+    for dv in (-1, 0, 1):
+        for du in (-1, 0, 1):
+            if (dv, du) != (0, 0):
+                other = filtered[v + dv, u + du]
+                keep &= centre >= other if (dv, du) > (0, 0) else centre > other
+    v, u, centre, noise = v[keep], u[keep], centre[keep], noise[keep]
+    sharp = image[v, u] > _HOT_PEAK_RATIO * centre
+    v, u, centre, noise = v[~sharp], u[~sharp], centre[~sharp], noise[~sharp]
+    place = _parabola_vertex(
+        filtered[v - _ALONG_V, u - _ALONG_U], centre, filtered[v + _ALONG_V, u + _ALONG_U]
+    )
+    order = np.argsort(-centre, kind='stable')
+    xy = place.T + np.stack([u, v], axis=-1)
+    snr = (centre / (_NOISE_LEFT * noise)).astype(np.float64)
+    return Sources(xy[order], snr[order], float(width * height))
+
+
+def detect_near(
+    pixels: Pixels,
+    background: Background,
+    predicted_px: Floats,
+    reach_px: int,
+    detection_sigma: float = DETECTION_SIGMA,
+) -> Sources:
+    """
+    The brightest star-like source in a square window about each predicted pixel (n, 2).
+
+    The method of the paper ("Extracting star centroids"): its cost does not grow with the image.
+    Filter, threshold and rejection of single lit pixels are those of `detect`; a source in several
+    windows is listed once.
+    """
+    shape = (pixels.shape[0], pixels.shape[1])
+    centre = np.rint(predicted_px).astype(np.int64)
+    inside = windows_inside(shape, centre, reach_px + _RIM_PX)
+    xy, snr = _brightest(pixels, background, centre[inside], reach_px)
+    good = snr > detection_sigma
+    nearest = np.rint(xy).astype(np.int64)
+    _, first = np.unique(nearest[:, 1] * shape[1] + nearest[:, 0], return_index=True)
+    once = np.zeros(len(xy), bool)
+    once[first] = True
+    good &= once
+    order = np.nonzero(good)[0]
+    order = order[np.argsort(-snr[order], kind='stable')]
+    area = min(len(xy) * (2 * reach_px + 1) ** 2, shape[0] * shape[1])
+    return Sources(xy[order], snr[order], float(area))
+
+
+def brightest_near(
+    pixels: Pixels,
+    background: Background,
+    predicted_px: Floats,
+    reach_px: int,
+    detection_sigma: float = DETECTION_SIGMA,
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """
+    Place (n, 2) of the brightest source near each predicted pixel, and a mask (n,) of detections.
+
+    Like `detect_near`, but with one row per window.  Windows must lie 4 px inside the image.
+    """
+    centre = np.rint(predicted_px).astype(np.int64)
+    xy, snr = _brightest(pixels, background, centre, reach_px)
+    return xy, snr > detection_sigma
+
+
+def _brightest(
+    pixels: Pixels, background: Background, centre: NDArray[np.int64], reach_px: int
+) -> tuple[Floats, Floats]:
+    """Place (n, 2) and signal-to-noise (n,) of the star-like maximum of each window; 0 if none."""
+    shape = (pixels.shape[0], pixels.shape[1])
+    half = reach_px + _RIM_PX
+    windows = windows_about(pixels, centre, half).astype(np.float32)
+    level = sample_mesh(background.level_mesh, shape, centre.astype(np.float64))
+    windows -= level[:, None, None].astype(np.float32)
+    filtered = np.zeros_like(windows)
+    if len(windows):
+        # One filter call for all windows, stacked in one image: the rim absorbs light that the
+        # filter carries over a joint.
+        cv2.GaussianBlur(
+            windows.reshape(-1, 2 * half + 1),
+            (7, 7),
+            _DETECTION_SIGMA_PX,
+            dst=filtered.reshape(-1, 2 * half + 1),
+        )
+    within = slice(_RIM_PX, _RIM_PX + 2 * reach_px + 1)
+    side = 2 * reach_px + 1
+    best = filtered[:, within, within].reshape(len(centre), side * side).argmax(axis=1)
+    v, u = best // side + _RIM_PX, best % side + _RIM_PX
+    n = np.arange(len(centre))
+    peak = filtered[n, v, u]
+    place = _parabola_vertex(
+        filtered[n, v - _ALONG_V, u - _ALONG_U], peak, filtered[n, v + _ALONG_V, u + _ALONG_U]
+    )
+    xy = centre + np.stack([u, v], axis=-1) - half
+    noise = sample_mesh(background.noise_mesh, shape, xy.astype(np.float64))
+    # A maximum at the rim of the window is the flank of a source outside.
+    star_like = (np.abs(xy - centre) < reach_px).all(axis=1)
+    star_like &= windows[n, v, u] < _HOT_PEAK_RATIO * peak
+    snr = np.where(star_like, peak / (_NOISE_LEFT * noise), 0.0)
+    return xy + place.T, snr
+
+
+def _parabola_vertex(
+    before: NDArray[np.floating], centre: NDArray[np.floating], after: NDArray[np.floating]
+) -> Floats:
+    """Place of the maximum of the parabola through three equidistant values, in their step."""
+    curvature = 2 * centre - before - after
+    vertex = 0.5 * (after - before) / np.maximum(curvature, 1e-12)
+    return np.asarray(vertex.clip(-0.5, 0.5), np.float64)
+
+
+def windows_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Pixels:
+    """Square windows (n, 2 radius + 1, 2 radius + 1) about integer pixels (n, 2), all inside."""
+    side = 2 * radius + 1
+    # The type stubs of NumPy drop the type of the pixels here.
+    every: Any = np.lib.stride_tricks.sliding_window_view(pixels, (side, side))
+    windows: Pixels = every[centre[:, 1] - radius, centre[:, 0] - radius]
+    return windows
+
+
+def stamps_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Floats:
+    """As `windows_about`, as float64."""
+    return windows_about(pixels, centre, radius).astype(np.float64)
+
+
+def stamps_at_edges(
+    pixels: Pixels, centre: NDArray[np.int64], radius: int
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """
+    As `stamps_about` for windows that may leave the image, and a mask of their pixels outside.
+
+    Pixels outside repeat the pixel at the edge.
+    """
+    shape = (pixels.shape[0], pixels.shape[1])
+    largest = np.array([shape[1] - 1, shape[0] - 1])
+    stamps = stamps_about(pixels, np.clip(centre, radius, largest - radius), radius)
+    outside = np.zeros(stamps.shape, bool)
+    leaves = np.nonzero(~windows_inside(shape, centre, radius))[0]
+    if len(leaves):
+        reach = np.arange(-radius, radius + 1)
+        u, v = (centre[leaves, axis, None] + reach for axis in (0, 1))
+        outside[leaves] = ((u < 0) | (u > largest[0]))[:, None] | ((v < 0) | (v > largest[1]))[
+            :, :, None
+        ]
+        u, v = np.clip(u, 0, largest[0]), np.clip(v, 0, largest[1])
+        stamps[leaves] = pixels[v[:, :, None], u[:, None]]
+    return stamps, outside
+
+
+def windows_inside(
+    shape: tuple[int, int], centre: NDArray[np.int64], radius: int
+) -> NDArray[np.bool_]:
+    """Mask (n,) of the integer pixels whose window lies within the image."""
+    height, width = shape
+    u, v = centre[:, 0], centre[:, 1]
+    return (u >= radius) & (u < width - radius) & (v >= radius) & (v < height - radius)

@@ -1,0 +1,192 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""PSF, pixel noise and saturation of an image, from its own stars or from earlier images."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.options import option
+from starcal_ros.robust_statistics import centre_and_scatter, median
+from starcal_ros.stars import detection
+from starcal_ros.stars.pixel_noise import PixelNoise
+from starcal_ros.stars.psf_field import Instrument, MIN_PSF_SIGMA_PX, PsfWidth, uniform_width
+from starcal_ros.stars.psf_fit import fit_psf, noise_sums, stamp_radius_px
+
+MAX_SHAPE_CHANGE = 0.35  # departure of second moments from the PSF's, a fraction: a blend
+_BELOW_PLATEAU = 0.98  # pixels of a plateau differ by their sensitivity
+_BRIGHTEST = 60  # stars that may show the level of saturation
+_MAX_PSF_SIGMA_PX = 4.0
+_CUT_OFF_BELOW_DN = 1.0  # many pixels of a lower background are clipped to 0 DN
+
+
+@dataclass(frozen=True)
+class CentroidOptions:
+    """Measurement of stars, and data sheet values of the detector."""
+
+    centroid: str = option(
+        'psf',
+        'centroid method; psf: fit of the point spread function; moment: centre of intensity, as'
+        ' in the paper',
+        choices=('psf', 'moment'),
+    )
+    min_snr: float = option(
+        5.0, 'smallest signal-to-noise ratio of the stars used', low=2.0, high=1000.0
+    )
+    saturation_dn: float = option(
+        0.0, 'smallest value of a saturated pixel, DN; 0: estimated from each image', low=0.0
+    )
+    max_saturated_pixels: int = option(
+        40,
+        'largest number of saturated pixels in a star used (the PSF is fitted to the others);'
+        ' 0 for a detector that blooms',
+        low=0,
+        high=200,
+    )
+    gain_e_per_dn: float = option(
+        0.0, 'detector gain, electrons per DN; 0: estimated from each image', low=0.0
+    )
+
+
+@dataclass(frozen=True)
+class ImageModel:
+    """
+    Background, PSF, pixel noise and saturation of an image, for the measurement of its stars.
+
+    ``psf`` is None if the image has too few bright stars.  ``shape_median`` and ``shape_scatter``
+    (3,) are median and scatter of `PsfFit.shape_change` of its stars: real lenses do not make
+    circular stars, so a star is refused only if its shape differs from the common one.
+    """
+
+    background: detection.Background
+    psf: PsfWidth | None
+    pixel_noise: PixelNoise
+    saturation_dn: float
+    shape_median: Floats
+    shape_scatter: Floats
+
+    @property
+    def psf_sigma_px(self) -> float:
+        """Mean Gaussian width of the stars; 0 without a PSF."""
+        return self.psf.sigma_px if self.psf else 0.0
+
+
+def saturation_level(pixels: Pixels, options: CentroidOptions) -> float:
+    """
+    Smallest value of a saturated pixel, DN; 0 if no pixel is saturated.
+
+    Without the option ``saturation_dn``, the largest value of the image counts as saturated if at
+    least four pixels share it, or if it is the end of an 8, 10, 12, 14 or 16 bit range.
+    """
+    if options.saturation_dn > 0:
+        return options.saturation_dn
+    peak = int(pixels.max(initial=0))
+    ends = (255,) if pixels.dtype == np.uint8 else (1023, 4095, 16383, 65535)
+    # Far above the background, photon noise does not give four pixels the same greatest value.
+    plateau = peak in ends or np.count_nonzero(pixels == peak) >= 4
+    return _BELOW_PLATEAU * peak if plateau else 0.0
+
+
+def model_image(
+    pixels: Pixels,
+    background: detection.Background,
+    sources: detection.Sources,
+    options: CentroidOptions,
+) -> ImageModel:
+    """
+    PSF width, pixel noise and saturation of an image from its own brighter sources.
+
+    The width is the median over up to 80 bright, unsaturated, isolated sources; gain and PSF
+    error are a robust regression of the squared residuals of their pixels on their signal.
+    """
+    saturation_dn = saturation_level(pixels, options) or np.inf
+    gain = options.gain_e_per_dn
+    unknown = ImageModel(
+        background, None, PixelNoise(gain or 1.0, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
+    )
+    shape = (pixels.shape[0], pixels.shape[1])
+    bright = sources.xy_px[sources.snr > 15.0][:400]
+    nearest = np.rint(bright).astype(np.int64)
+    bright = bright[pixels[nearest[:, 1], nearest[:, 0]] < saturation_dn]
+    xy = _isolated(bright, 12.0)[:80]
+    sigma = 1.2
+    if len(xy) < 5:
+        return unknown
+    noise_model = PixelNoise(gain or 1.0, 0.02)
+    for _ in range(6):
+        radius = stamp_radius_px(sigma)
+        centre = np.rint(xy).astype(np.int64)
+        inside = detection.windows_inside(shape, centre, radius)
+        xy, centre = xy[inside], centre[inside]
+        stamps = detection.stamps_about(pixels, centre, radius)
+        clean = stamps.max(axis=(1, 2)) < saturation_dn
+        xy, centre, stamps = xy[clean], centre[clean], stamps[clean]
+        if len(xy) < 5:
+            return unknown
+        noise_dn = detection.sample_mesh(background.noise_mesh, shape, xy)
+        fit = fit_psf(stamps, sigma, noise_dn, noise_model)
+        change = median(fit.shape_change[:, :2].mean(axis=1))
+        sigma_before = sigma
+        sigma *= float(np.sqrt(np.clip(1.0 + change, 0.5, 2.0)))
+        sigma = float(np.clip(sigma, MIN_PSF_SIGMA_PX, _MAX_PSF_SIGMA_PX))
+        if abs(sigma - sigma_before) < 1e-3 * sigma:
+            break
+    shape_median, shape_scatter = centre_and_scatter(fit.shape_change)
+    limit = np.maximum(MAX_SHAPE_CHANGE, 3.0 * shape_scatter)
+    star_like = (np.abs(fit.shape_change - shape_median) < limit).all(axis=1)
+    stamps, noise_dn = stamps[star_like], noise_dn[star_like]
+    for _ in range(3):
+        fit = fit_psf(stamps, sigma, noise_dn, noise_model)
+        noise_model = noise_sums(fit, noise_dn, noise_model).pixel_noise(gain)
+    psf = uniform_width(sigma, shape[1], shape[0])
+    noise_model = _at_least_sky(noise_model, background)
+    return ImageModel(background, psf, noise_model, saturation_dn, shape_median, shape_scatter)
+
+
+def known_model(
+    pixels: Pixels,
+    background: detection.Background,
+    known: Instrument,
+    predicted_px: Floats,
+    options: CentroidOptions,
+) -> ImageModel:
+    """
+    Model of an image with the PSF and noise of earlier images.
+
+    ``predicted_px`` (n, 2) are sorted, brightest first: only these stars can be saturated.
+    """
+    shape = (pixels.shape[0], pixels.shape[1])
+    centre = np.rint(predicted_px).astype(np.int64)
+    centre = centre[detection.windows_inside(shape, centre, 2)][:_BRIGHTEST]
+    cores = detection.windows_about(pixels, centre, 2)
+    saturation_dn = saturation_level(cores, options)
+    if saturation_dn == 0 and _BELOW_PLATEAU * cores.max(initial=0) <= known.saturation_dn:
+        saturation_dn = known.saturation_dn
+    return ImageModel(
+        background,
+        known.psf_width(),
+        _at_least_sky(known.noise.pixel_noise(options.gain_e_per_dn), background),
+        saturation_dn or np.inf,
+        known.shape_median,
+        known.shape_scatter,
+    )
+
+
+def _at_least_sky(noise: PixelNoise, background: detection.Background) -> PixelNoise:
+    """Pixel noise, raised to the noise of the sky if the converter clips it at 0 DN."""
+    if background.level_dn >= _CUT_OFF_BELOW_DN:
+        return noise
+    # Clipped pixels have no scatter: with it the sigmas of faint stars would be too small.
+    return dataclasses.replace(noise, background=max(noise.background, 1.0))
+
+
+def _isolated(xy_px: Floats, distance_px: float) -> Floats:
+    """Return the points that have no other point within a distance."""
+    if len(xy_px) < 2:
+        return xy_px
+    separation = np.linalg.norm(xy_px[:, None] - xy_px[None], axis=-1)
+    np.fill_diagonal(separation, np.inf)
+    return np.asarray(xy_px[separation.min(axis=1) > distance_px])

@@ -1,0 +1,352 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Simulated campaigns with known truth, and the stars in each of their images.
+
+A `Scenario` is a campaign whose truth is drawn from a seed; a `Scene` holds the stars of one of
+its images, without noise.  `images` renders pixels, `centroids` draws noisy centroids without
+pixels.
+
+Modelled: proper motion and aberration of the catalog, and one star-tracker error per image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+import functools
+import math
+
+import erfa
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel, field_radius_rad, project
+from starcal_ros.camera.lens import fold_radius2, ideal_points
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.records import AttitudeSample, CameraGeometry
+from starcal_ros.sky.astrometry import apparent_directions, tt_julian_date
+from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
+
+# Random streams (seed, purpose, image): an image does not depend on the previous ones.
+TRUTH_STREAM, ATTITUDE_STREAM, CENTROID_STREAM, PATTERN_STREAM, PIXEL_STREAM = range(5)
+_STAMP_SIGMAS = 6.0  # half width of a stamp: 2e-9 of the light of a star is outside
+_UNIX_EPOCH_JD = 2440587.5  # 1970-01-01T00:00 UTC, POSIX
+ATTITUDE_OFFSETS_S = (-0.75, -0.25, 0.25, 0.75)
+"""Times of the star-tracker samples relative to an image: 2 Hz, none at the image itself."""
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Detector and signal levels; electrons are per pixel and image."""
+
+    psf_sigma_px: float = 0.95  # at the centre of the detector
+    psf_growth: float = 0.0  # relative growth centre to corner, with the square of the distance
+    zero_point_electrons: float = 3.0e5  # flux of a star of V = 0: 35 mm f/2 lens, 0.1 s
+    sky_electrons: float = 1.5
+    dark_electrons: float = 3.0
+    read_noise_electrons: float = 8.0
+    electrons_per_dn: float = 4.0
+    offset_dn: float = 64.0
+    bits: int = 12
+    hot_fraction: float = 2e-4
+    hot_electrons: float = 600.0  # mean of an exponential distribution
+    cosmic_rays: float = 2.0  # mean number per image
+
+    def psf_sigma_at(self, pixels_px: Floats, shape: tuple[int, int]) -> Floats:
+        """PSF sigma (n,) at pixels (n, 2) of a detector (height, width)."""
+        middle = np.array([shape[1] - 1, shape[0] - 1]) / 2.0
+        part2 = ((pixels_px - middle) ** 2).sum(axis=1) / (middle**2).sum()
+        # The PSF does not widen further outside the detector.
+        return np.asarray(self.psf_sigma_px * (1.0 + self.psf_growth * np.minimum(part2, 1.0)))
+
+    @property
+    def full_dn(self) -> int:
+        """Saturation level of the converter."""
+        return (1 << self.bits) - 1
+
+    @property
+    def background_electrons(self) -> float:
+        """Mean signal of a pixel without a star."""
+        return self.sky_electrons + self.dark_electrons
+
+    @property
+    def noise_electrons(self) -> float:
+        """1-sigma noise of a pixel without a star: photon, dark, read and quantisation noise."""
+        rounding = self.electrons_per_dn**2 / 12
+        return math.sqrt(self.background_electrons + self.read_noise_electrons**2 + rounding)
+
+
+@dataclass(frozen=True)
+class EarthFixed:
+    """A camera fixed to the Earth that points at the zenith: stars drift through its field."""
+
+    latitude_deg: float
+    longitude_deg: float
+    roll_deg: float = 0.0  # angle of +x from east towards north
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """A camera that points at one star field after another: (ra, dec, roll) of each, degrees."""
+
+    attitudes_deg: tuple[tuple[float, float, float], ...]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One campaign: truth, prior, detector and exposure times."""
+
+    name: str
+    seed: int
+    truth: CameraGeometry
+    prior: CameraGeometry
+    detector: Detector
+    star_tracker_sigma_arcsec: tuple[float, float, float]
+    pointing: EarthFixed | Inertial
+    start_ns: int
+    cadence_s: float
+    image_count: int
+    magnitude_limit: float = 9.0
+    stars_per_image: int | None = None  # the brightest on the detector; None: all
+
+    def time_ns(self, index: int) -> int:
+        """Middle of the exposure of an image."""
+        return self.start_ns + round(index * self.cadence_s * NANOSECONDS_PER_SECOND)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """
+    Stars of one image, without noise.
+
+    Attributes
+    ----------
+    camera_from_icrf : (3, 3)
+        True attitude.
+    icrf_from_star_tracker_xyzw : (4,)
+        Reported attitude, with the star-tracker error of this image.
+    catalog_id, magnitude, direction_icrf, pixel_px, flux_electrons : (n,) or (n, 2 or 3)
+        Stars on the detector, and those outside with light on it.
+    """
+
+    time_ns: int
+    camera_from_icrf: Floats
+    icrf_from_star_tracker_xyzw: Floats
+    catalog_id: NDArray[np.int64]
+    magnitude: Floats
+    direction_icrf: Floats
+    pixel_px: Floats
+    flux_electrons: Floats
+    catalog_digest: str
+
+
+# Fields with many bright stars, over the whole sky, each at a different roll.
+_TINY_FIELDS = (
+    (250.0, 32.0, 10.0),
+    (305.0, 40.0, 95.0),
+    (283.0, 36.0, 200.0),
+    (84.0, -2.0, 290.0),
+    (57.0, 24.0, 45.0),
+    (155.0, -48.0, 130.0),
+    (190.0, -58.0, 250.0),
+    (252.0, -38.0, 340.0),
+    (15.0, 60.0, 170.0),
+    (110.0, -30.0, 60.0),
+)
+_HOUSTON = EarthFixed(latitude_deg=29.76, longitude_deg=-95.37, roll_deg=20.0)
+_HERCULES_NS = 1778829600 * NANOSECONDS_PER_SECOND  # 2026-05-15 07:20 UTC: 16.5 h sidereal there
+SCENARIOS: Mapping[str, str] = {
+    'tiny': '10 images of 640 x 512, ten star fields, 4 s apart: the bag in the repository',
+    'small': '24 images of 1296 x 1024, zenith over Houston at 60 s',
+    'paper': '359 images of 2592 x 2048, zenith over Houston at 10 s (Christian et al. 2016)',
+}
+"""Descriptions of the scenarios by name."""
+
+
+def scenario(name: str, seed: int = 1) -> Scenario:
+    """
+    Scenario by name; the seed determines its truth and all its noise.
+
+    Raises ValueError if no scenario has that name.
+    """
+    if name == 'tiny':
+        # A coarse quantisation keeps the noise near 1 DN, so that the bag compresses well.
+        return _scenario(
+            name,
+            seed,
+            size=(640, 512),
+            detector=Detector(electrons_per_dn=8.0, offset_dn=32.0, zero_point_electrons=2e5),
+            star_tracker_sigma_arcsec=(10.0, 10.0, 40.0),
+            pointing=Inertial(_TINY_FIELDS),
+            cadence_s=4.0,
+            image_count=10,
+        )
+    if name == 'small':
+        return _scenario(
+            name, seed, size=(1296, 1024), start_s=1200.0, cadence_s=60.0, image_count=24
+        )
+    if name == 'paper':
+        return _scenario(name, seed, size=(2592, 2048), cadence_s=10.0, image_count=359)
+    raise ValueError(f'scenario: {name!r} is not one of {", ".join(SCENARIOS)}')
+
+
+def _scenario(
+    name: str,
+    seed: int,
+    size: tuple[int, int],
+    cadence_s: float,
+    image_count: int,
+    start_s: float = 0.0,
+    detector: Detector = Detector(),
+    star_tracker_sigma_arcsec: tuple[float, float, float] = (20.0, 20.0, 20.0),
+    pointing: EarthFixed | Inertial = _HOUSTON,
+) -> Scenario:
+    """Scenario with a 20 x 16 degree camera: ground calibration as prior, changed after launch."""
+    rng = random_stream(seed, TRUTH_STREAM)
+    width, height = size
+    focal_px = 35.0 / 0.0048 * width / 2592  # 35 mm lens; 4.8 um pixels at full resolution
+    nominal = CameraModel(
+        width,
+        height,
+        np.array(
+            [focal_px, 0, focal_px, (width - 1) / 2, (height - 1) / 2, -0.045, 0.08, 0, 0, 0]
+        ),
+    )
+    focal_true_px = focal_px * (1 + 1e-3 * rng.normal())
+    true = nominal.replace(
+        fx=focal_true_px,
+        fy=focal_true_px * (1 + 2e-4 * rng.normal()),
+        skew=rng.normal() * width / 2592,
+        k1=-0.045 + 0.01 * rng.normal(),
+        k2=0.08 + 0.05 * rng.normal(),
+        p1=4e-4 * rng.normal(),
+        p2=4e-4 * rng.normal(),
+    )
+    # An arbitrary mounting in which no axis of the camera is parallel to one of the star tracker.
+    mounting = Rotation.from_euler('zyx', [-91.0, -28.0, 3.0], degrees=True)
+    shift = Rotation.from_rotvec(150.0 * ARCSECOND_RAD * rng.normal(size=3))
+    return Scenario(
+        name=name,
+        seed=seed,
+        truth=CameraGeometry(true, (mounting * shift).as_quat()),
+        prior=CameraGeometry(nominal, mounting.as_quat()),
+        detector=detector,
+        star_tracker_sigma_arcsec=star_tracker_sigma_arcsec,
+        pointing=pointing,
+        start_ns=_HERCULES_NS + round(start_s * NANOSECONDS_PER_SECOND),
+        cadence_s=cadence_s,
+        image_count=image_count,
+    )
+
+
+def random_stream(seed: int, purpose: int, index: int = 0) -> np.random.Generator:
+    """Random generator of an image for one of the purposes ``*_STREAM``."""
+    return np.random.default_rng([seed, purpose, index])
+
+
+def camera_from_icrf(scenario: Scenario, index: int, offset_s: float = 0.0) -> Floats:
+    """True attitude (3, 3) of the camera at an image, or some seconds after it."""
+    if isinstance(scenario.pointing, Inertial):
+        fields = scenario.pointing.attitudes_deg
+        ra, dec, roll = np.radians(fields[index % len(fields)])
+        # +z to (ra, dec), +x towards the east: Rz(ra + 90) Rx(90 - dec), then the roll.
+        icrf_from_camera = Rotation.from_euler('ZXZ', [ra + np.pi / 2, np.pi / 2 - dec, roll])
+        return np.asarray(icrf_from_camera.inv().as_matrix())
+    site = scenario.pointing
+    latitude, longitude = math.radians(site.latitude_deg), math.radians(site.longitude_deg)
+    earth_from_camera = Rotation.from_euler(
+        'ZXZ', [longitude + np.pi / 2, np.pi / 2 - latitude, math.radians(site.roll_deg)]
+    )
+    time_ns = scenario.time_ns(index) + round(offset_s * NANOSECONDS_PER_SECOND)
+    # UTC replaces UT1: the zenith is off by 13 arcsec at most, which does not matter here.
+    ut_days = time_ns / (86400 * NANOSECONDS_PER_SECOND)
+    earth_from_icrf = erfa.c2t06a(*tt_julian_date(time_ns), _UNIX_EPOCH_JD, ut_days, 0.0, 0.0)
+    return np.asarray(earth_from_camera.inv().as_matrix() @ earth_from_icrf)
+
+
+def _icrf_from_star_tracker_xyzw(
+    scenario: Scenario, index: int, offset_s: float = 0.0, noise: bool = True
+) -> Floats:
+    """Reported star-tracker attitude (4,): the truth with one error for the whole image."""
+    camera_from_star_tracker = Rotation.from_quat(
+        scenario.truth.star_tracker_from_camera_xyzw
+    ).inv()
+    icrf_from_camera = Rotation.from_matrix(camera_from_icrf(scenario, index, offset_s)).inv()
+    # The tracker's frame is off by small passive angles about its own axes.
+    sigma_rad = np.array(scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD
+    rng = random_stream(scenario.seed, ATTITUDE_STREAM, index)
+    error_rad = noise * sigma_rad * rng.normal(size=3)
+    reported = icrf_from_camera * camera_from_star_tracker * Rotation.from_rotvec(error_rad)
+    return np.asarray(reported.as_quat())
+
+
+def attitude_samples(scenario: Scenario, index: int) -> tuple[AttitudeSample, ...]:
+    """Star-tracker samples around an image, at `ATTITUDE_OFFSETS_S`."""
+    return tuple(
+        AttitudeSample(
+            scenario.time_ns(index) + round(offset_s * NANOSECONDS_PER_SECOND),
+            _icrf_from_star_tracker_xyzw(scenario, index, offset_s),
+        )
+        for offset_s in ATTITUDE_OFFSETS_S
+    )
+
+
+@functools.lru_cache(maxsize=4)
+def _bundled_catalog(magnitude_limit: float) -> StarCatalog:
+    return load_catalog(None, magnitude_limit)
+
+
+def stamp_half_px(psf_sigma_px: float) -> int:
+    """Half width of the stamp in which the light of a star is drawn, px."""
+    return math.ceil(_STAMP_SIGMAS * psf_sigma_px)
+
+
+def scene(
+    scenario: Scenario, index: int, catalog: StarCatalog | None = None, attitude_noise: bool = True
+) -> Scene:
+    """Stars of an image; default: the bundled catalog down to the magnitude limit."""
+    if catalog is None:
+        catalog = _bundled_catalog(scenario.magnitude_limit)
+    camera, time_ns = scenario.truth.camera, scenario.time_ns(index)
+    R = camera_from_icrf(scenario, index)
+    margin_px = stamp_half_px(scenario.detector.psf_sigma_px * (1 + scenario.detector.psf_growth))
+    stars = catalog.select(cone(catalog, R[2], field_radius_rad(camera, margin_px)))
+    directions = apparent_directions(stars, time_ns)
+    in_camera = directions @ R.T
+    # Beyond the fold of the distortion the model has a second image, which no lens has.
+    ideal = ideal_points(camera.model, in_camera)
+    folded = (ideal**2).sum(axis=1) >= fold_radius2(camera.model, camera.distortion)
+    pixels = np.where(folded[:, None], np.nan, project(camera, in_camera))
+    size = np.array([camera.width, camera.height])
+    near = ((pixels > -margin_px) & (pixels < size - 1 + margin_px)).all(axis=1)
+    if scenario.stars_per_image is not None:
+        inside = near & ((pixels >= 0) & (pixels <= size - 1)).all(axis=1)
+        brightest = np.argsort(np.where(inside, stars.magnitude, np.inf), kind='stable')
+        shown = brightest[: min(scenario.stars_per_image, int(inside.sum()))]
+        near = np.zeros_like(near)
+        near[shown] = True
+    magnitude = stars.magnitude[near]
+    zero_point = scenario.detector.zero_point_electrons
+    return Scene(
+        time_ns=time_ns,
+        camera_from_icrf=R,
+        icrf_from_star_tracker_xyzw=_icrf_from_star_tracker_xyzw(
+            scenario, index, noise=attitude_noise
+        ),
+        catalog_id=stars.id[near],
+        magnitude=magnitude,
+        direction_icrf=directions[near],
+        pixel_px=pixels[near],
+        flux_electrons=zero_point * 10 ** (-0.4 * magnitude),
+        catalog_digest=catalog.digest,
+    )
+
+
+def scenes(
+    scenario: Scenario, catalog: StarCatalog | None = None, attitude_noise: bool = True
+) -> Iterator[Scene]:
+    """Scenes of all images."""
+    for index in range(scenario.image_count):
+        yield scene(scenario, index, catalog, attitude_noise)

@@ -1,0 +1,169 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Simulated scenarios as bags, with files of their truth and of the prior of a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import dataclasses
+from dataclasses import dataclass
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+import yaml
+
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel
+from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
+from starcal_ros.formats.bag.writer import BagWriter, check_replaceable
+from starcal_ros.formats.products.camera_yaml import write_camera_info
+from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.records import AttitudeSample, CameraGeometry
+from starcal_ros.sky.astrometry import observer_at
+from starcal_ros.studies.simulation import centroids
+from starcal_ros.studies.simulation.mistakes import Mistakes, NO_MISTAKES
+from starcal_ros.studies.simulation.rendering import images
+from starcal_ros.studies.simulation.scenario import attitude_samples, Scenario, scenes
+
+IMAGE_TOPIC = '/opnav/image_raw'
+ATTITUDE_TOPIC = '/star_tracker/attitude'
+VELOCITY_TOPIC = '/spacecraft/velocity'
+
+
+@dataclass(frozen=True)
+class SimulatedBag:
+    """Paths of a simulated bag, its truth, and the parameter and camera files to calibrate it."""
+
+    bag: Path
+    truth: Path
+    params: Path
+    camera: Path
+
+
+def truth_content(scenario: Scenario, bag_name: str) -> dict[str, object]:
+    """Content of the truth file of a bag, a JSON object."""
+    true, prior = scenario.truth, scenario.prior
+    stars = stars_above = 0
+    for shown in scenes(scenario):
+        shape = (true.camera.height, true.camera.width)
+        _, snr = centroids.centroid_bound(
+            shown.pixel_px, shown.flux_electrons, scenario.detector, shape
+        )
+        stars += len(snr)
+        stars_above += int((snr > centroids.BOUND_SNR).sum())
+    return {
+        'scenario': scenario.name,
+        'seed': scenario.seed,
+        'bag': bag_name,
+        'width': true.camera.width,
+        'height': true.camera.height,
+        'k_true': true.camera.intrinsics.tolist(),
+        'lens_model': true.camera.model,
+        'd_true': true.camera.distortion.tolist(),
+        'k_prior': prior.camera.intrinsics.tolist(),
+        'd_prior': prior.camera.distortion.tolist(),
+        'A_true': _camera_from_star_tracker(true).tolist(),
+        'A_prior': _camera_from_star_tracker(prior).tolist(),
+        'sigma_st_arcsec': max(scenario.star_tracker_sigma_arcsec),
+        'sigma_st_axes_arcsec': list(scenario.star_tracker_sigma_arcsec),
+        'images': scenario.image_count,
+        'stars': stars,
+        'stars_snr5': stars_above,
+        'crlb_keep': [
+            true.camera.parameter_names.index(name) for name in centroids.bound_names(true.camera)
+        ],
+        'crlb_cov': centroids.cramer_rao_covariance(scenario).tolist(),
+        't0': scenario.start_ns / NANOSECONDS_PER_SECOND,
+        'step': scenario.cadence_s,
+    }
+
+
+def true_geometry(content: Mapping[str, Any]) -> CameraGeometry:
+    """The true camera and alignment of a truth file's JSON object."""
+    parameters = np.array([*content['k_true'], *content['d_true']])
+    model = content.get('lens_model', 'plumb_bob')
+    camera = CameraModel(content['width'], content['height'], parameters, model)
+    star_tracker_from_camera = Rotation.from_matrix(np.array(content['A_true']).T)
+    return CameraGeometry(camera, star_tracker_from_camera.as_quat())
+
+
+def _camera_from_star_tracker(geometry: CameraGeometry) -> Floats:
+    quaternion = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
+    return np.asarray(quaternion.inv().as_matrix())
+
+
+def write_bag(
+    scenario: Scenario,
+    path: Path,
+    camera_url: str = '',
+    on_image: Callable[[int], None] = lambda index: None,
+    mistakes: Mistakes = NO_MISTAKES,
+) -> SimulatedBag:
+    """
+    Render a scenario to a bag, and write its truth and the files to calibrate it.
+
+    A bag folder holds ``truth.json``, ``params.yaml`` and ``camera.yaml``; for a single file
+    ``NAME.mcap`` they are ``NAME.json``, ``NAME_params.yaml`` and ``NAME_camera.yaml``. Raises
+    BagError when a file cannot be written, or one that is not of a simulated bag would be
+    replaced.
+
+    Parameters
+    ----------
+    camera_url : str
+        URL of the prior camera in the parameter file; default: a ``file://`` URL.
+    on_image : callable
+        Called with the index of each image written.
+    mistakes : Mistakes
+        Made in the bag and in the files to calibrate it; the truth file names them.
+    """
+    writer = BagWriter(path)
+    if path.suffix == '.mcap':
+        beside = (f'{path.stem}.json', f'{path.stem}_params.yaml', f'{path.stem}_camera.yaml')
+    else:
+        beside = ('truth.json', 'params.yaml', 'camera.yaml')
+    truth, params, camera = (writer.file.with_name(name) for name in beside)
+    check_replaceable(path, truth, (params, camera), 'scenario', 'a simulated bag')
+    scenario = dataclasses.replace(scenario, prior=mistakes.prior(scenario.prior))
+    content = parameters(scenario, camera_url or f'file://{camera.resolve()}')
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=10_000)
+    true = truth_content(scenario, writer.file.name)
+    if mistakes != NO_MISTAKES:
+        true['mistakes'] = dataclasses.asdict(mistakes)
+    truth_text = json.dumps(true, indent=1) + '\n'
+    with writer:
+        for index, image in enumerate(images(scenario)):
+            samples = attitude_samples(scenario, index)
+            for sample in (s for s in samples if s.time_ns <= image.time_ns):
+                _write_telemetry(writer, sample, mistakes)
+            writer.write_image(IMAGE_TOPIC, mistakes.image(image), 'camera')
+            for sample in (s for s in samples if s.time_ns > image.time_ns):
+                _write_telemetry(writer, sample, mistakes)
+            on_image(index)
+        # Just before the bag replaces an older one, so that they replace theirs together.
+        write_atomically(truth, truth_text)
+        write_camera_info(scenario.prior.camera, camera, 'opnav')
+        write_atomically(params, text)
+    return SimulatedBag(path, truth, params, camera)
+
+
+def _write_telemetry(writer: BagWriter, sample: AttitudeSample, mistakes: Mistakes) -> None:
+    # The Earth's, which the simulated directions have.
+    velocity_m_s = observer_at(sample.time_ns).velocity_c * SPEED_OF_LIGHT_M_S
+    writer.write_velocity(VELOCITY_TOPIC, sample.time_ns, velocity_m_s, 'icrf')
+    quaternion = mistakes.attitude(sample.icrf_from_star_tracker_xyzw)
+    writer.write_attitude(ATTITUDE_TOPIC, sample.time_ns, quaternion, 'icrf')
+
+
+def parameters(scenario: Scenario, camera_url: str) -> dict[str, object]:
+    """Content of the ROS parameter file with the prior of a scenario."""
+    values = {
+        'camera_info_url': camera_url,
+        'prior_alignment': scenario.prior.star_tracker_from_camera_xyzw.tolist(),
+        'star_tracker_frame': 'star_tracker',
+        'camera_frame': 'camera',
+        'star_tracker_sigma_arcsec': list(scenario.star_tracker_sigma_arcsec),
+        'shutter': 'global',
+    }
+    return {'/**': {'ros__parameters': values}}

@@ -1,0 +1,207 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Budget of the sigma of lines of sight: against estimates with an assumption switched off."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+
+from bench.observed_campaign import Campaign, simulate, World
+from starcal_ros.assessment import budget
+from starcal_ros.assessment.budget import sigma_budget
+from starcal_ros.assessment.lookup import line_of_sight_table
+from starcal_ros.camera import pixel_grid
+from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
+from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.equations import equations
+from starcal_ros.estimation.posterior import with_shared_errors
+from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, parts_that_matter, SigmaPart
+
+RAM = World(pointing='ram', velocity_m_s=1.0)  # pointings on one side of the sky
+FIELDS = World(24, 'fields4', star_arcsec=3.0)
+
+
+@functools.cache
+def campaign(world: World) -> Campaign:
+    return simulate(world, 1)
+
+
+@functools.cache
+def estimate(world: World, **options: object) -> tuple[Estimate, CalibrationOptions]:
+    made = campaign(world)
+    chosen = CalibrationOptions(
+        star_tracker_sigma_arcsec=(made.star_tracker_sigma_arcsec,) * 3,
+        **options,  # type: ignore[arg-type]
+    )
+    return estimate_calibration(made.ensemble, made.prior, chosen), chosen
+
+
+@functools.cache
+def parts(world: World, **options: object) -> dict[str, SigmaPart]:
+    return {part.cause: part for part in sigma_budget(*estimate(world, **options))}
+
+
+def fall(before: SigmaPart, after: SigmaPart) -> tuple[float, float]:
+    """Roots of the variances that are gone."""
+    return (
+        math.sqrt(max(before.map_arcsec**2 - after.map_arcsec**2, 0.0)),
+        math.sqrt(max(before.pointing_arcsec**2 - after.pointing_arcsec**2, 0.0)),
+    )
+
+
+@pytest.mark.parametrize('world', [RAM, FIELDS], ids=['ram', 'fields'])
+def test_the_total_is_the_rms_of_the_table(world: World) -> None:
+    found, _ = estimate(world)
+    camera = found.geometry.camera
+    table = line_of_sight_table(camera, found.map_covariance, pixel_grid(camera, 25, 25))
+    total = parts(world)['total']
+    for part, column in (
+        (total.map_arcsec, table.shape_sigma_arcsec),
+        (total.pointing_arcsec, table.sigma_arcsec),
+    ):
+        assert part == pytest.approx(float(np.sqrt(np.mean(column**2))), rel=1e-9)
+
+
+def test_the_parts_over_the_detector_are_those_of_its_pixels() -> None:
+    found, _ = estimate(RAM)
+    camera = found.geometry.camera
+    pixels = pixel_grid(camera, BUDGET_COLUMNS, BUDGET_ROWS)
+    table = line_of_sight_table(camera, found.map_covariance, pixels)
+    budget_of = parts(RAM)
+    total = np.array(budget_of['total'].map_over_detector_arcsec)
+    assert total == pytest.approx(table.shape_sigma_arcsec, rel=1e-9)
+    given = parts(RAM, velocity_sigma_m_s=0.0)['total'].map_over_detector_arcsec
+    fallen = np.sqrt(np.maximum(total**2 - np.square(given), 0.0))
+    velocity = np.array(budget_of['velocity'].map_over_detector_arcsec)
+    # The estimate that is given it has amplitudes of its own, up to a tenth of the total.
+    assert velocity == pytest.approx(fallen, abs=0.1 * total.max())
+    assert velocity[0] > 2.0 * velocity[31]  # a change of focal length shows in the corners
+
+
+@pytest.mark.parametrize('world', [World(), RAM, FIELDS], ids=['spread', 'ram', 'fields'])
+def test_independent_causes_sum_to_the_total(world: World) -> None:
+    found = dict(parts(world))
+    total = found.pop('total')
+    for axis in ('map_arcsec', 'pointing_arcsec'):
+        summed = sum(getattr(part, axis) ** 2 for part in found.values())
+        # Velocity, field and camera are correlated by some percent.
+        assert summed == pytest.approx(getattr(total, axis) ** 2, rel=0.06), axis
+
+
+def test_velocity_is_the_fall_of_an_estimate_that_is_given_it() -> None:
+    part = parts(RAM)['velocity']
+    given = parts(RAM, velocity_sigma_m_s=0.0)
+    assert 'velocity' not in given
+    of_map, _ = fall(parts(RAM)['total'], given['total'])
+    assert part.map_arcsec == pytest.approx(of_map, rel=0.03)
+    assert part.map_arcsec > 0.5 * parts(RAM)['total'].map_arcsec
+    assert part.assumption == 'not given: 8 km/s per axis assumed'
+    stated = parts(RAM, velocity_sigma_m_s=10.0)['velocity']
+    assert stated.assumption == '10 m/s per axis stated'
+    assert stated.map_arcsec < 0.01 * part.map_arcsec
+
+
+def test_a_held_parameter_is_the_fall_of_an_estimate_that_holds_it_exactly() -> None:
+    kept = ('fx', 'skew', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2')
+    sigma = [0.0] * 10
+    exact = parts(RAM, estimate=kept, prior_sigma=tuple(sigma))
+    sigma[7] = 2.0
+    loose = parts(RAM, estimate=kept, prior_sigma=tuple(sigma))
+    assert 'held parameters' not in exact
+    part = loose['held parameters']
+    of_map, of_pointing = fall(loose['total'], exact['total'])
+    assert part.map_arcsec == pytest.approx(of_map, rel=0.02)
+    assert part.pointing_arcsec == pytest.approx(of_pointing, rel=0.02)
+    assert part.assumption == '1-sigma of the prior: k3 2'
+
+
+def test_places_of_stars_are_the_fall_of_a_campaign_without_their_errors() -> None:
+    part = parts(FIELDS)['star places']
+    without = parts(dataclasses.replace(FIELDS, star_arcsec=0.0))
+    of_map, _ = fall(parts(FIELDS)['total'], without['total'])
+    assert part.map_arcsec > 0.5 * parts(FIELDS)['total'].map_arcsec
+    # That estimate has other weights: the part is of those that allow for the errors.
+    assert part.map_arcsec == pytest.approx(of_map, rel=0.25)
+
+
+def test_a_slow_error_is_the_fall_of_an_estimate_that_has_none() -> None:
+    part = parts(World())['star tracker slow error']
+    stated = parts(World(), star_tracker_slow_arcsec=1e-3)
+    _, of_pointing = fall(parts(World())['total'], stated['total'])
+    assert part.pointing_arcsec == pytest.approx(of_pointing, rel=0.05)
+    assert part.assumption.startswith('not given: as the noise assumed; estimated: ')
+
+
+@pytest.mark.parametrize('names', [['velocity'], ['field'], ['velocity', 'field']])
+def test_known_unknowns_leave_their_schur_complement(names: list[str]) -> None:
+    found, _ = estimate(RAM)
+    errors, layout = found.posterior.errors, found.layout
+    assert errors is not None
+    bare = dataclasses.replace(errors, excess=np.zeros_like(errors.excess))
+    T = budget._known(errors, found, names)
+    known = layout.of(names)
+    size = np.linalg.norm(errors.root, axis=1, keepdims=True)
+    root = errors.root / np.where(size > 0, size, 1.0)
+    C = root @ root.T
+    left = C - C[:, known] @ np.linalg.pinv(C[np.ix_(known, known)], rcond=1e-12) @ C[known]
+    np.testing.assert_allclose(root @ T @ T.T @ root.T, left, atol=1e-6)
+    in_root = np.stack([root.T @ root] * 2)
+    assert budget._with(bare, T, in_root)[0] == pytest.approx(np.trace(left), rel=1e-6)
+
+
+def test_known_shapes_add_the_information_that_they_hide() -> None:
+    breathing = World(6, breathing=3e-4)
+    found, _ = estimate(breathing)
+    errors = found.posterior.errors
+    assert errors is not None
+    T = budget._known_shapes(found, errors)
+    given = (found.sums, found.problem, found.state, found.layout)
+    hidden = equations(*given, np.full(3, 1e-7)).information
+    hidden = hidden - equations(*given, found.posterior.shape_sigma_px).information
+    C = errors.root @ errors.root.T
+    size = np.sqrt(np.diag(C))
+    size[size == 0] = 1.0
+    left = errors.root @ T @ T.T @ errors.root.T  # (C^-1 + hidden)^-1
+    back = (left + left @ hidden @ C) / np.outer(size, size)
+    np.testing.assert_allclose(back, C / np.outer(size, size), atol=1e-6)
+    part = parts(breathing)['change from image to image']
+    assert part.map_arcsec > 0.5 * parts(breathing)['total'].map_arcsec
+
+
+def test_an_error_that_no_two_observations_share_is_noise() -> None:
+    assert parts(World(3))['star places'].map_arcsec == 0.0
+
+
+def test_the_covariance_is_the_root_with_its_parts() -> None:
+    found, _ = estimate(FIELDS)
+    errors = found.posterior.errors
+    assert errors is not None
+    again = with_shared_errors(
+        dataclasses.replace(
+            found.posterior,
+            covariance=found.posterior.covariance - errors.root @ errors.excess @ errors.root.T,
+        ),
+        found.sums, found.measurements, found.problem, found.state, found.layout,
+        dataclasses.replace(found.weights, errors=()),
+    )  # fmt: skip
+    assert again.errors is not None
+    assert set(errors.shared) - set(again.errors.shared) >= {'star places'}
+    # The part of the place errors on top of independent noise.
+    gone = (errors.excess - again.errors.excess)[0, 0]
+    assert 0.0 < gone < sum(one[0, 0] for one in errors.shared.values())
+
+
+def test_only_parts_that_matter_are_printed() -> None:
+    budget_of = [
+        SigmaPart('total', 1.0, 10.0, ''),
+        SigmaPart('stars', 0.2, 0.1, 'a'),
+        SigmaPart('velocity', 0.6, 0.1, 'b'),
+        SigmaPart('star tracker noise', 0.0, 9.9, 'c'),
+    ]
+    found = [part.cause for part in parts_that_matter(budget_of)]
+    assert found == ['total', 'star tracker noise', 'velocity']
+    assert parts_that_matter([]) == []

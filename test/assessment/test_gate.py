@@ -1,0 +1,475 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The gate: every limit trips by itself, with its own reason, and nothing that is NaN passes."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from sample_records import calibration, model_checks  # type: ignore[import-not-found]
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.assessment.agreement import movement
+from starcal_ros.assessment.gate import judge, reasons_of
+from starcal_ros.assessment.gate_options import GateOptions
+from starcal_ros.camera import CameraModel
+from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.options import names_of
+from starcal_ros.records import (
+    Calibration,
+    CameraGeometry,
+    DetectorMaps,
+    DetectorStep,
+    GateCheck,
+    HeldTerm,
+    ResidualBin,
+)
+
+CAMERA = CameraModel(
+    640, 512, np.array([1800, 0.2, 1801, 320, 255, -0.045, 0.08, 0.0, 4e-4, -3e-4])
+)
+MOUNTING = Rotation.from_euler('zyx', [-91.0, -28.0, 3.0], degrees=True)
+PRIOR = CameraGeometry(CAMERA, MOUNTING.as_quat())
+ESTIMATED = ('fx', 'skew', 'fy', 'k1', 'k2', 'k3', 'p1', 'p2')
+SIGHT_ARCSEC = 2.0
+ASSUMED = CalibrationOptions(star_tracker_sigma_arcsec=(10.0, 10.0, 10.0))
+# An alignment known to 1.4 arcsec each axis, and a camera without uncertainty.
+SIGMA = np.r_[np.zeros(10), np.full(3, 1e-6)]
+GOOD: Calibration = dataclasses.replace(
+    calibration(),
+    geometry=PRIOR,
+    covariance=np.diag(SIGMA**2),
+    estimated=ESTIMATED,
+    residual_rms_px=0.1,
+    images_used=20,
+    misfit_images_ns=(5,),
+    stars_used=990,
+    stars_rejected=10,
+    star_tracker_sigma_arcsec=ASSUMED.star_tracker_sigma_arcsec,
+    singular_values=(1.5, 0.02),
+    zero_skew_cost_px=0.1,
+    termination='converged',
+    maps=DetectorMaps(
+        np.ones((8, 10), np.int64), np.full((16, 20), SIGHT_ARCSEC), np.zeros((16, 20))
+    ),
+    model_checks=model_checks(),
+    field=None,
+)
+
+
+def judged(
+    found: Calibration, options: GateOptions, active: Calibration | None = None
+) -> tuple[GateCheck, ...]:
+    return judge(found, PRIOR, active, options, ASSUMED)
+
+
+def reasons(
+    found: Calibration, options: GateOptions, active: Calibration | None = GOOD
+) -> tuple[str, ...]:
+    return reasons_of(judged(found, options, active))
+
+
+def checks(
+    found: Calibration, options: GateOptions, active: Calibration | None = GOOD
+) -> dict[str, GateCheck]:
+    """By the parameter that limits them, those without one by their name."""
+    return {check.option or check.name: check for check in judged(found, options, active)}
+
+
+def limits_in(found: tuple[str, ...]) -> list[str]:
+    """The first word in brackets of each reason: the parameter of the limit."""
+    return [re.findall(r'\((\w+)\)', reason)[0] for reason in found]
+
+
+def turned(degrees: float, axis: str = 'x', **parameters: float) -> CameraGeometry:
+    rotation = MOUNTING * Rotation.from_euler(axis, degrees, degrees=True)
+    return CameraGeometry(CAMERA.replace(**parameters), rotation.as_quat())
+
+
+def half_covered() -> np.ndarray:
+    cells = np.zeros((8, 10), np.int64)
+    cells[:4] = 7
+    return cells
+
+
+def with_stars(stars: np.ndarray) -> DetectorMaps:
+    assert GOOD.maps is not None
+    return dataclasses.replace(GOOD.maps, stars=stars)
+
+
+def with_model(**changes: Any) -> dict[str, Any]:
+    """The checks of the model with some numbers changed."""
+    assert GOOD.model_checks is not None
+    return {'model_checks': dataclasses.replace(GOOD.model_checks, **changes)}
+
+
+def with_sigma(**sigma: float) -> np.ndarray:
+    """The covariance of the good calibration with the sigma of some parameters changed."""
+    changed = SIGMA.copy()
+    for name, value in sigma.items():
+        changed[GOOD.parameter_names.index(name)] = value
+    return np.diag(changed**2)
+
+
+def test_a_good_calibration_passes() -> None:
+    assert reasons(GOOD, GateOptions()) == ()
+    assert reasons(GOOD, GateOptions(), active=None) == ()
+
+
+@pytest.mark.parametrize(
+    ('changes', 'limit', 'at_limit', 'beyond', 'reason'),
+    [
+        (
+            {'residual_rms_px': 0.8},
+            'max_residual_rms_px',
+            0.8,
+            0.79,
+            'residual per axis is 0.8 px, over the limit of 0.79 px (max_residual_rms_px)',
+        ),
+        (
+            {'stars_used': 90, 'stars_rejected': 10},
+            'max_rejected_fraction',
+            0.1,
+            0.099,
+            (
+                'fraction of stars left out as outliers is 0.1, over the limit of 0.099 '
+                '(max_rejected_fraction)'
+            ),
+        ),
+        (
+            {'maps': with_stars(half_covered())},
+            'min_coverage',
+            0.5,
+            0.51,
+            (
+                'fraction of the detector with stars that fit is 0.5, under the limit of 0.51 '
+                '(min_coverage)'
+            ),
+        ),
+        (
+            {'misfit_images_ns': (1, 2, 3, 4, 5, 6)},
+            'max_misfit_fraction',
+            0.3,
+            0.29,
+            (
+                'fraction of images whose attitude does not fit is 0.3, over the limit of 0.29 '
+                '(max_misfit_fraction)'
+            ),
+        ),
+        (
+            {},
+            'max_line_of_sight_sigma_arcsec',
+            SIGHT_ARCSEC,
+            1.9,
+            (
+                'largest 1-sigma of a line of sight is 2 arcsec, over the limit of 1.9 arcsec '
+                '(max_line_of_sight_sigma_arcsec)'
+            ),
+        ),
+        (
+            with_model(held=(HeldTerm('cx', 320.0, 323.0, 1.0),)),
+            'max_held_term_sigma',
+            3.0,
+            2.9,
+            (
+                'distance of cx from its assumed value is 3 sigma, over the limit of 2.9 sigma '
+                '(max_held_term_sigma); the stars put cx at 323, assumed is 320; estimate cx, or '
+                'widen its prior (estimate, prior_sigma)'
+            ),
+        ),
+        (
+            with_model(step=DetectorStep('u', 320.4, 'v', -0.15, 1e-9)),
+            'max_detector_step_px',
+            0.15,
+            0.14,
+            (
+                'step of the detector in v at u = 320 is 0.15 px, over the limit of 0.14 px '
+                '(max_detector_step_px); the p-value is 1e-09; columns or rows are lost or '
+                'shifted there: check the read-out'
+            ),
+        ),
+        (
+            with_model(held=(HeldTerm('velocity_x_m_s', 0.0, -6e4, 8000.0),)),
+            'max_held_term_sigma',
+            7.5,
+            7.4,
+            (
+                'distance of velocity_x_m_s from its assumed value is 7.5 sigma, over the limit '
+                'of 7.4 sigma (max_held_term_sigma); the stars put velocity_x_m_s at -60000, '
+                'assumed is 0; the velocity or the clock is wrong, or air bends the light: check '
+                'the velocity topic, the stamps and the site'
+            ),
+        ),
+        (
+            with_model(held=(HeldTerm('mounting of head_2 x_deg', 0.0, 20.0, 0.125),)),
+            'max_held_term_sigma',
+            160.0,
+            159.0,
+            (
+                'distance of mounting of head_2 x_deg from its assumed value is 160 sigma, over '
+                'the limit of 159 sigma (max_held_term_sigma); the stars put mounting of head_2 '
+                'x_deg at 20, assumed is 0; check more_alignments, or widen '
+                'star_tracker_mounting_sigma_arcsec'
+            ),
+        ),
+        (
+            with_model(image_variation_px=0.25),
+            'max_image_variation_px',
+            0.25,
+            0.2,
+            (
+                'change of the camera from image to image in a corner is 0.25 px, over the limit '
+                'of 0.2 px (max_image_variation_px); focal length or lens changes between images: '
+                'estimate with temperature, or calibrate each state by itself'
+            ),
+        ),
+        (
+            with_model(predictions=(ResidualBin('star', 5.0, 9.0, 10000, 1.5, 0.005),)),
+            'max_cross_validated_residual',
+            1.5,
+            1.25,
+            (
+                'residual over predicted sigma at star 5 to 9 is 1.5, over the limit of 1.25 '
+                '(max_cross_validated_residual); not within 5% of 1: star 5 to 9: 1.500; the '
+                'sigma does not hold there: look at the PSF, the lens model or those images'
+            ),
+        ),
+    ],
+)
+def test_each_limit_trips_alone(
+    changes: dict[str, Any], limit: str, at_limit: Any, beyond: Any, reason: str
+) -> None:
+    # cx with a sigma of 2 px turns the lines of sight, and bends the map by little.
+    found = dataclasses.replace(GOOD, **changes)
+    assert reasons(found, GateOptions(**{limit: at_limit})) == ()
+    assert reasons(found, GateOptions(**{limit: beyond})) == (reason,)
+
+
+LONGER = turned(0.0, fx=1818.0, fy=1819.01)
+TURNED = turned(0.2)
+CHANGES = [
+    # 1 px of each focal length at the corner, 0.227 focal lengths off the axis.
+    ('max_map_sigma_px', {'covariance': with_sigma(fx=1.0, fy=1.0)}, None, 0.227),
+    ('max_change_px', {'geometry': LONGER}, None, 3.916),
+    ('max_rotation_deg', {'geometry': TURNED}, None, 0.2),
+    ('max_step_px', {'geometry': LONGER}, GOOD, 3.916),
+    ('max_step_rotation_deg', {'geometry': TURNED}, GOOD, 0.2),
+]
+
+
+@pytest.mark.parametrize(('limit', 'changes', 'active', 'expected'), CHANGES)
+def test_each_limit_of_a_change_trips_alone(
+    limit: str, changes: dict[str, Any], active: Calibration | None, expected: float
+) -> None:
+    """The value found is the expected one, and a limit on either side of it decides."""
+    found = dataclasses.replace(GOOD, **changes)
+    check = checks(found, GateOptions(), active)[limit]
+    # The curvature of the field takes 4 % off the first; the others agree to 1e-3.
+    assert check.found == pytest.approx(expected, rel=0.05)
+    at_limit = GateOptions(**{limit: check.found})
+    beyond = GateOptions(**{limit: 0.99 * check.found})
+    assert reasons(found, at_limit, active) == ()
+    (reason,) = reasons(found, beyond, active)
+    assert reason.startswith(check.name) and f'({limit})' in reason
+    assert reason.endswith('(lens_model)' if limit == 'max_change_px' else f'({limit})')
+    assert ('active calibration' in reason) == (active is not None)
+
+
+def test_the_remaining_images_and_stars_must_be_enough() -> None:
+    """The limits on images and stars hold for those that fit, not for those collected."""
+    options = GateOptions(max_misfit_fraction=1.0)
+    found = dataclasses.replace(
+        GOOD, misfit_images_ns=tuple(range(18)), stars_used=50, stars_rejected=0
+    )
+    assert reasons(found, options) == (
+        'number of images that fit is 2, under the limit of 3 (min_images)',
+        'number of stars that fit is 50, under the limit of 60 (min_stars)',
+    )
+
+
+def test_a_missing_comparison_is_no_reason() -> None:
+    strict = GateOptions(max_step_px=0.0, max_step_rotation_deg=0.0)
+    assert reasons(GOOD, strict, active=None) == ()
+    by_option = checks(GOOD, strict, active=None)
+    none = 'no calibration was active'
+    notes = {option: check.note for option, check in by_option.items() if check.passed is None}
+    assert notes == {
+        'max_step_px': none,
+        'max_step_rotation_deg': none,
+    }
+    assert all(np.isnan(by_option[option].found) for option in notes)
+    step = by_option['max_step_px']
+    assert step.found_text == '' and step.limit_text == '0 px'
+
+
+def test_a_calibration_without_maps_cannot_be_judged() -> None:
+    with pytest.raises(ValueError, match='needs its detector maps'):
+        judged(dataclasses.replace(GOOD, maps=None), GateOptions())
+
+
+def test_every_limit_has_its_check() -> None:
+    """With the limit as the option has it."""
+    tracker = dataclasses.replace(GOOD.star_trackers[0], drift_arcsec=1.0, drift_p_value=0.5)
+    found = checks(dataclasses.replace(GOOD, star_trackers=(tracker,)), GateOptions())
+    assert all(check.passed for check in found.values())
+    limited = {name for name in found if found[name].option}
+    assert limited == names_of(GateOptions) | {'min_images', 'min_stars'}
+    for name in names_of(GateOptions):
+        assert found[name].limit == getattr(GateOptions(), name)
+    assert 'the p-value is 0.7' in found['max_detector_step_px'].note
+
+
+def test_a_step_that_noise_explains_passes() -> None:
+    for p_value, passes in ((1e-4, True), (1e-9, False)):
+        step = DetectorStep('v', 100.0, 'u', 0.5, p_value)
+        found = dataclasses.replace(GOOD, **with_model(step=step))
+        assert (reasons(found, GateOptions()) == ()) is passes
+
+
+@pytest.mark.parametrize(
+    ('normalised', 'sigma', 'passes'), [(1.3, 0.01, False), (1.3, 0.1, True), (1.15, 0.01, True)]
+)
+def test_a_part_fails_for_more_than_the_noise_of_its_few_stars(
+    normalised: float, sigma: float, passes: bool
+) -> None:
+    parts = (
+        ResidualBin('cell', 0.0, 300.0, 2500, 1.01, 0.01),
+        ResidualBin('cell', 300.0, 700.0, 2500, normalised, sigma),
+    )
+    found = dataclasses.replace(GOOD, **with_model(predictions=parts))
+    assert (reasons(found, GateOptions()) == ()) is passes
+    check = checks(found, GateOptions())['max_cross_validated_residual']
+    assert ('cell 300 to 700' in check.note) is (sigma < 0.1)
+
+
+@pytest.mark.parametrize(
+    ('drift_arcsec', 'p_value', 'passes'),
+    [(80.0, 1e-6, False), (80.0, 1e-3, True), (20.0, 1e-6, True)],
+)
+def test_a_star_tracker_that_drifts_is_named(
+    drift_arcsec: float, p_value: float, passes: bool
+) -> None:
+    """Where the drift is significant, and more than the limit."""
+    tracker = dataclasses.replace(
+        GOOD.star_trackers[0], frame='head_2', drift_arcsec=drift_arcsec, drift_p_value=p_value
+    )
+    found = dataclasses.replace(GOOD, star_trackers=(*GOOD.star_trackers, tracker))
+    said = reasons(found, GateOptions())
+    assert (said == ()) is passes
+    if not passes:
+        assert said[0].startswith('drift of the attitude of head_2 against the stars is 80 arcsec')
+        assert 'leave it out of more_star_trackers' in said[0]
+
+
+def test_a_calibration_of_an_older_file_has_no_checks_of_the_model() -> None:
+    found = checks(dataclasses.replace(GOOD, model_checks=None), GateOptions())
+    assert 'max_detector_step_px' not in found and 'max_image_variation_px' not in found
+
+
+def test_large_counts_are_written_out() -> None:
+    found = checks(dataclasses.replace(GOOD, stars_used=123456), GateOptions())['min_stars']
+    assert (found.found_text, found.limit_text) == ('123456', '60')
+
+
+def test_a_search_that_did_not_converge_is_refused() -> None:
+    for termination in ('no_descent', 'iteration_limit'):
+        found = dataclasses.replace(GOOD, termination=termination)
+        expected = (f'the solver did not converge ({termination})',)
+        assert reasons(found, GateOptions()) == expected
+
+
+def test_every_reason_is_given() -> None:
+    found = dataclasses.replace(
+        GOOD,
+        residual_rms_px=9.0,
+        stars_rejected=5000,
+        maps=with_stars(np.zeros((8, 10), np.int64)),
+        covariance=with_sigma(fx=100.0),
+        termination='no_descent',
+        geometry=turned(5.0, k1=6.0),
+    )
+    options = limits_in(reasons(found, GateOptions()))
+    assert options == [
+        'no_descent', 'max_residual_rms_px', 'max_rejected_fraction', 'min_coverage',
+        'max_map_sigma_px', 'max_change_px', 'max_rotation_deg', 'max_step_px',
+        'max_step_rotation_deg',
+    ]  # fmt: skip
+
+
+def not_finite(name: str, bad: float) -> Calibration:
+    """The good calibration with one number spoilt."""
+    if name.startswith('covariance'):
+        covariance = GOOD.covariance.copy()
+        place = (5, 5) if name.endswith('diagonal') else (5, 11)
+        covariance[place] = bad
+        return dataclasses.replace(GOOD, covariance=covariance)
+    if name == 'quaternion':
+        broken = CameraGeometry(CAMERA, np.array([bad, 0.0, 0.0, 1.0]))
+        return dataclasses.replace(GOOD, geometry=broken)
+    if name == 'map':
+        assert GOOD.maps is not None
+        sigma = GOOD.maps.line_of_sight_sigma_arcsec.copy()
+        sigma[3, 3] = bad
+        maps = dataclasses.replace(GOOD.maps, line_of_sight_sigma_arcsec=sigma)
+        return dataclasses.replace(GOOD, maps=maps)
+    changed: dict[str, Any] = {name: bad}
+    return dataclasses.replace(GOOD, **changed)
+
+
+@pytest.mark.parametrize('bad', [np.nan, np.inf])
+@pytest.mark.parametrize('name', ['covariance diagonal', 'map', 'residual_rms_px'])
+def test_an_infinite_number_or_nan_is_refused(name: str, bad: float) -> None:
+    assert reasons(not_finite(name, bad), GateOptions())
+
+
+@pytest.mark.parametrize('name', ['covariance', 'quaternion'])
+def test_nothing_that_is_nan_passes(name: str) -> None:
+    assert reasons(not_finite(name, np.nan), GateOptions())
+
+
+def test_a_negative_variance_is_refused() -> None:
+    covariance = GOOD.covariance.copy()
+    covariance[3, 3] = -1e-9
+    found = dataclasses.replace(GOOD, covariance=covariance)
+    assert reasons(found, GateOptions()) == ('a variance is negative',)
+
+
+def test_no_star_at_all_is_refused() -> None:
+    found = dataclasses.replace(
+        GOOD, stars_used=0, stars_rejected=0, maps=with_stars(np.zeros((8, 10), np.int64))
+    )
+    assert any('min_coverage' in reason for reason in reasons(found, GateOptions()))
+
+
+@pytest.mark.parametrize('axis', ['x', 'y', 'z'])
+@pytest.mark.parametrize('degrees', [0.01, 1.0, 30.0, 170.0])
+def test_a_rotation_is_no_change_of_shape(axis: str, degrees: float) -> None:
+    rotation_rad, left_px = movement(PRIOR, turned(degrees, axis))
+    assert np.degrees(rotation_rad) == pytest.approx(degrees, abs=1e-7)
+    assert left_px.max() < 1e-6
+
+
+def test_a_focal_length_is_a_change_of_shape() -> None:
+    # 1 % at the corner, 1800 px * 0.01 * 0.227 = 4.1 px; the field curves a little of it away.
+    rotation_rad, left_px = movement(PRIOR, turned(0.0, fx=1818.0, fy=1819.01))
+    assert left_px.max() == pytest.approx(4.1, abs=0.4)
+    assert np.degrees(rotation_rad) < 0.01
+
+
+def test_a_principal_point_is_mostly_a_rotation() -> None:
+    # 30 px of 1800 are 0.955 degrees.
+    rotation_rad, left_px = movement(PRIOR, turned(0.0, cx=350.0))
+    assert np.degrees(rotation_rad) == pytest.approx(0.955, abs=0.03)
+    assert left_px.max() < 30 * 0.23**2 * 2
+
+
+def test_a_camera_that_folds_over_is_refused() -> None:
+    # 1 + 3 k1 r^2 is zero at r = 0.18: the corners have no line of sight.
+    rotation_rad, left_px = movement(PRIOR, turned(0.0, k1=-10.0))
+    assert np.isinf(rotation_rad) and np.isinf(left_px).all()
+    folded = dataclasses.replace(GOOD, geometry=turned(0.0, k1=-10.0))
+    options = limits_in(reasons(folded, GateOptions(), None))
+    assert options == ['max_map_sigma_px', 'max_change_px', 'max_rotation_deg']

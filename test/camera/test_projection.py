@@ -1,0 +1,466 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Every camera model: derivatives, inverse, the fold of the distortion, fits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.camera import (
+    ALL_PARAMETER_NAMES,
+    CameraModel,
+    field_radius_rad,
+    line_of_sight,
+    model_of,
+    PARAMETER_NAMES,
+    parameter_names,
+    pixel_grid,
+    project,
+    project_jacobians,
+    project_parameters,
+)
+from starcal_ros.camera.conversion import convert, ros_fit
+from starcal_ros.camera.lens import (
+    coefficient_jacobian,
+    COEFFICIENTS,
+    distort,
+    distort_jacobian,
+    fold_radius2,
+    ideal_points,
+)
+
+#           k1   k2    k3    p1     p2     k4    k5   k6
+RATIONAL = [0.1, 0.05, 0.01, 1e-3, -7e-4, 0.35, 0.1, 0.02]
+PRISM = [2e-3, -1e-3, -1.5e-3, 5e-4]
+#                     fx     skew     fy     cx     cy     k1     k2     k3    p1     p2
+CAMERAS = {
+    'paper': CameraModel(
+        2592, 2048, np.array([7291, 1.5, 7286, 1290, 1030, -0.045, 0.08, 0.02, 4e-4, -3e-4])
+    ),
+    'barrel': CameraModel(
+        640, 480, np.array([420, -0.8, 415, 322, 236, -0.28, 0.07, -0.004, 1e-3, -7e-4])
+    ),
+    'pincushion': CameraModel(
+        1024, 1024, np.array([900, 3.0, 905, 500, 520, 0.25, 0.1, 0.05, -2e-3, 1e-3])
+    ),
+    'pinhole': CameraModel(1000, 800, np.array([5000, 0, 5000, 499.5, 399.5, 0, 0, 0, 0, 0])),
+    'rational': CameraModel(
+        640, 480, np.array([420, -0.8, 415, 322, 236, *RATIONAL]), 'rational_polynomial'
+    ),
+    # Large terms that nearly cancel, as calibrations of 90 degree lenses with OpenCV have them.
+    'rational wide': CameraModel(
+        1280,
+        720,
+        np.array([640, 0.4, 641, 639, 362, 9.2, 5.1, 0.19, 2e-5, -1e-4, 9.6, 8.1, 1.1]),
+        'rational_polynomial',
+    ),
+    'thin prism': CameraModel(
+        640, 480, np.array([420, 1.2, 418, 318, 243, *RATIONAL, *PRISM]), 'thin_prism'
+    ),
+    'tilted': CameraModel(
+        640, 480, np.array([420, 1.2, 418, 318, 243, *RATIONAL, *PRISM, 0.05, -0.03]), 'tilted'
+    ),
+    'fisheye': CameraModel(
+        1000, 1000, np.array([330, 0.7, 331, 501, 497, -0.02, 0.01, -0.004, 5e-4]), 'equidistant'
+    ),
+    # 291 degrees from corner to corner.
+    'fisheye behind': CameraModel(
+        640, 480, np.array([160, -0.8, 155, 322, 236, -0.02, 0.01, -0.004, 5e-4]), 'equidistant'
+    ),
+}
+each_camera = pytest.mark.parametrize('camera', CAMERAS.values(), ids=CAMERAS.keys())
+
+
+def wide_grid(camera: CameraModel, beyond: float = 0.2) -> np.ndarray:
+    """Pixels (n, 2) over the detector and that fraction of it beyond each side."""
+    if camera is CAMERAS['fisheye behind']:
+        beyond = 0.0  # the sphere ends close to its corners
+    grid = pixel_grid(camera, 29, 23)
+    centre = 0.5 * np.array([camera.width - 1, camera.height - 1])
+    return centre + (1 + 2 * beyond) * (grid - centre)
+
+
+@each_camera
+def test_derivatives_by_the_parameters(camera: CameraModel) -> None:
+    e = line_of_sight(camera, pixel_grid(camera, 9, 7))
+    pixels, J, _ = project_jacobians(camera, e)
+    # The same sum in another order: 1e-12 px is five roundings of 2592 px.
+    np.testing.assert_allclose(pixels, project(camera, e), rtol=0, atol=3e-12)
+    for k, name in enumerate(camera.parameter_names):
+        value = camera.parameters[k]
+        size = np.abs(J[..., k]).max()
+        complex_step = camera.parameters.astype(complex)
+        complex_step[k] += 1e-30j
+        exact = project_parameters(camera.model, complex_step, e).imag / 1e-30
+        # A complex step has no truncation error and no cancellation: rounding alone.
+        np.testing.assert_allclose(J[..., k], exact, rtol=0, atol=1e-10 * size, err_msg=name)
+        h = 1e-3 * max(abs(value), 0.1)
+        ahead, behind = (camera.replace(**{name: value + d}) for d in (h, -h))
+        central = (project(ahead, e) - project(behind, e)) / (2 * h)
+        # Pixels are linear in each parameter alone, but for a denominator and a tilt, of which
+        # h^2 of the third derivative is left out; and rounding, 1e-12 px over the step.
+        linear = camera.model in ('plumb_bob', 'equidistant')
+        bend = 0.0 if linear else 1000 * h**2
+        atol = 3e-12 / h + (1e-9 + bend) * size
+        np.testing.assert_allclose(J[..., k], central, rtol=0, atol=atol, err_msg=name)
+
+
+@each_camera
+def test_derivatives_by_a_passive_rotation(camera: CameraModel) -> None:
+    e = line_of_sight(camera, pixel_grid(camera, 9, 7))
+    _, _, J = project_jacobians(camera, e)
+    for axis in range(3):
+        theta = np.zeros(3)
+        theta[axis] = 1.0
+        # exp(-[theta x]) e to first order: e - theta x e = e + e x theta (Eqs. 11, 35).
+        complex_step = e + 1e-30j * np.cross(e, theta)
+        exact = project_parameters(camera.model, camera.parameters, complex_step).imag / 1e-30
+        size = np.abs(J).max()
+        np.testing.assert_allclose(J[..., axis], exact, rtol=0, atol=1e-10 * size)
+        h = 1e-4
+        ahead, behind = (Rotation.from_rotvec(-d * theta).apply(e) for d in (h, -h))
+        central = (project(camera, ahead) - project(camera, behind)) / (2 * h)
+        # The third derivative is a few times the first: h^2 of it is left out.
+        np.testing.assert_allclose(J[..., axis], central, rtol=0, atol=10 * h**2 * size)
+
+
+@each_camera
+def test_derivative_of_the_distortion(camera: CameraModel) -> None:
+    xy = ideal_points(camera.model, line_of_sight(camera, pixel_grid(camera, 9, 7)))
+    J = distort_jacobian(camera.model, xy, camera.distortion)
+    for axis in range(2):
+        step = xy.astype(complex)
+        step[:, axis] += 1e-30j
+        exact = distort(camera.model, step, camera.distortion).imag / 1e-30
+        np.testing.assert_allclose(J[..., axis], exact, rtol=0, atol=1e-12)
+    of_coefficients = coefficient_jacobian(camera.model, xy, camera.distortion)
+    assert of_coefficients.shape == (2, len(camera.distortion), len(xy))
+    for k in range(len(camera.distortion)):
+        coefficients = camera.distortion.astype(complex)
+        coefficients[k] += 1e-30j
+        exact = distort(camera.model, xy, coefficients).imag.T / 1e-30
+        size = np.abs(exact).max()
+        np.testing.assert_allclose(of_coefficients[:, k], exact, rtol=0, atol=1e-12 * size)
+
+
+def fold_angle(camera: CameraModel) -> float:
+    """Angle from the optical axis at which the radial distortion folds over, rad."""
+    radius = np.sqrt(fold_radius2(camera.model, camera.distortion))
+    return float(radius if camera.model == 'equidistant' else np.arctan(radius))
+
+
+@each_camera
+def test_a_pixel_comes_back_from_its_line_of_sight(camera: CameraModel) -> None:
+    pixels = wide_grid(camera)
+    e = line_of_sight(camera, pixels)
+    assert np.isfinite(e).all()
+    # The inverse stops at 1e-14 of the image plane: 7e-11 px at the longest focal length here.
+    np.testing.assert_allclose(project(camera, e), pixels, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(np.linalg.norm(e, axis=1), 1.0, rtol=0, atol=5e-16)
+
+
+@each_camera
+def test_a_direction_comes_back_from_its_pixel(camera: CameraModel) -> None:
+    # Directions that no inverse has made: over the cone in which the detector lies.
+    rng = np.random.default_rng(1)
+    inside = min(field_radius_rad(camera), 0.99 * fold_angle(camera))
+    theta = inside * np.sqrt(rng.uniform(size=300))
+    angle = rng.uniform(0, 2 * np.pi, 300)
+    rho = np.sin(theta)
+    e = np.stack([rho * np.cos(angle), rho * np.sin(angle), np.cos(theta)], axis=-1)
+    back = line_of_sight(camera, project(camera, e))
+    # 1e-14 of the image plane, a few times more where a barrel shrinks it.
+    np.testing.assert_allclose(back, e, rtol=0, atol=1e-13)
+
+
+@each_camera
+def test_one_and_many_alike(camera: CameraModel) -> None:
+    pixels = pixel_grid(camera, 4, 3)
+    e = line_of_sight(camera, pixels)
+    many = project_jacobians(camera, e)
+    for k in range(len(pixels)):
+        # The iteration goes on until the last of many is there: 1e-14 of the image plane.
+        np.testing.assert_allclose(line_of_sight(camera, pixels[k]), e[k], rtol=0, atol=2e-14)
+        assert project(camera, e[k]).shape == (2,)
+        # Arrays may round as vectors of the processor do, single numbers not: two roundings.
+        for one, all_ in zip(project_jacobians(camera, e[k]), many, strict=True):
+            np.testing.assert_allclose(one, all_[k], rtol=1e-15, atol=4e-16 * np.abs(all_).max())
+        np.testing.assert_allclose(project(camera, e[k]), many[0][k], rtol=1e-15, atol=5e-13)
+    stacked = line_of_sight(camera, pixels.reshape(3, 4, 2))
+    np.testing.assert_array_equal(stacked, e.reshape(3, 4, 3))
+    assert line_of_sight(camera, np.empty((0, 2))).shape == (0, 3)
+    assert project(camera, np.empty((0, 3))).shape == (0, 2)
+
+
+@each_camera
+def test_the_length_of_a_direction_does_not_matter(camera: CameraModel) -> None:
+    e = line_of_sight(camera, pixel_grid(camera, 5, 5))
+    # Powers of two scale exactly.
+    np.testing.assert_array_equal(project(camera, 4096.0 * e), project(camera, e))
+    np.testing.assert_array_equal(project(camera, e / 4096.0), project(camera, e))
+
+
+def test_behind_the_camera_is_nan() -> None:
+    e = np.array([[0.1, 0.2, -1.0], [0.1, 0.2, 0.0], [0.1, 0.2, 1.0]])
+    pixels = project(CAMERAS['paper'], e)
+    assert np.isnan(pixels[:2]).all() and np.isfinite(pixels[2]).all()
+    assert np.isnan(project(CAMERAS['paper'], e[0])).all()
+
+
+def test_a_fisheye_sees_behind_itself_but_not_along_its_axis() -> None:
+    camera = CAMERAS['fisheye behind']
+    theta = np.radians([0.0, 1e-7, 1.0, 89.0, 90.0, 91.0, 120.0, 150.0])
+    e = np.stack([np.sin(theta), np.zeros(8), np.cos(theta)], axis=-1)
+    k1, k2, k3, k4 = camera.distortion
+    t2 = theta**2
+    along = theta * (1 + k1 * t2 + k2 * t2**2 + k3 * t2**3 + k4 * t2**4)
+    fx, _, _, cx, cy = camera.intrinsics
+    expected = np.stack([cx + fx * along, np.full(8, cy)], axis=-1)
+    np.testing.assert_allclose(project(camera, e), expected, rtol=0, atol=1e-11)
+    assert np.isnan(project(camera, np.array([0.0, 0.0, -1.0]))).all()
+
+
+def test_the_rotation_of_a_fisheye_is_smooth_through_the_axis() -> None:
+    # From the series to the closed form at 0.2 rad, and on the axis itself.
+    camera = CAMERAS['fisheye']
+    theta = np.r_[0.0, 1e-12, 1e-5, 0.1, 0.2 - 1e-9, 0.2 + 1e-9, 0.3, 1.0]
+    e = np.stack([np.sin(theta) * 0.6, np.sin(theta) * 0.8, np.cos(theta)], axis=-1)
+    _, _, J = project_jacobians(camera, e)
+    for axis in range(3):
+        step = 1e-30j * np.cross(e[1:], np.eye(3)[axis])
+        exact = project_parameters(camera.model, camera.parameters, e[1:] + step).imag / 1e-30
+        np.testing.assert_allclose(J[1:, :, axis], exact, rtol=0, atol=1e-10 * np.abs(J).max())
+    fx, skew, fy, _, _ = camera.intrinsics
+    np.testing.assert_allclose(J[0], [[skew, -fx, 0], [fy, 0, 0]], rtol=0, atol=1e-12)
+
+
+def test_a_nan_pixel_spoils_no_other() -> None:
+    camera = CAMERAS['barrel']
+    pixels = pixel_grid(camera, 5, 5)
+    clean = line_of_sight(camera, pixels)
+    pixels[7] = np.nan
+    e = line_of_sight(camera, pixels)
+    assert np.isnan(e[7]).all()
+    others = np.arange(25) != 7
+    np.testing.assert_allclose(e[others], clean[others], rtol=0, atol=2e-14)
+
+
+def folding(k1: float, k2: float = 0.0, k3: float = 0.0) -> CameraModel:
+    return CameraModel(1000, 1000, np.array([500, 0, 500, 500, 500, k1, k2, k3, 0, 0]))
+
+
+@pytest.mark.parametrize('k1', [-0.2, -0.5])
+def test_beyond_the_fold_there_is_no_line_of_sight(k1: float) -> None:
+    # r (1 + k1 r^2) rises to 2/3 sqrt(1 / (-3 k1)) and falls from there on.
+    camera = folding(k1)
+    summit = 2 / 3 / np.sqrt(-3 * k1)
+    radius = summit * np.array([0.2, 0.9, 0.999, 1.001, 1.1, 2.0, 10.0])
+    e = line_of_sight(camera, np.stack([500 + 500 * radius, np.full(7, 500.0)], axis=-1))
+    assert np.isfinite(e[:3]).all()
+    assert np.isnan(e[3:]).all()
+    x = e[:3, 0] / e[:3, 2]
+    assert (x < 1 / np.sqrt(-3 * k1)).all()  # on the side of the axis
+
+
+def test_a_pixel_past_the_summit_takes_no_outer_branch() -> None:
+    # r (1 - 0.6 r^2 + 0.15 r^4) rises to 0.5515 at r = 0.934, falls to r = 1.236, rises again:
+    # beyond 0.5515 only the outer branch is left, where no lens is like its polynomial.
+    camera = folding(-0.6, 0.15)
+    radius = np.array([0.3, 0.54, 0.551, 0.553, 0.6, 0.8])
+    e = line_of_sight(camera, np.stack([500 + 500 * radius, np.full(6, 500.0)], axis=-1))
+    assert (e[:3, 0] / e[:3, 2] < 0.935).all()
+    assert np.isnan(e[3:]).all()
+
+
+def test_beyond_the_fold_of_a_fisheye_there_is_no_line_of_sight() -> None:
+    # theta (1 - theta^2 / 10) rises to 2/3 sqrt(10/3) and falls from there on.
+    camera = CameraModel(
+        1000, 1000, np.array([500, 0, 500, 500, 500, -0.1, 0, 0, 0]), 'equidistant'
+    )
+    summit = 2 / 3 * np.sqrt(10 / 3)
+    radius = summit * np.array([0.2, 0.9, 0.999, 1.001, 1.1, 2.0, 10.0])
+    e = line_of_sight(camera, np.stack([500 + 500 * radius, np.full(7, 500.0)], axis=-1))
+    assert np.isfinite(e[:3]).all() and np.isnan(e[3:]).all()
+    assert (np.arccos(e[:3, 2]) < np.sqrt(10 / 3)).all()
+    # Without a fold the sphere ends it.
+    whole = camera.replace(k1=0.0)
+    e = line_of_sight(whole, np.array([[500 + 500 * 3.14, 500.0], [500 + 500 * 3.15, 500.0]]))
+    assert np.isfinite(e[0]).all() and np.isnan(e[1]).all()
+
+
+def test_up_to_the_pole_of_a_rational_polynomial_the_whole_plane_is_seen() -> None:
+    # r / (1 - r^2 / 2) grows to infinity at r = sqrt(2): any pixel has a line of sight within.
+    camera = CameraModel(
+        1000, 1000, np.array([500, 0, 500, 500, 500, *[0] * 5, -0.5, 0, 0]), 'rational_polynomial'
+    )
+    pixels = np.array([[500.0 + 500.0 * radius, 500.0] for radius in (0.5, 2.0, 10.0, 100.0)])
+    e = line_of_sight(camera, pixels)
+    x = e[:, 0] / e[:, 2]
+    assert (np.diff(x) > 0).all() and x[-1] < np.sqrt(2)
+    np.testing.assert_allclose(project(camera, e), pixels, rtol=1e-10)
+    # r / (1 + r^2) rises to 1/2 at r = 1.
+    folds = camera.replace(k4=1.0)
+    e = line_of_sight(folds, np.array([[500 + 500 * 0.499, 500.0], [500 + 500 * 0.501, 500.0]]))
+    assert np.isfinite(e[0]).all() and e[0, 0] < e[0, 2] and np.isnan(e[1]).all()
+
+
+def test_a_tilted_detector_is_not_seen_from_behind() -> None:
+    camera = CameraModel(
+        1000, 1000, np.array([500, 0, 500, 500, 500, *[0] * 12, 0, 0.5]), 'tilted'
+    )
+    # w = sin(tau) x + cos(tau) ends at x = -1 / tan(tau).
+    x = -1 / np.tan(0.5) + np.array([-0.1, 0.1])
+    pixels = project(camera, np.stack([x, [0.0, 0.0], [1.0, 1.0]], axis=-1))
+    assert np.isnan(pixels[0]).all() and np.isfinite(pixels[1]).all()
+
+
+@each_camera
+def test_a_camera_becomes_one_of_a_larger_model(camera: CameraModel) -> None:
+    e = line_of_sight(camera, pixel_grid(camera, 9, 7))
+    for model, names in COEFFICIENTS.items():
+        larger = set(camera.parameter_names[5:]) <= set(names)
+        if 'equidistant' in (model, camera.model) or not larger:
+            continue
+        converted, worst_px = convert(camera, model)
+        assert converted.model == model and worst_px == 0.0
+        # The same polynomial: roundings of pixels up to 2592.
+        np.testing.assert_allclose(project(converted, e), project(camera, e), rtol=0, atol=3e-12)
+
+
+@pytest.mark.parametrize(
+    ('name', 'model', 'most_px'),
+    [
+        ('paper', 'equidistant', 0.8),  # decentring, which it has not: 4e-4 r^2 at the corner
+        ('rational', 'plumb_bob', 0.5),
+        ('rational wide', 'plumb_bob', 20.0),
+        ('rational wide', 'equidistant', 1.0),
+        ('tilted', 'thin_prism', 10.0),
+        ('fisheye behind', 'equidistant', 0.0),
+    ],
+)
+def test_a_camera_becomes_the_best_of_another_model(name: str, model: str, most_px: float) -> None:
+    camera = CAMERAS[name]
+    converted, worst_px = convert(camera, model)
+    assert converted.model == model and worst_px <= most_px
+    pixels = pixel_grid(camera, 25, 25)
+    error = np.linalg.norm(project(converted, line_of_sight(camera, pixels)) - pixels, axis=1)
+    assert error.max() == pytest.approx(worst_px, abs=1e-9)
+
+
+def test_what_a_pinhole_cannot_see_costs_everything() -> None:
+    assert convert(CAMERAS['fisheye behind'], 'plumb_bob')[1] == np.inf
+    with pytest.raises(ValueError, match="lens model: 'pinhole' is not one of plumb_bob"):
+        convert(CAMERAS['paper'], 'pinhole')
+
+
+def test_models_and_their_names() -> None:
+    for model in COEFFICIENTS:
+        assert model_of(parameter_names(model)) == model
+        assert set(parameter_names(model)) <= set(ALL_PARAMETER_NAMES)
+    with pytest.raises(ValueError, match='fx are not the parameters of a lens model'):
+        model_of(('fx',))
+    with pytest.raises(ValueError, match='9 finite numbers'):
+        CameraModel(10, 10, CAMERAS['paper'].parameters, 'equidistant')
+    with pytest.raises(ValueError, match="lens model: 'brown' is not one of"):
+        CameraModel(10, 10, CAMERAS['paper'].parameters, 'brown')
+
+
+def test_field_radius() -> None:
+    camera = CAMERAS['pinhole']
+    # The corner is half the size from the axis at the centre; a pinhole has no more to it.
+    corner = np.hypot(499.5, 399.5)
+    assert field_radius_rad(camera) == pytest.approx(np.arctan(corner / 5000), abs=1e-12)
+    margin = np.hypot(599.5, 499.5)
+    assert field_radius_rad(camera, 100.0) == pytest.approx(np.arctan(margin / 5000), abs=1e-12)
+
+
+@each_camera
+def test_no_pixel_lies_outside_the_field_radius(camera: CameraModel) -> None:
+    angle = np.arccos(line_of_sight(camera, pixel_grid(camera, 40, 40))[:, 2])
+    assert angle.max() <= field_radius_rad(camera) + 1e-12
+    # The pinhole without distortion counts too: a strong pincushion takes 12 % off its angle.
+    assert field_radius_rad(camera) < 1.15 * angle.max()
+
+
+def test_field_radius_of_a_camera_that_folds_over_is_finite() -> None:
+    assert np.isfinite(field_radius_rad(folding(-0.6)))
+
+
+def test_without_skew_nothing_is_fitted() -> None:
+    camera = CAMERAS['pinhole']
+    fitted, worst_px = ros_fit(camera)
+    assert fitted is camera and worst_px == 0.0
+
+
+@pytest.mark.parametrize('skew', [0.5, 2.0, -4.0])
+def test_the_fit_without_skew_costs_no_more_than_the_shear_itself(skew: float) -> None:
+    camera = CAMERAS['paper'].replace(skew=skew)
+    fitted, worst_px = ros_fit(camera)
+    assert fitted.parameters[1] == 0.0
+    # Dropped, skew leaves skew y', at most |skew| times half the height over the focal length.
+    bound_px = abs(skew) * 1024 / 7286
+    assert 0.05 * bound_px < worst_px <= 1.05 * bound_px
+    pixels = pixel_grid(camera, 25, 25)
+    error = project(fitted, line_of_sight(camera, pixels)) - pixels
+    assert np.linalg.norm(error, axis=1).max() == pytest.approx(worst_px, abs=1e-9)
+
+
+def test_the_fit_without_skew_is_a_least_squares_minimum() -> None:
+    camera = CAMERAS['pincushion']
+    fitted, _ = ros_fit(camera)
+    pixels = pixel_grid(camera, 25, 25)
+    e = line_of_sight(camera, pixels)
+    base = ((project(fitted, e) - pixels) ** 2).sum()
+    for k, name in enumerate(PARAMETER_NAMES):
+        if name == 'skew':
+            continue
+        _, J, _ = project_jacobians(fitted, e)
+        h = 1e-3 / np.abs(J[..., k]).max()  # 1e-3 px at the edge
+        for step in (h, -h):
+            moved = fitted.replace(**{name: fitted.parameters[k] + step})
+            assert ((project(moved, e) - pixels) ** 2).sum() > base, name
+
+
+@pytest.mark.parametrize(
+    ('change', 'says'),
+    [
+        ({'fx': 0.0}, 'fx, fy'),
+        ({'fy': -1.0}, 'fx, fy'),
+        ({'k1': np.nan}, '10 finite numbers'),
+        ({'cx': np.inf}, '10 finite numbers'),
+    ],
+)
+def test_impossible_parameters_are_refused(change: dict[str, float], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        CAMERAS['paper'].replace(**change)
+
+
+def test_impossible_sizes_are_refused() -> None:
+    parameters = CAMERAS['paper'].parameters
+    with pytest.raises(ValueError, match='10 finite numbers'):
+        CameraModel(10, 10, parameters[:9])
+    with pytest.raises(ValueError, match='image size: 0 x 10'):
+        CameraModel(0, 10, parameters)
+
+
+def test_parameters_cannot_be_changed_from_outside() -> None:
+    mine = CAMERAS['paper'].parameters.copy()
+    camera = CameraModel(10, 10, mine)
+    mine[0] = 1.0
+    assert camera.parameters[0] == 7291
+    with pytest.raises(ValueError, match='read-only'):
+        camera.parameters[0] = 1.0
+
+
+def test_the_matrix_is_the_pinhole_part() -> None:
+    camera = CAMERAS['pinhole'].replace(skew=7.0)
+    e = np.array([[0.03, -0.02, 1.0], [-0.01, 0.05, 1.0]])
+    homogeneous = e @ camera.matrix.T
+    expected = homogeneous[:, :2] / homogeneous[:, 2:]
+    np.testing.assert_allclose(project(camera, e), expected, rtol=0, atol=1e-12)
+
+
+def test_a_coefficient_next_to_zero_folds_nothing() -> None:
+    """As a first coefficient of the polynomial it would overflow as a divisor."""
+    assert fold_radius2('plumb_bob', np.array([0.0, 0.0, 2.2e-313, 0.0, 0.0])) == np.inf

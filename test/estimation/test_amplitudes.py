@@ -1,0 +1,410 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Amplitudes: restricted likelihoods against dense ones of error contrasts, and simulations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.random import Generator
+import pytest
+from scipy.linalg import null_space
+from scipy.optimize import brentq
+from scipy.stats import chi2, multivariate_normal, norm
+from scipy.stats import t as student_t
+
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.estimation import amplitudes as module
+from starcal_ros.estimation.amplitudes import (
+    averaged_field,
+    field_amplitudes,
+    interval_factor,
+    LARGEST_FIELD_PX,
+    LARGEST_SHAPE_PX,
+    octave_prior,
+    prior_of_last_octave,
+    shapes,
+    ShapeSums,
+)
+
+DRAWS = 200
+CENTRE, SIGMA, STEP = math.log(1e-5), 4.0, -0.7
+
+
+@dataclass(frozen=True)
+class Field:
+    """Observations ``y = X b + Z c + e`` with unit noise; b has an amplitude an octave."""
+
+    X: Floats
+    y: Floats
+    contrasts: Floats  # (n, n - z): orthonormal, free of Z
+    octave: Indices
+
+    @property
+    def sums(self) -> tuple[Floats, Floats, Indices]:
+        """Information and gradient of b, c eliminated; octaves."""
+        A = self.contrasts.T @ self.X
+        return A.T @ A, A.T @ (self.contrasts.T @ self.y), self.octave
+
+    def log_likelihood(self, sigma_px: Floats) -> float:
+        """Log density of the contrasts with amplitudes (3,)."""
+        A = self.contrasts.T @ (self.X * sigma_px[self.octave])
+        V = np.eye(len(A)) + A @ A.T
+        return float(multivariate_normal.logpdf(self.contrasts.T @ self.y, cov=V))
+
+    def log_posterior(self, log_px: Floats) -> float:
+        """Log likelihood with the prior: N(ln 1e-5, 4), each octave e^-0.7 within e."""
+        steps = np.diff(log_px) - STEP
+        off = (log_px[0] - CENTRE) / SIGMA
+        return self.log_likelihood(np.exp(log_px)) - 0.5 * float(off**2 + steps @ steps)
+
+
+def field(rng: Generator, sigma_px: Floats, each: int = 4, n: int = 60) -> Field:
+    octave = np.repeat(np.arange(3), each)
+    X = 30.0 * rng.normal(size=(n, len(octave))) * rng.uniform(0.5, 2.0, len(octave))
+    Z = rng.normal(size=(n, 5))
+    b = sigma_px[octave] * rng.normal(size=len(octave))
+    y = X @ b + Z @ (100.0 * rng.normal(size=5)) + rng.normal(size=n)
+    return Field(X, y, null_space(Z.T), octave)
+
+
+def test_the_prior_of_octaves_is_a_chain() -> None:
+    mean, precision = octave_prior(4)
+    assert mean == pytest.approx(CENTRE + STEP * np.arange(4))
+    later = np.minimum.outer(np.arange(4), np.arange(4))
+    assert np.linalg.inv(precision) == pytest.approx(16.0 + later)
+
+
+@pytest.mark.parametrize('count', [1, 3])
+def test_before_the_data_the_last_octave_has_its_prior(count: int) -> None:
+    log_px, weight = prior_of_last_octave(count)
+    mean, precision = octave_prior(count)
+    assert weight.sum() == pytest.approx(1.0)
+    assert weight @ log_px == pytest.approx(mean[-1])
+    variance = np.linalg.inv(precision)[-1, -1]
+    # Beyond three sigma nothing is left: 3 % of the variance.
+    assert weight @ (log_px - mean[-1]) ** 2 == pytest.approx(variance, rel=0.04)
+
+
+@pytest.mark.parametrize('sigma_px', [(0.3, 0.1, 0.05), (0.05, 0.05, 0.0), (0.0, 0.2, 0.2)])
+@pytest.mark.parametrize('seed', [1, 2])
+def test_the_mode_is_that_of_the_dense_posterior(sigma_px: tuple[float, ...], seed: int) -> None:
+    made = field(np.random.default_rng(seed), np.array(sigma_px))
+    found = field_amplitudes(*made.sums)
+    ratio = made.log_likelihood(np.exp(found.log_px)) - made.log_likelihood(np.zeros(3))
+    # Unknowns whose information is under a millionth of their prior's are left out.
+    assert found.likelihood_ratio == pytest.approx(2.0 * ratio, abs=1e-4)
+    at_mode = made.log_posterior(found.log_px)
+    for k in range(3):
+        step = 1e-4 * np.eye(3)[k]
+        slope = made.log_posterior(found.log_px + step) - made.log_posterior(found.log_px - step)
+        # Settled to a thousandth of the log likelihood: a slope of 0.045 at unit curvature.
+        at_cap = found.log_px[k] > math.log(LARGEST_FIELD_PX) - 1e-6
+        assert abs(slope / 2e-4) < 0.15 or (at_cap and slope > 0)
+    rng = np.random.default_rng(3)
+    trials = rng.uniform(-14.0, math.log(LARGEST_FIELD_PX), (400, 3))
+    near = found.log_px + 0.5 * rng.normal(size=(50, 3))
+    cap = math.log(LARGEST_FIELD_PX)
+    for one in (*trials, *np.minimum(near, cap)):
+        assert made.log_posterior(one) < at_mode + 0.01
+
+
+@pytest.mark.parametrize('start_px', [1e-4, 1e-2, 1e-1])
+def test_the_mode_is_found_from_each_start(
+    start_px: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = field(np.random.default_rng(5), np.array([0.2, 0.1, 0.05]), each=10, n=80)
+    whole = field_amplitudes(*made.sums)
+    monkeypatch.setattr(module, '_STARTS_PX', (start_px,))
+    alone = field_amplitudes(*made.sums)
+    assert alone.log_px == pytest.approx(whole.log_px, abs=0.1)
+    assert alone.likelihood_ratio == pytest.approx(whole.likelihood_ratio, abs=0.01)
+    assert alone.likelihood_ratio > 20.0
+
+
+def test_planted_amplitudes_are_recovered_within_their_uncertainty() -> None:
+    planted = np.array([0.2, 0.1, 0.05])  # a chain of its own prior
+    off = []
+    for seed in range(30):
+        made = field(np.random.default_rng(seed), planted, each=20, n=120)
+        off.append(field_amplitudes(*made.sums).log_px - np.log(planted))
+    # Twenty coefficients leave 1 / sqrt(40) of a logarithm, and the noise somewhat more.
+    sigma = 1.0 / math.sqrt(40.0)
+    assert np.abs(np.mean(off, axis=0)).max() < 4.0 * sigma / math.sqrt(30.0)
+    assert 0.7 < np.std(off) / sigma < 1.5
+
+
+def test_a_sound_field_passes_its_one_percent_level_at_most_so_often() -> None:
+    rng = np.random.default_rng(1)
+    ratios = []
+    for _ in range(DRAWS):
+        made = field(rng, np.zeros(3))
+        ratios.append(field_amplitudes(*made.sums).likelihood_ratio)
+    level = chi2.isf(0.01, 1)
+    assert np.mean(np.array(ratios) > level) <= 0.02
+    # It is a ratio, not noise about zero: half of the draws have nothing to show.
+    assert np.median(ratios) < 0.1 and min(ratios) > -0.1
+
+
+def test_a_field_larger_than_the_limit_stops_there() -> None:
+    made = field(np.random.default_rng(7), np.array([5.0, 0.01, 0.01]), each=10, n=80)
+    found = field_amplitudes(*made.sums)
+    assert found.log_px[0] == pytest.approx(math.log(LARGEST_FIELD_PX))
+    assert found.log_px.max() <= math.log(LARGEST_FIELD_PX) + 1e-12
+    averaged = averaged_field(*made.sums, found)
+    assert averaged.log_px.max() <= math.log(LARGEST_FIELD_PX) + 1e-9
+
+
+def test_a_field_without_any_effect_has_the_prior_mode() -> None:
+    octave = np.repeat(np.arange(3), 4)
+    found = field_amplitudes(1e-6 * np.eye(12), np.zeros(12), octave)
+    assert found.log_px == pytest.approx(CENTRE + STEP * np.arange(3), abs=1e-6)
+    assert found.likelihood_ratio == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize('sigma_px', [(0.0, 0.0, 0.0), (0.1, 0.05, 0.02)])
+def test_coefficients_are_the_mixture_of_dense_posteriors(sigma_px: tuple[float, ...]) -> None:
+    made = field(np.random.default_rng(8), np.array(sigma_px))
+    information, gradient, octave = made.sums
+    mode = field_amplitudes(information, gradient, octave)
+    averaged = averaged_field(information, gradient, octave, mode)
+    room = math.log(LARGEST_FIELD_PX) - mode.log_px.max()
+    shifts = averaged.log_px - mode.log_px[2]
+    assert shifts == pytest.approx(-8.0 + 0.25 * np.arange(len(shifts)))
+    assert shifts.max() <= room < shifts.max() + 0.25 or shifts.max() == pytest.approx(6.0)
+    logs, means, covariances = [], [], []
+    for shift in shifts:
+        log_px = mode.log_px + shift
+        logs.append(made.log_posterior(log_px))
+        inverse = np.linalg.inv(information + np.diag(np.exp(-2 * log_px[octave])))
+        means.append(inverse @ gradient)
+        covariances.append(inverse)
+    weight = np.exp(np.array(logs) - max(logs))
+    weight /= weight.sum()
+    assert averaged.weight == pytest.approx(weight, abs=1e-9)
+    mean = weight @ np.array(means)
+    apart = np.array(means) - mean
+    covariance = np.einsum('s,sij->ij', weight, covariances) + (apart.T * weight) @ apart
+    size = np.sqrt(np.diag(covariance))
+    assert averaged.mean / size == pytest.approx(mean / size, abs=1e-7)
+    assert averaged.covariance / np.outer(size, size) == pytest.approx(
+        covariance / np.outer(size, size), abs=1e-7
+    )
+
+
+@dataclass(frozen=True)
+class Images:
+    """Observations of m images, ``y_k = D_k s_k + H_k x + e``, unit noise; x is free."""
+
+    D: Floats  # (m, n, 3)
+    H: Floats  # (m, n, P)
+    y: Floats  # (m, n)
+
+    @property
+    def sums(self) -> ShapeSums:
+        """As the posterior forms them."""
+        D, H, y = self.D, self.H, self.y
+        return ShapeSums(
+            np.einsum('mni,mnj->mij', D, D),
+            np.einsum('mni,mn->mi', D, y),
+            np.einsum('mni,mnp->mip', D, H),
+            np.einsum('mnp,mnq->pq', H, H),
+            np.einsum('mnp,mn->p', H, y),
+        )
+
+    def log_likelihoods(self, log_px: Floats) -> Floats:
+        """Log density of contrasts free of x, for amplitudes (t, 3)."""
+        m, n, P = self.H.shape
+        K = null_space(self.H.reshape(m * n, P).T)
+        r = K.T @ self.y.ravel()
+        parts = []
+        for j in range(3):
+            A = np.zeros((m * n, m))
+            for k in range(m):
+                A[k * n : (k + 1) * n, k] = self.D[k, :, j]
+            parts.append(K.T @ A)
+        values = []
+        for one in log_px:
+            V = np.eye(len(r))
+            for A, s in zip(parts, np.exp(one), strict=True):
+                V += s**2 * A @ A.T
+            lower = np.linalg.cholesky(V)
+            white = np.linalg.solve(lower, r)
+            values.append(-0.5 * white @ white - np.log(np.diag(lower)).sum())
+        return np.array(values)
+
+
+def images(
+    rng: Generator,
+    sigma_px: tuple[float, ...],
+    m: int = 6,
+    n: int = 12,
+    memory: float = 0.0,
+    common: float = 7.0,
+) -> Images:
+    D = 3.0 * rng.normal(size=(m, n, 3))
+    # The common part of the shapes is that of the camera, and two parameters are others.
+    H = np.concatenate([D, rng.normal(size=(m, n, 2))], axis=2)
+    steps = rng.normal(size=(m, 3))
+    for k in range(1, m):
+        steps[k] = memory * steps[k - 1] + math.sqrt(1.0 - memory**2) * steps[k]
+    s = steps * sigma_px
+    y = np.einsum('mni,mi->mn', D, s) + common * H.sum(axis=2) + rng.normal(size=(m, n))
+    return Images(D, H, y)
+
+
+@pytest.mark.parametrize('sigma_px', [(3.0, 0.5, 0.0), (0.0, 0.0, 2.0), (0.3, 0.3, 0.3)])
+def test_the_mode_of_the_shapes_is_that_of_the_dense_posterior(
+    sigma_px: tuple[float, ...],
+) -> None:
+    made = images(np.random.default_rng(2), sigma_px)
+    best = shapes(made.sums).amplitudes
+
+    def log_posteriors(log_px: Floats) -> Floats:
+        prior = 0.5 * (((log_px - CENTRE) / SIGMA) ** 2).sum(axis=1)
+        return np.asarray(made.log_likelihoods(log_px) - prior)
+
+    none = np.full((1, 3), -60.0)
+    ratio = made.log_likelihoods(best.log_px[None]) - made.log_likelihoods(none)
+    assert best.likelihood_ratio == pytest.approx(2.0 * ratio[0], abs=1e-6)
+    rng = np.random.default_rng(3)
+    trials = rng.uniform(-14.0, math.log(LARGEST_SHAPE_PX), (300, 3))
+    near = best.log_px + 0.3 * rng.normal(size=(60, 3))
+    at_mode = log_posteriors(best.log_px[None])[0]
+    # Steps of a tenth of a logarithm: the curvature of six images is at most 2 m.
+    assert log_posteriors(np.concatenate([trials, near])).max() < at_mode + 0.05
+
+
+def test_planted_shapes_are_recovered_within_their_uncertainty() -> None:
+    found = np.array(
+        [
+            shapes(images(np.random.default_rng(seed), (2.0, 0.0, 0.5), m=20).sums).sigma_px
+            for seed in range(20)
+        ]
+    )
+    # 19 differences leave 1 / sqrt(38) of a logarithm.  The prior takes 0.04 off, as the interval
+    # of an uncertain variance adds.
+    for k, planted in ((0, 2.0), (2, 0.5)):
+        off = np.log(found[:, k] / planted)
+        assert abs(off.mean()) < 4.0 / math.sqrt(38.0 * 20.0)
+        assert 0.5 < off.std() * math.sqrt(38.0) < 1.5
+    assert np.median(found[:, 1]) < 0.01
+
+
+@pytest.mark.slow
+def test_sound_images_pass_their_one_percent_level_at_most_so_often() -> None:
+    rng = np.random.default_rng(4)
+    ratios = [
+        shapes(images(rng, (0.0, 0.0, 0.0), m=4, n=8).sums).amplitudes.likelihood_ratio
+        for _ in range(DRAWS)
+    ]
+    assert np.mean(np.array(ratios) > chi2.isf(0.01, 1)) <= 0.02
+    assert np.median(ratios) < 0.1 and min(ratios) > -0.1
+
+
+@pytest.mark.parametrize('m', [3, 40])
+def test_few_images_have_the_interval_of_an_uncertain_variance(m: int) -> None:
+    made = images(np.random.default_rng(5), (2.0, 0.0, 0.0), m=m, n=8)
+    found = shapes(made.sums)
+    best = found.amplitudes.log_px
+    shifts = np.linspace(-8.0, 6.0, 43)
+    shifts = shifts[shifts < math.log(LARGEST_SHAPE_PX) - best.max()]
+    at = best + shifts[:, None]
+    log_weight = made.log_likelihoods(at) - 0.5 * (((at - CENTRE) / SIGMA) ** 2).sum(axis=1)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    covered = norm.cdf(2.0) - norm.cdf(-2.0)
+
+    def outside(half: float) -> float:
+        return float(weight @ (1.0 - 2.0 * norm.sf(2.0 * half / np.exp(shifts))) - covered)
+
+    expected = np.exp(best) * brentq(outside, 1e-3, 1e3)
+    assert found.sigma_px == pytest.approx(expected, rel=1e-4)
+    over = found.sigma_px[0] / math.exp(best[0])
+    # Of Student's t with two degrees of freedom it is 2.3, of 39 1.03; the prior takes a part off.
+    assert (1.4 < over < 2.3) if m == 3 else (0.98 < over < 1.06)
+
+
+def test_a_shape_larger_than_the_limit_stops_there() -> None:
+    made = images(np.random.default_rng(6), (500.0, 0.0, 0.0))
+    found = shapes(made.sums)
+    assert found.amplitudes.log_px[0] == pytest.approx(math.log(LARGEST_SHAPE_PX), abs=0.11)
+    assert found.sigma_px[0] <= LARGEST_SHAPE_PX * 1.001
+
+
+def without_shared(made: Images, sigma_px: Floats) -> Floats:
+    """Gradients (m, 3) of the shapes, the shared unknowns of the dense joint solution known."""
+    sums = made.sums
+    m, _, P = sums.cross.shape
+    N = np.zeros((P + 3 * m, P + 3 * m))
+    N[:P, :P] = sums.shared_information
+    for k in range(m):
+        own = slice(P + 3 * k, P + 3 * k + 3)
+        N[own, own] = sums.information[k] + np.diag(sigma_px**-2.0)
+        N[own, :P], N[:P, own] = sums.cross[k], sums.cross[k].T
+    x = np.linalg.solve(N, np.concatenate([sums.shared_gradient, sums.gradient.ravel()]))[:P]
+    return np.asarray(sums.gradient - sums.cross @ x)
+
+
+def common_px2(made: Images, sigma_px: Floats, k: int) -> float:
+    """Variance that all images share, by dense contrasts."""
+    m, sums = len(made.D), made.sums
+    shown = without_shared(made, sigma_px)[:, k] / sums.information[:, k, k]
+    noise = np.diag(1.0 / sums.information[:, k, k])
+    K = null_space(np.ones((1, m)))
+    apart = np.abs(np.subtract.outer(np.arange(m), np.arange(m)))
+    evidence, ratio = [], []
+    # No correlation, one that decays and one that lasts.
+    for R, before in (
+        (np.eye(m), 0.5),
+        (0.9**apart, 0.45),
+        (0.5 * np.eye(m) + 0.5 * np.ones((m, m)), 0.05),
+    ):
+        found = 0.0
+        for log_px in np.linspace(math.log(1e-6), math.log(LARGEST_SHAPE_PX), 70):
+            V = K.T @ (noise + math.exp(2 * log_px) * R) @ K
+            likelihood = multivariate_normal.pdf(K.T @ shown, cov=V)
+            found += likelihood * math.exp(-0.5 * ((log_px - CENTRE) / SIGMA) ** 2)
+        evidence.append(before * found)
+        share = float(R[~np.eye(m, dtype=bool)].mean())
+        ratio.append(share / (1.0 - share))
+    return float(np.dot(evidence, ratio) / sum(evidence) * sigma_px[k] ** 2)
+
+
+@pytest.mark.parametrize('memory', [0.0, 0.95])
+def test_the_common_part_follows_from_the_correlation_in_time(memory: float) -> None:
+    made = images(np.random.default_rng(9), (3.0, 0.5, 0.3), 30, 40, memory, common=0.0)
+    found = shapes(made.sums)
+    expected = [common_px2(made, found.sigma_px, k) for k in range(3)]
+    assert found.common_px2 == pytest.approx(expected, rel=1e-3)
+    share = found.common_px2[0] / found.sigma_px[0] ** 2
+    assert share > 0.5 if memory else share < 0.2
+
+
+def test_images_without_stars_have_no_common_part() -> None:
+    made = images(np.random.default_rng(9), (3.0, 1.0, 0.3), m=7, memory=0.9)
+    one = Images(made.D[:1], made.H[:1], made.y[:1])
+    assert not shapes(one.sums).common_px2.any()
+    # An image that shows nothing drops out.
+    D, H, y = (np.concatenate([part, 0.0 * part[:1]]) for part in (made.D, made.H, made.y))
+    more = Images(D, H, y)
+    a, b = shapes(made.sums), shapes(more.sums)
+    assert b.common_px2 == pytest.approx(a.common_px2, rel=1e-6)
+    assert b.sigma_px == pytest.approx(a.sigma_px, rel=1e-6)
+
+
+def test_the_interval_of_a_normal_is_its_sigma() -> None:
+    assert interval_factor(np.array([0.1, 0.3, 5.0]), np.array([0.0, 2.0, 0.0])) == pytest.approx(
+        0.3, rel=1e-9
+    )
+
+
+@pytest.mark.parametrize('freedom', [2, 5, 50])
+def test_the_interval_is_that_of_students_t(freedom: int) -> None:
+    # A normal whose variance is one over a chi^2 per degree of freedom is Student's t.
+    sigma = np.exp(np.linspace(-4.0, 9.0, 20001))
+    density = chi2.pdf(freedom / sigma**2, freedom) * 2.0 * freedom / sigma**2
+    covered = norm.cdf(2.0) - norm.cdf(-2.0)
+    expected = student_t.ppf(0.5 + covered / 2.0, freedom) / 2.0
+    assert interval_factor(sigma, density) == pytest.approx(expected, rel=1e-3)

@@ -1,0 +1,213 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The arrow of normal equations is that of the dense problem of four images."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from four_images import CAMERA, Dense, dense, IMAGES, prior_precision, SHAPE, Small, usual  # type: ignore[import-not-found]
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+from starcal_ros.arrays import Floats
+from starcal_ros.estimation.equations import (
+    chain,
+    Equations,
+    equations,
+    information_of_images,
+    star_sums,
+    stars_alone,
+)
+from starcal_ros.estimation.levenberg_marquardt import NotObservable
+from starcal_ros.estimation.problem import image_blocks
+from starcal_ros.estimation.unknowns import unknowns_in_state
+
+# Finite differences leave 1e-10 of a derivative, and attitude errors of 20 arcsec, which enter the
+# derivatives of the star trackers to first order, 1e-8.
+EXACT = 5e-8
+
+
+@pytest.fixture(scope='module')
+def given() -> Small:
+    return usual()[0]
+
+
+@pytest.fixture(scope='module')
+def truth() -> Dense:
+    return usual()[1]
+
+
+@pytest.fixture(scope='module')
+def arrow(given: Small) -> Equations:
+    return equations(given.sums(), given.problem, given.state, given.layout, SHAPE)
+
+
+def scaled(difference: Floats, matrix: NDArray[np.floating]) -> float:
+    """Largest element of a difference in units of the diagonal of a matrix."""
+    size = np.sqrt(np.diag(matrix))
+    return float(np.abs(difference / np.outer(size, size)).max())
+
+
+def dense_arrow(given: Small, truth: Dense) -> tuple[Floats, Floats]:
+    """Information of all unknowns with the prior of the shapes only, and gradient."""
+    X = np.concatenate([truth.stars, truth.trackers])
+    r = np.concatenate([truth.residual, -truth.error])
+    N = X.T @ X
+    of_image = prior_precision(given, SHAPE, None)[given.layout.count :]
+    own = np.arange(given.layout.count, len(N))
+    N[own, own] += of_image
+    return N, X.T @ r
+
+
+def test_information_is_the_dense_one_with_the_images_eliminated(
+    given: Small, truth: Dense, arrow: Equations
+) -> None:
+    N, g = dense_arrow(given, truth)
+    P = given.layout.count
+    C = N[P:, P:]
+    information = N[:P, :P] - N[:P, P:] @ np.linalg.solve(C, N[P:, :P])
+    gradient = g[:P] - N[:P, P:] @ np.linalg.solve(C, g[P:])
+    assert scaled(arrow.information - information, N[:P, :P]) < EXACT
+    size = np.sqrt(np.diag(N)[:P]) * np.linalg.norm(truth.residual)
+    assert np.abs((arrow.gradient - gradient) / size).max() < EXACT
+    assert np.array_equal(arrow.information, arrow.information.T)
+
+
+def test_unknowns_of_the_images_follow_the_shared_ones(
+    given: Small, truth: Dense, arrow: Equations
+) -> None:
+    N, g = dense_arrow(given, truth)
+    P = given.layout.count
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=P) / np.sqrt(np.diag(N)[:P])
+    C = N[P:, P:]
+    y = np.linalg.solve(C, g[P:] - N[P:, :P] @ x)
+    sigma = 1.0 / np.sqrt(np.diag(C))
+    assert (arrow.own - arrow.back @ x).ravel() / sigma == pytest.approx(y / sigma, abs=1e-5)
+    covariance = np.linalg.inv(C)
+    for k in range(IMAGES):
+        own = slice(6 * k, 6 * k + 6)
+        expected = covariance[own, own]
+        assert scaled(arrow.covariance[k] - expected, expected) < EXACT
+
+
+def test_an_image_that_nothing_holds_stays_and_adds_nothing(given: Small) -> None:
+    keep = given.keep & (given.table.image != 2)
+    sigma = given.problem.star_tracker_sigma_rad.copy()
+    sigma[2] = np.inf
+    problem = dataclasses.replace(given.problem, star_tracker_sigma_rad=sigma)
+    without = dataclasses.replace(given, keep=keep, problem=problem)
+    arrow = equations(without.sums(), problem, given.state, given.layout, SHAPE)
+    assert not arrow.own[2].any() and not arrow.back[2].any()
+    assert arrow.covariance[2] == pytest.approx(np.diag(np.r_[1.0, 1.0, 1.0, SHAPE**2]))
+    assert arrow.back[1].any()
+    # The images are independent: the others give what they give together with it, less its part.
+    whole = dense(without)
+    N, _ = dense_arrow(without, whole)
+    P = given.layout.count
+    others = np.r_[P : P + 12, P + 18 : P + 24]
+    cross = N[:P, others]
+    information = N[:P, :P] - cross @ np.linalg.solve(N[np.ix_(others, others)], cross.T)
+    assert scaled(arrow.information - information, N[:P, :P] + np.eye(P) * 1e-300) < EXACT
+
+
+def test_an_image_that_its_star_tracker_alone_holds_follows_it(given: Small) -> None:
+    keep = given.keep & (given.table.image != 1)
+    without = dataclasses.replace(given, keep=keep)
+    arrow = equations(without.sums(), given.problem, given.state, given.layout, SHAPE)
+    at = given.layout.of(['alignment'])
+    # Its rotation is that of the alignment in the camera frame of its temperature.
+    entry = given.layout['alignment'].tracker
+    assert entry is not None
+    assert arrow.back[1][:3, at] == pytest.approx(-entry[1], abs=1e-9)
+
+
+def test_the_sums_do_not_depend_on_the_order_of_stars_and_images(given: Small) -> None:
+    order = np.lexsort((np.random.default_rng(1).random(len(given.table)), given.table.image))
+    table = dataclasses.replace(
+        given.table,
+        **{
+            name: getattr(given.table, name)[order]
+            for name in (
+                'image',
+                'catalog_id',
+                'star',
+                'direction_icrf',
+                'magnitude',
+                'measured_px',
+                'covariance_px2',
+            )
+        },
+    )
+    shuffled = dataclasses.replace(given, table=table, keep=given.keep[order])
+    one, other = given.sums(), shuffled.sums()
+    for name in ('blocks', 'field_information', 'field_cross'):
+        a, b = getattr(one, name), getattr(other, name)
+        assert b == pytest.approx(a, rel=1e-9, abs=1e-11 * np.abs(a).max())
+
+
+def test_a_star_behind_the_camera_is_named(given: Small) -> None:
+    direction = given.table.direction_icrf.copy()
+    direction[3] *= -1.0
+    table = dataclasses.replace(given.table, direction_icrf=direction)
+    behind = dataclasses.replace(given, table=table)
+    with pytest.raises(NotObservable, match='a star has no image'):
+        star_sums(
+            behind.measurements(), given.problem, given.state, given.layout, given.predicted_px
+        )
+
+
+def test_the_chain_turns_camera_columns_into_unknowns(given: Small) -> None:
+    E = chain(given.problem, given.layout, IMAGES)
+    p = len(CAMERA.parameters)
+    for k in range(IMAGES):
+        above_k = given.problem.above_reference_k[k]
+        factor = 1.0 + given.state.focal @ [above_k, above_k**2]
+        assert np.diag(E[k])[:3] == pytest.approx(factor)
+        assert E[k][:3, p] == pytest.approx(given.state.parameters[:3] * above_k)
+        assert E[k][:3, p + 1] == pytest.approx(given.state.parameters[:3] * above_k**2)
+        # Rows: camera, velocity and read-out, rotation, residual.
+        assert E[k][p:-1, p + 2 : p + 9] == pytest.approx(np.eye(7))
+        assert E[k][:3, -4:-1] == pytest.approx(
+            np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, -1.0, 0.0]])
+        )
+        assert E[k][-1, -1] == 1.0 and not E[k][-1, :-1].any() and not E[k][:-1, -1].any()
+
+
+def test_the_information_of_the_images_without_field_and_shapes_is_the_dense_one(
+    given: Small, truth: Dense
+) -> None:
+    layout = unknowns_in_state(given.problem, given.state)
+    _, blocks = image_blocks(given.problem, given.state, given.measurements())
+    each = information_of_images(stars_alone(blocks), given.problem, given.state, layout)
+    P = given.layout.count
+    at = given.layout.of([e.name for e in layout.shared])
+    for k in range(IMAGES):
+        stars = np.repeat(given.table.image == k, 2)
+        X = np.concatenate([truth.stars[stars], truth.trackers[3 * k : 3 * k + 3]])
+        N = X.T @ X
+        own = P + 6 * k + np.arange(3)
+        cross = N[np.ix_(at, own)]
+        expected = N[np.ix_(at, at)] - cross @ np.linalg.solve(N[np.ix_(own, own)], cross.T)
+        # In units of all images: one star tracker shows no error of the mounting of another.
+        size = np.sqrt(np.diag(truth.stars.T @ truth.stars + truth.trackers.T @ truth.trackers))
+        difference = (each[k] - expected) / np.outer(size[at], size[at])
+        assert np.abs(difference).max() < EXACT
+    # The same arrow, from the sums of the whole list.
+    arrow = equations(stars_alone(blocks), given.problem, given.state, layout, SHAPE)
+    size = np.diag(each.sum(axis=0))
+    assert arrow.information / np.sqrt(np.outer(size, size)) == pytest.approx(
+        each.sum(axis=0) / np.sqrt(np.outer(size, size)), abs=1e-9
+    )
+
+
+def test_an_image_without_stars_and_star_tracker_has_no_information(given: Small) -> None:
+    sigma = given.problem.star_tracker_sigma_rad.copy()
+    sigma[2] = np.inf
+    problem = dataclasses.replace(given.problem, star_tracker_sigma_rad=sigma)
+    without = dataclasses.replace(given, keep=given.keep & (given.table.image != 2))
+    layout = unknowns_in_state(problem, given.state)
+    _, blocks = image_blocks(problem, given.state, without.measurements())
+    each = information_of_images(stars_alone(blocks), problem, given.state, layout)
+    assert not each[2].any() and all(each[k].any() for k in (0, 1, 3))

@@ -1,0 +1,286 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Outliers: bad observations, stars and images are left out, sound ones are not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+import pytest
+from scipy.stats import chi2
+
+from starcal_ros.arrays import Floats, Mask
+from starcal_ros.estimation.reweighting import (
+    dropped_stars,
+    FEWEST_STARS,
+    fitting_stars,
+    misfit_images,
+)
+from starcal_ros.estimation.shared_errors import Groups, pairs_of
+from starcal_ros.estimation.star_equations import StarTable
+
+IMAGES, STARS = 12, 30
+SIGMA_PX = 0.2
+
+
+def table_of(image: NDArray[np.integer], star: NDArray[np.integer]) -> StarTable:
+    n = len(image)
+    return StarTable(
+        image=np.asarray(image, np.int64),
+        catalog_id=np.asarray(star, np.int64) * 10 + 5,
+        star=np.asarray(star, np.int64),
+        direction_icrf=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        magnitude=np.full(n, 5.0, np.float32),
+        measured_px=np.zeros((n, 2)),
+        covariance_px2=np.tile([SIGMA_PX**2, 0.0, SIGMA_PX**2], (n, 1)),
+        image_count=int(max(image)) + 1,
+    )
+
+
+def usual() -> tuple[StarTable, Floats]:
+    """Twelve images of the same thirty stars, and sound residuals."""
+    image, star = np.divmod(np.arange(IMAGES * STARS), STARS)
+    residual = SIGMA_PX * np.random.default_rng(1).normal(size=(len(image), 2))
+    return table_of(image, star), np.clip(residual, -3.0 * SIGMA_PX, 3.0 * SIGMA_PX)
+
+
+def fits(residual: Floats, table: StarTable, place_px2: float = 0.0) -> Mask:
+    return fitting_stars(residual, table.covariance_px2, place_px2, table, apart(table), 4.5)
+
+
+def apart(table: StarTable) -> Groups:
+    """Return cells of the detector that no two observations share."""
+    return Groups('cells', np.arange(len(table)), np.arange(len(table)))
+
+
+def test_sound_stars_are_all_used() -> None:
+    table, residual = usual()
+    kept = fits(residual, table)
+    assert kept.all()
+    assert len(dropped_stars(table, kept)) == 0
+
+
+def test_an_outlier_is_left_out_alone_at_the_length_of_its_residual() -> None:
+    table, residual = usual()
+    u, v = 4.6 * SIGMA_PX * np.array([0.6, -0.8])
+    residual[37] = u, v
+    residual[111] = 4.4 * SIGMA_PX, 0.0
+    assert np.flatnonzero(~fits(residual, table)).tolist() == [37]
+    # A star that is seen twice cannot be told from its images.
+    assert len(dropped_stars(table, fits(residual, table))) == 0
+
+
+def test_what_neighbours_on_the_detector_share_is_no_outlier() -> None:
+    table, residual = usual()
+    residual *= 0.2  # so that the sums below are those of the bump
+    # Cells of nine stars: in the first, the lens moves all by 7 sigma; one star has an error too.
+    cell = np.arange(len(table)) // 9
+    bump = 7.0 * SIGMA_PX * np.array([0.6, 0.8])
+    residual[cell == 0] += bump
+    residual[4] = -40.0 * bump
+    # A lone error in the second one, and two that have nothing in common in the third.
+    residual[12] += bump
+    residual[[20, 23]] = bump, -bump
+    cells = Groups('cells', cell, pairs_of(cell, table.star))
+    kept = fitting_stars(residual, table.covariance_px2, 0.0, table, cells, 4.5)
+    assert np.flatnonzero(~kept).tolist() == [4, 12, 20, 23]
+    assert np.count_nonzero(~fits(residual, table)) == 9 + 3
+
+
+def test_images_of_one_star_are_no_neighbours_of_each_other() -> None:
+    table, residual = usual()
+    # Thirty images at one pointing: a star with a wrong place is in one cell of the detector.
+    residual[table.star == 8] += [7.0 * SIGMA_PX, 0.0]
+    cells = Groups('cells', table.star, pairs_of(table.star, table.star))
+    kept = fitting_stars(residual, table.covariance_px2, 0.0, table, cells, 4.5)
+    assert np.flatnonzero(~kept).tolist() == np.flatnonzero(table.star == 8).tolist()
+
+
+def test_a_star_that_is_an_outlier_in_most_of_its_images_is_left_out_of_all() -> None:
+    table, residual = usual()
+    for star, misses in ((4, 7), (9, 6)):
+        rows = np.flatnonzero(table.star == star)
+        residual[rows] = 0.0
+        residual[rows[:misses], 0] = 9.0 * SIGMA_PX
+    kept = fits(residual, table)
+    assert not kept[table.star == 4].any()
+    assert kept[table.star == 9].sum() == 6
+    assert dropped_stars(table, kept).tolist() == [45]
+
+
+def test_a_star_whose_residuals_together_are_too_large_is_left_out() -> None:
+    table, residual = usual()
+    # Half of the level on each of 24 axes is a chance of 1 in 10^7 for sound stars.
+    level = math.sqrt(chi2.isf(1e-7, 2 * IMAGES) / IMAGES) * SIGMA_PX
+    for star, share in ((3, 1.02), (7, 0.98)):
+        residual[table.star == star] = share * level * np.array([0.6, 0.8])
+    kept = fits(residual, table)
+    assert not kept[table.star == 3].any()
+    assert kept[table.star == 7].all()
+    assert kept.sum() == len(table) - IMAGES
+    assert dropped_stars(table, kept).tolist() == [35]
+
+
+def test_a_star_of_two_images_is_not_judged_as_a_star() -> None:
+    table, residual = usual()
+    few = table.star.copy()
+    # Star 3 only twice, star 4 three times; the others are of stars of their own.
+    for star, sightings in ((3, 2), (4, 3)):
+        rows = np.flatnonzero(few == star)[sightings:]
+        few[rows] = few.max() + 1 + np.arange(len(rows))
+    table = table_of(table.image, few)
+    residual[(few == 3) | (few == 4)] = 4.4 * SIGMA_PX / math.sqrt(2.0)
+    kept = fits(residual, table)
+    assert kept[few == 3].all()
+    assert not kept[few == 4].any()
+    assert dropped_stars(table, kept).tolist() == [45]
+
+
+def test_the_variance_of_a_place_does_not_drop_good_stars() -> None:
+    # All images of a star share the error of its place: their residuals are one large number.
+    rng = np.random.default_rng(2)
+    m, n = 60, 200
+    image, star = np.divmod(np.arange(m * n), n)
+    place_px2 = 3.0 * SIGMA_PX**2
+    table = table_of(image, star)
+    covariance = table.covariance_px2 + place_px2 * np.array([1.0, 0.0, 1.0])
+    place = math.sqrt(place_px2) * rng.normal(size=(n, 2))
+    residual = place[star] + SIGMA_PX * rng.normal(size=(m * n, 2))
+    kept = fitting_stars(residual, covariance, place_px2, table, apart(table), 4.5)
+    assert kept.mean() > 0.999
+    assert len(dropped_stars(table, kept)) == 0
+    alone = fitting_stars(residual, covariance, 0.0, table, apart(table), 4.5)
+    assert len(dropped_stars(table, alone)) > 5
+    # A place that is wrong beyond that variance goes.
+    residual[star == 17] += [7.0 * math.sqrt(place_px2 + SIGMA_PX**2), 0.0]
+    kept = fitting_stars(residual, covariance, place_px2, table, apart(table), 4.5)
+    assert kept[star == 18].all()
+    assert not kept[star == 17].any()
+
+
+def test_an_image_with_too_few_of_its_stars_is_not_used() -> None:
+    table, residual = usual()
+    left = FEWEST_STARS - 1
+    for image, stars in ((2, left), (5, FEWEST_STARS)):
+        rows = np.flatnonzero(table.image == image)
+        residual[rows[stars:], 1] = 50.0 * SIGMA_PX
+    kept = fits(residual, table)
+    assert not kept[table.image == 2].any()
+    assert kept[table.image == 5].sum() == 3
+    assert kept.sum() == len(table) - 2 * STARS + 3
+
+
+def attitudes(
+    rng: Generator, m: int, sigma: float = 1.0
+) -> tuple[Floats, Floats, NDArray[np.integer]]:
+    """Attitude errors (m, 3), their variances by the stars, and times, a minute apart."""
+    error = sigma * rng.normal(size=(m, 3))
+    return error, np.full((m, 3), 1e-3, np.float64), 10**18 + 60 * 10**9 * np.arange(m)
+
+
+def judged(
+    error: Floats,
+    variance: Floats,
+    time_ns: NDArray[np.integer],
+    seen: Mask | None = None,
+    tracker: NDArray[np.integer] | None = None,
+) -> Mask:
+    m = len(error)
+    return misfit_images(
+        error,
+        variance,
+        np.ones(m, bool) if seen is None else seen,
+        np.asarray(np.zeros(m) if tracker is None else tracker, np.int64),
+        np.asarray(time_ns, np.int64),
+    )
+
+
+def test_sound_images_are_no_misfits() -> None:
+    rng = np.random.default_rng(3)
+    for m in (3, 6, 40):
+        for _ in range(50):
+            assert not judged(*attitudes(rng, m)).any()
+
+
+@pytest.mark.parametrize('m', [4, 12, 36])
+@pytest.mark.parametrize('axis', [0, 1, 2])
+def test_an_attitude_that_jumps_is_a_misfit(m: int, axis: int) -> None:
+    error, variance, time_ns = attitudes(np.random.default_rng(4), m, 0.5)
+    error[1, axis] -= 9.0
+    assert np.flatnonzero(judged(error, variance, time_ns)).tolist() == [1]
+    error[1, axis] += 5.0
+    assert not judged(error, variance, time_ns).any()
+
+
+def test_the_limit_is_six_sigma_of_the_stated_noise() -> None:
+    error = np.zeros((9, 3))
+    variance, time_ns = np.zeros((9, 3)), np.arange(9) * 10**9
+    error[4, 1] = 5.9
+    assert not judged(error, variance, time_ns).any()
+    error[4, 1] = 6.1
+    assert judged(error, variance, time_ns)[4]
+    # Few stars do not show it.
+    variance[4, 1] = 1.2
+    assert not judged(error, variance, time_ns).any()
+
+
+def test_the_limit_grows_with_the_scatter_of_the_images() -> None:
+    rng = np.random.default_rng(5)
+    error, variance, time_ns = attitudes(rng, 60, 4.0)
+    error = np.clip(error, -10.0, 10.0)
+    error[7, 0] = 18.0
+    assert not judged(error, variance, time_ns).any()
+    error[7, 0] = 40.0
+    assert np.flatnonzero(judged(error, variance, time_ns)).tolist() == [7]
+
+
+@pytest.mark.parametrize('m', [8, 36])
+def test_a_star_tracker_that_drifts_has_no_misfits(m: int) -> None:
+    rng = np.random.default_rng(6)
+    error, variance, time_ns = attitudes(rng, m)
+    # 48 sigma from the first image to the last.
+    error += np.linspace(-24.0, 24.0, m)[:, None] * [1.0, -0.5, 0.2]
+    assert not judged(error, variance, time_ns).any()
+    error[m // 2, 2] += 15.0
+    assert np.flatnonzero(judged(error, variance, time_ns)).tolist() == [m // 2]
+
+
+def test_star_trackers_are_judged_apart() -> None:
+    # One of three drifts by 240 arcsec over 36 images, at a stated sigma of 5 arcsec; the
+    # alignments of the others are off by as much.
+    rng = np.random.default_rng(7)
+    error, variance, time_ns = attitudes(rng, 36)
+    tracker = np.arange(36) % 3
+    drifts = tracker == 1
+    error[drifts] += np.linspace(0.0, 48.0, 12)[:, None] * [1.0, 0.0, 0.0]
+    error[tracker == 2] += [0.0, -48.0, 0.0]
+    assert not judged(error, variance, time_ns, tracker=tracker).any()
+    # As one star tracker, some would be; and a jump of one of the drifting one is found.
+    error[16, 1] += 20.0
+    assert np.flatnonzero(judged(error, variance, time_ns, tracker=tracker)).tolist() == [16]
+
+
+def test_without_a_majority_there_is_no_misfit() -> None:
+    error = np.zeros((9, 3))
+    time_ns = np.arange(9) * 10**9
+    error[[0, 3, 7], 0] = [100.0, -90.0, 80.0]
+    assert judged(error, np.zeros((9, 3)), time_ns).sum() == 3
+    error[5, 0] = 120.0
+    assert not judged(error, np.zeros((9, 3)), time_ns).any()
+
+
+def test_two_attitudes_cannot_show_which_is_wrong() -> None:
+    error = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
+    assert not judged(error, np.zeros((2, 3)), np.arange(2) * 10**9).any()
+
+
+def test_images_without_stars_enough_are_not_judged() -> None:
+    error, variance, time_ns = attitudes(np.random.default_rng(8), 12, 0.3)
+    seen = np.ones(12, bool)
+    seen[:5] = False
+    error[:5] = 1e3
+    error[8, 1] = 20.0
+    found = judged(error, variance, time_ns, seen=seen)
+    assert np.flatnonzero(found).tolist() == [8]

@@ -1,0 +1,257 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Errors of a star tracker: dense restricted likelihoods, and the mean's sigma in simulations."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.random import Generator
+import pytest
+from scipy.linalg import null_space
+from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
+
+from starcal_ros.arrays import Floats
+from starcal_ros.estimation import tracker_errors as module
+from starcal_ros.estimation.amplitudes import interval_factor
+from starcal_ros.estimation.tracker_errors import tracker_errors, TrackerErrors
+
+CADENCE_NS = 60 * 10**9
+
+
+def found_of(
+    error: Floats,
+    variance: float = 1e-4,
+    *,
+    is_stated: bool = True,
+    stated_slow: float = 0.0,
+    attitudes: Rotation | None = None,
+) -> TrackerErrors:
+    """Posterior of errors (m, 3), an image a minute; attitudes far apart by default."""
+    m = len(error)
+    if attitudes is None:
+        attitudes = Rotation.random(m, random_state=np.random.default_rng(77))
+    time_ns = 10**18 + CADENCE_NS * np.arange(m)
+    return tracker_errors(
+        error, np.full((m, 3), variance), time_ns, attitudes, is_stated, stated_slow
+    )
+
+
+def walk(rng: Generator, m: int, time: float, size: float) -> Floats:
+    """Stationary Ornstein-Uhlenbeck walks (m, 3); ``time`` in images."""
+    rho = math.exp(-1.0 / time)
+    steps = rng.normal(size=(m, 3))
+    for k in range(1, m):
+        steps[k] = rho * steps[k - 1] + math.sqrt(1.0 - rho**2) * steps[k]
+    return np.asarray(size * steps)
+
+
+def test_the_restricted_likelihood_is_that_of_dense_contrasts() -> None:
+    rng = np.random.default_rng(1)
+    m = 7
+    error = rng.normal(size=(m, 3))
+    time = np.arange(m)
+    K = np.exp(-np.abs(np.subtract.outer(time, time)) / 3.0)
+    slow2, noise2 = np.array([0.0, 0.3, 2.0]), np.array([0.5, 1.0])
+    of_stars = 0.4
+    values, information = module._restricted(K, error, slow2, noise2, of_stars, 1.0)
+    contrasts = null_space(np.ones((1, m)))
+    expected = np.zeros((3, 2))
+    for i, s2 in enumerate(slow2):
+        for j, n2 in enumerate(noise2):
+            V = s2 * K + n2 * np.eye(m)
+            within = contrasts.T @ (V + of_stars * np.eye(m)) @ contrasts
+            expected[i, j] = multivariate_normal.logpdf(error.T @ contrasts, cov=within).sum()
+            assert information[i, j] == pytest.approx(np.linalg.inv(V).sum())
+    assert values - values[0, 0] == pytest.approx(expected - expected[0, 0], abs=1e-9)
+
+
+def test_correlations_are_in_time_and_in_the_angle_of_the_boresights() -> None:
+    attitudes = Rotation.from_euler('xz', [[0, 0], [10, 40], [30, 80], [180, 0]], degrees=True)
+    time_ns = np.array([0, 10, 40, 100], np.int64) * 10**9
+    names, kernels = module._kernels(time_ns, attitudes, np.arange(4))
+    assert names == [
+        'over 30 s',
+        'over 100 s',
+        'over 300 s',
+        'over 1e+03 s',
+        'over 10 deg',
+        'over 30 deg',
+        'over 60 deg',
+    ]
+    apart = np.abs(np.subtract.outer([0, 10, 40, 100], [0, 10, 40, 100]))
+    for share, K in zip((0.3, 1.0, 3.0, 10.0), kernels[:4], strict=True):
+        assert pytest.approx(np.exp(-apart / (100.0 * share))) == K
+    for width, K in zip((10.0, 30.0, 60.0), kernels[4:], strict=True):
+        assert np.diag(K) == pytest.approx(1.0)
+        assert K[0, 1] == pytest.approx(math.exp(-0.5 * (10.0 / width) ** 2))
+        assert K[0, 2] == pytest.approx(math.exp(-0.5 * (30.0 / width) ** 2))
+        assert K[0, 3] == pytest.approx(math.exp(-0.5 * (180.0 / width) ** 2))
+
+
+def brute(error: Floats, variance: float, is_stated: bool, stated_slow: float) -> TrackerErrors:
+    """Posterior by dense matrices: covariance, sigma of the mean and sizes, no interval."""
+    m = len(error)
+    attitudes = Rotation.random(m, random_state=np.random.default_rng(77))
+    names, kernels = module._kernels(10**18 + CADENCE_NS * np.arange(m), attitudes, np.arange(m))
+    contrasts = null_space(np.ones((1, m)))
+    logs, slows, noises, covariances, of_mean = [], [], [], [], []
+    log_likelihoods, plain = [], []
+    for K in kernels:
+        for a in np.linspace(-4.5, 4.0, 18):
+            for b in np.linspace(-2.1, 2.8, 15):
+                slow2 = ((stated_slow or 1.0) * math.exp(a)) ** 2
+                noise2 = math.exp(2 * b)
+                V = slow2 * K + noise2 * np.eye(m)
+                within = contrasts.T @ (V + variance * np.eye(m)) @ contrasts
+                one = multivariate_normal.logpdf(error.T @ contrasts, cov=within).sum()
+                log_likelihoods.append(one)
+                if a == -4.5:
+                    plain.append(one)
+                wide = 0.3 if stated_slow else 1.25
+                one -= 0.5 * (a / wide) ** 2
+                one -= 0.5 * (b / (0.5 if is_stated else 3.0)) ** 2
+                logs.append(one)
+                slows.append(slow2)
+                noises.append(noise2)
+                covariances.append(V)
+                of_mean.append(np.linalg.inv(V).sum() ** -0.5)
+    weight = np.exp(np.array(logs) - max(logs))
+    weight /= weight.sum()
+    covariance = np.einsum('s,sij->ij', weight, covariances)
+    half = interval_factor(np.array(of_mean), weight)
+    shrunk = min(half**2 * m**2 / covariance.sum(), 1.0)
+    covariance *= shrunk
+    return TrackerErrors(
+        math.sqrt(weight @ noises),
+        math.sqrt(weight @ slows),
+        covariance,
+        np.arange(m),
+        math.sqrt(m) * half,
+        2.0 * (max(log_likelihoods) - max(plain)),
+        names[int(np.argmax(weight.reshape(len(names), -1).sum(axis=1)))],
+        shrunk * float(weight @ noises),
+    )
+
+
+@pytest.mark.parametrize(('is_stated', 'stated_slow'), [(True, 0.0), (False, 0.0), (True, 2.0)])
+@pytest.mark.parametrize('seed', [1, 2])
+def test_the_posterior_is_the_dense_average_over_the_grid(
+    seed: int, is_stated: bool, stated_slow: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    error = rng.normal(size=(6, 3)) + walk(rng, 6, 10.0, 2.0 * (seed - 1))
+    found = found_of(error, 0.04, is_stated=is_stated, stated_slow=stated_slow)
+    expected = brute(error, 0.04, is_stated, stated_slow)
+    assert found.noise == pytest.approx(expected.noise, rel=1e-9)
+    assert found.slow == pytest.approx(expected.slow, rel=1e-9)
+    assert found.working == pytest.approx(expected.working, rel=1e-9)
+    assert found.covariance == pytest.approx(expected.covariance, rel=1e-9)
+    assert found.likelihood_ratio == pytest.approx(expected.likelihood_ratio, abs=1e-8)
+    assert found.correlation == expected.correlation
+    assert found.independent == pytest.approx(expected.independent, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('noise', 'slow', 'time', 'low', 'high'),
+    [
+        (1.0, 0.0, 1.0, 0.2, 1.1),
+        (2.0, 0.0, 1.0, 0.2, 1.1),
+        (1.0, 3.0, 8.0, 0.3, 1.15),
+        (0.5, 2.0, 40.0, 0.3, 1.3),
+    ],
+)
+def test_the_sigma_of_the_mean_covers_white_noise_and_walks(
+    noise: float, slow: float, time: float, low: float, high: float
+) -> None:
+    # A slow error as large as the noise stays until the images say otherwise: for white noise the
+    # sigma is three times too large.
+    rng = np.random.default_rng(3)
+    m, over = 24, []
+    for _ in range(60):
+        error = noise * rng.normal(size=(m, 3)) + walk(rng, m, time, slow)
+        found = found_of(error)
+        over.append(error.mean(axis=0) * math.sqrt(m) / found.working)
+        # The covariance of all images has the mean's at most.
+        assert found.covariance.sum() / m <= found.working**2 * (1.0 + 1e-9)
+    rms = math.sqrt(np.mean(np.square(over)))
+    assert low < rms < high
+
+
+def test_white_noise_is_found_with_its_sigma_and_walks_are_not_noise() -> None:
+    rng = np.random.default_rng(4)
+    white = [found_of(1.5 * rng.normal(size=(30, 3))) for _ in range(20)]
+    assert np.mean([f.noise for f in white]) == pytest.approx(1.5, rel=0.08)
+    assert np.mean([f.likelihood_ratio for f in white]) < 2.0
+    assert min(f.likelihood_ratio for f in white) >= 0.0
+    slow = [found_of(0.5 * rng.normal(size=(30, 3)) + walk(rng, 30, 8, 4.0)) for _ in range(20)]
+    assert 2.0 < np.median([f.slow for f in slow]) < 8.0
+    assert np.median([f.noise for f in slow]) < 1.5
+    assert min(f.likelihood_ratio for f in slow) > 10.0
+    assert all(f.correlation.endswith(' s') for f in slow)
+
+
+def test_the_variance_by_the_stars_is_no_noise_of_the_star_tracker() -> None:
+    rng = np.random.default_rng(5)
+    noises = []
+    for _ in range(30):
+        error = math.sqrt(1.0 + 3.0) * rng.normal(size=(40, 3))
+        noises.append(found_of(error, 3.0).noise)
+    assert np.mean(noises) == pytest.approx(1.0, rel=0.2)
+    assert found_of(0.01 * rng.normal(size=(40, 3)), 3.0).noise < 1.0
+    # Few stars beside a star tracker a hundred times better: it keeps its weight.
+    found = found_of(100.0 * rng.normal(size=(16, 3)), 1e4)
+    assert found.working < 12.0 and found.covariance.max() < 30.0
+
+
+def test_errors_that_depend_on_the_attitude_are_named() -> None:
+    rng = np.random.default_rng(6)
+    fields = Rotation.random(4, random_state=rng)
+    which = rng.integers(0, 4, 40)
+    error = 4.0 * rng.normal(size=(4, 3))[which] + 0.3 * rng.normal(size=(40, 3))
+    found = found_of(error, attitudes=fields[which])
+    assert found.correlation.endswith(' deg')
+    # Images of one field share their error: the mean has four, not forty.
+    assert found.working / math.sqrt(40.0) > 1.0
+
+
+def test_a_data_sheet_counts_where_images_are_few() -> None:
+    rng = np.random.default_rng(7)
+    error = rng.normal(size=(4, 3))
+    unstated, small, large = (found_of(error, stated_slow=s).slow for s in (0.0, 0.1, 10.0))
+    assert small < 0.2 < unstated < 5.0 < large
+    assert found_of(5.0 * error, is_stated=False).noise > found_of(5.0 * error).noise
+    # A slow error that lasts longer than the campaign stays in the mean at its prior's size.
+    assert found_of(error, stated_slow=10.0).working / 2.0 > 5.0
+
+
+def test_times_may_be_equal() -> None:
+    error = np.random.default_rng(8).normal(size=(5, 3))
+    attitudes = Rotation.random(5, random_state=np.random.default_rng(1))
+    found = tracker_errors(error, np.full((5, 3), 1e-4), np.full(5, 10**18), attitudes, True, 0.0)
+    assert np.isfinite(found.covariance).all() and found.working > 0.3
+
+
+def test_groups_of_neighbours_give_the_posterior_of_all_images(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # 180 images of a slow walk, by themselves and in 60 groups of three.
+    rng = np.random.default_rng(4)
+    error = rng.normal(size=(180, 3)) + walk(rng, 180, 90.0, 2.0)
+    whole = found_of(error)
+    monkeypatch.setattr(module, '_MOST_GROUPS', 60)
+    found = found_of(error)
+    assert found.covariance.shape == (60, 60) and whole.covariance.shape == (180, 180)
+    assert np.array_equal(found.group, np.arange(180) // 3)
+    assert found.noise == pytest.approx(whole.noise, rel=0.02)
+    assert found.slow == pytest.approx(whole.slow, rel=0.05)
+    assert found.working == pytest.approx(whole.working, rel=0.05)
+    assert found.likelihood_ratio == pytest.approx(whole.likelihood_ratio, rel=0.1)
+
+
+def test_groups_are_neighbours_in_time_in_any_order_of_the_images() -> None:
+    time_ns = np.random.default_rng(5).permutation(403)
+    group = module.groups_of(time_ns)
+    assert np.array_equal(group, time_ns // 3)
+    assert np.array_equal(module.groups_of(time_ns[:200]), np.arange(200))

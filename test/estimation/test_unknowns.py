@@ -1,0 +1,309 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The list of unknowns: each derivative is that of an independent projection."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from four_images import (  # type: ignore[import-not-found]
+    ASSUMED,
+    CAMERA,
+    cosine,
+    Dense,
+    HEIGHT,
+    IMAGES,
+    octave_size,
+    octaves,
+    shared_steps,
+    Small,
+    small,
+    usual,
+    whitener,
+    WIDTH,
+)
+import numpy as np
+import pytest
+
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import rotation_jacobian
+from starcal_ros.estimation.attitude_errors import attitude_errors
+from starcal_ros.estimation.equations import star_columns, tracker_turns
+from starcal_ros.estimation.unknowns import Assumptions, moved, unknowns_in_state, unknowns_of
+
+# Finite differences are exact to 1e-10 of a column; attitude errors of 20 arcsec enter the
+# derivatives of the star trackers to first order, which leaves their square: 1e-8.
+EXACT = 2e-8
+
+
+@pytest.fixture(scope='module')
+def given() -> Small:
+    return usual()[0]
+
+
+@pytest.fixture(scope='module')
+def truth() -> Dense:
+    return usual()[1]
+
+
+def star_matrix(given: Small) -> tuple[Floats, Floats]:
+    """
+    Unwhitened derivatives (2 n, P + 6 m) of all pixels by the entries of the list; residuals.
+
+    Each entry by its own form: camera, turn or functions.
+    """
+    count, n = given.layout.count, len(given.table)
+    X = np.zeros((n, 2, count + 6 * IMAGES))
+    r = np.zeros((n, 2))
+    table, p = given.table, given.problem.camera_count
+    image = table.image
+    rotations = given.state.camera_from_icrf.as_matrix()[image]
+    e = np.einsum('nij,nj->ni', rotations, table.direction_icrf)
+    measurements = given.measurements()
+    for chunk, Z in star_columns(measurements, given.problem, given.state, given.layout):
+        real = chunk.whitener[0] > 0
+        rows = chunk.row[real]
+        white = np.zeros((len(rows), 2, 2))
+        white[:, 0, 0], white[:, 0, 1], white[:, 1, 1] = chunk.whitener[:, real]
+        plain = np.linalg.solve(white, Z.transpose(2, 0, 1)[real])
+        J = plain[:, :, :p]
+        for entry in given.layout.entries:
+            at = given.layout.places[entry.name]
+            if entry.camera is None:
+                continue
+            by = J @ entry.camera[image[rows]]
+            if entry.of_image:
+                for row, value in zip(rows, by, strict=True):
+                    first = count + 6 * image[row]
+                    X[row, :, first + at.start : first + at.stop] = value
+            else:
+                X[rows, :, at] = by
+        for row, value in zip(rows, plain[:, :, -4:-1], strict=True):
+            X[row, :, count + 6 * image[row] : count + 6 * image[row] + 3] = value
+        r[rows] = plain[:, :, -1]
+    # The turns again, with the documented rotation jacobian of the camera.
+    for entry in given.layout.shared:
+        at = given.layout.places[entry.name]
+        if entry.turn is not None:
+            turned = entry.turn(given.predicted_px.T, e.T, image)
+            for k in range(IMAGES):
+                here = image == k
+                own = given.state.parameters.copy()
+                above_k = given.problem.above_reference_k[k]
+                own[:3] *= 1.0 + sum(
+                    a * above_k ** (i + 1) for i, a in enumerate(given.state.focal)
+                )
+                J = rotation_jacobian(dataclasses.replace(CAMERA, parameters=own), e[here])
+                X[here, :, at] = np.einsum('nab,bqn->naq', J, turned[:, :, here])
+        if entry.functions is not None:
+            t = len(entry) // 2
+            values = entry.functions(given.predicted_px.T).T
+            X[:, 0, at.start : at.start + t] = values
+            X[:, 1, at.start + t : at.stop] = values
+    return X.reshape(2 * n, -1), r.ravel()
+
+
+def places(given: Small, name: str) -> np.ndarray:
+    """Columns of an entry in the dense matrices."""
+    at = given.layout.places[name]
+    if name == 'shape':
+        return np.concatenate(
+            [given.layout.count + 6 * k + np.arange(at.start, at.stop) for k in range(IMAGES)]
+        )
+    return np.arange(at.start, at.stop)
+
+
+@pytest.mark.parametrize('name', ['camera', 'focal', 'velocity', 'readout', 'field', 'shape'])
+def test_a_derivative_by_pixels_is_that_of_the_projection(
+    given: Small, truth: Dense, name: str
+) -> None:
+    X, _ = star_matrix(given)
+    white = whitener(given.table.covariance_px2) * np.repeat(given.keep, 2)[:, None]
+    at = places(given, name)
+    expected = truth.stars[:, at]
+    size = np.abs(expected).max(axis=0)
+    assert (size > 0).all()
+    assert np.abs(white @ X[:, at] - expected).max(axis=0) / size == pytest.approx(0.0, abs=EXACT)
+
+
+@pytest.mark.parametrize('name', ['alignment', 'rate', 'mountings', 'stamps'])
+def test_a_turn_against_the_star_tracker_is_that_of_the_attitudes(
+    given: Small, truth: Dense, name: str
+) -> None:
+    # The rotation of an image undoes a turn of the alignment: the ratio of the two is the entry.
+    at, turns = tracker_turns(given.layout)
+    turns = turns[:, :, np.isin(at, np.arange(given.layout.count)[places(given, name)])]
+    for k in range(IMAGES):
+        rows = slice(3 * k, 3 * k + 3)
+        rotation = given.layout.count + 6 * k + np.arange(3)
+        expected = truth.trackers[rows][:, places(given, name)]
+        found = -truth.trackers[rows][:, rotation] @ turns[k]
+        size = max(float(np.abs(truth.trackers[:, places(given, name)]).max()), 1e-300)
+        assert np.abs(found - expected).max() < EXACT * size
+
+
+def test_star_columns_end_with_the_residual(given: Small, truth: Dense) -> None:
+    _, r = star_matrix(given)
+    # Pixels near 1000 are rounded by 1e-13; directions and rotations by some times that.
+    expected = (given.table.measured_px - given.predicted_px) * given.keep[:, None]
+    assert r == pytest.approx(expected.ravel(), abs=1e-9)
+    assert np.abs(truth.residual).max() > 1.0
+
+
+def test_labels_have_a_name_and_a_unit_for_each_unknown(given: Small) -> None:
+    layout = given.layout
+    assert len(set(layout.labels)) == layout.count == len(layout.labels)
+    assert layout.labels[:12] == (
+        *CAMERA.parameter_names,
+        'focal_temperature_1',
+        'focal_temperature_2',
+    )
+    assert layout.labels[layout.places['stamps']] == ('stamp_offset_s',)
+    assert [e.name for e in layout.of_image] == ['shape']
+    assert layout.places['shape'] == slice(3, 6)
+    assert layout.places['field'].stop == layout.count
+    for entry in layout.entries:
+        assert len(entry.sigma) == len(entry.offset) == len(entry) > 0
+    taken = np.concatenate([layout.of([e.name]) for e in layout.shared])
+    assert np.array_equal(taken, np.arange(layout.count))
+    assert np.array_equal(layout.of(['readout', 'nothing', 'camera'])[1:], np.arange(10))
+    assert 'shape' in layout and 'field' in layout and 'nothing' not in layout
+    assert layout['velocity'].labels[1] == 'velocity_y_m_s'
+
+
+def test_priors_are_those_of_the_options(given: Small) -> None:
+    layout, problem = given.layout, given.problem
+    precision, offset = layout.prior_precision, layout.prior_offset
+    held = [CAMERA.parameter_names.index(name) for name in ('skew', 'k3')]
+    assert np.isposinf(precision[held]).all()
+    assert precision[[3, 4]] == pytest.approx(1 / 400.0)
+    assert precision[5] == pytest.approx(1 / 0.02**2)
+    assert not precision[layout.of(['focal', 'alignment', 'rate'])].any()
+    assert precision[layout.of(['mountings'])] == pytest.approx(problem.mounting_sigma_rad**-2)
+    assert precision[layout.of(['velocity'])] == pytest.approx(8000.0**-2)
+    assert precision[layout.of(['readout'])] == pytest.approx(0.02**-2)
+    assert precision[layout.of(['stamps'])] == pytest.approx(0.005**-2)
+    assert precision[layout.of(['field'])] == pytest.approx(octave_size(given) ** 2)
+    assert offset[:10] == pytest.approx(given.state.parameters - problem.prior_parameters)
+    assert offset[layout.of(['mountings'])] == pytest.approx(given.state.mountings)
+    assert offset[layout.of(['focal'])] == pytest.approx(given.state.focal)
+    assert offset[layout.of(['rate'])] == pytest.approx(given.state.rate)
+    assert offset[layout.of(['readout'])] == -0.004  # the state has none
+    assert not offset[layout.of(['alignment', 'velocity', 'stamps', 'field'])].any()
+
+
+def test_octaves_are_of_wavelengths_down_to_a_width_its_half_and_its_quarter(
+    given: Small,
+) -> None:
+    entry = given.layout['field']
+    assert entry.octave is not None and np.array_equal(entry.octave, octaves(given))
+    # All cosines down to a quarter of the width but the constant, for u and for v.
+    most = 12
+    i, j = np.meshgrid(np.arange(most), np.arange(2 * most), indexing='ij')
+    waves = np.hypot(i / 2.4, j * WIDTH / (2.4 * HEIGHT))
+    assert len(entry) == 2 * (np.count_nonzero(waves <= 4.0) - 1)
+    assert {'field_9_0_u_px', 'field_0_6_v_px', 'field_1_0_v_px'} <= set(entry.labels)
+
+
+def test_an_amplitude_of_one_is_about_the_rms_of_its_octave_along_each_axis(
+    given: Small,
+) -> None:
+    entry = given.layout['field']
+    assert entry.functions is not None and entry.octave is not None
+    u, v = (size * (np.arange(60) + 0.5) / 60 - 0.5 for size in (WIDTH, HEIGHT))
+    grid = np.stack([np.repeat(u, 60), np.tile(v, 60)])
+    phi = entry.functions(grid)
+    t = len(entry) // 2
+    for axis in (slice(0, t), slice(t, 2 * t)):
+        for octave in range(3):
+            terms = entry.octave[axis] == octave
+            variance = (entry.sigma[axis][terms, None] ** 2 * phi[terms] ** 2).sum(axis=0)
+            # The mean square is one over the longer domain of the cosines.
+            assert np.sqrt(variance.mean()) == pytest.approx(1.0, abs=0.15)
+    k = entry.labels.index('field_3_1_u_px')
+    assert phi[k] == pytest.approx(cosine(grid[0], 3, WIDTH) * cosine(grid[1], 1, HEIGHT))
+
+
+def test_what_is_not_assumed_or_not_known_is_no_unknown() -> None:
+    given = small(terms=False, two_trackers=False)
+    size = WIDTH, HEIGHT
+
+    def names(rates: Floats, assumed: Assumptions) -> list[str]:
+        layout = unknowns_of(given.problem, given.state, rates, size, assumed)
+        return [e.name for e in layout.entries]
+
+    basic = ['camera', 'alignment', 'field', 'shape']
+    none = Assumptions(0.0, (0.004, 0.0), 0.0)
+    still, unknown = np.zeros((IMAGES, 3)), np.full((IMAGES, 3), np.nan)
+    half = np.where(np.arange(IMAGES)[:, None] == 1, np.nan, given.rates_rad_s)
+    assert names(given.rates_rad_s, none) == basic
+    assert names(still, ASSUMED) == ['camera', 'alignment', 'velocity', 'field', 'shape']
+    # A rolling shutter turns by an unknown constant rate over its read-out; any other is left out.
+    for rates in (unknown, half):
+        assert names(rates, ASSUMED)[2:4] == ['velocity', 'readout']
+        assert names(rates, Assumptions(0.0, (0.0, 0.02), 0.005)) == basic
+    layout = unknowns_of(given.problem, given.state, unknown, size, ASSUMED)
+    readout = layout['readout']
+    assert readout.sigma == pytest.approx(np.full(3, 0.004 * 1e-3))
+    assert not readout.offset.any() and readout.turn is not None
+    pixels = np.array([[3.0, 3.0], [-0.5, HEIGHT - 0.5]])
+    turns = readout.turn(pixels, np.zeros((3, 2)), np.array([0, 2]))
+    assert turns.transpose(2, 0, 1) == pytest.approx(np.stack([-0.5 * np.eye(3), 0.5 * np.eye(3)]))
+    assert names(given.rates_rad_s, Assumptions(0.0, (0.0, 0.0), 0.1)) == [
+        'camera',
+        'alignment',
+        'stamps',
+        'field',
+        'shape',
+    ]
+    assert names(given.rates_rad_s, Assumptions(0.0, (0.0, 0.1), 0.0))[2] == 'readout'
+    one = np.zeros((IMAGES, 3))
+    one[2, 1] = 1e-5
+    assert 'readout' in names(one, ASSUMED) and 'stamps' in names(one, ASSUMED)
+
+
+def test_the_search_moves_the_unknowns_of_camera_and_attitudes(given: Small) -> None:
+    layout = unknowns_in_state(given.problem, given.state)
+    assert [e.name for e in layout.entries] == [
+        'camera',
+        'focal',
+        'alignment',
+        'rate',
+        'mountings',
+    ]
+    for entry in layout.entries:
+        same = given.layout[entry.name]
+        assert entry.labels == same.labels
+        assert np.array_equal(entry.sigma, same.sigma)
+        assert np.array_equal(entry.offset, same.offset)
+
+
+def test_a_step_moves_pixels_and_attitudes_as_the_unknowns_do(given: Small) -> None:
+    rng = np.random.default_rng(1)
+    layout = unknowns_in_state(given.problem, given.state)
+    x, y = np.zeros(given.layout.count), np.zeros((IMAGES, 6))
+    at = given.layout.of([e.name for e in layout.entries])
+    x[at] = 1e-2 * shared_steps(given)[at] * rng.normal(size=len(at))
+    y[:, :3] = 1e-6 * rng.normal(size=(IMAGES, 3))
+    state = moved(given.problem, given.state, layout, x[at], y[:, :3])
+    after = dataclasses.replace(given, state=state)
+    zero = np.zeros(given.layout.count), np.zeros((IMAGES, 6))
+    change = given.pixels(x, y) - given.predicted_px
+    # Products of two small rotations remain: 1e-12 of a radian.
+    assert after.predicted_px - given.predicted_px == pytest.approx(change, abs=1e-7)
+    assert np.abs(change).max() > 1e-3
+    expected = given.tracker_errors(x, y)
+    assert after.tracker_errors(*zero) == pytest.approx(expected, abs=1e-11)
+    errors = attitude_errors(given.problem, state, state.camera_from_icrf)
+    assert errors == pytest.approx(expected, abs=1e-11)
+
+
+def test_the_camera_follows_a_large_turn_of_the_alignment(given: Small) -> None:
+    layout = unknowns_in_state(given.problem, given.state)
+    x = np.zeros(layout.count)
+    x[layout.of(['alignment'])] = [0.3, -0.2, 0.5]
+    at, turns = tracker_turns(layout)
+    state = moved(given.problem, given.state, layout, x, turns @ x[at])
+    before = attitude_errors(given.problem, given.state, given.state.camera_from_icrf)
+    after = attitude_errors(given.problem, state, state.camera_from_icrf)
+    assert after == pytest.approx(before, abs=1e-14)
+    assert np.array_equal(state.parameters, given.state.parameters)

@@ -1,0 +1,225 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Images with the telemetry of their time, from one pass over a bag in any order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import subprocess
+import sys
+import threading
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap import stream_reader
+import numpy as np
+import pytest
+
+from starcal_ros.arrays import Floats
+from starcal_ros.errors import BagError
+from starcal_ros.formats.bag import frames as frames_module
+from starcal_ros.formats.bag import mcap_reader
+from starcal_ros.formats.bag import writer as writer_module
+from starcal_ros.formats.bag.frames import Frame, read_frames, read_telemetry, Telemetry
+from starcal_ros.formats.bag.reader import read_images, Topics
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.records import Image
+from starcal_ros.sky.attitude import AttitudeOptions
+
+TOPICS = Topics('/image', '/attitude', '/velocity', '/temperature')
+OPTIONS = AttitudeOptions()
+START_NS = 1_700_000_000_000_000_000
+TENTH_NS = 100_000_000
+IMAGES = 9
+
+Recorded = tuple[str, int]  # kind and stamp in tenths of a second
+
+
+def recording() -> list[Recorded]:
+    """Images every second between attitudes at 5 Hz; one velocity and temperature in between."""
+    made: list[Recorded] = [('attitude', k) for k in range(-1, 10 * IMAGES + 15, 2)]
+    made += [('image', 10 * k) for k in range(IMAGES)]
+    made += [(kind, k) for kind in ('velocity', 'temperature') for k in (-4, 33, 61)]
+    return sorted(made, key=lambda item: item[1])
+
+
+def write(path: Path, messages: list[Recorded], size: int = 4) -> Path:
+    """Write messages in the order given."""
+    random = np.random.default_rng(3)
+    with BagWriter(path) as writer:
+        for kind, tenths in messages:
+            time_ns = START_NS + tenths * TENTH_NS
+            if kind == 'image':
+                pixels = random.integers(0, 4096, (size, size)).astype(np.uint16)
+                writer.write_image('/image', Image(time_ns, pixels), 'camera')
+            elif kind == 'attitude':
+                half_rad = 1e-3 * tenths**1.1 if tenths > 0 else 0.0
+                xyzw = np.array([0.0, np.sin(half_rad), 0.0, np.cos(half_rad)])
+                writer.write_attitude('/attitude', time_ns, xyzw, 'icrf')
+            elif kind == 'velocity':
+                writer.write_velocity('/velocity', time_ns, np.array([tenths, 2.0, 3e4]), 'icrf')
+            else:
+                writer.write_temperature('/temperature', time_ns, 0.5 * tenths, 'camera')
+    return path
+
+
+def numbers_of(frame: Frame) -> Floats:
+    """Attitude (4), gap, velocity (3) and temperature of a frame when it is yielded."""
+    seen = Telemetry(TOPICS, OPTIONS)
+    seen.attitudes = frame.attitudes
+    numbers = seen.numbers_at(frame.image.time_ns)
+    velocity_m_s = frame.velocity_m_s
+    numbers[10:13] = np.nan if velocity_m_s is None else velocity_m_s
+    numbers[13] = frame.temperature_degc
+    return numbers
+
+
+def compared(paths: list[Path]) -> tuple[int, int, list[str]]:
+    """Frames, frames with other telemetry than that of a full read, and reports."""
+    said: list[str] = []
+    full = read_telemetry(paths, TOPICS, OPTIONS)
+    count = differ = 0
+    for frame in read_frames(paths, TOPICS, OPTIONS, said.append):
+        assert isinstance(frame, Frame)
+        expected = full.numbers_at(frame.image.time_ns)
+        differ += not np.array_equal(numbers_of(frame), expected, equal_nan=True)
+        count += 1
+    return count, differ, said
+
+
+@pytest.fixture
+def chunks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Sizes of the chunks that are decompressed; bags are written in small ones."""
+    sizes: list[int] = []
+    decompress = stream_reader.get_chunk_data_stream
+
+    def counted(chunk: Any, validate_crc: bool) -> Any:
+        sizes.append(chunk.uncompressed_size)
+        return decompress(chunk, validate_crc=validate_crc)
+
+    monkeypatch.setattr(mcap_reader, 'get_chunk_data_stream', counted)
+    monkeypatch.setattr(writer_module, '_CHUNK_BYTES', 600)
+    return sizes
+
+
+def test_a_bag_in_order_is_decompressed_once(tmp_path: Path, chunks: list[int]) -> None:
+    bag = write(tmp_path / 'bag', recording())
+    list(read_images([bag], '/image'))
+    once = list(chunks)
+    assert len(once) > 8
+    chunks.clear()
+    assert len(list(read_frames([bag], TOPICS, OPTIONS))) == IMAGES
+    assert chunks == once
+
+
+def test_attitudes_in_a_file_of_their_own_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Few images wait: the fourth starts a pass over the telemetry."""
+    monkeypatch.setattr(frames_module, '_WAITING_BYTES', 100)
+    images = [item for item in recording() if item[0] == 'image']
+    others = [item for item in recording() if item[0] != 'image']
+    paths = [write(tmp_path / 'images', images), write(tmp_path / 'others', others)]
+    assert compared(paths) == (IMAGES, 0, [])
+
+
+@pytest.mark.parametrize('hole', [(22, 48), (-10, 12), (75, 120)])
+def test_a_gap_filled_at_the_end_of_the_recording(tmp_path: Path, hole: tuple[int, int]) -> None:
+    """A spacecraft sends what was lost after everything else; the gap is over 2 s long."""
+    low, high = hole
+    late = [item for item in recording() if item[0] == 'attitude' and low < item[1] < high]
+    rest = [item for item in recording() if item not in late]
+    assert compared([write(tmp_path / 'bag', rest + late)]) == (IMAGES, 0, [])
+
+
+@pytest.mark.slow
+@settings(max_examples=60, derandomize=True, deadline=None)
+@given(data=st.data())
+def test_no_order_of_recording_changes_a_frame_unreported(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    """Messages that are delayed by under a second change nothing; others are counted."""
+    most_tenths = data.draw(st.sampled_from([9, 40, 200]))
+    messages = recording()
+    delays = data.draw(
+        st.lists(st.integers(0, most_tenths), min_size=len(messages), max_size=len(messages))
+    )
+    order = sorted(range(len(messages)), key=lambda k: messages[k][1] + delays[k])
+    bag = write(tmp_path_factory.mktemp('order') / 'bag', [messages[k] for k in order])
+    count, differ, said = compared([bag])
+    assert count == IMAGES
+    assert len(said) == (differ > 0)
+    assert not said or f'; {differ} images' in said[0]
+    if most_tenths == 9:
+        assert differ == 0
+
+
+def test_late_samples_are_reported(tmp_path: Path) -> None:
+    """One of the attitudes about the second image comes two seconds late."""
+    messages = recording()
+    late = messages.pop(messages.index(('attitude', 11)))
+    messages.insert(messages.index(('attitude', 31)), late)
+    count, differ, said = compared([write(tmp_path / 'bag', messages)])
+    assert (count, differ) == (IMAGES, 1)
+    (sentence,) = said
+    assert sentence == (
+        'telemetry is recorded more than a second out of order; 1 images before it'
+        ' were measured without it; sort the messages of the bag by time'
+    )
+
+
+def test_a_damaged_chunk_costs_what_is_in_it(tmp_path: Path, chunks: list[int]) -> None:
+    """The frames of a damaged bag are its images, and the loss is reported as by `read_images`."""
+    bag = write(tmp_path / 'bag', recording())
+    (file,) = bag.glob('*.mcap')
+    whole = bytearray(file.read_bytes())
+    whole[len(whole) // 3] ^= 4
+    file.write_bytes(whole)
+    of_images: list[str] = []
+    images = list(read_images([bag], '/image', on_damage=of_images.append))
+    _, _, said = compared([bag])
+    frames = list(read_frames([bag], TOPICS, OPTIONS, said.append))
+    assert [frame.image.time_ns for frame in frames if isinstance(frame, Frame)] == [
+        image.time_ns for image in images if isinstance(image, Image)
+    ]
+    assert of_images and set(of_images) <= set(said)
+
+
+def test_the_reading_thread_ends_with_its_reader(tmp_path: Path) -> None:
+    frames = read_frames([write(tmp_path / 'bag', recording(), size=64)], TOPICS, OPTIONS)
+    next(frames)
+    assert any(thread.name.startswith('read-ahead') for thread in threading.enumerate())
+    frames.close()  # type: ignore[attr-defined]
+    assert not any(thread.name.startswith('read-ahead') for thread in threading.enumerate())
+
+
+def test_an_error_of_reading_reaches_the_caller(tmp_path: Path) -> None:
+    file = tmp_path / 'vanished.mcap'
+    with pytest.raises(BagError, match='no such bag'):
+        list(read_frames([file], TOPICS, OPTIONS))
+
+
+MEMORY = """
+import resource, sys
+from starcal_ros.formats.bag.frames import read_frames
+from starcal_ros.formats.bag.reader import Topics
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for k, frame in enumerate(read_frames([sys.argv[1]], Topics('/image', '/attitude'))):
+    if k == 15:
+        early = peak()
+print(k, peak() - early)
+"""
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='ru_maxrss is in kB on Linux')
+@pytest.mark.slow
+def test_memory_is_flat(tmp_path: Path) -> None:
+    """Fifty images need no more memory than fifteen, with an attitude after each only."""
+    messages = [item for k in range(50) for item in (('attitude', 20 * k - 1), ('image', 20 * k))]
+    path = write(tmp_path / 'long', [*messages, ('attitude', 1001)], size=1000)
+    done = subprocess.run(
+        [sys.executable, '-c', MEMORY, str(path)], capture_output=True, text=True, check=True
+    )
+    last, growth_kb = map(int, done.stdout.split())
+    assert last == 49
+    assert growth_kb < 15_000  # the 34 images between are 68 MB

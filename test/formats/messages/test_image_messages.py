@@ -1,0 +1,181 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Messages of images: every layout, what is refused, and round trips."""
+
+from __future__ import annotations
+
+import array
+import struct
+import sys
+import tracemalloc
+from types import SimpleNamespace
+from typing import Any
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from sample_records import plain, TIME_NS  # type: ignore[import-not-found]
+
+from starcal_ros.errors import ImageRefused
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.messages.image_messages import (
+    decode_image,
+    decode_png,
+    image_from_message,
+    image_to_message,
+    refused_from_message,
+)
+from starcal_ros.formats.messages.message_fields import make_header
+from starcal_ros.formats.messages.observation_messages import (
+    observations_from_message,
+    observations_to_message,
+)
+from starcal_ros.records import Image
+
+RAMP = np.arange(12, dtype=np.uint16).reshape(3, 4) * 257 + 3
+
+
+def decode(encoding: str, big: bool, padding: int, container: Any) -> Image:
+    """Image of a ramp laid out as asked, with rubbish in the row padding."""
+    dtype = 'u1' if encoding in ('mono8', '8UC1') else '>u2' if big else '<u2'
+    rows = RAMP.astype(dtype).view(np.uint8).reshape(3, -1)
+    padded = np.hstack([rows, np.full((3, padding), 0xAA, np.uint8)])
+    data = container(padded.tobytes())
+    return decode_image(encoding, 4, 3, padded.shape[1], big, data, TIME_NS)
+
+
+@pytest.mark.parametrize(
+    'container', [bytes, bytearray, memoryview, lambda b: array.array('B', b)]
+)
+@pytest.mark.parametrize('padding', [0, 1, 6])
+@pytest.mark.parametrize('big', [False, True])
+@pytest.mark.parametrize('encoding', ['mono8', '8UC1', 'mono16', '16UC1'])
+def test_image_layouts(encoding: str, big: bool, padding: int, container: Any) -> None:
+    """Either byte order and any row padding give the same native pixels."""
+    image = decode(encoding, big, padding, container)
+    dtype = np.dtype(np.uint8 if '8' in encoding else np.uint16)
+    assert image.time_ns == TIME_NS
+    assert image.pixels.dtype == dtype and image.pixels.dtype.isnative
+    np.testing.assert_array_equal(image.pixels, RAMP.astype(dtype))
+
+
+def test_native_images_are_not_copied() -> None:
+    """Pixels that are laid out right already are only looked at."""
+    data = np.zeros(1024 * 1296 * 2, np.uint8)
+    big = sys.byteorder == 'big'
+    image = decode_image('mono16', 1296, 1024, 2592, big, data, 0)
+    assert np.shares_memory(image.pixels, data)
+    assert not image.pixels.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ('change', 'reason', 'detail'),
+    [
+        ({'encoding': 'yuv422'}, 'bad_encoding', "'yuv422' is not one of mono8"),
+        ({'encoding': 'rgb8'}, 'bad_encoding', 'rgb8 is a colour image: set image_channel'),
+        ({'encoding': ''}, 'bad_encoding', "'' is not"),
+        ({'encoding': 'x' * 9999}, 'bad_encoding', 'xxx'),
+        ({'width': 0}, 'bad_layout', '0 x 3'),
+        ({'height': 0}, 'bad_layout', '4 x 0'),
+        ({'step': 7}, 'bad_layout', 'step 7 is less than a row of 8 bytes'),
+        ({'step': 9}, 'bad_layout', '24 bytes of data, not 27'),
+        ({'data': b''}, 'bad_layout', '0 bytes of data'),
+        ({'data': bytes(25)}, 'bad_layout', '25 bytes of data'),
+        ({'width': 2**32 - 1, 'height': 2**32 - 1, 'step': 2**32 - 1}, 'bad_layout', 'step'),
+    ],
+)
+def test_image_refusals(change: dict[str, Any], reason: str, detail: str) -> None:
+    """An image that does not fit its own description is refused by name, with what was found."""
+    fields: dict[str, Any] = {
+        'encoding': 'mono16',
+        'width': 4,
+        'height': 3,
+        'step': 8,
+        'is_bigendian': False,
+        'data': bytes(24),
+    }
+    with pytest.raises(ImageRefused) as refused:
+        decode_image(**{**fields, **change}, time_ns=TIME_NS)
+    assert refused.value.reason == reason
+    assert detail in refused.value.detail
+    assert len(refused.value.detail) < 200
+
+
+@pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
+def test_png(dtype: Any) -> None:
+    pixels = RAMP.astype(dtype)
+    data = array.array('B', cv2.imencode('.png', pixels)[1].tobytes())
+    header = make_header(TIME_NS, '', plain)
+    image = image_from_message(SimpleNamespace(header=header, data=data), 1e-9)
+    assert image.time_ns == TIME_NS + 1
+    np.testing.assert_array_equal(image.pixels, pixels, strict=True)
+
+
+def png(width: int, height: int, raw: bytes = b'') -> bytes:
+    """A PNG of 16 bit with any size in its header and any rows."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        checked = name + data
+        return struct.pack('>I', len(data)) + checked + struct.pack('>I', zlib.crc32(checked))
+
+    header = chunk(b'IHDR', struct.pack('>IIBBBBB', width, height, 16, 0, 0, 0, 0))
+    rows = chunk(b'IDAT', zlib.compress(raw or bytes((1 + 2 * 4) * 3)))
+    return b'\x89PNG\r\n\x1a\n' + header + rows + chunk(b'IEND', b'')
+
+
+def test_a_png_of_another_size_is_not_decoded() -> None:
+    whole = png(4, 3)
+    assert decode_png(whole, 7, (4, 3)).pixels.shape == (3, 4)
+    for size in ((5, 3), (4, 4)):
+        with pytest.raises(ImageRefused, match='wrong_size: image of 4 x 3, prior camera of'):
+            decode_png(whole, 7, size)
+    # 65000 x 65000 of 16 bit would take 8 GB; less than a page is allocated for the refusal.
+    tracemalloc.start()
+    with pytest.raises(ImageRefused, match='wrong_size'):
+        decode_png(png(65000, 65000), 7, (640, 512))
+    assert tracemalloc.get_traced_memory()[1] < 2**20
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize(('sec', 'offset_s'), [(-1, 0.0), (0, -1e-9), (2**31 - 1, 1.0)])
+def test_a_stamp_that_no_message_can_hold_is_refused(sec: int, offset_s: float) -> None:
+    message = image_to_message(Image(0, RAMP), 'camera', make_message)
+    message.header.stamp.sec = sec
+    with pytest.raises(ImageRefused, match='bad_stamp: .* range of ROS stamps') as caught:
+        image_from_message(message, offset_s)
+    record = refused_from_message(message, offset_s, caught.value)
+    assert record.refusal == 'bad_stamp'
+    back = observations_from_message(observations_to_message(record, 'camera', make_message))
+    assert back.time_ns == record.time_ns  # it can be written
+
+
+@pytest.mark.parametrize(
+    ('data', 'reason'),
+    [
+        (b'', 'bad_encoding'),
+        (cv2.imencode('.jpg', RAMP.astype(np.uint8))[1].tobytes(), 'bad_encoding'),
+        (cv2.imencode('.png', np.zeros((2, 2, 3), np.uint8))[1].tobytes(), 'bad_encoding'),
+        (cv2.imencode('.png', RAMP)[1].tobytes()[:20], 'bad_encoding'),
+        (cv2.imencode('.png', RAMP)[1].tobytes()[:40], 'bad_layout'),
+        (png(60000, 60000), 'bad_layout'),
+        (png(2**31 - 1, 2**31 - 1), 'bad_layout'),
+        (png(4, 3, bytes(10**7)), 'bad_layout'),
+    ],
+)
+def test_png_refusals(data: bytes, reason: str) -> None:
+    with pytest.raises(ImageRefused) as refused:
+        decode_png(array.array('B', data), TIME_NS)
+    assert refused.value.reason == reason
+
+
+@pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
+@pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
+def test_image_round_trip(make: Any, dtype: Any) -> None:
+    """An image written is the image read, its time shifted by the stamp offset."""
+    image = Image(TIME_NS, RAMP.astype(dtype))
+    message = image_to_message(image, 'camera', make)
+    assert message.header.frame_id == 'camera'
+    back = image_from_message(message, stamp_offset_s=-0.025)
+    assert back.time_ns == TIME_NS - 25_000_000
+    assert back.pixels.dtype == dtype
+    np.testing.assert_array_equal(back.pixels, image.pixels)

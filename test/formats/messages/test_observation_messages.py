@@ -1,0 +1,136 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Messages of star observations: round trips, and what is refused."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from sample_records import assert_same, observations, plain, TIME_NS  # type: ignore[import-not-found]
+
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.messages.observation_messages import (
+    checked_observations,
+    observations_from_message,
+    observations_to_message,
+)
+from starcal_ros.records import refused_image
+
+
+@pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
+def test_observations_round_trip(make: Any) -> None:
+    """Every number of a record survives its message, bit for bit."""
+    refused = refused_image(TIME_NS, 1, 2, 'no_stars', 'three')
+    for record in (observations(), refused):
+        message = observations_to_message(record, 'cam', make)
+        assert_same(record, observations_from_message(message))
+
+
+@pytest.mark.parametrize(
+    ('field', 'value', 'text'),
+    [
+        ('measured_px', np.zeros(9), 'measured_px: 9 numbers, not 5 x 2'),
+        ('measured_px', np.full(10, np.nan), r'measured_px\[0\]\[0\]: nan is not a finite number'),
+        ('covariance_px2', np.zeros(15), 'not positive definite'),
+        ('refused_star_counts', np.zeros(1, np.uint32), '2 reasons but 1 counts'),
+        ('refused_star_px', np.zeros(7), 'refused_star_px: 7 numbers, not 4 x 2'),
+        ('refused_star_px', np.full(8, np.inf), r'refused_star_px\[0\]\[0\]: inf is not a finite'),
+        ('refused_star_reason', np.full(4, 2), 'refused_star_reason: 2 is none of 2 reasons'),
+    ],
+)
+def test_bad_observations_are_refused(field: str, value: Any, text: str) -> None:
+    """Observations that do not fit together are refused by the name of the field."""
+    message = observations_to_message(observations(), 'cam', plain)
+    setattr(message, field, value)
+    with pytest.raises(ValueError, match=text):
+        observations_from_message(message)
+
+
+@pytest.mark.parametrize(
+    ('place', 'value', 'text'),
+    [
+        ('header.stamp.sec', -1, 'header.stamp: -876543211 is not within 0 to'),
+        ('header.stamp.nanosec', 2**32 - 1, ''),  # a carry that the stamp can hold
+        ('attitude.w', 0.0, 'attitude: length 0.714143 is not 1'),
+        ('attitude.w', 1e300, 'attitude: length inf is not 1'),
+        ('temperature_degc', 1e300, r'temperature_degc: 1e\+300 is not within -273.15 to 1000'),
+        ('velocity_sigma_m_s', -1.0, 'velocity_sigma_m_s: -1.0 is not at least 0'),
+        ('velocity_sigma_m_s', np.inf, 'velocity_sigma_m_s: inf is not a finite number'),
+        (
+            'star_tracker_rate_rad_s',
+            np.array([0, 0, np.inf]),
+            r'star_tracker_rate_rad_s\[2\]: inf',
+        ),
+        ('background_dn', np.inf, 'background_dn: inf is not a finite number'),
+        ('width', 2**32 - 1, 'width: 4294967295 is not within 0 to 65536'),
+        (
+            'refusal',
+            'x' * 10**6,
+            "refusal: 'x{50,60}[.]{3} is not one of bad_encoding, ",
+        ),
+        ('catalog_digest', 'x' * 10**6, "catalog_digest: 'x.* is not a text of at most 100 char"),
+    ],
+)
+def test_a_value_that_no_image_has_is_refused(place: str, value: Any, text: str) -> None:
+    message = observations_to_message(observations(), 'cam', plain)
+    *holders, field = place.split('.')
+    holder = message
+    for name in holders:
+        holder = getattr(holder, name)
+    setattr(holder, field, value)
+    record = checked_observations(message)
+    assert record.refusal == ('bad_observations' if text else '')
+    assert re.match(text, record.detail) and len(record.detail) <= 500
+    # The refusal itself can be published and saved.
+    back = observations_from_message(observations_to_message(record, 'cam', make_message))
+    assert_same(record, back)
+
+
+@pytest.mark.parametrize(
+    ('field', 'value', 'text'),
+    [
+        ('direction_icrf', 0.0, r'direction_icrf\[0\]: length 0.785404 is not 1'),
+        ('direction_icrf', 1e300, r'direction_icrf\[0\]: length inf is not 1'),
+        ('measured_px', 1e300, r'measured_px: \(1e\+300, '),
+        ('measured_px', -2.0, r'measured_px: \(-2, '),
+        ('covariance_px2', 1e300, 'covariance_px2: '),
+        ('covariance_px2', 1e-300, 'covariance_px2: '),
+        ('snr', np.inf, r'snr\[0\]: inf is not a finite number'),
+    ],
+)
+def test_a_value_that_no_star_has_is_refused(field: str, value: float, text: str) -> None:
+    message = observations_to_message(observations(), 'cam', plain)
+    getattr(message, field)[0] = value
+    record = checked_observations(message)
+    assert record.refusal == 'bad_observations' and len(record) == 0
+    assert re.match(text, record.detail)
+
+
+def test_a_long_detail_is_cut() -> None:
+    message = observations_to_message(observations(), 'cam', plain)
+    message.detail = 'x' * 10**6
+    assert len(checked_observations(message).detail) == 500
+
+
+def test_refused_stars_are_found_by_reason() -> None:
+    record = observations()
+    places = record.refused_places()
+    assert list(places) == ['blend', 'saturated']
+    np.testing.assert_array_equal(places['blend'], record.refused_px[[0, 2, 3]])
+    np.testing.assert_array_equal(places['saturated'], record.refused_px[[1]])
+
+
+def test_older_observations_are_read() -> None:
+    """Fields that were added since have their defaults; an unknown attitude gap was -1."""
+    message = observations_to_message(observations(), 'cam', plain)
+    del message.temperature_degc
+    message.attitude_gap_s = -1.0
+    del message.refused_star_id, message.refused_star_px, message.refused_star_reason
+    del message.star_tracker_rate_rad_s, message.velocity_sigma_m_s
+    record = observations_from_message(message)
+    assert np.isnan(record.temperature_degc) and np.isnan(record.attitude_gap_s)
+    assert np.isnan(record.star_tracker_rate_rad_s).all() and np.isnan(record.velocity_sigma_m_s)
+    assert record.refused_stars == {'blend': 3, 'saturated': 1}
+    assert record.refused_px.shape == (0, 2)

@@ -1,0 +1,97 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Messages of attitude, velocity and temperature: round trips."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from sample_records import plain  # type: ignore[import-not-found]
+
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.messages.message_fields import (
+    make_header,
+    quaternion_to_message,
+    vector_to_message,
+)
+from starcal_ros.formats.messages.telemetry import (
+    attitude_from_message,
+    attitude_to_message,
+    latest_at,
+    temperature_from_message,
+    temperature_to_message,
+    velocity_from_message,
+    velocity_to_message,
+)
+from starcal_ros.formats.messages.types import ATTITUDE_TYPES
+
+
+def test_attitude_and_velocity_round_trip() -> None:
+    """Components come back in their own places."""
+    message = attitude_to_message(5, np.array([0.1, 0.2, 0.3, 0.4]), 'icrf', plain)
+    assert (message.quaternion.w, message.header.frame_id) == (0.4, 'icrf')
+    time_ns, xyzw = attitude_from_message(message)
+    assert time_ns == 5
+    np.testing.assert_array_equal(xyzw, [0.1, 0.2, 0.3, 0.4])
+    message = velocity_to_message(6, np.array([1.0, -2.0, 3e4]), 'icrf', plain)
+    time_ns, velocity = velocity_from_message(message)
+    assert time_ns == 6
+    np.testing.assert_array_equal(velocity, [1.0, -2.0, 3e4])
+
+
+@pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
+def test_temperature_round_trip(make: Any) -> None:
+    message = temperature_to_message(7, -12.5, 'camera', make)
+    assert temperature_from_message(message) == (7, -12.5)
+    # A sensor that has failed says inf or NaN: not known.
+    message = temperature_to_message(7, np.inf, 'camera', make)
+    assert np.isnan(temperature_from_message(message)[1])
+
+
+@pytest.mark.parametrize('make', [plain, make_message], ids=['plain', 'rosbags'])
+@pytest.mark.parametrize('kind', list(ATTITUDE_TYPES))
+def test_attitudes_of_each_type_are_read(make: Any, kind: str) -> None:
+    message = attitude_message(kind, make)
+    time_ns, xyzw = attitude_from_message(message)
+    assert time_ns == 5
+    np.testing.assert_array_equal(xyzw, XYZW)
+    if kind == 'imu':
+        message.orientation_covariance[0] = -1.0  # sensor_msgs/Imu: orientation not known
+        assert np.isnan(attitude_from_message(message)[1]).all()
+
+
+XYZW = np.array([0.1, 0.7, -0.1, 0.7])
+
+
+def attitude_message(kind: str, make: Any) -> Any:
+    """A message of a type with the attitude `XYZW` at 5 ns."""
+    rotation = quaternion_to_message(XYZW, make)
+    zero = vector_to_message(np.zeros(3), make)
+    fields: dict[str, Any] = {'header': make_header(5, 'icrf', make)}
+    if kind == 'quaternion':
+        fields['quaternion'] = rotation
+    elif kind == 'pose':
+        point = make('geometry_msgs/msg/Point', x=1.0, y=2.0, z=3.0)
+        pose = make('geometry_msgs/msg/Pose', position=point, orientation=rotation)
+        fields['pose'] = pose
+    elif kind == 'transform':
+        transform = make('geometry_msgs/msg/Transform', translation=zero, rotation=rotation)
+        fields |= {'child_frame_id': 'st', 'transform': transform}
+    else:
+        fields |= {
+            'orientation': rotation,
+            'orientation_covariance': np.zeros(9),
+            'angular_velocity': zero,
+            'angular_velocity_covariance': np.zeros(9),
+            'linear_acceleration': zero,
+            'linear_acceleration_covariance': np.zeros(9),
+        }
+    return make(ATTITUDE_TYPES[kind], **fields)
+
+
+def test_the_last_sample_at_or_before_an_image_counts() -> None:
+    samples = [(10, 'a'), (20, 'b'), (30, 'c')]
+    for time_ns, sample in ((5, 'a'), (10, 'a'), (29, 'b'), (30, 'c'), (99, 'c')):
+        assert latest_at(samples, time_ns, 'none') == sample
+    assert latest_at([], 5, 'none') == 'none'

@@ -1,0 +1,41 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The record of a failed calibration: round trip, removal of older products, damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from starcal_ros.errors import ProductError
+from starcal_ros.formats.products.product_folder import (
+    NOT_CALIBRATED_FILE,
+    NotCalibrated,
+    read_not_calibrated,
+    write_not_calibrated,
+)
+
+RECORD = NotCalibrated(
+    'too few', ('a.mcap', 'b'), {'no_match': 3}, 'clock', ('seen',), ('stamp_offset_s: 3.0',), 'x'
+)
+
+
+def test_round_trip_without_older_products(tmp_path: Path) -> None:
+    kept = tmp_path / 'observations.mcap'
+    for name in ('calibration.json', 'camera_info.yaml', 'residuals.npz', 'report.html'):
+        (tmp_path / name).write_text('old')
+    kept.write_text('stars')
+    write_not_calibrated(RECORD, tmp_path)
+    assert read_not_calibrated(tmp_path) == RECORD
+    assert {path.name for path in tmp_path.iterdir()} == {NOT_CALIBRATED_FILE, kept.name}
+
+
+def test_no_failure(tmp_path: Path) -> None:
+    assert read_not_calibrated(tmp_path) is None
+
+
+@pytest.mark.parametrize('text', ['', '[]', '{"reason": "x"}', '{"images_refused": 3}'])
+def test_damage_is_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / NOT_CALIBRATED_FILE).write_text(text)
+    with pytest.raises(ProductError, match='not a record of a failure: |not JSON: '):
+        read_not_calibrated(tmp_path)

@@ -1,0 +1,172 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Calibration from images alone, against the truth of the simulated bag in the repository."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bench.night_sky import camera_of
+import starcal_ros
+from starcal_ros.arrays import Pixels
+from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
+from starcal_ros.cli.main import main
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import NotFromStars
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.pipeline.from_stars import from_stars
+from starcal_ros.records import Image
+from starcal_ros.sky.catalog import load_catalog
+from starcal_ros.studies.simulation.rendering import images
+
+TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
+TOPIC = '/camera/image_raw'
+
+
+def tiny_images() -> list[Image]:
+    topic = next(t.name for t in reader.topics([TINY]) if t.type_name.endswith('/Image'))
+    return [one for one in reader.read_images([TINY], topic) if isinstance(one, Image)]
+
+
+def write_pngs(images: Sequence[Pixels], folder: Path) -> Path:
+    folder.mkdir()
+    for k, pixels in enumerate(images):
+        cv2.imwrite(str(folder / f'{k:02}.png'), pixels)
+    return folder
+
+
+def difference_and_sigma_arcsec(calibration: starcal_ros.Calibration) -> tuple[float, float]:
+    """RMS difference of lines of sight from the truth, common rotation removed, and 1-sigma."""
+    truth = json.loads((TINY / 'truth.json').read_text())
+    camera = calibration.geometry.camera
+    parameters = np.array([*truth['k_true'], *truth['d_true']])
+    true = CameraModel(camera.width, camera.height, parameters)
+    pixels = pixel_grid(camera, 15, 15)
+    a, b = line_of_sight(camera, pixels), line_of_sight(true, pixels)
+    turn, _ = Rotation.align_vectors(b, a)
+    assert calibration.maps is not None
+    sigma = float(np.sqrt(np.mean(calibration.maps.shape_sigma_arcsec**2)))
+    difference = np.linalg.norm(turn.apply(a) - b, axis=1)
+    return float(np.sqrt(np.mean(difference**2))) / ARCSECOND_RAD, sigma
+
+
+@pytest.mark.slow
+def test_pictures_give_the_camera_without_attitudes_focal_length_and_clock(
+    tmp_path: Path,
+) -> None:
+    folder = write_pngs([one.pixels for one in tiny_images()], tmp_path / 'night')
+    calibration = starcal_ros.calibrate_images(folder)
+    difference, sigma = difference_and_sigma_arcsec(calibration)
+    assert not calibration.has_alignment
+    assert difference < 2 * sigma
+
+
+@pytest.mark.slow
+def test_a_bag_without_attitudes_is_calibrated_and_states_that_it_has_no_alignment(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / 'bag.mcap'
+    with BagWriter(bag) as writer:
+        for image in tiny_images():
+            writer.write_image(TOPIC, image, 'camera')
+    assert main(['calibrate', str(bag), '-o', str(tmp_path / 'out')]) in (0, 3)
+    calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
+    difference, sigma = difference_and_sigma_arcsec(calibration)
+    assert difference < 2 * sigma
+    assert not calibration.has_alignment
+    assert 'none: attitudes from the stars' in capsys.readouterr().out
+    assert 'No alignment' in (tmp_path / 'out' / 'report.html').read_text()
+
+
+@pytest.mark.slow
+def test_mirrored_pictures_are_mirrored_back(tmp_path: Path) -> None:
+    mirrored = [one.pixels[:, ::-1].copy() for one in tiny_images()]
+    calibration = starcal_ros.calibrate_images(write_pngs(mirrored, tmp_path / 'night'))
+    difference, sigma = difference_and_sigma_arcsec(calibration)
+    assert difference < 2 * sigma
+
+
+@pytest.mark.slow
+def test_an_equidistant_lens_of_103_degrees_is_found() -> None:
+    given, half_deg = camera_of(59)
+    frames = images(dataclasses.replace(given, image_count=4))
+    found = from_stars(frames, load_catalog())
+    true = given.truth.camera
+    assert half_deg > 50 and found.camera.model == true.model == 'equidistant'
+    assert len(found.icrf_from_camera) == 4
+    assert found.camera.parameters[0] == pytest.approx(true.parameters[0], rel=2e-3)
+
+
+def zoomed(pixels: Pixels, factor: float) -> Pixels:
+    height, width = pixels.shape
+    middle = (np.array([width, height]) - 1) / 2
+    turn = np.column_stack([np.eye(2) * factor, (1 - factor) * middle])
+    size = (width, height)
+    found = cv2.warpAffine(pixels, turn, size, flags=cv2.INTER_CUBIC)
+    return found.astype(np.uint16)
+
+
+def lights(seed: int) -> Pixels:
+    """Lights in random places: a city, or a hall."""
+    rng = np.random.default_rng(seed)
+    light = np.zeros((512, 640))
+    light[rng.integers(5, 500, 60), rng.integers(5, 630, 60)] = rng.uniform(1e3, 2e4, 60)
+    seen = cv2.GaussianBlur(light, (0, 0), 1.0) + rng.normal(200.0, 5.0, light.shape)
+    return seen.clip(0, 65535).astype(np.uint16)
+
+
+def test_two_images_are_too_few(tmp_path: Path) -> None:
+    folder = write_pngs([one.pixels for one in tiny_images()[:2]], tmp_path / 'night')
+    with pytest.raises(NotFromStars, match='2 different images, 3 are needed: take 20 frames'):
+        starcal_ros.calibrate_images(folder)
+
+
+def test_one_frame_many_times_is_too_few(tmp_path: Path) -> None:
+    pixels = tiny_images()[0].pixels
+    folder = write_pngs([pixels] * 4, tmp_path / 'night')
+    said = r'1 different images \(3 more are copies\), 3 are needed: take 20 frames'
+    with pytest.raises(NotFromStars, match=said):
+        starcal_ros.calibrate_images(folder)
+
+
+@pytest.mark.slow
+def test_frames_that_are_no_sky_are_counted(tmp_path: Path) -> None:
+    frames = [*(one.pixels for one in tiny_images()[:2]), lights(0), lights(1)]
+    folder = write_pngs(frames, tmp_path / 'night')
+    said = '2 of 4 images match the sky, 3 are needed: take 20 frames.*no frames of anything else'
+    with pytest.raises(NotFromStars, match=said):
+        starcal_ros.calibrate_images(folder)
+
+
+@pytest.mark.slow
+def test_a_zoom_between_the_frames_is_named(tmp_path: Path) -> None:
+    frames = [one.pixels for one in tiny_images()[:6]]
+    frames[3:] = [zoomed(pixels, 1.1) for pixels in frames[3:]]
+    folder = write_pngs(frames, tmp_path / 'night')
+    with pytest.raises(NotFromStars, match='focal lengths of 180. to 198. px: .* zoom .*take 20'):
+        starcal_ros.calibrate_images(folder)
+
+
+@pytest.mark.slow
+def test_a_change_of_focus_is_refused_by_the_gate(tmp_path: Path) -> None:
+    frames = [one.pixels for one in tiny_images()[:6]]
+    frames[3:] = [zoomed(pixels, 1.005) for pixels in frames[3:]]
+    calibration = starcal_ros.calibrate_images(write_pngs(frames, tmp_path / 'night'))
+    assert not calibration.accepted
+    assert 'focal length or lens changes between images' in ' '.join(calibration.reasons)
+
+
+def test_pictures_without_stars_are_refused_with_the_frames_to_take(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    flat = [rng.normal(100, 3, (300, 400)).astype(np.uint8) for _ in range(3)]
+    with pytest.raises(NotFromStars, match=r'no stars: .* take 20 frames'):
+        starcal_ros.calibrate_images(write_pngs(flat, tmp_path / 'night'))

@@ -1,0 +1,79 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Covariance of a field as factor and remainder: every line of sight keeps its sigma."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from starcal_ros.assessment.lookup import Derivatives, line_of_sight_table
+from starcal_ros.camera import CameraModel, pixel_grid
+from starcal_ros.camera.detector_field import degrees, DetectorField
+from starcal_ros.records import factored_field, MapCovariance
+
+DEGREE = 11
+TERMS = len(degrees(DEGREE))
+LENS = CameraModel(1296, 1024, np.array([3641.5, -0.7, 3642.3, 647.5, 511.5, -0.05, 0.1, 0, 0, 0]))
+CAMERA = dataclasses.replace(LENS, field=DetectorField(1296, 1024, DEGREE, np.zeros((2, TERMS))))
+SIGMA = np.r_[0.3, 0.1, 0.3, 0.5, 0.5, 1e-3, 1e-2, 1e-1, 1e-4, 1e-4, np.full(3, 2e-5)]
+
+
+def covariance(rank: int, held: bool = False) -> MapCovariance:
+    """Of a calibration whose parameters and field cancel in what the stars have seen."""
+    random = np.random.default_rng(rank)
+    of_field = random.normal(size=(2 * TERMS, rank)) * 1e-3
+    # A constant and slopes are the camera's.
+    of_field[[0, 1, 2, TERMS, TERMS + 1, TERMS + 2]] = 0.0
+    mixed = random.normal(size=(13, 30))
+    parameters = 300.0 * SIGMA[:, None] * mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
+    if held:
+        parameters[7] = 0.0
+    # What the parameters move, coefficients undo but for a part in three hundred.
+    pixels = pixel_grid(CAMERA, 40, 40)
+    found = Derivatives.at(CAMERA, pixels)
+    by_field, by_parameters = (
+        part.reshape(-1, part.shape[2]) for part in (found.J[:, :, 13:], found.J[:, :, :13])
+    )
+    undone, *_ = np.linalg.lstsq(by_field, -by_parameters @ parameters, rcond=1e-10)
+    root = np.zeros((13 + 2 * TERMS, 30 + rank))
+    root[:13, :30] = parameters
+    root[13:, :30] = undone * (1.0 - 1.0 / 300.0)
+    root[13:, 30:] = of_field
+    return MapCovariance(root @ root.T, 0.002)
+
+
+@pytest.mark.parametrize('rank', [1, 20, 300])
+@pytest.mark.parametrize('held', [False, True], ids=['free', 'held'])
+def test_every_sigma_of_a_line_of_sight_holds_to_a_thousandth(rank: int, held: bool) -> None:
+    given = covariance(rank, held)
+    assert CAMERA.field is not None
+    record = factored_field(CAMERA.field, given)
+    pixels = pixel_grid(CAMERA, 61, 47)
+    expected = line_of_sight_table(CAMERA, given, pixels)
+    found = line_of_sight_table(
+        CAMERA, MapCovariance(record.covariance, record.unresolved_px), pixels
+    )
+    for name in ('sigma_arcsec', 'shape_sigma_arcsec'):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3)
+    np.testing.assert_allclose(
+        np.diag(record.covariance)[:13], np.diag(given.matrix)[:13], rtol=1e-7
+    )  # exactly zero where held
+    assert np.linalg.eigvalsh(record.covariance).min() > -1e-9 * np.trace(record.covariance)
+
+
+def test_the_record_is_a_quarter_of_the_square() -> None:
+    assert CAMERA.field is not None
+    record = factored_field(CAMERA.field, covariance(300))
+    numbers = (record.covariance_factor, record.remainder_unit_px, record.remainder)
+    square = record.covariance.nbytes
+    assert sum(one.nbytes for one in numbers) < 0.25 * square
+
+
+def test_a_field_without_variance_has_none() -> None:
+    assert CAMERA.field is not None
+    matrix = np.zeros((13 + 2 * TERMS,) * 2)
+    matrix[:13, :13] = np.diag(SIGMA**2)
+    record = factored_field(CAMERA.field, MapCovariance(matrix))
+    np.testing.assert_allclose(record.covariance, matrix, rtol=1e-8, atol=1e-30)

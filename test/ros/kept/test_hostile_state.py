@@ -1,0 +1,179 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Hostile state folders of a calibrator: forged files, and names that are no files of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+import dataclasses
+import json
+import os
+from pathlib import Path
+import shutil
+import tempfile
+import time
+
+from attacks import (  # type: ignore[import-not-found]
+    calibration,
+    CHANGES,
+    digests,
+    drawn,
+    fifo_in_place_of,
+    in_time,
+    observations,
+    setup,
+    with_changes,
+)
+from hypothesis import given
+import pytest
+
+from starcal_ros.assessment.gate import judge, reasons_of
+from starcal_ros.errors import StarcalError
+from starcal_ros.pipeline.node_options import CalibratorOptions
+from starcal_ros.records import Ensemble
+from starcal_ros.ros.kept.archive import Archive
+from starcal_ros.ros.kept.seal import CHECKSUMS, Seal
+from starcal_ros.ros.kept.state import CalibratorState
+from starcal_ros.ros.kept.stored import Activation
+
+pytestmark = pytest.mark.slow
+
+KEY = b'the key of these tests, 32 bytes'
+Change = list[tuple[int, object]]
+
+
+def write_state(folder: Path, seal: Seal) -> Path:
+    """A state folder with two images and two activations of one calibration."""
+    first = dataclasses.replace(calibration(), number=1, active_since_ns=10**9)
+    history = (Activation(1, 0, first), Activation(2, 1, dataclasses.replace(first, number=2)))
+    with contextlib.closing(Archive(folder, 'camera', seal)) as archive:
+        archive.keep(Ensemble(observations()[:2], {'no_stars': 1}), history)
+    return folder
+
+
+@pytest.fixture(scope='module')
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_state(tmp_path_factory.mktemp('sound') / 'state', CHECKSUMS)
+
+
+@pytest.fixture(scope='module')
+def keyed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('keyed')
+    (folder / 'key').write_bytes(KEY)
+    return write_state(folder / 'state', Seal(KEY))
+
+
+@contextlib.contextmanager
+def copied(folder: Path):
+    with tempfile.TemporaryDirectory(dir=folder.parent) as parent:
+        copy = Path(parent) / 'state'
+        shutil.copytree(folder, copy)
+        yield copy
+
+
+def restarted(folder: Path, key_file: object = '') -> CalibratorState:
+    """A calibrator's state after a restart, closed again."""
+    state = CalibratorState(time.time_ns)
+    options = CalibratorOptions(state_dir=str(folder), state_key_file=str(key_file))
+    with in_time(), contextlib.suppress(StarcalError):  # then the node does not start
+        state.open(setup(), options)
+    state.close()
+    return state
+
+
+def passes_the_gate(state: CalibratorState) -> bool:
+    """No calibration is active that the gate refuses, by a call of the gate itself."""
+    if state.active is None:
+        return True
+    checks = judge(state.active, setup().prior, None, setup().gate, setup().calibration)
+    return not reasons_of(checks)
+
+
+def forge(path: Path, changes: Change) -> None:
+    """Change a state file and compute its checksum again, as anyone can."""
+    content = json.loads(path.read_text())
+    for key in ('sha256', 'hmac_sha256'):
+        content.pop(key, None)
+    changed = with_changes(content, changes)
+    try:
+        text = CHECKSUMS.sealed(changed)
+    except ValueError:  # not finite, or too deep: as a forger would write it
+        text = json.dumps(changed)
+    path.write_text(text)
+
+
+@drawn(60)
+@given(CHANGES)
+def test_a_forged_calibration_is_not_active_past_the_gate(sound: Path, changes: Change) -> None:
+    with copied(sound) as folder:
+        (path,) = folder.glob('calibrations/00000002_*')
+        before = digests(folder)
+        del before[str(path.relative_to(folder))]
+        forge(path, changes)
+        assert passes_the_gate(restarted(folder))
+        assert before.items() <= digests(folder).items()
+
+
+@drawn(20)
+@given(CHANGES)
+def test_nothing_changed_without_the_key_is_used(keyed: Path, changes: Change) -> None:
+    with copied(keyed) as folder:
+        for path in folder.glob('calibrations/*.json'):
+            forge(path, changes)
+        first = min(folder.glob('ensemble/*.mcap'))
+        first.write_bytes(first.read_bytes()[:-1])
+        state = restarted(folder, keyed.with_name('key'))
+        assert state.active is None and len(state.ensemble.images) == 1
+
+
+def test_what_is_sealed_with_the_key_is_used(keyed: Path) -> None:
+    with copied(keyed) as folder:
+        state = restarted(folder, keyed.with_name('key'))
+        assert state.active is not None and len(state.ensemble.images) == 2
+
+
+def _sparse(path: Path) -> None:
+    with path.open('wb') as file:
+        file.truncate(1 << 40)
+
+
+_EVENT = 'calibrations/00000003_calibration_00000003.json'
+STRANGE: dict[str, Callable[[Path], object]] = {
+    'FIFO as image': lambda f: os.mkfifo(f / 'ensemble/00000003.mcap'),
+    'FIFO as calibration': lambda f: os.mkfifo(f / _EVENT),
+    'FIFO as refused': lambda f: fifo_in_place_of(f / 'ensemble/refused.json'),
+    '/dev/zero as image': lambda f: (f / 'ensemble/00000003.mcap').symlink_to('/dev/zero'),
+    '/dev/zero as calibration': lambda f: (f / _EVENT).symlink_to('/dev/zero'),
+    'link to itself': lambda f: (f / _EVENT).symlink_to(f / _EVENT),
+    'folder as calibration': lambda f: (f / _EVENT).mkdir(),
+    'folder as image': lambda f: (f / 'ensemble/00000003.mcap').mkdir(),
+    '10^20_x': lambda f: (f / f'calibrations/{10**20}_x').write_text(''),
+    '10^20 as event': lambda f: (
+        f / f'calibrations/{10**20}_calibration_{10**20}.json'
+    ).write_text('{}'),
+    '10^20 as image': lambda f: (f / f'ensemble/{10**20}.mcap').write_text(''),
+    '999999999 as event': lambda f: (
+        f / 'calibrations/999999999_calibration_00000001.json'
+    ).write_text('{}'),
+    'Arabic digits': lambda f: (f / 'ensemble/٠٠٠٠٠٠٠٣.mcap').write_text(''),
+    'no UTF-8': lambda f: Path(os.fsdecode(bytes(f) + b'/ensemble/\xff\xfe.mcap')).write_text(''),
+    'new line in a name': lambda f: (f / 'ensemble/00000003\n.mcap').write_text(''),
+    'a TB as image': lambda f: _sparse(f / 'ensemble/00000003.mcap'),
+    'a TB as calibration': lambda f: _sparse(f / _EVENT),
+    'deep JSON': lambda f: (f / _EVENT).write_text('[' * 100_000),
+    'digits': lambda f: (f / _EVENT).write_text('9' * 100_000),
+    'nothing': lambda f: (f / _EVENT).write_text(''),
+}
+
+
+@pytest.mark.parametrize('name', STRANGE)
+def test_names_and_files_that_a_calibrator_never_writes(name: str, sound: Path) -> None:
+    with copied(sound) as folder:
+        before = digests(folder)
+        STRANGE[name](folder)
+        before = {name: old for name, old in before.items() if (folder / name).is_file()}
+        state = restarted(folder)
+        assert state.active is not None and passes_the_gate(state)
+        assert len(state.ensemble.images) == 2
+        assert state.solve().message
+        assert before.items() <= digests(folder).items()

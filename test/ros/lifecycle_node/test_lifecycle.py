@@ -1,0 +1,226 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Every transition in every state of both nodes, and the end by a signal in each state."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import random
+import signal
+import subprocess
+import sys
+import time
+from typing import Any, TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+
+pytestmark = pytest.mark.nodes
+
+NUMBERS = sorted(
+    {value for name in dir(Transition) if isinstance(value := getattr(Transition, name), int)}
+)
+NO_TRANSITION = 200
+CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
+ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
+SHUTDOWN = {
+    'unconfigured': Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
+    'inactive': Transition.TRANSITION_INACTIVE_SHUTDOWN,
+    'active': Transition.TRANSITION_ACTIVE_SHUTDOWN,
+}
+PATHS = {'unconfigured': (), 'inactive': (CONFIGURE,), 'active': (CONFIGURE, ACTIVATE)}
+# What a state allows but the shutdown: there, where it leads, and the way back.
+ALLOWED: dict[str, tuple[tuple[int, str, tuple[int, ...]], ...]] = {
+    'unconfigured': ((CONFIGURE, 'inactive', (CLEANUP,)),),
+    'inactive': ((CLEANUP, 'unconfigured', (CONFIGURE,)), (ACTIVATE, 'active', (DEACTIVATE,))),
+    'active': ((DEACTIVATE, 'inactive', (ACTIVATE,)),),
+    'finalized': (),
+}
+
+
+class Manager:
+    """Client of the lifecycle services of one node."""
+
+    def __init__(self, client: Client, name: str) -> None:
+        self._client = client
+        self._change = client.node.create_client(ChangeState, f'/{name}/change_state')
+        self._get = client.node.create_client(GetState, f'/{name}/get_state')
+        client.until(lambda: self._change.service_is_ready() and self._get.service_is_ready())
+        # The first answer may be lost, before the node has found its reader: what changes nothing.
+        client.ask(self._change, _to(NO_TRANSITION), again_s=5.0)
+        client.ask(self._get, GetState.Request(), again_s=5.0)
+
+    def _call(self, service: Any, request: Any) -> Any:
+        future = service.call_async(request)
+        self._client.until(future.done)
+        return future.result()
+
+    def change(self, number: int) -> bool:
+        """Request a transition; return True if the node made it."""
+        return bool(self._call(self._change, _to(number)).success)
+
+    def state(self) -> str:
+        """Label of the present state of the node."""
+        return str(self._call(self._get, GetState.Request()).current_state.label)
+
+
+def _to(number: int) -> Any:
+    return ChangeState.Request(transition=Transition(id=number))
+
+
+def try_everything(manager: Manager, state: str) -> None:
+    """Try every transition: valid ones are made, the others are refused without effect."""
+    own = {number for number, _, _ in ALLOWED[state]} | {SHUTDOWN.get(state)}
+    for number in (*NUMBERS, NO_TRANSITION):
+        if number not in own:
+            assert not manager.change(number), number
+            assert manager.state() == state, number
+    for number, reached, back in ALLOWED[state]:
+        assert manager.change(number)
+        assert manager.state() == reached
+        assert all(manager.change(step) for step in back)
+        assert manager.state() == state
+
+
+@pytest.mark.parametrize('shut_down', [False, True])
+@pytest.mark.parametrize('state', PATHS)
+def test_every_transition_in_every_state(
+    client: Client, start_node: StartNode, tiny_bag: Path, state: str, shut_down: bool
+) -> None:
+    """Each node survives all transitions, and a signal ends it with status 0 in every state."""
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'autostart:=false')
+    nodes = [start_node(name, ros=ros) for name in ('star_observer', 'calibrator')]
+    # Each state meets both signals; the two nodes end by the same code.
+    signals = [signal.SIGINT, signal.SIGTERM]
+    for node, number in zip(nodes, signals[::-1] if shut_down else signals, strict=True):
+        manager = Manager(client, node.name)
+        assert all(manager.change(step) for step in PATHS[state])
+        if shut_down:
+            assert manager.change(SHUTDOWN[state])
+        else:
+            try_everything(manager, state)
+        reached = 'finalized' if shut_down else state
+        assert manager.state() == reached
+        if shut_down and state == 'active':
+            try_everything(manager, reached)
+        assert node.stop(number) == 0, node.said()
+        assert 'Traceback' not in node.said()
+
+
+SIGNALLED = """
+import os, signal, sys, time
+import rclpy
+from starcal_ros.ros.lifecycle_node.lifecycle import end_quietly, until_told_to_end
+
+def work():
+    if 'told' in sys.argv:
+        os.kill(os.getpid(), signal.SIGTERM)
+        while rclpy.ok():
+            time.sleep(0.01)
+    raise RuntimeError('the context\\nis invalid\x1b[2J')
+
+sys.exit(until_told_to_end('maker', [], work, lambda: end_quietly(None)))
+"""
+
+
+@pytest.mark.parametrize(
+    ('argument', 'status', 'said'),
+    [('', 2, 'maker: the context is invalid\\x1b[2J\n'), ('told', 0, '')],
+)
+def test_what_fails_after_a_signal_is_no_error(argument: str, status: int, said: str) -> None:
+    """Errors after a signal give status 0; other errors give one line and status 2."""
+    command = [sys.executable, '-c', SIGNALLED, argument]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (status, '', said)
+
+
+SIGNALLED_AGAIN = """
+import os, signal, sys, time
+import rclpy
+from starcal_ros.ros.lifecycle_node.lifecycle import end_quietly, until_told_to_end
+
+def tell():
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):
+        os.kill(os.getpid(), number)
+    time.sleep(0)  # where Python runs the handlers
+
+def work():
+    tell()
+    while rclpy.ok():
+        time.sleep(0.01)
+
+def end():
+    tell()
+    end_quietly(None)
+    tell()
+    print('ended')
+
+sys.exit(until_told_to_end('maker', [], work, end))
+"""
+
+
+def test_signals_do_not_cut_the_end_short() -> None:
+    command = [sys.executable, '-c', SIGNALLED_AGAIN]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, 'ended\n', '')
+
+
+SIGNALLED_AT_AN_ENTRY = """
+import os, signal, sys, time
+import rclpy
+from starcal_ros.ros.lifecycle_node.lifecycle import end_quietly, until_told_to_end
+
+class Lock:
+    def __enter__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0)  # where Python runs the handlers
+    def __exit__(self, *_):
+        print('released')
+
+def work():
+    with Lock():
+        pass
+    while rclpy.ok():
+        time.sleep(0.01)
+    return 0
+
+if 'early' in sys.argv:
+    init = rclpy.init
+    rclpy.init = lambda args: (os.kill(os.getpid(), signal.SIGTERM), init(args=args))
+sys.exit(until_told_to_end('maker', [], work, lambda: end_quietly(None)))
+"""
+
+
+@pytest.mark.parametrize(('argument', 'said'), [('', 'released\n'), ('early', '')])
+def test_a_signal_leaves_no_lock_taken(argument: str, said: str) -> None:
+    """A KeyboardInterrupt at the entry of a lock would, and the threads that need it never end."""
+    command = [sys.executable, '-c', SIGNALLED_AT_AN_ENTRY, argument]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, said, '')
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_nodes_end_after_several_signals(
+    client: Client, start_node: StartNode, tiny_bag: Path, seed: int
+) -> None:
+    """`ros2 launch` sends SIGINT to a node whose process group may have had one already."""
+    rng = random.Random(seed)
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'))
+    nodes = [start_node(name, ros=ros) for name in ('star_observer', 'calibrator')]
+    managers = [Manager(client, node.name) for node in nodes]
+    client.until(lambda: all(manager.state() == 'active' for manager in managers))
+    for _ in range(rng.choice([2, 3])):
+        for node in nodes:
+            node.send(rng.choice([signal.SIGINT, signal.SIGINT, signal.SIGTERM]))
+        # The end takes 0.1 s to 0.5 s: the next signal comes at once, or somewhere in it.
+        time.sleep(rng.choice([0.0, 0.5 * rng.random()]))
+    for node in nodes:
+        assert node.wait() == 0, node.said()
+        assert 'Traceback' not in node.said()

@@ -1,0 +1,79 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Parameter files in a namespace: each section reaches its node, or is warned of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from rcl_interfaces.srv import GetParameters
+
+from starcal_ros.ros.lifecycle_node.parameters import unread_sections
+
+pytestmark = pytest.mark.nodes
+
+
+@pytest.mark.parametrize(
+    ('section', 'reaches'),
+    [('/**/calibrator', True), ('/opnav/calibrator', True), ('calibrator', False)],
+)
+def test_a_section_in_a_namespace(
+    client: Client, start_node: StartNode, tmp_path: Path, section: str, reaches: bool
+) -> None:
+    """What rcl does with it, and that the node warns of what rcl passes over."""
+    params = tmp_path / 'params.yaml'
+    params.write_text(f'{section}:\n  ros__parameters: {{min_images: 7}}\n')
+    ros = ('-r', '__ns:=/opnav', '--params-file', str(params), '-p', 'autostart:=false')
+    node = start_node('calibrator', ros=ros)
+    answer = client.call(GetParameters, '/opnav/calibrator/get_parameters', names=['min_images'])
+    assert answer.values[0].integer_value == (7 if reaches else 3)
+    warning = f"section '{section}' does not apply to /opnav/calibrator: write /**/calibrator"
+    assert (warning in node.said()) is not reaches
+
+
+def test_a_node_starts_with_the_minimal_file(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    params = Path(__file__).parents[3] / 'config' / 'minimal.yaml'
+    camera = f'camera_info_url:=file://{tiny_bag / "camera.yaml"}'
+    node = start_node('calibrator', ros=('--params-file', str(params), '-p', camera))
+    client.until(lambda: 'active, listening to' in node.said())
+
+
+def test_sections_of_others_are_no_concern(tmp_path: Path) -> None:
+    """Two cameras in one file, other packages in it, and a name that is misspelt."""
+    params = tmp_path / 'params.yaml'
+    sections = ('/west/calibrator', '/east/calibrator', 'star_observer', 'camera_calibrator')
+    params.write_text(''.join(f'{name}:\n  ros__parameters: {{}}\n' for name in sections))
+    given = ['calibrator', '--ros-args', '--params-file', str(params)]
+    assert unread_sections(given, '/west/calibrator', 'calibrator') == []
+    (text,) = unread_sections(given, '/west/star_observer', 'star_observer')
+    assert "section 'star_observer' does not apply to /west/star_observer" in text
+    assert len(unread_sections(given, '/calibrator', 'calibrator')) == 2
+    params.write_text('/**/calibratr:\n  ros__parameters: {}\n')
+    (text,) = unread_sections(given, '/calibrator', 'calibrator')
+    assert "'/**/calibratr' does not apply" in text and text.endswith('write /**/calibrator')
+
+
+def test_a_misspelt_parameter_stops_a_node(start_node: StartNode, tiny_bag: Path) -> None:
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'magnitude_limt:=6.0')
+    node = start_node('star_observer', ros=ros)
+    assert node.wait() == 2
+    assert 'magnitude_limt: no such parameter (did you mean magnitude_limit?)' in node.said()
+
+
+def test_a_parameter_of_an_older_version_is_named_with_what_replaces_it(
+    start_node: StartNode, tiny_bag: Path
+) -> None:
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'residual_field:=true')
+    node = start_node('calibrator', ros=ros)
+    assert node.wait() == 2
+    assert 'residual_field: not an option any more: the field over the detector' in node.said()

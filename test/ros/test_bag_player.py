@@ -1,0 +1,67 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Bags whose images are compressed and whose attitudes are poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import cv2
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from mission_files import attitudes, images  # type: ignore[import-not-found]
+
+from starcal.msg import StarObservations
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.messages.message_fields import make_header, quaternion_to_message
+from starcal_ros.formats.messages.types import COMPRESSED_TYPE, POSE_TYPE
+
+pytestmark = pytest.mark.nodes
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    zero = make_message('geometry_msgs/msg/Point', x=0.0, y=0.0, z=0.0)
+    messages: list[tuple[int, str, str, Any]] = []
+    for time_ns, xyzw in attitudes():
+        rotation = quaternion_to_message(xyzw, make_message)
+        pose = make_message('geometry_msgs/msg/Pose', position=zero, orientation=rotation)
+        header = make_header(time_ns, 'icrf', make_message)
+        message = make_message(POSE_TYPE, header=header, pose=pose)
+        messages.append((time_ns, '/attitude', POSE_TYPE, message))
+    for image in images():
+        message = make_message(
+            COMPRESSED_TYPE,
+            header=make_header(image.time_ns, 'camera', make_message),
+            format='mono16; png compressed',
+            data=cv2.imencode('.png', image.pixels)[1].reshape(-1),
+        )
+        messages.append((image.time_ns, '/image/compressed', COMPRESSED_TYPE, message))
+    with BagWriter(tmp_path / 'bag') as writer:
+        for time_ns, topic, kind, message in sorted(messages, key=lambda one: one[0]):
+            writer._write(topic, kind, time_ns, message)
+    return tmp_path / 'bag'
+
+
+def test_compressed_images_are_paced(
+    client: Client, start_node: StartNode, tiny_bag: Path, bag: Path
+) -> None:
+    """A queue of two overflows where they are not."""
+    found: list[Any] = client.collect(StarObservations, 'observations')
+    options = ('image_transport:=compressed', 'attitude_message:=pose', 'image_queue:=2')
+    given = [part for one in (*options, 'attitude_timeout_s:=60.0') for part in ('-p', one)]
+    start_node('star_observer', ros=('--params-file', str(tiny_bag / 'params.yaml'), *given))
+    client.until_listened()
+    patient = ('-p', 'wait_for_subscribers_s:=100.0', '-p', 'images_in_flight:=2')
+    player = start_node('bag_player', ros=('-p', f'bag:={bag}', '-p', 'rate:=0.0', *patient))
+    assert player.wait(120.0) == 0, player.said()
+    client.until(lambda: len(found) == len(images()))
+    assert [one.refusal for one in found] == [''] * len(found)
+    assert 'playing anyway' not in player.said()

@@ -1,0 +1,277 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Diagnostics of the running nodes: keys and levels as in docs/icd.md."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import math
+from pathlib import Path
+import re
+from typing import Any, TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import QuaternionStamped, TwistStamped
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from sensor_msgs.msg import Image, Temperature
+from std_srvs.srv import Trigger
+
+from starcal.msg import Calibration, EnsembleStatus, StarObservations
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.messages.observation_messages import observations_to_message
+from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, read_calibration
+from starcal_ros.records import Ensemble, IMAGE_REFUSALS
+from starcal_ros.ros.kept.archive import Archive
+from starcal_ros.ros.kept.stored import Activation
+from starcal_ros.ros.lifecycle_node.message_factory import make_message
+
+pytestmark = pytest.mark.nodes
+
+ICD = Path(__file__).parents[2] / 'docs' / 'icd.md'
+REMAPS = (
+    *('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude'),
+    *('-r', 'velocity:=/spacecraft/velocity'),
+)
+
+
+def documented(*tables: str) -> set[str]:
+    """Keys in the document; those with a reason in the name once per reason."""
+    keys: set[str] = set()
+    for table in ('both nodes', *tables):
+        marks = f'<!-- diagnostics of {table} -->\n(.*?)<!-- end -->'
+        found = re.search(marks, ICD.read_text(), re.DOTALL)
+        assert found, table
+        keys |= set(re.findall(r'^\| `(.*?)`', found[1], re.MULTILINE))
+    if 'refused_…' in keys:
+        keys.remove('refused_…')
+        keys |= {f'refused_{reason}' for reason in IMAGE_REFUSALS}
+    return keys
+
+
+def newest(diagnostics: list[Any], name: str) -> tuple[bytes, str, dict[str, str]]:
+    """Level, message and values of the latest diagnostics of a node; empty before the first."""
+    for message in reversed(diagnostics):
+        for status in message.status:
+            if status.name == f'starcal: {name}':
+                pairs = [(value.key, value.value) for value in status.values]
+                assert len(dict(pairs)) == len(pairs), 'a key twice'
+                return status.level, status.message, dict(pairs)
+    return b'', '', {}
+
+
+def test_observer_says_what_the_document_says(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), *REMAPS)
+    start_node('star_observer', ros=(*ros, '-p', 'attitude_timeout_s:=60.0'))
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: newest(diagnostics, 'star_observer')[1] == 'waiting for images')
+    level, _, values = newest(diagnostics, 'star_observer')
+    assert level == b'\x00' and set(values) == documented('star_observer')
+    assert values['latency_median_s'] == values['attitude_gap_s'] == 'none'
+
+    images = client.publisher(Image, '/opnav/image_raw', 10)
+    attitudes = client.publisher(QuaternionStamped, '/star_tracker/attitude')
+    samples = list(reader.read_raw([tiny_bag], ['/star_tracker/attitude']))
+    images.publish(next(reader.read_raw([tiny_bag], ['/opnav/image_raw'])).data)
+    for sample in samples:
+        attitudes.publish(sample.data)
+    client.until(lambda: newest(diagnostics, 'star_observer')[2].get('images_used') == '1')
+    client.until(
+        lambda: newest(diagnostics, 'star_observer')[2].get('attitudes') == str(len(samples))
+    )
+    level, text, values = newest(diagnostics, 'star_observer')
+    assert (level, text) == (b'\x00', 'observing')
+    assert set(values) == documented('star_observer')
+    stamps_ns = [sample.log_time_ns for sample in samples]
+    steps_s = [(b - a) / 1e9 for a, b in itertools.pairwise(stamps_ns)]
+    assert float(values['attitude_gap_s']) == pytest.approx(max(steps_s), abs=0.001)
+    assert 0 < float(values['image_rate_hz']) < float(values['attitude_rate_hz'])
+    assert 0 < float(values['latency_median_s']) == float(values['latency_worst_s'])
+    assert int(values['memory_peak_mb']) > 10
+    assert values['callback_errors'] == '0'
+
+
+def test_calibrator_diagnostics_match_the_document(
+    client: Client,
+    start_node: StartNode,
+    tiny_bag: Path,
+    tiny_observations: Ensemble,
+    tmp_path: Path,
+) -> None:
+    """While collecting, with a damaged state file, and with an active calibration."""
+    history = tmp_path / 'state' / 'calibrations'
+    history.mkdir(parents=True)
+    (history / '00000001_calibration_00000001.json').write_text('{"schema": 1}')
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'))
+    start_node('calibrator', ros=(*ros, '-p', f'state_dir:={tmp_path / "state"}'))
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: 'images' in newest(diagnostics, 'calibrator')[2])
+    level, text, values = newest(diagnostics, 'calibrator')
+    assert set(values) == documented('calibrator')
+    assert level == b'\x01' and text.startswith('set aside as damaged: ')
+    assert '00000001_calibration_00000001.json' in text
+    assert values['state_damaged_files'] == '1'
+    assert (values['active'], values['calibration_age_s']) == ('none', 'none')
+    assert (values['last_gate'], values['camera_driver']) == ('none', 'none')
+
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    observations = client.publisher(StarObservations, 'observations')
+    for image in tiny_observations.images:
+        observations.publish(observations_to_message(image, 'camera', make_message))
+    client.until(lambda: status and status[-1].images == len(tiny_observations.images))
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    client.until(lambda: newest(diagnostics, 'calibrator')[2].get('active') != 'none')
+    _, _, values = newest(diagnostics, 'calibrator')
+    assert set(values) == documented('calibrator')
+    assert values['last_gate'] == 'accepted'
+    # On this machine's clock, within the time a test may take.
+    assert 0 <= float(values['calibration_age_s']) < 600
+    assert math.isfinite(float(values['disk_free_mb']))
+
+
+def test_a_stored_calibration_that_the_gate_refuses_is_not_active(
+    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path, tmp_path: Path
+) -> None:
+    """With a tighter limit at the restart; without it, it is active again."""
+    stored = read_calibration(tiny_products / CALIBRATION_FILE)
+    stored = dataclasses.replace(stored, number=1, active_since_ns=1)
+    with contextlib.closing(Archive(tmp_path / 'state', 'camera')) as archive:
+        archive.keep(Ensemble(), (Activation(1, 0, stored),))
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', f'state_dir:={tmp_path}/state')
+    first = start_node('calibrator', ros=(*ros, '-p', 'max_residual_rms_px:=0.001'))
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: 'images' in newest(diagnostics, 'calibrator')[2])
+    level, text, values = newest(diagnostics, 'calibrator')
+    assert level == b'\x01'
+    assert text.startswith('calibration 1 is not active, the gate refuses it now: residual')
+    assert 'max_residual_rms_px' in text and text in first.said()
+    assert values['active'] == 'none' and values['last_gate'] == f'refused: {text}'
+    assert values['state_refused_calibrations'] == '1'
+    first.stop()
+    start_node('calibrator', ros=(*ros, '-r', '__node:=second'))
+    client.until(lambda: newest(diagnostics, 'second')[2].get('active') == '1')
+    assert newest(diagnostics, 'second')[2]['state_refused_calibrations'] == '0'
+
+
+def test_nodes_that_are_not_active(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), '-p', 'autostart:=false')
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    for name in ('star_observer', 'calibrator'):
+        start_node(name, ros=ros)
+    for name in ('star_observer', 'calibrator'):
+        client.until(lambda name=name: newest(diagnostics, name)[0])
+        level, text, values = newest(diagnostics, name)
+        assert (level, text) == (b'\x01', 'not active: unconfigured')
+        assert set(values) == documented()
+
+
+def test_sensor_data_publishers_are_received(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """Best effort, as drivers offer it: all inputs connect, remapped or not."""
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), *REMAPS)
+    start_node('star_observer', ros=ros)
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    publishers = [
+        client.node.create_publisher(kind, topic, qos_profile_sensor_data)
+        for kind, topic in (
+            (QuaternionStamped, '/star_tracker/attitude'),
+            (TwistStamped, '/spacecraft/velocity'),
+            (Temperature, '/temperature'),
+            (Image, '/opnav/image_raw'),
+        )
+    ]
+    client.until(lambda: all(one.get_subscription_count() for one in publishers))
+    # Where all connect, nothing is left to warn of.
+    client.until(
+        lambda: newest(diagnostics, 'star_observer')[:2] == (b'\x00', 'waiting for images')
+    )
+    publishers[0].publish(QuaternionStamped())
+    client.until(lambda: newest(diagnostics, 'star_observer')[2].get('messages') == '1')
+
+
+def test_a_publisher_that_is_not_received_is_named(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """By its name on the graph: the image was asked for as reliable, the calibration latched."""
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), *REMAPS)
+    reliable = 'qos_overrides./opnav/image_raw.subscription.reliability:=reliable'
+    observer = start_node('star_observer', ros=(*ros, '-p', reliable))
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    image = client.node.create_publisher(Image, '/opnav/image_raw', qos_profile_sensor_data)
+    refused = '/opnav/image_raw: a publisher offers best effort, reliable is requested'
+    client.until(lambda: newest(diagnostics, 'star_observer')[1] == f'not received: {refused}')
+    assert newest(diagnostics, 'star_observer')[0] == b'\x01'
+    assert refused in observer.said()
+    client.node.destroy_publisher(image)
+    client.node.create_publisher(Calibration, '/calibration', QoSProfile(depth=1))
+    refused = '/calibration: a publisher offers volatile, transient local is requested'
+    client.until(lambda: newest(diagnostics, 'star_observer')[1] == f'not received: {refused}')
+
+
+def play(client: Client, bag: Path) -> None:
+    """Publish the attitudes of a bag, then its images."""
+    images = client.publisher(Image, '/opnav/image_raw', 20)
+    attitudes = client.publisher(QuaternionStamped, '/star_tracker/attitude')
+    for sample in reader.read_raw([bag], ['/star_tracker/attitude']):
+        attitudes.publish(sample.data)
+    for image in reader.read_raw([bag], ['/opnav/image_raw']):
+        images.publish(image.data)
+
+
+def test_five_images_without_a_match_are_diagnosed(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    wrong = ('-p', 'attitude_direction:=inertial_to_st')
+    start_node(
+        'star_observer', ros=('--params-file', str(tiny_bag / 'params.yaml'), *wrong, *REMAPS)
+    )
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: newest(diagnostics, 'star_observer')[1] == 'waiting for images')
+    play(client, tiny_bag)
+    client.until(
+        lambda: newest(diagnostics, 'star_observer')[2].get('diagnosis') == 'attitude_direction'
+    )
+    level, text, values = newest(diagnostics, 'star_observer')
+    assert level == b'\x01' and 'Set attitude_direction: st_to_inertial.' in text
+    client.until(lambda: newest(diagnostics, 'star_observer')[2].get('refused_no_match') == '10')
+    assert values['callback_errors'] == '0'
+
+
+def test_an_alignment_not_given_is_found_and_all_images_are_used(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    zeros = ('-p', 'prior_alignment:=[0.0, 0.0, 0.0, 0.0]')
+    node = start_node(
+        'star_observer', ros=('--params-file', str(tiny_bag / 'params.yaml'), *zeros, *REMAPS)
+    )
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    client.until(lambda: newest(diagnostics, 'star_observer')[1] == 'waiting for images')
+    assert 'prior_alignment not given: found from the images' in node.said()
+    play(client, tiny_bag)
+    # Of the images before the answer the last five are kept, and measured again.
+    client.until(lambda: int(newest(diagnostics, 'star_observer')[2].get('images_used', '0')) >= 5)
+    _, _, values = newest(diagnostics, 'star_observer')
+    assert values['retried'] == values['retried_used'] != '0'
+    assert values['diagnosis'] == 'none'
+    client.until(lambda: 'prior_alignment is not given: found [' in node.said())
+
+
+def test_a_silent_topic_is_warned_of_once(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    node = start_node(
+        'star_observer', ros=('--params-file', str(tiny_bag / 'params.yaml'), *REMAPS)
+    )
+    client.until(lambda: '/star_tracker/attitude: no message in 5 s, from 0 pub' in node.said())
+    assert node.said().count('/opnav/image_raw: no message in 5 s') == 1

@@ -1,0 +1,127 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Real processes: replay with /clock, and the permissions of each node."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from diagnostic_msgs.msg import DiagnosticArray
+
+from starcal.msg import EnsembleStatus
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.messages.message_fields import stamp_ns
+from starcal_ros.records import Image
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.nodes
+def test_a_bag_plays_again_by_its_clock(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """Nodes as in replay.launch.py, with a namespace and /clock; a second pass adds nothing."""
+    given = ('-r', '__ns:=/cam', '--params-file', str(tiny_bag / 'params.yaml'))
+    common = (*given, '-p', 'autostart:=true', '-p', 'use_sim_time:=true', '--log-level', 'info')
+    remaps = ('-r', 'image:=/opnav/image_raw', '-r', 'attitude:=/star_tracker/attitude')
+    start_node('star_observer', ros=(*common, '-r', '__node:=star_observer', *remaps))
+    start_node('calibrator', ros=(*common, '-r', '__node:=calibrator'))
+    client.until(lambda: client.node.count_subscribers('/cam/observations'))
+    status = client.latched(EnsembleStatus, '/cam/ensemble_status')
+    health = client.collect(DiagnosticArray, '/diagnostics')
+    # Simulated time without a /clock yet: diagnostics come all the same.
+    client.until(lambda: len({one.status[0].name for one in health}) == 2)
+    player = ('-r', '__ns:=/cam', '-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0', '-p', 'loop:=true')
+    start_node('bag_player', ros=(*player, '-p', 'clock:=true'))
+
+    def restarts() -> int:
+        told = (one.status[0] for one in health if 'star_observer' in one.status[0].name)
+        values = [int(v.value) for s in told for v in s.values if v.key == 'restarts']
+        return max(values, default=0)
+
+    client.until(lambda: restarts() >= 1, 60.0)
+    images = len(list(reader.read_images([tiny_bag], '/opnav/image_raw')))
+    client.until(lambda: status and status[-1].images == images)
+    stamps = [raw.log_time_ns for raw in reader.read_raw([tiny_bag])]
+    last_ns = stamp_ns(health[-1].header.stamp)
+    # Within the bag, whatever pass of it: the diagnostics take the time from /clock.
+    assert min(stamps) <= last_ns <= max(stamps) + 10**9
+
+
+NODES = ('star_observer', 'calibrator', 'bag_player')
+
+
+@pytest.mark.nodes
+def test_the_policies_name_what_the_nodes_have(
+    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
+) -> None:
+    """Each security policy allows exactly the topics and services of its node."""
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write_image('/image', Image(1, np.zeros((2, 2), np.uint8)), 'camera')
+        writer.write_attitude('/attitude', 1, np.array([0, 0, 0, 1.0]), 'icrf')
+        writer.write_velocity('/velocity', 1, np.zeros(3), 'icrf')
+        writer.write_temperature('/temperature', 1, 20.0, 'camera')
+    start_node('bag_player', ros=('-p', f'bag:={tmp_path / "bag"}', '-p', 'clock:=true', *WAIT))
+    for name in NODES[:2]:
+        # Nobody may listen to the player, or it plays and ends.
+        remaps = ('-r', 'image:=/elsewhere') if name == 'star_observer' else ()
+        start_node(name, ros=('--params-file', str(tiny_bag / 'params.yaml'), *remaps))
+    for name in NODES:
+        path = ROOT / 'config' / 'security' / f'{name}.policy.xml'
+        profile = ElementTree.parse(path).getroot().find('enclaves/enclave/profiles/profile')
+        assert profile is not None and profile.get('node') == name and profile.get('ns') == '/'
+        allowed = {
+            (kind, full_name(name, str(element.text)))
+            for group in profile
+            for kind in ('publish', 'subscribe', 'reply', 'request')
+            if group.get(kind) == 'ALLOW'
+            for element in group
+        }
+        if importlib.util.find_spec('tf2_msgs') is None:
+            allowed -= {('publish', '/tf_static'), ('subscribe', '/tf_static')}
+        client.until(functools.partial(shows, client, name, allowed))
+        assert of_graph(client, name) == allowed, name
+
+
+WAIT = ('-p', 'wait_for_subscribers_s:=100.0')
+
+
+def full_name(node: str, name: str) -> str:
+    """Name in a policy, resolved for a node in the root namespace."""
+    if name.startswith('~/'):
+        return f'/{node}/{name[2:]}'
+    return name if name.startswith('/') else f'/{name}'
+
+
+def of_graph(client: Client, name: str) -> set[tuple[str, str]]:
+    """Names of the topics and services of a node, by the policy tags."""
+    node = client.node
+    found = set()
+    for kind, ask in (
+        ('publish', node.get_publisher_names_and_types_by_node),
+        ('subscribe', node.get_subscriber_names_and_types_by_node),
+        ('reply', node.get_service_names_and_types_by_node),
+        ('request', node.get_client_names_and_types_by_node),
+    ):
+        found |= {(kind, topic) for topic, _ in ask(name, '/')}
+    if ('subscribe', '/elsewhere') in found:
+        found = {*found - {('subscribe', '/elsewhere')}, ('subscribe', '/image')}
+    return found
+
+
+def shows(client: Client, name: str, allowed: set[tuple[str, str]]) -> bool:
+    """Return True once the graph shows all names that a node may use."""
+    return name in client.node.get_node_names() and of_graph(client, name) >= allowed

@@ -1,0 +1,341 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Malformed messages and requests to real nodes, callers that end, and kills of both nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+import itertools
+from pathlib import Path
+import random
+import subprocess
+import sys
+from typing import Any, TYPE_CHECKING
+
+from attacks import BAG, calibration, many, observations  # type: ignore[import-not-found]
+import cv2
+import numpy as np
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, NodeProcess, StartNode
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from flight import Flight  # type: ignore[import-not-found]
+from geometry_msgs.msg import QuaternionStamped, TransformStamped, TwistStamped
+from lifecycle_msgs.srv import ChangeState, GetState
+from mutants import is_decodable, mutated, not_finite  # type: ignore[import-not-found]
+from node_campaign import Campaign  # type: ignore[import-not-found]
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Temperature
+from std_srvs.srv import Trigger
+
+from starcal.msg import Calibration, EnsembleStatus, StarObservations
+from starcal.srv import Calibrate
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.messages.calibration_messages import calibration_to_message
+from starcal_ros.formats.messages.image_messages import image_to_message
+from starcal_ros.formats.messages.observation_messages import observations_to_message
+from starcal_ros.formats.messages.telemetry import attitude_to_message
+from starcal_ros.records import Image as ImageRecord
+from starcal_ros.ros.lifecycle_node.message_factory import make_message
+
+pytestmark = [pytest.mark.nodes, pytest.mark.slow, pytest.mark.timeout(600)]
+
+# Fields that may be NaN or infinite by the interface document.
+MAY_BE_INFINITE = frozenset(
+    [
+        *(
+            'temperature_degc',
+            'star_tracker_rate_rad_s',
+            'velocity_sigma_m_s',
+            'zenith_icrf',
+            'predicted_sigma',
+        ),
+        *('attitude_gap_s', 'found', 'limit', 'shape_px', 'shape_p_value', 'rotation_arcsec'),
+        'p_value',
+    ]
+)
+IMAGE_TOPIC = '/opnav/image_raw'
+CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
+SHUTDOWNS = (5, 6, 7)  # a node rightly executes it
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def parameters(bag: Path, *values: str) -> tuple[str, ...]:
+    """ROS arguments with the parameter file of a bag and further values."""
+    more = [word for value in values for word in ('-p', value)]
+    return ('--params-file', str(bag / 'params.yaml'), *more)
+
+
+class Received:
+    """Number of messages that a node has received, from its diagnostics."""
+
+    def __init__(self, client: Client, node: str) -> None:
+        self._client, self._name = client, f'starcal: {node}'
+        self._health = client.collect(DiagnosticArray, '/diagnostics')
+        self._state = client.node.create_client(GetState, f'/{node}/get_state')
+        client.until(lambda: self.count() is not None and self._state.service_is_ready())
+
+    def count(self) -> int | None:
+        """Messages received, up to a second old; None before the first diagnostics."""
+        mine = [m.status[0] for m in self._health if m.status[0].name == self._name]
+        values = {v.key: v.value for status in mine[-1:] for v in status.values}
+        return int(values['messages']) if values else None
+
+    def send(self, publisher: Any, messages: Iterable[Any], at_once: int = 500) -> None:
+        """Publish messages; return once the node has received all that can be decoded."""
+        for batch in batches(messages, at_once):
+            before = self.count() or 0
+            sent = sum(map(is_decodable, batch))
+            for message, _ in batch:
+                publisher.publish(message)
+            self._client.until(lambda: (self.count() or 0) - before >= sent)  # noqa: B023
+
+
+def batches(messages: Iterable[Any], size: int) -> Iterable[list[Any]]:
+    """Lists of at most so many messages."""
+    left = iter(messages)
+    return iter(lambda: list(itertools.islice(left, size)), [])
+
+
+def assert_finite(messages: Iterable[Any]) -> None:
+    for message in messages:
+        assert not_finite(message, MAY_BE_INFINITE) == []
+
+
+def assert_requests_are_answered(
+    client: Client, kind: Any, name: str, template: Any, process: NodeProcess
+) -> None:
+    """Mutants of a request are answered with finite numbers."""
+    service = client.node.create_client(kind, name)
+    client.until(service.service_is_ready)
+    for request, _ in mutated(template, 20):
+        if isinstance(request, bytes):  # rclpy clients cannot send them
+            continue
+        if hasattr(request, 'transition') and request.transition.id in SHUTDOWNS:
+            continue
+        if hasattr(request, 'dry_run'):
+            request.dry_run = True
+        assert_finite([client.ask(service, request)])
+    assert process.process.poll() is None
+
+
+def assert_common_requests_are_answered(client: Client, name: str, process: NodeProcess) -> None:
+    """Mutants of the requests that every node answers; afterwards it is active again."""
+    value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=8.0)
+    given = [Parameter(name='magnitude_limit', value=value)]
+    change = ChangeState.Request()
+    change.transition.id = CONFIGURE
+    for kind, service, request in (
+        (SetParameters, 'set_parameters', SetParameters.Request(parameters=given)),
+        (
+            SetParametersAtomically,
+            'set_parameters_atomically',
+            SetParametersAtomically.Request(parameters=given),
+        ),
+        (ChangeState, 'change_state', change),
+    ):
+        assert_requests_are_answered(client, kind, f'/{name}/{service}', request, process)
+    for transition in (CONFIGURE, ACTIVATE):  # each may be refused
+        change_state(client, name, transition)
+    assert client.call(GetState, f'/{name}/get_state').current_state.label == 'active'
+
+
+def change_state(client: Client, name: str, transition: int) -> None:
+    request = ChangeState.Request()
+    request.transition.id = transition
+    client.call(ChangeState, f'/{name}/change_state', transition=request.transition)
+
+
+def small_image() -> Any:
+    record = ImageRecord(10**18, np.zeros((4, 4), np.uint16))
+    return image_to_message(record, 'camera', make_message)
+
+
+def compressed_image() -> Any:
+    data = cv2.imencode('.png', np.zeros((4, 4), np.uint16))[1].tobytes()
+    return CompressedImage(header=small_image().header, format='mono16; png compressed', data=data)
+
+
+@pytest.mark.parametrize(
+    ('transport', 'kind', 'topic', 'template'),
+    [
+        ('raw', Image, IMAGE_TOPIC, small_image),
+        ('compressed', CompressedImage, f'{IMAGE_TOPIC}/compressed', compressed_image),
+    ],
+)
+def test_every_decodable_image_is_answered(
+    client: Client,
+    start_node: StartNode,
+    tiny_bag: Path,
+    transport: str,
+    kind: Any,
+    topic: str,
+    template: Callable[[], Any],
+) -> None:
+    values = ('attitude_timeout_s:=0.0', 'image_queue:=1000')
+    given = parameters(tiny_bag, f'image_transport:={transport}', *values)
+    node = start_node('star_observer', ros=(*given, '-r', f'image:={IMAGE_TOPIC}'))
+    answers = client.collect(StarObservations, 'observations')
+    infos = client.collect(CameraInfo, 'image_camera_info')
+    client.until_listened()
+    images = client.publisher(kind, topic)
+    for batch in batches(mutated(template(), 20), 100):
+        before = len(answers)
+        sent = sum(map(is_decodable, batch))
+        for message, _ in batch:
+            images.publish(message)
+        client.until(lambda: len(answers) - before >= sent)  # noqa: B023
+    assert_finite([*answers, *infos])
+    assert node.process.poll() is None
+
+
+def test_the_star_observer_measures_images_after_hostile_messages(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    remaps = ('-r', f'image:={IMAGE_TOPIC}', '-r', 'attitude:=/star_tracker/attitude')
+    node = start_node('star_observer', ros=(*parameters(tiny_bag), *remaps))
+    answers = client.collect(StarObservations, 'observations')
+    received = Received(client, 'star_observer')
+    header = small_image().header
+    attitude = attitude_to_message(10**18, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf', make_message)
+    for kind, topic, template in (
+        (QuaternionStamped, '/star_tracker/attitude', attitude),
+        (TwistStamped, 'velocity', TwistStamped(header=header)),
+        (Temperature, 'temperature', Temperature(header=header)),
+    ):
+        received.send(client.publisher(kind, topic), mutated(template, 20))
+    latched = client.publisher(Calibration, 'calibration', LATCHED)
+    sound = calibration_to_message(calibration(), make_message)
+    received.send(latched, mutated(sound, 20), at_once=1)  # a latched topic holds one message
+    assert_common_requests_are_answered(client, 'star_observer', node)
+    latched.publish(sound)
+    start_node('bag_player', ros=('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0'))
+    images = len(list(reader.read_images([BAG], IMAGE_TOPIC)))
+    # Stamps that went far ahead and come back cost the first images.
+    client.until(lambda: sum(not answer.refusal for answer in answers) >= images // 2)
+    assert_finite(answers)
+    assert node.process.poll() is None
+
+
+def test_the_calibrator_calibrates_after_hostile_messages(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    node = start_node('calibrator', ros=parameters(tiny_bag, 'max_images:=30'))
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    published = [
+        status,
+        *(client.latched(Calibration, t) for t in ('calibration', 'candidate_calibration')),
+        client.latched(CameraInfo, 'camera_info'),
+        client.latched(TransformStamped, 'alignment'),
+    ]
+    received = Received(client, 'calibrator')
+    publisher = client.publisher(StarObservations, 'observations')
+    brightest = observations()[0]
+    brightest = brightest.select(np.argsort(np.argsort(-brightest.flux_dn)) < 40)
+    template = observations_to_message(brightest, 'camera', make_message)
+    received.send(publisher, mutated(template, 20))
+    request = Calibrate.Request(method='magic', estimate=['fx', 'fz'])
+    assert_requests_are_answered(client, Calibrate, '/calibrator/solve', request, node)
+    assert_common_requests_are_answered(client, 'calibrator', node)
+    client.call(Trigger, '/calibrator/reset')
+    client.until(lambda: status and status[-1].images == 0)
+    fill(client, publisher, status)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    assert_finite(itertools.chain.from_iterable(published))
+    assert node.process.poll() is None
+
+
+def fill(client: Client, publisher: Any, status: list[Any]) -> None:
+    """Publish the observations of the tiny bag; wait until the ensemble holds them."""
+    for record in observations():
+        publisher.publish(observations_to_message(record, 'camera', make_message))
+    client.until(lambda: status and status[-1].images == len(observations()))
+
+
+@pytest.fixture
+def filled(client: Client, start_node: StartNode, tiny_bag: Path) -> NodeProcess:
+    """A calibrator with the images of the tiny bag."""
+    node = start_node('calibrator', ros=parameters(tiny_bag))
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    fill(client, client.publisher(StarObservations, 'observations'), status)
+    return node
+
+
+def test_callers_at_once_and_callers_that_end(client: Client, filled: NodeProcess) -> None:
+    callers = [client.node.create_client(Trigger, '/calibrator/calibrate') for _ in range(10)]
+    client.until(lambda: all(caller.service_is_ready() for caller in callers))
+    futures = [caller.call_async(Trigger.Request()) for caller in callers]
+    client.until(lambda: all(future.done() for future in futures))
+    assert all(future.result().success for future in futures)
+    caller = subprocess.Popen([sys.executable, '-c', CALLER], stdout=subprocess.PIPE)
+    assert caller.stdout is not None
+    caller.stdout.readline()
+    caller.kill()
+    caller.wait()
+    caller.stdout.close()
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    assert filled.process.poll() is None
+
+
+CALLER = """
+import time, rclpy
+from std_srvs.srv import Trigger
+rclpy.init()
+node = rclpy.create_node('caller')
+client = node.create_client(Trigger, 'calibrator/calibrate')
+client.wait_for_service()
+client.call_async(Trigger.Request())
+print('called', flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_second_calibrator_is_warned_of(
+    client: Client, start_node: StartNode, tiny_bag: Path, filled: NodeProcess
+) -> None:
+    health = client.collect(DiagnosticArray, '/diagnostics')
+    start_node('calibrator', ros=(*parameters(tiny_bag), '-r', '__node:=double'))
+    text = 'another node publishes'
+    client.until(lambda: any(text in one.status[0].message for one in health))
+    assert client.call(Trigger, '/calibrator/calibrate').success
+
+
+def test_calls_to_a_node_that_is_deactivated_are_answered(
+    client: Client, filled: NodeProcess
+) -> None:
+    calls = [(client.node.create_client(Calibrate, '/calibrator/solve'), Calibrate.Request())]
+    for name in ('calibrate', 'rollback', 'send_camera_info'):
+        service = client.node.create_client(Trigger, f'/calibrator/{name}')
+        calls.append((service, Trigger.Request()))
+    client.until(lambda: all(service.service_is_ready() for service, _ in calls))
+    for transitions in ((DEACTIVATE, ACTIVATE), (DEACTIVATE, CLEANUP, CONFIGURE, ACTIVATE)):
+        futures = [service.call_async(request) for service, request in calls]
+        for transition in transitions:
+            change_state(client, 'calibrator', transition)
+        client.until(lambda: all(future.done() for future in futures))  # noqa: B023
+    assert filled.process.poll() is None
+
+
+@pytest.mark.timeout(300)  # a transport that stops is waited for
+def test_kill_9_loses_no_image_that_was_saved(tmp_path: Path) -> None:
+    """Kills at random during images and solves, and of nodes that start."""
+    choose = random.Random(2)
+    with Flight(Campaign(tmp_path), tmp_path / 'state') as flight:
+        for k in range(many(3)):
+            flight.fly(choose.uniform(0.1, 2.5))
+            names = (('calibrator',), ('star_observer',), flight.NODES)[k % 3]
+            flight.kill(*names)
+            if k % 5 == 1:
+                flight.kill_at_start(names[0], choose.uniform(0.0, 3.0))
+        flight.fly(0.5)
+    counts = [dict(+count) for count in (flight.lost, flight.wrong, flight.died)]
+    assert counts == [{}, {}, {}], (tmp_path / 'log').read_text()
+    assert sum(flight.undelivered.values()) <= 4  # one stop of the transport, which is not ours
+    assert flight.reported > 0 and flight.answered > 0
+    assert not list((tmp_path / 'state').rglob('*.damaged'))

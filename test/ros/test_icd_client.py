@@ -1,0 +1,167 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+Test of an integrator: only generated interfaces and the names of the ICD.
+
+Nothing here imports starcal_ros; the images come from a bag through rosbags.
+"""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Iterator
+import functools
+import json
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+rosbags = pytest.importorskip('rosbags.highlevel')
+pytest.importorskip('starcal.msg')
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from geometry_msgs.msg import QuaternionStamped, TransformStamped  # noqa: E402
+from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from starcal.msg import Calibration, EnsembleStatus, StarObservations  # noqa: E402
+from starcal.srv import Calibrate  # noqa: E402
+
+pytestmark = pytest.mark.nodes
+
+ARCSECOND_RAD = np.pi / 648000
+
+
+def bag_messages(folder: Path) -> Iterator[Any]:
+    """Images and attitudes of a bag as rclpy messages, in order."""
+    with rosbags.AnyReader([folder]) as reader:
+        # The velocity of the observer is not in the contract of this client.
+        wanted = [one for one in reader.connections if 'Twist' not in one.msgtype]
+        for connection, _, data in reader.messages(wanted):
+            found = reader.deserialize(data, connection.msgtype)
+            made: Any
+            if connection.msgtype == 'sensor_msgs/msg/Image':
+                made = Image(height=found.height, width=found.width, encoding=found.encoding)
+                made.step, made.is_bigendian = found.step, found.is_bigendian
+                made.data = array.array('B', found.data.tobytes())
+            else:
+                made = QuaternionStamped()
+                for axis in 'xyzw':
+                    setattr(made.quaternion, axis, getattr(found.quaternion, axis))
+            made.header.stamp.sec = found.header.stamp.sec
+            made.header.stamp.nanosec = found.header.stamp.nanosec
+            made.header.frame_id = found.header.frame_id
+            yield made
+
+
+def test_calibrates_through_the_icd(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    """Images and attitudes give the true camera, also to late subscribers."""
+    parameters = ('--params-file', str(tiny_bag / 'params.yaml'))
+    for name in ('star_observer', 'calibrator'):
+        start_node(name, ros=parameters)
+    early = client.latched(CameraInfo, 'camera_info')
+    observations: list[Any] = client.collect(StarObservations, 'observations')
+    images = client.publisher(Image, 'image', 20)
+    attitudes = client.publisher(QuaternionStamped, 'attitude')
+    client.until_listened(listeners=2)
+
+    sent = 0
+    for message in bag_messages(tiny_bag):
+        if isinstance(message, Image):
+            # An observer works at its own speed: two images ahead are enough.
+            enough = sent - 2
+            client.until(functools.partial(has, observations, enough), 60.0)
+            images.publish(message)
+            sent += 1
+        else:
+            attitudes.publish(message)
+    client.until(lambda: len(observations) == sent, 60.0)
+    assert [o.refusal for o in observations] == [''] * sent
+    for one in observations:
+        n = len(one.catalog_id)
+        assert n > 50
+        sizes = [len(one.direction_icrf), len(one.measured_px), len(one.covariance_px2)]
+        assert sizes == [3 * n, 2 * n, 3 * n]
+        assert len(one.magnitude) == len(one.flux_dn) == len(one.snr) == n
+        assert (
+            np.abs(np.linalg.norm(np.reshape(one.direction_icrf, (n, 3)), axis=1) - 1).max()
+            < 1e-12
+        )
+
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    client.until(lambda: status and status[-1].images == sent)
+    assert sum(status[-1].coverage) == status[-1].stars == sum(len(o.snr) for o in observations)
+    assert len(status[-1].coverage) == status[-1].coverage_rows * status[-1].coverage_cols
+    assert len(status[-1].predicted_sigma) == len(status[-1].parameter_names)
+
+    trial = client.call(Calibrate, '/calibrator/solve', dry_run=True)
+    assert trial.success, trial.message
+    assert trial.calibration.stars_used > 0
+    assert not early, 'nothing is published as a calibration before one is active'
+
+    answer = client.call(Trigger, '/calibrator/calibrate')
+    assert answer.success, answer.message
+    infos = client.latched(CameraInfo, 'camera_info')
+    alignments = client.latched(TransformStamped, 'alignment')
+    calibrations = client.latched(Calibration, 'calibration')
+    client.until(lambda: infos and alignments and calibrations and early)
+    check_products(infos[0], alignments[0], calibrations[0], tiny_bag)
+
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    names = {'starcal: star_observer', 'starcal: calibrator'}
+    client.until(lambda: names <= {m.status[0].name for m in diagnostics})
+    assert {m.status[0].level for m in diagnostics} == {b'\x00'}
+
+
+def has(messages: list[Any], count: int) -> bool:
+    """Return True once a number of messages has arrived."""
+    return len(messages) >= count
+
+
+def check_products(info: Any, alignment: Any, calibration: Any, folder: Path) -> None:
+    """The three latched messages agree with each other and, within 5 sigma, with the truth."""
+    truth = json.loads((folder / 'truth.json').read_text())
+    assert calibration.accepted and not calibration.reasons
+    sigma = np.sqrt(np.diag(np.reshape(calibration.covariance, (13, 13))))
+    assert list(calibration.camera.parameter_names) == list(calibration.parameter_names)[:10]
+    off = np.array(calibration.camera.parameters) - np.r_[truth['k_true'], truth['d_true']]
+    free = sigma[:10] > 0
+    assert free.sum() >= 5
+    assert np.abs(off[free] / sigma[:10][free]).max() < 5
+    # plumb_bob has another order; at this skew the refit without it moves little.
+    assert info.distortion_model == 'plumb_bob'
+    assert (info.width, info.height) == (truth['width'], truth['height'])
+    assert info.k[1] == 0.0
+    found = dict(
+        zip(calibration.camera.parameter_names, calibration.camera.parameters, strict=True)
+    )
+    assert abs(info.k[0] - found['fx']) < 1.0
+    assert abs(info.d[0] - found['k1']) < 0.01
+    assert abs(info.d[2] - found['p1']) < 0.001
+    assert (alignment.header.frame_id, alignment.child_frame_id) == (
+        calibration.alignment.parent_frame,
+        calibration.header.frame_id,
+    )
+    q = alignment.transform.rotation
+    assert q == calibration.alignment.rotation
+    camera_from_st = np.array(truth['A_true'])
+    error = rotation(q).T @ camera_from_st.T
+    angle = np.arccos(np.clip((np.trace(error) - 1) / 2, -1, 1))
+    assert angle < 5 * np.linalg.norm(sigma[10:])
+    assert 0 < np.linalg.norm(sigma[10:]) < 60 * ARCSECOND_RAD
+
+
+def rotation(q: Any) -> Any:
+    """Matrix of a quaternion message: from child to parent."""
+    x, y, z, w = q.x, q.y, q.z, q.w
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

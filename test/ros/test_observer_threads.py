@@ -1,0 +1,61 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""What the threads of a star observer share, on the node itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+import threading
+
+import pytest
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+import rclpy
+
+from starcal_ros.formats.messages.calibration_messages import calibration_to_message
+from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, read_calibration
+from starcal_ros.ros.lifecycle_node.message_factory import make_message
+from starcal_ros.ros.star_observer import StarObserver
+
+pytestmark = pytest.mark.nodes
+
+
+@pytest.fixture
+def observer(ros_domain: None, tiny_bag: Path) -> Iterator[StarObserver]:
+    """An active star observer in this process."""
+    rclpy.init(args=['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')])
+    node = StarObserver()
+    try:
+        node.trigger_configure()
+        node.trigger_activate()
+        yield node
+    finally:
+        node.deactivate()
+        node.cleanup()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def test_the_worker_alone_changes_prediction_and_counts(
+    observer: StarObserver, tiny_products: Path
+) -> None:
+    """A calibration that arrives while the worker measures waits for it."""
+    busy, go_on, done = threading.Event(), threading.Event(), threading.Event()
+
+    def hold() -> None:
+        busy.set()
+        assert go_on.wait(60.0)
+
+    assert observer._queue is not None
+    observer._queue.call(hold)
+    assert busy.wait(60.0)
+    active = read_calibration(tiny_products / CALIBRATION_FILE)
+    observer._on_calibration(calibration_to_message(active, make_message))
+    prior = observer._setup.prior
+    assert observer._geometry is prior
+    observer._queue.call(done.set)
+    go_on.set()
+    assert done.wait(60.0)
+    assert observer._geometry is not prior

@@ -1,0 +1,208 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""set_camera_info client: each active calibration is sent; failures of a real service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+import signal
+import subprocess
+import sys
+from typing import Any, TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Client, StartNode
+
+    from starcal_ros.records import Ensemble
+
+pytest.importorskip('rclpy')
+pytest.importorskip('starcal.msg')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo
+from sensor_msgs.srv import SetCameraInfo
+from std_srvs.srv import Trigger
+
+from starcal.msg import EnsembleStatus, StarObservations
+from starcal_ros.formats.messages.observation_messages import observations_to_message
+from starcal_ros.ros.lifecycle_node.message_factory import make_message
+
+pytestmark = pytest.mark.nodes
+
+SERVICE = '/opnav/set_camera_info'
+
+# Keeps the camera that it receives in a file, as drivers do; SIGTERM ends it.
+DRIVER = """
+from pathlib import Path
+import sys
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.serialization import serialize_message
+from sensor_msgs.srv import SetCameraInfo
+
+def keep(request, response):
+    part = Path(sys.argv[1] + '.part')
+    part.write_bytes(serialize_message(request.camera_info))
+    part.rename(sys.argv[1])
+    response.success = True
+    return response
+
+rclpy.init()
+node = rclpy.create_node('camera_driver')
+node.create_service(SetCameraInfo, sys.argv[2], keep)
+try:
+    while rclpy.ok():  # rmw_fastrtps may lose the wake-up by a signal: wait for half a second
+        rclpy.spin_once(node, timeout_sec=0.5)
+except ExternalShutdownException:
+    pass
+node.destroy_node()
+"""
+
+
+@contextmanager
+def driver(kept: Path, ends_by: signal.Signals) -> Iterator[None]:
+    """A camera driver in a process of its own."""
+    process = subprocess.Popen([sys.executable, '-c', DRIVER, str(kept), SERVICE])
+    try:
+        yield
+    finally:
+        process.send_signal(ends_by)
+        assert process.wait(60) == (0 if ends_by == signal.SIGTERM else -ends_by)
+
+
+def fill(client: Client, ensemble: Ensemble) -> None:
+    """Publish the observations of an ensemble to a calibrator."""
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    observations = client.publisher(StarObservations, 'observations')
+    for image in ensemble.images:
+        observations.publish(observations_to_message(image, 'camera', make_message))
+    client.until(lambda: status and status[-1].images == len(ensemble.images))
+
+
+def told(diagnostics: list[Any], outcome: str, level: bytes) -> Callable[[], bool]:
+    """Condition on the level and driver outcome in the latest diagnostics."""
+
+    def is_so() -> bool:
+        newest = [status for message in diagnostics[-1:] for status in message.status]
+        return any(
+            status.level == level
+            and {v.key: v.value for v in status.values}.get('camera_driver') == outcome
+            for status in newest
+        )
+
+    return is_so
+
+
+def failures(diagnostics: list[Any]) -> int:
+    """Failed calls that the latest diagnostics count."""
+    values = {v.key: v.value for v in diagnostics[-1].status[0].values}
+    return int(values['camera_driver_failures'])
+
+
+def test_driver_is_told_and_its_failures_are_seen(
+    client: Client,
+    other_client: Client,
+    start_node: StartNode,
+    tiny_bag: Path,
+    tiny_observations: Ensemble,
+) -> None:
+    """A missing, silent, refusing and accepting driver: outcome, count and retry of each."""
+    calibrator = start_node(
+        'calibrator',
+        ros=(
+            *('--params-file', str(tiny_bag / 'params.yaml')),
+            *('-p', f'set_camera_info_service:={SERVICE}'),
+        ),
+    )
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    nothing = client.call(Trigger, '/calibrator/send_camera_info')
+    assert (nothing.success, nothing.message) == (False, 'no calibration is active')
+    fill(client, tiny_observations)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    client.until(told(diagnostics, 'service not available; will be sent when it is', b'\x01'))
+
+    # A driver that takes the call and never answers: nobody spins its node.
+    silent = other_client.node.create_service(SetCameraInfo, SERVICE, lambda _, answer: answer)
+    client.until(told(diagnostics, 'no answer within 5 s', b'\x01'))
+    # The first failure was that the service was not there; then it is called again and again.
+    client.until(lambda: failures(diagnostics) >= 4)
+    other_client.node.destroy_service(silent)
+
+    received: list[Any] = []
+    accepts = False
+
+    def answer(request: Any, response: Any) -> Any:
+        received.append(request.camera_info)
+        response.success = accepts
+        response.status_message = '' if accepts else 'sensor\nbusy'
+        return response
+
+    client.node.create_service(SetCameraInfo, SERVICE, answer)
+    refused = client.call(Trigger, '/calibrator/send_camera_info')
+    assert not refused.success and refused.message == f'{SERVICE}: refused: sensor busy'
+    client.until(told(diagnostics, 'refused: sensor busy', b'\x01'))
+
+    accepts = True
+    taken = client.call(Trigger, '/calibrator/send_camera_info')
+    assert taken.success, taken.message
+    client.until(told(diagnostics, 'accepted', b'\x00'))
+    published = client.latched(CameraInfo, 'camera_info')
+    client.until(lambda: published)
+    assert received[-1] == published[-1]
+
+    before = len(received)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    client.until(lambda: len(received) > before)
+    said = calibrator.said()
+    for outcome in (
+        'service not available',
+        'no answer within 5 s',
+        'refused: sensor busy',
+        'accepted',
+    ):
+        assert f'{SERVICE}: {outcome}' in said
+    assert 'Traceback' not in said
+
+
+def test_without_a_driver(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+    start_node('calibrator', ros=('--params-file', str(tiny_bag / 'params.yaml')))
+    answer = client.call(Trigger, '/calibrator/send_camera_info')
+    assert not answer.success and 'set_camera_info_service' in answer.message
+
+
+@pytest.mark.parametrize('ends_by', [signal.SIGTERM, signal.SIGKILL], ids=lambda s: s.name)
+def test_a_driver_process_that_restarts(
+    ends_by: signal.Signals,
+    client: Client,
+    start_node: StartNode,
+    tiny_bag: Path,
+    tiny_observations: Ensemble,
+    tmp_path: Path,
+) -> None:
+    """
+    A driver in another process receives the calibration that was active before it started.
+
+    The next one starts at once.  After SIGKILL, DDS takes the one before it as still there.
+    """
+    start_node(
+        'calibrator',
+        ros=(
+            *('--params-file', str(tiny_bag / 'params.yaml')),
+            *('-p', f'set_camera_info_service:={SERVICE}'),
+        ),
+    )
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    fill(client, tiny_observations)
+    assert client.call(Trigger, '/calibrator/calibrate').success
+    published = client.latched(CameraInfo, 'camera_info')
+    client.until(lambda: published)
+    for name in ('first', 'second'):
+        kept = tmp_path / name
+        with driver(kept, ends_by):
+            client.until(kept.exists)
+            client.until(told(diagnostics, 'accepted', b'\x00'))
+        assert deserialize_message(kept.read_bytes(), CameraInfo) == published[-1]

@@ -1,0 +1,226 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Files and messages from outside, spoilt by hypothesis: read, or refused in one line, in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+from pathlib import Path
+import shutil
+from typing import Any
+
+from attacks import drawn, in_time, spoilt_text  # type: ignore[import-not-found]
+from hypothesis import given
+import numpy as np
+import pytest
+
+from bench.frames import write_set_up
+from starcal_ros.assessment.comparison import compare
+from starcal_ros.assessment.lookup import line_of_sight_table
+from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
+from starcal_ros.camera.conversion import ros_fit
+from starcal_ros.cli import main
+from starcal_ros.errors import StarcalError
+from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.writer import BagWriter
+from starcal_ros.formats.products.calibration_json import (
+    CALIBRATION_FILE,
+    prior_of,
+    read_calibration,
+    write_calibration,
+)
+from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.options import read_parameter_file
+from starcal_ros.pipeline import solve
+from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
+from starcal_ros.pipeline.setup import load_setup, NODES
+from starcal_ros.records import Calibration, Ensemble, Image
+from starcal_ros.ros.kept.archive import Archive
+from starcal_ros.ros.kept.stored import Activation
+from starcal_ros.studies.simulation.centroids import true_observations
+from starcal_ros.studies.simulation.scenario import scenario
+
+SCENARIO = scenario('tiny')
+BAG = Path(__file__).parents[2] / 'bags' / 'tiny'
+pytestmark = pytest.mark.slow
+
+
+@contextlib.contextmanager
+def read_or_refused() -> Iterator[None]:
+    """A `StarcalError` of one line may leave the block, no other exception."""
+    refusal = ''
+    with in_time(), np.errstate(all='ignore'):
+        try:
+            yield
+        except StarcalError as error:
+            refusal = str(error)
+    assert len(refusal.splitlines()) <= 1 and len(refusal) < 5000
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the parameter file and the camera file of the scenario."""
+    path = tmp_path_factory.mktemp('set_up')
+    write_set_up(SCENARIO, path)
+    return path
+
+
+@pytest.fixture(scope='module')
+def calibration(folder: Path) -> Calibration:
+    setup = load_setup(read_parameter_file(folder / 'params.yaml', NODES), NODE_OPTION_CLASSES)
+    return solve.solve(true_observations(SCENARIO), setup)
+
+
+def spoils(base: str, path: Path, read: Callable[[Path], None], count: int = 60) -> None:
+    """Write spoilt copies of a text to a file, and read each."""
+
+    @drawn(count)
+    @given(spoilt_text(base))
+    def spoil(content: bytes) -> None:
+        path.write_bytes(content)
+        with read_or_refused():
+            read(path)
+
+    spoil()
+
+
+def test_parameter_files(folder: Path, tmp_path: Path) -> None:
+    values = read_parameter_file(folder / 'params.yaml', NODES)
+    setup = load_setup(values, NODE_OPTION_CLASSES)
+    flow = {n: list(v) if isinstance(v, tuple) else v for n, v in setup.options().items()}
+    lines = [f'    {name}: {json.dumps(value)}' for name, value in flow.items()]
+
+    def read(path: Path) -> None:
+        load_setup(read_parameter_file(path, NODES), NODE_OPTION_CLASSES, setup.prior)
+
+    text = '\n'.join(['/**:', '  ros__parameters:', *lines])
+    spoils(text, tmp_path / 'params.yaml', read)
+
+
+def test_camera_files(folder: Path, tmp_path: Path) -> None:
+    def read(path: Path) -> None:
+        camera = read_camera_info(path)
+        project(camera, line_of_sight(camera, pixel_grid(camera, 5, 5)))
+        field_radius_rad(camera)
+        ros_fit(camera)
+
+    spoils((folder / 'camera.yaml').read_text(), tmp_path / 'camera.yaml', read)
+
+
+def test_metadata_of_bags(tmp_path: Path) -> None:
+    """The bag beside it is read, not another one."""
+    with BagWriter(tmp_path / 'bag') as writer:
+        for k in range(3):
+            writer.write_image('/image', Image(k, np.zeros((2, 2), np.uint8)), '')
+
+    def read(path: Path) -> None:
+        assert [topic.count for topic in reader.topics([path.parent])] == [3]
+
+    path = tmp_path / 'bag' / 'metadata.yaml'
+    spoils(path.read_text(), path, read)
+
+
+def test_calibration_files(calibration: Calibration, tmp_path: Path) -> None:
+    path = tmp_path / CALIBRATION_FILE
+    write_calibration(calibration, path)
+
+    def read(path: Path) -> None:
+        back = read_calibration(path)
+        prior_of(back)
+        if back.accepted or back.forced:
+            compare(calibration, back)
+            camera = back.geometry.camera
+            line_of_sight_table(camera, back.map_covariance, pixel_grid(camera, 3, 3))
+
+    spoils(path.read_text(), path, read)
+
+
+def test_state_files_with_new_checksums(calibration: Calibration, tmp_path: Path) -> None:
+    """Other records are not read in place of those of the folder."""
+    sound, copy = tmp_path / 'sound', tmp_path / 'copy'
+    first = Activation(1, 0, dataclasses.replace(calibration, number=1))
+    ensemble = Ensemble(true_observations(SCENARIO).images[:1], {'no_match': 3})
+    with contextlib.closing(Archive(sound, 'camera')) as archive:
+        archive.keep(ensemble, (first,))
+
+    for file in sorted(sound.rglob('*.json')):
+
+        def read(path: Path, file: Path = file) -> None:
+            shutil.rmtree(copy, ignore_errors=True)
+            shutil.copytree(sound, copy)
+            (copy / file.relative_to(sound)).write_bytes(sealed_again(path.read_bytes()))
+            with contextlib.closing(Archive(copy, 'camera')) as archive:
+                images, history = archive.read_ensemble(), archive.read_history()
+                assert len(images.images) == 1 and len(history) <= 1
+                archive.keep(images, history)
+                assert all('\n' not in text for text in archive.damage)
+
+        spoils(file.read_text(), tmp_path / 'content', read, 30)
+
+
+def sealed_again(content: bytes) -> bytes:
+    """The content with its checksum made right, where it is a JSON object."""
+    try:
+        fields = json.loads(content)
+        del fields['sha256']
+        text = json.dumps(fields, sort_keys=True, separators=(',', ':'))
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        return json.dumps({**fields, 'sha256': digest}).encode()
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return content
+
+
+@pytest.mark.nodes
+def test_observations() -> None:
+    """Mutants of a message are refused, or saved, read again and counted."""
+    pytest.importorskip('rclpy')
+    from mutants import mutants  # type: ignore[import-not-found]
+
+    from starcal_ros.formats.messages.observation_messages import (
+        checked_observations,
+        observations_to_message,
+    )
+    from starcal_ros.ros.lifecycle_node.message_factory import make_message
+
+    images = true_observations(SCENARIO).images
+    brightest = images[0].select(np.argsort(np.argsort(-images[0].flux_dn)) < 20)
+    setup = load_setup({}, NODE_OPTION_CLASSES, SCENARIO.prior)
+    answers = {'refused': 0, 'saved': 0}
+
+    @drawn(60)
+    @given(mutants(observations_to_message(brightest, 'camera', make_message)))
+    def mutate(message: Any) -> None:
+        with read_or_refused():
+            record = checked_observations(message)
+            BagWriter.one_observation('/observations', record, 'camera')
+            ensemble = solve.add_to_ensemble(Ensemble(images[1:4]), record, setup)
+            assert not np.isnan(solve.ensemble_status(ensemble, setup).predicted_sigma).any()
+            answers['refused' if record.refusal else 'saved'] += 1
+
+    mutate()
+    assert answers['saved'] and answers['refused']
+
+
+def test_pipes_and_devices_are_no_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pipe = tmp_path / 'pipe'
+    os.mkfifo(pipe)
+    (tmp_path / 'bag').mkdir()
+    for name in ('metadata.yaml', 'a.mcap'):
+        os.mkfifo(tmp_path / 'bag' / name)
+    for arguments, text in (
+        (['inspect', pipe], 'not a regular file'),
+        (['inspect', '/dev/zero'], 'not a regular file'),
+        (['inspect', tmp_path / 'bag'], 'no .mcap files in the folder'),
+        (['inspect', BAG, '--params', pipe], 'not a regular file'),
+        (['calibrate', BAG, '--params', '/dev/zero', '-o', tmp_path], 'not a regular file'),
+        (['compare', pipe, '/dev/zero'], 'not a regular file'),
+    ):
+        assert main.main([str(word) for word in arguments]) == 2
+        error = capsys.readouterr().err
+        assert text in error and error.count('\n') == 1

@@ -1,0 +1,190 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Every file, function, option, message and test that a document names exists."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+from pathlib import Path
+import pkgutil
+import re
+import shlex
+import subprocess
+
+import pytest
+
+from bench import LONG, NAMES
+import starcal_ros
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCUMENTS = sorted(
+    [
+        *(ROOT / name for name in ('README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md')),
+        *(ROOT / 'docs').glob('*.md'),
+        *(ROOT / 'bags').glob('tiny/*.md'),
+        ROOT / 'bench' / 'README.md',
+    ]
+)
+MODULES = [module.name for module in pkgutil.walk_packages(starcal_ros.__path__, 'starcal_ros.')]
+# Composed by the code, of other packages of ROS, or of the tools whose users read coming_from.md.
+ELSEWHERE = {
+    *(
+        'malloc_trim',
+        'refused_overrun',
+        'star_tracker_2_x',
+        'camera_calibration',
+        'foxglove_bridge',
+    ),
+    *('Calibration.id_stars', 'estimate_geometric_calibration', 'estimate_attitude'),
+    *('estimate_static_alignment', 'estimate_temperature_dependent_alignment'),
+    *('kalibr_calibrate_imu_camera', 'target.yaml', '--scale-low', '--scale-high'),
+}
+# Hypothetical files of a user, and modules that were rejected.
+NOT_OURS = {'rotation.py', 'env.sh', 'STUDY.json', 'STUDY.svg', '00000012.mcap'}
+SUFFIXES = (
+    *('bc', 'cameramodel', 'csv', 'html', 'json', 'mcap', 'md', 'npz', 'parquet', 'pdf', 'png'),
+    *('sh', 'tf', 'ti', 'toml', 'txt', 'xml', 'yaml'),
+)
+FOLDERS = 'bench|config|docs|examples|launch|requirements|starcal_ros|test|tools'
+NAME = re.compile(r'(?:\w+/)*[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+')
+
+
+def spans(document: Path) -> list[str]:
+    """Code spans of a document, those of its fences left out."""
+    text = re.sub(r'^```.*?^```', '', document.read_text(), flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r'^( {4}|\$\$).*$', '', text, flags=re.MULTILINE)
+    # In a span a line may be broken, a paragraph not.
+    return [' '.join(span.split()) for span in re.findall(r'`((?:[^`\n]|\n(?!\n))+)`', text)]
+
+
+@functools.cache
+def source() -> str:
+    """Text of all files of the repository that are no documents."""
+    listed = ['git', 'ls-files', '--cached', '--others', '--exclude-standard']
+    names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True)
+    paths = [ROOT / name for name in names.stdout.splitlines()]
+    kinds = {
+        '.py',
+        '.msg',
+        '.srv',
+        '.yaml',
+        '.cfg',
+        '.toml',
+        '.xml',
+        '.txt',
+        '.json',
+        '.html',
+        '.c',
+        '.h',
+        '',
+    }
+    texts = [
+        path.read_text() for path in paths if path.suffix in kinds and path != Path(__file__)
+        and path.is_file()
+    ]  # fmt: skip
+    return '\n'.join([*texts, *(f'/{name}' for name in names.stdout.splitlines())])
+
+
+@functools.cache
+def words() -> frozenset[str]:
+    return frozenset(re.findall(r'\w+', source()))
+
+
+def resolves(name: str) -> bool:
+    """True for ``[room/]module[.class].attribute``, or a name of another package."""
+    path = name.replace('/', '.').removeprefix('starcal_ros.').split('.')
+    is_ours = False
+    for count in range(len(path), 0, -1):
+        tail = '.' + '.'.join(path[:count])
+        for module in filter(lambda module: module.endswith(tail), MODULES):
+            is_ours = True
+            if has(importlib.import_module(module), path[count:]):
+                return True
+    # A field of a record or a message is cited by the names of both.
+    return not is_ours and (
+        importlib.util.find_spec(path[0]) is not None or all(part in words() for part in path)
+    )
+
+
+def has(owner: object, attributes: list[str]) -> bool:
+    for attribute in attributes:
+        if not hasattr(owner, attribute):
+            return False
+        owner = getattr(owner, attribute)
+    return True
+
+
+@pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_what_a_document_names_exists(document: Path) -> None:
+    assert [span for span in spans(document) if not exists(span)] == []
+
+
+def exists(span: str) -> bool:
+    """True if everything in a code span that looks like a name of the project is one."""
+    if span in ELSEWHERE or span.rpartition('/')[2] in NOT_OURS:
+        return True
+    files = re.findall(rf'(?<![\w/.~-])(?:{FOLDERS})/[\w./-]*\w', span)
+    options = re.findall(r'(?<!\S)--[a-z][a-z-]+', span)
+    keys = re.findall(r'"(\w+)"', span) if span.startswith('{') else []
+    return (
+        all((ROOT / name).exists() for name in files)
+        and all(option in source() for option in options)
+        and all(key in words() for key in keys)
+        and (not re.fullmatch(r'[a-z]\w*_\w+', span) or span in words())
+        and (not re.fullmatch(r"[a-z][a-z']*( [a-z']+)+", span) or is_text(span))
+        and (not NAME.fullmatch(span.removesuffix('()')) or is_name(span.removesuffix('()')))
+        and (not re.match(r'(python -m )?bench \w', span) or is_bench(span))
+        and (not span.startswith('pytest test') or are_tests(span))
+    )
+
+
+def is_text(span: str) -> bool:
+    """True for a command, or a message that the code has."""
+    return span.split()[0] in ('starcal', 'make', 'bench', 'ros2', 'pip') or span in source()
+
+
+def is_name(name: str) -> bool:
+    """True for a file, or a name in a module."""
+    if name.endswith('.py'):
+        return f'/{name}\n' in source() + '\n'
+    if name.rpartition('.')[2] in SUFFIXES:
+        return re.sub(r'\d{8}', '', name.rpartition('/')[2]) in source()
+    return resolves(name)
+
+
+def is_bench(span: str) -> bool:
+    return span.removeprefix('python -m ').split()[1] in (*NAMES, *LONG, 'NAME')
+
+
+def are_tests(span: str) -> bool:
+    """True if the files of a pytest command hold a test that its -k matches."""
+    arguments = shlex.split(span)[1:]
+    name = arguments[arguments.index('-k') + 1] if '-k' in arguments else ''
+    files = [ROOT / word for word in arguments if word.startswith('test/')]
+    found = [re.findall(r'def (test_\w+)', file.read_text()) for file in files if file.is_file()]
+    return len(found) == len(files) and any(name in test for tests in found for test in tests)
+
+
+@pytest.mark.parametrize(
+    'span',
+    [
+        *('estimation/calibrate.no_such', 'docs/no_such.md', 'no_such_option', '--no-such'),
+        *('pytest test/test_api.py -k no_such', 'bench no_such', 'no such message', 'no_such.py'),
+    ],
+)
+def test_a_name_that_does_not_exist_is_found(span: str) -> None:
+    """The test above could fail."""
+    assert not exists(span)
+
+
+def test_lines_of_pytest_and_bench_in_documents_exist() -> None:
+    """In indented blocks too: files of tests, -m and -k, and names of benches."""
+    for document in DOCUMENTS:
+        for line in re.findall(r'-m (pytest|bench) ([^\n#`]*)', document.read_text()):
+            if line[0] == 'bench':
+                name = line[1].split()[:1]
+                assert not name or name[0].startswith('-') or is_bench(f'bench {name[0]}')
+            else:
+                words_of = [word for word in line[1].split() if word.startswith('test/')]
+                assert all((ROOT / word).exists() for word in words_of), line

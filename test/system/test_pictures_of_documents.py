@@ -1,0 +1,85 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The commands that draw the pictures of the documents, run in the small."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import functools
+from pathlib import Path
+import shutil
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from docs import make_gallery, make_images, make_phase, make_trend
+from starcal_ros.studies.simulation import scenario
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[2]
+IN_BROWSER = {'report', 'trend'}
+IMAGES = ROOT / 'docs' / 'images'
+SHOWN = {path.stem for path in IMAGES.iterdir()}
+BY_COMMAND = {
+    'make_images': {'star_field', 'focal_plane', 'report'},
+    'make_gallery': {name for name in SHOWN if name.startswith('gallery_')},
+    'make_phase': {'pixel_phase'},
+    'make_trend': {'trend'},
+    # `starcal campaign paper`: test/studies/test_paper.py draws them from a few images.
+    'paper': {f'paper_figure_{k}' for k in (5, 6, 7, 8)},
+}
+
+
+def test_every_picture_has_its_command() -> None:
+    assert set().union(*BY_COMMAND.values()) == SHOWN
+
+
+def small_images(patch: pytest.MonkeyPatch, folder: Path) -> None:
+    tiny = scenario.scenario('tiny')
+    patch.setattr(scenario, 'scenario', lambda _: tiny)
+    patch.setattr(make_images, 'SHOWN_IMAGE', 3)
+    patch.setattr(make_images, 'CLOSE_UP_FIRST', (300, 200))
+    patch.setattr(sys, 'argv', ['make_images', str(folder)])
+    make_images.main()
+
+
+def small_gallery(patch: pytest.MonkeyPatch, folder: Path) -> None:
+    patch.setattr(sys, 'argv', ['make_gallery', str(folder)])
+    make_gallery.main()
+
+
+def small_phase(patch: pytest.MonkeyPatch, folder: Path) -> None:
+    patch.setattr(make_phase, 'IMAGES', 1)
+    patch.setattr(make_phase, 'FLUXES_ELECTRONS', (2e3, 2e4))
+    patch.setattr(sys, 'argv', ['make_phase', str(folder / 'pixel_phase.svg')])
+    make_phase.main()
+
+
+def small_trend(patch: pytest.MonkeyPatch, folder: Path) -> None:
+    write = functools.partial(make_trend.write_mission, months=3)
+    patch.setattr(make_trend, 'write_mission', write)
+    patch.setattr(make_trend, 'FOLDER', folder)
+    patch.setattr(sys, 'argv', ['make_trend', str(folder)])
+    patch.chdir(folder)  # the command changes its folder: come back from there
+    assert make_trend.main() == 0
+
+
+@pytest.mark.parametrize('draw', [small_images, small_gallery, small_phase, small_trend])
+def test_a_command_draws_its_pictures(
+    draw: Callable[[pytest.MonkeyPatch, Path], None],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    draw(monkeypatch, tmp_path)
+    drawn = {path.stem for path in tmp_path.iterdir() if path.suffix in ('.png', '.svg')}
+    expected = BY_COMMAND[draw.__name__.replace('small', 'make')]
+    if not (shutil.which('chromium') or shutil.which('google-chrome')):
+        expected = expected - IN_BROWSER
+    assert drawn == expected
+    for path in tmp_path.glob('gallery_*.png'):  # drawn in whole, unlike the others
+        drawn_px, shown_px = (cv2.imread(str(one)) for one in (path, IMAGES / path.name))
+        assert drawn_px is not None and shown_px is not None, path.name
+        assert drawn_px.shape == shown_px.shape, path.name
+        assert np.mean(cv2.absdiff(drawn_px, shown_px) > 60) < 0.01, path.name

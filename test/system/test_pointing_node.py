@@ -1,0 +1,109 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The C++ node of examples/, built with the exported C where rclcpp is installed, and run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import os
+from pathlib import Path
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.camera import line_of_sight
+from starcal_ros.mission.export.export_formats import export
+from starcal_ros.records import Calibration
+
+if TYPE_CHECKING:
+    from conftest import Client
+
+pytest.importorskip('rclpy')
+
+from export_calibrations import calibration  # type: ignore[import-not-found]
+from geometry_msgs.msg import PointStamped, Vector3Stamped
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+
+pytestmark = [pytest.mark.nodes, pytest.mark.slow, pytest.mark.timeout(900)]
+EXAMPLE = Path(__file__).resolve().parents[2] / 'examples' / 'pointing_node'
+# A unit vector in double precision; the table is that of the Python package.
+SAME_DIRECTION = 1e-12
+COMPILED_IN, UPLINKED = calibration('plumb_bob'), calibration('thin_prism', with_field=True)
+
+
+@pytest.fixture(scope='module')
+def node(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the example as a user does: camera exported, then CMake."""
+    prefixes = [*os.environ.get('CMAKE_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+    if not any(Path(one, 'share/rclcpp/cmake').is_dir() for one in prefixes if one):
+        pytest.skip('no rclcpp with its headers: PyPI has none')
+    folder = tmp_path_factory.mktemp('pointing_node')
+    export(COMPILED_IN, 'c', folder, None)
+    definitions = (f'-DSTARCAL_CAMERA_DIR={folder}', f'-DPython3_EXECUTABLE={sys.executable}')
+    build = os.environ | {'CMAKE_PREFIX_PATH': os.pathsep.join(filter(None, prefixes))}
+    for command in (
+        ('cmake', '-S', EXAMPLE, '-B', folder / 'build', *definitions),
+        ('cmake', '--build', folder / 'build'),
+    ):
+        done = subprocess.run(command, env=build, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+    return folder / 'build' / 'pointing_node'
+
+
+@pytest.fixture
+def started(node: Path, client: Client) -> Iterator[None]:
+    with subprocess.Popen([node]) as process:
+        yield
+        process.kill()
+
+
+def test_it_answers_with_the_lines_of_sight_of_the_python_package(
+    client: Client, started: None, tmp_path: Path
+) -> None:
+    answers = client.collect(Vector3Stamped, 'line_of_sight')
+    client.until(lambda: client.node.count_publishers('line_of_sight'))
+    pixels = client.publisher(PointStamped, 'pixel')
+    asked = np.array([[0.0, 0.0], [640.5, 500.25], [1295.0, 1023.0]])
+
+    def sights() -> np.ndarray:
+        answers.clear()
+        for x, y in asked.tolist():
+            message = PointStamped()
+            message.point.x, message.point.y = x, y
+            pixels.publish(message)
+        client.until(lambda: len(answers) == len(asked))
+        return np.array([[a.vector.x, a.vector.y, a.vector.z] for a in answers])
+
+    def set_table(path: Path) -> str:
+        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=str(path))
+        wish = Parameter(name='table', value=value)
+        (answer,) = client.call(
+            SetParameters, '/pointing_node/set_parameters', parameters=[wish]
+        ).results
+        return '' if answer.successful else answer.reason
+
+    assert np.abs(sights() - expected(COMPILED_IN, asked)).max() < SAME_DIRECTION
+    (table,) = export(UPLINKED, 'c', tmp_path, None, table=True).files
+    assert set_table(table) == ''
+    assert np.abs(sights() - expected(UPLINKED, asked)).max() < SAME_DIRECTION
+    damaged = tmp_path / 'damaged.bin'
+    damaged.write_bytes(table.read_bytes()[:-9])
+    assert set_table(damaged) == f'table {damaged}: refused with starcal_status 7'
+    assert set_table(tmp_path / 'none') == f'table {tmp_path}/none: cannot be read'
+    assert np.abs(sights() - expected(UPLINKED, asked)).max() < SAME_DIRECTION
+
+
+def test_a_bad_table_at_the_start_costs_one_line(node: Path, tmp_path: Path) -> None:
+    command: list[str | Path] = [node, '--ros-args', '-p', f'table:={tmp_path / "none"}']
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert 'none: cannot be read' in done.stderr and done.stderr.count('\n') == 1
+
+
+def expected(made: Calibration, pixels: np.ndarray) -> np.ndarray:
+    tracker = Rotation.from_quat(made.geometry.star_tracker_from_camera_xyzw)
+    return np.asarray(tracker.apply(line_of_sight(made.geometry.camera, pixels)))

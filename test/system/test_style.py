@@ -1,0 +1,47 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Rules of CONTRIBUTING.md that ruff and mypy do not check."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+import re
+
+ROOT = Path(__file__).parents[2]
+MODULES = {path.stem for path in (ROOT / 'starcal_ros').rglob('*.py')}
+FILES = sorted(
+    path for folder in ('starcal_ros', 'bench', 'tools', 'docs', 'examples')
+    for path in (ROOT / folder).rglob('*.py')
+)  # fmt: skip
+# No longer than the longest of today: a new one must earn more.
+LONGEST_FUNCTION_LINES = 95
+SUBJECTS = {  # tests of several modules together
+    *('activations', 'awkward_frames', 'diagnostics', 'faults', 'icd_client', 'kills'),
+    *('lens_models', 'motion', 'nodes', 'observer_threads', 'set_up_mistakes', 'star_trackers'),
+    *('trend', 'worlds'),
+}
+
+
+def test_tests_have_the_names_of_their_modules() -> None:
+    names = {path.stem.removeprefix('test_'): path for path in (ROOT / 'test').rglob('test_*.py')
+             if path.parent.name != 'system'}  # fmt: skip
+    strange = {
+        str(path.relative_to(ROOT)) for name, path in names.items()
+        if name not in MODULES | SUBJECTS
+        and not name.startswith(('against_', 'hostile_', *(f'{module}_' for module in MODULES)))
+    }  # fmt: skip
+    assert strange == set()
+
+
+def test_docstrings_state_a_result_and_functions_are_short() -> None:
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    texts, long = [], []
+    for path in FILES:
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        texts += [ast.get_docstring(node) or '' for node in nodes if isinstance(node, documented)]
+        for node in nodes:
+            if isinstance(node, ast.FunctionDef):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                long += [f'{path}: {node.name}'] if lines > LONGEST_FUNCTION_LINES else []
+    assert [text for text in texts if re.match(r'(What|Whether|Of)\b', text)] == []
+    assert long == []

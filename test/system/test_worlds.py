@@ -1,0 +1,104 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Simulated worlds: the noise is as stated, the departures are those of the recorded truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bench import worlds
+from bench.observed_campaign import Campaign, GRID
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import line_of_sight, pixel_grid, project, rotation_jacobian
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.studies.simulation import scenario as synthetic
+
+
+def residuals(made: Campaign, index: int) -> tuple[Floats, Floats]:
+    """Residuals (n, 2) of an image by the true camera and its best rotation; sigma (n,), px."""
+    image, camera = made.ensemble.images[index], made.truth.camera
+    seen = line_of_sight(camera, image.measured_px)
+    sigma_px = np.sqrt(image.covariance_px2[:, 0])
+    rotation, _ = Rotation.align_vectors(seen, image.direction_icrf, weights=sigma_px**-2)
+    in_camera = rotation.apply(image.direction_icrf)
+    for _ in range(2):
+        residual_px = image.measured_px - project(camera, in_camera)
+        J = rotation_jacobian(camera, in_camera) / sigma_px[:, None, None]
+        step, *_ = np.linalg.lstsq(
+            J.reshape(-1, 3), (residual_px / sigma_px[:, None]).ravel(), rcond=None
+        )
+        in_camera = Rotation.from_rotvec(-step).apply(in_camera)
+    return image.measured_px - project(camera, in_camera), sigma_px
+
+
+def chi2_per_number(made: Campaign) -> float:
+    """Mean squared residual over its variance, each image with a rotation of its own."""
+    found = [residuals(made, k) for k in range(len(made.ensemble.images))]
+    whole = sum(float(((r / s[:, None]) ** 2).sum()) for r, s in found)
+    return whole / sum(r.size - 3 for r, _ in found)
+
+
+@pytest.mark.parametrize('name', ['plain', 'bright24', 'vel_leo_ram', 'stamp_50ms'])
+def test_centroids_scatter_by_their_stated_covariance(name: str) -> None:
+    # A velocity of 7.6 km/s moves stars by 0.04 px within an image; a late stamp moves none.
+    low, high = (0.9, 1.1) if name != 'vel_leo_ram' else (1.0, 1.5)
+    assert low < chi2_per_number(worlds.campaign(name, 1)) < high
+
+
+@pytest.mark.parametrize('name', ['rolling_fast', 'wave11_050', 'breath6', 'out5', 'fields4_cat'])
+def test_a_departure_shows_in_the_residuals(name: str) -> None:
+    assert chi2_per_number(worlds.campaign(name, 1)) > 1.1
+
+
+def test_a_campaign_is_determined_by_its_seed() -> None:
+    one, same, other = (worlds.campaign('plain', seed, 3) for seed in (1, 1, 2))
+    measured = [made.ensemble.images[2].measured_px for made in (one, same, other)]
+    assert np.array_equal(measured[0], measured[1])
+    assert len(measured[2]) != len(measured[0]) or not np.allclose(measured[2], measured[0])
+
+
+@pytest.mark.parametrize('name', ['rip7_050', 'wave11_050', 'radial8_10'])
+def test_true_directions_have_the_displacement_of_the_stars(name: str) -> None:
+    made = worlds.campaign(name, 1)
+    camera = made.truth.camera
+    grid = pixel_grid(camera, GRID, GRID)
+    moved_px = grid - project(camera, made.true_directions)
+    shown, left = [], []
+    for index, image in enumerate(made.ensemble.images):
+        residual_px, sigma_px = residuals(made, index)
+        distance2 = ((image.measured_px[:, None] - grid) ** 2).sum(axis=2)
+        near = (sigma_px < 0.03) & (distance2.min(axis=1) < 10.0**2)
+        shown.append(residual_px[near])
+        left.append(residual_px[near] - moved_px[distance2[near].argmin(axis=1)])
+    rms_shown, rms_left = (np.sqrt(np.mean(np.concatenate(r) ** 2)) for r in (shown, left))
+    assert rms_left < 0.7 * rms_shown
+
+
+def test_the_rate_is_that_of_the_attitudes() -> None:
+    made = worlds.campaign('small24', 1)
+    base = synthetic.scenario('small', 1)
+    before, after = (
+        Rotation.from_matrix(synthetic.camera_from_icrf(base, 5, s)) for s in (-10.0, 10.0)
+    )
+    rate_rad_s = (before * after.inv()).as_rotvec() / 20.0
+    # The pole of today is 0.15 degrees from that of the ICRF.
+    assert np.allclose(made.rate_rad_s[5], rate_rad_s, atol=3e-7)
+
+
+def test_a_late_stamp_turns_the_reported_attitude_by_the_rate() -> None:
+    early, late = (worlds.campaign(name, 1) for name in ('plain', 'stamp_50ms'))
+    to_camera = Rotation.from_quat(late.truth.star_tracker_from_camera_xyzw).inv()
+    reported = [
+        to_camera * Rotation.from_quat(m.ensemble.images[3].icrf_from_star_tracker_xyzw).inv()
+        for m in (early, late)
+    ]
+    turned_rad = (reported[0] * reported[1].inv()).as_rotvec()
+    assert np.allclose(turned_rad, 0.05 * late.rate_rad_s[3], atol=0.05 * ARCSECOND_RAD)
+
+
+@pytest.mark.slow
+def test_a_sound_world_is_honest_and_near_its_bound() -> None:
+    scores = [worlds.score('plain', seed) for seed in (1, 2, 3)]
+    assert 0.5 < np.sqrt(np.mean([s.shape**2 for s in scores])) < 1.6
+    assert all(0.9 < s.over_bound < 1.6 for s in scores)

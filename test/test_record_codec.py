@@ -1,0 +1,115 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Records to JSON and back by the types of their fields: a new field needs no other edit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import json
+import math
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+from sample_records import assert_same  # type: ignore[import-not-found]
+
+from starcal_ros.arrays import Floats
+from starcal_ros.record_codec import json_object, read_record
+from starcal_ros.record_fields import Count, Finite, Shape, Within
+
+
+@dataclass(frozen=True)
+class Knot:
+    """Nested, with an array of a stated shape."""
+
+    places_px: Annotated[Floats, Shape(('n', 2))]
+    used: Annotated[NDArray[np.int64], Within(0), Shape(('n',))]
+    weight: Annotated[float, Finite()] = 1.0
+
+
+@dataclass(frozen=True)
+class Field:
+    """One of each kind."""
+
+    name: str
+    count: Count
+    one: Knot
+    grid: Annotated[Floats, Shape(('rows', 'cols'))]
+    maybe: Knot | None = None
+    knots: tuple[Knot, ...] = ()
+    pair: Annotated[tuple[float, ...], Shape((2,))] = (0.0, math.nan)
+    flag: bool | None = None
+    by_name: Mapping[str, Annotated[float, Finite()]] | None = None
+
+    def __post_init__(self) -> None:
+        """Check a limit of the record's own."""
+        if self.count > 9:
+            raise ValueError(f'count: {self.count} is over 9')
+
+
+def knot(n: int) -> Knot:
+    return Knot(np.arange(2.0 * n).reshape(n, 2) / 7, np.arange(n), 1 / 3)
+
+
+FIELD = Field(
+    'a', 3, knot(2), np.array([[1.0, 2.0]]), knot(1), (knot(0), knot(3)), (0.1, 0.2), False,
+    {'k1': -1e-300},
+)  # fmt: skip
+
+
+def test_a_record_comes_back_to_the_last_bit() -> None:
+    text = json.dumps(json_object(FIELD), allow_nan=False)
+    found = read_record(Field, json.loads(text))
+    assert_same(found.one, FIELD.one)
+    assert found.maybe is not None and FIELD.maybe is not None
+    assert_same(found.maybe, FIELD.maybe)
+    assert len(found.knots) == 2
+    for one, expected in zip(found.knots, FIELD.knots, strict=True):
+        assert_same(one, expected)
+    assert (found.name, found.count, found.pair, found.flag) == ('a', 3, (0.1, 0.2), False)
+    assert found.grid.tolist() == [[1.0, 2.0]] and found.by_name == {'k1': -1e-300}
+
+
+def test_a_field_with_a_default_may_be_missing() -> None:
+    content = json_object(FIELD)
+    for name in ('maybe', 'knots', 'pair', 'flag', 'by_name'):
+        del content[name]
+    found = read_record(Field, {**content, 'of a later version': 1})
+    assert found.maybe is None and found.knots == () and found.flag is None
+
+
+@pytest.mark.parametrize(
+    ('key', 'value', 'error'),
+    [
+        ('name', 3, 'name: 3 is not a text'),
+        ('count', -1, 'count: -1 is not at least 0'),
+        ('count', 10, 'count: 10 is over 9'),
+        ('count', 1.5, 'count: 1.5 is not a whole number'),
+        ('one', None, 'one: None is not an object'),
+        ('one', {}, "key 'one.places_px' is missing"),
+        ('one', {'places_px': [[1.0]], 'used': [1]}, 'one.places_px: 1 x 1 numbers, not 1 x 2'),
+        ('one', {'places_px': [[1, 2]], 'used': []}, 'one.used: 0 numbers, not 1'),
+        ('one', {'places_px': [[1, 2]], 'used': [-1]}, r'one.used\[0\]: -1 is not at least 0'),
+        ('one', {'places_px': [1, 2], 'used': []}, r'one.places_px\[0\]: 1 is not a list'),
+        ('one', {'places_px': [], 'used': [], 'weight': None}, 'one.weight: None is not a number'),
+        ('grid', [[1.0], [1.0, 2.0]], 'grid: rows of different length'),
+        ('grid', [[10**400]], 'grid: a number is out of the range of float64'),
+        ('knots', {}, 'knots: {} is not a list'),
+        ('knots', [{}], r"key 'knots\[0\].places_px' is missing"),
+        ('pair', [1.0], 'pair: 1 numbers, not 2'),
+        ('pair', ['1', 2], r"pair\[0\]: '1' is not a number"),
+        ('flag', 0, 'flag: 0 is not true or false'),
+        ('by_name', {'k': None}, 'by_name.k: None is not a number'),
+    ],
+)
+def test_a_wrong_value_is_refused_by_its_key(key: str, value: object, error: str) -> None:
+    with pytest.raises(ValueError, match=error) as caught:
+        read_record(Field, {**json_object(FIELD), key: value})
+    assert '\n' not in str(caught.value) and len(str(caught.value)) < 150
+
+
+def test_a_number_that_is_not_finite_is_null() -> None:
+    content = json_object(Knot(np.array([[np.nan, np.inf]]), np.array([1])))
+    assert content['places_px'] == [[None, None]]
+    assert np.isnan(read_record(Knot, content).places_px).all()
