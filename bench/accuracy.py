@@ -26,14 +26,10 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import observe, solve
-from starcal_ros.records import (
-    CameraGeometry,
-    Ensemble,
-    StarObservations,
-)
-from starcal_ros.simulation import centroids as simulated_centroids
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.scenario import Scenario
+from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, StarObservations
+from starcal_ros.studies.simulation import centroids as simulated_centroids
+from starcal_ros.studies.simulation import scenario as synthetic
+from starcal_ros.studies.simulation.scenario import Scenario
 from starcal_ros.studies.trials import map_bound_px
 
 SIZE = (1296, 1024)
@@ -178,8 +174,8 @@ def trial(case: Case, seed: int) -> Floats:
     bound[np.ix_(columns, columns)] = simulated_centroids.cramer_rao_covariance(scenario)
     error_px = map_error_px(found.geometry.camera, scenario.truth.camera)
     over_bound2, over_sigma2 = np.concatenate(stars, axis=1).mean(axis=1)
-    bound_px = map_bound_px(scenario.truth.camera, bound)
-    sigma_px = map_bound_px(scenario.truth.camera, found.covariance)
+    bound_px = map_bound_px(scenario.truth.camera, MapCovariance(bound))
+    sigma_px = map_bound_px(found.geometry.camera, found.map_covariance)
     return np.array(
         [error_px / bound_px, sigma_px / bound_px, over_bound2, over_sigma2, found.stars_used]
     )

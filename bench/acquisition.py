@@ -32,10 +32,10 @@ from starcal_ros.identification.star_finder import (
 )
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.records import CameraGeometry, Image
-from starcal_ros.simulation import images as simulated_images
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
+from starcal_ros.studies.simulation import rendering
+from starcal_ros.studies.simulation import scenario as synthetic
+from starcal_ros.studies.simulation.scenario import Inertial, Scenario, Scene
 
 SEED = 20161
 IMAGES = 45  # rendered for each kind of field
@@ -110,7 +110,7 @@ def to_be_found(fields: int) -> Table:
         found = []
         for index in range(fields):
             drawn = synthetic.scene(scenario, index)
-            image = simulated_images.render(scenario, changed(drawn, rng, missing, strange), index)
+            image = rendering.render(scenario, changed(drawn, rng, missing, strange), index)
             off = turned(scenario.prior, error_within_the_search(rng))
             found.append(trial(image, drawn, drawn.icrf_from_star_tracker_xyzw, off, catalog))
         wrong = sum(one.wrong for one in found)
@@ -226,7 +226,7 @@ def random_attitudes(
     """True stars and a random attitude."""
     for index in range(scenario.image_count):
         drawn = synthetic.scene(scenario, index)
-        yield simulated_images.render(scenario, drawn, index), drawn, _anywhere(rng, count)
+        yield rendering.render(scenario, drawn, index), drawn, _anywhere(rng, count)
 
 
 def beyond_the_search(
@@ -244,7 +244,7 @@ def beyond_the_search(
         )
         angle_rad = np.radians(rng.uniform(2.0, 8.0, count))
         wrong = right * Rotation.from_rotvec(angle_rad[:, None] * axis)
-        yield simulated_images.render(scenario, drawn, index), drawn, list(wrong.as_quat())
+        yield rendering.render(scenario, drawn, index), drawn, list(wrong.as_quat())
 
 
 def random_sources(
@@ -253,7 +253,7 @@ def random_sources(
     """True brightnesses at random pixels."""
     for index in range(scenario.image_count):
         drawn = synthetic.scene(scenario, index)
-        image = simulated_images.render(
+        image = rendering.render(
             scenario,
             dataclasses.replace(drawn, pixel_px=scattered(rng, len(drawn.pixel_px))),
             index,
@@ -276,7 +276,7 @@ def dense_fields(
             pixel_px=np.concatenate([drawn.pixel_px, scattered(rng, more)]),
             flux_electrons=np.concatenate([drawn.flux_electrons, 10 ** rng.uniform(2.5, 4, more)]),
         )
-        yield simulated_images.render(scenario, crowded, index), drawn, _anywhere(rng, count)
+        yield rendering.render(scenario, crowded, index), drawn, _anywhere(rng, count)
 
 
 def shifted_copies(
@@ -291,7 +291,7 @@ def shifted_copies(
             pixel_px=(drawn.pixel_px[None] + shifts[:, None]).reshape(-1, 2),
             flux_electrons=np.tile(drawn.flux_electrons, 4),
         )
-        yield simulated_images.render(scenario, doubled, index), drawn, _anywhere(rng, count)
+        yield rendering.render(scenario, doubled, index), drawn, _anywhere(rng, count)
 
 
 FOLLOWED = ('tracked, random attitude', 'tracked, attitude 2 to 8 degrees off')

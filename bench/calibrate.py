@@ -16,8 +16,8 @@ import time
 from typing import NamedTuple
 
 from bench.table import Table
-from starcal_ros.simulation import bag as simulated_bag
-from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.studies.simulation import scenario as synthetic
+from starcal_ros.studies.simulation import simulated_bag
 
 MOST_MB = 300.0
 # Scenario, images, most wall time in seconds, and as a multiple of the bare read.
@@ -39,15 +39,15 @@ _TOOL = 'import sys; from starcal_ros.cli.entry_point import main; sys.exit(main
 _STAGES = (
     ('import of Python modules', 'importlib._bootstrap', '_find_and_load'),
     ('load options, camera, catalog', 'pipeline/setup', 'read_setup'),
-    ('images and stars', 'pipeline/observe', 'observe_bag'),
-    ('  wait for the reading thread', 'bag/frames', 'read_ahead'),
+    ('images and stars', 'pipeline/observe_bags', 'observe_bag'),
+    ('  wait for the reading thread', 'formats/bag/frames', 'read_ahead'),
     ('  measure and identify stars', 'pipeline/observe', 'observe_next'),
     ('  select pictures', 'report/pictures/thumbnails', 'show'),
-    ('write the observations', 'products/folder', 'write_observations'),
+    ('write the observations', 'formats/products/product_folder', 'write_observations'),
     ('solve and judge', 'pipeline/solve', 'solve_with_residuals'),
     ('  estimates', 'estimation/calibrate', 'estimate_calibration'),
     ('report', 'report/page', 'render'),
-    ('  figures', 'report/charts', 'charts_of'),
+    ('  figures', 'report/page', 'charts_of'),
 )
 
 

@@ -16,9 +16,9 @@ import time
 import psutil  # type: ignore[import-untyped]
 
 from bench.table import Table, verdict
-from starcal_ros.trend import fleet, tasks
-from starcal_ros.trend.table import Table as Rows
-from starcal_ros.trend.tasks import Task
+from starcal_ros.mission.trend import fleet, tasks
+from starcal_ros.mission.trend.tasks import Cameras, Task
+from starcal_ros.mission.trend.trend_table import Table as Rows
 
 LEAST_EFFICIENCY = 0.85
 _WORKERS = 2
@@ -39,7 +39,7 @@ class Watch:
     def on_row(self) -> None:
         """Note the memory, and kill a worker when its time has come."""
         us = psutil.Process()
-        workers = [p for p in us.children() if 'starcal_ros.studies.worker' in p.cmdline()]
+        workers = [p for p in us.children() if 'starcal_ros.child_process' in p.cmdline()]
         self.parent_mb.append(us.memory_info().rss / 1e6)
         self.worker_mb.append(max(p.memory_info().rss / 1e6 for p in workers))
         if len(self.parent_mb) == self.kill_at:
@@ -53,7 +53,7 @@ def run(quick: bool) -> list[Table]:
     with tempfile.TemporaryDirectory(prefix='starcal-fleet-') as name:
         folder = Path(name)
         copy_bags(folder / 'fleet', count)
-        found = list(tasks.find(folder / 'fleet', _PARAMS))
+        found = list(tasks.find(str(folder / 'fleet'), Cameras(params=str(_PARAMS))))
         before = one_bag_s(found[:alone], folder / 'before')
         watch = Watch(kill_at=count // 2)
         start_s, start_processor_s = time.perf_counter(), processor_s()
@@ -66,7 +66,7 @@ def run(quick: bool) -> list[Table]:
     one_s = (before[0] + after[0]) / 2
     one_used_s = (before[1] + after[1]) / 2
     efficiency = count * one_s / (_WORKERS * wall_s)
-    keys = Counter(row.key for row in rows)
+    stamps = Counter(row.stamp for row in rows)
     made = Table(f'starcal trend over {count} bags on {_WORKERS} workers', ('quantity', 'value'))
     made.add('one bag alone, before, s', before[0])
     made.add('one bag alone, after, s', after[0])
@@ -76,8 +76,8 @@ def run(quick: bool) -> list[Table]:
     made.add(f'processor time of a bag of {count}, s', used_s)
     made.add('efficiency, processor time', one_used_s / used_s)
     made.add('workers killed with SIGKILL', watch.killed)
-    made.add('bags lost', sum(task.key not in keys for task in found))
-    made.add('bags counted twice', sum(n > 1 for n in keys.values()))
+    made.add('bags lost', sum(task.stamp not in stamps for task in found))
+    made.add('bags counted twice', sum(n > 1 for n in stamps.values()))
     made.add('bags failed', sum(bool(row.error) for row in rows))
     for who, values in (('this process', watch.parent_mb), ('largest worker', watch.worker_mb)):
         tenth = max(1, len(values) // 10)

@@ -9,15 +9,14 @@ import tempfile
 
 import yaml
 
+from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.products.camera_yaml import write_camera_info
 from starcal_ros.records import AttitudeSample, Image
-from starcal_ros.simulation import bag as simulated_bag
-from starcal_ros.simulation import images as simulated_images
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.scenario import Scenario
 from starcal_ros.sky.attitude import AttitudeHistory
+from starcal_ros.studies.simulation import rendering, simulated_bag
+from starcal_ros.studies.simulation import scenario as synthetic
+from starcal_ros.studies.simulation.scenario import Scenario
 
 
 def write_set_up(scenario: Scenario, folder: Path, **values: object) -> Path:
@@ -44,7 +43,7 @@ def paper_scenario(magnitude_limit: float) -> Scenario:
 
 def render_frame(scenario: Scenario, index: int) -> tuple[Image, list[AttitudeSample]]:
     """Frame and the star-tracker samples around it."""
-    image = simulated_images.render(scenario, synthetic.scene(scenario, index), index)
+    image = rendering.render(scenario, synthetic.scene(scenario, index), index)
     return image, list(synthetic.attitude_samples(scenario, index))
 
 

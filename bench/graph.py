@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 import contextlib
 import os
 from pathlib import Path
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -42,29 +43,26 @@ def start(
     log: Path,
     *values: str,
     node: str = '',
-    before: Sequence[str] = (),
-    **options: Any,
 ) -> subprocess.Popen[bytes]:
-    """Start a node process with parameters; ``before`` is a command prefix."""
-    arguments = ['-m', f'starcal_ros.nodes.{name}', '--ros-args', '--params-file', str(params)]
+    """Start a node process with parameters."""
+    arguments = ['-m', f'starcal_ros.ros.{name}', '--ros-args', '--params-file', str(params)]
     arguments += [word for value in values for word in ('-p', value)]
     arguments += ['-r', f'__node:={node or name}', '--log-level', 'warn']
     with log.open('ab') as output:
         return subprocess.Popen(
-            [*before, sys.executable, *arguments],
+            [sys.executable, *arguments],
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            **options,
         )
 
 
 @contextlib.contextmanager
 def running(
-    name: str, params: Path, log: Path, *values: str, node: str = '', **options: Any
+    name: str, params: Path, log: Path, *values: str, node: str = ''
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Context manager of a node process; stops it at the end."""
-    process = start(name, params, log, *values, node=node, **options)
+    process = start(name, params, log, *values, node=node)
     try:
         yield process
     finally:
@@ -152,6 +150,13 @@ class Client:
         publisher = self.node.create_publisher(kind, topic, qos)
         self.until(publisher.get_subscription_count, f'a listener of {topic}')
         return publisher
+
+
+def stamped(content: bytes, time_ns: int) -> bytes:
+    """Return a serialised message whose header has another stamp."""
+    # The stamp is first in the message, after four bytes of encoding.
+    stamp = struct.pack('=iI', *divmod(time_ns, 10**9))
+    return b''.join((content[:4], stamp, memoryview(content)[12:]))
 
 
 def resident_mb(number: int) -> float:

@@ -34,7 +34,7 @@ from scipy.stats import beta, gamma
 from bench.table import Table
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, field_radius_rad, project
-from starcal_ros.lost_in_space.search import find_sky, MAX_LOG10_P_VALUE, SkyMatch
+from starcal_ros.identification.blind.search import find_sky, MAX_LOG10_P_VALUE, SkyMatch
 from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
 
 SEED = 416

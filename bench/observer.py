@@ -14,7 +14,6 @@ import importlib.util
 import multiprocessing
 from pathlib import Path
 import statistics
-import struct
 import tempfile
 import time
 from typing import Any
@@ -146,9 +145,9 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import Image as ImageMessage
 
-    from starcal_ros.messages.images import image_to_message
-    from starcal_ros.messages.telemetry import attitude_to_message
-    from starcal_ros.nodes.lifecycle_node.message_factory import make_message
+    from starcal_ros.formats.messages.image_messages import image_to_message
+    from starcal_ros.formats.messages.telemetry import attitude_to_message
+    from starcal_ros.ros.lifecycle_node.message_factory import make_message
 
     sent_s: dict[int, float] = {}
     # Serialised once, to leave the processor to the node.
@@ -168,9 +167,7 @@ def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None
 
         def send(k: int, time_ns: int) -> None:
             content, attitude = ready[k % len(ready)]
-            # The stamp is first in the message, after four bytes of encoding.
-            stamp = struct.pack('=iI', *divmod(time_ns, 10**9))
-            message = b''.join((content[:4], stamp, memoryview(content)[12:]))
+            message = graph.stamped(content, time_ns)
             xyzw = attitude.icrf_from_star_tracker_xyzw
             sent_s[time_ns] = time.monotonic()
             for around_ns in (-_AROUND_NS, _AROUND_NS):

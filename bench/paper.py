@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from bench.calibrate import compare
 from bench.table import Table
-from starcal_ros.simulation import scenario as synthetic
+from starcal_ros.studies.simulation import scenario as synthetic
 
 MOST_RATIO = 2.0
 

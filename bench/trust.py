@@ -1,17 +1,20 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Whether the sigma holds where the world differs from the model.
+Error over reported sigma where the world differs from the model.
 
 Each row is a world: a lens, a detector or a star tracker with a fault of a stated size.  Every
 seed renders a campaign of star images in that world, measures it as the observer does, and solves
 it with the default options.  The error of the lines of sight over the detector, the best common
 rotation removed, is divided by the 1-sigma that the calibration reports.  A row is honest where
 the RMS of that ratio over the accepted calibrations is 0.7 to 1.5 and none exceeds 2, or where the
-gate refuses and names the cause.
+gate refuses and names the cause.  The worlds of simulated observations follow (`bench.worlds`).
+
+``python -m bench.trust --seeds 5 --markdown FILE`` also writes the tables as Markdown.
 """
 
 from __future__ import annotations
 
+import argparse
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -20,11 +23,13 @@ from dataclasses import dataclass
 import math
 import multiprocessing
 import os
+from pathlib import Path
 
 import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bench import worlds
 from bench.frames import history, load_set_up
 from bench.table import Table
 from starcal_ros.arrays import Floats
@@ -34,10 +39,10 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import observe, solve
 from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, Image
-from starcal_ros.simulation import images as simulated_images
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.scenario import Inertial, Scenario, Scene
 from starcal_ros.sky.astrometry import tt_julian_date
+from starcal_ros.studies.simulation import rendering
+from starcal_ros.studies.simulation import scenario as synthetic
+from starcal_ros.studies.simulation.scenario import Inertial, Scenario, Scene
 
 Field = Callable[[Floats], Floats]  # displacement (n, 2) px of pixels (n, 2)
 
@@ -48,7 +53,7 @@ _GRID = 25
 _SPEED_OF_LIGHT_M_S = 299792458.0
 _AU_PER_DAY_M_S = 149597870700.0 / 86400.0
 _WANDER_IMAGES = 10.0  # correlation length of the star tracker that wanders
-_ABBBA = (0, 1, 1, 1, 0)  # too few images for halves
+_ABBBA = (0, 1, 1, 1, 0)
 _LENSES = {'two lenses': (0, 1), 'two lenses as ABBBA': _ABBBA}  # by image
 _HONEST = (0.7, 1.5)
 _NEVER = 2.0
@@ -64,33 +69,34 @@ class World:
     causes: tuple[str, ...] = ()
 
 
-_FIELD = ('field', 'cross-validated')
-_LARGE_FIELD = ('camera_info', '1-sigma of the distortion map')  # its cost, and its own sigma
+_FIELD = ('residual over predicted sigma',)
+_LARGE_FIELD = ('1-sigma of the distortion map',)
 WORLDS = (
     World('sound'),
     *(World('principal point', size, 'px', ('cx', 'cy')) for size in (2.0, 20.0, 60.0)),
     *(World('tilted detector', size, 'px', _FIELD) for size in (0.3, 1.0, 3.0)),
     *(World('8th-order radial', size, 'px', _FIELD) for size in (0.3, 1.0, 3.0)),
     *(World('ripple', size, 'px', (*_FIELD, *_LARGE_FIELD)) for size in (0.03, 0.1, 0.3, 1.0)),
-    World('fisheye', 0.0, '', ('lens', *_FIELD)),
+    World('fisheye', 0.0, '', ('lens', *_FIELD, *_LARGE_FIELD)),
     *(World('columns lost', size, 'px', ('step',)) for size in (1.0, 3.0)),
     World('odd rows shifted', 1.0, 'px', ('rows', 'step')),
     World('two lenses', 1.0, 'px', ('image to image',)),
     *(World('two lenses as ABBBA', size, 'px', ('image to image',)) for size in (0.3, 1.0)),
-    World('one image', COPIES, 'times', ('pointing',)),
+    World('one image', COPIES, 'times', _FIELD),
     *(World('focal breathing', size, 'px', ('image to image',)) for size in (0.5, 2.0, 4.0)),
     World('aberration reversed', 0.5, 'year', ('velocity', 'aberration')),
-    World('tracker wanders', 60.0, 'arcsec', ('correlated',)),
+    World('tracker wanders', 60.0, 'arcsec', ('1-sigma of a line of sight',)),
 )
 QUICK = ('sound', 'principal point', 'ripple', 'columns lost', 'tracker wanders')
 
 
-def run(quick: bool) -> list[Table]:
-    """Print and return the table of all worlds."""
-    seeds = 2 if quick else SEEDS
-    worlds = [w for w in WORLDS if not quick or w.name in QUICK]
+def run(quick: bool, seeds: int = SEEDS) -> list[Table]:
+    """Print and return the tables of all worlds."""
+    seeds = 2 if quick else seeds
+    rendered = [w for w in WORLDS if not quick or w.name in QUICK]
     if quick:
-        worlds = [w for k, w in enumerate(worlds) if w.name not in {x.name for x in worlds[:k]}]
+        names = [w.name for w in rendered]
+        rendered = [w for k, w in enumerate(rendered) if w.name not in names[:k]]
     os.environ.update(OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1')
     table = Table(
         f'Error over reported sigma where the world differs from the model, {seeds} seeds each',
@@ -107,15 +113,26 @@ def run(quick: bool) -> list[Table]:
             'refused for',
         ),
     )
-    jobs = [(world, seed) for world in worlds for seed in range(1, seeds + 1)]
+    jobs = [(world, seed) for world in rendered for seed in range(1, seeds + 1)]
     context = multiprocessing.get_context('forkserver')
     with ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
         results = list(pool.map(_trial, jobs))
-    for world in worlds:
+    for world in rendered:
         found = [r for (w, _), r in zip(jobs, results, strict=True) if w is world]
         table.add(*_summary(world, found))
-    print(table.text())
-    return [table]
+    print(table.text(), flush=True)
+    return [table, *worlds.run(quick, seeds)]
+
+
+def main() -> None:
+    """Print the tables, and write them as Markdown."""
+    parser = argparse.ArgumentParser(prog='python -m bench.trust', description=__doc__)
+    parser.add_argument('--seeds', type=int, default=SEEDS, help='seeds 1 to this number')
+    parser.add_argument('--markdown', type=Path, help='file to write')
+    args = parser.parse_args()
+    tables = run(False, args.seeds)
+    if args.markdown:
+        args.markdown.write_text('\n'.join(table.markdown() for table in tables))
 
 
 @dataclass(frozen=True)
@@ -178,7 +195,7 @@ def trial(world: World, seed: int) -> Outcome:
         return Outcome(False, (str(error),))
     camera = scenario.truth.camera
     pixels = pixel_grid(camera, _GRID, _GRID)
-    table = line_of_sight_table(found.geometry.camera, found.joint_covariance, pixels)
+    table = line_of_sight_table(found.geometry.camera, found.map_covariance, pixels)
     estimated = table.direction_camera
     to_tracker, to_true = (
         Rotation.from_quat(g.star_tracker_from_camera_xyzw)
@@ -250,7 +267,7 @@ def _wide(geometry: CameraGeometry) -> CameraGeometry:
 
 def frames(world: World, scenario: Scenario) -> list[tuple[Image, list[AttitudeSample]]]:
     """All frames of a campaign in a world, with the star tracker's samples about each."""
-    pattern = simulated_images.fixed_pattern(scenario)
+    pattern = rendering.fixed_pattern(scenario)
     rng = np.random.default_rng([scenario.seed, 78])
     wander_rad: Floats = np.zeros(3)
     step = math.exp(-1.0 / _WANDER_IMAGES)
@@ -264,7 +281,7 @@ def frames(world: World, scenario: Scenario) -> list[tuple[Image, list[AttitudeS
             pixels = np.clip(first.pixels.astype(np.int64) + noise, 0, scenario.detector.full_dn)
             image = Image(shown.time_ns, pixels.astype(np.uint16))
         else:
-            image = simulated_images.render(scenario, moved, index, pattern)
+            image = rendering.render(scenario, moved, index, pattern)
         first = first or image
         samples = list(synthetic.attitude_samples(scenario, index))
         if world.name == 'tracker wanders':
@@ -386,3 +403,7 @@ def true_directions(world: World, scenario: Scenario, pixels: Floats, index: int
     for _ in range(60):  # the displacement is a contraction: 0.1 px of 10 px at most
         at = pixels - field(at)
     return line_of_sight(camera_at(world, scenario, index), at)
+
+
+if __name__ == '__main__':
+    main()
