@@ -18,8 +18,8 @@ import spiceypy
 import yaml
 
 import starcal_ros
-from starcal_ros.bag import reader
 from starcal_ros.cli.main import main as starcal
+from starcal_ros.formats.bag import reader
 from starcal_ros.records import Image
 
 
