@@ -46,8 +46,8 @@ extensions = [
     'myst_parser',
 ]
 exclude_patterns = ['_build']
-html_theme = 'alabaster'
-html_theme_options = {'page_width': '1100px', 'sidebar_width': '240px'}
+html_theme = 'furo'
+html_title = f'starcal {release}'
 default_role = 'py:obj'
 
 autosummary_generate = True
@@ -58,6 +58,7 @@ add_module_names = False
 numpydoc_class_members_toctree = False
 numpydoc_show_class_members = False
 myst_heading_anchors = 4
+myst_enable_extensions = ['amsmath', 'dollarmath']  # MathJax sets them in the browser
 
 
 def copy_of(document: Path) -> Path:

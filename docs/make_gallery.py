@@ -22,9 +22,8 @@ from starcal_ros.arrays import Floats, Picture
 from starcal_ros.pipeline import observe
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.report.pictures.annotation import annotate
-from starcal_ros.simulation import images as simulated_images
-from starcal_ros.simulation import scenario
 from starcal_ros.sky.attitude import AttitudeHistory
+from starcal_ros.studies.simulation import rendering, scenario
 
 SCENARIO = scenario.scenario('tiny')
 PLAIN = setup_of(SCENARIO)
@@ -44,17 +43,17 @@ def electrons(smear_px: float = 0.0, field: int = FIELD) -> Floats:
     """Mean signal of a field, its stars smeared along a line."""
     shown, psf_px = scenario.scene(SCENARIO, field), SCENARIO.detector.psf_sigma_px
     steps = max(1, round(4 * smear_px))
-    mean = simulated_images.fixed_pattern(SCENARIO)
+    mean = rendering.fixed_pattern(SCENARIO)
     for k in range(steps):
         moved = shown.pixel_px + ((k + 0.5) / steps - 0.5) * smear_px * np.array([0.8, 0.6])
         flux = shown.flux_electrons / steps
-        mean = mean + simulated_images.star_electrons(moved, flux, psf_px, SHAPE)
+        mean = mean + rendering.star_electrons(moved, flux, psf_px, SHAPE)
     return mean
 
 
 def expose(mean: Floats) -> NDArray[np.uint16]:
     """Frame with a mean signal and always the same noise."""
-    pixels = simulated_images.expose(mean, SCENARIO.detector, np.random.default_rng(8))
+    pixels = rendering.expose(mean, SCENARIO.detector, np.random.default_rng(8))
     return pixels.astype(np.uint16)
 
 
@@ -85,7 +84,7 @@ def whole_frames() -> Mapping[str, tuple[Image, StarObservations]]:
         'glare': expose(sound + 2.0e3 * (1.0 + np.cos(np.hypot(u + 60.0, v + 60.0) / 40.0))),
         'incomplete_lost': lost,
         'incomplete_torn': torn,
-        'no_stars': expose(simulated_images.fixed_pattern(SCENARIO)),
+        'no_stars': expose(rendering.fixed_pattern(SCENARIO)),
         'too_few_stars': expose(electrons(25.0)),
     }
     found = {}
@@ -105,20 +104,8 @@ def whole_frames() -> Mapping[str, tuple[Image, StarObservations]]:
 
 def drawn(image: Image, observations: StarObservations) -> Picture:
     """A whole frame with its marks, at the size of the gallery."""
-    scale = DRAWN_PX[0] / SHAPE[1]
-    camera = SETUP.prior.camera
-    fx, skew, fy = scale * camera.intrinsics[:3]
-    cx, cy = scale * (camera.intrinsics[3:] + 0.5) - 0.5
     small = cv2.resize(image.pixels, DRAWN_PX, interpolation=cv2.INTER_AREA)
-    shown = dataclasses.replace(
-        observations,
-        measured_px=scale * (observations.measured_px + 0.5) - 0.5,
-        refused_px=(scale * (observations.refused_px + 0.5) - 0.5).astype(np.float32),
-    )
-    geometry = dataclasses.replace(
-        SETUP.prior, camera=camera.replace(fx=fx, skew=skew, fy=fy, cx=cx, cy=cy)
-    )
-    return annotate(Image(image.time_ns, np.asarray(small, np.uint16)), shown, geometry)
+    return annotate(Image(image.time_ns, np.asarray(small, np.uint16)), observations, SETUP.prior)
 
 
 def spoilt_stars() -> tuple[Image, StarObservations]:

@@ -16,7 +16,6 @@ import subprocess
 import tempfile
 
 import cv2
-from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 import PIL.Image
@@ -25,25 +24,30 @@ import yaml
 
 from starcal_ros.arrays import Floats, Picture
 from starcal_ros.assessment.observability import coverage
-from starcal_ros.camera import distortion_px, pixel_grid
 from starcal_ros.cli import main as cli
+from starcal_ros.formats.products.calibration_json import read_calibration
+from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe as observing
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.products.calibration_json import read_calibration
-from starcal_ros.products.camera_yaml import write_camera_info
 from starcal_ros.records import Calibration, CameraGeometry, Ensemble, Image, StarObservations
+from starcal_ros.report.detector_figures import (
+    cell_counts,
+    distortion_contours,
+    distortion_vectors,
+    star_cloud,
+)
 from starcal_ros.report.pictures.annotation import annotate_reduced
-from starcal_ros.simulation import bag as simulated_bag
-from starcal_ros.simulation import images as simulated_images
-from starcal_ros.simulation import scenario as synthetic
-from starcal_ros.simulation.scenario import Scenario
+from starcal_ros.report.svg import sheet
 from starcal_ros.sky.attitude import AttitudeHistory
+from starcal_ros.studies.simulation import rendering, simulated_bag
+from starcal_ros.studies.simulation import scenario as synthetic
+from starcal_ros.studies.simulation.scenario import Scenario
 
 FOLDER = Path(__file__).parent / 'images'
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
-REPORT_SIZE = (1100, 900)  # the first screen, px
+REPORT_SIZE = (1400, 880)  # the first screen, px
 SHOWN_IMAGE = 12
 CLOSE_UP_FIRST, CLOSE_UP_SIZE = (931, 541), (94, 74)  # enlarged until an offset of 3 px is seen
 
@@ -136,29 +140,15 @@ def focal_plane(ensemble: Ensemble, setup: Setup, file: Path) -> None:
     """The estimated distortion and the star positions it was estimated from."""
     calibration = solve.solve(ensemble, setup)
     camera = calibration.geometry.camera
-    figure = Figure(figsize=(11, 4.6), layout='constrained')
-    left, right = figure.subplots(1, 2)
-
-    grid = pixel_grid(camera, 60, 48)
-    shift = distortion_px(camera, grid)
-    u, v, length = (a.reshape(48, 60) for a in (*grid.T, np.hypot(*shift.T)))
-    lines = left.contour(u, v, length, levels=(0.25, 0.5, 1.0, 1.5, 2.0), cmap='viridis')
-    left.clabel(lines, fmt='%g px')
-    coarse = pixel_grid(camera, 14, 11)
-    arrows = distortion_px(camera, coarse)
-    left.quiver(*coarse.T, *arrows.T, angles='xy', color='0.4', width=0.003)
-    left.set_title('estimated distortion')
-
-    counts = coverage(ensemble, camera)
-    extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
-    cells = right.imshow(counts, extent=extent, cmap='Blues', vmin=0)
     stars = np.concatenate([observed.measured_px for observed in ensemble.images])
-    right.plot(*stars.T, '.', color='0.2', markersize=0.8)
-    figure.colorbar(cells, ax=right, shrink=0.85, label='star observations per cell')
-    right.set_title(f'{calibration.stars_used} stars in {calibration.images_used} images')
-    for axes in (left, right):
-        axes.set(xlim=extent[:2], ylim=extent[2:], aspect='equal', xlabel='u, px', ylabel='v, px')
-    figure.savefig(file, dpi=90, metadata={'Software': None})
+    drawn = sheet(
+        [
+            [distortion_vectors(camera).svg, distortion_contours(camera).svg],
+            [star_cloud(stars, camera), cell_counts(coverage(ensemble, camera), camera).svg],
+        ],
+        f'distortion; {calibration.stars_used} stars in {calibration.images_used} images',
+    )
+    file.write_text(drawn.document())
 
 
 def report_page(file: Path) -> None:
@@ -210,12 +200,12 @@ def main() -> None:
     scenario = synthetic.scenario('small')
     setup = setup_of(scenario)
     ensemble = Ensemble()
-    for index, image in enumerate(simulated_images.images(scenario)):
+    for index, image in enumerate(rendering.images(scenario)):
         observations = observe(scenario, setup, image, index)
         ensemble = ensemble.add(observations)
         if index == SHOWN_IMAGE:
             star_field(image, observations, setup.prior, folder / 'star_field.png')
-    focal_plane(ensemble, setup, folder / 'focal_plane.png')
+    focal_plane(ensemble, setup, folder / 'focal_plane.svg')
     report_page(folder / 'report.png')
 
 

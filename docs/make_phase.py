@@ -12,18 +12,19 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from matplotlib.figure import Figure
 import numpy as np
 
 from starcal_ros.arrays import Floats
-from starcal_ros.image.centroiding import measure_stars
-from starcal_ros.image.detection import detect, measure_background
-from starcal_ros.image.image_model import CentroidOptions, model_image
 from starcal_ros.records import StarRefusal
-from starcal_ros.simulation.images import expose, star_electrons
-from starcal_ros.simulation.scenario import Detector
+from starcal_ros.report.plots import plot
+from starcal_ros.report.svg import Curve, MUTED, SERIES, sheet
+from starcal_ros.stars.centroiding import measure_stars
+from starcal_ros.stars.detection import detect, measure_background
+from starcal_ros.stars.image_model import CentroidOptions, model_image
+from starcal_ros.studies.simulation.rendering import expose, star_electrons
+from starcal_ros.studies.simulation.scenario import Detector
 
-FILE = Path(__file__).parent / 'images' / 'pixel_phase.png'
+FILE = Path(__file__).parent / 'images' / 'pixel_phase.svg'
 SHAPE = (1024, 1296)
 SPACING_PX = 24
 IMAGES = 12
@@ -47,7 +48,7 @@ def measure(method: str, flux_electrons: float) -> tuple[Floats, Floats, float]:
         light = star_electrons(xy, np.full(len(xy), flux_electrons), detector.psf_sigma_px, SHAPE)
         pixels = expose(light + detector.background_electrons, detector, rng)
         background = measure_background(pixels)
-        sources = detect(pixels, background, options.detection_sigma)
+        sources = detect(pixels, background)
         model = model_image(pixels, background, sources, options)
         found = measure_stars(pixels, xy, model, options)
         good = found.refusal == StarRefusal.NONE
@@ -61,26 +62,26 @@ def main() -> None:
     """Draw both methods side by side and print the amplitudes."""
     parser = argparse.ArgumentParser(description='Draw the pixel-phase error of centroids.')
     parser.add_argument('file', nargs='?', type=Path, default=FILE)
-    figure = Figure(figsize=(11, 3.6), layout='constrained')
-    panels = figure.subplots(1, 2, sharey=True)
     edges = np.linspace(-0.5, 0.5, BINS + 1)
-    for axes, method in zip(panels, METHODS, strict=True):
-        for flux in FLUXES_ELECTRONS:
+    panels = []
+    for method in METHODS:
+        curves = []
+        for flux, colour in zip(FLUXES_ELECTRONS, (*SERIES, MUTED), strict=False):
             error, phase, snr = measure(method, flux)
             part = np.clip(np.digitize(phase, edges) - 1, 0, BINS - 1)
             count = np.bincount(part, minlength=BINS)
             mean = np.bincount(part, error, minlength=BINS) / count
             sigma = np.sqrt(np.bincount(part, error**2, minlength=BINS)) / count
             middle = 0.5 * (edges[1:] + edges[:-1])
-            axes.errorbar(middle, mean, sigma, marker='.', label=f'S/N {snr:.0f}')
+            curves.append(Curve(middle, mean, colour, f'S/N {snr:.0f}', 'circle', sigma=sigma))
             harmonic = 2 * abs(np.mean(error * np.exp(2j * np.pi * phase)))
             noise = 2 * np.sqrt(np.mean(error**2) / len(error))
             print(f'{method:<7} S/N {snr:6.1f}  harmonic {harmonic:.4f} px, noise {noise:.4f} px')
-        axes.axhspan(-0.01, 0.01, color='0.9', zorder=0)
-        axes.set(title=method, xlabel='place of the star in its pixel, px')
-    panels[0].set_ylabel('mean error, px')
-    panels[1].legend()
-    figure.savefig(parser.parse_args().file, dpi=90, metadata={'Software': None})
+        panels.append(
+            plot(curves, 'place of the star in its pixel (px)', 'mean error (px)', title=method,
+                 y=(-0.04, 0.05), under=lambda panel: panel.band(-0.01, 0.01))
+        )  # fmt: skip
+    parser.parse_args().file.write_text(sheet([panels]).document())
 
 
 if __name__ == '__main__':

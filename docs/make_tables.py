@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-import dataclasses
 from pathlib import Path
 import re
 import sys
@@ -18,29 +17,29 @@ from typing import Any
 
 from starcal_ros.pipeline.node_options import (
     CalibratorOptions,
+    NODE_OPTION_CLASSES,
     NodeOptions,
     ObserverOptions,
     PlayerOptions,
 )
 from starcal_ros.pipeline.setup import OPTION_CLASSES
 from starcal_ros.records import IMAGE_REFUSALS, STAR_REFUSALS
-from tools.write_parameters import allowed, as_yaml
+from tools.write_parameters import allowed, as_yaml, fields_of
 
 FILE = Path(__file__).parent / 'icd.md'
 
 
-def parameter_table(*option_classes: type[Any]) -> str:
-    """Table of the parameters of option dataclasses."""
+def parameter_table(*option_classes: type[Any], basic: bool = False) -> str:
+    """Table of the basic or of the advanced parameters of option dataclasses."""
     rows = ['| parameter | default | allowed | description |', '|---|---|---|---|']
-    for options in option_classes:
-        for field in dataclasses.fields(options):
-            cells = (
-                f'`{field.name}`',
-                f'`{as_yaml(field.default)}`',
-                allowed(field).removeprefix('; ').replace('|', ','),
-                field.metadata['description'],
-            )
-            rows.append('| ' + ' | '.join(cells) + ' |')
+    for field in fields_of(option_classes, basic=basic):
+        cells = (
+            f'`{field.name}`',
+            f'`{as_yaml(field.default)}`',
+            allowed(field).removeprefix('; ').replace(' |', ','),
+            field.metadata['description'],
+        )
+        rows.append('| ' + ' | '.join(cells) + ' |')
     return '\n'.join(rows)
 
 
@@ -51,6 +50,7 @@ def reason_table(reasons: Mapping[str, str]) -> str:
 
 
 TABLES = {
+    'basic parameters': parameter_table(*OPTION_CLASSES, *NODE_OPTION_CLASSES, basic=True),
     'parameters of both nodes and the tool': parameter_table(*OPTION_CLASSES, NodeOptions),
     'parameters of star_observer': parameter_table(ObserverOptions),
     'parameters of calibrator': parameter_table(CalibratorOptions),

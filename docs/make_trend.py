@@ -17,17 +17,18 @@ from pathlib import Path
 import sys
 
 import numpy as np
+import PIL.Image
 from scipy.spatial.transform import Rotation
 
 from docs.make_images import draw_page, FOLDER
 from starcal_ros.cli.main import main as starcal
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.formats.products.product_folder import write_observations, write_products
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup
-from starcal_ros.products.folder import write_observations, write_products
 from starcal_ros.records import Calibration, CameraGeometry, Ensemble
-from starcal_ros.simulation.centroids import true_observations
-from starcal_ros.simulation.scenario import Inertial, Scenario, scenario
+from starcal_ros.studies.simulation.centroids import true_observations
+from starcal_ros.studies.simulation.scenario import Inertial, Scenario, scenario
 
 MONTHS = 60
 SIZE = (1184, 1688)  # of the picture, px
@@ -85,7 +86,7 @@ def campaign(month: int, base: Scenario) -> Scenario:
 def calibrations(months: int = MONTHS) -> Iterator[tuple[Calibration, Ensemble]]:
     """One calibration a month with its observations; that of each January is activated."""
     base = scenario('small', seed=18)
-    options = {'star_tracker_sigma_arcsec': [3.0, 3.0, 10.0], 'residual_field': False}
+    options = {'star_tracker_sigma_arcsec': [3.0, 3.0, 10.0]}
     active, number = None, 0
     for month in range(months):
         one = campaign(month, base)
@@ -120,7 +121,9 @@ def main() -> int:
     write_mission(folder / 'mission')
     os.chdir(folder)  # the page names the mission as it is given
     status = starcal(['trend', 'mission', '-o', '.'])
-    draw_page(folder / 'trend.html', picture, SIZE)
+    if draw_page(folder / 'trend.html', picture, SIZE):
+        with PIL.Image.open(picture) as drawn:  # lines in few colours
+            drawn.convert('RGB').quantize(192).save(picture, optimize=True)
     return status
 
 
