@@ -73,6 +73,7 @@ class NodeProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
+                env={**os.environ, 'PYTHONFAULTHANDLER': '1'},
             )
 
     def said(self) -> str:
@@ -80,18 +81,19 @@ class NodeProcess:
         return self._log.read_text(errors='replace')
 
     def wait(self, timeout_s: float = START_S) -> int:
-        """Wait for the end of the process; return its exit status."""
-        return self.process.wait(timeout_s)
+        """Wait for the end of the process; return its exit status.  One that hangs is killed."""
+        try:
+            return self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            # Python's fault handler answers SIGABRT with the stacks of all threads.
+            self.process.send_signal(signal.SIGABRT)
+            self.process.wait()
+            pytest.fail(f'{self.name} did not end in {timeout_s:.0f} s:\n{self.said()}')
 
     def stop(self, number: int = signal.SIGINT) -> int:
-        """Send a signal and return the exit status; kill the process if it does not end."""
+        """Send a signal and return the exit status, as `wait` does."""
         self.send(number)
-        try:
-            return self.process.wait(START_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-            raise
+        return self.wait()
 
     def send(self, number: int = signal.SIGINT) -> None:
         """Send a signal if the process still runs."""
