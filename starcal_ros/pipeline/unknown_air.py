@@ -45,7 +45,7 @@ _OCTAVES = 2
 _LATITUDES_RAD = np.radians(np.arange(-84.0, 85.0, 6.0))
 _LOWEST_BORESIGHT = math.cos(math.radians(75.0))
 _TURNS = 30  # of fits of the camera and of the times
-_TELLING, _LIKELIER = 12.0, 2.2  # twice the logarithm of a ratio of likelihoods: 400 and 3
+_TELLING = 12.0  # twice the logarithm of a ratio of likelihoods: 400
 _MISSHAPEN, _MISSHAPEN_PX = 3.5, 0.5  # of an image, over the median and in a corner
 
 
@@ -82,9 +82,9 @@ def with_air(
     if site.gain < _TELLING:
         size = sigma = 0.5 * size
         velocity_m_s = SPACE_M_S
-        text = 'observer: ground or space: the stars do not show it; state it (option observer)'
-    if site.gain < _LIKELIER:  # of what air there is, only the change of the focal length
+        # A zenith found by chance would be trusted: only the change of the focal length is left.
         zenith = np.array([one.boresight for one in images])
+        text = 'observer: ground or space: the stars do not show it; state it (option observer)'
     if site.gain < -_TELLING:
         size = sigma = 0.0
         text = 'observer: space: the stars show no refraction'
