@@ -138,7 +138,8 @@ def _at_the_prior(
     enough = np.array([len(image) >= FEWEST_STARS for image in ensemble.images])
     measurements = arrange(table, enough[table.image], table.covariance_px2)
     cost, blocks = image_blocks(problem, state, measurements)
-    return problem, state, stars_alone(blocks), math.isfinite(cost)
+    sums = stars_alone(blocks, problem, unknowns_in_state(problem, state))
+    return problem, state, sums, math.isfinite(cost)
 
 
 def _sigma_with(

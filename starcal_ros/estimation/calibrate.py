@@ -337,7 +337,9 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         freedom = degrees_of_freedom(
             found, measurements, problem, state, layout, table, judged.kept
         )
-        attitudes = tracker_attitudes(data, problem, state, after_step, sums, layout, found)
+        attitudes = tracker_attitudes(
+            data, problem, state, after_step, sums, layout, found, judged.attitudes
+        )
         after = judge(data, from_sky, residual_px, freedom, judged, found, attitudes)
         shape_px = np.maximum(found.shape_sigma_px, _FIRST_SHAPE_PX)
         iterations += 1

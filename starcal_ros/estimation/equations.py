@@ -32,8 +32,8 @@ class StarSums:
     """
     Sums over the stars of m images.
 
-    ``blocks`` (m, c, c): columns are the p camera parameters, the turns, the rotation of the image
-    and the residual; ``field_information`` (2 t, 2 t) and ``field_cross`` (m, 2 t, c) have the
+    ``blocks`` (m, d, d) has the columns of `chain`: the unknowns that stars see, the field aside,
+    and the residual; ``field_information`` (2 t, 2 t) and ``field_cross`` (m, 2 t, d) have the
     functions of the field for u, then for v.
     """
 
@@ -42,10 +42,18 @@ class StarSums:
     field_cross: Floats
 
 
-def stars_alone(blocks: Floats) -> StarSums:
+def stars_alone(blocks: Floats, problem: Problem, layout: Layout) -> StarSums:
     """Return the sums of a list without turns and field, from `problem.image_blocks`."""
     none: Floats = np.empty((0, 0))
-    return StarSums(blocks, none, np.empty((len(blocks), 0, blocks.shape[2])))
+    return _chained(blocks, none, np.empty((len(blocks), 0, blocks.shape[2])), problem, layout)
+
+
+def _chained(
+    blocks: Floats, field: Floats, cross: Floats, problem: Problem, layout: Layout
+) -> StarSums:
+    """Return the sums by the unknowns from those by the columns of `star_columns`."""
+    E = chain(problem, layout, len(blocks))
+    return StarSums(E.transpose(0, 2, 1) @ blocks @ E, field, cross @ E)
 
 
 @dataclass(frozen=True)
@@ -80,9 +88,10 @@ def star_columns(
     layout: Layout,
 ) -> Iterator[tuple[Chunk, Floats]]:
     """
-    Yield each chunk with the whitened columns (2, c, m n) of `StarSums`.
+    Yield each chunk with its whitened columns (2, c, m n).
 
-    The residual is that of the camera parameters and the rotations of the state alone.
+    They are the camera parameters, the turns (velocity of the observer and others), the rotation
+    of the image, and the residual: that of the camera parameters and the rotations of the state.
 
     Raises
     ------
@@ -166,14 +175,13 @@ def star_sums(
             mixed = phi * wuv
             uv += of_u @ mixed.T
             vv += mixed @ mixed.T
-    return StarSums(blocks, np.block([[uu, uv], [uv.T, vv]]), cross)
+    return _chained(blocks, np.block([[uu, uv], [uv.T, vv]]), cross, problem, layout)
 
 
 def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> NormalEquations:
     """Return the normal equations without priors of what stars see; the cost is zero."""
     at = seen_by_stars(layout)
-    E = chain(problem, layout, len(sums.blocks))
-    blocks = E.transpose(0, 2, 1) @ sums.blocks @ E
+    blocks, cross = sums.blocks, sums.field_cross
     m, P = len(blocks), layout.count
     stars, own, _ = chain_columns(layout)
     total = blocks.sum(axis=0)
@@ -184,7 +192,6 @@ def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> Nor
     B[:, :, at] = blocks[:, own, stars]
     if 'field' in layout:
         field = np.arange(P)[layout.places['field']]
-        cross = sums.field_cross @ E
         A[np.ix_(field, field)] = sums.field_information
         A[np.ix_(field, at)] = cross[:, :, stars].sum(axis=0)
         A[np.ix_(at, field)] = A[np.ix_(field, at)].T
@@ -231,8 +238,7 @@ def information_of_images(
     The list has neither field nor shapes; the rotation of the image is eliminated.
     """
     at = seen_by_stars(layout)
-    E = chain(problem, layout, len(sums.blocks))
-    blocks = E.transpose(0, 2, 1) @ sums.blocks @ E
+    blocks = sums.blocks
     m = len(blocks)
     stars, own, _ = chain_columns(layout)
     A = np.zeros((m, layout.count, layout.count))
@@ -265,7 +271,7 @@ def _columns(layout: Layout) -> tuple[list[Unknown], list[Unknown], list[Unknown
 
 def chain(problem: Problem, layout: Layout, m: int) -> Floats:
     """
-    Return the derivatives (m, c, d) of the columns of `StarSums` by the unknowns.
+    Return the derivatives (m, c, d) of the columns of `star_columns` by the unknowns.
 
     In the order: shared ones by camera, by turn; the rotation of the image, its shape; residual.
     """

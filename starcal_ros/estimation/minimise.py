@@ -109,7 +109,7 @@ def equations_in_state(
     ``cost`` and ``blocks`` are those of `problem.image_blocks`.
     """
     layout = unknowns_in_state(problem, state)
-    normal = arrow(stars_alone(blocks), problem, state, layout)
+    normal = arrow(stars_alone(blocks, problem, layout), problem, state, layout)
     kept = estimated(layout)
     precision, offset = layout.prior_precision[kept], layout.prior_offset[kept]
     off_tracker, _ = whitened_attitude_errors(problem, state)

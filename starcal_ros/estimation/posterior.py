@@ -167,7 +167,7 @@ def posterior(
     found, last = Shapes(before, none, np.zeros(3)), start
     if whole and len(sums.blocks) > 1:
         field_px = solver.solve(start, base)[0][layout.places['field']]
-        by_image = _shape_sums(sums, problem, layout, solver, field_px)
+        by_image = _shape_sums(sums, layout, solver, field_px)
         found = shapes(by_image, near.shape if near else None)
         last = eliminated(normal, layout, found.sigma_px)
     mean, covariance, last_octave = solver.solve(last, base)
@@ -295,17 +295,13 @@ class _Solver:
         return float(np.einsum('ij,ji->', arrow.information[part], covariance[part]))
 
 
-def _shape_sums(
-    sums: StarSums, problem: Problem, layout: Layout, solver: _Solver, field_px: Floats
-) -> ShapeSums:
+def _shape_sums(sums: StarSums, layout: Layout, solver: _Solver, field_px: Floats) -> ShapeSums:
     """
     Return what each image shows of its shape, the field known.
 
     The images are alike in the field; each has stars in other parts of it.
     """
-    information, gradient, cross, shared, right = _without_rotation(
-        sums, problem, layout, field_px
-    )
+    information, gradient, cross, shared, right = _without_rotation(sums, layout, field_px)
     at = seen_by_stars(layout)
     precision = solver.precision[at]
     free = np.flatnonzero(np.isfinite(precision))
@@ -319,13 +315,11 @@ def _shape_sums(
 
 
 def _without_rotation(
-    sums: StarSums, problem: Problem, layout: Layout, field_px: Floats
+    sums: StarSums, layout: Layout, field_px: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Return the sums of shapes and shared unknowns, the rotations free."""
-    E = chain(problem, layout, len(sums.blocks))
-    blocks = E.transpose(0, 2, 1) @ sums.blocks @ E
-    explained = ((field_px @ sums.field_cross)[:, None] @ E)[:, 0]
-    blocks[:, :-1, -1] -= explained[:, :-1]
+    blocks = sums.blocks.copy()
+    blocks[:, :-1, -1] -= (field_px @ sums.field_cross)[:, :-1]
     stars, own, rotation = chain_columns(layout)
     C = blocks[:, rotation, rotation].copy()
     size = np.einsum('mii->mi', C).max(axis=1)

@@ -37,6 +37,21 @@ _MOST_MEMBERS = 4  # of a group, of which the mean correlation is taken
 
 
 @dataclass(frozen=True)
+class Correlations:
+    """
+    Correlations K (g, g) that slow errors of groups of images may have, in time and in attitude.
+
+    ``group`` (m,) as for `TrackerErrors`; ``axes`` has the eigenvalues (g,) and the eigenvectors
+    (g, g) of each K.
+    """
+
+    group: Indices
+    names: tuple[str, ...]
+    kernels: Floats  # (k, g, g)
+    axes: tuple[tuple[Floats, Floats], ...]
+
+
+@dataclass(frozen=True)
 class TrackerErrors:
     """
     Posterior of the errors of one star tracker over m images.
@@ -72,8 +87,7 @@ class TrackerErrors:
 def tracker_errors(
     error: Floats,
     variance: Floats,
-    time_ns: Indices,
-    camera_from_icrf: Rotation,
+    correlations: Correlations,
     is_stated: bool,
     stated_slow: float,
 ) -> TrackerErrors:
@@ -90,8 +104,7 @@ def tracker_errors(
     stated_slow : float
         Slow error by the data sheet, in stated sigmas; 0: not stated, of the size of the noise.
     """
-    m = len(error)
-    group = groups_of(time_ns)
+    m, group = len(error), correlations.group
     size = np.bincount(group)
     slow_sigma = _STATED_SLOW_SIGMA if stated_slow else _SLOW_SIGMA
     noise_sigma = _NOISE_SIGMA if is_stated else _UNSTATED_SIGMA
@@ -99,13 +112,12 @@ def tracker_errors(
     of_stars = float(np.median(variance))
     noise2 = np.exp(2.0 * _LOG_NOISE)
     prior = -0.5 * (_LOG_SLOW[:, None] / slow_sigma) ** 2 - 0.5 * (_LOG_NOISE / noise_sigma) ** 2
-    names, kernels = _kernels(time_ns, camera_from_icrf, group)
     of_group = np.stack([np.bincount(group, one) for one in error.T], axis=1) / size[:, None]
     within = float(((error - of_group[group]) ** 2).sum())
     log_weight, mean_information = [], []
     plain = -math.inf
-    for K in kernels:
-        likelihood, information = _restricted(K, of_group, slow2, noise2, of_stars, m / len(K))
+    for K, axes in zip(correlations.kernels, correlations.axes, strict=True):
+        likelihood, information = _restricted(*axes, of_group, slow2, noise2, of_stars, m / len(K))
         # Within a group there is noise, and the slow error that its members do not share.
         if m > len(K):
             apart = m / (m - len(K)) * (1.0 - float(size @ np.diag(K)) / m)
@@ -119,7 +131,7 @@ def tracker_errors(
     noise = float(weight.sum(axis=(0, 1)) @ noise2)
     of_mean = interval_factor(np.array(mean_information).ravel() ** -0.5, weight.ravel())
     per_kernel = weight.sum(axis=2) @ slow2
-    shared = np.einsum('k,kij->ij', per_kernel, np.array(kernels))
+    shared = np.einsum('k,kij->ij', per_kernel, correlations.kernels)
     covariance = noise * np.eye(len(size)) + shared
     # Long tails of s: the covariance of the mean is that of its interval.
     mean_variance = noise / m + float(size @ shared @ size) / m**2
@@ -134,7 +146,7 @@ def tracker_errors(
         group=group,
         working=math.sqrt(m) * of_mean,
         likelihood_ratio=2.0 * ratio,
-        correlation=names[best],
+        correlation=correlations.names[best],
         independent=shrunk * noise,
     )
 
@@ -147,10 +159,9 @@ def groups_of(time_ns: Indices) -> Indices:
     return group if m > _MOST_GROUPS else np.arange(m)
 
 
-def _kernels(
-    time_ns: Indices, camera_from_icrf: Rotation, group: Indices
-) -> tuple[list[str], list[Floats]]:
-    """Return correlations (g, g) of slow errors in time and in attitude, with their names."""
+def correlations_of(time_ns: Indices, camera_from_icrf: Rotation) -> Correlations:
+    """Return the correlations of slow errors of images at these stamps (m,) and attitudes."""
+    group = groups_of(time_ns)
     size = np.bincount(group)
     order = np.argsort(group, kind='stable')
     some = order[np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size) < _MOST_MEMBERS]
@@ -176,11 +187,13 @@ def _kernels(
     kernels = [of_groups(np.exp(-apart_s / (share * span_s))) for share in _SPANS]
     names += [f'over {one:g} deg' for one in _ANGLES_DEG]
     kernels += [of_groups(np.exp(-0.5 * (angle_deg / one) ** 2)) for one in _ANGLES_DEG]
-    return names, kernels
+    axes = tuple(eigh(K, check_finite=False) for K in kernels)
+    return Correlations(group, tuple(names), np.array(kernels), axes)
 
 
 def _restricted(
-    K: Floats,
+    values: Floats,
+    vectors: Floats,
     error: Floats,
     slow2: Floats,
     noise2: Floats,
@@ -191,10 +204,9 @@ def _restricted(
     Return restricted log likelihood and information on the mean, (slow, noise), on a grid.
 
     The likelihood is that of errors as the stars show them, the information that of the star
-    tracker alone: the noise of the stars is in their own equations.  In the axes of K every
-    covariance of the grid is diagonal.
+    tracker alone: the noise of the stars is in their own equations.  In the axes of K, with
+    ``values`` (g,) and ``vectors`` (g, g), every covariance of the grid is diagonal.
     """
-    values, vectors = eigh(K, check_finite=False)
     ones = vectors.sum(axis=0)
     along = vectors.T @ error
     alone = slow2[:, None, None] * np.maximum(values, 0.0) + noise2[:, None] / members

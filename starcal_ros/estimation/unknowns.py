@@ -399,9 +399,10 @@ def _by_velocity(
     passive rotation ``d e x e = v x e / c`` gives.
     """
     del pixels
-    axes = camera_from_icrf[image].transpose(1, 2, 0)  # columns: ICRF axes in the camera frame
-    e = directions[:, None, :]
-    return np.asarray(np.cross(axes, e, axisa=0, axisb=0, axisc=0) / SPEED_OF_LIGHT_M_S)
+    # Columns: ICRF axes in the camera frame.
+    x, y, z = (camera_from_icrf[:, k].T[:, image] for k in range(3))
+    e_x, e_y, e_z = directions / SPEED_OF_LIGHT_M_S
+    return np.stack([y * e_z - z * e_y, z * e_x - x * e_z, x * e_y - y * e_x])
 
 
 def _by_readout(

@@ -42,7 +42,12 @@ from starcal_ros.estimation.star_equations import (
     StarTable,
     whitened_chunks,
 )
-from starcal_ros.estimation.tracker_errors import tracker_errors, TrackerErrors
+from starcal_ros.estimation.tracker_errors import (
+    Correlations,
+    correlations_of,
+    tracker_errors,
+    TrackerErrors,
+)
 from starcal_ros.estimation.unknowns import Layout
 from starcal_ros.records import CameraGeometry
 
@@ -76,6 +81,7 @@ class Attitudes:
     misfit: Mask
     trackers: tuple[TrackerErrors, ...]
     images: tuple[NDArray[np.int64], ...]  # of each of them, those that fit
+    correlations: tuple[Correlations, ...] = ()  # of these images
 
 
 @dataclass(frozen=True)
@@ -173,11 +179,17 @@ def tracker_attitudes(
     sums: StarSums,
     layout: Layout,
     found: Posterior,
+    before: Attitudes | None,
 ) -> Attitudes:
-    """Return the errors of the star trackers as the stars alone show them."""
+    """
+    Return the errors of the star trackers as the stars alone show them.
+
+    ``before`` are those of the round before.  Of the same images they have the same correlations:
+    the attitudes change by arcseconds from round to round.
+    """
     m = data.table.image_count
     stated = data.stated_rad
-    rotation, covariance, seen = _rotations_of_stars(sums, problem, layout, found)
+    rotation, covariance, seen = _rotations_of_stars(sums, layout, found)
     by_stars = Rotation.from_rotvec(-rotation) * state.camera_from_icrf
     error = attitude_errors(problem, after, by_stars)
     tracker_from_camera = np.swapaxes(image_alignment(problem, after).as_matrix(), -1, -2)
@@ -196,40 +208,57 @@ def tracker_attitudes(
         )
         return Attitudes(error, covariance, seen, np.zeros(m, bool), trackers, images)
     misfit = misfit_images(error / stated, variance, seen, problem.star_tracker, data.time_ns)
-    found_images, found_trackers = [], []
+    found_images, found_trackers, found_correlations = [], [], []
     for k in np.unique(problem.star_tracker):
         here = np.flatnonzero((problem.star_tracker == k) & seen & ~misfit)
         if len(here) == 0:
             continue
+        correlations = _known_correlations(here, before)
+        if correlations is None:
+            correlations = correlations_of(data.time_ns[here], after.camera_from_icrf[here])
         found_images.append(here)
+        found_correlations.append(correlations)
         found_trackers.append(
             tracker_errors(
                 error[here] / stated,
                 variance[here],
-                data.time_ns[here],
-                after.camera_from_icrf[here],
+                correlations,
                 tracker_sigma_is_given(data.options),
                 data.options.star_tracker_slow_arcsec * ARCSECOND_RAD / float(stated.mean()),
             )
         )
-    return Attitudes(error, covariance, seen, misfit, tuple(found_trackers), tuple(found_images))
+    return Attitudes(
+        error,
+        covariance,
+        seen,
+        misfit,
+        tuple(found_trackers),
+        tuple(found_images),
+        tuple(found_correlations),
+    )
+
+
+def _known_correlations(images: Indices, before: Attitudes | None) -> Correlations | None:
+    """Return the correlations of these images of the round before, if it had them."""
+    if before is not None:
+        for those, correlations in zip(before.images, before.correlations, strict=True):
+            if np.array_equal(those, images):
+                return correlations
+    return None
 
 
 def _rotations_of_stars(
-    sums: StarSums, problem: Problem, layout: Layout, found: Posterior
+    sums: StarSums, layout: Layout, found: Posterior
 ) -> tuple[Floats, Floats, Mask]:
     """Rotations (m, 3) by the stars alone, their covariances (m, 3, 3), images with enough."""
-    m = len(sums.blocks)
-    E = chain(problem, layout, m)
-    blocks = E.transpose(0, 2, 1) @ sums.blocks @ E
+    blocks = sums.blocks
     stars, own, rotation = chain_columns(layout)
     C = blocks[:, rotation, rotation]
     values = np.zeros(blocks.shape[:2])
     values[:, stars], values[:, own] = found.mean[seen_by_stars(layout)], found.of_images
     values[:, rotation] = 0.0
     c = blocks[:, rotation, -1] - np.einsum('mij,mj->mi', blocks[:, rotation], values)
-    explained = found.mean[layout.of(['field'])] @ sums.field_cross
-    c = c - np.einsum('mi,mij->mj', explained, E[:, :, rotation])
+    c = c - (found.mean[layout.of(['field'])] @ sums.field_cross)[:, rotation]
     diagonal = np.einsum('mii->mi', C)
     seen: Mask = np.asarray((diagonal > 0).all(axis=1))
     scale = np.where(seen[:, None], 1.0 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)

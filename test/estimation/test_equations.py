@@ -180,7 +180,9 @@ def test_the_information_of_the_images_without_field_and_shapes_is_the_dense_one
 ) -> None:
     layout = unknowns_in_state(given.problem, given.state)
     _, blocks = image_blocks(given.problem, given.state, given.measurements())
-    each = information_of_images(stars_alone(blocks), given.problem, given.state, layout)
+    each = information_of_images(
+        stars_alone(blocks, given.problem, layout), given.problem, given.state, layout
+    )
     P = given.layout.count
     at = given.layout.of([e.name for e in layout.shared])
     for k in range(IMAGES):
@@ -195,7 +197,9 @@ def test_the_information_of_the_images_without_field_and_shapes_is_the_dense_one
         difference = (each[k] - expected) / np.outer(size[at], size[at])
         assert np.abs(difference).max() < EXACT
     # The same arrow, from the sums of the whole list.
-    arrow = equations(stars_alone(blocks), given.problem, given.state, layout, SHAPE)
+    arrow = equations(
+        stars_alone(blocks, given.problem, layout), given.problem, given.state, layout, SHAPE
+    )
     size = np.diag(each.sum(axis=0))
     assert arrow.information / np.sqrt(np.outer(size, size)) == pytest.approx(
         each.sum(axis=0) / np.sqrt(np.outer(size, size)), abs=1e-9
@@ -209,5 +213,7 @@ def test_an_image_without_stars_and_star_tracker_has_no_information(given: Small
     without = dataclasses.replace(given, keep=given.keep & (given.table.image != 2))
     layout = unknowns_in_state(problem, given.state)
     _, blocks = image_blocks(problem, given.state, without.measurements())
-    each = information_of_images(stars_alone(blocks), problem, given.state, layout)
+    each = information_of_images(
+        stars_alone(blocks, problem, layout), problem, given.state, layout
+    )
     assert not each[2].any() and all(each[k].any() for k in (0, 1, 3))

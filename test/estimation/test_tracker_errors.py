@@ -15,7 +15,7 @@ from scipy.stats import multivariate_normal
 from starcal_ros.arrays import Floats
 from starcal_ros.estimation import tracker_errors as module
 from starcal_ros.estimation.amplitudes import interval_factor
-from starcal_ros.estimation.tracker_errors import tracker_errors, TrackerErrors
+from starcal_ros.estimation.tracker_errors import correlations_of, tracker_errors, TrackerErrors
 
 CADENCE_NS = 60 * 10**9
 
@@ -33,9 +33,8 @@ def found_of(
     if attitudes is None:
         attitudes = Rotation.random(m, random_state=np.random.default_rng(77))
     time_ns = 10**18 + CADENCE_NS * np.arange(m)
-    return tracker_errors(
-        error, np.full((m, 3), variance), time_ns, attitudes, is_stated, stated_slow
-    )
+    correlations = correlations_of(time_ns, attitudes)
+    return tracker_errors(error, np.full((m, 3), variance), correlations, is_stated, stated_slow)
 
 
 def walk(rng: Generator, m: int, time: float, size: float) -> Floats:
@@ -55,7 +54,9 @@ def test_the_restricted_likelihood_is_that_of_dense_contrasts() -> None:
     K = np.exp(-np.abs(np.subtract.outer(time, time)) / 3.0)
     slow2, noise2 = np.array([0.0, 0.3, 2.0]), np.array([0.5, 1.0])
     of_stars = 0.4
-    values, information = module._restricted(K, error, slow2, noise2, of_stars, 1.0)
+    values, information = module._restricted(
+        *np.linalg.eigh(K), error, slow2, noise2, of_stars, 1.0
+    )
     contrasts = null_space(np.ones((1, m)))
     expected = np.zeros((3, 2))
     for i, s2 in enumerate(slow2):
@@ -70,8 +71,9 @@ def test_the_restricted_likelihood_is_that_of_dense_contrasts() -> None:
 def test_correlations_are_in_time_and_in_the_angle_of_the_boresights() -> None:
     attitudes = Rotation.from_euler('xz', [[0, 0], [10, 40], [30, 80], [180, 0]], degrees=True)
     time_ns = np.array([0, 10, 40, 100], np.int64) * 10**9
-    names, kernels = module._kernels(time_ns, attitudes, np.arange(4))
-    assert names == [
+    found = correlations_of(time_ns, attitudes)
+    kernels = found.kernels
+    assert found.names == (
         'over 30 s',
         'over 100 s',
         'over 300 s',
@@ -79,7 +81,7 @@ def test_correlations_are_in_time_and_in_the_angle_of_the_boresights() -> None:
         'over 10 deg',
         'over 30 deg',
         'over 60 deg',
-    ]
+    )
     apart = np.abs(np.subtract.outer([0, 10, 40, 100], [0, 10, 40, 100]))
     for share, K in zip((0.3, 1.0, 3.0, 10.0), kernels[:4], strict=True):
         assert pytest.approx(np.exp(-apart / (100.0 * share))) == K
@@ -94,7 +96,8 @@ def brute(error: Floats, variance: float, is_stated: bool, stated_slow: float) -
     """Posterior by dense matrices: covariance, sigma of the mean and sizes, no interval."""
     m = len(error)
     attitudes = Rotation.random(m, random_state=np.random.default_rng(77))
-    names, kernels = module._kernels(10**18 + CADENCE_NS * np.arange(m), attitudes, np.arange(m))
+    correlations = correlations_of(10**18 + CADENCE_NS * np.arange(m), attitudes)
+    names, kernels = correlations.names, correlations.kernels
     contrasts = null_space(np.ones((1, m)))
     logs, slows, noises, covariances, of_mean = [], [], [], [], []
     log_likelihoods, plain = [], []
@@ -229,7 +232,8 @@ def test_a_data_sheet_counts_where_images_are_few() -> None:
 def test_times_may_be_equal() -> None:
     error = np.random.default_rng(8).normal(size=(5, 3))
     attitudes = Rotation.random(5, random_state=np.random.default_rng(1))
-    found = tracker_errors(error, np.full((5, 3), 1e-4), np.full(5, 10**18), attitudes, True, 0.0)
+    correlations = correlations_of(np.full(5, 10**18), attitudes)
+    found = tracker_errors(error, np.full((5, 3), 1e-4), correlations, True, 0.0)
     assert np.isfinite(found.covariance).all() and found.working > 0.3
 
 
