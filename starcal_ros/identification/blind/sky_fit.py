@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import betainc
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.camera import CameraModel, project, project_jacobians
+from starcal_ros.camera import CameraModel, line_of_sight, project, project_jacobians
 from starcal_ros.sky.catalog import StarCatalog
 
 FOCAL_RANGE = 0.25  # half range of the logarithm of the focal length
@@ -44,6 +44,7 @@ _JUDGED_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5)  # radii of matching for the p
 _DEPTHS = (6, 8, 11, 15, 20, 30, 50, 80, 130, 200)  # numbers of brightest predictions for it
 _LOOKS = 10.0  # independent tests among them: most of their stars are common
 _ORDERED = 30  # brightest matches whose order is judged: more would not change a verdict
+_WIDEST_RAD = math.radians(80.0)  # of half a diagonal: sources are matched in a tangent plane
 _ALONE = 10.0  # radius about a star for the local density of sources, in radii of matching
 
 
@@ -61,9 +62,13 @@ class SourceImage:
 
     @functools.cached_property
     def half_diagonal_rad(self) -> float:
-        """Half of the diagonal as an angle of the prior camera."""
-        ideal = self.half_diagonal_px / float(self.camera.parameters[0])
-        return ideal if self.camera.model == 'equidistant' else math.atan(ideal)
+        """Mean angle of the corners from the axis of the prior camera."""
+        x, y = self.camera.width - 0.5, self.camera.height - 0.5
+        corners = np.array([[-0.5, -0.5], [x, -0.5], [-0.5, y], [x, y]])
+        cosine = line_of_sight(self.camera, corners)[:, 2]
+        # A corner that a strong distortion folds over has no line of sight.
+        seen = cosine[np.isfinite(cosine)]
+        return min(float(np.arccos(seen).mean()), _WIDEST_RAD) if len(seen) else _WIDEST_RAD
 
     @functools.cached_property
     def area_px2(self) -> float:

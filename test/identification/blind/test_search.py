@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.lost_in_space import camera, Frame, frames
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.camera import line_of_sight
+from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.identification.blind.pattern_index import (
     equal_shapes,
     equivalent,
@@ -28,7 +28,7 @@ from starcal_ros.identification.blind.search import (
     NotFound,
     SkyMatch,
 )
-from starcal_ros.identification.blind.sky_fit import _chance_of_order
+from starcal_ros.identification.blind.sky_fit import _chance_of_order, SourceImage
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 
@@ -200,3 +200,21 @@ def test_a_catalog_too_small_for_a_pattern_identifies_nothing(catalog: StarCatal
     frame = next(frames(catalog, 20, 20, 10, 0.0, 1))
     few = catalog.select(np.arange(49))
     assert isinstance(find_sky(frame.xy_px, frame.prior, few, try_mirrored=True), NotFound)
+
+
+@pytest.mark.parametrize(
+    ('model', 'parameters', 'half_deg'),
+    [
+        # The focal length alone would put the corners beyond 90 degrees, where a tangent is
+        # negative, and every patch of the sky was searched for 100 s.
+        ('equidistant', [314.0, 0.0, 314.0, 399.5, 319.5, 0.29, 0.25, -0.1, 0.17], 58.0),
+        ('plumb_bob', [700.0, 0.0, 700.0, 399.5, 319.5, 0.0, 0.0, 0.0, 0.0, 0.0], 36.2),
+        ('equidistant', [280.0, 0.0, 280.0, 399.5, 319.5, 0.0, 0.0, 0.0, 0.0], 80.0),
+    ],
+)
+def test_half_of_the_diagonal_is_that_of_the_lens(
+    model: str, parameters: list[float], half_deg: float
+) -> None:
+    image = SourceImage(np.empty((0, 2)), CameraModel(800, 640, np.array(parameters), model))
+    # The corners of the first lens are 58 degrees off by its series, to half a degree.
+    assert math.degrees(image.half_diagonal_rad) == pytest.approx(half_deg, abs=0.6)
