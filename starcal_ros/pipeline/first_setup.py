@@ -18,8 +18,8 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.images.photographs import Photograph
 from starcal_ros.formats.messages.types import ATTITUDE_TYPES, VELOCITY_TYPE
 from starcal_ros.pipeline import night_sky
-from starcal_ros.pipeline.diagnosis.alignment import found_alignment
 from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
+from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
 from starcal_ros.pipeline.from_stars import FromStars
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.pipeline.topics import choose_image_topic, choose_topics, Topics
