@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from starcal_ros.pipeline.observe_bags import OnImage, Wanted
     from starcal_ros.pipeline.setup import Setup
 
-
+_RAW = types.IMAGE_TYPE
+_IMAGE_TYPES = {_RAW, types.COMPRESSED_TYPE}
 _WITHOUT = {
     'image': 'record the images, or make a bag of image files with starcal import',
     'attitude': (
@@ -38,8 +39,7 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
     """
     there = reader.topics(paths)
     kinds = {topic.type_name for topic in there}
-    image_types = [t for t in (types.IMAGE_TYPE, types.COMPRESSED_TYPE) if t in kinds]
-    only_recorded = not image_types and types.OBSERVATIONS_TYPE in kinds
+    only_recorded = not kinds & _IMAGE_TYPES and types.OBSERVATIONS_TYPE in kinds
     if asked.observations or (only_recorded and not asked.image):
         kind = types.OBSERVATIONS_TYPE
         return Topics(observations=_choose(paths, kind, asked.observations, 'observations'))
@@ -59,17 +59,9 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
 
 def choose_image_topic(paths: Sequence[Path], asked: Topics) -> str:
     """Topic of the images of bags; raises BagError when it is missing, or there are several."""
-    there = reader.topics(paths)
-    image_types = [
-        t
-        for t in (types.IMAGE_TYPE, types.COMPRESSED_TYPE)
-        if any(x.type_name == t for x in there)
-    ]
-    image_type = next(iter(image_types), types.IMAGE_TYPE)
-    for kind in image_types:
-        if any(t.type_name == kind and t.name == f'/{asked.image.lstrip("/")}' for t in there):
-            image_type = kind
-    return _choose(paths, image_type, asked.image, 'image')
+    there = [t for t in reader.topics(paths) if t.type_name in _IMAGE_TYPES]
+    there.sort(key=lambda t: (t.name != f'/{asked.image.lstrip("/")}', t.type_name != _RAW))
+    return _choose(paths, there[0].type_name if there else _RAW, asked.image, 'image')
 
 
 def _choose_attitudes(
@@ -82,7 +74,7 @@ def _choose_attitudes(
     """
     kind = types.ATTITUDE_TYPES[setup.attitude.attitude_message] if setup else types.ATTITUDE_TYPE
     fitting = [topic.name for topic in there if topic.type_name == kind]
-    named = more_attitude_topics(setup)
+    named = [f'/{one.frame.lstrip("/")}/attitude' for one in setup.mountings] if setup else []
     more = tuple(name if name in fitting else '' for name in named)
     for name in set(named) - set(more):
         reader.log_damage(
@@ -116,11 +108,6 @@ def _other_attitudes(there: Sequence[reader.Topic], asked: str) -> str:
     )
 
 
-def more_attitude_topics(setup: Setup | None) -> tuple[str, ...]:
-    """Topics in bags of the attitudes of the further star trackers."""
-    return tuple(f'/{one.frame.lstrip("/")}/attitude' for one in setup.mountings) if setup else ()
-
-
 def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str:
     try:
         return reader.choose_topic(paths, type_name, asked)
@@ -150,11 +137,7 @@ def without_attitudes(bags: Sequence[Path], asked: Topics) -> bool:
     """Return True if bags hold images, but neither attitudes nor observations."""
     kinds = {topic.type_name for topic in reader.topics(bags)}
     others = {*types.ATTITUDE_TYPES.values(), types.OBSERVATIONS_TYPE}
-    return (
-        bool(kinds & {types.IMAGE_TYPE, types.COMPRESSED_TYPE})
-        and not kinds & others
-        and not asked.attitude
-    )
+    return bool(kinds & _IMAGE_TYPES) and not kinds & others and not asked.attitude
 
 
 def count(paths: Sequence[Path], topics: Topics) -> int:

@@ -15,11 +15,12 @@ import dataclasses
 from dataclasses import dataclass
 import functools
 import math
+import operator
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import CameraModel, project_jacobians
 from starcal_ros.camera.detector_field import basis
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
@@ -166,7 +167,7 @@ def _images(used: Sequence[StarObservations], camera: CameraModel) -> list[_Seen
     chosen = []
     for one in used:
         order = np.argsort(one.covariance_px2[:, [0, 2]].sum(axis=1), kind='stable')
-        chosen.append(one.select(_mask(order[:_STARS], len(one))))
+        chosen.append(one.select(np.isin(np.arange(len(one)), order[:_STARS])))
     first_ns = used[0].time_ns
     images = [_seen(one, camera, first_ns) for one in chosen]
     inverse, h = _common(images, SPACE_M_S)
@@ -179,12 +180,6 @@ def _images(used: Sequence[StarObservations], camera: CameraModel) -> list[_Seen
         size = np.linalg.norm(left.reshape(-1, 2), axis=1)
         kept.append(one.select(size < _OUTLIER * max(median(size), 1.0)))
     return [_seen(one, camera, first_ns) for one in kept]
-
-
-def _mask(rows: Indices, n: int) -> Mask:
-    mask = np.zeros(n, bool)
-    mask[rows] = True
-    return mask
 
 
 def _seen(one: StarObservations, camera: CameraModel, first_ns: int) -> _Seen:
@@ -255,10 +250,11 @@ def _searched(images: Sequence[_Seen]) -> _Site:
     inverse, h = _common(images, EARTH_M_S)
     fit = _Fit(images, inverse, h, variance)
     found = []
+    by_chi2 = operator.attrgetter('chi2')
     for times in (fit.by_stamps, fit.by_images):
-        coarse = min((times(latitude, None) for latitude in _LATITUDES_RAD), key=_chi2_of)
+        coarse = min((times(latitude, None) for latitude in _LATITUDES_RAD), key=by_chi2)
         near = coarse.latitude_rad + np.radians(np.arange(-5.0, 5.5))
-        fine = min((times(latitude, coarse) for latitude in near.clip(-1.5, 1.5)), key=_chi2_of)
+        fine = min((times(latitude, coarse) for latitude in near.clip(-1.5, 1.5)), key=by_chi2)
         # The mean of a likelihood is that over all times, not over those about the best.
         gain = none / variance - coarse.chi2
         best = fine if len(fine.times_rad) else coarse
@@ -299,10 +295,6 @@ class _Times:
     latitude_rad: float
     times_rad: Floats
     chi2: float
-
-
-def _chi2_of(one: _Times) -> float:
-    return one.chi2
 
 
 @dataclass(frozen=True)
