@@ -41,7 +41,6 @@ from starcal_ros.records import (
     EnsembleStatus,
     factored_field,
     StarObservations,
-    StarTrackerAlignment,
 )
 
 _FEWEST_STARS = 3  # two fit their mirror image
@@ -169,24 +168,15 @@ def estimated(ensemble: Ensemble, setup: Setup) -> Estimate:
     return estimate_calibration(ensemble, setup.prior, setup.calibration)
 
 
-def _named(
-    found: tuple[StarTrackerAlignment, ...], first_frame: str
-) -> tuple[StarTrackerAlignment, ...]:
-    """The star trackers, the first one with the name of its frame."""
-    return tuple(dataclasses.replace(one, frame=one.frame or first_frame) for one in found)
-
-
 def _as_asked_for(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:
     """The setup with the requested method and parameters to estimate, where given."""
-    override: dict[str, object] = {}
-    if method:
-        override['method'] = method
-    if estimate:
-        override['estimate'] = tuple(estimate)
+    options = setup.calibration
+    options = dataclasses.replace(
+        options, method=method or options.method, estimate=tuple(estimate) or options.estimate
+    )
     for field in dataclasses.fields(CalibrationOptions):
-        if field.name in override:
-            check_value(field, override[field.name])
-    options = dataclasses.replace(setup.calibration, **override)  # type: ignore[arg-type]
+        if field.name in ('method', 'estimate'):
+            check_value(field, getattr(options, field.name))
     return dataclasses.replace(setup, calibration=options)
 
 
@@ -233,7 +223,10 @@ def _not_judged(
         maps=detector_maps(camera, result.map_covariance, result.table.measured_px[kept]),
         correlation=correlation(result.shared_covariance, result.shared_names),
         removals=removal_study(result),
-        star_trackers=_named(result.star_trackers, setup.frames.star_tracker_frame),
+        star_trackers=tuple(
+            dataclasses.replace(one, frame=one.frame or setup.frames.star_tracker_frame)
+            for one in result.star_trackers
+        ),
         model_checks=model_checks(result),
         field=factored_field(field, result.map_covariance) if field else None,
         sigma_budget=sigma_budget(result, setup.calibration),
