@@ -228,8 +228,10 @@ def residuals_against_pixel_phase(residuals: Residuals) -> Chart:
     )
 
 
-def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Chart:
-    """Star tracker error of each image from its stars, about the three tracker axes."""
+def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Chart | None:
+    """Star tracker error of each image about the three tracker axes; None without attitudes."""
+    if not np.isfinite(residuals.attitude_error_arcsec).any():
+        return None
     minutes = (residuals.image_time_ns - residuals.image_time_ns.min()) / (
         60.0 * NANOSECONDS_PER_SECOND
     )

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from collections.abc import Mapping, Sequence
 import math
 
@@ -20,11 +21,6 @@ _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200
 
 
-def _spread(count: int, most: int) -> list[int]:
-    """Evenly spaced indices below a count, at most ``most``."""
-    return [round(place) for place in np.linspace(0, count - 1, min(count, most)).tolist()]
-
-
 def slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str, object] | None:
     """Data of the single-image view: positions in px, residuals in 0.001 px."""
     if residuals is None or len(residuals.image_time_ns) == 0:
@@ -32,7 +28,8 @@ def slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str
     camera, typical_px = calibration.geometry.camera, max(calibration.residual_rms_px, 1e-6)
     count = len(residuals.image_time_ns)
     mean_stars = max(1.0, len(residuals.image) / count)
-    chosen = _spread(count, max(1, min(_SLIDER_IMAGES, int(_SLIDER_STARS / mean_stars))))
+    most = max(1, min(_SLIDER_IMAGES, int(_SLIDER_STARS / mean_stars)))
+    chosen = np.rint(np.linspace(0, count - 1, min(count, most))).astype(int).tolist()
     rms = residuals.image_rms_px()
     images = []
     for k in chosen:
@@ -76,7 +73,7 @@ def refused_images(
     """For each reason: its count, the refused images and pictures of some."""
     pictures = {t.time_ns: t for t in thumbnails if not t.reason}
     groups: list[Mapping[str, object]] = []
-    for reason, count in sorted(counts.items(), key=lambda i: -i[1]):
+    for reason, count in Counter(counts).most_common():
         images = [o for o in observations if o.refusal == reason]
         groups.append(
             {
@@ -94,12 +91,11 @@ def refused_images(
     return groups
 
 
-def _counts(observations: Sequence[StarObservations]) -> Mapping[str, int]:
+def _counts(observations: Sequence[StarObservations]) -> Counter[str]:
     """Refused stars of all images by reason."""
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for observed in observations:
-        for reason, count in observed.refused_stars.items():
-            counts[reason] = counts.get(reason, 0) + count
+        counts.update(observed.refused_stars)
     return counts
 
 
@@ -137,7 +133,7 @@ def refused_stars(
             'count': count,
             'pictures': _cut_outs(reason, observations, thumbnails),
         }
-        for reason, count in sorted(_counts(observations).items(), key=lambda item: -item[1])
+        for reason, count in _counts(observations).most_common()
         if count
     ]
 

@@ -43,42 +43,30 @@ _REMEDIES = {
 """Measures against the causes of a sigma."""
 
 
-@dataclass(frozen=True)
-class CheckRow:
-    """Row of the table of the checks of the gate."""
-
-    name: str
-    option: str
-    result: str
-    found: str
-    limit: str
-    note: str
+_RESULTS = {False: 'failed', True: 'passed', None: 'not checked'}
 
 
-def check_rows(gate: Sequence[GateCheck]) -> list[CheckRow]:
-    """Rows of the checks: the failed ones first, the others in their order."""
-    return [_row(check) for check in sorted(gate, key=lambda check: check.passed is not False)]
-
-
-def _row(check: GateCheck) -> CheckRow:
-    result = {True: 'passed', False: 'failed', None: 'not checked'}[check.passed]
-    found, limit, note = check.found_text, '', check.note
-    if check.unit == 'sigma' and found and math.isfinite(check.found):
-        found = f'{check.found:.1f} sigma of the difference'
-        note = '' if check.passed and check.found < INFORMATIVE_SIGMAS else note
-    if note == 'no limit is set':
-        limit = 'none'
-    elif check.option:
-        limit = f'{"at least" if check.is_least else "at most"} {check.limit_text}'
-    return CheckRow(check.name, check.option, result, found, limit, note)
+def check_rows(gate: Sequence[GateCheck]) -> list[tuple[GateCheck, str, str, str, str]]:
+    """Checks, the failed ones first, each with its result, value, limit and note as text."""
+    rows = []
+    for check in sorted(gate, key=lambda check: check.passed is not False):
+        found, limit, note = check.found_text, '', check.note
+        if check.unit == 'sigma' and found and math.isfinite(check.found):
+            found = f'{check.found:.1f} sigma of the difference'
+            note = '' if check.passed and check.found < INFORMATIVE_SIGMAS else note
+        if note == 'no limit is set':
+            limit = 'none'
+        elif check.option:
+            limit = f'{"at least" if check.is_least else "at most"} {check.limit_text}'
+        rows.append((check, _RESULTS[check.passed], found, limit, note))
+    return rows
 
 
 def checks_sentence(gate: Sequence[GateCheck]) -> str:
     """How many checks passed, failed and were not made, and why not; empty without a gate."""
     if not gate:
         return ''
-    groups = (('failed', False), ('passed', True), ('not checked', None))
-    counts = [(name, sum(check.passed is value for check in gate)) for name, value in groups]
+    counts = [(name, sum(check.passed is key for check in gate)) for key, name in _RESULTS.items()]
     text = ', '.join(f'{name} {count}' for name, count in counts if count or name == 'passed')
     reasons = dict.fromkeys(check.note for check in gate if check.passed is None and check.note)
     why = f' ({"; ".join(reasons)})' if reasons else ''
@@ -90,14 +78,10 @@ def precision_sentences(calibration: Calibration) -> list[str]:
     maps, budget = calibration.maps, parts_that_matter(calibration.sigma_budget)
     if maps is None:
         return []
+    frame, sigma = f'In {calibration.parent_frame}', maps.line_of_sight_sigma_arcsec
     return [
         _precision('Camera alone', maps.shape_sigma_arcsec, budget, 'map_arcsec'),
-        _precision(
-            f'In {calibration.parent_frame}',
-            maps.line_of_sight_sigma_arcsec,
-            budget,
-            'pointing_arcsec',
-        ),
+        _precision(frame, sigma, budget, 'pointing_arcsec'),
     ]
 
 

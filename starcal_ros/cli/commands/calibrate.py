@@ -223,7 +223,7 @@ def _load_report() -> None:
     with contextlib.suppress(ModuleNotFoundError):
         from starcal_ros.report import page
 
-        page.template()
+        page.page_template('report.html')
 
 
 def _write_all(
