@@ -164,13 +164,11 @@ def calibrate_into(
     """
     topics = bag_topics.choose_topics(bags, asked, setup)
     count = bag_topics.count(bags, topics)
-    album, expected = thumbnails.Album(count), thumbnails.ExpectedAlbum(setup)
-    drawings = Drawings()
+    album, drawings = thumbnails.Album(count, setup), Drawings()
 
     def show(image: Image, observed: StarObservations, geometry: CameraGeometry) -> None:
         with drawings.kind('pictures of images'):
             album.show(image, observed, geometry)
-            expected.add(image, observed, geometry)
 
     records = bag_topics.read(bags, topics, setup, show, wanted)
     observations = list(with_progress(records, count, 'images'))
@@ -195,7 +193,7 @@ def calibrate_into(
             )
         except TooFewObservations as error:
             failure = _failure(str(error), bags, asked, setup, observations, bool(topics.image))
-            _write_failure(folder, failure, expected.pictures)
+            _write_failure(folder, failure, album.unmatched)
             raise TooFewObservations(failure.reason) from error
         pictures: Sequence[thumbnails.Thumbnail] = ()
         with drawings.kind('pictures of images'):

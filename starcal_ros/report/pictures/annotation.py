@@ -72,18 +72,7 @@ def annotate_reduced(
 ) -> Picture:
     """Picture of an image that was reduced to ``pixels``, with its stars marked, no legend."""
     picture = np.asarray(cv2.cvtColor(stretch(pixels), cv2.COLOR_GRAY2BGR), np.uint8)
-    _draw_stars(picture, observations, geometry, pixels.shape[1] / max(observations.width, 1))
-    return picture
-
-
-def _mark_size(picture: Picture) -> float:
-    return max(max(picture.shape) / 1000.0, 0.6)  # smaller text is illegible
-
-
-def _draw_stars(
-    picture: Picture, observations: StarObservations, geometry: CameraGeometry, scale: float
-) -> None:
-    """Mark all stars on a picture that is smaller than the image by ``scale``."""
+    scale = pixels.shape[1] / max(observations.width, 1)
     size = _mark_size(picture)
     width = max(1, round(size))
 
@@ -99,6 +88,11 @@ def _draw_stars(
         radius = (5 + 2 * np.log10(max(float(snr), 1.0))) * size
         center, radius = _fixed_point(uv), int(radius * (1 << _SHIFT))
         cv2.circle(picture, center, radius, _MEASURED, width, cv2.LINE_AA, _SHIFT)
+    return picture
+
+
+def _mark_size(picture: Picture) -> float:
+    return max(max(picture.shape) / 1000.0, 0.6)  # smaller text is illegible
 
 
 def predicted_px(observations: StarObservations, geometry: CameraGeometry) -> Floats:
