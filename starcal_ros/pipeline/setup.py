@@ -34,13 +34,7 @@ from starcal_ros.options import (
     read_parameter_file,
     unknown_option,
 )
-from starcal_ros.pipeline import set_up_checks
-from starcal_ros.pipeline.detector_frames import (
-    read_bad_pixels,
-    read_dark,
-    read_flat,
-    with_bad_pixels,
-)
+from starcal_ros.pipeline import detector_frames, set_up_checks
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
@@ -228,15 +222,18 @@ def load_setup(
     catalog = load_catalog(Path(frames.catalog) if frames.catalog else None, magnitude_limit)
     set_up_checks.check_field_of_stars(len(catalog), magnitude_limit, prior.camera)
     size = prior.camera.width, prior.camera.height
-    dark, flat = read_dark(frames.dark_frame, *size), read_flat(frames.flat_field, *size)
-    bad = read_bad_pixels(frames.bad_pixel_map, *size)
+    dark, flat = (
+        detector_frames.read_dark(frames.dark_frame, *size),
+        detector_frames.read_flat(frames.flat_field, *size),
+    )
+    bad = detector_frames.read_bad_pixels(frames.bad_pixel_map, *size)
     return Setup(
         **groups,
         prior=prior,
         catalog=catalog,
         dark=dark,
         dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
-        hot=with_bad_pixels(hot_in_dark(dark), bad, flat),
+        hot=detector_frames.with_bad_pixels(hot_in_dark(dark), bad, flat),
         is_aligned=is_aligned,
         camera_name=camera_yaml.read_camera_name(frames.camera_info_url)
         if frames.camera_info_url

@@ -12,16 +12,10 @@ import warnings
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.assessment import observability
 from starcal_ros.assessment.amplitude_checks import model_checks
 from starcal_ros.assessment.budget import sigma_budget
 from starcal_ros.assessment.gate import judge, reasons_of
-from starcal_ros.assessment.observability import (
-    correlation,
-    detector_maps,
-    keep_most_informative,
-    weakest_direction,
-)
-from starcal_ros.assessment.observability import ensemble_status as _ensemble_status
 from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.blas_threads import one_blas_thread
@@ -109,14 +103,14 @@ def aligned_by(ensemble: Ensemble, setup: Setup) -> Setup:
 def within_limit(ensemble: Ensemble, setup: Setup) -> Ensemble:
     """Return the ensemble without its least informative images, down to ``max_images``."""
     setup = aligned_by(ensemble, setup)
-    return keep_most_informative(ensemble, setup.prior, setup.calibration)
+    return observability.keep_most_informative(ensemble, setup.prior, setup.calibration)
 
 
 @one_blas_thread()
 def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
     """Images and stars collected, and the predicted precision of a calibration from them."""
     setup = aligned_by(ensemble, setup)
-    return _ensemble_status(ensemble, setup.prior, setup.calibration)
+    return observability.ensemble_status(ensemble, setup.prior, setup.calibration)
 
 
 def solve(
@@ -186,7 +180,9 @@ def _not_judged(
     """An estimate with its statistics, before the gate."""
     kept, camera = result.kept, result.geometry.camera
     field = camera.field
-    singular_values, weakest = weakest_direction(result.information, result.information_names)
+    singular_values, weakest = observability.weakest_direction(
+        result.information, result.information_names
+    )
     stamps_ns = [image.time_ns for image in ensemble.images]
     return Calibration(
         time_ns=max(stamps_ns),
@@ -220,8 +216,10 @@ def _not_judged(
         child_frame=setup.frames.camera_frame,
         provenance=provenance,
         temperature=result.thermal,
-        maps=detector_maps(camera, result.map_covariance, result.table.measured_px[kept]),
-        correlation=correlation(result.shared_covariance, result.shared_names),
+        maps=observability.detector_maps(
+            camera, result.map_covariance, result.table.measured_px[kept]
+        ),
+        correlation=observability.correlation(result.shared_covariance, result.shared_names),
         removals=removal_study(result),
         star_trackers=tuple(
             dataclasses.replace(one, frame=one.frame or setup.frames.star_tracker_frame)

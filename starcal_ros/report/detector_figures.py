@@ -31,18 +31,7 @@ from starcal_ros.records import (
     StarObservations,
 )
 from starcal_ros.report import svg
-from starcal_ros.report.svg import (
-    Chart,
-    Curve,
-    Drawing,
-    GRID,
-    in_digits,
-    MUTED,
-    Panel,
-    Scale,
-    SERIES,
-    sheet,
-)
+from starcal_ros.report.svg import Chart, Curve, Drawing, in_digits, Panel, Scale, SERIES, sheet
 
 FLAT = 0.02  # relative range below which a map is called flat
 _MOST_HEIGHT = 400.0
@@ -397,14 +386,14 @@ def _draw_graticule(panel: Panel) -> None:
     along = np.linspace(-np.pi, np.pi, 73, dtype=np.float64)
     for hours in range(-12, 13, 3):
         x, y = _projected(np.radians(15.0 * hours * 0.99999), along / 2)
-        panel.curve(Curve(x, y, GRID, width=1.0))
+        panel.curve(Curve(x, y, svg.GRID, width=1.0))
         if hours % 6 == 0 and abs(hours) < 12:
-            panel.text(x[36], y[36], f'{hours % 24} h', MUTED)
+            panel.text(x[36], y[36], f'{hours % 24} h', svg.MUTED)
     for degrees in (-60, -30, 0, 30, 60):
         x, y = _projected(along * 0.99999, np.radians(degrees))
-        panel.curve(Curve(x, y, GRID, width=1.0))
+        panel.curve(Curve(x, y, svg.GRID, width=1.0))
         if degrees:
-            panel.text(x[36], y[36], f'{in_digits(degrees)}°', MUTED)
+            panel.text(x[36], y[36], f'{in_digits(degrees)}°', svg.MUTED)
 
 
 def _projected(longitude: Floats | float, latitude: Floats | float) -> tuple[Floats, Floats]:

@@ -32,6 +32,7 @@ _CLOCK_IMAGES = 3  # fewest: the shift itself takes part of what two images show
 _ALIKE_RAD = math.radians(0.003)  # a scatter under this is that of the stars
 _WRONG_ALIGNMENT_RAD = math.radians(25.0)  # chance alone comes so near in one case of 200
 _DIRECTIONS = ('st_to_inertial', 'inertial_to_st')
+_ROLLS = [Rotation.from_euler('z', 90.0 * turns, degrees=True) for turns in range(4)]
 _NORM_TOLERANCE = 1e-3
 
 
@@ -66,41 +67,32 @@ class Reading:
     def __str__(self) -> str:
         return f'{self.direction} ({", ".join(self.order)})'
 
+    def off_by(self, prior: Rotation) -> tuple[float, float]:
+        """Errors of a prior alignment in pointing and in roll, given the one found, rad."""
+        axes = (prior.inv() * self.star_tracker_from_camera).as_matrix()
+        tilt_rad = math.acos(min(max(float(axes[2, 2]), -1.0), 1.0))
+        return tilt_rad, math.atan2(float(axes[1, 0]), float(axes[0, 0]))
+
+    def is_off(self, prior: Rotation) -> bool:
+        """True if a prior alignment is farther off than is searched."""
+        tilt_rad, roll_rad = self.off_by(prior)
+        return tilt_rad > ACQUISITION_RADIUS_RAD or abs(roll_rad) > ACQUISITION_ROLL_RAD
+
+    def quarter_turns(self, prior: Rotation) -> int:
+        """
+        Number of quarter turns about the boresight that correct a prior alignment; 0 for none.
+
+        Counted from the camera's +x towards its +y.
+        """
+        fitting = (turns for turns in range(4) if not self.is_off(prior * _ROLLS[turns]))
+        return next(fitting, 0)
+
 
 def prior_alignment(setup: Setup) -> Rotation | None:
     """The prior ``star_tracker_from_camera``; None where it is not given."""
     if not setup.is_aligned:
         return None
     return Rotation.from_quat(setup.prior.star_tracker_from_camera_xyzw)
-
-
-def off_by(reading: Reading, prior: Rotation) -> tuple[float, float]:
-    """Errors of a prior alignment in pointing and in roll, given the one found, rad."""
-    axes = (prior.inv() * reading.star_tracker_from_camera).as_matrix()
-    tilt_rad = math.acos(min(max(float(axes[2, 2]), -1.0), 1.0))
-    return tilt_rad, math.atan2(float(axes[1, 0]), float(axes[0, 0]))
-
-
-def is_off(reading: Reading, prior: Rotation) -> bool:
-    """True if a prior alignment is farther off than is searched."""
-    tilt_rad, roll_rad = off_by(reading, prior)
-    return tilt_rad > ACQUISITION_RADIUS_RAD or abs(roll_rad) > ACQUISITION_ROLL_RAD
-
-
-def _roll(quarter_turns: int) -> Rotation:
-    return Rotation.from_euler('z', 90.0 * quarter_turns, degrees=True)
-
-
-def quarter_turns(reading: Reading, prior: Rotation) -> int:
-    """
-    Number of quarter turns about the boresight that correct a prior alignment; 0 for none.
-
-    Counted from the camera's +x towards its +y.
-    """
-    if not is_off(reading, prior):
-        return 0
-    fitting = (turns for turns in (1, 2, 3) if not is_off(reading, prior * _roll(turns)))
-    return next(fitting, 0)
 
 
 def _ways(setup: Setup) -> list[tuple[str, str]]:
@@ -160,13 +152,13 @@ class Case:
         if prior is None:
             is_given = (fit[0].order, fit[0].direction) == _ways(self.setup)[0]
             return fit[0] if is_given else None
-        near = [reading for reading in fit if not is_off(reading, prior)]
+        near = [reading for reading in fit if not reading.is_off(prior)]
         if near:
             return near[0]
         likely = [
             reading
             for reading in fit
-            if quarter_turns(reading, prior)
+            if reading.quarter_turns(prior)
             or (prior.inv() * reading.star_tracker_from_camera).magnitude() < _WRONG_ALIGNMENT_RAD
         ]
         return likely[0] if len(likely) == 1 else None
@@ -206,7 +198,7 @@ def expected_rotations(attitudes: WireAttitudes, setup: Setup, time_ns: int) -> 
         return []
     sent = (_read_at(attitudes, np.array([time_ns]), way, setup)[0] for way in _ways(setup))
     read = [(one[0] * prior).inv() for one in sent if one is not None]
-    return [_roll(turns) * rotation for turns in (0, 2, 1, 3) for rotation in read]
+    return [_ROLLS[turns] * rotation for turns in (0, 2, 1, 3) for rotation in read]
 
 
 def _agreed(alignments: Rotation, way: tuple[str, str], shift_s: float) -> Reading:

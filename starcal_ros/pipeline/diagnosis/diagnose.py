@@ -23,10 +23,7 @@ from starcal_ros.pipeline.diagnosis.attitude_reading import (
     Case,
     CLOCK_SEARCH_S,
     expected_rotations,
-    is_off,
-    off_by,
     prior_alignment,
-    quarter_turns,
     Reading,
     WireAttitudes,
 )
@@ -277,12 +274,12 @@ def _alignment(reading: Reading, setup: Setup) -> list[Diagnosis]:
     if prior is None:
         sentence = 'prior_alignment is not given; the images show it.'
         return [Diagnosis('prior_alignment', values, sentence, (), mend)]
-    if not is_off(reading, prior):
+    if not reading.is_off(prior):
         return []
-    tilt_deg, roll_deg = (math.degrees(angle) for angle in off_by(reading, prior))
+    tilt_deg, roll_deg = (math.degrees(angle) for angle in reading.off_by(prior))
     away = f'{tilt_deg:.1f} degrees away from it and is rolled by {roll_deg:.1f} degrees'
     evidence = [f'prior_alignment points {away}']
-    if turns := quarter_turns(reading, prior):
+    if turns := reading.quarter_turns(prior):
         degrees = 180.0 if turns == 2 else 90.0
         way = {1: ' counterclockwise', 2: '', 3: ' clockwise'}[turns]
         sentence = f'The image is rotated by {degrees:.0f} degrees{way} against prior_alignment.'
@@ -302,7 +299,7 @@ def _alignment(reading: Reading, setup: Setup) -> list[Diagnosis]:
 def _sides_exchanged(reading: Reading, setup: Setup) -> Diagnosis:
     prior = prior_alignment(setup)
     way, back = 'clockwise', 'counterclockwise'
-    if prior is not None and quarter_turns(reading, prior) == 2:
+    if prior is not None and reading.quarter_turns(prior) == 2:
         way, back = back, way
     return Diagnosis(
         'rotated',
@@ -316,7 +313,7 @@ def _sides_exchanged(reading: Reading, setup: Setup) -> Diagnosis:
 def _mirrored(reading: Reading | None, setup: Setup) -> Diagnosis:
     how, prior = 'left to right', prior_alignment(setup)
     if reading is not None and prior is not None:
-        _, roll_rad = off_by(reading, prior)
+        _, roll_rad = reading.off_by(prior)
         if abs(roll_rad) > math.radians(135.0):
             how = 'top to bottom'
     return Diagnosis(
