@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+import itertools
 import math
 from pathlib import Path
 
@@ -37,8 +38,6 @@ from starcal_ros.pipeline.topics import choose_image_topic, Topics
 from starcal_ros.pipeline.unknown_air import EARTH_M_S, with_air
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.sky.catalog import load_catalog
-
-IMAGE_TOPIC = '/camera/image_raw'
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def from_photographs(
         for image in _images(photographs):
             if found.mirrored:
                 image = Image(image.time_ns, image.pixels[:, ::-1].copy())
-            writer.write_image(IMAGE_TOPIC, image, 'camera')
+            writer.write_image('/camera/image_raw', image, 'camera')
     stated = {**site_of(photographs), **values}
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
@@ -137,21 +136,23 @@ def from_bags(
 
     Raises NotFromStars when the stars give no camera, or the images are mirrored.
     """
-    topic = choose_image_topic(bags, asked)
-    read = reader.read_images(bags, topic, channel=str(values.get('image_channel', '')))
-    found = camera_of_images((image for image in read if isinstance(image, Image)), values)
+    found = camera_of_bags(bags, choose_image_topic(bags, asked), values)
     types = {topic.type_name for topic in reader.topics(bags)}
     is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
     return _set_up(found, bags, values, folder, is_located)
 
 
-def camera_of_images(images: Iterator[Image], values: Mapping[str, object]) -> FromStars:
+def camera_of_bags(
+    bags: Sequence[Path], topic: str, values: Mapping[str, object], most: int | None = None
+) -> FromStars:
     """
-    Camera and rotations of the images of a bag.
+    Camera and rotations of the images of bags, at most the first few.
 
     Raises NotFromStars when the stars give no camera, or the images are mirrored.
     """
-    found = _found(images, values, None)
+    read = reader.read_images(bags, topic, channel=str(values.get('image_channel', '')))
+    images = (image for image in read if isinstance(image, Image))
+    found = _found(itertools.islice(images, most), values, None)
     if found.mirrored:
         raise NotFromStars('the images are mirrored: mirror them where they are read out')
     return found

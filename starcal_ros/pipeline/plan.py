@@ -63,11 +63,6 @@ class Cone:
     dec_deg: float
     radius_deg: float
 
-    def holds(self, directions: Floats) -> Mask:
-        """Return which directions (n, 3) are within."""
-        cosine = directions @ _direction(self.ra_deg, self.dec_deg)
-        return np.asarray(cosine > math.cos(math.radians(self.radius_deg)))
-
 
 @dataclass(frozen=True)
 class Request:
@@ -202,7 +197,8 @@ def _allowed(request: Request) -> list[Pointing]:
     boresights = np.array([_direction(one.ra_deg, one.dec_deg) for one in allowed])
     clear = np.ones(len(allowed), bool)
     for cone in request.avoid:
-        clear &= ~cone.holds(boresights)
+        cosine = boresights @ _direction(cone.ra_deg, cone.dec_deg)
+        clear &= cosine <= math.cos(math.radians(cone.radius_deg))
     return [one for one, is_clear in zip(allowed, clear, strict=True) if is_clear]
 
 

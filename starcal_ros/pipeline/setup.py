@@ -222,10 +222,8 @@ def load_setup(
     catalog = load_catalog(Path(frames.catalog) if frames.catalog else None, magnitude_limit)
     set_up_checks.check_field_of_stars(len(catalog), magnitude_limit, prior.camera)
     size = prior.camera.width, prior.camera.height
-    dark, flat = (
-        detector_frames.read_dark(frames.dark_frame, *size),
-        detector_frames.read_flat(frames.flat_field, *size),
-    )
+    dark = detector_frames.read_dark(frames.dark_frame, *size)
+    flat = detector_frames.read_flat(frames.flat_field, *size)
     bad = detector_frames.read_bad_pixels(frames.bad_pixel_map, *size)
     return Setup(
         **groups,

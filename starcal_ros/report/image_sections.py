@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import base64
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 import math
 
@@ -108,30 +108,26 @@ def star_marks(observations: Sequence[StarObservations]) -> list[tuple[str, str]
     ]
 
 
-def _cut_outs(
-    reason: str, observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
-) -> list[tuple[Markup, str, str]]:
-    """Pictures of stars refused for a reason, with the stamp and the catalog number of each."""
-    by_time = {o.time_ns: o for o in observations}
-    cut_outs = []
-    for one in thumbnails:
-        if one.reason == reason:
-            number = star_of(one, by_time[one.time_ns]) if one.time_ns in by_time else None
-            label = '' if number is None else str(number)
-            cut_outs.append((picture(one), utc_text(one.time_ns), label))
-    return cut_outs
-
-
 def refused_stars(
     observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
 ) -> list[Mapping[str, object]]:
-    """For each reason: its meaning, its count and pictures of some, the most frequent first."""
+    """
+    For each reason, the most frequent first: its meaning, its count and pictures of some.
+
+    Each picture is with the stamp and the catalog number of its star.
+    """
+    by_time = {o.time_ns: o for o in observations}
+    pictures = defaultdict(list)
+    for one in (thumbnail for thumbnail in thumbnails if thumbnail.reason):
+        number = star_of(one, by_time[one.time_ns]) if one.time_ns in by_time else None
+        label = '' if number is None else str(number)
+        pictures[one.reason].append((picture(one), utc_text(one.time_ns), label))
     return [
         {
             'reason': reason,
             'meaning': STAR_REFUSALS.get(reason, ''),
             'count': count,
-            'pictures': _cut_outs(reason, observations, thumbnails),
+            'pictures': pictures[reason],
         }
         for reason, count in _counts(observations).most_common()
         if count

@@ -10,14 +10,7 @@ import math
 import numpy as np
 
 from starcal_ros.arrays import Floats
-from starcal_ros.records import (
-    Calibration,
-    GateCheck,
-    HeldTerm,
-    ModelChecks,
-    parts_that_matter,
-    SigmaPart,
-)
+from starcal_ros.records import Calibration, GateCheck, HeldTerm, parts_that_matter, SigmaPart
 
 INFORMATIVE_SIGMAS = 2.0
 """Distance from an assumed value below which the value that the stars ask for is noise."""
@@ -133,9 +126,8 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
     found = calibration.model_checks
     if found is None:
         return []
-    camera_info = (
-        f'camera_info carries neither field nor skew: {_px(calibration.zero_skew_cost_px)}'
-    )
+    step, cost_px = found.step, calibration.zero_skew_cost_px
+    camera_info = f'camera_info carries neither field nor skew: {_px(cost_px)}'
     field = f'field of {_px(found.field_rms_px)} rms per axis, at most {_px(found.field_worst_px)}'
     return [
         ModelRow(
@@ -145,7 +137,18 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
             'choose another lens_model; for lines of sight with the field use starcal lookup',
         ),
         *_held(found.held),
-        *_detector_and_images(found),
+        ModelRow(
+            'The detector has no step',
+            f'{_px(abs(step.size_px))} in {step.moved} at {step.across} = {step.place_px:.0f}',
+            _p(step.p_value),
+            'columns or rows are lost or shifted there: check the read-out',
+        ),
+        ModelRow(
+            'The camera is the same in all images',
+            f'varies by {_px(found.image_variation_px)} in a corner',
+            '',
+            'estimate with temperature, or calibrate each state by itself',
+        ),
     ]
 
 
@@ -166,22 +169,6 @@ def _held(held: Sequence[HeldTerm]) -> Iterator[ModelRow]:
         worst = max(term.significance for term in agreeing)
         found = f'the stars agree, within {worst:.1f} sigma of the difference'
         yield ModelRow(names, found, _p(math.erfc(worst / math.sqrt(2))), '')
-
-
-def _detector_and_images(found: ModelChecks) -> Iterator[ModelRow]:
-    step = found.step
-    yield ModelRow(
-        'The detector has no step',
-        f'{_px(abs(step.size_px))} in {step.moved} at {step.across} = {step.place_px:.0f}',
-        _p(step.p_value),
-        'columns or rows are lost or shifted there: check the read-out',
-    )
-    yield ModelRow(
-        'The camera is the same in all images',
-        f'varies by {_px(found.image_variation_px)} in a corner',
-        '',
-        'estimate with temperature, or calibrate each state by itself',
-    )
 
 
 def _px(value: float) -> str:
