@@ -5,18 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.reader import Topics as Topics
 from starcal_ros.formats.messages import types
+from starcal_ros.pipeline.observe_bags import observe_bag, OnImage, Wanted
+from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import StarObservations
-
-# A choice of topics needs no measurement, which is slow to import.
-if TYPE_CHECKING:
-    from starcal_ros.pipeline.observe_bags import OnImage, Wanted
-    from starcal_ros.pipeline.setup import Setup
 
 _RAW = types.IMAGE_TYPE
 _IMAGE_TYPES = {_RAW, types.COMPRESSED_TYPE}
@@ -128,9 +124,7 @@ def read(
     if topics.observations:
         recorded = reader.read_observations(paths, topics.observations)
         return (record for record in recorded if wanted is None or wanted(record.time_ns))
-    from starcal_ros.pipeline import observe_bags
-
-    return observe_bags.observe_bag(paths, topics, setup, on_image, wanted)
+    return observe_bag(paths, topics, setup, on_image, wanted)
 
 
 def without_attitudes(bags: Sequence[Path], asked: Topics) -> bool:
