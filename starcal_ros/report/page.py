@@ -198,23 +198,14 @@ def charts_of(
 ) -> Mapping[str, Chart]:
     """Charts by their name in the template; charts without data are left out."""
     geometry, prior = calibration.geometry, calibration_json.prior_of(calibration)
-    charts = _camera_charts(calibration)
-    charts['sky'] = detector_figures.pointings(observations, geometry)
-    if prior is not None:
-        charts['change'] = detector_figures.change_contours(prior, geometry)
-    if residuals is not None and residuals.used.any():
-        charts |= _residual_charts(calibration, residuals)
-        if prior is not None:
-            charts['before'] = figures.before_and_after(residuals, observations, prior)
-    return {name: chart for name, chart in charts.items() if chart is not None}
-
-
-def _camera_charts(calibration: Calibration) -> dict[str, Chart | None]:
-    camera, maps = calibration.geometry.camera, calibration.maps
+    camera, maps = geometry.camera, calibration.maps
     charts: dict[str, Chart | None] = {
         'vectors': detector_figures.distortion_vectors(camera),
         'contours': detector_figures.distortion_contours(camera),
+        'sky': detector_figures.pointings(observations, geometry),
     }
+    if prior is not None:
+        charts['change'] = detector_figures.change_contours(prior, geometry)
     if (field := camera.moving_field) is not None:
         charts['lens_field'] = detector_figures.field_vectors(field, camera)
     if maps is not None:
@@ -227,7 +218,11 @@ def _camera_charts(calibration: Calibration) -> dict[str, Chart | None]:
         charts['causes'] = detector_figures.budget_over_detector(parts, camera)
     if len(calibration.removals) > 1:
         charts['terms'] = figures.term_worth(calibration.removals)
-    return charts
+    if residuals is not None and residuals.used.any():
+        charts |= _residual_charts(calibration, residuals)
+        if prior is not None:
+            charts['before'] = figures.before_and_after(residuals, observations, prior)
+    return {name: chart for name, chart in charts.items() if chart is not None}
 
 
 def _residual_charts(calibration: Calibration, residuals: Residuals) -> dict[str, Chart | None]:

@@ -144,13 +144,13 @@ class _Search:
         """True if one of its guessed rotations identifies an image."""
         rotations = self.guesses(one.time_ns)
         ways = [self.solved[0].sky.mirrored] if self.solved else [False, True]
-        return any(
-            self._take(one, search.confirm_sky(
+        for mirrored, rotation in itertools.product(ways, rotations):
+            sky = search.confirm_sky(
                 one.sources.xy_px, self.camera, self.catalog, rotation, mirrored
-            ))
-            for mirrored in ways
-            for rotation in rotations
-        )  # fmt: skip
+            )
+            if self._take(one, sky):
+                return True
+        return False
 
     def look_up(self, one: _Seen, searched: tuple[int, int], scale: float = 1.0) -> bool:
         """True if a round of the search identifies an image; ``scale`` of the focal length."""

@@ -86,7 +86,7 @@ def annotate_reduced(
         _draw_mark(picture, Mark(cv2.MARKER_CROSS, _PREDICTED), pixel, size)
     for uv, snr in zip(reduced(observations.measured_px), observations.snr, strict=True):
         radius = (5 + 2 * np.log10(max(float(snr), 1.0))) * size
-        center, radius = _fixed_point(uv), int(radius * (1 << _SHIFT))
+        (center,), radius = _pixels(uv[None], 1 << _SHIFT), int(radius * (1 << _SHIFT))
         cv2.circle(picture, center, radius, _MEASURED, width, cv2.LINE_AA, _SHIFT)
     return picture
 
@@ -194,13 +194,9 @@ def _write(
     )  # fmt: skip
 
 
-def _pixels(places: Floats) -> list[list[int]]:
+def _pixels(places: Floats, per_pixel: int = 1) -> list[list[int]]:
+    """Places (n, 2) in whole units, of which a pixel has some."""
     # Predictions far outside the image would overflow OpenCV's integers.
-    inside = np.clip(np.nan_to_num(places, nan=-1e4), -1e4, 1e5)
+    inside = np.clip(np.nan_to_num(places, nan=-1e4), -1e4, 1e5) * per_pixel
     pixels: list[list[int]] = np.rint(inside).astype(int).tolist()
     return pixels
-
-
-def _fixed_point(uv: Floats) -> tuple[int, int]:
-    u, v = np.clip(uv, -1e4, 1e5) * (1 << _SHIFT)
-    return round(float(u)), round(float(v))
