@@ -34,10 +34,9 @@ from starcal_ros.formats.products.product_folder import (
 )
 from starcal_ros.pipeline import inspect, solve
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.observe_bags import measured_again, Wanted
 from starcal_ros.pipeline.provenance import inputs_of, software_version
 from starcal_ros.pipeline.setup import files_of, read_setup, read_values, Setup
-from starcal_ros.pipeline.topics import Topics, without_attitudes
+from starcal_ros.pipeline.topics import measured_again, Topics, Wanted, without_attitudes
 from starcal_ros.records import Calibration, CameraGeometry, Image, StarObservations
 from starcal_ros.report.pictures import thumbnails
 
