@@ -39,7 +39,7 @@ _TOOL = 'import sys; from starcal_ros.cli.entry_point import main; sys.exit(main
 _STAGES = (
     ('import of Python modules', 'importlib._bootstrap', '_find_and_load'),
     ('load options, camera, catalog', 'pipeline/setup', 'read_setup'),
-    ('images and stars', 'pipeline/observe_bags', 'observe_bag'),
+    ('images and stars', 'pipeline/topics', 'read'),
     ('  wait for the reading thread', 'formats/bag/frames', 'read_ahead'),
     ('  measure and identify stars', 'pipeline/observe', 'observe_next'),
     ('  select pictures', 'report/pictures/thumbnails', 'show'),

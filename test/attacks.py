@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.reader import Topics
 from starcal_ros.formats.products.product_folder import write_observations, write_products
-from starcal_ros.pipeline import observe_bags, solve
+from starcal_ros.pipeline import solve, topics
 from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.records import Calibration, Ensemble, StarObservations
 
@@ -69,7 +69,7 @@ def observations() -> tuple[StarObservations, ...]:
     """Return the observations of that bag."""
     image = reader.choose_topic([BAG], 'sensor_msgs/msg/Image')
     attitude = reader.choose_topic([BAG], 'geometry_msgs/msg/QuaternionStamped')
-    return tuple(observe_bags.observe_bag([BAG], Topics(image, attitude), setup()))
+    return tuple(topics.read([BAG], Topics(image, attitude), setup()))
 
 
 @functools.cache

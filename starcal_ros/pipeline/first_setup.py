@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
+import textwrap
 
 import numpy as np
 import yaml
@@ -18,12 +18,12 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.images.photographs import Photograph
 from starcal_ros.formats.messages.types import ATTITUDE_TYPES, VELOCITY_TYPE
 from starcal_ros.pipeline import night_sky
-from starcal_ros.pipeline.diagnosis.alignment import found_alignment
 from starcal_ros.pipeline.diagnosis.bags import diagnose_bags
+from starcal_ros.pipeline.diagnosis.diagnose import found_alignment
 from starcal_ros.pipeline.from_stars import FromStars
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.pipeline.topics import choose_image_topic, choose_topics, Topics
-from starcal_ros.records import CameraGeometry, Image
+from starcal_ros.records import CameraGeometry
 
 CAMERA_FILE = 'camera.yaml'
 _LOOKED_AT = 20  # images, the first ones
@@ -58,17 +58,11 @@ class FirstSetup:
     def parameter_file(self) -> str:
         """Text of the parameter file, with what is left to state as comments."""
         values = {'camera_info_url': CAMERA_FILE, **self.options}
-        lines = yaml.safe_dump(values, sort_keys=False, default_flow_style=None).splitlines()
-        return '\n'.join(
-            [
-                *(f'# {line}' for line in self.found),
-                '/**:',
-                '  ros__parameters:',
-                *(f'    {line}' for line in lines),
-                *(f'    # {line}' for line in self.to_state),
-                '',
-            ]
-        )
+        options = yaml.safe_dump(values, sort_keys=False, default_flow_style=None)
+        found = ''.join(f'# {line}\n' for line in self.found)
+        to_state = ''.join(f'# {line}\n' for line in self.to_state)
+        parameters = textwrap.indent(options + to_state, 4 * ' ')
+        return f'{found}/**:\n  ros__parameters:\n{parameters}'
 
 
 def of_photographs(photographs: Sequence[Photograph]) -> FirstSetup:
@@ -79,9 +73,8 @@ def of_photographs(photographs: Sequence[Photograph]) -> FirstSetup:
     """
     found = night_sky.camera_of_photographs(photographs[:_LOOKED_AT], {})
     options = night_sky.site_of(photographs)
-    return FirstSetup(
-        found.camera, options, (found.in_a_sentence(),), () if options else (_OF_PLACE,)
-    )
+    to_state = () if options else (_OF_PLACE,)
+    return FirstSetup(found.camera, options, (found.in_a_sentence(),), to_state)
 
 
 def of_bags(bags: Sequence[Path], asked: Topics) -> FirstSetup:
@@ -92,17 +85,16 @@ def of_bags(bags: Sequence[Path], asked: Topics) -> FirstSetup:
     or several topics have a type. Raises OptionError when attitudes and images do not agree.
     """
     topic = choose_image_topic(bags, asked)
-    images = (one for one in reader.read_images(bags, topic) if isinstance(one, Image))
-    camera = night_sky.camera_of_images(islice(images, _LOOKED_AT), {})
+    camera = night_sky.camera_of_bags(bags, topic, {}, _LOOKED_AT)
     there = {one.type_name for one in reader.topics(bags)}
     words = f'images of {topic}: {camera.in_a_sentence()}'
-    place = () if VELOCITY_TYPE in there else (_OF_PLACE,)
+    has_velocity = VELOCITY_TYPE in there
     kinds = [kind for kind, type_name in ATTITUDE_TYPES.items() if type_name in there]
     if not kinds:
-        return FirstSetup(camera.camera, {}, (words,), place)
+        return FirstSetup(camera.camera, {}, (words,), () if has_velocity else (_OF_PLACE,))
     options, attitudes = _aligned(bags, asked, camera, kinds[0])
-    place = () if VELOCITY_TYPE in there else (_OF_VELOCITY,)
-    return FirstSetup(camera.camera, options, (words, attitudes), (*_OF_TRACKER, *place))
+    to_state = _OF_TRACKER if has_velocity else (*_OF_TRACKER, _OF_VELOCITY)
+    return FirstSetup(camera.camera, options, (words, attitudes), to_state)
 
 
 def _aligned(

@@ -15,7 +15,6 @@ import dataclasses
 from dataclasses import dataclass
 import itertools
 import math
-from pathlib import Path
 import time
 
 import numpy as np
@@ -28,15 +27,20 @@ from starcal_ros.camera.conversion import convert
 from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions
-from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.identification.blind.bright_sources import bright_sources, BrightSources
-from starcal_ros.identification.blind.search import confirm_sky, find_sky, mirror, ROUNDS, SkyMatch
+from starcal_ros.identification.blind.bright_sources import bright_sources
+from starcal_ros.identification.blind.search import (
+    confirm_sky,
+    find_sky,
+    mirror,
+    NotFound,
+    ROUNDS,
+    SkyMatch,
+)
 from starcal_ros.records import CameraGeometry, Ensemble, Image, refused_image, StarObservations
 from starcal_ros.sky.catalog import StarCatalog
 
 ADVICE = 'take 20 frames over the whole sky, stars to the corners, 1 to 10 s each'
 FEWEST_IMAGES = 3
-ATTITUDE_TOPIC = '/stars/attitude'
 # Half diagonals that are tried, degrees, the usual ones first: each is searched to 25 % of the
 # focal length, and together they span fields of 5 to 120 degrees.  Up to 45 degrees
 # an equidistant lens is found as a pinhole with distortion.
@@ -105,10 +109,7 @@ def from_stars(
     """
     The camera and the rotations of images; ``prior`` is a camera good to 25 %, None: none known.
 
-    Raises
-    ------
-    NotFromStars
-        When the images give no camera; the text says what to photograph.
+    Raises NotFromStars when the images give no camera; the text says what to photograph.
     """
     seen, size, copies = _sources(images)
     if len(seen) < min_images:
@@ -163,15 +164,12 @@ def _sources(images: Iterable[Image]) -> tuple[list[_Seen], tuple[int, int], int
             copies += 1
             continue
         sums.add(digest)
-        seen.append(_seen(image.time_ns, bright_sources(image.pixels)))
+        sources = bright_sources(image.pixels)
+        # The structure of a corona is wide along both axes, as few stars are.
+        middle_px = np.median(sources.wide_px) if len(sources.wide_px) else 0.0
+        compact = sources.xy_px[sources.wide_px <= middle_px]
+        seen.append(_Seen(image.time_ns, sources.xy_px, compact))
     return seen, size, copies
-
-
-def _seen(time_ns: int, sources: BrightSources) -> _Seen:
-    """Sources of an image; the structure of a corona is wide along both axes, as few stars are."""
-    wide_px = sources.wide_px
-    middle_px = float(np.median(wide_px)) if len(wide_px) else 0.0
-    return _Seen(time_ns, sources.xy_px, sources.xy_px[wide_px <= middle_px])
 
 
 def pinhole(size: tuple[int, int], focal_px: float) -> CameraModel:
@@ -187,8 +185,7 @@ def _usual(size: tuple[int, int], half_px: float, model: str, half_rad: float) -
     """A camera of a model without distortion, of this half diagonal."""
     if model == _PINHOLE:
         return pinhole(size, half_px / math.tan(half_rad))
-    camera = pinhole(size, half_px / half_rad)
-    return CameraModel(*size, camera.parameters[:9], model)
+    return CameraModel(*size, pinhole(size, half_px / half_rad).parameters[:9], model)
 
 
 def _first_match(
@@ -231,32 +228,21 @@ def _all_matches(
     """The images that the camera of the first match identifies, by stamp, mirrored back."""
     found: dict[int, SkyMatch] = {}
     camera = first.camera
+    before: SkyMatch | NotFound = NotFound('')
     for one in seen:
         rankings = (one.compact, one.all) if compact_first else (one.all, one.compact)
         # Both rankings before either is searched further.
         for rounds, xy_px in itertools.product((ROUNDS[:1], ROUNDS[1:]), rankings):
             turned_px = mirror(xy_px, camera.width) if first.mirrored else xy_px
-            sky = _matched(turned_px, camera, catalog, list(found.values())[-1:], rounds)
-            if sky is not None:
-                found[one.time_ns] = sky
+            sky = before
+            if isinstance(before, SkyMatch):
+                sky = confirm_sky(turned_px, camera, catalog, before.camera_from_icrf)
+            if isinstance(sky, NotFound):
+                sky = find_sky(turned_px, camera, catalog, rounds=rounds)
+            if isinstance(sky, SkyMatch):
+                found[one.time_ns] = before = sky
                 break
     return found
-
-
-def _matched(
-    xy_px: Floats,
-    camera: CameraModel,
-    catalog: StarCatalog,
-    before: Sequence[SkyMatch],
-    rounds: Sequence[tuple[int, int]],
-) -> SkyMatch | None:
-    """An image identified near the one before, else anywhere."""
-    for known in before:
-        sky = confirm_sky(xy_px, camera, catalog, known.camera_from_icrf)
-        if isinstance(sky, SkyMatch):
-            return sky
-    sky = find_sky(xy_px, camera, catalog, rounds=rounds)
-    return sky if isinstance(sky, SkyMatch) else None
 
 
 def _of_one_lens(found: Mapping[int, SkyMatch]) -> dict[int, SkyMatch]:
@@ -277,24 +263,18 @@ def _common_camera(
 ) -> tuple[CameraModel, dict[int, Rotation]]:
     """The camera that fits all matches, and the rotations ``icrf_from_camera`` with it."""
     stars = sum(len(sky.xy_px) for sky in found.values())
-    options = CalibrationOptions(
-        method='per_image', min_images=1, min_stars=10, velocity_sigma_m_s=0.0
-    )
     parameters = np.median([sky.camera.parameters for sky in found.values()], axis=0)
     camera = dataclasses.replace(camera, parameters=parameters)
     if len(found) < 2 or stars < 30:
         return camera, {t: sky.camera_from_icrf.inv() for t, sky in found.items()}
-    ensemble = Ensemble()
-    for time_ns, sky in found.items():
-        ensemble = ensemble.add(_observations(time_ns, sky, catalog, camera))
-    geometry = CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
-    fit = estimate_calibration(ensemble, geometry, options)
-    rotations = fit.state.camera_from_icrf.inv()
-    stamps = [image.time_ns for image in ensemble.images]
-    return (
-        dataclasses.replace(fit.geometry.camera, field=None),
-        {stamp: rotations[k] for k, stamp in enumerate(stamps)},
+    options = CalibrationOptions(
+        method='per_image', min_images=1, min_stars=10, velocity_sigma_m_s=0.0
     )
+    images = tuple(_observations(*one, catalog, camera) for one in found.items())
+    geometry = CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
+    fit = estimate_calibration(Ensemble(images), geometry, options)
+    rotations = dict(zip(found, fit.state.camera_from_icrf.inv(), strict=True))
+    return dataclasses.replace(fit.geometry.camera, field=None), rotations
 
 
 def _observations(
@@ -333,11 +313,3 @@ def options_of(values: Mapping[str, object]) -> dict[str, object]:
         'shutter': 'global',
         'stamp_sigma_s': 0.0,
     }
-
-
-def write_attitudes(found: FromStars, bag: Path) -> None:
-    """Write the rotations into a bag, as those of a star tracker with the axes of the camera."""
-    with BagWriter(bag) as writer:
-        for time_ns in sorted(found.icrf_from_camera):
-            xyzw = found.icrf_from_camera[time_ns].as_quat()
-            writer.write_attitude(ATTITUDE_TOPIC, time_ns, xyzw, 'icrf')

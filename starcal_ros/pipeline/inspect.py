@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,13 +21,10 @@ from starcal_ros.formats.messages.image_messages import decode_png
 from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.observe import check_order
+from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import EnsembleStatus, IMAGE_REFUSALS, refused_image, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
-
-# What measures and solves takes most of the start: imported only with a setup.
-if TYPE_CHECKING:
-    from starcal_ros.pipeline.setup import Setup
 
 _IMAGES = (types.IMAGE_TYPE, types.COMPRESSED_TYPE)
 _STAMPED = (
@@ -79,29 +75,12 @@ class Inspection:
     """
     Contents of a bag as a calibration reads it.
 
-    Attributes
-    ----------
-    bags : tuple of str
-    topics : tuple of TopicContent
-    chosen : Topics or None
-        Topics that a calibration would read; None if they are ambiguous or missing.
-    images : int
-        Images of the chosen topic.
-    refused : tuple of Refused
-        Refused images, most frequent reason first.
-    longest_attitude_gap_s : float
-        Between the attitude samples around an accepted image; NaN if none records it.
-    measured : bool
-        Whether the stars were measured; if not, an image may still be refused for its stars.
-    stars_per_image : tuple of int
-        Stars of each accepted image, if measured.
-    refused_stars : mapping
-        Reason -> count, if measured.
-    status : EnsembleStatus or None
-        Predicted uncertainty of a calibration, if measured.
-    damage : tuple of str
-    problems : tuple of str
-        Why the bag cannot be calibrated; empty if it can.
+    ``chosen`` are the topics that it would read, None if they are ambiguous or missing, and
+    ``images`` the number of its images.  ``longest_attitude_gap_s`` is between the attitude
+    samples around an accepted image; NaN if none records it.  Only if the stars were ``measured``
+    are there ``stars_per_image`` (accepted images), ``refused_stars`` (by reason) and the
+    ``status`` of a calibration; if not, an image may still be refused for its stars.
+    ``problems`` are why the bag cannot be calibrated.
     """
 
     bags: tuple[str, ...]
@@ -153,7 +132,7 @@ def inspect(
     measured = setup is not None or bool(chosen and chosen.observations)
     status = None
     if setup and chosen:
-        from starcal_ros.pipeline import solve
+        from starcal_ros.pipeline import solve  # a tenth of the start
 
         status = solve.ensemble_status(solve.ensemble_of(seen, setup), setup)
     if chosen and not problems:
@@ -198,29 +177,25 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
                     sample = attitude_sample(*attitude_from_message(message), '')
                     bad[raw.topic] += sample is None
         stamps[raw.topic].append(stamp_ns)
-    return tuple(
-        _topic_content(name, type_names[name], stamps[name], kinds[name], bad[name])
-        for name in sorted(type_names)
-    )
-
-
-def _topic_content(
-    name: str, type_name: str, stamps_ns: list[int], kinds: Mapping[str, int], bad: int
-) -> TopicContent:
-    steps_s = np.diff(sorted(stamps_ns)) / NANOSECONDS_PER_SECOND
-    middle_s = float(np.median(steps_s)) if steps_s.size else 0.0
-    return TopicContent(
-        name=name,
-        type_name=type_name,
-        count=len(stamps_ns),
-        rate_hz=1.0 / middle_s if middle_s > 0 else 0.0,
-        first_ns=min(stamps_ns),
-        last_ns=max(stamps_ns),
-        longest_gap_s=float(steps_s.max()) if steps_s.size else 0.0,
-        backward=int((np.diff(stamps_ns) < 0).sum()),
-        kinds=dict(kinds),
-        bad=bad,
-    )
+    found = []
+    for name, type_name in sorted(type_names.items()):
+        steps_s = np.diff(sorted(stamps[name])) / NANOSECONDS_PER_SECOND
+        middle_s = float(np.median(steps_s)) if steps_s.size else 0.0
+        found.append(
+            TopicContent(
+                name=name,
+                type_name=type_name,
+                count=len(stamps[name]),
+                rate_hz=1.0 / middle_s if middle_s > 0 else 0.0,
+                first_ns=min(stamps[name]),
+                last_ns=max(stamps[name]),
+                longest_gap_s=float(steps_s.max(initial=0.0)),
+                backward=int((np.diff(stamps[name]) < 0).sum()),
+                kinds=dict(kinds[name]),
+                bad=bad[name],
+            )
+        )
+    return tuple(found)
 
 
 def _kind(message: types.Message) -> str:
@@ -278,11 +253,12 @@ def _shortages(used: Sequence[StarObservations], status: EnsembleStatus | None) 
         return ['no usable image']
     if status is None:
         return []
-    found = []
-    for what, there, wanted in (
+    counts = (
         ('images', status.images, status.min_images),
         ('stars', status.stars, status.min_stars),
-    ):
-        if there < wanted:
-            found.append(f'only {there} usable {what}, {wanted} needed (min_{what})')
-    return found
+    )
+    return [
+        f'only {there} usable {what}, {wanted} needed (min_{what})'
+        for what, there, wanted in counts
+        if there < wanted
+    ]

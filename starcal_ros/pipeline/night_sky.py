@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+import itertools
 import math
 from pathlib import Path
 
@@ -30,21 +31,13 @@ from starcal_ros.formats.images.photographs import (
 )
 from starcal_ros.formats.messages.types import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.pipeline.from_stars import (
-    from_stars,
-    FromStars,
-    options_of,
-    pinhole,
-    write_attitudes,
-)
+from starcal_ros.pipeline.from_stars import from_stars, FromStars, options_of, pinhole
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.pipeline.topics import choose_image_topic, Topics
 from starcal_ros.pipeline.unknown_air import EARTH_M_S, with_air
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.sky.catalog import load_catalog
-
-IMAGE_TOPIC = '/camera/image_raw'
 
 
 @dataclass(frozen=True)
@@ -75,10 +68,7 @@ def photographs_of(
     """
     Photographs of one camera in order of time, and lines about the files left out.
 
-    Raises
-    ------
-    NotFromStars
-        When no file can be read.
+    Raises NotFromStars when no file can be read.
     """
     looked: list[Photograph] = []
     notes = []
@@ -103,16 +93,15 @@ def from_photographs(
     """
     Set-up of a calibration of photographs, whose bags are written into a folder.
 
-    Raises
-    ------
-    NotFromStars
-        When the stars give no camera.
+    Raises NotFromStars when the stars give no camera.
     """
     found = camera_of_photographs(photographs, values)
     bag = folder / 'images.mcap'
     with BagWriter(bag) as writer:
         for image in _images(photographs):
-            writer.write_image(IMAGE_TOPIC, _turned_back(image, found), 'camera')
+            if found.mirrored:
+                image = Image(image.time_ns, image.pixels[:, ::-1].copy())
+            writer.write_image('/camera/image_raw', image, 'camera')
     stated = {**site_of(photographs), **values}
     is_located = 'observer' in stated or 'observer_velocity_m_s' in stated
     if is_located and not all(one.dated for one in photographs):
@@ -126,10 +115,7 @@ def camera_of_photographs(
     """
     Camera and rotations of photographs, from the focal length that they state, if any.
 
-    Raises
-    ------
-    NotFromStars
-        When the stars give no camera.
+    Raises NotFromStars when the stars give no camera.
     """
     first = photographs[0]
     focal_px = float(np.nanmedian([one.focal_px for one in photographs] + [math.inf]))
@@ -148,29 +134,25 @@ def from_bags(
     """
     Set-up of a calibration of bags without attitudes; those by the stars are written to a folder.
 
-    Raises
-    ------
-    NotFromStars
-        When the stars give no camera, or the images are mirrored.
+    Raises NotFromStars when the stars give no camera, or the images are mirrored.
     """
-    topic = choose_image_topic(bags, asked)
-    read = reader.read_images(bags, topic, channel=str(values.get('image_channel', '')))
-    found = camera_of_images((image for image in read if isinstance(image, Image)), values)
+    found = camera_of_bags(bags, choose_image_topic(bags, asked), values)
     types = {topic.type_name for topic in reader.topics(bags)}
     is_located = VELOCITY_TYPE in types or bool({'observer', 'observer_velocity_m_s'} & {*values})
     return _set_up(found, bags, values, folder, is_located)
 
 
-def camera_of_images(images: Iterator[Image], values: Mapping[str, object]) -> FromStars:
+def camera_of_bags(
+    bags: Sequence[Path], topic: str, values: Mapping[str, object], most: int | None = None
+) -> FromStars:
     """
-    Camera and rotations of the images of a bag.
+    Camera and rotations of the images of bags, at most the first few.
 
-    Raises
-    ------
-    NotFromStars
-        When the stars give no camera, or the images are mirrored.
+    Raises NotFromStars when the stars give no camera, or the images are mirrored.
     """
-    found = _found(images, values, None)
+    read = reader.read_images(bags, topic, channel=str(values.get('image_channel', '')))
+    images = (image for image in read if isinstance(image, Image))
+    found = _found(itertools.islice(images, most), values, None)
     if found.mirrored:
         raise NotFromStars('the images are mirrored: mirror them where they are read out')
     return found
@@ -196,17 +178,13 @@ def _set_up(
     is_located: bool,
 ) -> NightSky:
     attitudes = folder / 'attitudes.mcap'
-    write_attitudes(found, attitudes)
+    with BagWriter(attitudes) as writer:
+        for time_ns in sorted(found.icrf_from_camera):
+            xyzw = found.icrf_from_camera[time_ns].as_quat()
+            writer.write_attitude('/stars/attitude', time_ns, xyzw, 'icrf')
     prior = CameraGeometry(found.camera, np.array([0.0, 0.0, 0.0, 1.0]))
     setup = load_setup(options_of(values), others=NODE_OPTION_CLASSES, prior=prior)
     return NightSky((*bags, attitudes), setup, (found.in_a_sentence(),), is_located)
-
-
-def _turned_back(image: Image, found: FromStars) -> Image:
-    """An image as it would be without a mirror."""
-    if not found.mirrored:
-        return image
-    return Image(image.time_ns, image.pixels[:, ::-1].copy())
 
 
 def site_of(photographs: Sequence[Photograph]) -> dict[str, object]:

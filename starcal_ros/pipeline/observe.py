@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import contextlib
 import dataclasses
 from dataclasses import dataclass
 import math
@@ -155,27 +156,27 @@ def _with_any(
     attitudes: Sequence[Attitude], exposure: Exposure, setup: Setup, track: Track
 ) -> tuple[StarObservations, Track]:
     """Observations with the first attitude that leads to no refusal, else the first refusal."""
-    outcomes: list[tuple[StarObservations, Track]] = []
+    refused_by_stars: list[tuple[StarObservations, Track]] = []
     errors: list[ImageRefused] = []
     unfit: dict[str, str] = {}
     for attitude in attitudes:
-        label = attitude.star_tracker or setup.frames.star_tracker_frame
         try:
             observations, after = _with_one(attitude, exposure, setup, track)
         except ImageRefused as refused:
             errors.append(refused)
-            unfit[attitude.star_tracker] = f'{label} not used: {refused.reason}: {refused.detail}'
-            continue
-        if not observations.refusal:
-            detail = '; '.join(unfit.values())
-            observations = dataclasses.replace(observations, detail=detail)
-            return observations, _with_fitness(after, attitude.star_tracker, unfit)
-        why = f'{observations.refusal}: {observations.detail}'
+            why = f'{refused.reason}: {refused.detail}'
+        else:
+            if not observations.refusal:
+                detail = '; '.join(unfit.values())
+                observations = dataclasses.replace(observations, detail=detail)
+                return observations, _with_fitness(after, attitude.star_tracker, unfit)
+            refused_by_stars.append((observations, after))
+            why = f'{observations.refusal}: {observations.detail}'
+        label = attitude.star_tracker or setup.frames.star_tracker_frame
         unfit[attitude.star_tracker] = f'{label} not used: {why}'
-        outcomes.append((observations, after))
-    if errors and len(errors) == len(attitudes):
+    if not refused_by_stars:
         raise errors[0]
-    return outcomes[0]
+    return refused_by_stars[0]
 
 
 def _with_fitness(track: Track, used: str, unfit: Mapping[str, str]) -> Track:
@@ -194,16 +195,11 @@ def _with_one(
 ) -> tuple[StarObservations, Track]:
     """Observations with an attitude; the new state updates that star tracker only."""
     name = attitude.star_tracker
-    own = track.others.get(name) if name else track
-    before = track
-    if name:
-        # The error of the mounting exceeds the uncertainty of a tracked camera.
-        before = dataclasses.replace(
-            track,
-            geometry=own.geometry if own else track.geometry,
-            tracked_camera=own.tracked_camera if own else None,
-            held=own.held if own else None,
-        )
+    # The error of the mounting exceeds the uncertainty of a tracked camera.
+    own = track.others.get(name, Track(track.geometry)) if name else track
+    before = dataclasses.replace(
+        track, geometry=own.geometry, tracked_camera=own.tracked_camera, held=own.held
+    )
     exposure = dataclasses.replace(
         exposure,
         icrf_from_star_tracker_xyzw=attitude.icrf_from_star_tracker_xyzw,
@@ -272,9 +268,8 @@ def _after_order(track: Track, time_ns: int) -> Track:
 
 def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservations, Track]:
     """Stars of an image by the track of the images before it, or else by a search."""
-    time_ns = exposure.image.time_ns
     if track.tracked_camera is not None:
-        try:
+        with contextlib.suppress(ImageRefused):  # the full search finds the reason of refusal
             observations, tracked_camera = track_stars(
                 exposure, track.tracked_camera, setup.star_search
             )
@@ -283,23 +278,15 @@ def _stars(exposure: Exposure, setup: Setup, track: Track) -> tuple[StarObservat
                 track.geometry,
                 star_tracker_from_camera_xyzw=tracked_camera.geometry.star_tracker_from_camera_xyzw,
             )
-            after = dataclasses.replace(
-                track, geometry=geometry, latest_ns=time_ns, tracked_camera=tracked_camera
-            )
-            return observations, _with_hot_pixels(after, exposure, observations, setup)
-        except ImageRefused:
-            pass  # the full search finds the reason of refusal
+            after = dataclasses.replace(track, geometry=geometry, tracked_camera=tracked_camera)
+            return observations, _after_image(after, exposure, observations, setup)
     observations, instrument = observe_stars(exposure, track.geometry, setup.star_search)
     if observations.refusal:
         return observations, track
     geometry = realigned(track.geometry, observations)
-    after = dataclasses.replace(
-        track,
-        geometry=geometry,
-        latest_ns=time_ns,
-        tracked_camera=start_tracking(geometry, observations, instrument),
-    )
-    return observations, _with_hot_pixels(after, exposure, observations, setup)
+    started = start_tracking(geometry, observations, instrument)
+    after = dataclasses.replace(track, geometry=geometry, tracked_camera=started)
+    return observations, _after_image(after, exposure, observations, setup)
 
 
 def _first_at_attitude(
@@ -338,10 +325,10 @@ def _first_at_attitude(
     return held
 
 
-def _with_hot_pixels(
+def _after_image(
     track: Track, exposure: Exposure, observations: StarObservations, setup: Setup
 ) -> Track:
-    """Track with the hot pixels of an image that has the alignment of the track."""
+    """Track with the stamp and the hot pixels of an image that has the alignment of the track."""
     icrf_from_star_tracker = Rotation.from_quat(exposure.icrf_from_star_tracker_xyzw)
     hot = learn_hot_pixels(
         track.hot or setup.hot,
@@ -351,7 +338,7 @@ def _with_hot_pixels(
         icrf_from_star_tracker * Rotation.from_quat(track.geometry.star_tracker_from_camera_xyzw),
         float(track.geometry.camera.parameters[0]),
     )
-    return dataclasses.replace(track, hot=hot)
+    return dataclasses.replace(track, latest_ns=exposure.image.time_ns, hot=hot)
 
 
 def _check_size(image: Image, camera: CameraModel) -> None:

@@ -63,31 +63,16 @@ class Cone:
     dec_deg: float
     radius_deg: float
 
-    def holds(self, directions: Floats) -> Mask:
-        """Return which directions (n, 3) are within."""
-        cosine = directions @ _direction(self.ra_deg, self.dec_deg)
-        return np.asarray(cosine > math.cos(math.radians(self.radius_deg)))
-
 
 @dataclass(frozen=True)
 class Request:
     """
     Wishes and bounds of a plan.
 
-    Attributes
-    ----------
-    images : int
-        Images that may be taken.
-    minimise : str
-        ``line_of_sight``, ``map``, or a camera parameter or alignment angle; see
-        `assessment.plan.target`.
-    pointings : tuple of Pointing
-        Those that are allowed, each at most once; empty: any of ``within``.
-    within : Cone
-    avoid : tuple of Cone
-        The Sun, the Moon, the Earth: no boresight comes into these.
-    largest_slew_deg : float
-        Between the boresights of one image and the next.
+    ``minimise`` is ``line_of_sight``, ``map``, or a camera parameter or alignment angle; see
+    `assessment.plan.target`.  ``pointings`` are allowed, each at most once; empty: any of
+    ``within``.  No boresight comes into ``avoid``, as the Sun, the Moon and the Earth.  A slew is
+    between the boresights of one image and the next.
     """
 
     images: int
@@ -137,16 +122,11 @@ def request_of(
     within: Sequence[float] = (0.0, 0.0, 180.0),
 ) -> Request:
     """
-    Return a request from plain numbers.
+    Return a request from plain numbers, in degrees.
 
-    Raises OptionError for numbers that have no meaning.
-
-    Parameters
-    ----------
-    pointings : right ascensions, declinations and rolls, deg
-        Those that are allowed; empty: any within the cone.
-    avoid : right ascensions, declinations and radii, deg
-    within : right ascension, declination and radius, deg
+    ``pointings`` are columns of right ascension, declination and roll, ``avoid`` columns and
+    ``within`` numbers of right ascension, declination and radius.  Raises OptionError for numbers
+    that have no meaning.
     """
     for name, columns in (('pointings', pointings), ('avoid', avoid)):
         if len({len(column) for column in columns}) > 1:
@@ -217,7 +197,8 @@ def _allowed(request: Request) -> list[Pointing]:
     boresights = np.array([_direction(one.ra_deg, one.dec_deg) for one in allowed])
     clear = np.ones(len(allowed), bool)
     for cone in request.avoid:
-        clear &= ~cone.holds(boresights)
+        cosine = boresights @ _direction(cone.ra_deg, cone.dec_deg)
+        clear &= cosine <= math.cos(math.radians(cone.radius_deg))
     return [one for one, is_clear in zip(allowed, clear, strict=True) if is_clear]
 
 

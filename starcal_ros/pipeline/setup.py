@@ -34,13 +34,7 @@ from starcal_ros.options import (
     read_parameter_file,
     unknown_option,
 )
-from starcal_ros.pipeline import set_up_checks
-from starcal_ros.pipeline.detector_frames import (
-    read_bad_pixels,
-    read_dark,
-    read_flat,
-    with_bad_pixels,
-)
+from starcal_ros.pipeline import detector_frames, set_up_checks
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
@@ -182,11 +176,9 @@ def files_of(frames: SetupOptions) -> dict[str, Path]:
 
     Raises ProductError for a camera URL that names no file.
     """
-    files = (
-        {'camera_info_url': camera_yaml.resolve_url(frames.camera_info_url)}
-        if frames.camera_info_url
-        else {}
-    )
+    files = {}
+    if frames.camera_info_url:
+        files['camera_info_url'] = camera_yaml.resolve_url(frames.camera_info_url)
     for name in ('catalog', 'dark_frame', 'flat_field', 'bad_pixel_map'):
         if path := getattr(frames, name):
             files[name] = Path(path.removeprefix('file://'))
@@ -226,23 +218,20 @@ def load_setup(
     set_up_checks.check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
     set_up_checks.check_site(groups['site'])
     check_options(groups['calibration'], prior.camera.model)
-    path = Path(frames.catalog) if frames.catalog else None
     magnitude_limit = groups['identification'].magnitude_limit
-    catalog = load_catalog(path, magnitude_limit)
+    catalog = load_catalog(Path(frames.catalog) if frames.catalog else None, magnitude_limit)
     set_up_checks.check_field_of_stars(len(catalog), magnitude_limit, prior.camera)
-    dark = read_dark(frames.dark_frame, prior.camera.width, prior.camera.height)
-    flat = read_flat(frames.flat_field, prior.camera.width, prior.camera.height)
+    size = prior.camera.width, prior.camera.height
+    dark = detector_frames.read_dark(frames.dark_frame, *size)
+    flat = detector_frames.read_flat(frames.flat_field, *size)
+    bad = detector_frames.read_bad_pixels(frames.bad_pixel_map, *size)
     return Setup(
         **groups,
         prior=prior,
         catalog=catalog,
         dark=dark,
         dark_pedestal_dn=0 if dark is None else int(np.median(dark)),
-        hot=with_bad_pixels(
-            hot_in_dark(dark),
-            read_bad_pixels(frames.bad_pixel_map, prior.camera.width, prior.camera.height),
-            flat,
-        ),
+        hot=detector_frames.with_bad_pixels(hot_in_dark(dark), bad, flat),
         is_aligned=is_aligned,
         camera_name=camera_yaml.read_camera_name(frames.camera_info_url)
         if frames.camera_info_url
@@ -265,14 +254,14 @@ def _mountings(
     frames = [frame for frame in options.more_star_trackers if frame]
     if not frames:
         return ()
-    others = [setup.star_tracker_frame, setup.camera_frame]
-    for k, frame in enumerate(frames):
-        if frame.lstrip('/') in (name.lstrip('/') for name in [*others, *frames[:k]]):
+    taken = {setup.star_tracker_frame.lstrip('/'), setup.camera_frame.lstrip('/')}
+    for frame in frames:
+        if frame.lstrip('/') in taken:
             raise OptionError(
                 f'more_star_trackers: {shown(frame)} is given twice: each of them,'
                 ' star_tracker_frame and camera_frame need a name of their own'
             )
-    for frame in frames:
+        taken.add(frame.lstrip('/'))
         if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', frame):
             raise OptionError(f'more_star_trackers: {shown(frame)} is not a valid frame name')
     if not is_aligned:
@@ -285,15 +274,11 @@ def _mountings(
             f'more_alignments: {len(options.more_alignments)} numbers, but {len(frames)} further'
             f' star trackers need {4 * len(frames)}'
         )
-    alignments = [
-        Rotation.from_quat(_unit_quaternion('more_alignments', row.tolist()))
-        for row in np.array(options.more_alignments).reshape(-1, 4)
-    ]
+    rows = np.array(options.more_alignments).reshape(-1, 4).tolist()
+    quaternions = [_unit_quaternion('more_alignments', row) for row in rows]
     first = Rotation.from_quat(prior.star_tracker_from_camera_xyzw)
-    return tuple(
-        Mounting(frame, (first * alignment.inv()).as_quat())
-        for frame, alignment in zip(frames, alignments, strict=True)
-    )
+    mounted = (first * Rotation.from_quat(quaternions).inv()).as_quat()
+    return tuple(Mounting(*pair) for pair in zip(frames, mounted, strict=True))
 
 
 def _unit_quaternion(option: str, values: Sequence[float]) -> Floats:

@@ -12,16 +12,10 @@ import warnings
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.assessment import observability
 from starcal_ros.assessment.amplitude_checks import model_checks
 from starcal_ros.assessment.budget import sigma_budget
 from starcal_ros.assessment.gate import judge, reasons_of
-from starcal_ros.assessment.observability import (
-    correlation,
-    detector_maps,
-    keep_most_informative,
-    weakest_direction,
-)
-from starcal_ros.assessment.observability import ensemble_status as _ensemble_status
 from starcal_ros.assessment.residuals import Residuals, residuals_of
 from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.blas_threads import one_blas_thread
@@ -41,7 +35,6 @@ from starcal_ros.records import (
     EnsembleStatus,
     factored_field,
     StarObservations,
-    StarTrackerAlignment,
 )
 
 _FEWEST_STARS = 3  # two fit their mirror image
@@ -110,14 +103,14 @@ def aligned_by(ensemble: Ensemble, setup: Setup) -> Setup:
 def within_limit(ensemble: Ensemble, setup: Setup) -> Ensemble:
     """Return the ensemble without its least informative images, down to ``max_images``."""
     setup = aligned_by(ensemble, setup)
-    return keep_most_informative(ensemble, setup.prior, setup.calibration)
+    return observability.keep_most_informative(ensemble, setup.prior, setup.calibration)
 
 
 @one_blas_thread()
 def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
     """Images and stars collected, and the predicted precision of a calibration from them."""
     setup = aligned_by(ensemble, setup)
-    return _ensemble_status(ensemble, setup.prior, setup.calibration)
+    return observability.ensemble_status(ensemble, setup.prior, setup.calibration)
 
 
 def solve(
@@ -169,24 +162,15 @@ def estimated(ensemble: Ensemble, setup: Setup) -> Estimate:
     return estimate_calibration(ensemble, setup.prior, setup.calibration)
 
 
-def _named(
-    found: tuple[StarTrackerAlignment, ...], first_frame: str
-) -> tuple[StarTrackerAlignment, ...]:
-    """The star trackers, the first one with the name of its frame."""
-    return tuple(dataclasses.replace(one, frame=one.frame or first_frame) for one in found)
-
-
 def _as_asked_for(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:
     """The setup with the requested method and parameters to estimate, where given."""
-    override: dict[str, object] = {}
-    if method:
-        override['method'] = method
-    if estimate:
-        override['estimate'] = tuple(estimate)
+    options = setup.calibration
+    options = dataclasses.replace(
+        options, method=method or options.method, estimate=tuple(estimate) or options.estimate
+    )
     for field in dataclasses.fields(CalibrationOptions):
-        if field.name in override:
-            check_value(field, override[field.name])
-    options = dataclasses.replace(setup.calibration, **override)  # type: ignore[arg-type]
+        if field.name in ('method', 'estimate'):
+            check_value(field, getattr(options, field.name))
     return dataclasses.replace(setup, calibration=options)
 
 
@@ -196,7 +180,9 @@ def _not_judged(
     """An estimate with its statistics, before the gate."""
     kept, camera = result.kept, result.geometry.camera
     field = camera.field
-    singular_values, weakest = weakest_direction(result.information, result.information_names)
+    singular_values, weakest = observability.weakest_direction(
+        result.information, result.information_names
+    )
     stamps_ns = [image.time_ns for image in ensemble.images]
     return Calibration(
         time_ns=max(stamps_ns),
@@ -230,10 +216,15 @@ def _not_judged(
         child_frame=setup.frames.camera_frame,
         provenance=provenance,
         temperature=result.thermal,
-        maps=detector_maps(camera, result.map_covariance, result.table.measured_px[kept]),
-        correlation=correlation(result.shared_covariance, result.shared_names),
+        maps=observability.detector_maps(
+            camera, result.map_covariance, result.table.measured_px[kept]
+        ),
+        correlation=observability.correlation(result.shared_covariance, result.shared_names),
         removals=removal_study(result),
-        star_trackers=_named(result.star_trackers, setup.frames.star_tracker_frame),
+        star_trackers=tuple(
+            dataclasses.replace(one, frame=one.frame or setup.frames.star_tracker_frame)
+            for one in result.star_trackers
+        ),
         model_checks=model_checks(result),
         field=factored_field(field, result.map_covariance) if field else None,
         sigma_budget=sigma_budget(result, setup.calibration),

@@ -1,24 +1,25 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Topics of a bag that a calibration reads."""
+"""Topics of bags that a calibration reads, and the star observations of their images."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
+from starcal_ros.formats.bag.frames import Frame, read_frames
 from starcal_ros.formats.bag.reader import Topics as Topics
 from starcal_ros.formats.messages import types
-from starcal_ros.records import StarObservations
+from starcal_ros.pipeline.observe import observe_next, Track
+from starcal_ros.pipeline.setup import Setup
+from starcal_ros.records import CameraGeometry, Image, StarObservations
 
-# A choice of topics needs no measurement, which is slow to import.
-if TYPE_CHECKING:
-    from starcal_ros.pipeline.observe_bags import OnImage, Wanted
-    from starcal_ros.pipeline.setup import Setup
+Wanted = Callable[[int], bool]
+OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
-
+_RAW = types.IMAGE_TYPE
+_IMAGE_TYPES = {_RAW, types.COMPRESSED_TYPE}
 _WITHOUT = {
     'image': 'record the images, or make a bag of image files with starcal import',
     'attitude': (
@@ -38,8 +39,7 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
     """
     there = reader.topics(paths)
     kinds = {topic.type_name for topic in there}
-    image_types = [t for t in (types.IMAGE_TYPE, types.COMPRESSED_TYPE) if t in kinds]
-    only_recorded = not image_types and types.OBSERVATIONS_TYPE in kinds
+    only_recorded = not kinds & _IMAGE_TYPES and types.OBSERVATIONS_TYPE in kinds
     if asked.observations or (only_recorded and not asked.image):
         kind = types.OBSERVATIONS_TYPE
         return Topics(observations=_choose(paths, kind, asked.observations, 'observations'))
@@ -59,17 +59,9 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
 
 def choose_image_topic(paths: Sequence[Path], asked: Topics) -> str:
     """Topic of the images of bags; raises BagError when it is missing, or there are several."""
-    there = reader.topics(paths)
-    image_types = [
-        t
-        for t in (types.IMAGE_TYPE, types.COMPRESSED_TYPE)
-        if any(x.type_name == t for x in there)
-    ]
-    image_type = next(iter(image_types), types.IMAGE_TYPE)
-    for kind in image_types:
-        if any(t.type_name == kind and t.name == f'/{asked.image.lstrip("/")}' for t in there):
-            image_type = kind
-    return _choose(paths, image_type, asked.image, 'image')
+    there = [t for t in reader.topics(paths) if t.type_name in _IMAGE_TYPES]
+    there.sort(key=lambda t: (t.name != f'/{asked.image.lstrip("/")}', t.type_name != _RAW))
+    return _choose(paths, there[0].type_name if there else _RAW, asked.image, 'image')
 
 
 def _choose_attitudes(
@@ -82,7 +74,7 @@ def _choose_attitudes(
     """
     kind = types.ATTITUDE_TYPES[setup.attitude.attitude_message] if setup else types.ATTITUDE_TYPE
     fitting = [topic.name for topic in there if topic.type_name == kind]
-    named = more_attitude_topics(setup)
+    named = [f'/{one.frame.lstrip("/")}/attitude' for one in setup.mountings] if setup else []
     more = tuple(name if name in fitting else '' for name in named)
     for name in set(named) - set(more):
         reader.log_damage(
@@ -116,11 +108,6 @@ def _other_attitudes(there: Sequence[reader.Topic], asked: str) -> str:
     )
 
 
-def more_attitude_topics(setup: Setup | None) -> tuple[str, ...]:
-    """Topics in bags of the attitudes of the further star trackers."""
-    return tuple(f'/{one.frame.lstrip("/")}/attitude' for one in setup.mountings) if setup else ()
-
-
 def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str:
     try:
         return reader.choose_topic(paths, type_name, asked)
@@ -137,24 +124,81 @@ def read(
     on_image: OnImage | None = None,
     wanted: Wanted | None = None,
 ) -> Iterator[StarObservations]:
-    """Observations of bags, as recorded or measured in the images (see `observe_bag`)."""
+    """
+    Observations of bags, as recorded or measured in the images, with few images in memory.
+
+    ``on_image`` is called with each decoded image, its observations and the geometry that
+    predicted its stars.  Images whose stamp is not ``wanted`` are skipped.  Raises BagError when
+    the bag cannot be read or a topic is not in it.
+    """
     if topics.observations:
         recorded = reader.read_observations(paths, topics.observations)
-        return (record for record in recorded if wanted is None or wanted(record.time_ns))
-    from starcal_ros.pipeline import observe_bags
+        yield from (record for record in recorded if wanted is None or wanted(record.time_ns))
+        return
+    track = Track(setup.prior)
+    for frame in _frames(paths, topics, setup):
+        if isinstance(frame, StarObservations):
+            yield frame
+        elif wanted is None or wanted(frame.image.time_ns):
+            predicted_with = track.geometry
+            observations, track = _of_frame(frame, setup, track)
+            if on_image is not None:
+                on_image(frame.image, observations, predicted_with)
+            yield observations
 
-    return observe_bags.observe_bag(paths, topics, setup, on_image, wanted)
+
+def measured_again(
+    paths: Sequence[Path],
+    topics: Topics,
+    setup: Setup,
+    geometry: CameraGeometry,
+    observations: Sequence[StarObservations],
+) -> list[StarObservations]:
+    """
+    Observations of bags; images refused as ``no_match`` are measured again with a calibration.
+
+    An image without a match in the second attempt keeps its first refusal.
+    """
+    wanted = {record.time_ns for record in observations if record.refusal == 'no_match'}
+    if not wanted or not topics.image:
+        return list(observations)
+    again: dict[int, StarObservations] = {}
+    for frame in _frames(paths, topics, setup):
+        if isinstance(frame, Frame) and frame.image.time_ns in wanted - again.keys():
+            record, _ = _of_frame(frame, setup, Track(geometry))
+            if not record.refusal:
+                again[record.time_ns] = record
+    return [
+        again.get(record.time_ns, record) if record.refusal == 'no_match' else record
+        for record in observations
+    ]
+
+
+def _frames(
+    paths: Sequence[Path], topics: Topics, setup: Setup
+) -> Iterator[Frame | StarObservations]:
+    size = (setup.prior.camera.width, setup.prior.camera.height)
+    channel = setup.frames.image_channel
+    return read_frames(paths, topics, setup.attitude, size=size, channel=channel)
+
+
+def _of_frame(frame: Frame, setup: Setup, track: Track) -> tuple[StarObservations, Track]:
+    return observe_next(
+        frame.image,
+        frame.attitudes,
+        setup,
+        track,
+        frame.velocity_m_s,
+        frame.temperature_degc,
+        frame.more_attitudes,
+    )
 
 
 def without_attitudes(bags: Sequence[Path], asked: Topics) -> bool:
     """Return True if bags hold images, but neither attitudes nor observations."""
     kinds = {topic.type_name for topic in reader.topics(bags)}
     others = {*types.ATTITUDE_TYPES.values(), types.OBSERVATIONS_TYPE}
-    return (
-        bool(kinds & {types.IMAGE_TYPE, types.COMPRESSED_TYPE})
-        and not kinds & others
-        and not asked.attitude
-    )
+    return bool(kinds & _IMAGE_TYPES) and not kinds & others and not asked.attitude
 
 
 def count(paths: Sequence[Path], topics: Topics) -> int:

@@ -13,13 +13,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 import dataclasses
 from dataclasses import dataclass
-import functools
 import math
+import operator
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import CameraModel, project_jacobians
 from starcal_ros.camera.detector_field import basis
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
@@ -51,7 +51,12 @@ _MISSHAPEN, _MISSHAPEN_PX = 3.5, 0.5  # of an image, over the median and in a co
 
 @dataclass(frozen=True)
 class _Site:
-    """Declination of the zenith, its right ascensions (m,), and 2 log likelihood over no air."""
+    """
+    Latitude, sidereal times (m,) of the images there, and 2 log of their mean likelihood.
+
+    ``gain`` is over that of no air; no times and minus infinity where an image has no zenith
+    above it.
+    """
 
     latitude_rad: float
     times_rad: Floats
@@ -150,11 +155,6 @@ class _Seen:
         moved = self.by_direction @ (through - self.direction[..., None])
         return _without(self.turns, moved.reshape(len(self.residual), len(zenith)))
 
-    @functools.cached_property
-    def chi2(self) -> float:
-        """Square of the residual."""
-        return float(self.residual @ self.residual)
-
 
 def _without(turns: Floats, columns: Floats) -> Floats:
     """Columns (2 n, c) free of the rotations that orthonormal ones (2 n, 3) span."""
@@ -166,7 +166,7 @@ def _images(used: Sequence[StarObservations], camera: CameraModel) -> list[_Seen
     chosen = []
     for one in used:
         order = np.argsort(one.covariance_px2[:, [0, 2]].sum(axis=1), kind='stable')
-        chosen.append(one.select(_mask(order[:_STARS], len(one))))
+        chosen.append(one.select(np.isin(np.arange(len(one)), order[:_STARS])))
     first_ns = used[0].time_ns
     images = [_seen(one, camera, first_ns) for one in chosen]
     inverse, h = _common(images, SPACE_M_S)
@@ -179,12 +179,6 @@ def _images(used: Sequence[StarObservations], camera: CameraModel) -> list[_Seen
         size = np.linalg.norm(left.reshape(-1, 2), axis=1)
         kept.append(one.select(size < _OUTLIER * max(median(size), 1.0)))
     return [_seen(one, camera, first_ns) for one in kept]
-
-
-def _mask(rows: Indices, n: int) -> Mask:
-    mask = np.zeros(n, bool)
-    mask[rows] = True
-    return mask
 
 
 def _seen(one: StarObservations, camera: CameraModel, first_ns: int) -> _Seen:
@@ -249,21 +243,21 @@ def _searched(images: Sequence[_Seen]) -> _Site:
     """
     inverse, h = _common(images, SPACE_M_S)
     freedom = sum(len(one.residual) - 3 for one in images) - len(h)
-    none = sum(one.chi2 for one in images) - float(h @ inverse @ h)
-    variance = max(none / max(freedom, 1), 1.0)
-    none -= sum(one.chi2 for one in images)
+    total = sum(float(one.residual @ one.residual) for one in images)
+    without_air = float(h @ inverse @ h)
+    variance = max((total - without_air) / max(freedom, 1), 1.0)
     inverse, h = _common(images, EARTH_M_S)
     fit = _Fit(images, inverse, h, variance)
     found = []
+    by_gain = operator.attrgetter('gain')
     for times in (fit.by_stamps, fit.by_images):
-        coarse = min((times(latitude, None) for latitude in _LATITUDES_RAD), key=_chi2_of)
+        coarse = max((times(latitude, None) for latitude in _LATITUDES_RAD), key=by_gain)
         near = coarse.latitude_rad + np.radians(np.arange(-5.0, 5.5))
-        fine = min((times(latitude, coarse) for latitude in near.clip(-1.5, 1.5)), key=_chi2_of)
+        fine = max((times(latitude, coarse) for latitude in near.clip(-1.5, 1.5)), key=by_gain)
         # The mean of a likelihood is that over all times, not over those about the best.
-        gain = none / variance - coarse.chi2
         best = fine if len(fine.times_rad) else coarse
-        found.append(_Site(best.latitude_rad, best.times_rad, gain))
-    return max(found, key=lambda one: one.gain)
+        found.append(dataclasses.replace(best, gain=coarse.gain - without_air / variance))
+    return max(found, key=by_gain)
 
 
 def _high(one: _Seen, zenith: Floats) -> Mask:
@@ -289,23 +283,6 @@ def _of_mean(chi2: Floats, at: int, variance: float) -> float:
 
 
 @dataclass(frozen=True)
-class _Times:
-    """
-    Sidereal times (m,) of images at a latitude, and chi^2 by their mean likelihood.
-
-    Less that of the residuals; no times and infinite where an image has no zenith above it.
-    """
-
-    latitude_rad: float
-    times_rad: Floats
-    chi2: float
-
-
-def _chi2_of(one: _Times) -> float:
-    return one.chi2
-
-
-@dataclass(frozen=True)
 class _Fit:
     """Images with the information and the gradient of what is common, and the noise."""
 
@@ -314,7 +291,7 @@ class _Fit:
     h: Floats
     variance: float
 
-    def by_stamps(self, latitude_rad: float, about: _Times | None) -> _Times:
+    def by_stamps(self, latitude_rad: float, about: _Site | None) -> _Site:
         """Times as the stamps run, the first one free."""
         if about is not None and not len(about.times_rad):
             return about
@@ -325,16 +302,16 @@ class _Fit:
         pairs = list(zip(self.images, zeniths, strict=True))
         high = np.all([_high(one, zenith) for one, zenith in pairs], axis=0)
         if not high.any():
-            return _Times(latitude_rad, first[:0], math.inf)
+            return _Site(latitude_rad, first[:0], -math.inf)
         made = [_choice(one, z[high], first[high] + one.late_rad) for one, z in pairs]
         left = self.h[:, None] - np.sum([one.by_common for one in made], axis=0)
         chi2 = np.sum([one.chi2 for one in made], axis=0)
         chi2 -= (left * (self.inverse @ left)).sum(axis=0)
         at = int(np.argmin(chi2))
         times = np.array([one.times_rad[at] for one in made])
-        return _Times(latitude_rad, times, _of_mean(chi2, at, self.variance))
+        return _Site(latitude_rad, times, -_of_mean(chi2, at, self.variance))
 
-    def by_images(self, latitude_rad: float, about: _Times | None) -> _Times:
+    def by_images(self, latitude_rad: float, about: _Site | None) -> _Site:
         """Times of each image by itself, by turns with camera and velocity."""
         choices = []
         for k, one in enumerate(self.images):
@@ -344,7 +321,7 @@ class _Fit:
             zenith = zenith_of(latitude_rad, times)
             high = _high(one, zenith)
             if not high.any():
-                return _Times(latitude_rad, times[:0], math.inf)
+                return _Site(latitude_rad, times[:0], -math.inf)
             choices.append(_choice(one, zenith[high], times[high]))
         at, before = [one.highest for one in choices], [-1]
         for _ in range(_TURNS):
@@ -361,4 +338,4 @@ class _Fit:
             total += _of_mean(each.chi2 + by_common, k, self.variance)
             total -= float(by_common[k]) / self.variance
         chosen = np.array([one.times_rad[k] for one, k in zip(choices, at, strict=True)])
-        return _Times(latitude_rad, chosen, total)
+        return _Site(latitude_rad, chosen, -total)

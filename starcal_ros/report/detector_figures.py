@@ -31,18 +31,7 @@ from starcal_ros.records import (
     StarObservations,
 )
 from starcal_ros.report import svg
-from starcal_ros.report.svg import (
-    Chart,
-    Curve,
-    Drawing,
-    GRID,
-    in_digits,
-    MUTED,
-    Panel,
-    Scale,
-    SERIES,
-    sheet,
-)
+from starcal_ros.report.svg import Chart, Curve, Drawing, in_digits, Panel, Scale, SERIES, sheet
 
 FLAT = 0.02  # relative range below which a map is called flat
 _MOST_HEIGHT = 400.0
@@ -370,7 +359,8 @@ def pointings(observations: Sequence[StarObservations], geometry: CameraGeometry
     in_tracker = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw).apply(in_camera)
     every = -(-len(placed) // _FOOTPRINTS) or 1
     for one in placed[::every]:
-        x, y = hammer(Rotation.from_quat(one.icrf_from_star_tracker_xyzw).apply(in_tracker))
+        seen = Rotation.from_quat(one.icrf_from_star_tracker_xyzw).apply(in_tracker)
+        x, y = hammer(np.arctan2(seen[:, 1], seen[:, 0]), np.arcsin(np.clip(seen[:, 2], -1, 1)))
         # Across the edge of the map a line would run through all of it.
         x = np.where(np.abs(np.diff(x, prepend=x[:1])) > 2.0, np.nan, x)
         panel.curve(Curve(x, y, SERIES[1 if one.refusal else 0], width=1.2))
@@ -385,32 +375,24 @@ def pointings(observations: Sequence[StarObservations], geometry: CameraGeometry
     return Chart('Pointings', panel.drawing(bottom + 32.0, below), text)
 
 
-def hammer(directions: Floats) -> tuple[Floats, Floats]:
-    """Hammer projection of unit vectors (n, 3), right ascension increasing to the left."""
-    x, y, z = directions.T
-    longitude, cos_latitude = np.arctan2(y, x), np.hypot(x, y)
-    scale = np.sqrt(2.0 / (1.0 + cos_latitude * np.cos(longitude / 2)))
-    return -2 * scale * cos_latitude * np.sin(longitude / 2), scale * z
+def hammer(longitude: Floats | float, latitude: Floats | float) -> tuple[Floats, Floats]:
+    """Hammer projection of places in rad, longitude increasing to the left."""
+    scale = np.sqrt(2.0 / (1.0 + np.cos(latitude) * np.cos(longitude / 2)))
+    return -2 * scale * np.cos(latitude) * np.sin(longitude / 2), scale * np.sin(latitude)
 
 
 def _draw_graticule(panel: Panel) -> None:
     along = np.linspace(-np.pi, np.pi, 73, dtype=np.float64)
     for hours in range(-12, 13, 3):
-        x, y = _projected(np.radians(15.0 * hours * 0.99999), along / 2)
-        panel.curve(Curve(x, y, GRID, width=1.0))
+        x, y = hammer(np.radians(15.0 * hours * 0.99999), along / 2)
+        panel.curve(Curve(x, y, svg.GRID, width=1.0))
         if hours % 6 == 0 and abs(hours) < 12:
-            panel.text(x[36], y[36], f'{hours % 24} h', MUTED)
+            panel.text(x[36], y[36], f'{hours % 24} h', svg.MUTED)
     for degrees in (-60, -30, 0, 30, 60):
-        x, y = _projected(along * 0.99999, np.radians(degrees))
-        panel.curve(Curve(x, y, GRID, width=1.0))
+        x, y = hammer(along * 0.99999, np.radians(degrees))
+        panel.curve(Curve(x, y, svg.GRID, width=1.0))
         if degrees:
-            panel.text(x[36], y[36], f'{in_digits(degrees)}°', MUTED)
-
-
-def _projected(longitude: Floats | float, latitude: Floats | float) -> tuple[Floats, Floats]:
-    longitude, latitude = np.broadcast_arrays(longitude, latitude)
-    x, y = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude)
-    return hammer(np.stack([x, y, np.sin(latitude)], axis=-1))
+            panel.text(x[36], y[36], f'{in_digits(degrees)}°', svg.MUTED)
 
 
 def write_comparison(found: Comparison, path: Path) -> None:

@@ -49,9 +49,13 @@ def outline(values: Floats, edges: Floats, colour: str, name: str, width: float 
 def histogram(residuals: Residuals) -> Chart:
     """Normalised residuals and the normal distribution (paper, Fig. 7)."""
     edges, x = np.linspace(-5, 5, 51, dtype=np.float64), np.linspace(-5, 5, 201)
+    uu, uv, vv = whitening(residuals.covariance_px2[residuals.used])
+    r_u, r_v = residuals.residual_px[residuals.used].T
     curves = [
         outline(values, edges, colour, f'{axis}: std {values.std():.2f}')
-        for values, colour, axis in zip(whitened_residuals(residuals), SERIES, 'uv', strict=False)
+        for values, colour, axis in zip(
+            (uu * r_u + uv * r_v, vv * r_v), SERIES, 'uv', strict=False
+        )
     ]
     normal = np.exp(-0.5 * x**2) / math.sqrt(2 * math.pi)
     curves.append(Curve(x, normal, INK, 'normal', width=1.0, dash='5 3'))
@@ -61,14 +65,6 @@ def histogram(residuals: Residuals) -> Chart:
         'Each residual divided by its sigma. A standard deviation near 1 confirms the sigmas; '
         'outliers are left out, which truncates the tails.',
     )
-
-
-def whitened_residuals(residuals: Residuals) -> tuple[Floats, Floats]:
-    """Whitened residuals of the used stars: unit variance if the covariances are correct."""
-    used = residuals.used
-    uu, uv, vv = whitening(residuals.covariance_px2[used])
-    r_u, r_v = residuals.residual_px[used].T
-    return uu * r_u + uv * r_v, vv * r_v
 
 
 def before_and_after(
@@ -228,8 +224,10 @@ def residuals_against_pixel_phase(residuals: Residuals) -> Chart:
     )
 
 
-def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Chart:
-    """Star tracker error of each image from its stars, about the three tracker axes."""
+def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Chart | None:
+    """Star tracker error of each image about the three tracker axes; None without attitudes."""
+    if not np.isfinite(residuals.attitude_error_arcsec).any():
+        return None
     minutes = (residuals.image_time_ns - residuals.image_time_ns.min()) / (
         60.0 * NANOSECONDS_PER_SECOND
     )

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import base64
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 import math
 
@@ -20,11 +21,6 @@ _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
 _LISTED_REFUSED = 200
 
 
-def _spread(count: int, most: int) -> list[int]:
-    """Evenly spaced indices below a count, at most ``most``."""
-    return [round(place) for place in np.linspace(0, count - 1, min(count, most)).tolist()]
-
-
 def slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str, object] | None:
     """Data of the single-image view: positions in px, residuals in 0.001 px."""
     if residuals is None or len(residuals.image_time_ns) == 0:
@@ -32,7 +28,8 @@ def slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str
     camera, typical_px = calibration.geometry.camera, max(calibration.residual_rms_px, 1e-6)
     count = len(residuals.image_time_ns)
     mean_stars = max(1.0, len(residuals.image) / count)
-    chosen = _spread(count, max(1, min(_SLIDER_IMAGES, int(_SLIDER_STARS / mean_stars))))
+    most = max(1, min(_SLIDER_IMAGES, int(_SLIDER_STARS / mean_stars)))
+    chosen = np.rint(np.linspace(0, count - 1, min(count, most))).astype(int).tolist()
     rms = residuals.image_rms_px()
     images = []
     for k in chosen:
@@ -76,7 +73,7 @@ def refused_images(
     """For each reason: its count, the refused images and pictures of some."""
     pictures = {t.time_ns: t for t in thumbnails if not t.reason}
     groups: list[Mapping[str, object]] = []
-    for reason, count in sorted(counts.items(), key=lambda i: -i[1]):
+    for reason, count in Counter(counts).most_common():
         images = [o for o in observations if o.refusal == reason]
         groups.append(
             {
@@ -94,12 +91,11 @@ def refused_images(
     return groups
 
 
-def _counts(observations: Sequence[StarObservations]) -> Mapping[str, int]:
+def _counts(observations: Sequence[StarObservations]) -> Counter[str]:
     """Refused stars of all images by reason."""
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for observed in observations:
-        for reason, count in observed.refused_stars.items():
-            counts[reason] = counts.get(reason, 0) + count
+        counts.update(observed.refused_stars)
     return counts
 
 
@@ -112,32 +108,28 @@ def star_marks(observations: Sequence[StarObservations]) -> list[tuple[str, str]
     ]
 
 
-def _cut_outs(
-    reason: str, observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
-) -> list[tuple[Markup, str, str]]:
-    """Pictures of stars refused for a reason, with the stamp and the catalog number of each."""
-    by_time = {o.time_ns: o for o in observations}
-    cut_outs = []
-    for one in thumbnails:
-        if one.reason == reason:
-            number = star_of(one, by_time[one.time_ns]) if one.time_ns in by_time else None
-            label = '' if number is None else str(number)
-            cut_outs.append((picture(one), utc_text(one.time_ns), label))
-    return cut_outs
-
-
 def refused_stars(
     observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
 ) -> list[Mapping[str, object]]:
-    """For each reason: its meaning, its count and pictures of some, the most frequent first."""
+    """
+    For each reason, the most frequent first: its meaning, its count and pictures of some.
+
+    Each picture is with the stamp and the catalog number of its star.
+    """
+    by_time = {o.time_ns: o for o in observations}
+    pictures = defaultdict(list)
+    for one in (thumbnail for thumbnail in thumbnails if thumbnail.reason):
+        number = star_of(one, by_time[one.time_ns]) if one.time_ns in by_time else None
+        label = '' if number is None else str(number)
+        pictures[one.reason].append((picture(one), utc_text(one.time_ns), label))
     return [
         {
             'reason': reason,
             'meaning': STAR_REFUSALS.get(reason, ''),
             'count': count,
-            'pictures': _cut_outs(reason, observations, thumbnails),
+            'pictures': pictures[reason],
         }
-        for reason, count in sorted(_counts(observations).items(), key=lambda item: -item[1])
+        for reason, count in _counts(observations).most_common()
         if count
     ]
 

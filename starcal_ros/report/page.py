@@ -16,7 +16,6 @@ import logging
 from pathlib import Path
 
 import jinja2
-import numpy as np
 
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.constants import utc_text
@@ -25,53 +24,27 @@ from starcal_ros.estimation.mountings import summary as tracker_summary
 from starcal_ros.estimation.temperature import summary as thermal_summary
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.types import OBSERVATIONS_TYPE
-from starcal_ros.formats.products.calibration_json import (
-    CALIBRATION_FILE,
-    prior_of,
-    read_calibration,
-)
+from starcal_ros.formats.products import calibration_json, product_folder
 from starcal_ros.formats.products.camera_yaml import CAMERA_INFO_FILE
 from starcal_ros.formats.products.product_files import (
     OBSERVATIONS_FILE,
     REPORT_FILE,
     write_atomically,
 )
-from starcal_ros.formats.products.product_folder import (
-    NotCalibrated,
-    read_not_calibrated,
-    read_residuals,
-    RESIDUALS_FILE,
-)
 from starcal_ros.pipeline.provenance import inputs_of
 from starcal_ros.records import Calibration, IMAGE_REFUSALS, parts_that_matter, StarObservations
-from starcal_ros.report import detector_figures, figures
-from starcal_ros.report.image_sections import (
-    picture,
-    refused_images,
-    refused_stars,
-    slider,
-    star_marks,
-    used_images,
-)
-from starcal_ros.report.pictures.thumbnails import (
-    EXPECTED,
-    read_thumbnails,
-    Thumbnail,
-    THUMBNAILS_FOLDER,
-)
-from starcal_ros.report.result_rows import alignment_rows, parameter_rows, tiles
+from starcal_ros.report import detector_figures, figures, image_sections, result_rows, verdict
+from starcal_ros.report.pictures import thumbnails
 from starcal_ros.report.svg import Chart, light
-from starcal_ros.report.verdict import (
-    check_rows,
-    checks_sentence,
-    model_rows,
-    next_step,
-    precision_sentences,
-)
 from starcal_ros.untrusted import json_value
 
 _DIGEST = '@sha256 of {}@'  # in a page that is drawn while its products are written
-_PRODUCTS = (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, OBSERVATIONS_FILE)
+_PRODUCTS = (
+    calibration_json.CALIBRATION_FILE,
+    CAMERA_INFO_FILE,
+    product_folder.RESIDUALS_FILE,
+    OBSERVATIONS_FILE,
+)
 PDF_FILE = 'report.pdf'
 
 
@@ -80,14 +53,14 @@ class Found:
     """
     Contents of a folder; ``residuals`` and ``observations`` are None without a file.
 
-    ``thumbnails`` are in the order of `ordered`, ``files`` the names of the products beside the
-    report.
+    ``pictures`` are in the order of `thumbnails.ordered`, ``files`` the names of the products
+    beside the report.
     """
 
     calibration: Calibration
     residuals: Residuals | None
     observations: tuple[StarObservations, ...] | None
-    thumbnails: tuple[Thumbnail, ...]
+    pictures: tuple[thumbnails.Thumbnail, ...]
     files: tuple[str, ...] = _PRODUCTS
 
 
@@ -95,36 +68,29 @@ def write_report(folder: Path) -> Path:
     """
     Write ``report.html`` from the product files of a folder and return its path.
 
-    Where the last calibration into the folder failed, it is the page of that failure.
-
-    Raises ProductError, BagError when a file cannot be read or the report cannot be written.
+    Where the last calibration into the folder failed, it is the page of that failure.  Raises
+    ProductError, BagError when a file cannot be read or the report cannot be written.
     """
-    failure = read_not_calibrated(folder)
+    failure = product_folder.read_not_calibrated(folder)
     if failure is not None:
         return write_failure_page(failure, folder)
     path = folder / REPORT_FILE
-    write_atomically(path, with_digests(render(read_folder(folder), folder), folder))
+    write_atomically(path, with_digests(render(_read_folder(folder), folder), folder))
     return path
 
 
-def read_folder(folder: Path) -> Found:
-    """
-    Contents of the product files of a folder.
-
-    Raises ProductError, BagError when there is no calibration, or a file is damaged.
-    """
-    calibration = read_calibration(folder / CALIBRATION_FILE)
-    residuals = folder / RESIDUALS_FILE
+def _read_folder(folder: Path) -> Found:
+    residuals = folder / product_folder.RESIDUALS_FILE
     observations = folder / OBSERVATIONS_FILE
     recorded = None
     if observations.is_file():
         topic = reader.choose_topic([observations], OBSERVATIONS_TYPE)
         recorded = tuple(reader.read_observations([observations], topic))
     return Found(
-        calibration,
-        read_residuals(residuals) if residuals.is_file() else None,
+        calibration_json.read_calibration(folder / calibration_json.CALIBRATION_FILE),
+        product_folder.read_residuals(residuals) if residuals.is_file() else None,
         recorded,
-        read_thumbnails(folder / THUMBNAILS_FOLDER),
+        thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER),
         tuple(name for name in _PRODUCTS if (folder / name).is_file()),
     )
 
@@ -145,46 +111,44 @@ def render(found: Found, folder: Path) -> str:
     Raises ProductError when the contents cannot be drawn.
     """
     try:
-        return template().render(_context(found))
+        return page_template('report.html').render(_context(found))
     # A file can hold numbers that no calibration has; the errors of drawing have no common base.
     except Exception as error:
         why = f'{type(error).__name__}: {error}'
         raise ProductError(f'{folder}: the products cannot be drawn: {why}') from error
 
 
-def template() -> jinja2.Template:
-    """Template of the report, compiled at the first call."""
-    return page_template('report.html')
-
-
 def _context(found: Found) -> Mapping[str, object]:
-    calibration, residuals = found.calibration, found.residuals
-    observations, thumbnails = found.observations or (), found.thumbnails
-    prior = prior_of(calibration)
+    calibration, residuals, pictures = found.calibration, found.residuals, found.pictures
+    observations = found.observations or ()
+    prior = calibration_json.prior_of(calibration)
+    refused = calibration.images_refused
     return {
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),
         'active_since': utc_text(calibration.active_since_ns),
-        'parameters': parameter_rows(calibration, prior),
-        'alignment': alignment_rows(calibration, prior) if calibration.has_alignment else [],
-        'tiles': tiles(calibration),
-        'checks': check_rows(calibration.gate),
-        'checks_sentence': checks_sentence(calibration.gate),
-        'precision': precision_sentences(calibration),
-        'next_step': next_step(calibration),
+        'parameters': result_rows.parameter_rows(calibration, prior),
+        'alignment': result_rows.alignment_rows(calibration, prior)
+        if calibration.has_alignment
+        else [],
+        'tiles': result_rows.tiles(calibration),
+        'checks': verdict.check_rows(calibration.gate),
+        'checks_sentence': verdict.checks_sentence(calibration.gate),
+        'precision': verdict.precision_sentences(calibration),
+        'next_step': verdict.next_step(calibration),
         'signed': _signed(calibration),
         'star_trackers': [tracker_summary(one) for one in calibration.star_trackers],
         'thermal': thermal_summary(calibration.temperature) if calibration.temperature else '',
         'charts': charts_of(calibration, residuals, observations),
         'correlation': calibration.correlation,
-        'slider': slider(calibration, residuals),
-        'refused_images': refused_images(calibration.images_refused, observations, thumbnails),
-        'refused_stars': refused_stars(observations, thumbnails),
-        'model_rows': model_rows(calibration),
-        'star_marks': star_marks(observations),
+        'slider': image_sections.slider(calibration, residuals),
+        'refused_images': image_sections.refused_images(refused, observations, pictures),
+        'refused_stars': image_sections.refused_stars(observations, pictures),
+        'model_rows': verdict.model_rows(calibration),
+        'star_marks': image_sections.star_marks(observations),
         'files': [(name, _DIGEST.format(name)) for name in found.files],
-        'has_images': any(not thumbnail.reason for thumbnail in thumbnails),
-        'used_images': used_images(observations, thumbnails),
+        'has_images': any(not one.reason for one in pictures),
+        'used_images': image_sections.used_images(observations, pictures),
         'options': _options(calibration),
     }
 
@@ -208,16 +172,16 @@ def _signed(calibration: Calibration) -> list[tuple[str, str]]:
     ]
 
 
-def write_failure_page(record: NotCalibrated, folder: Path) -> Path:
+def write_failure_page(record: product_folder.NotCalibrated, folder: Path) -> Path:
     """
     Write ``report.html`` of a failure and return its path.
 
     Raises ProductError when the page cannot be written.
     """
     pictures = [
-        (picture(one), utc_text(one.time_ns))
-        for one in read_thumbnails(folder / THUMBNAILS_FOLDER)
-        if one.reason == EXPECTED
+        (image_sections.picture(one), utc_text(one.time_ns))
+        for one in thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER)
+        if one.reason == thumbnails.EXPECTED
     ]
     refused = [
         (count, reason, IMAGE_REFUSALS.get(reason, ''))
@@ -230,29 +194,18 @@ def write_failure_page(record: NotCalibrated, folder: Path) -> Path:
 
 
 def charts_of(
-    calibration: Calibration,
-    residuals: Residuals | None,
-    observations: Sequence[StarObservations],
+    calibration: Calibration, residuals: Residuals | None, observations: Sequence[StarObservations]
 ) -> Mapping[str, Chart]:
     """Charts by their name in the template; charts without data are left out."""
-    geometry, prior = calibration.geometry, prior_of(calibration)
-    charts = _camera_charts(calibration)
-    charts['sky'] = detector_figures.pointings(observations, geometry)
-    if prior is not None:
-        charts['change'] = detector_figures.change_contours(prior, geometry)
-    if residuals is not None and residuals.used.any():
-        charts.update(_residual_charts(calibration, residuals))
-        if prior is not None:
-            charts['before'] = figures.before_and_after(residuals, observations, prior)
-    return {name: chart for name, chart in charts.items() if chart is not None}
-
-
-def _camera_charts(calibration: Calibration) -> dict[str, Chart | None]:
-    camera, maps = calibration.geometry.camera, calibration.maps
+    geometry, prior = calibration.geometry, calibration_json.prior_of(calibration)
+    camera, maps = geometry.camera, calibration.maps
     charts: dict[str, Chart | None] = {
         'vectors': detector_figures.distortion_vectors(camera),
         'contours': detector_figures.distortion_contours(camera),
+        'sky': detector_figures.pointings(observations, geometry),
     }
+    if prior is not None:
+        charts['change'] = detector_figures.change_contours(prior, geometry)
     if (field := camera.moving_field) is not None:
         charts['lens_field'] = detector_figures.field_vectors(field, camera)
     if maps is not None:
@@ -265,13 +218,16 @@ def _camera_charts(calibration: Calibration) -> dict[str, Chart | None]:
         charts['causes'] = detector_figures.budget_over_detector(parts, camera)
     if len(calibration.removals) > 1:
         charts['terms'] = figures.term_worth(calibration.removals)
-    return charts
+    if residuals is not None and residuals.used.any():
+        charts |= _residual_charts(calibration, residuals)
+        if prior is not None:
+            charts['before'] = figures.before_and_after(residuals, observations, prior)
+    return {name: chart for name, chart in charts.items() if chart is not None}
 
 
-def _residual_charts(calibration: Calibration, residuals: Residuals) -> Mapping[str, Chart | None]:
+def _residual_charts(calibration: Calibration, residuals: Residuals) -> dict[str, Chart | None]:
     camera = calibration.geometry.camera
-    has_attitudes = np.isfinite(residuals.attitude_error_arcsec).any()
-    tracker_arcsec = calibration.star_tracker_sigma_arcsec
+    sigma_arcsec = calibration.star_tracker_sigma_arcsec
     return {
         'coverage': detector_figures.star_coverage(residuals, camera),
         'images': figures.residuals_of_images(residuals),
@@ -281,9 +237,7 @@ def _residual_charts(calibration: Calibration, residuals: Residuals) -> Mapping[
         'magnitude': figures.residuals_against_magnitude(residuals),
         'colour': figures.residuals_against_colour(residuals),
         'phase': figures.residuals_against_pixel_phase(residuals),
-        'alignment': figures.alignment_in_time(residuals, tracker_arcsec)
-        if has_attitudes
-        else None,
+        'alignment': figures.alignment_in_time(residuals, sigma_arcsec),
     }
 
 

@@ -59,13 +59,12 @@ class Drawing:
 
     def document(self) -> str:
         """Text of an SVG file: the light palette on paper."""
-        size = f'{self.width:g} {self.height:g}'
-        wide, high = size.split()
+        size = f'width="{self.width:g}" height="{self.height:g}"'
         return light(
-            f'<svg xmlns="http://www.w3.org/2000/svg" width="{wide}" height="{high}"'
-            f' viewBox="0 0 {size}" font-family="DejaVu Sans, Arial, sans-serif"'
-            f' font-size="{LETTER:g}" fill="{INK}"><rect width="{wide}" height="{high}"'
-            f' fill="{PAPER}"/>{self.body}</svg>\n'
+            f'<svg xmlns="http://www.w3.org/2000/svg" {size}'
+            f' viewBox="0 0 {self.width:g} {self.height:g}"'
+            f' font-family="DejaVu Sans, Arial, sans-serif" font-size="{LETTER:g}" fill="{INK}">'
+            f'<rect {size} fill="{PAPER}"/>{self.body}</svg>\n'
         )
 
 
@@ -185,17 +184,16 @@ class Panel:
 
     def drawing(self, height: float, *others: Panel) -> Drawing:
         """The drawing of a panel and of others beside it."""
-        return Drawing(''.join(panel._elements() for panel in (self, *others)), height)
-
-    def _elements(self) -> str:
-        left, top = self._left - 4, self._top - 4  # marks on an end are whole
-        size = f'{self._right - left + 4:.1f} {self._bottom - top + 4:.1f}'
-        wide, high = size.split()
-        clipped = (
-            f'<svg x="{left:.1f}" y="{top:.1f}" width="{wide}" height="{high}"'
-            f' viewBox="{left:.1f} {top:.1f} {size}">{"".join(self.inside)}</svg>'
-        )
-        return f'{"".join(self.grid)}{clipped}{"".join(self.outside)}'
+        body = []
+        for panel in (self, *others):
+            left, top = panel._left - 4, panel._top - 4  # marks on an end are whole
+            wide, high = panel._right - left + 4, panel._bottom - top + 4
+            clipped = (
+                f'<svg x="{left:.1f}" y="{top:.1f}" width="{wide:.1f}" height="{high:.1f}"'
+                f' viewBox="{left:.1f} {top:.1f} {wide:.1f} {high:.1f}">'
+            )
+            body += [*panel.grid, clipped, *panel.inside, '</svg>', *panel.outside]
+        return Drawing(''.join(body), height)
 
     def axes(
         self,

@@ -10,14 +10,7 @@ import math
 import numpy as np
 
 from starcal_ros.arrays import Floats
-from starcal_ros.records import (
-    Calibration,
-    GateCheck,
-    HeldTerm,
-    ModelChecks,
-    parts_that_matter,
-    SigmaPart,
-)
+from starcal_ros.records import Calibration, GateCheck, HeldTerm, parts_that_matter, SigmaPart
 
 INFORMATIVE_SIGMAS = 2.0
 """Distance from an assumed value below which the value that the stars ask for is noise."""
@@ -43,42 +36,30 @@ _REMEDIES = {
 """Measures against the causes of a sigma."""
 
 
-@dataclass(frozen=True)
-class CheckRow:
-    """Row of the table of the checks of the gate."""
-
-    name: str
-    option: str
-    result: str
-    found: str
-    limit: str
-    note: str
+_RESULTS = {False: 'failed', True: 'passed', None: 'not checked'}
 
 
-def check_rows(gate: Sequence[GateCheck]) -> list[CheckRow]:
-    """Rows of the checks: the failed ones first, the others in their order."""
-    return [_row(check) for check in sorted(gate, key=lambda check: check.passed is not False)]
-
-
-def _row(check: GateCheck) -> CheckRow:
-    result = {True: 'passed', False: 'failed', None: 'not checked'}[check.passed]
-    found, limit, note = check.found_text, '', check.note
-    if check.unit == 'sigma' and found and math.isfinite(check.found):
-        found = f'{check.found:.1f} sigma of the difference'
-        note = '' if check.passed and check.found < INFORMATIVE_SIGMAS else note
-    if note == 'no limit is set':
-        limit = 'none'
-    elif check.option:
-        limit = f'{"at least" if check.is_least else "at most"} {check.limit_text}'
-    return CheckRow(check.name, check.option, result, found, limit, note)
+def check_rows(gate: Sequence[GateCheck]) -> list[tuple[GateCheck, str, str, str, str]]:
+    """Checks, the failed ones first, each with its result, value, limit and note as text."""
+    rows = []
+    for check in sorted(gate, key=lambda check: check.passed is not False):
+        found, limit, note = check.found_text, '', check.note
+        if check.unit == 'sigma' and found and math.isfinite(check.found):
+            found = f'{check.found:.1f} sigma of the difference'
+            note = '' if check.passed and check.found < INFORMATIVE_SIGMAS else note
+        if note == 'no limit is set':
+            limit = 'none'
+        elif check.option:
+            limit = f'{"at least" if check.is_least else "at most"} {check.limit_text}'
+        rows.append((check, _RESULTS[check.passed], found, limit, note))
+    return rows
 
 
 def checks_sentence(gate: Sequence[GateCheck]) -> str:
     """How many checks passed, failed and were not made, and why not; empty without a gate."""
     if not gate:
         return ''
-    groups = (('failed', False), ('passed', True), ('not checked', None))
-    counts = [(name, sum(check.passed is value for check in gate)) for name, value in groups]
+    counts = [(name, sum(check.passed is key for check in gate)) for key, name in _RESULTS.items()]
     text = ', '.join(f'{name} {count}' for name, count in counts if count or name == 'passed')
     reasons = dict.fromkeys(check.note for check in gate if check.passed is None and check.note)
     why = f' ({"; ".join(reasons)})' if reasons else ''
@@ -90,14 +71,10 @@ def precision_sentences(calibration: Calibration) -> list[str]:
     maps, budget = calibration.maps, parts_that_matter(calibration.sigma_budget)
     if maps is None:
         return []
+    frame, sigma = f'In {calibration.parent_frame}', maps.line_of_sight_sigma_arcsec
     return [
         _precision('Camera alone', maps.shape_sigma_arcsec, budget, 'map_arcsec'),
-        _precision(
-            f'In {calibration.parent_frame}',
-            maps.line_of_sight_sigma_arcsec,
-            budget,
-            'pointing_arcsec',
-        ),
+        _precision(frame, sigma, budget, 'pointing_arcsec'),
     ]
 
 
@@ -149,9 +126,8 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
     found = calibration.model_checks
     if found is None:
         return []
-    camera_info = (
-        f'camera_info carries neither field nor skew: {_px(calibration.zero_skew_cost_px)}'
-    )
+    step, cost_px = found.step, calibration.zero_skew_cost_px
+    camera_info = f'camera_info carries neither field nor skew: {_px(cost_px)}'
     field = f'field of {_px(found.field_rms_px)} rms per axis, at most {_px(found.field_worst_px)}'
     return [
         ModelRow(
@@ -161,7 +137,18 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
             'choose another lens_model; for lines of sight with the field use starcal lookup',
         ),
         *_held(found.held),
-        *_detector_and_images(found),
+        ModelRow(
+            'The detector has no step',
+            f'{_px(abs(step.size_px))} in {step.moved} at {step.across} = {step.place_px:.0f}',
+            _p(step.p_value),
+            'columns or rows are lost or shifted there: check the read-out',
+        ),
+        ModelRow(
+            'The camera is the same in all images',
+            f'varies by {_px(found.image_variation_px)} in a corner',
+            '',
+            'estimate with temperature, or calibrate each state by itself',
+        ),
     ]
 
 
@@ -182,22 +169,6 @@ def _held(held: Sequence[HeldTerm]) -> Iterator[ModelRow]:
         worst = max(term.significance for term in agreeing)
         found = f'the stars agree, within {worst:.1f} sigma of the difference'
         yield ModelRow(names, found, _p(math.erfc(worst / math.sqrt(2))), '')
-
-
-def _detector_and_images(found: ModelChecks) -> Iterator[ModelRow]:
-    step = found.step
-    yield ModelRow(
-        'The detector has no step',
-        f'{_px(abs(step.size_px))} in {step.moved} at {step.across} = {step.place_px:.0f}',
-        _p(step.p_value),
-        'columns or rows are lost or shifted there: check the read-out',
-    )
-    yield ModelRow(
-        'The camera is the same in all images',
-        f'varies by {_px(found.image_variation_px)} in a corner',
-        '',
-        'estimate with temperature, or calibrate each state by itself',
-    )
 
 
 def _px(value: float) -> str:

@@ -36,8 +36,7 @@ from starcal_ros.formats.messages.observation_messages import observations_to_me
 from starcal_ros.formats.messages.telemetry import latest_at
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import observe
-from starcal_ros.pipeline.diagnosis.alignment import found_alignment
-from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis
+from starcal_ros.pipeline.diagnosis.diagnose import Diagnosis, found_alignment
 from starcal_ros.pipeline.node_options import ObserverOptions
 from starcal_ros.pipeline.setup import aligned, load_setup
 from starcal_ros.records import (

@@ -5,18 +5,17 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+import dataclasses
 import os
-from pathlib import Path
 import threading
 
 from starcal_ros.arrays import Floats
 from starcal_ros.child_process import ChildProcess
-from starcal_ros.pipeline.diagnosis.alignment import IMAGES_OF_AN_ALIGNMENT, set_up, wire_attitudes
-from starcal_ros.pipeline.diagnosis.attitude_reading import SetUp, WireAttitudes
-from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis
+from starcal_ros.pipeline.diagnosis.attitude_reading import wire_attitudes, WireAttitudes
+from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis, IMAGES_OF_AN_ALIGNMENT
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Image
-from starcal_ros.sky.catalog import load_catalog
+from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS
 
 KEPT = 5  # images; of 5 megapixels and 16 bit they are 50 MB
 DIAGNOSED = 5  # images in a row without a match
@@ -77,9 +76,7 @@ class Unmatched:
             question = (
                 tuple(self._images),
                 wire_attitudes(stamps, quaternions),
-                set_up(self._setup),
-                self._setup.frames.catalog,
-                self._setup.identification.magnitude_limit,
+                dataclasses.replace(self._setup, dark=None, flat=None, hot=NO_HOT_PIXELS),
             )
             self._thread = threading.Thread(
                 target=self._ask, args=question, name='diagnose', daemon=True
@@ -126,14 +123,7 @@ class Unmatched:
         self._on_answer(found)
 
 
-def _answer(
-    images: tuple[Image, ...],
-    attitudes: WireAttitudes,
-    setup: SetUp,
-    catalog: str,
-    magnitude_limit: float,
-) -> Diagnosis:
-    """Diagnose in a process of its own; an empty path is the bundled catalog."""
+def _answer(images: tuple[Image, ...], attitudes: WireAttitudes, setup: Setup) -> Diagnosis:
+    """Diagnose in a process of its own."""
     os.nice(_LOWEST_PRIORITY)
-    stars = load_catalog(Path(catalog) if catalog else None, magnitude_limit)
-    return diagnose(images, attitudes, setup, stars)
+    return diagnose(images, attitudes, setup)

@@ -20,7 +20,7 @@ from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_fields import make_header
 from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.formats.messages.types import COMPRESSED_TYPE
-from starcal_ros.pipeline import inspect, observe_bags
+from starcal_ros.pipeline import inspect, topics
 from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Image
@@ -96,7 +96,7 @@ def test_verdicts_are_those_of_the_calibration(
     expected = {r.reason: r.count for r in quick.refused} | {'blank': 1, 'wrong_size': 1}
     assert by_reason == expected
     assert len(seen) == full.images == 12
-    observed = list(observe_bags.observe_bag([path], Topics(IMAGE, ATTITUDE), setup))
+    observed = list(topics.read([path], Topics(IMAGE, ATTITUDE), setup))
     assert by_reason == Counter(o.refusal for o in observed if o.refusal)
     assert full.stars_per_image == tuple(len(o) for o in observed if not o.refusal)
     gap = next(r for r in full.refused if r.reason == 'attitude_gap')

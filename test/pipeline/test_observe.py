@@ -17,7 +17,7 @@ from starcal_ros.camera import project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.formats.bag.frames import read_telemetry
 from starcal_ros.formats.bag.reader import read_images, Topics
-from starcal_ros.pipeline import observe, observe_bags, solve, topics
+from starcal_ros.pipeline import observe, solve, topics
 from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
 from starcal_ros.records import (
     AttitudeSample,
@@ -242,7 +242,7 @@ def test_a_star_tracker_that_jumped_and_came_back(setup: Setup, jump_deg: float)
 def test_a_bag_read_once_gives_what_two_passes_give(camera_yaml: Path) -> None:
     """The tiny bag, all telemetry read before the first image, to the last bit."""
     setup = load_setup(values(camera_yaml))
-    found = list(observe_bags.observe_bag([TINY], Topics(IMAGE_TOPIC, ATTITUDE_TOPIC), setup))
+    found = list(topics.read([TINY], Topics(IMAGE_TOPIC, ATTITUDE_TOPIC), setup))
     held = read_telemetry([TINY], Topics('', ATTITUDE_TOPIC), setup.attitude).attitudes
     track, expected = observe.Track(setup.prior), []
     for one in read_images([TINY], IMAGE_TOPIC):
@@ -474,7 +474,7 @@ def test_an_image_without_a_match_is_measured_with_the_calibration() -> None:
     for record in before:
         ensemble = solve.add_to_ensemble(ensemble, record, setup)
     geometry = solve.solve(ensemble, setup).geometry
-    again = observe_bags.measured_again([TINY], chosen, setup, geometry, before)
+    again = topics.measured_again([TINY], chosen, setup, geometry, before)
     assert [record.refusal for record in again] == [''] * 5 + ['no_stars'] + [''] * 4
     assert all(a is b for k, (a, b) in enumerate(zip(again, before, strict=True)) if k != 2)
     # The same stars at the same places, by a search in place of a track.

@@ -18,7 +18,7 @@ from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
 from starcal_ros.formats.bag.reader import Topics
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.pipeline import observe, observe_bags, solve
+from starcal_ros.pipeline import observe, solve, topics
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import ALIGNMENT_NAMES, Ensemble, refused_image
 from starcal_ros.sky.attitude import AttitudeHistory
@@ -223,11 +223,9 @@ def test_a_bag_with_temperatures_to_a_calibration_with_terms(
             writer.write_image('/image', one, 'camera')
     warm = load_setup(values(camera_yaml, focal_temperature_order=1, alignment_temperature=True))
     paths = [tmp_path / 'warm']
-    found = list(
-        observe_bags.observe_bag(paths, Topics('/image', '/attitude', temperature='/box'), warm)
-    )
+    found = list(topics.read(paths, Topics('/image', '/attitude', temperature='/box'), warm))
     assert [one.temperature_degc for one in found] == [10.0, 15.0, 20.0, 25.0]
-    plain = list(observe_bags.observe_bag(paths, Topics('/image', '/attitude'), warm))
+    plain = list(topics.read(paths, Topics('/image', '/attitude'), warm))
     assert all(np.isnan(one.temperature_degc) for one in plain)
     # The simulated camera does not change with temperature, and that is what is found.
     terms = solve.solve(Ensemble(tuple(found)), warm).temperature

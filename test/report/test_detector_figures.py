@@ -63,8 +63,8 @@ def test_a_flat_map_says_so_and_others_start_at_zero() -> None:
 def test_the_projection_of_the_sky() -> None:
     """Hammer: x = -2 sqrt(2) cos(d) sin(a/2) / sqrt(1 + cos(d) cos(a/2)), of unit area scale."""
     root2 = np.sqrt(2.0)
-    directions = np.array([[1.0, 0, 0], [0, 0, 1], [0, 0, -1], [0, 1, 0], [-1, 1e-12, 0]])
-    x, y = figures.hammer(directions)
+    longitude_deg, latitude_deg = np.array([0.0, 0, 0, 90, 180]), np.array([0.0, 90, -90, 0, 0])
+    x, y = figures.hammer(np.radians(longitude_deg), np.radians(latitude_deg))
     quarter = -2 * root2 * np.sin(np.pi / 4) / np.sqrt(1 + np.cos(np.pi / 4))
     np.testing.assert_allclose(x, [0, 0, 0, quarter, -2 * root2], atol=1e-9)
     np.testing.assert_allclose(y, [0, root2, -root2, 0, 0], atol=1e-9)

@@ -33,9 +33,9 @@ def test_checks_that_were_not_made_did_not_pass() -> None:
 def test_failed_checks_come_first_and_sigmas_have_one_name() -> None:
     rows = verdict.check_rows(GATE)
     names = ['coverage', 'residual', 'step', 'turn', 'distance of cx']
-    assert [row.name for row in rows] == names
-    assert rows[-1].found == '0.0 sigma of the difference' and rows[-1].note == ''
-    assert rows[0].limit == 'at least 0.3'
+    assert [check.name for check, *_ in rows] == names
+    assert rows[0][1:4] == ('failed', '0.1', 'at least 0.3')
+    assert rows[-1][1:] == ('passed', '0.0 sigma of the difference', 'at most 5 sigma', '')
 
 
 def test_the_precision_is_that_of_map_and_budget(tiny_products: Path) -> None:

@@ -34,10 +34,9 @@ from starcal_ros.formats.products.product_folder import (
 )
 from starcal_ros.pipeline import inspect, solve
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.observe_bags import measured_again, Wanted
 from starcal_ros.pipeline.provenance import inputs_of, software_version
 from starcal_ros.pipeline.setup import files_of, read_setup, read_values, Setup
-from starcal_ros.pipeline.topics import Topics, without_attitudes
+from starcal_ros.pipeline.topics import measured_again, Topics, Wanted, without_attitudes
 from starcal_ros.records import Calibration, CameraGeometry, Image, StarObservations
 from starcal_ros.report.pictures import thumbnails
 
@@ -164,13 +163,11 @@ def calibrate_into(
     """
     topics = bag_topics.choose_topics(bags, asked, setup)
     count = bag_topics.count(bags, topics)
-    album, expected = thumbnails.Album(count), thumbnails.ExpectedAlbum(setup)
-    drawings = Drawings()
+    album, drawings = thumbnails.Album(count, setup), Drawings()
 
     def show(image: Image, observed: StarObservations, geometry: CameraGeometry) -> None:
         with drawings.kind('pictures of images'):
             album.show(image, observed, geometry)
-            expected.add(image, observed, geometry)
 
     records = bag_topics.read(bags, topics, setup, show, wanted)
     observations = list(with_progress(records, count, 'images'))
@@ -195,7 +192,7 @@ def calibrate_into(
             )
         except TooFewObservations as error:
             failure = _failure(str(error), bags, asked, setup, observations, bool(topics.image))
-            _write_failure(folder, failure, expected.pictures)
+            _write_failure(folder, failure, album.unmatched)
             raise TooFewObservations(failure.reason) from error
         pictures: Sequence[thumbnails.Thumbnail] = ()
         with drawings.kind('pictures of images'):
@@ -223,7 +220,7 @@ def _load_report() -> None:
     with contextlib.suppress(ModuleNotFoundError):
         from starcal_ros.report import page
 
-        page.template()
+        page.page_template('report.html')
 
 
 def _write_all(

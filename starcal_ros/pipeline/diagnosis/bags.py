@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-import dataclasses
 from itertools import islice
 from pathlib import Path
 
@@ -15,9 +14,8 @@ from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.diagnosis.alignment import found_alignment, set_up, wire_attitudes
-from starcal_ros.pipeline.diagnosis.attitude_reading import WireAttitudes
-from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis
+from starcal_ros.pipeline.diagnosis.attitude_reading import wire_attitudes, WireAttitudes
+from starcal_ros.pipeline.diagnosis.diagnose import diagnose, Diagnosis, found_alignment
 from starcal_ros.pipeline.diagnosis.identified import LOOKED_AT
 from starcal_ros.pipeline.inspect import placed, refusals, Refused
 from starcal_ros.pipeline.setup import aligned, Setup
@@ -70,9 +68,8 @@ def diagnose_bags(
     attitudes = _attitudes(paths, topics.attitude)
     spans = _without_common_time(first, attitudes)
     shift_ns = spans[1][0] - spans[0][0] if spans else 0
-    given = dataclasses.replace(set_up(setup), shift_s=shift_ns / NANOSECONDS_PER_SECOND)
     images = _images(paths, topics.image, setup, shift_ns)
-    found = diagnose(images, attitudes, given, setup.catalog)
+    found = diagnose(images, attitudes, setup, shift_ns / NANOSECONDS_PER_SECOND)
     if spans:
         return found if found.cause == 'clock' else of_two_clocks(*spans)
     if found.cause not in ('none', 'unknown', 'no_stars'):

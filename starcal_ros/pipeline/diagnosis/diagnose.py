@@ -20,26 +20,20 @@ import numpy as np
 from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.identification.blind.bright_sources import LONGEST_STREAK_PX, smear
 from starcal_ros.pipeline.diagnosis.attitude_reading import (
-    best_reading,
+    Case,
     CLOCK_SEARCH_S,
     expected_rotations,
-    in_words,
-    is_off,
-    off_by,
-    Placed,
-    quarter_turns,
+    prior_alignment,
     Reading,
-    readings,
-    SetUp,
     WireAttitudes,
 )
 from starcal_ros.pipeline.diagnosis.identified import (
     FEWEST_SOURCES,
     Identified,
     identify_images,
-    SEARCH_S,
     Solved,
 )
+from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
 
@@ -47,6 +41,7 @@ CAUSES = (
     'none', 'mirrored', 'rotated', 'attitude_direction', 'quaternion_order', 'prior_alignment',
     'focal_length', 'clock', 'smear', 'no_stars', 'not_linear', 'unknown',
 )  # fmt: skip
+IMAGES_OF_AN_ALIGNMENT = 3
 
 _NO_PARAMETER = 'no parameter mends this: '
 _SAME_DATE_S = 86400.0  # aberration changes by 0.35 arcsec in a day
@@ -82,69 +77,72 @@ class Diagnosis:
 
     def in_a_sentence(self) -> str:
         """Cause and remedy, as the end of a complaint."""
-        lines = '; '.join(line for line in self.mend if not line.startswith('#'))
-        advice = [line.removeprefix('# ').removeprefix(_NO_PARAMETER) for line in self.mend]
-        advice = [line for line in advice if line not in self.mend]
-        said = [self.sentence, *([f'Set {lines}.'] if lines else [])]
-        said += [f'{line[0].upper()}{line[1:]}.' for line in advice]
+        said = [self.sentence]
+        if options := '; '.join(line for line in self.mend if not line.startswith('#')):
+            said.append(f'Set {options}.')
+        for line in self.mend:
+            if line.startswith('#'):
+                advice = line.removeprefix('# ').removeprefix(_NO_PARAMETER)
+                said.append(f'{advice[0].upper()}{advice[1:]}.')
         return f'{" ".join(said)} (details: starcal diagnose)'
+
+
+def found_alignment(found: Diagnosis) -> tuple[list[float] | None, str]:
+    """The alignment of a diagnosis without a prior one, or None, with a sentence on it."""
+    if found.cause != 'prior_alignment' or not isinstance(found.found, list):
+        return None, found.in_a_sentence()
+    if found.images < IMAGES_OF_AN_ALIGNMENT:
+        return None, (f'{found.images} images agree, {IMAGES_OF_AN_ALIGNMENT} are needed.')
+    return found.found, (
+        f'prior_alignment is not given: found {found.found} from {found.images} images that agree.'
+    )
 
 
 @one_blas_thread()
 def diagnose(
-    images: Iterable[Image],
-    attitudes: WireAttitudes,
-    setup: SetUp,
-    catalog: StarCatalog,
-    search_s: float = SEARCH_S,
+    images: Iterable[Image], attitudes: WireAttitudes, setup: Setup, shift_s: float = 0.0
 ) -> Diagnosis:
     """
     The cause that keeps the first images from matching, found from those images.
 
-    The catalog is sorted by magnitude, as `load_catalog` gives it.  ``search_s`` limits the time
-    that the identification may take.
+    ``shift_s`` was added to the stamps of the images, whose clock is far from that of the
+    attitudes.
     """
     guesses = functools.partial(expected_rotations, attitudes, setup)
-    found = identify_images(images, setup.camera, catalog, search_s, guesses=guesses)
-    if not found.solved:
-        return _nothing_found(found, setup)
-    return _held_against(found.solved, len(found.seen), attitudes, setup, catalog)
+    found = identify_images(images, setup.prior.camera, setup.catalog, guesses)
+    if found.solved:
+        return _held_against(Case(found.solved, attitudes, setup), len(found.seen), shift_s)
+    return _nothing_found(found, setup)
 
 
-def _nothing_found(found: Identified, setup: SetUp) -> Diagnosis:
+def _nothing_found(found: Identified, setup: Setup) -> Diagnosis:
     """The cause where no image was identified."""
-    seen = found.seen
+    camera, seen = setup.prior.camera, found.seen
     if not seen and found.other_sizes:
-        return _of_another_size(found.other_sizes[0], setup)
+        width, height = found.other_sizes[0]
+        sizes = f'{width} x {height}, the prior camera is of {camera.width} x {camera.height}'
+        evidence = 'images of another size are of another camera, binned, or cut'
+        mend = '# in the file of camera_info_url: size of the images, focal length in their pixels'
+        return Diagnosis('unknown', None, f'The images are {sizes}.', (evidence,), (mend,))
     if not seen:
         return Diagnosis('no_stars', 0, 'There is no image that can be read.')
-    counts = [len(sources.xy_px) for sources in seen]
+    count = int(np.median([len(sources.xy_px) for sources in seen]))
     streaks = [streak for streak in map(smear, seen) if streak is not None]
-    looked = f'{len(seen)} images looked at, {int(np.median(counts))} star-like sources each'
+    looked = f'{len(seen)} images looked at, {count} star-like sources each'
     if 2 * len(streaks) > len(seen):
-        length_px = float(np.median([length for length, _ in streaks]))
-        about = 'about' if length_px < LONGEST_STREAK_PX else 'at least'
-        length_px = min(length_px, LONGEST_STREAK_PX)
-        return Diagnosis(
-            'smear',
-            round(length_px, 1),
-            f'The stars are streaks {about} {length_px:.0f} px long: the camera moves during the'
-            ' exposure.',
-            (looked, 'the sources are more than twice as long as wide, and all point one way'),
-            ('# no parameter mends this: expose for a shorter time, or while not slewing',),
-        )
-    if np.median(counts) < FEWEST_SOURCES:
+        return _smeared(float(np.median([length for length, _ in streaks])), looked)
+    if count < FEWEST_SOURCES:
         level = float(np.median([s.background.level_dn for s in seen]))
         noise = float(np.median([s.background.noise_dn for s in seen]))
         return Diagnosis(
             'no_stars',
-            int(np.median(counts)),
+            count,
             'The images show too few stars.',
             (looked, f'background {level:.0f} DN with a noise of {noise:.1f} DN'),
             ('# no parameter mends this: expose for longer, or check that the lens sees the sky',),
         )
-    focal_px = float(setup.camera.parameters[0])
-    width_deg = math.degrees(2 * math.atan(setup.camera.width / 2 / focal_px))
+    focal_px = float(camera.parameters[0])
+    width_deg = math.degrees(2 * math.atan(camera.width / 2 / focal_px))
     return Diagnosis(
         'unknown',
         None,
@@ -158,48 +156,48 @@ def _nothing_found(found: Identified, setup: SetUp) -> Diagnosis:
     )
 
 
-def _of_another_size(size: tuple[int, int], setup: SetUp) -> Diagnosis:
-    """No cause can be named where the prior camera is of another image size."""
-    camera = setup.camera
+def _smeared(length_px: float, looked: str) -> Diagnosis:
+    """The cause where most images show streaks of this length."""
+    about = 'about' if length_px < LONGEST_STREAK_PX else 'at least'
+    length_px = min(length_px, LONGEST_STREAK_PX)
     return Diagnosis(
-        'unknown',
-        None,
-        f'The images are {size[0]} x {size[1]}, the prior camera is of {camera.width} x'
-        f' {camera.height}.',
-        ('images of another size are of another camera, binned, or cut',),
-        ('# in the file of camera_info_url: size of the images, focal length in their pixels',),
+        'smear',
+        round(length_px, 1),
+        f'The stars are streaks {about} {length_px:.0f} px long: the camera moves during the'
+        ' exposure.',
+        (looked, 'the sources are more than twice as long as wide, and all point one way'),
+        ('# no parameter mends this: expose for a shorter time, or while not slewing',),
     )
 
 
-def _held_against(
-    solved: Sequence[Solved],
-    tried: int,
-    attitudes: WireAttitudes,
-    setup: SetUp,
-    catalog: StarCatalog,
-) -> Diagnosis:
+def _held_against(case: Case, tried: int, shift_s: float) -> Diagnosis:
     """The causes where images were identified, the one that hides the others first."""
+    solved, setup = case.solved, case.setup
     worst = max(image.sky.log10_p_value for image in solved)
     stars = [len(image.sky.xy_px) for image in solved]
-    chance = f'expected false matches: under 10^{worst:.0f} each'
+    focal_px = float(np.median([image.sky.camera.parameters[0] for image in solved]))
+    prior_px = float(setup.prior.camera.parameters[0])
     identified = f'{len(solved)} of {tried} images identified without attitude'
+    chance = f'expected false matches: under 10^{worst:.0f} each'
     evidence = [f'{identified}, {min(stars)} to {max(stars)} stars each; {chance}']
-    placed = [Placed(image.time_ns, image.camera_from_icrf) for image in solved]
-    reading = best_reading(placed, attitudes, setup)
-    findings: list[Diagnosis | None] = []
-    if solved[0].sky.mirrored:
-        findings.append(_mirrored(reading, setup))
+    reading = case.best_reading()
+    is_mirrored = solved[0].sky.mirrored
+    findings = [_mirrored(reading, setup)] if is_mirrored else []
     if reading is not None:
-        evidence += _agreement(reading, placed, attitudes, setup)
-        findings += [_order(reading), _direction(reading, setup), _clock(reading, setup)]
+        evidence += _agreement(reading, case)
+        findings += [*_order(reading), *_direction(reading, setup)]
+        findings += _clock(shift_s + reading.shift_s, setup)
         if solved[0].quarter_turned:
             findings.append(_sides_exchanged(reading, setup))
-        elif not solved[0].sky.mirrored:
-            findings.append(_alignment(reading, setup))
-    elif not solved[0].sky.mirrored:
-        findings.append(_no_reading(placed, attitudes, setup))
-    findings += [_focal_length(solved, setup, evidence), _tone_curve(solved, catalog)]
-    joined = _joined([one for one in findings if one is not None], evidence)
+        elif not is_mirrored:
+            findings += _alignment(reading, setup)
+    elif not is_mirrored:
+        findings.append(_no_reading(case))
+    evidence.append(
+        f'the images show a focal length of {focal_px:.1f} px, the prior {prior_px:.1f}'
+    )
+    findings += [*_focal_length(focal_px, prior_px), *_tone_curve(solved, setup.catalog)]
+    joined = _joined(findings, evidence)
     return dataclasses.replace(joined, images=0 if reading is None else reading.agreeing)
 
 
@@ -220,117 +218,89 @@ def _joined(findings: Sequence[Diagnosis], evidence: list[str]) -> Diagnosis:
     )
 
 
-def _agreement(
-    reading: Reading, placed: Sequence[Placed], attitudes: WireAttitudes, setup: SetUp
-) -> list[str]:
+def _agreement(reading: Reading, case: Case) -> list[str]:
     """Evidence for a reading, and against the one set up where that is another."""
     alike = f'give one alignment to {math.degrees(reading.scatter_rad):.3f} degrees'
-    of = f'{reading.agreeing} of {len(placed)} images'
-    lines = [f'read as {in_words(reading)}, the attitudes of {of} {alike}']
-    given = readings(placed, attitudes, setup, 0.0)[0]
+    of = f'{reading.agreeing} of {len(case.solved)} images'
+    lines = [f'read as {reading}, the attitudes of {of} {alike}']
+    given = case.readings()[0]
     if (reading.order, reading.direction) != (given.order, given.direction):
         agree = f'those of {given.agreeing} agree to {math.degrees(given.scatter_rad):.3f} degrees'
         if given.agreeing < 2:
             agree = 'no two agree'
-        lines.append(f'read as {in_words(given)}, as they are now, {agree}')
+        lines.append(f'read as {given}, as they are now, {agree}')
     return lines
 
 
-def _order(reading: Reading) -> Diagnosis | None:
-    """The order of the quaternion as a cause; None: it is right."""
+# Each of the following is one cause; a list is empty where there is nothing wrong.
+
+
+def _order(reading: Reading) -> list[Diagnosis]:
     if reading.order == 'xyzw':
-        return None
-    return Diagnosis(
-        'quaternion_order',
-        'wxyz',
-        'The attitude quaternions are sent with w first; the message has x, y, z, w.',
-        mend=('# no parameter mends this: send x, y, z, w in the fields of that name',),
-    )
+        return []
+    sentence = 'The attitude quaternions are sent with w first; the message has x, y, z, w.'
+    mend = '# no parameter mends this: send x, y, z, w in the fields of that name'
+    return [Diagnosis('quaternion_order', 'wxyz', sentence, mend=(mend,))]
 
 
-def _direction(reading: Reading, setup: SetUp) -> Diagnosis | None:
-    """The direction of the attitudes as a cause; None: it is right."""
-    if reading.direction == setup.attitude_direction:
-        return None
-    return Diagnosis(
-        'attitude_direction',
-        reading.direction,
-        f'The attitude quaternions are {in_words(reading)}, not {setup.attitude_direction}.',
-        mend=(f'attitude_direction: {reading.direction}',),
-    )
+def _direction(reading: Reading, setup: Setup) -> list[Diagnosis]:
+    given, found = setup.attitude.attitude_direction, reading.direction
+    if found == given:
+        return []
+    sentence = f'The attitude quaternions are {reading}, not {given}.'
+    mend = f'attitude_direction: {found}'
+    return [Diagnosis('attitude_direction', found, sentence, mend=(mend,))]
 
 
-def _clock(reading: Reading, setup: SetUp) -> Diagnosis | None:
-    """The stamps as a cause; None: they are right."""
-    shift_s = setup.shift_s + reading.shift_s
+def _clock(shift_s: float, setup: Setup) -> list[Diagnosis]:
     if not shift_s:
-        return None
-    offset_s = round(setup.stamp_offset_s + shift_s, 2)
+        return []
+    offset_s = round(setup.attitude.stamp_offset_s + shift_s, 2)
     mend = [f'stamp_offset_s: {offset_s}']
     if abs(shift_s) > _SAME_DATE_S:
         mend.append('# that takes the date of the attitudes: if it is wrong, correct their stamps')
-    return Diagnosis(
-        'clock',
-        offset_s,
+    sentence = (
         f'The stamps of the images are {abs(shift_s):.2f} s'
-        f' {"behind" if shift_s > 0 else "ahead of"} those of the attitudes.',
-        ('the attitude at the shifted stamps gives one alignment, at others not',),
-        tuple(mend),
+        f' {"behind" if shift_s > 0 else "ahead of"} those of the attitudes.'
     )
+    evidence = 'the attitude at the shifted stamps gives one alignment, at others not'
+    return [Diagnosis('clock', offset_s, sentence, (evidence,), tuple(mend))]
 
 
-def _alignment(reading: Reading, setup: SetUp) -> Diagnosis | None:
-    """The prior alignment as a cause; None: it is near enough."""
-    if not is_off(reading, setup):
-        return None
-    values = alignment_values(reading)
+def _alignment(reading: Reading, setup: Setup) -> list[Diagnosis]:
+    found, prior = reading.star_tracker_from_camera, prior_alignment(setup)
+    values = [round(float(q), 7) for q in found.as_quat(canonical=True)]
     mend = (f'prior_alignment: {values}',)
-    prior = setup.star_tracker_from_camera
     if prior is None:
         sentence = 'prior_alignment is not given; the images show it.'
-        return Diagnosis('prior_alignment', values, sentence, (), mend)
-    tilt_deg, roll_deg = (math.degrees(angle) for angle in off_by(reading, setup))
+        return [Diagnosis('prior_alignment', values, sentence, (), mend)]
+    if not reading.is_off(prior):
+        return []
+    tilt_deg, roll_deg = (math.degrees(angle) for angle in reading.off_by(prior))
     away = f'{tilt_deg:.1f} degrees away from it and is rolled by {roll_deg:.1f} degrees'
     evidence = [f'prior_alignment points {away}']
-    turns = quarter_turns(reading, setup)
-    if turns:
-        degrees, way = {1: (90.0, ' counterclockwise'), 2: (180.0, ''), 3: (90.0, ' clockwise')}[
-            turns
-        ]
-        return Diagnosis(
-            'rotated',
-            degrees,
-            f'The image is rotated by {degrees:.0f} degrees{way} against prior_alignment.',
-            tuple(evidence),
-            mend,
-        )
-    found = reading.star_tracker_from_camera
+    if turns := reading.quarter_turns(prior):
+        degrees = 180.0 if turns == 2 else 90.0
+        way = {1: ' counterclockwise', 2: '', 3: ' clockwise'}[turns]
+        sentence = f'The image is rotated by {degrees:.0f} degrees{way} against prior_alignment.'
+        return [Diagnosis('rotated', degrees, sentence, tuple(evidence), mend)]
     if (prior * found).magnitude() < _SAME_ALIGNMENT_RAD:
         evidence.append('prior_alignment is the inverse of it: camera from star tracker')
     w_first = type(prior).from_quat(prior.as_quat()[[1, 2, 3, 0]])
     if (w_first.inv() * found).magnitude() < _SAME_ALIGNMENT_RAD:
         evidence.append('prior_alignment is given with w first')
-    return Diagnosis(
-        'prior_alignment',
-        values,
+    sentence = (
         f'prior_alignment points {tilt_deg:.1f} degrees away from where the images show the'
-        f' camera, and is rolled by {roll_deg:.1f} degrees.',
-        tuple(evidence),
-        mend,
+        f' camera, and is rolled by {roll_deg:.1f} degrees.'
     )
+    return [Diagnosis('prior_alignment', values, sentence, tuple(evidence), mend)]
 
 
-def alignment_values(reading: Reading) -> list[float]:
-    """The alignment of a reading as `prior_alignment` has it."""
-    quaternion = reading.star_tracker_from_camera.as_quat(canonical=True)
-    return [round(float(q), 7) for q in quaternion]
-
-
-def _sides_exchanged(reading: Reading, setup: SetUp) -> Diagnosis:
-    """The cause where the images have the sides of the prior camera exchanged."""
-    upside_down = setup.star_tracker_from_camera is not None and quarter_turns(reading, setup) == 2
-    way = 'counterclockwise' if upside_down else 'clockwise'
-    back = 'clockwise' if upside_down else 'counterclockwise'
+def _sides_exchanged(reading: Reading, setup: Setup) -> Diagnosis:
+    prior = prior_alignment(setup)
+    way, back = 'clockwise', 'counterclockwise'
+    if prior is not None and reading.quarter_turns(prior) == 2:
+        way, back = back, way
     return Diagnosis(
         'rotated',
         90.0,
@@ -340,11 +310,10 @@ def _sides_exchanged(reading: Reading, setup: SetUp) -> Diagnosis:
     )
 
 
-def _mirrored(reading: Reading | None, setup: SetUp) -> Diagnosis:
-    """The cause where the images are mirror images."""
-    how = 'left to right'
-    if reading is not None and setup.star_tracker_from_camera is not None:
-        _, roll_rad = off_by(reading, setup)
+def _mirrored(reading: Reading | None, setup: Setup) -> Diagnosis:
+    how, prior = 'left to right', prior_alignment(setup)
+    if reading is not None and prior is not None:
+        _, roll_rad = reading.off_by(prior)
         if abs(roll_rad) > math.radians(135.0):
             how = 'top to bottom'
     return Diagnosis(
@@ -356,21 +325,20 @@ def _mirrored(reading: Reading | None, setup: SetUp) -> Diagnosis:
     )
 
 
-def _no_reading(placed: Sequence[Placed], attitudes: WireAttitudes, setup: SetUp) -> Diagnosis:
+def _no_reading(case: Case) -> Diagnosis:
     """No cause can be named where no reading of the attitudes is the right one."""
-    several = [r for r in readings(placed, attitudes, setup, 0.0) if r.agreeing == len(placed)]
+    several = [r for r in case.readings() if r.agreeing == len(case.solved)]
     if len(several) > 1:
-        names = ' and '.join(in_words(reading) for reading in several)
         return Diagnosis(
             'unknown',
             None,
             'The stars are identified, but attitudes that do not turn leave open how they are'
             ' meant, and prior_alignment goes with no way to read them.',
-            (f'the images give one alignment read as {names}',),
+            (f'the images give one alignment read as {" and ".join(map(str, several))}',),
             ('# give a bag in which the spacecraft turns, or a prior_alignment to 1 degree',),
         )
     tried = (
-        f'no reading of the {len(attitudes.time_ns)} attitudes, at shifts of up to'
+        f'no reading of the {len(case.attitudes.time_ns)} attitudes, at shifts of up to'
         f' {CLOCK_SEARCH_S:.0f} s, gives one alignment for most of the images'
     )
     return Diagnosis(
@@ -382,38 +350,26 @@ def _no_reading(placed: Sequence[Placed], attitudes: WireAttitudes, setup: SetUp
     )
 
 
-def _focal_length(solved: Sequence[Solved], setup: SetUp, evidence: list[str]) -> Diagnosis | None:
-    """The focal length as a cause; None: it is near enough."""
-    prior_px = float(setup.camera.parameters[0])
-    focal_px = float(np.median([image.sky.camera.parameters[0] for image in solved]))
-    evidence.append(
-        f'the images show a focal length of {focal_px:.1f} px, the prior {prior_px:.1f}'
-    )
-    off = focal_px / prior_px - 1.0
-    if abs(off) <= _FOCAL_SHARE:
-        return None
-    return Diagnosis(
-        'focal_length',
-        round(focal_px, 2),
+def _focal_length(focal_px: float, prior_px: float) -> list[Diagnosis]:
+    if abs(focal_px / prior_px - 1.0) <= _FOCAL_SHARE:
+        return []
+    sentence = (
         f'The focal length of the prior camera, {prior_px:.0f} px, is'
-        f' {abs(100 * (prior_px / focal_px - 1)):.0f} %'
-        f' too {"short" if off > 0 else "long"}.',
-        mend=(f'# in the file of camera_info_url: fx = fy = {focal_px:.1f}',),
+        f' {abs(100 * (prior_px / focal_px - 1)):.0f} % too'
+        f' {"short" if focal_px > prior_px else "long"}.'
     )
+    mend = f'# in the file of camera_info_url: fx = fy = {focal_px:.1f}'
+    return [Diagnosis('focal_length', round(focal_px, 2), sentence, mend=(mend,))]
 
 
-def _tone_curve(solved: Sequence[Solved], catalog: StarCatalog) -> Diagnosis | None:
-    """A tone curve as a cause; None: the images are linear, or show too few stars for it."""
+def _tone_curve(solved: Sequence[Solved], catalog: StarCatalog) -> list[Diagnosis]:
     slope = _brightness_slope(max(solved, key=lambda image: len(image.sky.xy_px)), catalog)
     if slope is None or slope >= _LINEAR_SLOPE:
-        return None
-    return Diagnosis(
-        'not_linear',
-        round(slope, 2),
-        'The images are not linear in the light: they have been through a tone curve.',
-        (f'brightness grows with that of the catalog to the power {slope:.2f}',),
-        ('# no parameter mends this: record raw images',),
-    )
+        return []
+    sentence = 'The images are not linear in the light: they have been through a tone curve.'
+    evidence = f'brightness grows with that of the catalog to the power {slope:.2f}'
+    mend = '# no parameter mends this: record raw images'
+    return [Diagnosis('not_linear', round(slope, 2), sentence, (evidence,), (mend,))]
 
 
 def _brightness_slope(image: Solved, catalog: StarCatalog) -> float | None:

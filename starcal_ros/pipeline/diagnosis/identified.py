@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 import dataclasses
 from dataclasses import dataclass
+import itertools
 import time
 
 import numpy as np
@@ -22,32 +23,41 @@ from starcal_ros.identification.blind.bright_sources import bright_sources, Brig
 from starcal_ros.records import Image
 from starcal_ros.sky.catalog import StarCatalog
 
-IMAGES = 8  # identified: more would not change an answer
+_IMAGES = 8  # identified: more would not change an answer
 _SEARCHED = 12  # at most
 LOOKED_AT = 40  # at most, those without sources included
 # Focal lengths over that of the camera, each searched to 25 %: of other pixels or of binned ones.
 _OTHER_SCALES = (0.55, 1.8, 0.3, 3.3)
 _FEW = 3  # identified, with which no image is searched further
 FEWEST_SOURCES = 6
-SEARCH_S = 10.0  # of the 20 s that a diagnosis may take; reading and measuring are the rest
+_SEARCH_S = 10.0  # of the 20 s that a diagnosis may take; reading and measuring are the rest
 _MISFIT_PX = 3.0  # of a star whose identification is left out of a rotation
 
 
 @dataclass(frozen=True)
-class Solved:
+class _Seen:
     """
-    An image that was identified, its sources, and the rotation ``camera_from_icrf``.
+    Sources of an image.
 
-    Rotation and ``sky.camera`` are of the image mirrored left to right where it is a mirror image.
     ``quarter_turned``: the image has the sides of the prior camera exchanged, and was turned
     counterclockwise by 90 degrees.
     """
 
     time_ns: int
-    sky: search.SkyMatch
     sources: BrightSources
-    camera_from_icrf: Rotation
-    quarter_turned: bool = False
+    quarter_turned: bool
+
+
+@dataclass(frozen=True)
+class Solved(_Seen):
+    """
+    An image that was identified.
+
+    Rotation and camera of ``sky`` are of the image mirrored left to right where it is a mirror
+    image.
+    """
+
+    sky: search.SkyMatch
 
 
 @dataclass(frozen=True)
@@ -59,155 +69,125 @@ class Identified:
     other_sizes: tuple[tuple[int, int], ...]
 
 
-@dataclass
-class _Pending:
-    time_ns: int
-    sources: BrightSources
-    quarter_turned: bool
-
-
 Guesses = Callable[[int], Sequence[Rotation]]
 """Rotations ``camera_from_icrf`` that an image of a stamp may have, always in the same order."""
 
 
 def identify_images(
-    images: Iterable[Image],
-    camera: CameraModel,
-    catalog: StarCatalog,
-    search_s: float = SEARCH_S,
-    most: int = IMAGES,
-    guesses: Guesses = lambda _: (),
+    images: Iterable[Image], camera: CameraModel, catalog: StarCatalog, guesses: Guesses
 ) -> Identified:
     """
-    The first images that can be identified, at most ``most``, in the order of their stamps.
+    The first images that can be identified, in the order of their stamps.
 
-    ``guesses`` are tried before the sky is searched.  The search ends ``search_s`` after its start
-    at the latest, in processor time of this thread.
+    ``guesses`` are tried before the sky is searched.  The search ends after 10 s of processor time
+    of this thread.
     """
-    deadline_s = time.thread_time() + search_s
-    solved: list[Solved] = []
+    finder = _Search(camera, catalog, guesses, time.thread_time() + _SEARCH_S)
     seen: list[BrightSources] = []
     other_sizes: list[tuple[int, int]] = []
-    pending: list[_Pending] = []
+    pending: list[_Seen] = []
     searched = 0
-    for looked_at, image in enumerate(images, start=1):
-        height, width = image.pixels.shape
-        pixels, turned = image.pixels, False
-        if (width, height) == (camera.height, camera.width) != (height, width):
-            pixels, turned = np.ascontiguousarray(np.rot90(image.pixels)), True
-        elif (width, height) != (camera.width, camera.height):
+    for image in itertools.islice(images, LOOKED_AT):
+        one = _seen(image, camera)
+        if one is None:
+            height, width = image.pixels.shape
             other_sizes.append((width, height))
             if len(other_sizes) == _SEARCHED:
                 break
             continue
-        sources = bright_sources(pixels)
-        seen.append(sources)
+        seen.append(one.sources)
         # The pattern of streaks is none of points.
-        if len(sources.xy_px) >= FEWEST_SOURCES and smear(sources) is None:
-            one = _Pending(image.time_ns, sources, turned)
+        if len(one.sources.xy_px) >= FEWEST_SOURCES and smear(one.sources) is None:
             searched += 1
-            confirmed = _confirmed(one, guesses(one.time_ns), camera, catalog, solved)
-            if confirmed is not None:
-                solved.append(confirmed)
-            elif not _search(one, search.ROUNDS[0], camera, catalog, solved, deadline_s):
+            if not (finder.guess(one) or finder.look_up(one, search.ROUNDS[0])):
                 pending.append(one)
-                if len(pending) == _FEW and not solved:
-                    pending = _rescaled(pending, camera, catalog, solved, deadline_s)
-        if len(solved) == most or searched == _SEARCHED or looked_at == LOOKED_AT:
-            break
-        if time.thread_time() > deadline_s:
+                if len(pending) == _FEW and not finder.solved:
+                    pending = finder.look_up_rescaled(pending)
+        if len(finder.solved) == _IMAGES or searched == _SEARCHED or finder.is_over():
             break
     for later in search.ROUNDS[1:]:
         left, pending = pending, []
         for one in left:
-            if len(solved) >= min(_FEW, most) or time.thread_time() > deadline_s:
+            if len(finder.solved) >= _FEW or finder.is_over():
                 break
-            if not _search(one, later, camera, catalog, solved, deadline_s):
+            if not finder.look_up(one, later):
                 pending.append(one)
-    alike = _with_one_camera(solved, catalog)
-    return Identified(
-        tuple(sorted(alike, key=lambda one: one.time_ns)), tuple(seen), tuple(other_sizes)
-    )
+    alike = sorted(_with_one_camera(finder.solved, catalog), key=lambda one: one.time_ns)
+    return Identified(tuple(alike), tuple(seen), tuple(other_sizes))
 
 
-def _confirmed(
-    one: _Pending,
-    guessed: Sequence[Rotation],
-    camera: CameraModel,
-    catalog: StarCatalog,
-    solved: Sequence[Solved],
-) -> Solved | None:
-    """An image identified by one of its guessed rotations."""
-    ways = [solved[0].sky.mirrored] if solved else [False, True]
-    for mirrored in ways:
-        for rotation in guessed:
-            sky = search.confirm_sky(one.sources.xy_px, camera, catalog, rotation, mirrored)
-            if isinstance(sky, search.SkyMatch):
-                return Solved(
-                    one.time_ns, sky, one.sources, sky.camera_from_icrf, one.quarter_turned
-                )
-    return None
+def _seen(image: Image, camera: CameraModel) -> _Seen | None:
+    """Sources of an image, turned to the sides of the camera; None if it has another size."""
+    sides = (camera.height, camera.width)
+    is_turned = image.pixels.shape != sides and image.pixels.shape[::-1] == sides
+    pixels = np.ascontiguousarray(np.rot90(image.pixels)) if is_turned else image.pixels
+    if pixels.shape != sides:
+        return None
+    return _Seen(image.time_ns, bright_sources(pixels), is_turned)
 
 
-def _rescaled(
-    pending: list[_Pending],
-    camera: CameraModel,
-    catalog: StarCatalog,
-    solved: list[Solved],
-    deadline_s: float,
-) -> list[_Pending]:
-    """The images that no focal length far from that of the camera identifies."""
-    fx, fy = (float(camera.parameters[k]) for k in (0, 2))
-    for scale in _OTHER_SCALES:
-        tried = camera.replace(fx=scale * fx, fy=scale * fy)
-        left = [
-            one
-            for one in pending
-            if not _search(one, search.ROUNDS[0], tried, catalog, solved, deadline_s)
-        ]
-        if solved:
-            return left
-    return pending
+@dataclass
+class _Search:
+    """Identifies images one by one; the first one ``solved`` gives its camera to the others."""
 
+    camera: CameraModel
+    catalog: StarCatalog
+    guesses: Guesses
+    deadline_s: float
+    solved: list[Solved] = dataclasses.field(default_factory=list)
 
-def _search(
-    one: _Pending,
-    searched_round: tuple[int, int],
-    camera: CameraModel,
-    catalog: StarCatalog,
-    solved: list[Solved],
-    deadline_s: float,
-) -> bool:
-    """True if an image is identified, and is then among those solved."""
-    xy_px = one.sources.xy_px
-    rounds = (searched_round,)
-    sky: search.SkyMatch | search.NotFound
-    if not solved:
-        sky = search.find_sky(
-            xy_px, camera, catalog, try_mirrored=True, rounds=rounds, deadline_s=deadline_s
-        )
-    else:
-        known = solved[0].sky
-        focal_px = float(known.camera.parameters[0])
-        prior = search.mirrored_camera(camera) if known.mirrored else camera
-        sky = search.find_sky(
-            search.mirror(xy_px, camera.width) if known.mirrored else xy_px,
-            prior.replace(
-                fx=focal_px,
-                fy=focal_px * float(camera.parameters[2]) / float(camera.parameters[0]),
-            ),
-            catalog,
-            rounds=rounds,
-            deadline_s=deadline_s,
-        )
-        if isinstance(sky, search.SkyMatch) and known.mirrored:
-            sky = dataclasses.replace(
-                sky, mirrored=True, xy_px=search.mirror(sky.xy_px, camera.width)
+    def is_over(self) -> bool:
+        """True if the time given for the search has passed."""
+        return time.thread_time() > self.deadline_s
+
+    def guess(self, one: _Seen) -> bool:
+        """True if one of its guessed rotations identifies an image."""
+        rotations = self.guesses(one.time_ns)
+        ways = [self.solved[0].sky.mirrored] if self.solved else [False, True]
+        for mirrored, rotation in itertools.product(ways, rotations):
+            sky = search.confirm_sky(
+                one.sources.xy_px, self.camera, self.catalog, rotation, mirrored
             )
-    if not isinstance(sky, search.SkyMatch):
+            if self._take(one, sky):
+                return True
         return False
-    solved.append(Solved(one.time_ns, sky, one.sources, sky.camera_from_icrf, one.quarter_turned))
-    return True
+
+    def look_up(self, one: _Seen, searched: tuple[int, int], scale: float = 1.0) -> bool:
+        """True if a round of the search identifies an image; ``scale`` of the focal length."""
+        xy_px, width = one.sources.xy_px, self.camera.width
+        fx, fy = (float(self.camera.parameters[k]) for k in (0, 2))
+        camera, is_mirrored = self.camera.replace(fx=scale * fx, fy=scale * fy), False
+        if self.solved:
+            known = self.solved[0].sky
+            focal_px, is_mirrored = float(known.camera.parameters[0]), known.mirrored
+            prior = search.mirrored_camera(self.camera) if is_mirrored else self.camera
+            camera = prior.replace(fx=focal_px, fy=focal_px * fy / fx)
+        sky = search.find_sky(
+            search.mirror(xy_px, width) if is_mirrored else xy_px,
+            camera,
+            self.catalog,
+            try_mirrored=not self.solved,
+            rounds=(searched,),
+            deadline_s=self.deadline_s,
+        )
+        if isinstance(sky, search.SkyMatch) and is_mirrored:
+            sky = dataclasses.replace(sky, mirrored=True, xy_px=search.mirror(sky.xy_px, width))
+        return self._take(one, sky)
+
+    def look_up_rescaled(self, pending: list[_Seen]) -> list[_Seen]:
+        """The images that no focal length far from that of the camera identifies."""
+        for scale in _OTHER_SCALES:
+            left = [one for one in pending if not self.look_up(one, search.ROUNDS[0], scale)]
+            if self.solved:
+                return left
+        return pending
+
+    def _take(self, one: _Seen, sky: search.SkyMatch | search.NotFound) -> bool:
+        """Add an image to those solved if it was identified."""
+        if isinstance(sky, search.NotFound):
+            return False
+        self.solved.append(Solved(**vars(one), sky=sky))
+        return True
 
 
 def _with_one_camera(solved: Sequence[Solved], catalog: StarCatalog) -> list[Solved]:
@@ -221,7 +201,10 @@ def _with_one_camera(solved: Sequence[Solved], catalog: StarCatalog) -> list[Sol
     parameters = np.median([one.sky.camera.parameters for one in solved], axis=0)
     camera = dataclasses.replace(solved[0].sky.camera, parameters=parameters)
     return [
-        dataclasses.replace(one, camera_from_icrf=_rotation(one.sky, camera, catalog))
+        dataclasses.replace(
+            one,
+            sky=dataclasses.replace(one.sky, camera_from_icrf=_rotation(one.sky, camera, catalog)),
+        )
         for one in solved
     ]
 

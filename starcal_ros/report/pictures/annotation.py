@@ -72,18 +72,7 @@ def annotate_reduced(
 ) -> Picture:
     """Picture of an image that was reduced to ``pixels``, with its stars marked, no legend."""
     picture = np.asarray(cv2.cvtColor(stretch(pixels), cv2.COLOR_GRAY2BGR), np.uint8)
-    _draw_stars(picture, observations, geometry, pixels.shape[1] / max(observations.width, 1))
-    return picture
-
-
-def _mark_size(picture: Picture) -> float:
-    return max(max(picture.shape) / 1000.0, 0.6)  # smaller text is illegible
-
-
-def _draw_stars(
-    picture: Picture, observations: StarObservations, geometry: CameraGeometry, scale: float
-) -> None:
-    """Mark all stars on a picture that is smaller than the image by ``scale``."""
+    scale = pixels.shape[1] / max(observations.width, 1)
     size = _mark_size(picture)
     width = max(1, round(size))
 
@@ -97,8 +86,13 @@ def _draw_stars(
         _draw_mark(picture, Mark(cv2.MARKER_CROSS, _PREDICTED), pixel, size)
     for uv, snr in zip(reduced(observations.measured_px), observations.snr, strict=True):
         radius = (5 + 2 * np.log10(max(float(snr), 1.0))) * size
-        center, radius = _fixed_point(uv), int(radius * (1 << _SHIFT))
+        (center,), radius = _pixels(uv[None], 1 << _SHIFT), int(radius * (1 << _SHIFT))
         cv2.circle(picture, center, radius, _MEASURED, width, cv2.LINE_AA, _SHIFT)
+    return picture
+
+
+def _mark_size(picture: Picture) -> float:
+    return max(max(picture.shape) / 1000.0, 0.6)  # smaller text is illegible
 
 
 def predicted_px(observations: StarObservations, geometry: CameraGeometry) -> Floats:
@@ -200,13 +194,9 @@ def _write(
     )  # fmt: skip
 
 
-def _pixels(places: Floats) -> list[list[int]]:
+def _pixels(places: Floats, per_pixel: int = 1) -> list[list[int]]:
+    """Places (n, 2) in whole units, of which a pixel has some."""
     # Predictions far outside the image would overflow OpenCV's integers.
-    inside = np.clip(np.nan_to_num(places, nan=-1e4), -1e4, 1e5)
+    inside = np.clip(np.nan_to_num(places, nan=-1e4), -1e4, 1e5) * per_pixel
     pixels: list[list[int]] = np.rint(inside).astype(int).tolist()
     return pixels
-
-
-def _fixed_point(uv: Floats) -> tuple[int, int]:
-    u, v = np.clip(uv, -1e4, 1e5) * (1 << _SHIFT)
-    return round(float(u)), round(float(v))

@@ -17,7 +17,7 @@ from starcal_ros.arrays import Pixels
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.identification.blind.bright_sources import bright_sources
-from starcal_ros.identification.prediction import in_image, predict
+from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.report.pictures.annotation import annotate_reduced, stretch
@@ -81,10 +81,13 @@ class Album:
     Selects thumbnails from a stream of images.
 
     Keeps some used images, evenly spread, and the first images and stars of each refusal reason.
-    ``expected`` images, if known, are spread from the start; more or fewer may come.
+    ``expected`` images, if known, are spread from the start; more or fewer may come.  With a
+    setup, ``unmatched`` are the first images that match no star, with the stars expected there.
     """
 
     expected: int = 0
+    setup: Setup | None = None
+    unmatched: list[Thumbnail] = field(default_factory=list)
     used: list[_Reduced] = field(default_factory=list)
     refused: dict[str, list[_Reduced]] = field(default_factory=dict)
     stars: dict[str, list[Thumbnail]] = field(default_factory=dict)
@@ -98,18 +101,15 @@ class Album:
     def show(self, image: Image, observations: StarObservations, geometry: CameraGeometry) -> None:
         """Add an image, its observations and the geometry that predicted its stars."""
         if observations.refusal:
-            of_reason = self.refused.setdefault(observations.refusal, [])
-            if len(of_reason) < _REFUSED_OF_A_REASON:
-                of_reason.append(_Reduced(_reduced(image.pixels), observations, geometry))
+            of_refusal = self.refused.setdefault(observations.refusal, [])
+            if len(of_refusal) < _REFUSED_OF_A_REASON:
+                of_refusal.append(_Reduced(_reduced(image.pixels), observations, geometry))
         else:
             if self._seen % self._stride == 0:
                 self.used.append(_Reduced(_reduced(image.pixels), observations, geometry))
                 if len(self.used) == 2 * _USED:
                     self.used, self._stride = self.used[::2], 2 * self._stride
             self._seen += 1
-        self._show_stars(image, observations)
-
-    def _show_stars(self, image: Image, observations: StarObservations) -> None:
         for reason, places in observations.refused_places().items():
             of_reason = self.stars.setdefault(reason, [])
             # At most one star per image, for variety.
@@ -117,6 +117,10 @@ class Album:
                 number = len(of_reason)
                 encoded = _cut_out(image.pixels, places[number % len(places)])
                 of_reason.append(Thumbnail(image.time_ns, reason, number, encoded))
+        number = len(self.unmatched)
+        if self.setup and observations.refusal == 'no_match' and number < _EXPECTED_PICTURES:
+            encoded = _expected_picture(image, observations, geometry, self.setup)
+            self.unmatched.append(Thumbnail(image.time_ns, EXPECTED, number, encoded))
 
     def thumbnails(self) -> tuple[Thumbnail, ...]:
         """All selected thumbnails."""
@@ -214,47 +218,25 @@ def _cut_out(pixels: Pixels, place_px: NDArray[np.float32]) -> bytes:
     return encoded.tobytes()
 
 
-@dataclass
-class ExpectedAlbum:
-    """The first images of a set that match no star, drawn as they are shown."""
-
-    setup: Setup
-    pictures: list[Thumbnail] = field(default_factory=list)
-
-    def add(self, image: Image, observations: StarObservations, geometry: CameraGeometry) -> None:
-        """Add an image if it matched no star; ``geometry`` predicts the stars."""
-        if observations.refusal == 'no_match' and len(self.pictures) < _EXPECTED_PICTURES:
-            picture = _expected_picture(image, observations, geometry, self.setup)
-            number = len(self.pictures)
-            self.pictures.append(Thumbnail(image.time_ns, EXPECTED, number, picture))
-
-
 def _expected_picture(
     image: Image, observations: StarObservations, geometry: CameraGeometry, setup: Setup
 ) -> bytes:
     """PNG with crosses where the brightest stars are expected and circles about the sources."""
-    camera = geometry.camera
-    prediction = predict(
-        geometry,
+    attitude, limit = (
         observations.icrf_from_star_tracker_xyzw,
-        image.time_ns,
-        setup.catalog,
         setup.identification.magnitude_limit,
-        0.0,
     )
-    inside = in_image(prediction.xy_px, camera.width, camera.height)
-    magnitude = setup.catalog.magnitude[prediction.catalog_index]
-    order = np.argsort(np.where(inside, magnitude, np.inf), kind='stable')
+    stars = predict(geometry, attitude, image.time_ns, setup.catalog, limit, 0.0)
+    stars = within_image(stars, geometry.camera.width, geometry.camera.height)
     scale = min(1.0, _EXPECTED_WIDTH_PX / image.pixels.shape[1])
     grey = cv2.resize(
         stretch(image.pixels), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
     )
     picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
-    for u, v in prediction.xy_px[order[: min(_EXPECTED_STARS, int(inside.sum()))]]:
-        place = (round(float(u) * scale), round(float(v) * scale))
+    for place in np.rint(stars.xy_px[:_EXPECTED_STARS] * scale).astype(int).tolist():
         cv2.drawMarker(picture, place, _EXPECTED_BGR, cv2.MARKER_CROSS, 13, 1, cv2.LINE_AA)
-    for u, v in bright_sources(image.pixels).xy_px[:_EXPECTED_STARS]:
-        place = (round(float(u) * scale), round(float(v) * scale))
+    seen_px = bright_sources(image.pixels).xy_px[:_EXPECTED_STARS]
+    for place in np.rint(seen_px * scale).astype(int).tolist():
         cv2.circle(picture, place, 8, _SEEN_BGR, 1, cv2.LINE_AA)
     _, encoded = cv2.imencode('.png', picture)
     return encoded.tobytes()

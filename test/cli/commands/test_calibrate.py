@@ -68,7 +68,7 @@ def broken(*_: object) -> None:
     ('place', 'missing'),
     [
         ('starcal_ros.report.page._context', 'report'),
-        ('starcal_ros.report.page.template', 'report'),
+        ('starcal_ros.report.page.page_template', 'report'),
         ('starcal_ros.report.pictures.thumbnails.annotate_reduced', 'pictures of images'),
         ('starcal_ros.report.pictures.thumbnails._cut_out', 'pictures of images'),
     ],

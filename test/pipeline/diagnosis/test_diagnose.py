@@ -18,9 +18,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from starcal_ros.camera import CameraModel
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.telemetry import attitude_from_message
-from starcal_ros.pipeline.diagnosis.attitude_reading import SetUp, WireAttitudes
+from starcal_ros.pipeline.diagnosis.attitude_reading import WireAttitudes
 from starcal_ros.pipeline.diagnosis.diagnose import CAUSES, diagnose, Diagnosis
-from starcal_ros.records import Image
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.records import CameraGeometry, Image
+from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 from starcal_ros.studies.simulation import rendering
 from starcal_ros.studies.simulation import scenario as synthetic
@@ -37,19 +39,11 @@ class Night:
 
     images: tuple[Image, ...]
     attitudes: WireAttitudes
-    setup: SetUp
+    setup: Setup
 
 
-def set_up(camera: CameraModel, star_tracker_from_camera_xyzw: Any) -> SetUp:
-    return SetUp(
-        camera=camera,
-        star_tracker_from_camera=Rotation.from_quat(star_tracker_from_camera_xyzw),
-        attitude_direction='st_to_inertial',
-        stamp_offset_s=0.0,
-        max_attitude_gap_s=2.0,
-        acquisition_rad=math.radians(1.5),
-        acquisition_roll_rad=math.radians(5.0),
-    )
+def set_up(geometry: CameraGeometry) -> Setup:
+    return load_setup({}, prior=geometry)
 
 
 def slewing_night() -> Night:
@@ -89,7 +83,7 @@ def slewing_night() -> Night:
     return Night(
         tuple(rendering.images(scenario)),
         WireAttitudes(stamps_ns, sent),
-        set_up(prior.camera, prior.star_tracker_from_camera_xyzw),
+        set_up(prior),
     )
 
 
@@ -112,7 +106,7 @@ def granasat_night() -> Night:
     return Night(
         tuple(images[2:6]),  # the first two carry an attitude of something else
         WireAttitudes(stamps_ns[order], quaternions),
-        set_up(camera, prior['align_prior_xyzw']),
+        set_up(CameraGeometry(camera, np.array(prior['align_prior_xyzw']))),
     )
 
 
@@ -137,10 +131,9 @@ def with_pixels(night: Night, change: Callable[[Any], Any]) -> Night:
 
 
 def with_alignment(night: Night, turn: Rotation) -> Night:
-    prior = night.setup.star_tracker_from_camera
-    assert prior is not None
-    setup = dataclasses.replace(night.setup, star_tracker_from_camera=prior * turn)
-    return dataclasses.replace(night, setup=setup)
+    turned = Rotation.from_quat(night.setup.prior.star_tracker_from_camera_xyzw) * turn
+    prior = CameraGeometry(night.setup.prior.camera, turned.as_quat())
+    return with_setup(night, prior=prior)
 
 
 def with_stamps(night: Night, late_s: float) -> Night:
@@ -153,7 +146,8 @@ def with_setup(night: Night, **changes: Any) -> Night:
 
 
 def found_in(night: Night, catalog: StarCatalog) -> Diagnosis:
-    found = diagnose(night.images, night.attitudes, night.setup, catalog)
+    setup = dataclasses.replace(night.setup, catalog=catalog)
+    found = diagnose(night.images, night.attitudes, setup)
     assert found.cause in CAUSES and found.sentence.endswith('.')
     return found
 
@@ -174,16 +168,16 @@ def test_conjugated(night: Night, catalog: StarCatalog) -> None:
 
 
 def test_wrong_attitude_direction(night: Night, catalog: StarCatalog) -> None:
-    found = found_in(with_setup(night, attitude_direction='inertial_to_st'), catalog)
+    options = AttitudeOptions(attitude_direction='inertial_to_st')
+    found = found_in(with_setup(night, attitude=options), catalog)
     assert (found.cause, found.found) == ('attitude_direction', 'st_to_inertial')
 
 
 @pytest.mark.parametrize('missing', [False, True])
 def test_alignment(night: Night, catalog: StarCatalog, missing: bool) -> None:
-    right = night.setup.star_tracker_from_camera
-    assert right is not None
+    right = Rotation.from_quat(night.setup.prior.star_tracker_from_camera_xyzw)
     if missing:
-        wrong = with_setup(night, star_tracker_from_camera=None)
+        wrong = unaligned(night)
     else:
         wrong = with_alignment(night, Rotation.from_euler('x', 10.0, degrees=True))
     found = found_in(wrong, catalog)
@@ -217,9 +211,10 @@ def test_rotated_image(night: Night, catalog: StarCatalog) -> None:
 
 @pytest.mark.parametrize('share', [0.8, 1.2])
 def test_focal_length(night: Night, catalog: StarCatalog, share: float) -> None:
-    camera = night.setup.camera
+    camera = night.setup.prior.camera
     fx, _, fy = camera.intrinsics[:3]
-    wrong = with_setup(night, camera=camera.replace(fx=share * float(fx), fy=share * float(fy)))
+    wide = camera.replace(fx=share * float(fx), fy=share * float(fy))
+    wrong = with_setup(night, prior=dataclasses.replace(night.setup.prior, camera=wide))
     found = found_in(wrong, catalog)
     assert found.cause == 'focal_length'
     # One image tells it to a few parts in a thousand, its distortion being unknown.
@@ -314,7 +309,7 @@ def half_turned(night: Night) -> Night:
 
 
 def unaligned(night: Night) -> Night:
-    return with_setup(night, star_tracker_from_camera=None)
+    return with_setup(night, is_aligned=False)
 
 
 @pytest.mark.parametrize(
@@ -363,7 +358,7 @@ def at_rest(count: int) -> Night:
     return Night(
         tuple(rendering.images(scenario)),
         WireAttitudes(stamps_ns, sent),
-        set_up(prior.camera, prior.star_tracker_from_camera_xyzw),
+        set_up(prior),
     )
 
 
