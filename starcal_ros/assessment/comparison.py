@@ -106,10 +106,12 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
             for c in (a, b)
         )
     )
-    shape_sigma_px = _both(
-        *(map_sigma_px(c.geometry.camera, c.map_covariance, GRID) for c in (a, b))
+    shape_sigma_rad = _both(
+        *(
+            map_sigma_px(camera, c.map_covariance, GRID) / camera.parameters[0]
+            for c, camera in ((a, camera_a), (b, camera_b))
+        )
     )
-    shape_sigma_rad = shape_sigma_px / camera_a.parameters[0]
     return Comparison(
         a=a,
         b=b,
