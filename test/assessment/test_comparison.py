@@ -14,8 +14,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment import comparison
-from starcal_ros.assessment.comparison import compare, GRID
-from starcal_ros.assessment.lookup import line_of_sight_table
+from starcal_ros.assessment.comparison import compare
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.cli import main
 from starcal_ros.constants import ARCSECOND_RAD

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.assessment.observability import (
     coverage,
     ensemble_status,
     image_information,
     keep_most_informative,
-    line_of_sight_sigma_arcsec,
     map_sigma_px,
     predicted_sigma,
 )
@@ -181,6 +181,11 @@ def test_every_corner_of_the_detector_has_its_cell() -> None:
     assert found.sum() == 4
 
 
+def sight_sigma_arcsec(covariance: np.ndarray, columns: int, rows: int) -> np.ndarray:
+    pixels = pixel_grid(TRUTH.camera, columns, rows)
+    return line_of_sight_table(TRUTH.camera, MapCovariance(covariance), pixels).sigma_arcsec
+
+
 def sampled_directions(samples: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """
     Lines of sight (k, n, 3) of a 5-column grid in the star tracker frame, and at the mean (n, 3).
@@ -209,10 +214,9 @@ def sampled_directions(samples: int, rows: int) -> tuple[np.ndarray, np.ndarray]
 def test_the_line_of_sight_map_is_what_the_covariance_scatters() -> None:
     found, mean = sampled_directions(2000, 4)
     scatter_rad = np.sqrt(((found - mean) ** 2).sum(axis=2).mean(axis=0))
-    expected = line_of_sight_sigma_arcsec(TRUTH.camera, MapCovariance(covariance()), 5, 4)
-    assert expected.shape == (4, 5)
+    expected = sight_sigma_arcsec(covariance(), 5, 4)
     # 2000 draws of two angles: 1.6 % each; the worst of 20 pixels within four of those.
-    np.testing.assert_allclose(scatter_rad / ARCSECOND_RAD, expected.ravel(), rtol=0.065)
+    np.testing.assert_allclose(scatter_rad / ARCSECOND_RAD, expected, rtol=0.065)
 
 
 def test_the_map_sigma_is_the_scatter_that_a_common_turn_leaves() -> None:
@@ -224,7 +228,10 @@ def test_the_map_sigma_is_the_scatter_that_a_common_turn_leaves() -> None:
     fx = TRUTH.camera.parameters[0]
     scatter_px = fx * np.sqrt(np.mean(left))
     # Eight modes of unlike strength in 500 draws: 3 % or so.
-    expected_px = np.sqrt(np.mean(map_sigma_px(TRUTH.camera, MapCovariance(covariance()), 5) ** 2))
+    pixels = pixel_grid(TRUTH.camera, 5, 5)
+    table = line_of_sight_table(TRUTH.camera, MapCovariance(covariance()), pixels)
+    sigma_rad = table.shape_sigma_arcsec * ARCSECOND_RAD
+    expected_px = fx * np.sqrt(np.mean(sigma_rad**2))
     assert scatter_px == pytest.approx(expected_px, rel=0.10)
 
 
@@ -242,16 +249,16 @@ def test_the_map_does_not_mind_what_the_alignment_takes_up() -> None:
     # The whole line of sight does mind, one way or the other: 20 px are 2300 arcsec.
     C[3, 11] = C[11, 3] = 0.0
     C[11, 11] = 0.0
-    whole = line_of_sight_sigma_arcsec(TRUTH.camera, MapCovariance(C))
+    whole = sight_sigma_arcsec(C, 25, 20)
     np.testing.assert_allclose(whole, 20 / fx / ARCSECOND_RAD, rtol=0.1)
 
 
 def test_an_alignment_alone_is_seen_by_each_line_of_sight_but_its_own_axis() -> None:
     C = np.zeros((13, 13))
     C[12, 12] = (100 * ARCSECOND_RAD) ** 2  # roll
-    found = line_of_sight_sigma_arcsec(TRUTH.camera, MapCovariance(C), 3, 3)
+    found = sight_sigma_arcsec(C, 3, 3)
     e = line_of_sight(TRUTH.camera, pixel_grid(TRUTH.camera, 3, 3))
-    expected = 100 * np.hypot(e[:, 0], e[:, 1]).reshape(3, 3)
+    expected = 100 * np.hypot(e[:, 0], e[:, 1])
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
