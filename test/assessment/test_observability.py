@@ -18,6 +18,7 @@ from starcal_ros.assessment.observability import (
     keep_most_informative,
     map_sigma_px,
     predicted_sigma,
+    weakest_direction,
 )
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
@@ -280,6 +281,35 @@ def test_the_most_informative_images_are_kept() -> None:
     before, after = (predicted_sigma(e, PRIOR, OPTIONS) for e in (everything, kept))
     assert (after <= 1.06 * before)[:8].all()
     assert min(len(image) for image in kept.images) > 100
+
+
+def test_the_image_that_is_left_out_is_worth_least() -> None:
+    """By the definition, in units in which all unknowns are of one size."""
+    images = tuple(
+        one.select(np.arange(len(one)) % step == 0)
+        for one, step in zip(ensemble().images, (9, 6, 8, 5, 7, 9, 6, 5, 8, 7), strict=True)
+    )
+    information = image_information(images, PRIOR, OPTIONS)
+    left = list(range(len(images)))
+    while len(left) > 4:
+        total = information[left].sum(axis=0)
+        unit = 1.0 / np.sqrt(np.diag(total))
+        scaled = information[left] * np.outer(unit, unit)
+        worth = [np.trace(np.linalg.solve(scaled.sum(axis=0), one)) for one in scaled]
+        del left[int(np.argmin(worth))]
+    limit = dataclasses.replace(OPTIONS, max_images=4)
+    kept = keep_most_informative(Ensemble(images), PRIOR, limit)
+    assert [one.time_ns for one in kept.images] == [images[k].time_ns for k in left]
+
+
+def test_the_weakest_direction_is_named_with_its_loss() -> None:
+    C = np.array([[4.0, -5.7, 0.0], [-5.7, 9.0, 0.0], [0.0, 0.0, 1.0]])  # correlation -0.95
+    singular, text = weakest_direction(np.linalg.inv(C), ('fx', 'cx', 'k1'))
+    np.testing.assert_allclose(singular, np.sqrt([1.95, 1.0, 0.05]))
+    assert 'fx (' in text and 'cx (' in text and 'k1' not in text
+    assert 'nearly indistinguishable: their combination has 4 times the sigma' in text
+    _, alone = weakest_direction(np.diag([1.0, 2.0]), ('fx', 'cx'))
+    assert alone.endswith('(+1.00), uncorrelated with the others')
 
 
 def test_an_ensemble_within_its_limit_is_not_touched() -> None:
