@@ -188,13 +188,14 @@ def _changes(
     rotation_rad, left_px = movement(prior, calibration.geometry)
     step_px, step_deg = _step(active, calibration)
     of_map, of_sight = 'change of the distortion map', 'rotation of the lines of sight'
-    change = limit_check(
-        options, 'max_change_px', f'largest {of_map} from the prior', float(left_px.max()), 'px'
+    yield limit_check(
+        options,
+        'max_change_px',
+        f'largest {of_map} from the prior',
+        float(left_px.max()),
+        'px',
+        'the prior camera or its lens model is not of this lens (lens_model)',
     )
-    if not change.passed:
-        note = 'the prior camera or its lens model is not of this lens (lens_model)'
-        change = dataclasses.replace(change, note=note)
-    yield change
     for parameter, name, found, unit in (
         ('max_rotation_deg', f'{of_sight} from the prior', math.degrees(rotation_rad), 'deg'),
         ('max_step_px', f'largest {of_map} from the active calibration', step_px, 'px'),
@@ -265,20 +266,15 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         'columns or rows are lost or shifted there: check the read-out',
         _STEP_P_VALUE,
     )
-    check = limit_check(
+    yield limit_check(
         options,
         'max_image_variation_px',
         'change of the camera from image to image in a corner',
         found.image_variation_px,
         'px',
+        'focal length or lens changes between images: estimate with temperature, or calibrate'
+        ' each state by itself',
     )
-    if not check.passed:
-        note = (
-            'focal length or lens changes between images: estimate with temperature, or calibrate'
-            ' each state by itself'
-        )
-        check = dataclasses.replace(check, note=note)
-    yield check
     yield from _predicted(found.predictions, options)
 
 

@@ -158,7 +158,7 @@ def test_known_unknowns_do_not_depend_on_their_units() -> None:
     errors = found.posterior.errors
     assert errors is not None
     scale = np.ones((len(errors.root), 1))
-    scale[found.layout.places['velocity'].start] = 1e-16
+    scale[found.layout.places['velocity'].start] = 1e-24
     rescaled = dataclasses.replace(errors, root=errors.root * scale)
     T, again = (budget._known(one, found, ['velocity']) for one in (errors, rescaled))
     np.testing.assert_allclose(again @ again.T, T @ T.T, atol=1e-9)
