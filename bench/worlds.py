@@ -29,7 +29,7 @@ from bench.lens_departures import corner_bump, kink, radial8, rings, ripple, row
 from bench.observed_campaign import Campaign, GRID, MEMORY, simulate, World
 from bench.table import Table
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import line_of_sight_table, shape_sigma_rad
+from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid, project_jacobians
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
@@ -179,7 +179,8 @@ def bound_arcsec(made: Campaign, options: CalibrationOptions) -> float:
     unit = np.outer(scale, scale)
     covariance[:p, :p] = np.linalg.inv(information * unit) * unit
     pixels = pixel_grid(camera, GRID, GRID)
-    return _rms(shape_sigma_rad(camera, MapCovariance(covariance), pixels)) / ARCSECOND_RAD
+    table = line_of_sight_table(camera, MapCovariance(covariance), pixels)
+    return _rms(table.shape_sigma_arcsec)
 
 
 def _rms(values: Floats | Sequence[float]) -> float:

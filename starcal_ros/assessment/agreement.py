@@ -49,30 +49,6 @@ def chi_squared(difference: Floats, covariance: Floats) -> ChiSquared:
     return ChiSquared(float(scaled @ inverse @ scaled), rank)
 
 
-@dataclass(frozen=True)
-class Difference:
-    """
-    Difference of two calibrations of the same pixels.
-
-    Attributes
-    ----------
-    rotation_rad : float
-        The rotation common to all lines of sight, in the star tracker frame.
-    shape_px : float
-        The largest remaining change of a line of sight, px at the focal length.  Both are infinite
-        where a pixel no longer has a line of sight.
-    camera : ChiSquared
-        Of the camera parameters that both have estimated.
-    total : ChiSquared
-        The same with the three angles of the alignment.
-    """
-
-    rotation_rad: float
-    shape_px: float
-    camera: ChiSquared
-    total: ChiSquared
-
-
 def lines_of_sight(geometry: CameraGeometry, columns: int, rows: int) -> Floats:
     """
     Unit directions of a grid of pixels in the star tracker frame, (columns * rows, 3), by rows.
@@ -112,34 +88,3 @@ def alignment_difference_rad(a: CameraGeometry, b: CameraGeometry) -> Floats:
     star_tracker_from_b = Rotation.from_quat(b.star_tracker_from_camera_xyzw)
     # a_from_b = exp(-[dtheta x]), so b_from_a has dtheta as its rotation vector.
     return np.asarray((star_tracker_from_b.inv() * star_tracker_from_a).as_rotvec())
-
-
-def difference(
-    before: CameraGeometry,
-    before_covariance: Floats,
-    after: CameraGeometry,
-    after_covariance: Floats,
-    estimated: tuple[str, ...],
-) -> Difference:
-    """
-    Difference of two calibrations; ``estimated`` are the camera parameters that both estimate.
-
-    The covariances (p, p), of camera parameters and alignment angles, are taken as independent.
-    Ensembles that share images differ by less than their covariances predict.
-    """
-    rotation_rad, left_px = movement(before, after)
-    names = after.camera.parameter_names
-    changes = np.concatenate(
-        [
-            after.camera.parameters - before.camera.parameters,
-            alignment_difference_rad(after, before),
-        ]
-    )
-    covariance = before_covariance + after_covariance
-    camera = [names.index(name) for name in estimated]
-    angles = range(len(names), len(names) + 3)
-    of_camera, total = (
-        chi_squared(changes[rows], covariance[np.ix_(rows, rows)])
-        for rows in (camera, [*camera, *angles])
-    )
-    return Difference(rotation_rad, float(left_px.max()), of_camera, total)

@@ -15,13 +15,13 @@ import numpy as np
 from scipy.special import ndtr
 
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.lookup import GRID
 from starcal_ros.assessment.predictions import predictions
 from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.posterior import without_prior
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks
 
-_GRID = 25
 _STATED = ('camera', 'mountings', 'velocity', 'readout', 'stamps')  # entries with a prior
 _INNER = (0.1, 0.9)  # of the detector: beyond, too few stars lie on one side
 _STEPS = 97  # places along each axis at which a step is looked for
@@ -79,7 +79,7 @@ def _field_px(camera: CameraModel) -> tuple[float, float]:
     """RMS per axis and largest length of the field over the detector, px."""
     if camera.field is None:
         return 0.0, 0.0
-    moved = camera.field.displacement_px(pixel_grid(camera, _GRID, _GRID))
+    moved = camera.field.displacement_px(pixel_grid(camera, GRID, GRID))
     return float(np.sqrt((moved**2).mean())), float(np.linalg.norm(moved, axis=1).max())
 
 

@@ -15,12 +15,11 @@ from starcal_ros.assessment.agreement import (
     ChiSquared,
     lines_of_sight,
 )
-from starcal_ros.assessment.observability import line_of_sight_sigma_arcsec, map_sigma_px
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table
+from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.records import Calibration, CameraGeometry
-
-GRID = 25  # the columns and rows of `map_sigma_px`
 
 
 @dataclass(frozen=True)
@@ -99,17 +98,12 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     sigma = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
     old, new = (_sound_lines_of_sight(calibration.geometry) for calibration in (a, b))
     rotation, _ = Rotation.align_vectors(new, old)
-    sight_sigma_rad = _both(
-        *(
-            line_of_sight_sigma_arcsec(c.geometry.camera, c.map_covariance, GRID, GRID)
-            * ARCSECOND_RAD
-            for c in (a, b)
-        )
+    of_a, of_b = (
+        line_of_sight_table(camera, c.map_covariance, pixel_grid(camera, GRID, GRID))
+        for c, camera in ((a, camera_a), (b, camera_b))
     )
-    shape_sigma_px = _both(
-        *(map_sigma_px(c.geometry.camera, c.map_covariance, GRID) for c in (a, b))
-    )
-    shape_sigma_rad = shape_sigma_px / camera_a.parameters[0]
+    sight_sigma_rad = np.hypot(of_a.sigma_arcsec, of_b.sigma_arcsec) * ARCSECOND_RAD
+    shape_sigma_rad = np.hypot(of_a.shape_sigma_arcsec, of_b.shape_sigma_arcsec) * ARCSECOND_RAD
     return Comparison(
         a=a,
         b=b,
@@ -133,12 +127,8 @@ def _sound_lines_of_sight(geometry: CameraGeometry) -> Floats:
     return directions
 
 
-def _both(a: Floats, b: Floats) -> Floats:
-    return np.asarray(np.hypot(a, b).reshape(GRID, GRID))
-
-
 def _map(moved: Floats, frame: CameraGeometry, sigma_rad: Floats) -> DifferenceMap:
-    """Map of (GRID^2, 3) differences of unit vectors in the star tracker frame."""
+    """Map of differences (GRID^2, 3) of unit vectors, star tracker frame; sigmas (GRID^2,)."""
     camera_from_star_tracker = Rotation.from_quat(frame.star_tracker_from_camera_xyzw).inv()
     in_camera = camera_from_star_tracker.apply(moved).reshape(GRID, GRID, 3)
     length_rad = np.linalg.norm(in_camera, axis=-1)
@@ -146,7 +136,7 @@ def _map(moved: Floats, frame: CameraGeometry, sigma_rad: Floats) -> DifferenceM
     return DifferenceMap(
         difference_px=in_camera[..., :2] * focal_px,
         length_px=length_rad * focal_px,
-        sigmas=_ratio(length_rad, sigma_rad),
+        sigmas=_ratio(length_rad, sigma_rad.reshape(GRID, GRID)),
     )
 
 

@@ -105,11 +105,17 @@ def limit_check(
     name: str,
     found: float | str,
     unit: str = '',
+    remedy: str = '',
 ) -> GateCheck:
-    """A value, or the reason why there is none, against the limit of an option."""
+    """
+    A value, or the reason why there is none, against the limit of an option.
+
+    The remedy is the note of a check that failed.
+    """
     limit = float(getattr(options, option))
     if isinstance(found, str):
         return GateCheck(name, option, math.nan, limit, unit, None, found)
     # The condition is the one that must hold, so that NaN fails: a comparison with it is false.
     passed = found >= limit if option.startswith('min_') else found <= limit
-    return GateCheck(name, option, float(found), limit, unit, bool(passed))
+    note = '' if passed else remedy
+    return GateCheck(name, option, float(found), limit, unit, bool(passed), note)

@@ -13,7 +13,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.records import MapCovariance
 
 _CHUNK = 4096  # pixels at a time: the derivatives by a field of 300 terms take 30 MB
-GRID = 25  # pixels a side over which the common rotation is taken
+GRID = 25  # pixels a side over which calibrations are compared and common rotations taken
 
 
 @dataclass(frozen=True)
@@ -79,20 +79,6 @@ def pixels_every(camera: CameraModel, step_px: float) -> Floats:
         np.arange(0.0, camera.width - 0.5, step_px), np.arange(0.0, camera.height - 0.5, step_px)
     )
     return np.stack([u.ravel(), v.ravel()], axis=-1)
-
-
-def shape_sigma_rad(camera: CameraModel, covariance: MapCovariance, pixels: Floats) -> Floats:
-    """1-sigma (n,) of the directions of pixels (n, 2), the common rotation removed, rad."""
-    found = Derivatives.at(camera, pixels)
-    return np.asarray(np.sqrt(found.variance_rad2(covariance, found.of_shape(camera))))
-
-
-def line_of_sight_sigma_rad(
-    camera: CameraModel, covariance: MapCovariance, pixels: Floats
-) -> Floats:
-    """1-sigma (n,) of the directions of pixels (n, 2) in the star tracker frame, rad."""
-    found = Derivatives.at(camera, pixels)
-    return np.asarray(np.sqrt(found.variance_rad2(covariance, found.J)))
 
 
 @dataclass(frozen=True)

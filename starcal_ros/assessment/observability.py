@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import line_of_sight_sigma_rad, shape_sigma_rad
+from starcal_ros.assessment.agreement import movement
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import (
     CameraModel,
     line_of_sight,
@@ -42,7 +42,6 @@ from starcal_ros.records import (
 )
 
 COVERAGE_ROWS, COVERAGE_COLS = 8, 10  # cells of 2 degrees on the paper's camera
-GRID = 25  # points along each side of the detector at which maps are compared
 MAP_ROWS, MAP_COLS = 16, 20  # enough for a polynomial surface of degree seven
 
 
@@ -242,47 +241,32 @@ def keep_most_informative(
     return replace(ensemble, images=images)
 
 
-def line_of_sight_sigma_arcsec(
-    camera: CameraModel, covariance: MapCovariance, columns: int = 25, rows: int = 20
-) -> Floats:
-    """
-    1-sigma (rows, columns) of the line of sight of pixels in the star tracker frame, arcsec.
-
-    Root of the summed variance of the two angles.
-    """
-    sigma_rad = line_of_sight_sigma_rad(camera, covariance, pixel_grid(camera, columns, rows))
-    return sigma_rad.reshape(rows, columns) / ARCSECOND_RAD
-
-
-def map_sigma_px(camera: CameraModel, covariance: MapCovariance, columns: int = 25) -> Floats:
-    """1-sigma (columns * columns,) of the shape of the map, in pixels at the centre."""
-    sigma_rad = shape_sigma_rad(camera, covariance, pixel_grid(camera, columns, columns))
-    return np.asarray(sigma_rad * camera.parameters[0])
+def map_sigma_px(camera: CameraModel, covariance: MapCovariance) -> Floats:
+    """1-sigma (GRID * GRID,) of the shape of the map, in pixels at the centre."""
+    table = line_of_sight_table(camera, covariance, pixel_grid(camera, GRID, GRID))
+    return np.asarray(table.shape_sigma_arcsec * ARCSECOND_RAD * camera.parameters[0])
 
 
 def map_error_px(found: CameraModel, true: CameraModel) -> float:
     """
     RMS difference over the detector of the lines of sight of two cameras, px at the focal length.
 
-    The turn of all lines of sight that brings the two closest is removed: a calibration puts it
-    into the alignment.  Infinite where a pixel has no line of sight: a distortion folds.
+    The rotation of all lines of sight that brings the two closest is removed: a calibration puts
+    it into the alignment.  Infinite where a pixel has no line of sight: a distortion folds.
     """
-    grid = pixel_grid(true, GRID, GRID)
-    of_found, of_true = line_of_sight(found, grid), line_of_sight(true, grid)
-    if not (np.isfinite(of_found).all() and np.isfinite(of_true).all()):
-        return math.inf
-    turn, _ = Rotation.align_vectors(of_true, of_found)
-    angle = np.linalg.norm(turn.apply(of_found) - of_true, axis=1)
-    return float(np.sqrt(np.mean(angle**2)) * true.parameters[0])
+    unturned = np.array([0.0, 0.0, 0.0, 1.0])
+    before, after = CameraGeometry(found, unturned), CameraGeometry(true, unturned)
+    _, left_px = movement(before, after, GRID, GRID)
+    return float(np.sqrt(np.mean(left_px**2)))
 
 
 def detector_maps(camera: CameraModel, covariance: MapCovariance, pixels: Floats) -> DetectorMaps:
     """Maps of a camera with a covariance that is from stars at pixels (n, 2)."""
-    grid = pixel_grid(camera, MAP_COLS, MAP_ROWS)
+    table = line_of_sight_table(camera, covariance, pixel_grid(camera, MAP_COLS, MAP_ROWS))
     return DetectorMaps(
         stars_in_cells(pixels, camera),
-        line_of_sight_sigma_arcsec(camera, covariance, MAP_COLS, MAP_ROWS),
-        shape_sigma_rad(camera, covariance, grid).reshape(MAP_ROWS, MAP_COLS) / ARCSECOND_RAD,
+        table.sigma_arcsec.reshape(MAP_ROWS, MAP_COLS),
+        table.shape_sigma_arcsec.reshape(MAP_ROWS, MAP_COLS),
     )
 
 

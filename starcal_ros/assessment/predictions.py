@@ -83,8 +83,10 @@ def predicted_residuals(estimate: Estimate) -> tuple[Floats, Floats]:
     follow = _followed(estimate, part)
     part, covariance = part[follow], covariance[np.ix_(follow, follow)]
     information = inverse(covariance)
+    of_image = np.zeros(estimate.posterior.own.shape[1])
+    of_image[estimate.layout.places['shape']] = estimate.posterior.shape_sigma_px**-2
     for rows, columns, own, residual in _images(estimate, part):
-        predicted = _predicted(estimate, columns, own, residual, information)
+        predicted = _predicted(columns, own, residual, information, np.diag(of_image))
         if predicted is not None:
             found[rows], expected[rows] = predicted
     return found, expected
@@ -135,19 +137,18 @@ def _images(estimate: Estimate, part: Indices) -> Iterator[tuple[Indices, Floats
 
 
 def _predicted(
-    estimate: Estimate, J: Floats, K: Floats, r: Floats, information: Floats
+    J: Floats, K: Floats, r: Floats, information: Floats, own_prior: Floats
 ) -> tuple[Floats, Floats] | None:
     """
     Squared residuals (n,) and their expected values of an image that the others predict.
 
-    None where the image alone determines something, or has too few stars for its rotation.
+    Derivatives J (2 n, d) by the shared unknowns and K (2 n, b) by those of the image, residuals r
+    (2 n,), N (d, d) and W (b, b) as at the top of this module; components u before v.  None where
+    the image alone determines something, or has too few stars for its rotation.
     """
     n = len(r) // 2
-    held = K.T @ K
-    shape = estimate.layout.places['shape']
-    held[shape, shape] += np.diag(1.0 / estimate.posterior.shape_sigma_px**2)
     try:
-        factor = cho_factor(held, lower=True)
+        factor = cho_factor(K.T @ K + own_prior, lower=True)
         GJ = J - K @ cho_solve(factor, K.T @ J)
         Gr = r - K @ cho_solve(factor, K.T @ r)
         without = cho_factor(information - J.T @ GJ)

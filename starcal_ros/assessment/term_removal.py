@@ -13,6 +13,7 @@ import dataclasses
 import numpy as np
 from scipy.special import chdtrc
 
+from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.levenberg_marquardt import covariance, NotObservable
@@ -43,8 +44,9 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
     solution = minimise(problem, state, measurements, least_gain=_LEAST_GAIN)
     cost = solution.normal.cost
     names = estimate.geometry.camera.parameter_names
-    sigmas = _sigmas(names, problem, solution)
-    alone = _significances(names, estimate)
+    sigmas = _sigmas(problem, solution)
+    variance = np.diag(estimate.covariance)[problem.free]
+    alone = _distances(problem, estimate.geometry.camera.parameters, variance)
     removals = [_removal(estimate, problem, solution.state, '', 0.0, 0.0, 0.0, negligible=True)]
     while sigmas:
         least = min(sigmas, key=lambda name: abs(sigmas[name]))
@@ -69,7 +71,7 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
                 negligible=bool(chdtrc(len(removals), rise) > _SIGNIFICANT),
             )
         )
-        sigmas = _sigmas(names, problem, solution)
+        sigmas = _sigmas(problem, solution)
     return tuple(removals)
 
 
@@ -96,23 +98,19 @@ def _held_at(names: tuple[str, ...], k: int, problem: Problem) -> float:
     return float(problem.prior_parameters[k]) if names[k] in _HELD_AT_PRIOR else 0.0
 
 
-def _significances(names: tuple[str, ...], estimate: Estimate) -> dict[str, float]:
-    """Distance of each free parameter from the value it would be held at, in all its sigma."""
-    found, problem = estimate.geometry.camera.parameters, estimate.problem
-    sigma = np.sqrt(np.diag(estimate.covariance))
+def _distances(problem: Problem, parameters: Floats, variance: Floats) -> dict[str, float]:
+    """Distance of each free parameter from the value it would be held at, in sigmas."""
+    names = problem.parameter_names
     return {
-        names[k]: float((found[k] - _held_at(names, k, problem)) / sigma[k]) for k in problem.free
+        names[k]: float((parameters[k] - _held_at(names, k, problem)) / np.sqrt(v))
+        for k, v in zip(problem.free, variance, strict=False)
     }
 
 
-def _sigmas(names: tuple[str, ...], problem: Problem, solution: Minimum) -> dict[str, float]:
-    """Distance of each free parameter from the value it would be held at, in its sigma."""
-    state = solution.state
+def _sigmas(problem: Problem, solution: Minimum) -> dict[str, float]:
+    """Distances of the parameters of a solution in its sigmas, the field and others known."""
     variance = np.diag(covariance(solution.normal)[0])
-    return {
-        names[i]: float((state.parameters[i] - _held_at(names, i, problem)) / np.sqrt(v))
-        for i, v in zip(problem.free, variance, strict=False)
-    }
+    return _distances(problem, solution.state.parameters, variance)
 
 
 def _of_prior(names: tuple[str, ...], before: Problem, after: Problem) -> float:

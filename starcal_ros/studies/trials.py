@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import alignment_difference_rad, chi_squared, lines_of_sight
-from starcal_ros.assessment.observability import GRID, line_of_sight_sigma_arcsec, map_sigma_px
-from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, project
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table
+from starcal_ros.assessment.observability import map_sigma_px
+from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
@@ -189,12 +190,13 @@ def _inverse(information: Floats) -> Floats:
 
 def map_bound_px(camera: CameraModel, covariance: MapCovariance) -> float:
     """Expected `map_error_px` for a covariance, RMS over the detector, px."""
-    return rms(map_sigma_px(camera, covariance, GRID))
+    return rms(map_sigma_px(camera, covariance))
 
 
 def pointing_bound_arcsec(camera: CameraModel, covariance: MapCovariance) -> float:
     """Expected `pointing_error_arcsec` for a covariance, RMS over the detector."""
-    return rms(line_of_sight_sigma_arcsec(camera, covariance, GRID, GRID))
+    table = line_of_sight_table(camera, covariance, pixel_grid(camera, GRID, GRID))
+    return rms(table.sigma_arcsec)
 
 
 def pointing_error_arcsec(found: CameraGeometry, true: CameraGeometry) -> float:

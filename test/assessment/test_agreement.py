@@ -3,60 +3,41 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.assessment.agreement import chi_squared, difference
-from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
+from starcal_ros.assessment.agreement import alignment_difference_rad, chi_squared
+from starcal_ros.camera import CameraModel
 from starcal_ros.records import CameraGeometry
-from starcal_ros.studies.trials import draw_star_field, StarField
-
-ESTIMATED = estimated_parameters(CalibrationOptions(), 'plumb_bob')
 
 
-def drawn(trial: int, images: int = 8) -> StarField:
-    return draw_star_field(np.random.default_rng([41, trial]), images, 60)
-
-
-def test_differences_of_random_calibrations_are_chi2() -> None:
-    """Two draws from one covariance: the mean of chi^2 is its freedom, of camera and of all."""
-    truth = drawn(0).truth
+def test_chi_squared_of_draws_has_the_rank_as_its_mean() -> None:
+    """Two draws from one covariance, with two numbers that are held."""
     random = np.random.default_rng(3)
     sigma = np.r_[0.5, 0.1, 0.5, 0.0, 0.0, 1e-4, 1e-3, 1e-2, 1e-5, 1e-5, [2e-5] * 3]
-    mixed = np.eye(13) + 0.3 * random.normal(size=(13, 13))
-    factor = sigma[:, None] * mixed
-    covariance = factor @ factor.T
-
-    def draw() -> CameraGeometry:
-        errors = factor @ random.normal(size=13)
-        camera = dataclasses.replace(
-            truth.camera, parameters=truth.camera.parameters + errors[:10]
-        )
-        turn = Rotation.from_quat(truth.star_tracker_from_camera_xyzw)
-        turn = turn * Rotation.from_rotvec(errors[10:])
-        return CameraGeometry(camera, turn.as_quat())
-
-    found = [difference(draw(), covariance, draw(), covariance, ESTIMATED) for _ in range(400)]
-    assert {(one.camera.degrees_of_freedom, one.total.degrees_of_freedom) for one in found} == {
-        (8, 11)
-    }
+    factor = sigma[:, None] * (np.eye(13) + 0.3 * random.normal(size=(13, 13)))
+    covariance = 2.0 * factor @ factor.T
+    draws = random.normal(size=(400, 2, 13)) @ factor.T
+    found = [chi_squared(after - before, covariance) for before, after in draws]
+    assert {one.degrees_of_freedom for one in found} == {11}
     # 400 draws know the mean of chi^2 with f degrees to sqrt(2 f / 400): four of these.
-    for values, freedom in (
-        ([one.camera.value for one in found], 8),
-        ([one.total.value for one in found], 11),
-    ):
-        assert abs(np.mean(values) - freedom) < 4 * np.sqrt(2 * freedom / 400)
-    assert np.median([one.total.p_value for one in found]) == pytest.approx(0.5, abs=0.1)
+    assert abs(np.mean([one.value for one in found]) - 11) < 4 * np.sqrt(2 * 11 / 400)
+    assert np.median([one.p_value for one in found]) == pytest.approx(0.5, abs=0.1)
 
 
 def test_what_is_not_estimated_is_not_compared() -> None:
-    geometry = drawn(0).truth
-    held = difference(geometry, np.zeros((13, 13)), geometry, np.zeros((13, 13)), ())
-    for found in (held.camera, held.total):
-        assert (found.degrees_of_freedom, found.p_value) == (0, 1.0)
+    found = chi_squared(np.ones(13), np.zeros((13, 13)))
+    assert (found.degrees_of_freedom, found.p_value) == (0, 1.0)
+
+
+def test_an_alignment_differs_by_the_passive_rotation_of_the_camera() -> None:
+    camera = CameraModel(640, 512, np.array([1800.0, 0.0, 1800.0, 320.0, 255.0, *[0.0] * 5]))
+    before = Rotation.from_euler('zyx', [-91.0, -28.0, 3.0], degrees=True)
+    turn = [2e-5, -1e-5, 4e-5]
+    after = before * Rotation.from_rotvec(turn)
+    b, a = (CameraGeometry(camera, one.as_quat()) for one in (before, after))
+    np.testing.assert_allclose(alignment_difference_rad(a, b), turn, atol=1e-14)
 
 
 def test_chi_squared_leaves_out_what_has_no_variance_or_is_singular() -> None:

@@ -153,6 +153,17 @@ def test_known_unknowns_leave_their_schur_complement(names: list[str]) -> None:
     assert budget._with(bare, T, in_root)[0] == pytest.approx(np.trace(left), rel=1e-6)
 
 
+def test_known_unknowns_do_not_depend_on_their_units() -> None:
+    found, _ = estimate(RAM)
+    errors = found.posterior.errors
+    assert errors is not None
+    scale = np.ones((len(errors.root), 1))
+    scale[found.layout.places['velocity'].start] = 1e-24
+    rescaled = dataclasses.replace(errors, root=errors.root * scale)
+    T, again = (budget._known(one, found, ['velocity']) for one in (errors, rescaled))
+    np.testing.assert_allclose(again @ again.T, T @ T.T, atol=1e-9)
+
+
 def test_known_shapes_add_the_information_that_they_hide() -> None:
     breathing = World(6, breathing=3e-4)
     found, _ = estimate(breathing)

@@ -14,13 +14,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.assessment import comparison
-from starcal_ros.assessment.comparison import compare, GRID
+from starcal_ros.assessment.comparison import compare
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.cli import main
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.formats.products.calibration_json import read_calibration, write_calibration
-from starcal_ros.records import Calibration
+from starcal_ros.records import Calibration, TemperatureTerms
 from starcal_ros.report.detector_figures import write_comparison
 
 
@@ -92,6 +93,40 @@ def test_a_turn_is_taken_off(tiny: Calibration) -> None:
     expected_px = 100 * ARCSECOND_RAD * tiny.geometry.camera.parameters[0]
     assert found.before.length_px[middle, middle] == pytest.approx(expected_px, rel=1e-3)
     assert found.after.length_px.max() < 1e-9
+
+
+def test_sigmas_of_the_maps_are_those_of_the_table(tiny: Calibration) -> None:
+    """Angles over angles, also where B has another focal length."""
+    lens = dataclasses.replace(tiny.geometry.camera, field=None)
+    geometry = dataclasses.replace(tiny.geometry, camera=lens)
+    bare = dataclasses.replace(tiny, field=None, geometry=geometry)
+    certain = dataclasses.replace(bare, covariance=np.zeros((13, 13)))
+    longer = moved(bare, (2e-5, 0.0, 0.0), fx=90.0, fy=90.0)
+    found = compare(certain, longer)
+    camera = longer.geometry.camera
+    table = line_of_sight_table(camera, longer.map_covariance, pixel_grid(camera, GRID, GRID))
+    focal_px = certain.geometry.camera.parameters[0]
+    for part, sigma_arcsec in (
+        (found.before, table.sigma_arcsec),
+        (found.after, table.shape_sigma_arcsec),
+    ):
+        length_rad = part.length_px.ravel() / focal_px
+        expected = length_rad / (sigma_arcsec * ARCSECOND_RAD)
+        np.testing.assert_allclose(part.sigmas.ravel(), expected, rtol=1e-9)
+    made = comparison.content(found)
+    expected_arcsec = found.difference[-3:] / ARCSECOND_RAD
+    assert made['alignment_arcsec'] == pytest.approx(expected_arcsec, rel=1e-12)
+
+
+def test_a_reference_temperature_of_one_alone_is_noted(tiny: Calibration) -> None:
+    terms = TemperatureTerms(20.0, (), (), (), ())
+    at_20, at_25 = (
+        dataclasses.replace(tiny, temperature=dataclasses.replace(terms, reference_degc=degc))
+        for degc in (20.0, 25.0)
+    )
+    for a, b, noted in ((tiny, at_20, True), (at_20, at_20, False), (at_20, at_25, True)):
+        notes = compare(a, b).notes
+        assert any('different temperatures' in note for note in notes) is noted
 
 
 @pytest.mark.slow

@@ -305,6 +305,18 @@ def test_a_missing_comparison_is_no_reason() -> None:
     assert step.found_text == '' and step.limit_text == '0 px'
 
 
+def test_an_active_calibration_of_another_lens_model_is_not_compared() -> None:
+    rational = CameraModel(
+        640, 512, np.r_[CAMERA.parameters, 0.0, 0.0, 0.0], 'rational_polynomial'
+    )
+    geometry = CameraGeometry(rational, PRIOR.star_tracker_from_camera_xyzw)
+    active = dataclasses.replace(GOOD, geometry=geometry, covariance=np.zeros((16, 16)))
+    by_option = checks(GOOD, GateOptions(), active)
+    for option in ('max_step_px', 'max_step_rotation_deg'):
+        assert by_option[option].passed is None
+        assert by_option[option].note.endswith('has the lens model rational_polynomial')
+
+
 def test_a_calibration_without_maps_cannot_be_judged() -> None:
     with pytest.raises(ValueError, match='needs its detector maps'):
         judged(dataclasses.replace(GOOD, maps=None), GateOptions())

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.assessment.observability import (
     coverage,
     ensemble_status,
     image_information,
     keep_most_informative,
-    line_of_sight_sigma_arcsec,
     map_sigma_px,
     predicted_sigma,
+    weakest_direction,
 )
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
@@ -181,6 +182,11 @@ def test_every_corner_of_the_detector_has_its_cell() -> None:
     assert found.sum() == 4
 
 
+def sight_sigma_arcsec(covariance: np.ndarray, columns: int, rows: int) -> np.ndarray:
+    pixels = pixel_grid(TRUTH.camera, columns, rows)
+    return line_of_sight_table(TRUTH.camera, MapCovariance(covariance), pixels).sigma_arcsec
+
+
 def sampled_directions(samples: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """
     Lines of sight (k, n, 3) of a 5-column grid in the star tracker frame, and at the mean (n, 3).
@@ -209,10 +215,9 @@ def sampled_directions(samples: int, rows: int) -> tuple[np.ndarray, np.ndarray]
 def test_the_line_of_sight_map_is_what_the_covariance_scatters() -> None:
     found, mean = sampled_directions(2000, 4)
     scatter_rad = np.sqrt(((found - mean) ** 2).sum(axis=2).mean(axis=0))
-    expected = line_of_sight_sigma_arcsec(TRUTH.camera, MapCovariance(covariance()), 5, 4)
-    assert expected.shape == (4, 5)
+    expected = sight_sigma_arcsec(covariance(), 5, 4)
     # 2000 draws of two angles: 1.6 % each; the worst of 20 pixels within four of those.
-    np.testing.assert_allclose(scatter_rad / ARCSECOND_RAD, expected.ravel(), rtol=0.065)
+    np.testing.assert_allclose(scatter_rad / ARCSECOND_RAD, expected, rtol=0.065)
 
 
 def test_the_map_sigma_is_the_scatter_that_a_common_turn_leaves() -> None:
@@ -224,7 +229,10 @@ def test_the_map_sigma_is_the_scatter_that_a_common_turn_leaves() -> None:
     fx = TRUTH.camera.parameters[0]
     scatter_px = fx * np.sqrt(np.mean(left))
     # Eight modes of unlike strength in 500 draws: 3 % or so.
-    expected_px = np.sqrt(np.mean(map_sigma_px(TRUTH.camera, MapCovariance(covariance()), 5) ** 2))
+    pixels = pixel_grid(TRUTH.camera, 5, 5)
+    table = line_of_sight_table(TRUTH.camera, MapCovariance(covariance()), pixels)
+    sigma_rad = table.shape_sigma_arcsec * ARCSECOND_RAD
+    expected_px = fx * np.sqrt(np.mean(sigma_rad**2))
     assert scatter_px == pytest.approx(expected_px, rel=0.10)
 
 
@@ -242,16 +250,16 @@ def test_the_map_does_not_mind_what_the_alignment_takes_up() -> None:
     # The whole line of sight does mind, one way or the other: 20 px are 2300 arcsec.
     C[3, 11] = C[11, 3] = 0.0
     C[11, 11] = 0.0
-    whole = line_of_sight_sigma_arcsec(TRUTH.camera, MapCovariance(C))
+    whole = sight_sigma_arcsec(C, 25, 20)
     np.testing.assert_allclose(whole, 20 / fx / ARCSECOND_RAD, rtol=0.1)
 
 
 def test_an_alignment_alone_is_seen_by_each_line_of_sight_but_its_own_axis() -> None:
     C = np.zeros((13, 13))
     C[12, 12] = (100 * ARCSECOND_RAD) ** 2  # roll
-    found = line_of_sight_sigma_arcsec(TRUTH.camera, MapCovariance(C), 3, 3)
+    found = sight_sigma_arcsec(C, 3, 3)
     e = line_of_sight(TRUTH.camera, pixel_grid(TRUTH.camera, 3, 3))
-    expected = 100 * np.hypot(e[:, 0], e[:, 1]).reshape(3, 3)
+    expected = 100 * np.hypot(e[:, 0], e[:, 1])
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
@@ -273,6 +281,35 @@ def test_the_most_informative_images_are_kept() -> None:
     before, after = (predicted_sigma(e, PRIOR, OPTIONS) for e in (everything, kept))
     assert (after <= 1.06 * before)[:8].all()
     assert min(len(image) for image in kept.images) > 100
+
+
+def test_the_image_that_is_left_out_is_worth_least() -> None:
+    """By the definition, in units in which all unknowns are of one size."""
+    images = tuple(
+        one.select(np.arange(len(one)) % step == 0)
+        for one, step in zip(ensemble().images, (9, 6, 8, 5, 7, 9, 6, 5, 8, 7), strict=True)
+    )
+    information = image_information(images, PRIOR, OPTIONS)
+    left = list(range(len(images)))
+    while len(left) > 4:
+        total = information[left].sum(axis=0)
+        unit = 1.0 / np.sqrt(np.diag(total))
+        scaled = information[left] * np.outer(unit, unit)
+        worth = [np.trace(np.linalg.solve(scaled.sum(axis=0), one)) for one in scaled]
+        del left[int(np.argmin(worth))]
+    limit = dataclasses.replace(OPTIONS, max_images=4)
+    kept = keep_most_informative(Ensemble(images), PRIOR, limit)
+    assert [one.time_ns for one in kept.images] == [images[k].time_ns for k in left]
+
+
+def test_the_weakest_direction_is_named_with_its_loss() -> None:
+    C = np.array([[4.0, -5.7, 0.0], [-5.7, 9.0, 0.0], [0.0, 0.0, 1.0]])  # correlation -0.95
+    singular, text = weakest_direction(np.linalg.inv(C), ('fx', 'cx', 'k1'))
+    np.testing.assert_allclose(singular, np.sqrt([1.95, 1.0, 0.05]))
+    assert 'fx (' in text and 'cx (' in text and 'k1' not in text
+    assert 'nearly indistinguishable: their combination has 4 times the sigma' in text
+    _, alone = weakest_direction(np.diag([1.0, 2.0]), ('fx', 'cx'))
+    assert alone.endswith('(+1.00), uncorrelated with the others')
 
 
 def test_an_ensemble_within_its_limit_is_not_touched() -> None:

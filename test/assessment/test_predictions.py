@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment import predictions as predictions_module
 from starcal_ros.assessment.predictions import predicted_residuals, predictions
 from starcal_ros.camera import line_of_sight, project
 from starcal_ros.estimation.star_equations import whitening
@@ -75,6 +76,22 @@ def test_the_linear_step_is_the_calibration_without_the_image() -> None:
         np.testing.assert_allclose(np.sqrt(squared[inside]), np.sqrt(exact), atol=0.1)
     # Two a star, less the own rotation of five images, more the calibration of four.
     assert abs(expected[found.kept].mean() - 2.0) < 0.03
+
+
+def test_an_image_is_predicted_by_the_formula_of_the_module() -> None:
+    """Dense inverses on random numbers; the residuals have a part that the image follows."""
+    rng = np.random.default_rng(11)
+    J, K, r = rng.normal(size=(40, 5)), rng.normal(size=(40, 6)), rng.normal(size=40)
+    W = np.diag([0.0, 0.0, 0.0, 30.0, 40.0, 50.0])
+    G = np.eye(40) - K @ np.linalg.inv(K.T @ K + W) @ K.T
+    N = J.T @ G @ J + np.diag([2.0, 3.0, 5.0, 7.0, 11.0])
+    predicted = predictions_module._predicted(J, K, r, N, W)
+    assert predicted is not None
+    by_others = np.linalg.inv(N - J.T @ G @ J)
+    left = G @ r + G @ J @ by_others @ J.T @ G @ r
+    variance = np.diag(G + G @ J @ by_others @ J.T @ G)
+    for found, expected in zip(predicted, (left**2, variance), strict=True):
+        np.testing.assert_allclose(found, expected[:20] + expected[20:], rtol=1e-10)
 
 
 def test_a_sound_camera_is_as_predicted_in_every_part() -> None:

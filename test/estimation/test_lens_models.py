@@ -11,8 +11,9 @@ from random_pointings import displaced, estimated, of_random_pointings, WIDTH  #
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.observability import line_of_sight_sigma_arcsec, map_error_px
-from starcal_ros.camera import CameraModel, project_jacobians
+from starcal_ros.assessment.lookup import line_of_sight_table
+from starcal_ros.assessment.observability import map_error_px
+from starcal_ros.camera import CameraModel, pixel_grid, project_jacobians
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
@@ -115,7 +116,9 @@ def test_errors_are_those_of_the_reported_covariance(model: str) -> None:
         )
         squares, count = squares + float(whitened @ whitened), count + len(free)
         camera = found.geometry.camera
-        assert (line_of_sight_sigma_arcsec(camera, found.map_covariance) > 0).all()
+        pixels = pixel_grid(camera, 25, 20)
+        table = line_of_sight_table(camera, found.map_covariance, pixels)
+        assert (table.sigma_arcsec > 0).all()
     # Chi^2 with `count` degrees of freedom, 5 sigma on either side.
     assert abs(squares / count - 1.0) < 5 * np.sqrt(2 / count)
 
