@@ -26,7 +26,7 @@ from starcal_ros.errors import IngestError
 from starcal_ros.formats.images.file_header import has_surplus, png_header, tiff_header
 from starcal_ros.formats.images.header_times import Card, middle_of_exposure
 from starcal_ros.formats.images.time_systems import TimeError
-from starcal_ros.formats.messages.image_messages import of_mosaic, plane
+from starcal_ros.formats.messages.image_messages import CHANNELS, of_mosaic, plane
 from starcal_ros.untrusted import read_bytes
 
 FITS_ENDINGS = ('.fits', '.fit', '.fts', '.fits.gz', '.fit.gz', '.fits.fz', '.fz')
@@ -129,8 +129,8 @@ def look(path: Path, options: ImageOptions) -> ImageFile:
         float(values.max(where=finite, initial=some)),
         # The median step between neighbours is 0.954 sigma for white noise.
         float(np.nanmedian(steps)) / 0.954,
-        _number(header, 'SATURATE'),
-        _number(header, options.temperature_key) if options.temperature_key else np.nan,
+        number(header, 'SATURATE'),
+        number(header, options.temperature_key),
     )
 
 
@@ -185,13 +185,12 @@ def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str,
         values, header = read_fits(path, options.hdu)
     else:
         values, header = _read_picture(path), {}
-    if values.ndim == _RGB and values.shape[2] == _RGB:
-        if options.channel not in ('red', 'green', 'blue'):
-            raise IngestError(f'{path}: a colour image: choose --channel red, green or blue')
+    is_colour = values.ndim == _RGB and values.shape[2] == _RGB
+    if (is_colour or options.bayer) and options.channel not in CHANNELS:
+        raise IngestError(f'{path}: a colour image: choose --channel red, green or blue')
+    if is_colour:
         values = plane(values, 'rgb', options.channel)
     elif options.bayer:
-        if options.channel not in ('red', 'green', 'blue'):
-            raise IngestError(f'{path}: of a mosaic choose --channel red, green or blue')
         values = of_mosaic(values, options.bayer.lower(), options.channel)
     if values.ndim != _GREY or min(values.shape) < 2:
         raise IngestError(
@@ -278,13 +277,32 @@ def read_values(path: Path) -> NDArray[Any]:
     return _read(path, ImageOptions())[0]
 
 
-def _read_picture(path: Path) -> NDArray[Any]:
+def content_of(path: Path) -> bytes:
+    """Content of an image file; raises IngestError when it cannot be read."""
     try:
-        content = read_bytes(path, MOST_BYTES)
+        return read_bytes(path, MOST_BYTES)
     except OSError as error:
         raise IngestError(f'{path}: cannot be read: {error.strerror}') from error
     except ValueError as error:
         raise IngestError(f'{path}: {error}') from error
+
+
+def decoded(path: Path, content: bytes) -> NDArray[Any]:
+    """
+    Values of the content of an image file in the depth and orientation of the file; colour is BGR.
+
+    Raises IngestError when OpenCV cannot decode it.
+    """
+    values = None
+    with contextlib.suppress(cv2.error):
+        values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if values is None:
+        raise IngestError(f'{path}: damaged, or of a kind that OpenCV does not read')
+    return np.asarray(values)
+
+
+def _read_picture(path: Path) -> NDArray[Any]:
+    content = content_of(path)
     header = png_header(content) or tiff_header(content)
     if header is None:
         raise IngestError(f'{path}: not an image in FITS (by its ending), TIFF or PNG')
@@ -293,14 +311,8 @@ def _read_picture(path: Path) -> NDArray[Any]:
         raise IngestError(f'{path}: claims {header.width} x {header.height} pixels')
     if png_header(content) and has_surplus(content, header):
         raise IngestError(f'{path}: inflates to far more than its pixels')
-    values = None
-    with contextlib.suppress(cv2.error):
-        values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    if values is None:
-        raise IngestError(f'{path}: damaged, or of a kind that OpenCV does not read')
-    if values.ndim == _RGB:
-        values = values[:, :, 2::-1]  # OpenCV has BGR, with alpha last
-    return np.asarray(values)
+    values = decoded(path, content)
+    return values[:, :, 2::-1] if values.ndim == _RGB else values  # BGR, with alpha last
 
 
 def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> int:
@@ -316,6 +328,7 @@ def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> i
         raise IngestError(f'{path}: {error}') from error
 
 
-def _number(header: Mapping[str, Card], key: str) -> float:
-    value = header[key].value if key in header else None
-    return float(value) if isinstance(value, (int, float)) else np.nan
+def number(header: Mapping[str, Card], *keys: str) -> float:
+    """Value of the first of the keywords that has a number; NaN: none has."""
+    values = (header[key].value for key in keys if key in header)
+    return next((float(one) for one in values if isinstance(one, (int, float))), math.nan)
