@@ -68,7 +68,9 @@ def typestore_of(type_name: str, definition: str) -> Typestore:
     # The exceptions of a text that is no definition have no common base class.
     except Exception as error:
         if type_name not in typestore().types:
-            raise BagError(f'{type_name:.60}: its definition in the bag: {error!s:.100}') from error
+            raise BagError(
+                f'{type_name:.60}: its definition in the bag: {error!s:.100}'
+            ) from error
         return typestore()
 
 

@@ -39,7 +39,9 @@ def test_others_are_refused(definition: str, why: str) -> None:
     with pytest.raises(Exception, match=why):
         typestore_with(OBSERVATIONS_TYPE, definition)
     assert typestore_of(OBSERVATIONS_TYPE, definition) is typestore()
-    with pytest.raises(BagError, match='starcal/msg/Other: its definition in the bag: longer than'):
+    with pytest.raises(
+        BagError, match='starcal/msg/Other: its definition in the bag: longer than'
+    ):
         typestore_of('starcal/msg/Other', 'int8 a\n' * 100_000)
 
 
