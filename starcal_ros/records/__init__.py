@@ -10,7 +10,6 @@ JSON and messages.
 from starcal_ros.records.calibration import (
     ALIGNMENT_NAMES,
     Calibration,
-    calibration_parameter_names,
     CameraGeometry,
     check_calibration,
     check_drawable,

@@ -21,11 +21,6 @@ from starcal_ros.records.residual_field import MapCovariance, ResidualField
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
 
 
-def calibration_parameter_names(camera: CameraModel) -> tuple[str, ...]:
-    """Names of the parameters of a camera, and of the alignment angles."""
-    return camera.parameter_names + ALIGNMENT_NAMES
-
-
 @dataclass(frozen=True)
 class CameraGeometry:
     """

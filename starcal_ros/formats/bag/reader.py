@@ -200,17 +200,11 @@ def read_images(
     topic: str,
     stamp_offset_s: float = 0.0,
     on_damage: Damage = log_damage,
-    size: tuple[int, int] | None = None,
     channel: str = '',
 ) -> Iterator[Image | StarObservations]:
-    """
-    Images of a topic; an image that cannot be decoded becomes refused observations.
-
-    So does a compressed image of another ``size`` (width, height), where one is given.
-    ``channel`` is the colour that is taken of colour images (`image_from_message`).
-    """
+    """Images of a topic, as `image_of` reads them."""
     for raw in read_raw(paths, [topic], on_damage):
-        yield image_of(raw, stamp_offset_s, size, channel)
+        yield image_of(raw, stamp_offset_s, channel=channel)
 
 
 def image_of(
@@ -228,8 +222,7 @@ def image_of(
     try:
         message = decode(raw)
     except BagError as error:
-        log_time_ns = nearest_stamp_ns(raw.log_time_ns)
-        return refused_image(log_time_ns, 0, 0, 'bad_layout', str(error))
+        return refused_image(nearest_stamp_ns(raw.log_time_ns), 0, 0, 'bad_layout', str(error))
     try:
         return image_from_message(message, stamp_offset_s, size, channel)
     except ImageRefused as refused:
@@ -246,8 +239,7 @@ def read_observations(
     """
     for raw in read_raw(paths, [topic], on_damage):
         try:
-            message = decode(raw)
-            yield checked_observations(message)
+            yield checked_observations(decode(raw))
         except (AttributeError, ValueError) as error:
             raise BagError(f'{topic}: not readable as observations: {error}') from error
 

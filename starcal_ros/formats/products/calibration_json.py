@@ -24,14 +24,19 @@ from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_json, write_atomically
 from starcal_ros.record_codec import json_object, read_record
 from starcal_ros.record_fields import Count, Finite, Quaternion
-from starcal_ros.records import ALIGNMENT_NAMES, Calibration, CameraGeometry, check_calibration
+from starcal_ros.records import (
+    ALIGNMENT_NAMES,
+    Calibration,
+    CameraGeometry,
+    check_calibration,
+    check_drawable,
+)
 from starcal_ros.untrusted import json_value, shown
 
 SCHEMA = 1
 _LONGEST_REASON = 500  # characters: a text of the file may be in it
 CALIBRATION_FILE = 'calibration.json'
 
-_UNIT_TOLERANCE = 1e-6  # of the length of a quaternion: rounding to a text leaves less
 _INTRINSICS = 5  # the first parameters of every camera model: fx, skew, fy, cx, cy
 _REPLACED = ('geometry', 'parent_frame', 'child_frame')  # by the keys of `_Published`
 
@@ -164,11 +169,11 @@ def prior_of(calibration: Calibration) -> CameraGeometry | None:
         numbers = np.array(json_value(calibration.provenance['prior']), np.float64)
         if numbers.shape != (count + 4,):
             return None
-        if not abs(np.linalg.norm(numbers[count:]) - 1.0) < _UNIT_TOLERANCE:
-            return None
-        prior = dataclasses.replace(camera, parameters=numbers[:count])
-        check_plausible(prior)
-        return CameraGeometry(prior, numbers[count:])
+        camera = dataclasses.replace(camera, parameters=numbers[:count])
+        check_plausible(camera)
+        prior = CameraGeometry(camera, numbers[count:])
+        check_drawable(prior)
+        return prior
     except (KeyError, ValueError, TypeError, OverflowError):
         return None
 
