@@ -10,6 +10,9 @@ The tool prints it on stderr and ends with status 2, a node logs it::
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import contextlib
+
 
 class StarcalError(Exception):
     """Base class of the exceptions that starcal raises for bad input."""
@@ -63,3 +66,14 @@ class ImageRefused(StarcalError):
 
 class TooFewObservations(StarcalError):
     """The ensemble does not suffice for the requested calibration; the text names the shortage."""
+
+
+@contextlib.contextmanager
+def errors_as(kind: type[StarcalError], place: object, done: str = 'read') -> Iterator[None]:
+    """Raise an OSError or ValueError of the block as another kind that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f'{place}: cannot be {done}: {error.strerror or error}') from error
+    except ValueError as error:
+        raise kind(f'{place}: {error}') from error

@@ -16,7 +16,7 @@ import difflib
 from pathlib import Path
 from typing import Any, TypeVar
 
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import errors_as, OptionError
 from starcal_ros.record_codec import nearest, read_value
 from starcal_ros.record_fields import FieldType, MOST
 from starcal_ros.untrusted import PARAMETER_BYTES, read_text, shown, yaml_value
@@ -235,12 +235,8 @@ def parameter_sections(path: Path) -> dict[str, object]:
 
     Raises OptionError if the file cannot be read or is not a ROS parameter file.
     """
-    try:
+    with errors_as(OptionError, path):
         content = yaml_value(read_text(path, PARAMETER_BYTES))
-    except OSError as error:
-        raise OptionError(f'{path}: cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise OptionError(f'{path}: {error}') from error
     if not isinstance(content, dict):
         raise OptionError(f'{path}: not a ROS parameter file (no node sections)')
     sections = _flat(content, '')

@@ -16,7 +16,7 @@ import logging
 from pathlib import Path
 import re
 
-from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.errors import BagError, errors_as, ImageRefused
 from starcal_ros.formats.bag.mcap_reader import (
     Damage,
     MAGIC,
@@ -94,11 +94,8 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
         else:
             raise BagError(f'{path}: no such bag')
     for file in files:
-        try:
-            with file.open('rb') as stream:
-                magic = stream.read(_MAGIC_BYTES)
-        except OSError as error:
-            raise BagError(f'{file}: cannot be read: {error.strerror}') from error
+        with errors_as(BagError, file), file.open('rb') as stream:
+            magic = stream.read(_MAGIC_BYTES)
         if not magic.startswith(MAGIC):
             other = _how_to_convert(file, magic) or _how_to_import(file.parent, file)
             raise BagError(f'{file}: not an MCAP bag{other}')

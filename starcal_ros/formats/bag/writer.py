@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 import yaml
 
 from starcal_ros.arrays import Floats
-from starcal_ros.errors import BagError
+from starcal_ros.errors import BagError, errors_as
 from starcal_ros.files import replacing
 from starcal_ros.formats.bag.typestore import described, make_message, typestore
 from starcal_ros.formats.messages import telemetry, types
@@ -63,12 +63,10 @@ class BagWriter:
 
     def __enter__(self) -> Self:
         """Open a file beside the place of the bag."""
-        try:
+        with errors_as(BagError, self.file, 'written'):
             self.file.parent.mkdir(parents=True, exist_ok=True)
             self._replacing = replacing(self.file)
             stream = self._replacing.__enter__()
-        except OSError as error:
-            raise BagError(f'{self.file}: cannot be written: {error.strerror}') from error
         self._start(stream)
         return self
 
@@ -97,15 +95,13 @@ class BagWriter:
         if kind is not None:
             self._replacing.__exit__(kind, error, traceback)
             return
-        try:
+        with errors_as(BagError, self.file, 'written'):
             with contextlib.ExitStack() as stack:
                 stack.push(self._replacing)
                 self._writer.finish()
             if self._metadata_file is not None:
                 with replacing(self._metadata_file) as file:
                     file.write(self._metadata().encode())
-        except OSError as failure:
-            raise BagError(f'{self.file}: cannot be written: {failure.strerror}') from failure
 
     def write_image(self, topic: str, image: Image, frame_id: str) -> None:
         """Write a sensor_msgs/Image."""
@@ -149,12 +145,10 @@ class BagWriter:
             raise BagError(f'{topic}: a {type_name} cannot be written: {error}') from error
         # A recording time is not negative; the stamp in the message is written as it is.
         time_ns = max(time_ns, 0)
-        try:
+        with errors_as(BagError, self.file, 'written'):
             self._writer.add_message(
                 number, time_ns, data, publish_time=time_ns, sequence=self._counts[topic]
             )
-        except OSError as error:
-            raise BagError(f'{self.file}: cannot be written: {error.strerror}') from error
         self._counts[topic] += 1
         self._first_ns = time_ns if self._first_ns is None else min(self._first_ns, time_ns)
         self._last_ns = max(self._last_ns, time_ns)

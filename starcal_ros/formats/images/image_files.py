@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
-from starcal_ros.errors import IngestError
+from starcal_ros.errors import errors_as, IngestError
 from starcal_ros.formats.images.file_header import has_surplus, png_header, tiff_header
 from starcal_ros.formats.images.header_times import Card, middle_of_exposure
 from starcal_ros.formats.images.time_systems import TimeError
@@ -279,12 +279,8 @@ def read_values(path: Path) -> NDArray[Any]:
 
 def content_of(path: Path) -> bytes:
     """Content of an image file; raises IngestError when it cannot be read."""
-    try:
+    with errors_as(IngestError, path):
         return read_bytes(path, MOST_BYTES)
-    except OSError as error:
-        raise IngestError(f'{path}: cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise IngestError(f'{path}: {error}') from error
 
 
 def decoded(path: Path, content: bytes) -> NDArray[Any]:

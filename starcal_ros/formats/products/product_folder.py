@@ -17,7 +17,7 @@ import zipfile
 import numpy as np
 
 from starcal_ros.assessment.residuals import Residuals
-from starcal_ros.errors import ProductError
+from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, write_calibration
 from starcal_ros.formats.products.camera_yaml import (
     CAMERA_INFO_FILE,
@@ -107,20 +107,17 @@ def read_residuals(path: Path) -> Residuals:
 
     Raises ProductError naming the file and the array that is missing or wrong.
     """
+    with errors_as(ProductError, path):
+        content = path.read_bytes()  # whole: numpy leaves a file open that is no archive
     try:
-        # Read whole first: numpy leaves a file open that is no archive.
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             columns = dict(archive)
-    except OSError as error:
-        raise ProductError(f'{path}: cannot be read: {error.strerror or error}') from error
     except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
         raise ProductError(f'{path}: not a NumPy archive: {error}') from error
     if not np.array_equal(columns.pop('format', None), _RESIDUALS_FORMAT):
         raise ProductError(f'{path}: not of format {_RESIDUALS_FORMAT}')
-    try:
+    with errors_as(ProductError, path):
         residuals = read_record(Residuals, columns)
-    except ValueError as error:
-        raise ProductError(f'{path}: {error}') from error
     if (residuals.image >= len(residuals.image_time_ns)).any():
         raise ProductError(f'{path}: image names images that are not there')
     return residuals
@@ -147,11 +144,9 @@ def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:
     """
     content = {'calibrated': False, **json_object(record)}
     write_atomically(folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n')
-    try:
-        for name in (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, REPORT_FILE):
+    for name in (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, REPORT_FILE):
+        with errors_as(ProductError, folder / name, 'removed'):
             (folder / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise ProductError(f'{folder / name}: cannot be removed: {error.strerror}') from error
 
 
 def read_not_calibrated(folder: Path) -> NotCalibrated | None:
