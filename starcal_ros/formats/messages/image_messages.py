@@ -183,7 +183,7 @@ def image_from_message(
 def refused_from_message(
     message: Message, stamp_offset_s: float, refused: ImageRefused
 ) -> StarObservations:
-    """Return the observations of an image message that cannot be used."""
+    """Return the record of a message of an image, or of its stars, that cannot be used."""
     time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
     return refused_image(
         nearest_stamp_ns(time_ns),
