@@ -60,11 +60,7 @@ def option(
 
 
 def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
-    """
-    Value converted to the type of the field.
-
-    Raises OptionError with the option, the value and the expected type or range.
-    """
+    """Value in the type of its option; raises OptionError with what is allowed."""
     meta, default = field.metadata, field.default
     low, high = meta['low'], meta['high']
     kind = FieldType(
@@ -158,11 +154,7 @@ def unknown_option(name: str, known: Iterable[str]) -> str:
 
 
 def option_fields(*kinds: type[Any]) -> list[dataclasses.Field[Any]]:
-    """
-    Fields of dataclasses that were made with `option`.
-
-    The other fields of such a dataclass are constants in flight, which studies vary.
-    """
+    """Fields made with `option`; the others are constants in flight, which studies vary."""
     return [f for kind in kinds for f in dataclasses.fields(kind) if 'description' in f.metadata]
 
 
@@ -177,11 +169,7 @@ def names_of(*option_classes: type[Any]) -> set[str]:
 
 
 def from_mapping(cls: type[OptionsT], values: Mapping[str, object]) -> OptionsT:
-    """
-    Options dataclass from the entries of a mapping that match its fields.
-
-    Raises OptionError if a value has the wrong type or is out of range.
-    """
+    """Options from the entries of a mapping that match the fields; raises OptionError."""
     given = [field for field in option_fields(cls) if field.name in values]
     return cls(**{field.name: check_value(field, values[field.name]) for field in given})
 

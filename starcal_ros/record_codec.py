@@ -129,11 +129,7 @@ def read_value(kind: FieldType, value: object, path: str, sizes: dict[str, int])
 def check_shape(
     found: tuple[int, ...], dimensions: tuple[int | str, ...], path: str, sizes: dict[str, int]
 ) -> None:
-    """
-    Compare a shape with its description; ``sizes`` of the named dimensions grow.
-
-    Raises ValueError with the path of the field, when they differ.
-    """
+    """Check a shape; ``sizes`` of named dimensions grow.  Raises ValueError with the path."""
     expected = tuple(
         one if isinstance(one, int) else sizes.setdefault(one, size) if one else size
         for one, size in zip(dimensions, found, strict=False)

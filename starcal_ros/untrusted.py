@@ -82,12 +82,7 @@ def read_bytes(path: Path, most_bytes: int, follow_links: bool = True) -> bytes:
 
 @contextlib.contextmanager
 def regular_file(path: Path, follow_links: bool = True) -> Iterator[IO[bytes]]:
-    """
-    A regular file, open to read; never waits, as for a pipe.
-
-    Raises OSError when the file cannot be opened. Raises ValueError in one line, for a file that
-    is not regular.
-    """
+    """A regular file, open to read; never waits.  Raises OSError, or ValueError in one line."""
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow_links else os.O_NOFOLLOW)
     try:
         number = os.open(path, flags)
@@ -100,11 +95,7 @@ def regular_file(path: Path, follow_links: bool = True) -> Iterator[IO[bytes]]:
 
 
 def yaml_value(text: str) -> Any:
-    """
-    Value of a YAML document; None of an empty one.
-
-    Raises ValueError in one line, with the number of the line at fault where there is one.
-    """
+    """Value of a YAML document, None of an empty one; raises ValueError in one line."""
     if re.search(r'^%TAG', text, re.MULTILINE):
         raise ValueError('YAML tag directives are not read')
     _check_digits(text)
@@ -116,11 +107,7 @@ def yaml_value(text: str) -> Any:
 
 
 def json_value(text: str) -> Any:
-    """
-    Value of a JSON document; NaN and Infinity, which Python's parser takes, are refused.
-
-    Raises ValueError in one line.
-    """
+    """Value of a JSON document without NaN and Infinity; raises ValueError in one line."""
     _check_digits(text)
     if text.count('[') + text.count('{') > _VALUES:
         raise ValueError(f'more than {_VALUES} lists and objects')
@@ -133,11 +120,7 @@ def json_value(text: str) -> Any:
 
 
 def check_text(text: str) -> str:
-    """
-    Return a text without NUL and lone surrogates, which no file and no message can hold.
-
-    Raises ValueError for one with them.
-    """
+    """Return a text; raises ValueError for one with NUL or lone surrogates."""
     if '\0' in text:
         raise ValueError('a text with a NUL character')
     if _LONE.search(text):

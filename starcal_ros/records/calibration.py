@@ -370,11 +370,7 @@ def check_calibration(calibration: Calibration) -> None:
 
 
 def check_drawable(geometry: CameraGeometry) -> None:
-    """
-    Check that a report can show a geometry.
-
-    Raises ValueError naming the field and its value.
-    """
+    """Raise ValueError for a geometry that a report cannot show, with the field and value."""
     camera = geometry.camera
     largest, shortest_px = np.abs(camera.parameters).max(), camera.parameters[[0, 2]].min()
     if largest > _MOST:

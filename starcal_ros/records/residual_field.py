@@ -116,11 +116,7 @@ class ResidualField:
         return covariance
 
     def on(self, width: int, height: int) -> DetectorField:
-        """
-        Return the field on a detector of a size.
-
-        Raises ValueError when the coefficients are not those of the degree.
-        """
+        """Return the field on a detector; raises ValueError for a wrong number of terms."""
         if self.family not in FAMILIES:
             raise ValueError(f'field.family: {self.family!r} is not one of {", ".join(FAMILIES)}')
         found = self.coefficients.shape[1]

@@ -56,11 +56,7 @@ class RawMessage:
 
 
 def read_summary(file: Path) -> Summary | None:
-    """
-    Summary at the end of a file; empty if the file was written without one.
-
-    None if the summary is damaged (its checksum is verified) or missing.
-    """
+    """Summary at the end of a file, empty if none was written; None if missing or damaged."""
     with file.open('rb') as stream:
         # The exceptions of a damaged summary have no common base class.
         try:

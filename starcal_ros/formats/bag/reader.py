@@ -78,11 +78,7 @@ class Topics:
 
 
 def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
-    """
-    MCAP files of bags, in recording order.
-
-    Raises BagError if a path is neither an .mcap file nor a folder that holds some.
-    """
+    """MCAP files of bags in recording order; raises BagError where a path has none."""
     files = []
     for path in map(Path, paths):
         if path.is_dir():
@@ -103,21 +99,13 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
 
 
 def files_of_bags(paths: Iterable[Path | str]) -> tuple[Path, ...]:
-    """
-    The files that bags are read from, ``metadata.yaml`` of a folder included.
-
-    Raises BagError if a path is neither an .mcap file nor a folder that holds some.
-    """
+    """Files that bags are read from, metadata.yaml included; raises BagError as `mcap_files`."""
     bags = [Path(path) for path in paths]
     return (*mcap_files(bags), *(bag / 'metadata.yaml' for bag in bags if bag.is_dir()))
 
 
 def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple[Topic, ...]:
-    """
-    Topics with messages, by name.
-
-    The summaries of the files list them; a file without one is read completely.
-    """
+    """Topics with messages, by name; a file without a summary is read completely."""
     types: dict[str, str] = {}
     counts: Counter[str] = Counter()
     for file in mcap_files(paths):
@@ -159,11 +147,7 @@ def _counted(file: Path, on_damage: Damage) -> list[Topic]:
 
 
 def choose_topic(paths: Iterable[Path | str], type_name: str, asked: str = '') -> str:
-    """
-    The requested topic, or the only one of a type.
-
-    Raises BagError with the list of the topics of the type.
-    """
+    """The requested topic, or the only one of a type; raises BagError with those there are."""
     paths = list(paths)
     where = ', '.join(map(str, paths))
     there = topics(paths)
@@ -242,11 +226,7 @@ def read_observations(
 
 
 def decode(raw: RawMessage) -> Message:
-    """
-    Decoded message: by the definition in the bag, else by the one of ROS 2.
-
-    Raises BagError if the bytes are not a message of the type.
-    """
+    """Message by the definition in the bag, else by that of ROS 2; raises BagError."""
     try:
         store = typestore_of(raw.type_name, raw.definition)
         return store.deserialize_cdr(raw.view, raw.type_name)

@@ -107,11 +107,7 @@ class Scale:
 
 
 def look(path: Path, options: ImageOptions) -> ImageFile:
-    """
-    Stamp, size and range of an image file.
-
-    Raises IngestError when the file cannot be read or has no time; the text names the remedy.
-    """
+    """Stamp, size and range of an image file; raises IngestError with the remedy."""
     values, header = _read(path, options)
     finite = np.isfinite(values)
     if not finite.any():
@@ -142,11 +138,7 @@ def pixels_of(path: Path, options: ImageOptions, scale: Scale) -> Pixels:
 
 
 def common_scale(files: Sequence[ImageFile], options: ImageOptions) -> Scale:
-    """
-    The scale of all images; none where whole numbers fit 8 or 16 bit.
-
-    Raises IngestError for a range that is empty.
-    """
+    """The scale of all images; none if whole numbers fit 16 bit.  Raises IngestError."""
     kinds = {file.dtype.kind for file in files}
     low, high = min(file.low for file in files), max(file.high for file in files)
     whole = kinds <= {'u', 'i'}
@@ -162,11 +154,7 @@ def common_scale(files: Sequence[ImageFile], options: ImageOptions) -> Scale:
 
 
 def check_alike(files: Sequence[ImageFile]) -> None:
-    """
-    Check that images have one size and different stamps.
-
-    Raises IngestError naming two files.
-    """
+    """Check that images have one size and different stamps; raises IngestError."""
     first = files[0]
     for file in files:
         if (file.width, file.height) != (first.width, first.height):
@@ -201,11 +189,7 @@ def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str,
 
 
 def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
-    """
-    Values and header cards of an image in a FITS file, of ``hdu`` or of the first one.
-
-    Raises IngestError when the file cannot be read.
-    """
+    """Values and cards of the image ``hdu``, or the first, of a FITS file; raises IngestError."""
     try:
         from astropy.io import fits
     except ModuleNotFoundError as error:
@@ -269,11 +253,7 @@ def _truncation_is_an_error() -> Iterator[None]:
 
 
 def read_values(path: Path) -> NDArray[Any]:
-    """
-    Values (height, width) of an image file of one channel, FITS by its ending, as they are.
-
-    Raises IngestError when the file cannot be read or has more channels.
-    """
+    """Values (height, width) of an image file of one channel, as they are; raises IngestError."""
     return _read(path, ImageOptions())[0]
 
 
@@ -284,11 +264,7 @@ def content_of(path: Path) -> bytes:
 
 
 def decoded(path: Path, content: bytes) -> NDArray[Any]:
-    """
-    Values of the content of an image file in the depth and orientation of the file; colour is BGR.
-
-    Raises IngestError when OpenCV cannot decode it.
-    """
+    """Values of an image file, not turned by EXIF, colour as BGR; raises IngestError."""
     values = None
     with contextlib.suppress(cv2.error):
         values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)

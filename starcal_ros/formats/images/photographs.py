@@ -74,11 +74,7 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
 
 
 def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> Photograph:
-    """
-    Facts that a file states; a given focal length in mm goes before that of the file.
-
-    Raises IngestError when the file cannot be read.
-    """
+    """Facts of a file; a given focal length goes before its own.  Raises IngestError."""
     if path.name.lower().endswith(FITS_ENDINGS):
         values, header = read_fits(path, '')
         stated = _of_fits(path, values, header)

@@ -45,11 +45,7 @@ class TimeError(StarcalError):
 
 
 def system_of(name: str) -> str:
-    """
-    One of `SYSTEMS` for the name of a time system.
-
-    Raises TimeError for another system, as local time, MET or UT1.
-    """
+    """One of `SYSTEMS` by its name; raises TimeError for another, as local time, MET or UT1."""
     known = name.strip().upper()
     known = _OTHER_NAMES.get(known, known)
     if known not in SYSTEMS:

@@ -74,11 +74,7 @@ class _Published:
     model: str = 'plumb_bob'  # files of version 0.1 do not name it
 
     def geometry(self) -> CameraGeometry:
-        """
-        Camera and alignment.
-
-        Raises ValueError when the parameters are not those of the camera model.
-        """
+        """Camera and alignment; raises ValueError for parameters of another camera model."""
         names = self.parameter_names[: -len(ALIGNMENT_NAMES)]
         given = {'intrinsics': names[:_INTRINSICS], 'distortion': names[_INTRINSICS:]}
         parameters = []
@@ -97,14 +93,7 @@ class _Published:
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:
-    """
-    Write ``calibration.json``.
-
-    A number that is not finite is written as null, since JSON has no other word for it, and reads
-    back as NaN.
-
-    Raises ProductError when the file cannot be written.
-    """
+    """Write ``calibration.json``, NaN and infinity as null; raises ProductError if it cannot."""
     write_atomically(path, calibration_text(calibration))
 
 
@@ -125,11 +114,7 @@ def _text(value: object, margin: str = '\n') -> str:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """
-    The calibration in a ``calibration.json``, equal to the one that was written.
-
-    Raises ProductError naming the file and the key that is missing or wrong.
-    """
+    """The calibration in a file, equal to the one written; raises ProductError with the key."""
     content = read_json(path)
     if not isinstance(content, dict):
         raise ProductError(f'{path}: not a calibration (no JSON object)')

@@ -51,11 +51,7 @@ class _CameraInfo:
     distortion_model: str = 'plumb_bob'
 
     def camera(self) -> CameraModel:
-        """
-        Return the camera; K[0,1], where a file has one, is its skew.
-
-        Raises ValueError for a matrix, a distortion model or numbers that no camera has.
-        """
+        """Return the camera, K[0,1] as its skew; raises ValueError for what no camera has."""
         K = self.camera_matrix.data
         fx, skew, cx, zero, fy, cy = K[:6]
         if zero != 0.0 or K[6:] != (0.0, 0.0, 1.0):

@@ -16,21 +16,13 @@ REPORT_FILE = 'report.html'
 
 
 def read_text(path: Path, most_bytes: int) -> str:
-    """
-    The text of a file in UTF-8.
-
-    Raises ProductError when the file cannot be read, is larger than ``most_bytes`` or is no text.
-    """
+    """Text of a file in UTF-8 of at most ``most_bytes``; raises ProductError."""
     with errors_as(ProductError, path):
         return untrusted.read_text(path, most_bytes)
 
 
 def read_json(path: Path) -> Any:
-    """
-    The value of a JSON file, as `untrusted.json_value` reads it.
-
-    Raises ProductError when the file cannot be read, is too large or not JSON.
-    """
+    """Value of a JSON file, as `untrusted.json_value` reads it; raises ProductError."""
     with errors_as(ProductError, path):
         return untrusted.json_value(read_text(path, untrusted.PRODUCT_BYTES))
 
@@ -46,11 +38,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def check_not_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """
-    Compare the files that a command will write with those that it reads.
-
-    Raises ProductError naming a file that is both: no input is ever replaced.
-    """
+    """Check that no output of a command is one of its inputs; raises ProductError."""
     inputs = tuple(inputs)
     for path in outputs:
         if same_as_one_of(path, inputs):

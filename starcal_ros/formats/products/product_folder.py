@@ -49,11 +49,7 @@ _RESIDUALS_FORMAT = 1
 def write_products(
     calibration: Calibration, folder: Path, residuals: Residuals | None = None
 ) -> None:
-    """
-    Write a calibration, its camera and its residuals, if given, into a folder.
-
-    Raises ProductError when a file cannot be written.
-    """
+    """Write a calibration, its camera and residuals, if given; raises ProductError."""
     write_calibration(calibration, folder / CALIBRATION_FILE)
     name = calibration.provenance.get('camera_name', DEFAULT_CAMERA_NAME)
     write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE, name)
@@ -65,11 +61,7 @@ def write_products(
 def write_observations(
     observations: Iterable[StarObservations], folder: Path, frame_id: str
 ) -> None:
-    """
-    Write the observations of a calibration into a folder; ``frame_id`` is the camera's.
-
-    Raises BagError when the file cannot be written.
-    """
+    """Write the observations of a calibration with the frame of its camera; raises BagError."""
     from starcal_ros.formats.bag.writer import BagWriter  # a vehicle may not have mcap
 
     with BagWriter(folder / OBSERVATIONS_FILE) as writer:
@@ -78,11 +70,7 @@ def write_observations(
 
 
 def calibration_file(path: Path) -> Path:
-    """
-    Path of the calibration in a folder, or of the file itself.
-
-    Raises ProductError if the folder has no calibration.
-    """
+    """Path of the calibration in a folder, or the file itself; raises ProductError if none."""
     if not path.is_dir():
         return path
     if not (path / CALIBRATION_FILE).exists():
@@ -91,22 +79,14 @@ def calibration_file(path: Path) -> Path:
 
 
 def write_residuals(residuals: Residuals, path: Path) -> None:
-    """
-    Write ``residuals.npz``: a NumPy archive with an array for each attribute of `Residuals`.
-
-    Raises ProductError when the file cannot be written.
-    """
+    """Write a NumPy archive with an array for each attribute; raises ProductError."""
     memory = io.BytesIO()
     np.savez_compressed(memory, format=_RESIDUALS_FORMAT, **plain_record(residuals))
     write_atomically(path, memory.getvalue())
 
 
 def read_residuals(path: Path) -> Residuals:
-    """
-    The residuals in a ``residuals.npz``, equal to those that were written.
-
-    Raises ProductError naming the file and the array that is missing or wrong.
-    """
+    """The residuals in an archive, equal to those written; raises ProductError."""
     with errors_as(ProductError, path):
         content = path.read_bytes()  # whole: numpy leaves a file open that is no archive
     try:
@@ -137,11 +117,7 @@ class NotCalibrated:
 
 
 def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:
-    """
-    Write the record of a failure and remove the products of an earlier calibration.
-
-    Raises ProductError when the folder cannot be changed.
-    """
+    """Write the record of a failure and remove earlier products; raises ProductError."""
     content = {'calibrated': False, **json_object(record)}
     write_atomically(folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n')
     for name in (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, REPORT_FILE):
@@ -150,11 +126,7 @@ def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:
 
 
 def read_not_calibrated(folder: Path) -> NotCalibrated | None:
-    """
-    The record of a failure in a folder; None: there is none.
-
-    Raises ProductError when it cannot be read.
-    """
+    """The record of a failure in a folder; None: there is none.  Raises ProductError."""
     path = folder / NOT_CALIBRATED_FILE
     if not path.is_file():
         return None
