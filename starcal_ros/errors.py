@@ -50,12 +50,8 @@ class ImageRefused(StarcalError):
     """
     One image cannot be used; processing continues without it.
 
-    Attributes
-    ----------
-    reason : str
-        Stable name, counted and published (``records.IMAGE_REFUSALS``).
-    detail : str
-        Explanation for the operator.
+    ``reason`` is a name of `records.IMAGE_REFUSALS`, counted and published; ``detail`` explains it
+    to the operator.
     """
 
     def __init__(self, reason: str, detail: str = '') -> None:

@@ -173,13 +173,11 @@ def _number(kind: FieldType, value: object, path: str) -> float:
         return math.nan
     number = value.item() if isinstance(value, np.generic) else value
     is_whole = kind.kind is int
-    if isinstance(number, bool) or not isinstance(number, (int, float)):
+    is_part = is_whole and isinstance(number, float) and not number.is_integer()
+    if isinstance(number, bool) or not isinstance(number, (int, float)) or is_part:
         raise _refused(path, value, 'a whole number' if is_whole else 'a number')
     if is_whole:
-        if isinstance(number, float):
-            if not number.is_integer():
-                raise _refused(path, value, 'a whole number')
-            number = int(number)
+        number = int(number)
         if not -_INT64 <= number < _INT64:
             raise _refused(path, value, 'within 64 bit')
     else:

@@ -145,21 +145,10 @@ class GateCheck:
     """
     One check of the gate.
 
-    Attributes
-    ----------
-    name : str
-        Description of the check.
-    option : str
-        The parameter that sets the limit: a lower limit where its name begins with ``min_``, else
-        an upper limit.  Empty for a check without a number.
-    found, limit : float
-        In ``unit``; ``found`` is NaN if not checked, both are NaN for a check without a number.
-    unit : str
-        Empty for pure numbers.
-    passed : bool or None
-        None where it was not checked.
-    note : str
-        Why it was not checked, or another reason for the result; may be empty.
+    ``option`` is the parameter that sets the limit: a lower limit where its name begins with
+    ``min_``, else an upper limit.  ``found`` and ``limit`` are in ``unit``, empty for pure
+    numbers.  A check without a number has an empty option and NaN for both.  ``passed`` is None
+    and ``found`` NaN where it was not checked; ``note`` has the reason, or another for the result.
     """
 
     name: str

@@ -25,13 +25,9 @@ class MapCovariance:
     """
     Covariance of all that moves a line of sight.
 
-    Attributes
-    ----------
-    matrix : (k, k)
-        Of the numbers of `lookup.line_of_sight_jacobian`.
-    unresolved_px : float
-        1-sigma per axis of structure of the detector finer than the field: an independent
-        displacement of each pixel.
+    ``matrix`` is (k, k), of the numbers of `lookup.line_of_sight_jacobian`; ``unresolved_px`` the
+    1-sigma per axis of an independent displacement of each pixel, by structure of the detector
+    finer than the field.
     """
 
     matrix: Floats

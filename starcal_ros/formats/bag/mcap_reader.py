@@ -133,12 +133,8 @@ class _Pieces:
     """
     Schemas, channels and messages of a file, inside and outside chunks.
 
-    Attributes
-    ----------
-    complete : bool
-        True once the end of the data was reached.
-    lost : Counter
-        Messages in damaged chunks by channel, from the indexes after those chunks.
+    ``complete`` is True once the end of the data was reached; ``lost`` counts the messages in
+    damaged chunks by channel, from the indexes after those chunks.
     """
 
     def __init__(self, file: Path, summary: Summary, on_damage: Damage) -> None:

@@ -41,12 +41,7 @@ class BagWriter:
 
     Use it in a ``with`` statement: its end replaces the file whole.  After an exception in the
     block the file that was there before is unchanged.  A folder gets a ``metadata.yaml``, a single
-    file none: the one beside it may belong to another bag.
-
-    Parameters
-    ----------
-    path : Path or str
-        The folder is created if missing.
+    file none: the one beside it may belong to another bag.  Missing folders are created.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -180,18 +175,9 @@ def check_replaceable(
     """
     Check that a bag and the files beside it replace nothing but an earlier bag of their kind.
 
-    Raises BagError naming a file of another origin.
-
-    Parameters
-    ----------
-    record : Path
-        JSON object beside the bag; ``bag`` in it names the file of the bag.
-    others : iterable of Path
-        Further files to write.
-    mark : str
-        Key that only records of this kind have.
-    kind : str
-        Description for the error message, as 'a simulated bag'.
+    ``record`` is a JSON object beside the bag, whose key ``bag`` names the file of the bag and
+    whose key ``mark`` only records of this kind have; ``others`` are further files to write.
+    Raises BagError that names a file that is not of ``kind``, as 'a simulated bag'.
     """
     file = BagWriter(bag).file
     there = [path for path in (file, record, *others) if os.path.lexists(path)]

@@ -56,16 +56,9 @@ def decode_image(
     No copy where the message holds them so already.  Of a mosaic, the image of a colour has half
     the width and height (`of_mosaic`).
 
+    The first six arguments are those of sensor_msgs/Image, ``data`` anything with a buffer of
+    bytes; ``channel`` is red, green or blue, or empty, which refuses colour images.
     Raises ImageRefused ``bad_encoding`` or ``bad_layout``.
-
-    Parameters
-    ----------
-    encoding, width, height, step, is_bigendian, data
-        As in sensor_msgs/Image; ``data`` is anything with a buffer of bytes.
-    time_ns : int
-        Middle of the exposure.
-    channel : str
-        Channel to read from a colour image, red, green or blue; empty refuses colour images.
     """
     is_colour = encoding in RGB_ENCODINGS or encoding in BAYER_ENCODINGS
     if is_colour and not channel:

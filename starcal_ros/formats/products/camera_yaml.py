@@ -120,13 +120,9 @@ def read_camera_info(location: str | Path) -> CameraModel:
     """
     The camera in a ROS camera YAML; K[0,1], where a file has one, is its skew.
 
-    A ``.cameramodel`` of mrcal is read too: its lens, not its pose.
+    The location is a path, or a ``file://`` or ``package://`` URL.  A ``.cameramodel`` of mrcal is
+    read too: its lens, not its pose.
     Raises ProductError naming the file and the key that is missing, wrong or not supported.
-
-    Parameters
-    ----------
-    location : str or Path
-        A path, or a ``file://`` or ``package://`` URL.
     """
     path = resolve_url(location) if isinstance(location, str) else location
     text = read_text(path, PARAMETER_BYTES)
