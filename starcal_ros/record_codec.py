@@ -32,11 +32,6 @@ T = TypeVar('T')
 _PLAIN = {bool, int, float, str, np.ndarray, type(None)}
 _INT64 = 2**63
 _KINDS = {'f': 'fiu', 'i': 'iu', 'u': 'iu', 'b': 'b'}  # of arrays that are converted
-_ITEMS = {
-    (kind, is_finite): FieldType(float if kind == 'f' else int, is_finite=is_finite)
-    for kind in _KINDS
-    for is_finite in (False, True)
-}
 _COMPARED = 100  # characters: of a word of a million, each comparison takes seconds
 
 
@@ -59,8 +54,7 @@ def _plain(value: Any) -> Any:
 
 def json_object(record: Any) -> dict[str, Any]:
     """Plain values of a record for JSON: arrays are lists, a number that is not finite is null."""
-    found: dict[str, Any] = _json_value(plain_record(record))
-    return found
+    return {name: _json_value(item) for name, item in plain_record(record).items()}
 
 
 def _json_value(value: Any) -> Any:
@@ -89,8 +83,8 @@ def read_record(record_type: type[T], content: object, path: str = '') -> T:
     sizes: dict[str, int] = {}
     of_type: Any = record_type
     for name, kind in fields_of(of_type).items():
-        keys = (name, kind.in_messages, kind.formerly)
-        key = name if name in content else next((key for key in keys if key in content), None)
+        names = (name, kind.in_messages, kind.formerly)
+        key = next((key for key in names if key in content), None)
         if key is not None:
             values[name] = read_value(kind, content[key], _inside(path, key), sizes)
         elif not kind.has_default:
@@ -230,7 +224,8 @@ def _array(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> 
     if isinstance(value, np.ndarray):
         array = value
     else:
-        rows = _rows(_ITEMS[wanted.kind, kind.is_finite], value, path, depth)
+        item = FieldType(float if wanted.kind == 'f' else int, is_finite=kind.is_finite)
+        rows = _rows(item, value, path, depth)
         try:
             array = np.array(rows, np.float64 if wanted.kind == 'f' else np.int64)
         except OverflowError as error:

@@ -123,7 +123,12 @@ def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple
 def _listed(file: Path, size: int, modified_ns: int) -> tuple[list[Topic], list[str]]:
     """Topics of a file and its damage; kept, as a file without summary is read for them."""
     damage: list[str] = []
-    return _summary(file) or _counted(file, damage.append), damage
+    found = _summary(file)
+    if not found:
+        messages = read_messages(file, None, damage.append)
+        counts = Counter((raw.topic, raw.type_name) for raw in messages)
+        found = [Topic(*topic, count) for topic, count in counts.items()]
+    return found, damage
 
 
 def _summary(file: Path) -> list[Topic]:
@@ -139,11 +144,6 @@ def _summary(file: Path) -> list[Topic]:
         if count and channel and schema and channel.message_encoding == 'cdr':
             found.append(Topic(channel.topic, schema.name, count))
     return found
-
-
-def _counted(file: Path, on_damage: Damage) -> list[Topic]:
-    counts = Counter((raw.topic, raw.type_name) for raw in read_messages(file, None, on_damage))
-    return [Topic(name, type_name, count) for (name, type_name), count in counts.items()]
 
 
 def choose_topic(paths: Iterable[Path | str], type_name: str, asked: str = '') -> str:

@@ -82,9 +82,8 @@ def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> 
     else:
         stated, stated_um = _of_picture(path)
     pixel_um = pixel_um or stated_um
-    if focal_length_mm and pixel_um > 0:
-        stated = replace(stated, focal_px=1000.0 * focal_length_mm / pixel_um)
-    return stated
+    given_px = _focal_px(focal_length_mm, pixel_um)
+    return stated if math.isnan(given_px) else replace(stated, focal_px=given_px)
 
 
 def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
@@ -167,6 +166,10 @@ def _of_picture(path: Path) -> tuple[Photograph, float]:
     focal_mm, pixel_um = _real(tags.get(0x920A)), _pixel_um(tags, width)
     if words and focal_mm > 0:
         words.append(f'{focal_mm:g} mm')
+    focal_px = _focal_px(focal_mm, pixel_um)
+    equivalent_mm = _real(tags.get(0xA405))  # FocalLengthIn35mmFilm; 0: unknown
+    if math.isnan(focal_px) and equivalent_mm > 0:
+        focal_px = math.hypot(width, height) * equivalent_mm / _DIAGONAL_35_MM
     return (
         Photograph(
             path,
@@ -175,7 +178,7 @@ def _of_picture(path: Path) -> tuple[Photograph, float]:
             utc,
             width,
             height,
-            _exif_focal_px(tags, focal_mm, pixel_um, math.hypot(width, height)),
+            focal_px,
             _exif_site(gps),
             ' '.join(words),
         ),
@@ -200,13 +203,9 @@ def _pixel_um(tags: Mapping[int, Any], width: int) -> float:
     return 1000.0 * unit_mm / per_unit * full / width
 
 
-def _exif_focal_px(
-    tags: Mapping[int, Any], focal_mm: float, pixel_um: float, diagonal_px: float
-) -> float:
-    if focal_mm > 0 and pixel_um > 0:
-        return 1000.0 * focal_mm / pixel_um
-    equivalent_mm = _real(tags.get(0xA405))  # FocalLengthIn35mmFilm; 0: unknown
-    return diagonal_px * equivalent_mm / _DIAGONAL_35_MM if equivalent_mm > 0 else math.nan
+def _focal_px(focal_mm: float, pixel_um: float) -> float:
+    """Focal length in pixels; NaN where it or the size of a pixel is not known."""
+    return 1000.0 * focal_mm / pixel_um if focal_mm > 0 and pixel_um > 0 else math.nan
 
 
 def _exif_time(path: Path, tags: Mapping[int, Any]) -> tuple[int, bool, bool]:
@@ -246,11 +245,7 @@ def _of_fits(path: Path, values: NDArray[Any], header: Mapping[str, Card]) -> Ph
     step_deg = math.hypot(*(value for value in matrix if not math.isnan(value)))
     if not step_deg > 0:
         step_deg = abs(number(header, 'CDELT1'))
-    focal_px = math.nan
-    if step_deg > 0:
-        focal_px = math.degrees(1.0 / step_deg)
-    elif focal_mm > 0 and pixel_um > 0:
-        focal_px = 1000.0 * focal_mm / pixel_um
+    focal_px = math.degrees(1.0 / step_deg) if step_deg > 0 else _focal_px(focal_mm, pixel_um)
     words = [str(header[key].value) for key in ('TELESCOP', 'INSTRUME') if key in header]
     height, width = values.shape[:2]
     return Photograph(path, time_ns, dated, dated, width, height, focal_px, None, ' '.join(words))
