@@ -39,7 +39,7 @@ class IngestError(StarcalError):
 
 
 class NotFromStars(StarcalError):
-    """Images without attitudes give no camera; the text says what to photograph next."""
+    """Images without attitudes give no camera; the text names the images to take next."""
 
 
 class ArchiveError(StarcalError):

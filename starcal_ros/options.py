@@ -146,7 +146,7 @@ REMOVED: Mapping[str, str] = {
 
 
 def unknown_option(name: str, known: Iterable[str]) -> str:
-    """Return one line for a name that is no option: what replaced it, or a similar name."""
+    """Return one line for an unknown name: its replacement, or a similar name."""
     said = name if name.isidentifier() and len(name) < _LONGEST_NAME else shown(name)
     if name in REMOVED:
         return f'{said}: not an option any more: {REMOVED[name]}; take it out'

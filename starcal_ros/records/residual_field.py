@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Field over the detector beside the lens model, and the covariance of lines of sight."""
+"""Field over the detector in addition to the lens model; covariance of lines of sight."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class MapCovariance:
 @dataclass(frozen=True)
 class ResidualField:
     """
-    Field over the detector beside the lens model.
+    Field over the detector in addition to the lens model.
 
     With coefficients of zero none was found; its covariance is that of the fields that the stars
     do not rule out.  ``covariance`` is ``F F'``, plus ``R R'`` in the rows of the coefficients,
@@ -55,7 +55,7 @@ class ResidualField:
     joint_covariance : (p + 2 t, p + 2 t)
         As earlier versions wrote it; empty where there is a factor.
     family : str
-        Of its functions: one of `detector_field.FAMILIES`.
+        One of `detector_field.FAMILIES`, the kind of its functions.
     unresolved_px : float
         1-sigma per axis of structure finer than the field.
     covariance_factor : (p + 2 t, r)
@@ -145,7 +145,7 @@ def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualFiel
     unit_px = _to_digits(np.sqrt(np.diag(left).clip(0.0)) / _STEPS, 4)
     steps = np.where(unit_px > 0, unit_px, np.inf)
     values, vectors = np.linalg.eigh(left / np.outer(steps, steps))
-    # Of a matrix of deficient rank too: the triangle of the QR decomposition of a root.
+    # The triangle of the QR decomposition of a root exists for deficient rank too.
     _, upper = np.linalg.qr((vectors * np.sqrt(values.clip(0.0))).T)
     return ResidualField(
         degree=of.degree,

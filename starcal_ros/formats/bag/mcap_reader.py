@@ -189,7 +189,7 @@ class _Pieces:
                 elif not self._has_chunks or isinstance(record, (Schema, Channel)):
                     yield record
                 elif isinstance(record, Message):
-                    # Recorders put all messages into chunks or none: this is no real message.
+                    # Recorders put all messages into chunks or none: these are damaged bytes.
                     self.report(f'damaged after byte {read_to} of {size}')
                     return self._start_after(read_to)
             self.report(f'damaged before byte {read_to} of {size}: no end-of-data record')

@@ -83,7 +83,7 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
     for path in map(Path, paths):
         if path.is_dir():
             files += _files_of_folder(path)
-        elif path.exists():  # opening a pipe would wait for whoever writes to it
+        elif path.exists():  # opening a pipe would wait for its writer
             if not path.is_file():
                 raise BagError(f'{path}: not a regular file')
             files.append(path)

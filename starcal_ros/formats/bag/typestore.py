@@ -61,11 +61,11 @@ def typestore_of(type_name: str, definition: str) -> Typestore:
     """
     Types by the definition in a bag, whose writer may be another version; else `typestore`.
 
-    Raises BagError when the definition is none and the type is not one of `typestore`.
+    Raises BagError when the definition is invalid and the type is not one of `typestore`.
     """
     try:
         return typestore_with(type_name, definition)
-    # The exceptions of a text that is no definition have no common base class.
+    # The exceptions of an invalid definition have no common base class.
     except Exception as error:
         if type_name not in typestore().types:
             raise BagError(
@@ -78,8 +78,8 @@ def typestore_with(type_name: str, definition: str) -> Typestore:
     """
     Types with the bag's own definition of one: another version may have written the bag.
 
-    Raises an exception of any kind when the definition is none, and ValueError when it is too
-    large: code is generated from it.
+    Raises ValueError when the definition is too large, since code is generated from it, and
+    exceptions of any class when it is invalid.
     """
     if not _TYPE_NAME.fullmatch(type_name):
         raise ValueError('not a type name')

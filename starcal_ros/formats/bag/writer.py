@@ -57,7 +57,7 @@ class BagWriter:
         self._writer: Any = None
 
     def __enter__(self) -> Self:
-        """Open a file beside the place of the bag."""
+        """Open a temporary file in the folder of the bag."""
         with errors_as(BagError, self.file, 'written'):
             self.file.parent.mkdir(parents=True, exist_ok=True)
             self._replacing = replacing(self.file)

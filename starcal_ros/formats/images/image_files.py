@@ -34,7 +34,7 @@ _RGB, _GREY = 3, 2
 MOST_VALUES = 2**27  # of an image, all colours: as many as a node takes
 MOST_BYTES = 2**31
 _ROWS = 256  # mapped at a time: an image in double precision can exceed the memory
-_FULL = 65000  # of 16 bit: below the end of the range, which stands for saturation
+_FULL = 65000  # of 16 bit: below the end of the range, which means saturation
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
         raise IngestError(
             f"{path}: FITS files need astropy: pip install 'starcal_ros[mission]'"
         ) from error
-    if path.exists() and not path.is_file():  # opening a pipe would wait for whoever writes to it
+    if path.exists() and not path.is_file():  # opening a pipe would wait for its writer
         raise IngestError(f'{path}: not a regular file')
     try:
         # Not mapped to memory: scaled data cannot be, and files are read one at a time.
@@ -222,7 +222,7 @@ def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
             values = np.asarray(unit.data)
     except (IngestError, MemoryError):
         raise
-    except Exception as error:  # astropy raises whatever a damaged file brings about
+    except Exception as error:  # a damaged file makes astropy raise anything
         words = ' '.join(str(error).split())[:160]
         raise IngestError(f'{path}: not readable as FITS: {words}') from error
     values = values.squeeze()

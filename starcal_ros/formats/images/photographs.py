@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Photographs of any camera: JPEG, PNG, TIFF and FITS, with what EXIF or the header states."""
+"""Photographs of any camera: JPEG, PNG, TIFF and FITS, with the facts in EXIF or the header."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
 
 
 def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> Photograph:
-    """Facts of a file; a given focal length goes before its own.  Raises IngestError."""
+    """Facts of a file; a given focal length replaces its own.  Raises IngestError."""
     if path.name.lower().endswith(FITS_ENDINGS):
         values, header = read_fits(path, '')
         stated = _of_fits(path, values, header)
@@ -155,7 +155,7 @@ def _of_picture(path: Path) -> tuple[Photograph, float]:
             gps = dict(exif.get_ifd(_GPS))
     except IngestError:
         raise
-    except Exception as error:  # Pillow raises whatever a damaged file brings about
+    except Exception as error:  # a damaged file makes Pillow raise anything
         raise IngestError(f'{path}: not readable: {" ".join(str(error).split())[:160]}') from error
     if width * height > MOST_VALUES:
         raise IngestError(f'{path}: claims {width} x {height} pixels')

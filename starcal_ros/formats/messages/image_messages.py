@@ -229,8 +229,8 @@ def of_mosaic(pixels: NDArray[Any], letters: str, channel: str) -> NDArray[Any]:
     """
     Pixels (h // 2, w // 2) of a colour in a Bayer mosaic (h, w).
 
-    Of green, those of the first of the two sites.  Pixel (u, v) is pixel (2 u + i, 2 v + j) of the
-    mosaic with (i, j) from `site`: the prior camera must be one of this image.
+    Green is taken from the first of its two sites.  Pixel (u, v) is pixel (2 u + i, 2 v + j) of
+    the mosaic with (i, j) from `site`: the prior camera must be one of this image.
     """
     i, j = site(letters, channel)
     height, width = pixels.shape

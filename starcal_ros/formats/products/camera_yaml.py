@@ -51,7 +51,7 @@ class _CameraInfo:
     distortion_model: str = 'plumb_bob'
 
     def camera(self) -> CameraModel:
-        """Return the camera, K[0,1] as its skew; raises ValueError for what no camera has."""
+        """Return the camera, K[0,1] as its skew; raises ValueError for impossible values."""
         K = self.camera_matrix.data
         fx, skew, cx, zero, fy, cy = K[:6]
         if zero != 0.0 or K[6:] != (0.0, 0.0, 1.0):
@@ -174,7 +174,7 @@ def resolve_url(url: str) -> Path:
 
 
 def with_camera_url_from(values: Mapping[str, object], params: Path) -> dict[str, object]:
-    """Parameters of a file; a `camera_info_url` that is no URL is relative to that file."""
+    """Parameters of a file; a path in `camera_info_url` is relative to that file."""
     url = values.get('camera_info_url')
     if isinstance(url, str) and url and '://' not in url:
         return {**values, 'camera_info_url': str(params.parent / url)}

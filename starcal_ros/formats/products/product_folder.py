@@ -88,7 +88,7 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
 def read_residuals(path: Path) -> Residuals:
     """The residuals in an archive, equal to those written; raises ProductError."""
     with errors_as(ProductError, path):
-        content = path.read_bytes()  # whole: numpy leaves a file open that is no archive
+        content = path.read_bytes()  # whole: numpy leaves a damaged archive open
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             columns = dict(archive)
