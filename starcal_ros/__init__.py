@@ -32,23 +32,7 @@ if _is_found and any(word.startswith('starcal_ros.') for word in sys.orig_argv):
 from typing import TYPE_CHECKING  # noqa: E402
 
 if TYPE_CHECKING:
-    from starcal_ros.api import (
-        calibrate,
-        calibrate_bag,
-        calibrate_images,
-        Calibration,
-        CameraGeometry,
-        CameraModel,
-        lines_of_sight,
-        observations_of,
-        OptionError,
-        project,
-        read_calibration,
-        StarcalError,
-        StarObservations,
-        TooFewObservations,
-        write_calibration,
-    )
+    from starcal_ros.api import *
 
     __version__: str
 

@@ -26,6 +26,7 @@ from starcal_ros.errors import OptionError, StarcalError, TooFewObservations
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import calibration_json
+from starcal_ros.formats.products.product_folder import calibration_file
 from starcal_ros.options import names_of, unknown_option
 from starcal_ros.pipeline import night_sky, solve, topics
 from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags
@@ -253,10 +254,8 @@ def calibrate_images(images: Path | str | Sequence[Path | str], **options: objec
     chosen, _ = night_sky.photographs_of(paths)
     with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
         found = night_sky.from_photographs(chosen, options, Path(folder))
-        bags = found.bags
-        measured = topics.read(
-            bags, topics.choose_topics(bags, topics.Topics(), found.setup), found.setup
-        )
+        in_bags = topics.choose_topics(found.bags, topics.Topics(), found.setup)
+        measured = topics.read(found.bags, in_bags, found.setup)
         through_air = found.through_air(list(measured))[0]
         ensemble = solve.ensemble_of(through_air, found.setup)
     return solve.solve(ensemble, found.setup, inputs=inputs_of([one.path for one in chosen]))
@@ -271,7 +270,7 @@ def read_calibration(path: Path | str) -> Calibration:
     ProductError
         Naming the file and the key that is missing or wrong.
     """
-    return calibration_json.read_calibration(_calibration_file(path))
+    return calibration_json.read_calibration(calibration_file(Path(path)))
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:
@@ -283,7 +282,9 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
     ProductError
         When the file cannot be written.
     """
-    calibration_json.write_calibration(calibration, _calibration_file(path))
+    path = Path(path)
+    file = path / calibration_json.CALIBRATION_FILE if path.is_dir() else path
+    calibration_json.write_calibration(calibration, file)
 
 
 def lines_of_sight(
@@ -320,11 +321,6 @@ def lines_of_sight(
         raise ValueError(f"frame: {frame!r} is not 'camera' or 'star_tracker'")
     star_tracker_from_camera = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
     return np.asarray(in_camera @ star_tracker_from_camera.as_matrix().T)
-
-
-def _calibration_file(path: Path | str) -> Path:
-    path = Path(path)
-    return path / calibration_json.CALIBRATION_FILE if path.is_dir() else path
 
 
 def _unit(vectors: Floats) -> Floats:

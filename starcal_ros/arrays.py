@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Types of arrays, and their numbers rounded."""
+"""Types of arrays."""
 
 from __future__ import annotations
 
@@ -11,9 +11,3 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]  # (h, w) grey or (h, w, 3) BGR, for display
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]  # detector counts, indexed [v, u]
-
-
-def to_digits(values: Floats, digits: int) -> Floats:
-    """Return numbers rounded to so many significant digits: texts of them are as short."""
-    rounded = [float(f'{value:.{digits - 1}e}') for value in values.ravel().tolist()]
-    return np.array(rounded, np.float64).reshape(values.shape)

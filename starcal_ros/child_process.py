@@ -53,11 +53,7 @@ class ChildProcess:
             pickle.dump(sys.path, _pipe(self._process.stdin))
 
     def call(self, function: Callable[..., Result], *args: object) -> Result:
-        """
-        Result of a function; its exception is raised here.
-
-        Raises ProcessEnded when the process ended during the call.
-        """
+        """Result of a function; raises its exception, or ProcessEnded if the process ended."""
         request = pickle.dumps((function, args))
         try:
             _pipe(self._process.stdin).write(request)

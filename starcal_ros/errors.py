@@ -10,6 +10,9 @@ The tool prints it on stderr and ends with status 2, a node logs it::
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import contextlib
+
 
 class StarcalError(Exception):
     """Base class of the exceptions that starcal raises for bad input."""
@@ -36,7 +39,7 @@ class IngestError(StarcalError):
 
 
 class NotFromStars(StarcalError):
-    """Images without attitudes give no camera; the text says what to photograph next."""
+    """Images without attitudes give no camera; the text names the images to take next."""
 
 
 class ArchiveError(StarcalError):
@@ -47,12 +50,8 @@ class ImageRefused(StarcalError):
     """
     One image cannot be used; processing continues without it.
 
-    Attributes
-    ----------
-    reason : str
-        Stable name, counted and published (``records.IMAGE_REFUSALS``).
-    detail : str
-        Explanation for the operator.
+    ``reason`` is a name of `records.IMAGE_REFUSALS`, counted and published; ``detail`` explains it
+    to the operator.
     """
 
     def __init__(self, reason: str, detail: str = '') -> None:
@@ -63,3 +62,14 @@ class ImageRefused(StarcalError):
 
 class TooFewObservations(StarcalError):
     """The ensemble does not suffice for the requested calibration; the text names the shortage."""
+
+
+@contextlib.contextmanager
+def errors_as(kind: type[StarcalError], place: object, done: str = 'read') -> Iterator[None]:
+    """Raise an OSError or ValueError of the block as another kind that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f'{place}: cannot be {done}: {error.strerror or error}') from error
+    except ValueError as error:
+        raise kind(f'{place}: {error}') from error

@@ -2,9 +2,9 @@
 """
 The one way to write a file.
 
-A file is written beside its place, synced and renamed, and its folder is synced: a reader, a kill
-and a power loss see the old file or the new one, each whole.  A kill may leave the file beside; it
-is locked while its writer lives, and the next write to the same place removes it.
+A temporary file in the same folder is written, synced and renamed, and the folder is synced: a
+reader, a kill and a power loss see the old file or the new one, each whole.  A kill may leave the
+temporary file; it is locked while its writer lives, and the next write to that path removes it.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import difflib
 from pathlib import Path
 from typing import Any, TypeVar
 
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import errors_as, OptionError
 from starcal_ros.record_codec import nearest, read_value
 from starcal_ros.record_fields import FieldType, MOST
 from starcal_ros.untrusted import PARAMETER_BYTES, read_text, shown, yaml_value
@@ -60,11 +60,7 @@ def option(
 
 
 def check_value(field: dataclasses.Field[Any], value: object) -> OptionValue:
-    """
-    Value converted to the type of the field.
-
-    Raises OptionError with the option, the value and the expected type or range.
-    """
+    """Value in the type of its option; raises OptionError with what is allowed."""
     meta, default = field.metadata, field.default
     low, high = meta['low'], meta['high']
     kind = FieldType(
@@ -150,7 +146,7 @@ REMOVED: Mapping[str, str] = {
 
 
 def unknown_option(name: str, known: Iterable[str]) -> str:
-    """Return one line for a name that is no option: what replaced it, or a similar name."""
+    """Return one line for an unknown name: its replacement, or a similar name."""
     said = name if name.isidentifier() and len(name) < _LONGEST_NAME else shown(name)
     if name in REMOVED:
         return f'{said}: not an option any more: {REMOVED[name]}; take it out'
@@ -158,11 +154,7 @@ def unknown_option(name: str, known: Iterable[str]) -> str:
 
 
 def option_fields(*kinds: type[Any]) -> list[dataclasses.Field[Any]]:
-    """
-    Fields of dataclasses that were made with `option`.
-
-    The other fields of such a dataclass are constants in flight, which studies vary.
-    """
+    """Fields made with `option`; the others are constants in flight, which studies vary."""
     return [f for kind in kinds for f in dataclasses.fields(kind) if 'description' in f.metadata]
 
 
@@ -177,11 +169,7 @@ def names_of(*option_classes: type[Any]) -> set[str]:
 
 
 def from_mapping(cls: type[OptionsT], values: Mapping[str, object]) -> OptionsT:
-    """
-    Options dataclass from the entries of a mapping that match its fields.
-
-    Raises OptionError if a value has the wrong type or is out of range.
-    """
+    """Options from the entries of a mapping that match the fields; raises OptionError."""
     given = [field for field in option_fields(cls) if field.name in values]
     return cls(**{field.name: check_value(field, values[field.name]) for field in given})
 
@@ -235,12 +223,8 @@ def parameter_sections(path: Path) -> dict[str, object]:
 
     Raises OptionError if the file cannot be read or is not a ROS parameter file.
     """
-    try:
+    with errors_as(OptionError, path):
         content = yaml_value(read_text(path, PARAMETER_BYTES))
-    except OSError as error:
-        raise OptionError(f'{path}: cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise OptionError(f'{path}: {error}') from error
     if not isinstance(content, dict):
         raise OptionError(f'{path}: not a ROS parameter file (no node sections)')
     sections = _flat(content, '')

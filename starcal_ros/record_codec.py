@@ -32,11 +32,6 @@ T = TypeVar('T')
 _PLAIN = {bool, int, float, str, np.ndarray, type(None)}
 _INT64 = 2**63
 _KINDS = {'f': 'fiu', 'i': 'iu', 'u': 'iu', 'b': 'b'}  # of arrays that are converted
-_ITEMS = {
-    (kind, is_finite): FieldType(float if kind == 'f' else int, is_finite=is_finite)
-    for kind in _KINDS
-    for is_finite in (False, True)
-}
 _COMPARED = 100  # characters: of a word of a million, each comparison takes seconds
 
 
@@ -59,8 +54,7 @@ def _plain(value: Any) -> Any:
 
 def json_object(record: Any) -> dict[str, Any]:
     """Plain values of a record for JSON: arrays are lists, a number that is not finite is null."""
-    found: dict[str, Any] = _json_value(plain_record(record))
-    return found
+    return {name: _json_value(item) for name, item in plain_record(record).items()}
 
 
 def _json_value(value: Any) -> Any:
@@ -89,8 +83,8 @@ def read_record(record_type: type[T], content: object, path: str = '') -> T:
     sizes: dict[str, int] = {}
     of_type: Any = record_type
     for name, kind in fields_of(of_type).items():
-        keys = (name, kind.in_messages, kind.formerly)
-        key = name if name in content else next((key for key in keys if key in content), None)
+        names = (name, kind.in_messages, kind.formerly)
+        key = next((key for key in names if key in content), None)
         if key is not None:
             values[name] = read_value(kind, content[key], _inside(path, key), sizes)
         elif not kind.has_default:
@@ -129,11 +123,7 @@ def read_value(kind: FieldType, value: object, path: str, sizes: dict[str, int])
 def check_shape(
     found: tuple[int, ...], dimensions: tuple[int | str, ...], path: str, sizes: dict[str, int]
 ) -> None:
-    """
-    Compare a shape with its description; ``sizes`` of the named dimensions grow.
-
-    Raises ValueError with the path of the field, when they differ.
-    """
+    """Check a shape; ``sizes`` of named dimensions grow.  Raises ValueError with the path."""
     expected = tuple(
         one if isinstance(one, int) else sizes.setdefault(one, size) if one else size
         for one, size in zip(dimensions, found, strict=False)
@@ -177,13 +167,11 @@ def _number(kind: FieldType, value: object, path: str) -> float:
         return math.nan
     number = value.item() if isinstance(value, np.generic) else value
     is_whole = kind.kind is int
-    if isinstance(number, bool) or not isinstance(number, (int, float)):
+    is_part = is_whole and isinstance(number, float) and not number.is_integer()
+    if isinstance(number, bool) or not isinstance(number, (int, float)) or is_part:
         raise _refused(path, value, 'a whole number' if is_whole else 'a number')
     if is_whole:
-        if isinstance(number, float):
-            if not number.is_integer():
-                raise _refused(path, value, 'a whole number')
-            number = int(number)
+        number = int(number)
         if not -_INT64 <= number < _INT64:
             raise _refused(path, value, 'within 64 bit')
     else:
@@ -236,7 +224,8 @@ def _array(kind: FieldType, value: object, path: str, sizes: dict[str, int]) -> 
     if isinstance(value, np.ndarray):
         array = value
     else:
-        rows = _rows(_ITEMS[wanted.kind, kind.is_finite], value, path, depth)
+        item = FieldType(float if wanted.kind == 'f' else int, is_finite=kind.is_finite)
+        rows = _rows(item, value, path, depth)
         try:
             array = np.array(rows, np.float64 if wanted.kind == 'f' else np.int64)
         except OverflowError as error:

@@ -97,24 +97,11 @@ class FieldType:
     """
     Type of a field of a record, or of the items of one, with its marks.
 
-    Attributes
-    ----------
-    kind : type
-        bool, int, float or str, a record, or tuple, dict or numpy.ndarray.
-    is_record : bool
-    optional : bool
-        Whether None is allowed.
-    has_default : bool
-    item : FieldType or None
-        Of a tuple or a mapping from str.
-    dtype : numpy.dtype or None
-        Of an array.
-    in_messages, formerly : str
-        Other names of the field.
-    are_different : bool
-        Whether a tuple must not have an item twice.
-    dimensions and the others
-        As in the marks; one dimension of any length where there is no `Shape`.
+    ``kind`` is bool, int, float or str, a record, or tuple, dict or numpy.ndarray; ``item`` is the
+    type of the items of a tuple or of a mapping from str, ``dtype`` that of an array.
+    ``optional`` allows None, ``are_different`` forbids an item twice, ``in_messages`` and
+    ``formerly`` are other names of the field.  The other attributes are those of the marks;
+    without a `Shape` there is one dimension of any length.
     """
 
     kind: type[Any]

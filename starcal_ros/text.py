@@ -16,6 +16,6 @@ def printable(text: str) -> str:
     The text with an escape, such as ``\x1b``, for each character that acts on a terminal.
 
     Names of topics and files come from others: an escape sequence in one could clear the screen,
-    change what stands above, or set the title of the window.
+    change the lines above, or set the title of the window.
     """
     return _UNSAFE.sub(lambda found: ascii(found[0])[1:-1], text)

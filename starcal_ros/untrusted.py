@@ -4,7 +4,7 @@ The door for text from outside: bounded regular files, strict YAML and JSON, pla
 
 Parameter files, camera files, ``metadata.yaml`` and ``calibration.json`` are read here, before
 any code looks at their values.  Values are None, bool, int, float, str, list, and dict with str
-keys.  Refused are duplicate keys, keys that are no text, integers beyond 64 bit, deep nesting,
+keys.  Refused are duplicate keys, keys that are no text, numbers of over 400 digits, deep nesting,
 NUL characters, lone surrogates, YAML aliases, and the YAML tags that construct objects.
 
 YAML differs from PyYAML in two points, as the parser of rcl does: ``1e-6`` is a number, and dates
@@ -13,6 +13,7 @@ stay texts.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 import contextlib
 import json
@@ -30,11 +31,12 @@ PRODUCT_BYTES = 8 * 1024 * 1024  # a calibration.json with the covariance of a f
 
 _DEPTH = 32
 _VALUES = 100_000  # of a YAML document; containers of a JSON document
-_INT64 = 2**63
-_INT64_DIGITS = 67  # binary, with the sign
-_DIGITS = re.compile(r'[0-9]{400}')  # in a row: no number that a double or an integer needs
+# Python takes quadratic time to read an integer, or refuses it from 4300 digits.
+_DIGITS = re.compile(r'[0-9]{400}')
 _SHOWN = 60  # characters of a value in an error message
 
+_TAG = 'tag:yaml.org,2002:'
+_KINDS = ('null', 'bool', 'int', 'float', 'str', 'seq', 'map')
 _BOOL_WORDS = ('yes', 'no', 'true', 'false', 'on', 'off')
 _LONE = re.compile('[\ud800-\udfff]')
 
@@ -80,12 +82,7 @@ def read_bytes(path: Path, most_bytes: int, follow_links: bool = True) -> bytes:
 
 @contextlib.contextmanager
 def regular_file(path: Path, follow_links: bool = True) -> Iterator[IO[bytes]]:
-    """
-    A regular file, open to read; never waits, as for a pipe.
-
-    Raises OSError when the file cannot be opened. Raises ValueError in one line, for a file that
-    is not regular.
-    """
+    """A regular file, open to read; never waits.  Raises OSError, or ValueError in one line."""
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow_links else os.O_NOFOLLOW)
     try:
         number = os.open(path, flags)
@@ -98,52 +95,32 @@ def regular_file(path: Path, follow_links: bool = True) -> Iterator[IO[bytes]]:
 
 
 def yaml_value(text: str) -> Any:
-    """
-    Value of a YAML document; None of an empty one.
-
-    Raises ValueError in one line, with the number of the line at fault.
-    """
+    """Value of a YAML document, None of an empty one; raises ValueError in one line."""
     if re.search(r'^%TAG', text, re.MULTILINE):
         raise ValueError('YAML tag directives are not read')
+    _check_digits(text)
     try:
         _check_size(yaml.parse(text, Loader=_Loader))
-        return yaml.load(text, _Loader)
-    except yaml.YAMLError as error:
+        return _checked(yaml.load(text, _Loader))
+    except (yaml.YAMLError, LookupError) as error:  # LookupError: !!bool of another word
         raise ValueError(f'not YAML: {" ".join(str(error).split())}') from error
-    except UnicodeError as error:
-        raise ValueError('not YAML: a character that is none') from error
 
 
 def json_value(text: str) -> Any:
-    """
-    Value of a JSON document; NaN and Infinity, which Python's parser takes, are refused.
-
-    Raises ValueError in one line.
-    """
+    """Value of a JSON document without NaN and Infinity; raises ValueError in one line."""
+    _check_digits(text)
+    if text.count('[') + text.count('{') > _VALUES:
+        raise ValueError(f'more than {_VALUES} lists and objects')
     try:
-        if _DIGITS.search(text):  # Python takes quadratic time, or refuses from 4300 digits
-            raise ValueError('a number of more than 400 digits')
-        if text.count('[') + text.count('{') > _VALUES:
-            raise ValueError(f'more than {_VALUES} lists and objects')
-        found = json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant)
+        return _checked(json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant))
     except json.JSONDecodeError as error:
         raise ValueError(f'not JSON: {error}') from error
     except RecursionError as error:
         raise ValueError(f'not JSON: nested deeper than {_DEPTH}') from error
-    level = [found]
-    for _ in range(_DEPTH):
-        level = [inner for value in level for inner in _inner(value)]
-        if not level:
-            return found
-    raise ValueError(f'not JSON: nested deeper than {_DEPTH}')
 
 
 def check_text(text: str) -> str:
-    """
-    Return a text without NUL and lone surrogates, which no file and no message can hold.
-
-    Raises ValueError for one with them.
-    """
+    """Return a text; raises ValueError for one with NUL or lone surrogates."""
     if '\0' in text:
         raise ValueError('a text with a NUL character')
     if _LONE.search(text):
@@ -151,33 +128,34 @@ def check_text(text: str) -> str:
     return text
 
 
-def _inner(value: object) -> Iterator[object]:
-    """Containers in a value; its texts are checked."""
-    members: list[object] = []
+def _check_digits(text: str) -> None:
+    if _DIGITS.search(text):
+        raise ValueError('a number of more than 400 digits')
+
+
+def _checked(value: Any, depth: int = 0) -> Any:
+    """Return a value; raises ValueError for one that is nested deep, or a text in it."""
     if isinstance(value, str):
         check_text(value)
-    elif isinstance(value, list):
-        members = value
-    elif isinstance(value, dict):
-        members = [*value, *value.values()]
-    for member in members:
-        if isinstance(member, str):
-            check_text(member)
-        elif isinstance(member, (list, dict)):
-            yield member
+    elif isinstance(value, (list, dict)):
+        if depth == _DEPTH:
+            raise ValueError(f'nested deeper than {_DEPTH}')
+        for member in value if isinstance(value, list) else (*value, *value.values()):
+            if isinstance(member, (str, list, dict)):  # no call for each of many numbers
+                _checked(member, depth + 1)
+    return value
 
 
 def _object(pairs: list[tuple[str, object]]) -> dict[str, object]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-        raise ValueError(f'key {shown(twice)} stands twice')
+        ((twice, _),) = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f'duplicate key {shown(twice)}')
     return found
 
 
 def _no_constant(name: str) -> object:
-    raise ValueError(f'{name} is no number of JSON')
+    raise ValueError(f'{name} is not a number of JSON')
 
 
 def _check_size(events: Iterator[Any]) -> None:
@@ -196,24 +174,16 @@ def _check_size(events: Iterator[Any]) -> None:
             raise ValueError(f'line {line}: more than {_VALUES} values')
 
 
-class _Placed(ValueError):
-    """An error that names its line."""
-
-
 class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
     """Safe loader of plain values with unique keys; the one in C is a hundred times faster."""
 
     yaml_implicit_resolvers: Mapping[str, Any] = {}
-    yaml_constructors: Mapping[str, Any] = {}
-
-    def construct_object(self, node: Any, deep: bool = False) -> Any:
-        """Value of a node; an error names its line."""
-        try:
-            return super().construct_object(node, deep)
-        except (_Placed, yaml.YAMLError):
-            raise
-        except (ValueError, LookupError) as error:
-            raise _Placed(f'line {node.start_mark.line + 1}: {error}') from error
+    # The constructor of no tag refuses all other tags.
+    yaml_constructors: Mapping[str | None, Any] = {
+        tag: constructor
+        for tag, constructor in yaml.SafeLoader.yaml_constructors.items()
+        if tag is None or tag.removeprefix(_TAG) in _KINDS
+    }
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[str, Any]:
         """Mapping with different texts as keys."""
@@ -221,40 +191,13 @@ class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[mi
         for key_node, value_node in node.value:
             key, line = self.construct_object(key_node, deep), key_node.start_mark.line + 1
             if not isinstance(key, str):
-                raise _Placed(f'line {line}: key {shown(key)} is not a text')
+                raise ValueError(f'line {line}: key {shown(key)} is not a text')
             if key in found:
-                raise _Placed(f'line {line}: duplicate key {shown(key)}')
+                raise ValueError(f'line {line}: duplicate key {shown(key)}')
             found[key] = self.construct_object(value_node, deep)
         return found
 
-    def construct_int(self, node: Any) -> int:
-        """An integer of 64 bit."""
-        digits = self.construct_scalar(node)
-        if len(digits) > _INT64_DIGITS or not -_INT64 <= self.construct_yaml_int(node) < _INT64:
-            raise ValueError(f'an integer of {len(digits)} digits is beyond 64 bit')
-        return int(self.construct_yaml_int(node))
 
-    def construct_text(self, node: Any) -> str:
-        """A text that files and messages can hold."""
-        return check_text(self.construct_scalar(node))
-
-    def refuse(self, node: Any) -> Any:
-        """Refuse a value with a tag that is not of the core schema."""
-        raise ValueError(f'tag {shown(node.tag)} is not read')
-
-
-_CONSTRUCTORS = {
-    'null': _Loader.construct_yaml_null,
-    'bool': _Loader.construct_yaml_bool,
-    'int': _Loader.construct_int,
-    'float': _Loader.construct_yaml_float,
-    'str': _Loader.construct_text,
-    'seq': lambda loader, node: loader.construct_sequence(node, deep=True),
-    'map': lambda loader, node: loader.construct_mapping(node, deep=True),
-}
-for _kind, _constructor in _CONSTRUCTORS.items():
-    _Loader.add_constructor(f'tag:yaml.org,2002:{_kind}', _constructor)
-_Loader.add_constructor(None, _Loader.refuse)
 # As the core schema of YAML and rcl read plain words; the first that matches counts.
 for _kind, _pattern in (
     ('null', r'(~|null|Null|NULL|)\Z'),
@@ -268,4 +211,4 @@ for _kind, _pattern in (
         ),
     ),
 ):
-    _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_kind}', re.compile(_pattern), None)
+    _Loader.add_implicit_resolver(_TAG + _kind, re.compile(_pattern), None)

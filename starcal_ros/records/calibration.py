@@ -21,11 +21,6 @@ from starcal_ros.records.residual_field import MapCovariance, ResidualField
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
 
 
-def calibration_parameter_names(camera: CameraModel) -> tuple[str, ...]:
-    """Names of the parameters of a camera, and of the alignment angles."""
-    return camera.parameter_names + ALIGNMENT_NAMES
-
-
 @dataclass(frozen=True)
 class CameraGeometry:
     """
@@ -150,21 +145,10 @@ class GateCheck:
     """
     One check of the gate.
 
-    Attributes
-    ----------
-    name : str
-        Description of the check.
-    option : str
-        The parameter that sets the limit: a lower limit where its name begins with ``min_``, else
-        an upper limit.  Empty for a check without a number.
-    found, limit : float
-        In ``unit``; ``found`` is NaN if not checked, both are NaN for a check without a number.
-    unit : str
-        Empty for pure numbers.
-    passed : bool or None
-        None where it was not checked.
-    note : str
-        Why it was not checked, or another reason for the result; may be empty.
+    ``option`` is the parameter that sets the limit: a lower limit where its name begins with
+    ``min_``, else an upper limit.  ``found`` and ``limit`` are in ``unit``, empty for pure
+    numbers.  A check without a number has an empty option and NaN for both.  ``passed`` is None
+    and ``found`` NaN where it was not checked; ``note`` has the reason, or another for the result.
     """
 
     name: str
@@ -375,11 +359,7 @@ def check_calibration(calibration: Calibration) -> None:
 
 
 def check_drawable(geometry: CameraGeometry) -> None:
-    """
-    Check that a report can show a geometry.
-
-    Raises ValueError naming the field and its value.
-    """
+    """Raise ValueError for a geometry that a report cannot show, with the field and value."""
     camera = geometry.camera
     largest, shortest_px = np.abs(camera.parameters).max(), camera.parameters[[0, 2]].min()
     if largest > _MOST:

@@ -56,19 +56,11 @@ class ResidualBin:
     """
     Residuals of a group of stars, each predicted from the other data.
 
-    Attributes
-    ----------
-    by : str
-        ``radius`` (px from the middle of the detector), ``magnitude`` or ``image`` (its number in
-        order of time) for images that others predict; ``star`` (its number of images) or ``cell``
-        (px from the middle) for sums over stars and cells of the detector.
-    low, high : float
-        Limits of the group.
-    stars : int
-    normalised : float
-        RMS of the residuals over their predicted sigma: 1 where the model and its sigmas hold.
-    sigma : float
-        1-sigma of ``normalised``, from the number of stars.
+    ``by`` is ``radius`` (px from the middle of the detector), ``magnitude`` or ``image`` (its
+    number in order of time) for images that others predict; ``star`` (its number of images) or
+    ``cell`` (px from the middle) for sums over stars and cells of the detector.  ``low`` and
+    ``high`` are the limits of the group.  ``normalised`` is the RMS of the residuals over their
+    predicted sigma, 1 where the model and its sigmas hold, and ``sigma`` its 1-sigma.
     """
 
     by: str
@@ -84,14 +76,8 @@ class Amplitude:
     """
     An estimated amplitude of errors that the model does not describe.
 
-    Attributes
-    ----------
-    name : str
-    value : float
-        1-sigma, in ``unit``.
-    unit : str
-    likelihood_ratio : float
-        Twice the log likelihood ratio against an amplitude of zero; reported only.
+    ``value`` is its 1-sigma in ``unit``; ``likelihood_ratio`` is twice the log likelihood ratio
+    against an amplitude of zero, which is only reported.
     """
 
     name: str
@@ -105,18 +91,10 @@ class ModelChecks:
     """
     Deviations of the data from the model and its priors.
 
-    Attributes
-    ----------
-    field_rms_px, field_worst_px : float
-        Residual field of the lens model: RMS per axis and largest length over the detector.
-    held : tuple of HeldTerm
-        Unknowns that are held, or that have a stated prior.
-    step : DetectorStep
-    image_variation_px : float
-        1-sigma change of the camera between images at a corner, included in the covariance.
-    amplitudes : tuple of Amplitude
-    predictions : tuple of ResidualBin
-        Empty with fewer than four images, and in older calibrations.
+    ``field_rms_px`` and ``field_worst_px`` are RMS per axis and largest length of the residual
+    field over the detector.  ``image_variation_px`` is the 1-sigma change of the camera between
+    images at a corner, included in the covariance.  ``predictions`` are empty with fewer than four
+    images, and in older calibrations.
     """
 
     field_rms_px: float

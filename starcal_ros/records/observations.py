@@ -131,7 +131,6 @@ class AttitudeSample:
 
 _Name = Annotated[str, Most(most_characters=100)]
 _Side = Annotated[int, Within(0, MAX_SIDE_PX)]
-_REFUSAL = OneOf(('', *IMAGE_REFUSALS))
 _Attitude = Annotated[Quaternion, Unit(1e-3)]  # single precision and rounding leave less
 _FiniteOrNaN = Annotated[float, Within()]
 _FloatsOrNaN = Annotated[NDArray[np.float32], Within(), Shape(('n',))]
@@ -200,7 +199,7 @@ class StarObservations:
     time_ns: Stamp
     width: _Side
     height: _Side
-    refusal: Annotated[str, _REFUSAL]
+    refusal: Annotated[str, OneOf(('', *IMAGE_REFUSALS))]
     detail: str
     icrf_from_star_tracker_xyzw: Annotated[_Attitude, Named('attitude')]
     attitude_gap_s: _FiniteOrNaN

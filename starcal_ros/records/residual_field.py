@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Field over the detector beside the lens model, and the covariance of lines of sight."""
+"""Field over the detector in addition to the lens model; covariance of lines of sight."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats, to_digits
+from starcal_ros.arrays import Floats
 from starcal_ros.camera.detector_field import DetectorField, FAMILIES, term_count
 from starcal_ros.record_fields import Count, Finite, OneOf, Shape
 
@@ -25,27 +25,19 @@ class MapCovariance:
     """
     Covariance of all that moves a line of sight.
 
-    Attributes
-    ----------
-    matrix : (k, k)
-        Of the numbers of `lookup.line_of_sight_jacobian`.
-    unresolved_px : float
-        1-sigma per axis of structure of the detector finer than the field: an independent
-        displacement of each pixel.
+    ``matrix`` is (k, k), of the numbers of `lookup.line_of_sight_jacobian`; ``unresolved_px`` the
+    1-sigma per axis of an independent displacement of each pixel, by structure of the detector
+    finer than the field.
     """
 
     matrix: Floats
     unresolved_px: float = 0.0
 
 
-def _none(*shape: int) -> Floats:
-    return np.empty(shape)
-
-
 @dataclass(frozen=True)
 class ResidualField:
     """
-    Field over the detector beside the lens model.
+    Field over the detector in addition to the lens model.
 
     With coefficients of zero none was found; its covariance is that of the fields that the stars
     do not rule out.  ``covariance`` is ``F F'``, plus ``R R'`` in the rows of the coefficients,
@@ -63,7 +55,7 @@ class ResidualField:
     joint_covariance : (p + 2 t, p + 2 t)
         As earlier versions wrote it; empty where there is a factor.
     family : str
-        Of its functions: one of `detector_field.FAMILIES`.
+        One of `detector_field.FAMILIES`, the kind of its functions.
     unresolved_px : float
         1-sigma per axis of structure finer than the field.
     covariance_factor : (p + 2 t, r)
@@ -76,15 +68,15 @@ class ResidualField:
     degree: Count
     coefficients: Annotated[Floats, Finite(), Shape((2, 'terms'))]
     joint_covariance: Annotated[Floats, Finite(), Shape(('joint', 'joint'))] = field(
-        default_factory=lambda: _none(0, 0)
+        default_factory=lambda: np.empty((0, 0))
     )
     family: Annotated[str, OneOf(FAMILIES)] = 'legendre'
     unresolved_px: Annotated[float, Finite()] = 0.0
     covariance_factor: Annotated[Floats, Finite(), Shape(('factor_rows', 'factor_cols'))] = field(
-        default_factory=lambda: _none(0, 0)
+        default_factory=lambda: np.empty((0, 0))
     )
     remainder_unit_px: Annotated[Floats, Finite(), Shape(('c',))] = field(
-        default_factory=lambda: _none(0)
+        default_factory=lambda: np.empty(0)
     )
     remainder: Annotated[NDArray[np.int16], Shape(('n',))] = field(
         default_factory=lambda: np.empty(0, np.int16)
@@ -92,13 +84,12 @@ class ResidualField:
 
     def __post_init__(self) -> None:
         """Check the size of the remainder."""
-        count = len(self.remainder_unit_px)
-        if len(self.remainder) != count * (count + 1) // 2:
-            expected = count * (count + 1) // 2
-            raise ValueError(f'remainder: {len(self.remainder)} numbers, not {expected}')
-        if count not in (0, self.coefficients.size) or count > len(self.covariance_factor):
-            expected = self.coefficients.size
-            raise ValueError(f'remainder_unit_px: {count} numbers, not {expected}')
+        count, all_of_them = len(self.remainder_unit_px), self.coefficients.size
+        in_triangle = count * (count + 1) // 2
+        if len(self.remainder) != in_triangle:
+            raise ValueError(f'remainder: {len(self.remainder)} numbers, not {in_triangle}')
+        if count not in (0, all_of_them) or count > len(self.covariance_factor):
+            raise ValueError(f'remainder_unit_px: {count} numbers, not {all_of_them}')
 
     @property
     def rows(self) -> int:
@@ -121,16 +112,12 @@ class ResidualField:
         return covariance
 
     def on(self, width: int, height: int) -> DetectorField:
-        """
-        Return the field on a detector of a size.
-
-        Raises ValueError when the coefficients are not those of the degree.
-        """
+        """Return the field on a detector; raises ValueError for a wrong number of terms."""
         if self.family not in FAMILIES:
             raise ValueError(f'field.family: {self.family!r} is not one of {", ".join(FAMILIES)}')
+        found = self.coefficients.shape[1]
         expected = term_count(width, height, self.degree, self.family)
-        if self.coefficients.shape[1] != expected:
-            found = self.coefficients.shape[1]
+        if found != expected:
             raise ValueError(f'field.coefficients: {found} for an axis, not {expected}')
         return DetectorField(width, height, self.degree, self.coefficients, self.family)
 
@@ -153,12 +140,12 @@ def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualFiel
     factor = np.concatenate(
         [known[:, None] * vectors * root, matrix[p:, :p] / scale @ vectors / root]
     )
-    factor = to_digits(factor, _DIGITS)
+    factor = _to_digits(factor, _DIGITS)
     left = matrix[p:, p:] - factor[p:] @ factor[p:].T
-    unit_px = to_digits(np.sqrt(np.diag(left).clip(0.0)) / _STEPS, 4)
+    unit_px = _to_digits(np.sqrt(np.diag(left).clip(0.0)) / _STEPS, 4)
     steps = np.where(unit_px > 0, unit_px, np.inf)
     values, vectors = np.linalg.eigh(left / np.outer(steps, steps))
-    # Of a matrix of deficient rank too: the triangle of the QR decomposition of a root.
+    # The triangle of the QR decomposition of a root exists for deficient rank too.
     _, upper = np.linalg.qr((vectors * np.sqrt(values.clip(0.0))).T)
     return ResidualField(
         degree=of.degree,
@@ -169,3 +156,9 @@ def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualFiel
         remainder_unit_px=unit_px,
         remainder=np.rint(upper.T[np.tril_indices(count)]).astype(np.int16),
     )
+
+
+def _to_digits(values: Floats, digits: int) -> Floats:
+    """Return numbers rounded to so many significant digits: texts of them are as short."""
+    rounded = [float(f'{value:.{digits - 1}e}') for value in values.ravel().tolist()]
+    return np.array(rounded, np.float64).reshape(values.shape)

@@ -22,7 +22,7 @@ from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
-from starcal_ros.records import calibration_parameter_names, Ensemble
+from starcal_ros.records import ALIGNMENT_NAMES, Ensemble
 from starcal_ros.studies.simulation.centroids import true_observations
 from starcal_ros.studies.trials import (
     bound,
@@ -240,7 +240,7 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
             for row, estimate in _solutions(design, key, ensemble, field, tracker):
                 sigma = np.sqrt(np.diag(estimate.covariance))[ESTIMATED]
                 error = errors(estimate.geometry, field.truth)[ESTIMATED]
-                names = calibration_parameter_names(estimate.geometry.camera)
+                names = estimate.geometry.camera.parameter_names + ALIGNMENT_NAMES
                 yield {
                     **row,
                     'reported_px': map_bound_px(estimate.geometry.camera, estimate.map_covariance),

@@ -766,7 +766,7 @@ def test_lifecycle_by_hand(
 def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: Path) -> None:
     """A bag of large images at full speed arrives completely, in order, with its stamps."""
     random = np.random.default_rng(2)
-    with BagWriter(tmp_path / 'large', compression='') as writer:
+    with BagWriter(tmp_path / 'large') as writer:
         for k in range(24):
             pixels = random.integers(0, 4096, (1024, 1296)).astype(np.uint16)
             for j in range(40):

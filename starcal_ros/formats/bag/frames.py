@@ -73,11 +73,7 @@ class Telemetry:
         self._newest_ns: dict[str, int] = {}
 
     def add(self, raw: RawMessage) -> bool:
-        """
-        Add a message, or report that it cannot be decoded.
-
-        Returns False where its stamp is before that of an earlier message of the topic.
-        """
+        """Add a message, or report damage; False if its topic had a later stamp before."""
         try:
             message = decode(raw)
         except BagError as error:

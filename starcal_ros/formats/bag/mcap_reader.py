@@ -56,11 +56,7 @@ class RawMessage:
 
 
 def read_summary(file: Path) -> Summary | None:
-    """
-    Summary at the end of a file; empty if the file was written without one.
-
-    None if the summary is damaged (its checksum is verified) or missing.
-    """
+    """Summary at the end of a file, empty if none was written; None if missing or damaged."""
     with file.open('rb') as stream:
         # The exceptions of a damaged summary have no common base class.
         try:
@@ -137,12 +133,8 @@ class _Pieces:
     """
     Schemas, channels and messages of a file, inside and outside chunks.
 
-    Attributes
-    ----------
-    complete : bool
-        True once the end of the data was reached.
-    lost : Counter
-        Messages in damaged chunks by channel, from the indexes after those chunks.
+    ``complete`` is True once the end of the data was reached; ``lost`` counts the messages in
+    damaged chunks by channel, from the indexes after those chunks.
     """
 
     def __init__(self, file: Path, summary: Summary, on_damage: Damage) -> None:
@@ -197,7 +189,7 @@ class _Pieces:
                 elif not self._has_chunks or isinstance(record, (Schema, Channel)):
                     yield record
                 elif isinstance(record, Message):
-                    # Recorders put all messages into chunks or none: this is no real message.
+                    # Recorders put all messages into chunks or none: these are damaged bytes.
                     self.report(f'damaged after byte {read_to} of {size}')
                     return self._start_after(read_to)
             self.report(f'damaged before byte {read_to} of {size}: no end-of-data record')

@@ -16,7 +16,7 @@ import logging
 from pathlib import Path
 import re
 
-from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.errors import BagError, errors_as, ImageRefused
 from starcal_ros.formats.bag.mcap_reader import (
     Damage,
     MAGIC,
@@ -78,27 +78,20 @@ class Topics:
 
 
 def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
-    """
-    MCAP files of bags, in recording order.
-
-    Raises BagError if a path is neither an .mcap file nor a folder that holds some.
-    """
+    """MCAP files of bags in recording order; raises BagError where a path has none."""
     files = []
     for path in map(Path, paths):
         if path.is_dir():
             files += _files_of_folder(path)
-        elif path.exists():  # opening a pipe would wait for whoever writes to it
+        elif path.exists():  # opening a pipe would wait for its writer
             if not path.is_file():
                 raise BagError(f'{path}: not a regular file')
             files.append(path)
         else:
             raise BagError(f'{path}: no such bag')
     for file in files:
-        try:
-            with file.open('rb') as stream:
-                magic = stream.read(_MAGIC_BYTES)
-        except OSError as error:
-            raise BagError(f'{file}: cannot be read: {error.strerror}') from error
+        with errors_as(BagError, file), file.open('rb') as stream:
+            magic = stream.read(_MAGIC_BYTES)
         if not magic.startswith(MAGIC):
             other = _how_to_convert(file, magic) or _how_to_import(file.parent, file)
             raise BagError(f'{file}: not an MCAP bag{other}')
@@ -106,21 +99,13 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
 
 
 def files_of_bags(paths: Iterable[Path | str]) -> tuple[Path, ...]:
-    """
-    The files that bags are read from, ``metadata.yaml`` of a folder included.
-
-    Raises BagError if a path is neither an .mcap file nor a folder that holds some.
-    """
+    """Files that bags are read from, metadata.yaml included; raises BagError as `mcap_files`."""
     bags = [Path(path) for path in paths]
     return (*mcap_files(bags), *(bag / 'metadata.yaml' for bag in bags if bag.is_dir()))
 
 
 def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple[Topic, ...]:
-    """
-    Topics with messages, by name.
-
-    The summaries of the files list them; a file without one is read completely.
-    """
+    """Topics with messages, by name; a file without a summary is read completely."""
     types: dict[str, str] = {}
     counts: Counter[str] = Counter()
     for file in mcap_files(paths):
@@ -138,7 +123,12 @@ def topics(paths: Iterable[Path | str], on_damage: Damage = log_damage) -> tuple
 def _listed(file: Path, size: int, modified_ns: int) -> tuple[list[Topic], list[str]]:
     """Topics of a file and its damage; kept, as a file without summary is read for them."""
     damage: list[str] = []
-    return _summary(file) or _counted(file, damage.append), damage
+    found = _summary(file)
+    if not found:
+        messages = read_messages(file, None, damage.append)
+        counts = Counter((raw.topic, raw.type_name) for raw in messages)
+        found = [Topic(*topic, count) for topic, count in counts.items()]
+    return found, damage
 
 
 def _summary(file: Path) -> list[Topic]:
@@ -156,17 +146,8 @@ def _summary(file: Path) -> list[Topic]:
     return found
 
 
-def _counted(file: Path, on_damage: Damage) -> list[Topic]:
-    counts = Counter((raw.topic, raw.type_name) for raw in read_messages(file, None, on_damage))
-    return [Topic(name, type_name, count) for (name, type_name), count in counts.items()]
-
-
 def choose_topic(paths: Iterable[Path | str], type_name: str, asked: str = '') -> str:
-    """
-    The requested topic, or the only one of a type.
-
-    Raises BagError with the list of the topics of the type.
-    """
+    """The requested topic, or the only one of a type; raises BagError with those there are."""
     paths = list(paths)
     where = ', '.join(map(str, paths))
     there = topics(paths)
@@ -200,17 +181,11 @@ def read_images(
     topic: str,
     stamp_offset_s: float = 0.0,
     on_damage: Damage = log_damage,
-    size: tuple[int, int] | None = None,
     channel: str = '',
 ) -> Iterator[Image | StarObservations]:
-    """
-    Images of a topic; an image that cannot be decoded becomes refused observations.
-
-    So does a compressed image of another ``size`` (width, height), where one is given.
-    ``channel`` is the colour that is taken of colour images (`image_from_message`).
-    """
+    """Images of a topic, as `image_of` reads them."""
     for raw in read_raw(paths, [topic], on_damage):
-        yield image_of(raw, stamp_offset_s, size, channel)
+        yield image_of(raw, stamp_offset_s, channel=channel)
 
 
 def image_of(
@@ -228,8 +203,7 @@ def image_of(
     try:
         message = decode(raw)
     except BagError as error:
-        log_time_ns = nearest_stamp_ns(raw.log_time_ns)
-        return refused_image(log_time_ns, 0, 0, 'bad_layout', str(error))
+        return refused_image(nearest_stamp_ns(raw.log_time_ns), 0, 0, 'bad_layout', str(error))
     try:
         return image_from_message(message, stamp_offset_s, size, channel)
     except ImageRefused as refused:
@@ -246,18 +220,13 @@ def read_observations(
     """
     for raw in read_raw(paths, [topic], on_damage):
         try:
-            message = decode(raw)
-            yield checked_observations(message)
+            yield checked_observations(decode(raw))
         except (AttributeError, ValueError) as error:
             raise BagError(f'{topic}: not readable as observations: {error}') from error
 
 
 def decode(raw: RawMessage) -> Message:
-    """
-    Decoded message: by the definition in the bag, else by the one of ROS 2.
-
-    Raises BagError if the bytes are not a message of the type.
-    """
+    """Message by the definition in the bag, else by that of ROS 2; raises BagError."""
     try:
         store = typestore_of(raw.type_name, raw.definition)
         return store.deserialize_cdr(raw.view, raw.type_name)

@@ -56,17 +56,21 @@ def _definitions_folder() -> Path:
     raise BagError(f'the starcal .msg files are not installed in {candidates[-1]}')
 
 
+@functools.lru_cache(maxsize=64)
 def typestore_of(type_name: str, definition: str) -> Typestore:
     """
     Types by the definition in a bag, whose writer may be another version; else `typestore`.
 
-    Raises BagError when the definition is none and the type is not one of `typestore`.
+    Raises BagError when the definition is invalid and the type is not one of `typestore`.
     """
     try:
         return typestore_with(type_name, definition)
-    except BagError:
+    # The exceptions of an invalid definition have no common base class.
+    except Exception as error:
         if type_name not in typestore().types:
-            raise
+            raise BagError(
+                f'{type_name:.60}: its definition in the bag: {error!s:.100}'
+            ) from error
         return typestore()
 
 
@@ -74,34 +78,22 @@ def typestore_with(type_name: str, definition: str) -> Typestore:
     """
     Types with the bag's own definition of one: another version may have written the bag.
 
-    Raises BagError when the definition is none, or too large: code is generated from it.
+    Raises ValueError when the definition is too large, since code is generated from it, and
+    exceptions of any class when it is invalid.
     """
-    found = _store_or_fault(type_name, definition)
-    if isinstance(found, str):
-        raise BagError(f'{type_name:.60}: the definition in the bag cannot be used: {found}')
-    return found
-
-
-@functools.lru_cache(maxsize=64)
-def _store_or_fault(type_name: str, definition: str) -> Typestore | str:
-    """The types, or why there are none: a bad definition is not read for each message again."""
     if not _TYPE_NAME.fullmatch(type_name):
-        return 'not a type name'
+        raise ValueError('not a type name')
     if len(definition) > _MOST_CHARACTERS:
-        return f'longer than {_MOST_CHARACTERS} characters'
+        raise ValueError(f'longer than {_MOST_CHARACTERS} characters')
     for count in _COUNT.findall(definition):
         if len(count) > 9 or int(count) > _MOST_ITEMS:
-            return f'an array of more than {_MOST_ITEMS} items'
+            raise ValueError(f'an array of more than {_MOST_ITEMS} items')
+    found = get_types_from_msg(definition, type_name)
+    _count_items(type_name, found, {})
+    for name, (_, fields) in found.items():
+        _check_fields(name, dict(fields))
     store = get_typestore(Stores.EMPTY)
-    # The exceptions of a text that is no definition have no common base class.
-    try:
-        found = get_types_from_msg(definition, type_name)
-        _count_items(type_name, found, {})
-        for name, (_, fields) in found.items():
-            _check_fields(name, dict(fields))
-        store.register(found)
-    except Exception as error:
-        return f'{error}'[:100]
+    store.register(found)
     return store
 
 

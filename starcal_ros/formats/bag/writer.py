@@ -12,33 +12,27 @@ import json
 import os
 from pathlib import Path
 from types import TracebackType
-from typing import Any, IO, NamedTuple, TYPE_CHECKING
+from typing import Any, IO, TYPE_CHECKING
 
 from mcap.writer import CompressionType, Writer
 import yaml
 
 from starcal_ros.arrays import Floats
-from starcal_ros.errors import BagError
+from starcal_ros.errors import BagError, errors_as
 from starcal_ros.files import replacing
 from starcal_ros.formats.bag.typestore import described, make_message, typestore
 from starcal_ros.formats.messages import telemetry, types
-from starcal_ros.formats.messages.calibration_messages import calibration_to_message
 from starcal_ros.formats.messages.image_messages import image_to_message
 from starcal_ros.formats.messages.observation_messages import observations_to_message
-from starcal_ros.records import Calibration, Image, StarObservations
+from starcal_ros.records import Image, StarObservations
 from starcal_ros.untrusted import PRODUCT_BYTES, read_text
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 _OF_BAGS = ('metadata.yaml', '*.mcap', '*.db3')
+_COMPRESSION = CompressionType.ZSTD
 _CHUNK_BYTES = 4 << 20  # an image or two: lost in a crash, and held in memory by a reader
-
-
-class _Channel(NamedTuple):
-    number: int
-    type_name: str
-    latched: bool
 
 
 class BagWriter:
@@ -47,22 +41,15 @@ class BagWriter:
 
     Use it in a ``with`` statement: its end replaces the file whole.  After an exception in the
     block the file that was there before is unchanged.  A folder gets a ``metadata.yaml``, a single
-    file none: the one beside it may belong to another bag.
-
-    Parameters
-    ----------
-    path : Path or str
-        The folder is created if missing.
-    compression : {'zstd', 'lz4', ''}
+    file none: the one beside it may belong to another bag.  Missing folders are created.
     """
 
-    def __init__(self, path: Path | str, compression: str = 'zstd') -> None:
+    def __init__(self, path: Path | str) -> None:
         path = Path(path)
         is_file = path.suffix == '.mcap'
         self.file = path if is_file else path / f'{path.name}_0.mcap'
         self._metadata_file = None if is_file else path / 'metadata.yaml'
-        self._compression = CompressionType[(compression or 'none').upper()]
-        self._channels: dict[str, _Channel] = {}
+        self._channels: dict[str, tuple[int, str]] = {}  # number and type by topic
         self._counts: Counter[str] = Counter()
         self._first_ns: int | None = None
         self._last_ns = 0
@@ -70,18 +57,16 @@ class BagWriter:
         self._writer: Any = None
 
     def __enter__(self) -> Self:
-        """Open a file beside the place of the bag."""
-        try:
+        """Open a temporary file in the folder of the bag."""
+        with errors_as(BagError, self.file, 'written'):
             self.file.parent.mkdir(parents=True, exist_ok=True)
             self._replacing = replacing(self.file)
             stream = self._replacing.__enter__()
-        except OSError as error:
-            raise BagError(f'{self.file}: cannot be written: {error.strerror}') from error
         self._start(stream)
         return self
 
     def _start(self, stream: IO[bytes]) -> None:
-        self._writer = Writer(stream, _CHUNK_BYTES, self._compression)
+        self._writer = Writer(stream, _CHUNK_BYTES, _COMPRESSION)
         self._writer.start('ros2', library='starcal')
 
     @classmethod
@@ -105,15 +90,13 @@ class BagWriter:
         if kind is not None:
             self._replacing.__exit__(kind, error, traceback)
             return
-        try:
+        with errors_as(BagError, self.file, 'written'):
             with contextlib.ExitStack() as stack:
                 stack.push(self._replacing)
                 self._writer.finish()
             if self._metadata_file is not None:
                 with replacing(self._metadata_file) as file:
                     file.write(self._metadata().encode())
-        except OSError as failure:
-            raise BagError(f'{self.file}: cannot be written: {failure.strerror}') from failure
 
     def write_image(self, topic: str, image: Image, frame_id: str) -> None:
         """Write a sensor_msgs/Image."""
@@ -146,17 +129,10 @@ class BagWriter:
         message = observations_to_message(record, frame_id, make_message)
         self._write(topic, types.OBSERVATIONS_TYPE, record.time_ns, message)
 
-    def write_calibration(self, topic: str, calibration: Calibration) -> None:
-        """Write a starcal/Calibration."""
-        message = calibration_to_message(calibration, make_message)
-        self._write(topic, types.CALIBRATION_TYPE, calibration.time_ns, message, latched=True)
-
-    def _write(
-        self, topic: str, type_name: str, time_ns: int, message: object, latched: bool = False
-    ) -> None:
-        channel = self._channels.get(topic) or self._open(topic, type_name, latched)
-        if channel.type_name != type_name:
-            raise ValueError(f'topic: {topic} holds {channel.type_name}, not {type_name}')
+    def _write(self, topic: str, type_name: str, time_ns: int, message: object) -> None:
+        number, of_topic = self._channels.get(topic) or self._open(topic, type_name)
+        if of_topic != type_name:
+            raise ValueError(f'topic: {topic} holds {of_topic}, not {type_name}')
         try:
             data = bytes(typestore().serialize_cdr(message, type_name))
         # The exceptions of a value that its field cannot hold have no common base class.
@@ -164,37 +140,33 @@ class BagWriter:
             raise BagError(f'{topic}: a {type_name} cannot be written: {error}') from error
         # A recording time is not negative; the stamp in the message is written as it is.
         time_ns = max(time_ns, 0)
-        try:
+        with errors_as(BagError, self.file, 'written'):
             self._writer.add_message(
-                channel.number, time_ns, data, publish_time=time_ns, sequence=self._counts[topic]
+                number, time_ns, data, publish_time=time_ns, sequence=self._counts[topic]
             )
-        except OSError as error:
-            raise BagError(f'{self.file}: cannot be written: {error.strerror}') from error
         self._counts[topic] += 1
         self._first_ns = time_ns if self._first_ns is None else min(self._first_ns, time_ns)
         self._last_ns = max(self._last_ns, time_ns)
 
-    def _open(self, topic: str, type_name: str, latched: bool) -> _Channel:
+    def _open(self, topic: str, type_name: str) -> tuple[int, str]:
         definition, type_hash = described(type_name)
         schema_id = self._writer.register_schema(type_name, 'ros2msg', definition.encode())
         metadata = {
-            'offered_qos_profiles': yaml.safe_dump([qos_profile(latched)], sort_keys=False),
+            'offered_qos_profiles': yaml.safe_dump([_offered_qos()], sort_keys=False),
             'topic_type_hash': type_hash,
         }
         number = self._writer.register_channel(topic, 'cdr', schema_id, metadata)
-        self._channels[topic] = _Channel(number, type_name, latched)
-        return self._channels[topic]
+        self._channels[topic] = number, type_name
+        return number, type_name
 
     def _metadata(self) -> str:
         messages = sum(self._counts.values())
         file = FileSpan(self.file.name, self._first_ns or 0, self._last_ns, messages)
-        return metadata_text(
-            [file],
-            [
-                TopicSummary(topic, channel.type_name, channel.latched, self._counts[topic])
-                for topic, channel in self._channels.items()
-            ],
-        )
+        topics = [
+            TopicSummary(topic, type_name, self._counts[topic])
+            for topic, (_, type_name) in self._channels.items()
+        ]
+        return metadata_text([file], topics)
 
 
 def check_replaceable(
@@ -203,18 +175,9 @@ def check_replaceable(
     """
     Check that a bag and the files beside it replace nothing but an earlier bag of their kind.
 
-    Raises BagError naming a file of another origin.
-
-    Parameters
-    ----------
-    record : Path
-        JSON object beside the bag; ``bag`` in it names the file of the bag.
-    others : iterable of Path
-        Further files to write.
-    mark : str
-        Key that only records of this kind have.
-    kind : str
-        Description for the error message, as 'a simulated bag'.
+    ``record`` is a JSON object beside the bag, whose key ``bag`` names the file of the bag and
+    whose key ``mark`` only records of this kind have; ``others`` are further files to write.
+    Raises BagError that names a file that is not of ``kind``, as 'a simulated bag'.
     """
     file = BagWriter(bag).file
     there = [path for path in (file, record, *others) if os.path.lexists(path)]
@@ -244,11 +207,10 @@ class FileSpan:
 
 @dataclass(frozen=True)
 class TopicSummary:
-    """A topic of a bag; ``latched``: offered as transient local."""
+    """A topic of a bag."""
 
     name: str
     type_name: str
-    latched: bool
     messages: int
 
 
@@ -262,7 +224,7 @@ def metadata_text(files: Sequence[FileSpan], topics: Sequence[TopicSummary]) -> 
                 'name': topic.name,
                 'type': topic.type_name,
                 'serialization_format': 'cdr',
-                'offered_qos_profiles': [qos_profile(topic.latched)],
+                'offered_qos_profiles': [_offered_qos()],
                 'type_description_hash': typestore().hash_rihs01(topic.type_name),
             },
             'message_count': topic.messages,
@@ -292,17 +254,17 @@ def _span(file: FileSpan) -> dict[str, object]:
     }
 
 
-def qos_profile(latched: bool) -> dict[str, object]:
-    """Return the QoS in the notation of rosbag2: reliable, and transient local if latched."""
+def _offered_qos() -> dict[str, object]:
+    """Return the QoS of the topics, reliable and volatile, in the notation of rosbag2."""
 
     def forever() -> dict[str, int]:
         return {'sec': 9223372036, 'nsec': 854775807}
 
     return {
         'history': 'keep_last',
-        'depth': 1 if latched else 10,
+        'depth': 10,
         'reliability': 'reliable',
-        'durability': 'transient_local' if latched else 'volatile',
+        'durability': 'volatile',
         'deadline': forever(),
         'lifespan': forever(),
         'liveliness': 'automatic',

@@ -32,7 +32,7 @@ class Header:
 
 
 def png_header(content: bytes) -> Header | None:
-    """Header at the start of a PNG (PNG 1.2, section 4.1.1); None for what is no PNG."""
+    """Header at the start of a PNG (PNG 1.2, section 4.1.1); None if it is not a PNG."""
     if len(content) < _PNG.size:
         return None
     signature, length, name, width, height, _, colour = _PNG.unpack_from(content)
@@ -66,7 +66,7 @@ def has_surplus(content: bytes, header: Header) -> bool:
 
 
 def tiff_header(content: bytes) -> Header | None:
-    """Header of the first image of a TIFF (TIFF 6.0, section 2); None for what is no TIFF."""
+    """Header of the first image of a TIFF (TIFF 6.0, section 2); None if it is not a TIFF."""
     order = {b'II*\0': '<', b'MM\0*': '>'}.get(content[:4])
     if order is None:
         return None

@@ -9,13 +9,7 @@ import re
 from typing import Any, NamedTuple
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.formats.images.time_systems import (
-    from_mjd,
-    from_text,
-    has_clock,
-    system_of,
-    TimeError,
-)
+from starcal_ros.formats.images.time_systems import from_mjd, from_text, system_of, TimeError
 
 _EXPOSURE_KEYS = ('XPOSURE', 'EXPTIME', 'EXPOSURE')  # the first is that of the standard
 # Keywords with the time of day of a date alone: a custom older than the standard.
@@ -82,7 +76,7 @@ def _stamp(header: Mapping[str, Card], name: str) -> int:
     if isinstance(value, (int, float)):
         return from_mjd(float(value), system)
     text = str(value).strip()
-    if has_clock(text):
+    if ':' in text:
         return from_text(text, system)
     clocks = [key for key in _CLOCKS.get(name, ()) if key in header]
     # UT is UTC, also where TIMESYS is not.

@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
-from starcal_ros.errors import IngestError
+from starcal_ros.errors import errors_as, IngestError
 from starcal_ros.formats.images.file_header import has_surplus, png_header, tiff_header
 from starcal_ros.formats.images.header_times import Card, middle_of_exposure
 from starcal_ros.formats.images.time_systems import TimeError
-from starcal_ros.formats.messages.image_messages import of_mosaic, plane
+from starcal_ros.formats.messages.image_messages import CHANNELS, of_mosaic, plane
 from starcal_ros.untrusted import read_bytes
 
 FITS_ENDINGS = ('.fits', '.fit', '.fts', '.fits.gz', '.fit.gz', '.fits.fz', '.fz')
@@ -34,7 +34,7 @@ _RGB, _GREY = 3, 2
 MOST_VALUES = 2**27  # of an image, all colours: as many as a node takes
 MOST_BYTES = 2**31
 _ROWS = 256  # mapped at a time: an image in double precision can exceed the memory
-_FULL = 65000  # of 16 bit: below the end of the range, which stands for saturation
+_FULL = 65000  # of 16 bit: below the end of the range, which means saturation
 
 
 @dataclass(frozen=True)
@@ -107,11 +107,7 @@ class Scale:
 
 
 def look(path: Path, options: ImageOptions) -> ImageFile:
-    """
-    Stamp, size and range of an image file.
-
-    Raises IngestError when the file cannot be read or has no time; the text names the remedy.
-    """
+    """Stamp, size and range of an image file; raises IngestError with the remedy."""
     values, header = _read(path, options)
     finite = np.isfinite(values)
     if not finite.any():
@@ -129,8 +125,8 @@ def look(path: Path, options: ImageOptions) -> ImageFile:
         float(values.max(where=finite, initial=some)),
         # The median step between neighbours is 0.954 sigma for white noise.
         float(np.nanmedian(steps)) / 0.954,
-        _number(header, 'SATURATE'),
-        _number(header, options.temperature_key) if options.temperature_key else np.nan,
+        number(header, 'SATURATE'),
+        number(header, options.temperature_key),
     )
 
 
@@ -142,11 +138,7 @@ def pixels_of(path: Path, options: ImageOptions, scale: Scale) -> Pixels:
 
 
 def common_scale(files: Sequence[ImageFile], options: ImageOptions) -> Scale:
-    """
-    The scale of all images; none where whole numbers fit 8 or 16 bit.
-
-    Raises IngestError for a range that is empty.
-    """
+    """The scale of all images; none if whole numbers fit 16 bit.  Raises IngestError."""
     kinds = {file.dtype.kind for file in files}
     low, high = min(file.low for file in files), max(file.high for file in files)
     whole = kinds <= {'u', 'i'}
@@ -162,11 +154,7 @@ def common_scale(files: Sequence[ImageFile], options: ImageOptions) -> Scale:
 
 
 def check_alike(files: Sequence[ImageFile]) -> None:
-    """
-    Check that images have one size and different stamps.
-
-    Raises IngestError naming two files.
-    """
+    """Check that images have one size and different stamps; raises IngestError."""
     first = files[0]
     for file in files:
         if (file.width, file.height) != (first.width, first.height):
@@ -185,13 +173,12 @@ def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str,
         values, header = read_fits(path, options.hdu)
     else:
         values, header = _read_picture(path), {}
-    if values.ndim == _RGB and values.shape[2] == _RGB:
-        if options.channel not in ('red', 'green', 'blue'):
-            raise IngestError(f'{path}: a colour image: choose --channel red, green or blue')
+    is_colour = values.ndim == _RGB and values.shape[2] == _RGB
+    if (is_colour or options.bayer) and options.channel not in CHANNELS:
+        raise IngestError(f'{path}: a colour image: choose --channel red, green or blue')
+    if is_colour:
         values = plane(values, 'rgb', options.channel)
     elif options.bayer:
-        if options.channel not in ('red', 'green', 'blue'):
-            raise IngestError(f'{path}: of a mosaic choose --channel red, green or blue')
         values = of_mosaic(values, options.bayer.lower(), options.channel)
     if values.ndim != _GREY or min(values.shape) < 2:
         raise IngestError(
@@ -202,18 +189,14 @@ def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str,
 
 
 def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
-    """
-    Values and header cards of an image in a FITS file, of ``hdu`` or of the first one.
-
-    Raises IngestError when the file cannot be read.
-    """
+    """Values and cards of the image ``hdu``, or the first, of a FITS file; raises IngestError."""
     try:
         from astropy.io import fits
     except ModuleNotFoundError as error:
         raise IngestError(
             f"{path}: FITS files need astropy: pip install 'starcal_ros[mission]'"
         ) from error
-    if path.exists() and not path.is_file():  # opening a pipe would wait for whoever writes to it
+    if path.exists() and not path.is_file():  # opening a pipe would wait for its writer
         raise IngestError(f'{path}: not a regular file')
     try:
         # Not mapped to memory: scaled data cannot be, and files are read one at a time.
@@ -239,7 +222,7 @@ def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
             values = np.asarray(unit.data)
     except (IngestError, MemoryError):
         raise
-    except Exception as error:  # astropy raises whatever a damaged file brings about
+    except Exception as error:  # a damaged file makes astropy raise anything
         words = ' '.join(str(error).split())[:160]
         raise IngestError(f'{path}: not readable as FITS: {words}') from error
     values = values.squeeze()
@@ -270,21 +253,28 @@ def _truncation_is_an_error() -> Iterator[None]:
 
 
 def read_values(path: Path) -> NDArray[Any]:
-    """
-    Values (height, width) of an image file of one channel, FITS by its ending, as they are.
-
-    Raises IngestError when the file cannot be read or has more channels.
-    """
+    """Values (height, width) of an image file of one channel, as they are; raises IngestError."""
     return _read(path, ImageOptions())[0]
 
 
+def content_of(path: Path) -> bytes:
+    """Content of an image file; raises IngestError when it cannot be read."""
+    with errors_as(IngestError, path):
+        return read_bytes(path, MOST_BYTES)
+
+
+def decoded(path: Path, content: bytes) -> NDArray[Any]:
+    """Values of an image file, not turned by EXIF, colour as BGR; raises IngestError."""
+    values = None
+    with contextlib.suppress(cv2.error):
+        values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if values is None:
+        raise IngestError(f'{path}: damaged, or of a kind that OpenCV does not read')
+    return np.asarray(values)
+
+
 def _read_picture(path: Path) -> NDArray[Any]:
-    try:
-        content = read_bytes(path, MOST_BYTES)
-    except OSError as error:
-        raise IngestError(f'{path}: cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise IngestError(f'{path}: {error}') from error
+    content = content_of(path)
     header = png_header(content) or tiff_header(content)
     if header is None:
         raise IngestError(f'{path}: not an image in FITS (by its ending), TIFF or PNG')
@@ -293,14 +283,8 @@ def _read_picture(path: Path) -> NDArray[Any]:
         raise IngestError(f'{path}: claims {header.width} x {header.height} pixels')
     if png_header(content) and has_surplus(content, header):
         raise IngestError(f'{path}: inflates to far more than its pixels')
-    values = None
-    with contextlib.suppress(cv2.error):
-        values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    if values is None:
-        raise IngestError(f'{path}: damaged, or of a kind that OpenCV does not read')
-    if values.ndim == _RGB:
-        values = values[:, :, 2::-1]  # OpenCV has BGR, with alpha last
-    return np.asarray(values)
+    values = decoded(path, content)
+    return values[:, :, 2::-1] if values.ndim == _RGB else values  # BGR, with alpha last
 
 
 def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> int:
@@ -316,6 +300,7 @@ def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> i
         raise IngestError(f'{path}: {error}') from error
 
 
-def _number(header: Mapping[str, Card], key: str) -> float:
-    value = header[key].value if key in header else None
-    return float(value) if isinstance(value, (int, float)) else np.nan
+def number(header: Mapping[str, Card], *keys: str) -> float:
+    """Value of the first of the keywords that has a number; NaN: none has."""
+    values = (header[key].value for key in keys if key in header)
+    return next((float(one) for one in values if isinstance(one, (int, float))), math.nan)

@@ -1,19 +1,18 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Photographs of any camera: JPEG, PNG, TIFF and FITS, with what EXIF or the header states."""
+"""Photographs of any camera: JPEG, PNG, TIFF and FITS, with the facts in EXIF or the header."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 import contextlib
-from dataclasses import dataclass
-from datetime import datetime, timezone
+from dataclasses import dataclass, replace
+from datetime import datetime
 import glob
 import io
 import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,9 +20,15 @@ from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import IngestError
 from starcal_ros.formats.images.header_times import Card, middle_of_exposure
-from starcal_ros.formats.images.image_files import FITS_ENDINGS, MOST_BYTES, MOST_VALUES, read_fits
+from starcal_ros.formats.images.image_files import (
+    content_of,
+    decoded,
+    FITS_ENDINGS,
+    MOST_VALUES,
+    number,
+    read_fits,
+)
 from starcal_ros.formats.images.time_systems import TimeError
-from starcal_ros.untrusted import read_bytes
 
 ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', *FITS_ENDINGS)
 _DIAGONAL_35_MM = 43.2666  # of 36 mm x 24 mm
@@ -69,21 +74,16 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
 
 
 def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> Photograph:
-    """
-    Facts that a file states; a given focal length in mm goes before that of the file.
-
-    Raises IngestError when the file cannot be read.
-    """
+    """Facts of a file; a given focal length replaces its own.  Raises IngestError."""
     if path.name.lower().endswith(FITS_ENDINGS):
         values, header = read_fits(path, '')
         stated = _of_fits(path, values, header)
-        stated_um = _number(header, 'PIXSIZE1', 'XPIXSZ')
+        stated_um = number(header, 'PIXSIZE1', 'XPIXSZ')
     else:
         stated, stated_um = _of_picture(path)
     pixel_um = pixel_um or stated_um
-    if focal_length_mm and pixel_um > 0:
-        stated = _with(stated, focal_px=1000.0 * focal_length_mm / pixel_um)
-    return stated
+    given_px = _focal_px(focal_length_mm, pixel_um)
+    return stated if math.isnan(given_px) else replace(stated, focal_px=given_px)
 
 
 def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
@@ -92,7 +92,7 @@ def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
     found: list[Photograph] = []
     for one in ordered:
         if found and one.time_ns <= found[-1].time_ns:
-            one = _with(one, time_ns=found[-1].time_ns + _SAME_STAMP_NS)
+            one = replace(one, time_ns=found[-1].time_ns + _SAME_STAMP_NS)
         found.append(one)
     return found
 
@@ -114,7 +114,7 @@ def pixels_of_photograph(path: Path) -> Pixels:
     if path.name.lower().endswith(FITS_ENDINGS):
         values = read_fits(path, '')[0]
     else:
-        values = _decoded(path)
+        values = decoded(path, content_of(path))  # the EXIF orientation is not applied
     if values.ndim == 3:
         is_rendered = values.dtype == np.uint8
         values = np.ascontiguousarray(values[:, :, _GREEN])
@@ -138,30 +138,6 @@ def _srgb_to_light() -> NDArray[np.uint16]:
 _SRGB_TO_LIGHT = _srgb_to_light()
 
 
-def _with(one: Photograph, **changes: Any) -> Photograph:
-    return Photograph(**{**vars(one), **changes})
-
-
-def _decoded(path: Path) -> NDArray[Any]:
-    content = _content(path)
-    values = None
-    with contextlib.suppress(cv2.error):
-        # Unchanged: 16 bit stay, and the EXIF orientation is not applied.
-        values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    if values is None:
-        raise IngestError(f'{path}: damaged, or of a kind that OpenCV does not read')
-    return np.asarray(values)
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return read_bytes(path, MOST_BYTES)
-    except OSError as error:
-        raise IngestError(f'{path}: cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise IngestError(f'{path}: {error}') from error
-
-
 def _of_picture(path: Path) -> tuple[Photograph, float]:
     """Facts of EXIF, and the size of a pixel, micrometres, NaN where it has none."""
     try:
@@ -172,14 +148,14 @@ def _of_picture(path: Path) -> tuple[Photograph, float]:
         ) from error
     try:
         # Opened, not decoded: size and tags only.
-        with Image.open(io.BytesIO(_content(path))) as image:
+        with Image.open(io.BytesIO(content_of(path))) as image:
             width, height = image.size
             exif = image.getexif()
             tags = {**dict(exif), **dict(exif.get_ifd(_EXIF))}
             gps = dict(exif.get_ifd(_GPS))
     except IngestError:
         raise
-    except Exception as error:  # Pillow raises whatever a damaged file brings about
+    except Exception as error:  # a damaged file makes Pillow raise anything
         raise IngestError(f'{path}: not readable: {" ".join(str(error).split())[:160]}') from error
     if width * height > MOST_VALUES:
         raise IngestError(f'{path}: claims {width} x {height} pixels')
@@ -190,6 +166,10 @@ def _of_picture(path: Path) -> tuple[Photograph, float]:
     focal_mm, pixel_um = _real(tags.get(0x920A)), _pixel_um(tags, width)
     if words and focal_mm > 0:
         words.append(f'{focal_mm:g} mm')
+    focal_px = _focal_px(focal_mm, pixel_um)
+    equivalent_mm = _real(tags.get(0xA405))  # FocalLengthIn35mmFilm; 0: unknown
+    if math.isnan(focal_px) and equivalent_mm > 0:
+        focal_px = math.hypot(width, height) * equivalent_mm / _DIAGONAL_35_MM
     return (
         Photograph(
             path,
@@ -198,7 +178,7 @@ def _of_picture(path: Path) -> tuple[Photograph, float]:
             utc,
             width,
             height,
-            _exif_focal_px(tags, focal_mm, pixel_um, math.hypot(width, height)),
+            focal_px,
             _exif_site(gps),
             ' '.join(words),
         ),
@@ -223,13 +203,9 @@ def _pixel_um(tags: Mapping[int, Any], width: int) -> float:
     return 1000.0 * unit_mm / per_unit * full / width
 
 
-def _exif_focal_px(
-    tags: Mapping[int, Any], focal_mm: float, pixel_um: float, diagonal_px: float
-) -> float:
-    if focal_mm > 0 and pixel_um > 0:
-        return 1000.0 * focal_mm / pixel_um
-    equivalent_mm = _real(tags.get(0xA405))  # FocalLengthIn35mmFilm; 0: unknown
-    return diagonal_px * equivalent_mm / _DIAGONAL_35_MM if equivalent_mm > 0 else math.nan
+def _focal_px(focal_mm: float, pixel_um: float) -> float:
+    """Focal length in pixels; NaN where it or the size of a pixel is not known."""
+    return 1000.0 * focal_mm / pixel_um if focal_mm > 0 and pixel_um > 0 else math.nan
 
 
 def _exif_time(path: Path, tags: Mapping[int, Any]) -> tuple[int, bool, bool]:
@@ -239,10 +215,7 @@ def _exif_time(path: Path, tags: Mapping[int, Any]) -> tuple[int, bool, bool]:
     zone = str(tags.get(0x9011) or tags.get(0x9010) or '').strip('\0 ')  # OffsetTimeOriginal
     text = str(tags.get(0x9003) or tags.get(0x0132) or '').strip('\0 ')  # DateTimeOriginal
     with contextlib.suppress(ValueError, OverflowError):
-        local = datetime.strptime(text, '%Y:%m:%d %H:%M:%S')
-        aware = local.replace(tzinfo=timezone.utc)
-        if zone:
-            aware = datetime.strptime(f'{text} {zone}', '%Y:%m:%d %H:%M:%S %z')
+        aware = datetime.strptime(f'{text} {zone or "+0000"}', '%Y:%m:%d %H:%M:%S %z')
         if aware.year >= 1990:  # a clock that was never set
             return round((aware.timestamp() + half_s) * NANOSECONDS_PER_SECOND), True, bool(zone)
     return path.stat().st_mtime_ns, False, False
@@ -267,20 +240,12 @@ def _of_fits(path: Path, values: NDArray[Any], header: Mapping[str, Card]) -> Ph
     time_ns, dated = path.stat().st_mtime_ns, False
     with contextlib.suppress(TimeError, ValueError, OverflowError):
         time_ns, dated = middle_of_exposure(header, ''), True
-    focal_mm, pixel_um = _number(header, 'FOCALLEN'), _number(header, 'PIXSIZE1', 'XPIXSZ')
-    matrix = (_number(header, key) for key in ('CD1_1', 'CD2_1'))
+    focal_mm, pixel_um = number(header, 'FOCALLEN'), number(header, 'PIXSIZE1', 'XPIXSZ')
+    matrix = (number(header, key) for key in ('CD1_1', 'CD2_1'))
     step_deg = math.hypot(*(value for value in matrix if not math.isnan(value)))
     if not step_deg > 0:
-        step_deg = abs(_number(header, 'CDELT1'))
-    focal_px = math.degrees(1.0 / step_deg) if step_deg > 0 else 1000.0 * focal_mm / pixel_um
+        step_deg = abs(number(header, 'CDELT1'))
+    focal_px = math.degrees(1.0 / step_deg) if step_deg > 0 else _focal_px(focal_mm, pixel_um)
     words = [str(header[key].value) for key in ('TELESCOP', 'INSTRUME') if key in header]
     height, width = values.shape[:2]
     return Photograph(path, time_ns, dated, dated, width, height, focal_px, None, ' '.join(words))
-
-
-def _number(header: Mapping[str, Card], *keys: str) -> float:
-    for key in keys:
-        value = header[key].value if key in header else None
-        if isinstance(value, (int, float)) and value:
-            return float(value)
-    return math.nan

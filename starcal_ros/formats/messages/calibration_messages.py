@@ -100,11 +100,7 @@ def calibration_from_message(message: Message) -> Calibration:
 
 
 def camera_info_to_message(calibration: Calibration, make: Make) -> Message:
-    """
-    Return a sensor_msgs/CameraInfo: the best camera without skew.
-
-    CameraInfo cannot carry skew: its readers ignore K[0,1].
-    """
+    """Return a sensor_msgs/CameraInfo: the best camera without skew, which readers ignore."""
     camera, _ = ros_fit(calibration.geometry.camera)
     fx, _, fy, cx, cy = camera.intrinsics
     distortion_model, D = ros_distortion(camera.model, camera.distortion)
@@ -168,9 +164,5 @@ def status_to_message(status: EnsembleStatus, frame_id: str, make: Make) -> Mess
 
 
 def status_from_message(message: Message) -> EnsembleStatus:
-    """
-    Status of a starcal/EnsembleStatus.
-
-    Raises ValueError when the arrays of the message do not fit each other.
-    """
+    """Status of a starcal/EnsembleStatus; raises ValueError as `record_from_message`."""
     return record_from_message(EnsembleStatus, message)

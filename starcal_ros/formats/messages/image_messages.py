@@ -56,16 +56,9 @@ def decode_image(
     No copy where the message holds them so already.  Of a mosaic, the image of a colour has half
     the width and height (`of_mosaic`).
 
+    The first six arguments are those of sensor_msgs/Image, ``data`` anything with a buffer of
+    bytes; ``channel`` is red, green or blue, or empty, which refuses colour images.
     Raises ImageRefused ``bad_encoding`` or ``bad_layout``.
-
-    Parameters
-    ----------
-    encoding, width, height, step, is_bigendian, data
-        As in sensor_msgs/Image; ``data`` is anything with a buffer of bytes.
-    time_ns : int
-        Middle of the exposure.
-    channel : str
-        Channel to read from a colour image, red, green or blue; empty refuses colour images.
     """
     is_colour = encoding in RGB_ENCODINGS or encoding in BAYER_ENCODINGS
     if is_colour and not channel:
@@ -183,7 +176,7 @@ def image_from_message(
 def refused_from_message(
     message: Message, stamp_offset_s: float, refused: ImageRefused
 ) -> StarObservations:
-    """Return the observations of an image message that cannot be used."""
+    """Return the record of a message of an image, or of its stars, that cannot be used."""
     time_ns = stamp_ns(message.header.stamp) + offset_ns(stamp_offset_s)
     return refused_image(
         nearest_stamp_ns(time_ns),
@@ -236,8 +229,8 @@ def of_mosaic(pixels: NDArray[Any], letters: str, channel: str) -> NDArray[Any]:
     """
     Pixels (h // 2, w // 2) of a colour in a Bayer mosaic (h, w).
 
-    Of green, those of the first of the two sites.  Pixel (u, v) is pixel (2 u + i, 2 v + j) of the
-    mosaic with (i, j) from `site`: the prior camera must be one of this image.
+    Green is taken from the first of its two sites.  Pixel (u, v) is pixel (2 u + i, 2 v + j) of
+    the mosaic with (i, j) from `site`: the prior camera must be one of this image.
     """
     i, j = site(letters, channel)
     height, width = pixels.shape

@@ -7,12 +7,13 @@ import math
 
 import numpy as np
 
-from starcal_ros.camera import MAX_SIDE_PX
+from starcal_ros.errors import ImageRefused
+from starcal_ros.formats.messages.image_messages import refused_from_message
 from starcal_ros.formats.messages.message_codec import message_fields, plain_message
-from starcal_ros.formats.messages.message_fields import flat_array, nearest_stamp_ns, stamp_ns
+from starcal_ros.formats.messages.message_fields import flat_array
 from starcal_ros.formats.messages.types import Make, Message, OBSERVATIONS_TYPE
 from starcal_ros.record_codec import plain_record, read_record
-from starcal_ros.records import refused_image, StarObservations
+from starcal_ros.records import StarObservations
 
 _VARIANCE_PX2 = (1e-10, 1e6)  # of a measured star, smallest and largest
 _LONGEST_DETAIL = 500  # characters
@@ -65,13 +66,8 @@ def checked_observations(message: Message) -> StarObservations:
     try:
         return observations_from_message(message)
     except ValueError as error:
-        return refused_image(
-            nearest_stamp_ns(stamp_ns(message.header.stamp)),
-            min(int(message.width), MAX_SIDE_PX),
-            min(int(message.height), MAX_SIDE_PX),
-            'bad_observations',
-            ' '.join(str(error).split())[:_LONGEST_DETAIL],
-        )
+        detail = ' '.join(str(error).split())[:_LONGEST_DETAIL]
+        return refused_from_message(message, 0.0, ImageRefused('bad_observations', detail))
 
 
 def _check_stars(record: StarObservations) -> None:

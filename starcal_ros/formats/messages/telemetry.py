@@ -35,8 +35,8 @@ def attitude_from_message(message: Message) -> tuple[int, Floats]:
     """
     Stamp and (4,) xyzw of an attitude, as on the wire and unchecked.
 
-    Of a geometry_msgs/QuaternionStamped, PoseStamped or TransformStamped, or a sensor_msgs/Imu;
-    NaN for an Imu that marks its orientation as not known (first covariance -1).
+    The message is a geometry_msgs/QuaternionStamped, PoseStamped or TransformStamped, or a
+    sensor_msgs/Imu; NaN for an Imu that marks its orientation as not known (first covariance -1).
     """
     if hasattr(message, 'quaternion'):
         quaternion = message.quaternion
@@ -91,7 +91,7 @@ def temperature_from_message(message: Message) -> tuple[int, float]:
 def temperature_to_message(
     time_ns: int, temperature_degc: float, frame_id: str, make: Make
 ) -> Message:
-    """Return a sensor_msgs/Temperature; its variance is 0, which stands for unknown in ROS."""
+    """Return a sensor_msgs/Temperature; its variance is 0, which means unknown in ROS."""
     return make(
         TEMPERATURE_TYPE,
         header=make_header(time_ns, frame_id, make),

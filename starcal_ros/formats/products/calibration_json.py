@@ -24,14 +24,19 @@ from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_json, write_atomically
 from starcal_ros.record_codec import json_object, read_record
 from starcal_ros.record_fields import Count, Finite, Quaternion
-from starcal_ros.records import ALIGNMENT_NAMES, Calibration, CameraGeometry, check_calibration
+from starcal_ros.records import (
+    ALIGNMENT_NAMES,
+    Calibration,
+    CameraGeometry,
+    check_calibration,
+    check_drawable,
+)
 from starcal_ros.untrusted import json_value, shown
 
 SCHEMA = 1
 _LONGEST_REASON = 500  # characters: a text of the file may be in it
 CALIBRATION_FILE = 'calibration.json'
 
-_UNIT_TOLERANCE = 1e-6  # of the length of a quaternion: rounding to a text leaves less
 _INTRINSICS = 5  # the first parameters of every camera model: fx, skew, fy, cx, cy
 _REPLACED = ('geometry', 'parent_frame', 'child_frame')  # by the keys of `_Published`
 
@@ -69,11 +74,7 @@ class _Published:
     model: str = 'plumb_bob'  # files of version 0.1 do not name it
 
     def geometry(self) -> CameraGeometry:
-        """
-        Camera and alignment.
-
-        Raises ValueError when the parameters are not those of the camera model.
-        """
+        """Camera and alignment; raises ValueError for parameters of another camera model."""
         names = self.parameter_names[: -len(ALIGNMENT_NAMES)]
         given = {'intrinsics': names[:_INTRINSICS], 'distortion': names[_INTRINSICS:]}
         parameters = []
@@ -92,14 +93,7 @@ class _Published:
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:
-    """
-    Write ``calibration.json``.
-
-    A number that is not finite is written as null, since JSON has no other word for it, and reads
-    back as NaN.
-
-    Raises ProductError when the file cannot be written.
-    """
+    """Write ``calibration.json``, NaN and infinity as null; raises ProductError if it cannot."""
     write_atomically(path, calibration_text(calibration))
 
 
@@ -120,11 +114,7 @@ def _text(value: object, margin: str = '\n') -> str:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """
-    The calibration in a ``calibration.json``, equal to the one that was written.
-
-    Raises ProductError naming the file and the key that is missing or wrong.
-    """
+    """The calibration in a file, equal to the one written; raises ProductError with the key."""
     content = read_json(path)
     if not isinstance(content, dict):
         raise ProductError(f'{path}: not a calibration (no JSON object)')
@@ -164,11 +154,11 @@ def prior_of(calibration: Calibration) -> CameraGeometry | None:
         numbers = np.array(json_value(calibration.provenance['prior']), np.float64)
         if numbers.shape != (count + 4,):
             return None
-        if not abs(np.linalg.norm(numbers[count:]) - 1.0) < _UNIT_TOLERANCE:
-            return None
-        prior = dataclasses.replace(camera, parameters=numbers[:count])
-        check_plausible(prior)
-        return CameraGeometry(prior, numbers[count:])
+        camera = dataclasses.replace(camera, parameters=numbers[:count])
+        check_plausible(camera)
+        prior = CameraGeometry(camera, numbers[count:])
+        check_drawable(prior)
+        return prior
     except (KeyError, ValueError, TypeError, OverflowError):
         return None
 

@@ -51,11 +51,7 @@ class _CameraInfo:
     distortion_model: str = 'plumb_bob'
 
     def camera(self) -> CameraModel:
-        """
-        Return the camera; K[0,1], where a file has one, is its skew.
-
-        Raises ValueError for a matrix, a distortion model or numbers that no camera has.
-        """
+        """Return the camera, K[0,1] as its skew; raises ValueError for impossible values."""
         K = self.camera_matrix.data
         fx, skew, cx, zero, fy, cy = K[:6]
         if zero != 0.0 or K[6:] != (0.0, 0.0, 1.0):
@@ -124,13 +120,9 @@ def read_camera_info(location: str | Path) -> CameraModel:
     """
     The camera in a ROS camera YAML; K[0,1], where a file has one, is its skew.
 
-    A ``.cameramodel`` of mrcal is read too: its lens, not its pose.
+    The location is a path, or a ``file://`` or ``package://`` URL.  A ``.cameramodel`` of mrcal is
+    read too: its lens, not its pose.
     Raises ProductError naming the file and the key that is missing, wrong or not supported.
-
-    Parameters
-    ----------
-    location : str or Path
-        A path, or a ``file://`` or ``package://`` URL.
     """
     path = resolve_url(location) if isinstance(location, str) else location
     text = read_text(path, PARAMETER_BYTES)
@@ -182,7 +174,7 @@ def resolve_url(url: str) -> Path:
 
 
 def with_camera_url_from(values: Mapping[str, object], params: Path) -> dict[str, object]:
-    """Parameters of a file; a `camera_info_url` that is no URL is relative to that file."""
+    """Parameters of a file; a path in `camera_info_url` is relative to that file."""
     url = values.get('camera_info_url')
     if isinstance(url, str) and url and '://' not in url:
         return {**values, 'camera_info_url': str(params.parent / url)}

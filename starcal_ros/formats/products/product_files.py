@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from starcal_ros import untrusted
-from starcal_ros.errors import ProductError
+from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.files import replacing, same_as_one_of
 
 OBSERVATIONS_FILE = 'observations.mcap'
@@ -16,29 +16,15 @@ REPORT_FILE = 'report.html'
 
 
 def read_text(path: Path, most_bytes: int) -> str:
-    """
-    The text of a file in UTF-8.
-
-    Raises ProductError when the file cannot be read, is larger than ``most_bytes`` or is no text.
-    """
-    try:
+    """Text of a file in UTF-8 of at most ``most_bytes``; raises ProductError."""
+    with errors_as(ProductError, path):
         return untrusted.read_text(path, most_bytes)
-    except OSError as error:
-        raise ProductError(f'{path}: cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise ProductError(f'{path}: {error}') from error
 
 
 def read_json(path: Path) -> Any:
-    """
-    The value of a JSON file, as `untrusted.json_value` reads it.
-
-    Raises ProductError when the file cannot be read, is too large or not JSON.
-    """
-    try:
+    """Value of a JSON file, as `untrusted.json_value` reads it; raises ProductError."""
+    with errors_as(ProductError, path):
         return untrusted.json_value(read_text(path, untrusted.PRODUCT_BYTES))
-    except ValueError as error:
-        raise ProductError(f'{path}: {error}') from error
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
@@ -47,19 +33,12 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
     Raises ProductError when the file cannot be written; the old one is then unchanged.
     """
-    try:
-        with replacing(path) as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-    except OSError as error:
-        raise ProductError(f'{path}: cannot be written: {error.strerror}') from error
+    with errors_as(ProductError, path, 'written'), replacing(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
 
 
 def check_not_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """
-    Compare the files that a command will write with those that it reads.
-
-    Raises ProductError naming a file that is both: no input is ever replaced.
-    """
+    """Check that no output of a command is one of its inputs; raises ProductError."""
     inputs = tuple(inputs)
     for path in outputs:
         if same_as_one_of(path, inputs):

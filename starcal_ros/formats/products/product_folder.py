@@ -17,7 +17,7 @@ import zipfile
 import numpy as np
 
 from starcal_ros.assessment.residuals import Residuals
-from starcal_ros.errors import ProductError
+from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE, write_calibration
 from starcal_ros.formats.products.camera_yaml import (
     CAMERA_INFO_FILE,
@@ -49,11 +49,7 @@ _RESIDUALS_FORMAT = 1
 def write_products(
     calibration: Calibration, folder: Path, residuals: Residuals | None = None
 ) -> None:
-    """
-    Write a calibration, its camera and its residuals, if given, into a folder.
-
-    Raises ProductError when a file cannot be written.
-    """
+    """Write a calibration, its camera and residuals, if given; raises ProductError."""
     write_calibration(calibration, folder / CALIBRATION_FILE)
     name = calibration.provenance.get('camera_name', DEFAULT_CAMERA_NAME)
     write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE, name)
@@ -65,11 +61,7 @@ def write_products(
 def write_observations(
     observations: Iterable[StarObservations], folder: Path, frame_id: str
 ) -> None:
-    """
-    Write the observations of a calibration into a folder; ``frame_id`` is the camera's.
-
-    Raises BagError when the file cannot be written.
-    """
+    """Write the observations of a calibration with the frame of its camera; raises BagError."""
     from starcal_ros.formats.bag.writer import BagWriter  # a vehicle may not have mcap
 
     with BagWriter(folder / OBSERVATIONS_FILE) as writer:
@@ -78,11 +70,7 @@ def write_observations(
 
 
 def calibration_file(path: Path) -> Path:
-    """
-    Path of the calibration in a folder, or of the file itself.
-
-    Raises ProductError if the folder has no calibration.
-    """
+    """Path of the calibration in a folder, or the file itself; raises ProductError if none."""
     if not path.is_dir():
         return path
     if not (path / CALIBRATION_FILE).exists():
@@ -91,36 +79,25 @@ def calibration_file(path: Path) -> Path:
 
 
 def write_residuals(residuals: Residuals, path: Path) -> None:
-    """
-    Write ``residuals.npz``: a NumPy archive with an array for each attribute of `Residuals`.
-
-    Raises ProductError when the file cannot be written.
-    """
+    """Write a NumPy archive with an array for each attribute; raises ProductError."""
     memory = io.BytesIO()
     np.savez_compressed(memory, format=_RESIDUALS_FORMAT, **plain_record(residuals))
     write_atomically(path, memory.getvalue())
 
 
 def read_residuals(path: Path) -> Residuals:
-    """
-    The residuals in a ``residuals.npz``, equal to those that were written.
-
-    Raises ProductError naming the file and the array that is missing or wrong.
-    """
+    """The residuals in an archive, equal to those written; raises ProductError."""
+    with errors_as(ProductError, path):
+        content = path.read_bytes()  # whole: numpy leaves a damaged archive open
     try:
-        # Read whole first: numpy leaves a file open that is no archive.
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             columns = dict(archive)
-    except OSError as error:
-        raise ProductError(f'{path}: cannot be read: {error.strerror or error}') from error
     except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
         raise ProductError(f'{path}: not a NumPy archive: {error}') from error
     if not np.array_equal(columns.pop('format', None), _RESIDUALS_FORMAT):
         raise ProductError(f'{path}: not of format {_RESIDUALS_FORMAT}')
-    try:
+    with errors_as(ProductError, path):
         residuals = read_record(Residuals, columns)
-    except ValueError as error:
-        raise ProductError(f'{path}: {error}') from error
     if (residuals.image >= len(residuals.image_time_ns)).any():
         raise ProductError(f'{path}: image names images that are not there')
     return residuals
@@ -140,26 +117,16 @@ class NotCalibrated:
 
 
 def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:
-    """
-    Write the record of a failure and remove the products of an earlier calibration.
-
-    Raises ProductError when the folder cannot be changed.
-    """
+    """Write the record of a failure and remove earlier products; raises ProductError."""
     content = {'calibrated': False, **json_object(record)}
     write_atomically(folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n')
-    try:
-        for name in (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, REPORT_FILE):
+    for name in (CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, REPORT_FILE):
+        with errors_as(ProductError, folder / name, 'removed'):
             (folder / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise ProductError(f'{folder / name}: cannot be removed: {error.strerror}') from error
 
 
 def read_not_calibrated(folder: Path) -> NotCalibrated | None:
-    """
-    The record of a failure in a folder; None: there is none.
-
-    Raises ProductError when it cannot be read.
-    """
+    """The record of a failure in a folder; None: there is none.  Raises ProductError."""
     path = folder / NOT_CALIBRATED_FILE
     if not path.is_file():
         return None

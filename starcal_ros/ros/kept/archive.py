@@ -138,7 +138,7 @@ class Archive:
         if not kept:
             return
         files = [FileSpan(one.path.name, stamp, stamp, 1) for stamp, one in kept]
-        topic = TopicSummary(TOPIC, OBSERVATIONS_TYPE, False, len(files))
+        topic = TopicSummary(TOPIC, OBSERVATIONS_TYPE, len(files))
         with contextlib.suppress(OSError, ProductError):  # the images are whole without it
             self._write(_ENSEMBLE, _METADATA, metadata_text(files, [topic]))
 

@@ -132,7 +132,7 @@ def test_hand_written_ros_yaml(tmp_path: Path) -> None:
         ('-0.1, 1e-2', '1e300, 1e300', 'no line of sight over most of the detector'),
         ('-0.1, 1e-2', '-50.0, 0.0', 'no line of sight over most of the detector'),
         ('image_width: 640', 'image_width: 99999999', 'image size: 99999999 x 480 is over'),
-        ('image_width: 640', 'image_width: ' + 5000 * '9', 'line 1: an integer of 5000 digits'),
+        ('image_width: 640', 'image_width: ' + 5000 * '9', 'a number of more than 400 digits'),
         ('image_width: 640', 'image_width: 2026-13-01', "'2026-13-01' is not a whole number"),
         (
             'image_width: 640',
@@ -141,7 +141,7 @@ def test_hand_written_ros_yaml(tmp_path: Path) -> None:
         ),
         ('image_width: 640', '5: 640', 'line 1: key 5 is not a text'),
         ('narrow_stereo', 40 * '[' + 40 * ']', 'line 3: nested deeper than 32'),
-        ('narrow_stereo', '"\\0"', 'line 3: a text with a NUL character'),
+        ('narrow_stereo', '"\\0"', 'a text with a NUL character'),
         ('[500.0, 0.5', '[.nan, 0.5', r'camera_matrix.data\[0\]: nan is not a finite number'),
         ('239.5, 0, 0, 1]', '239.5, 0, 0, 2]', 'camera_matrix.data: .* is not'),
         (

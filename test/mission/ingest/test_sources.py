@@ -174,7 +174,7 @@ def changed(path: Path, old: str, new: str) -> Path:
         ('= ICRF', '= TEME', 'one must be ICRF or EME2000'),
         ('= STARTRACKER_1', '= EME2000', 'one must be ICRF'),
         ('CCSDS_AEM_VERS = 1.0', 'CCSDS_AEM_VERS = 9.0', 'not readable as CCSDS AEM'),
-        ('T07:20', 'T99:20', 'no time of a day'),
+        ('T07:20', 'T99:20', 'is not a date and time'),
     ],
 )
 def test_a_bad_aem_is_one_line(tmp_path: Path, old: str, new: str, words: str) -> None:
