@@ -46,26 +46,17 @@ def conclude(design: Design, rows: Iterable[Row]) -> StudyResult:
 
 def content(result: StudyResult, software: str) -> str:
     """JSON text of a result: design, summary rows, and all trials as columns."""
-    columns = list(dict.fromkeys(name for row in result.rows for name in row))
+    columns = dict.fromkeys(name for row in result.rows for name in row)
     parameters = dataclasses.asdict(result.design)
-    lines = [
-        f' {json.dumps(name)}: {json.dumps(value, allow_nan=False)}'
-        for name, value in (
-            ('software', software),
-            ('study', parameters.pop('study')),
-            ('seed', parameters.pop('seed')),
-            ('parameters', parameters),
-        )
-    ]
-    summary = [f'  {json.dumps(row, allow_nan=False)}' for row in result.summary]
-    trials = [
-        f'  {json.dumps(name)}: '
-        + json.dumps([row.get(name) for row in result.rows], allow_nan=False)
-        for name in columns
-    ]
-    lines.append(' "summary": [\n' + ',\n'.join(summary) + '\n ]')
-    lines.append(' "trials": {\n' + ',\n'.join(trials) + '\n }')
-    return '{\n' + ',\n'.join(lines) + '\n}\n'
+    content = {
+        'software': software,
+        'study': parameters.pop('study'),
+        'seed': parameters.pop('seed'),
+        'parameters': parameters,
+        'summary': result.summary,
+        'trials': {name: [row.get(name) for row in result.rows] for name in columns},
+    }
+    return json.dumps(content, indent=1, allow_nan=False) + '\n'
 
 
 def _groups(rows: Sequence[Row], *names: str) -> Iterable[tuple[Row, list[Row]]]:
