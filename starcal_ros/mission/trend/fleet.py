@@ -61,14 +61,7 @@ def update(
     A task that ends its worker process on every attempt becomes the row of a failure; the others
     go on.  A file that cannot be reached is tried again after the others, with a pause.
     What is computed is on disk within a batch, so a run that was stopped starts where it stopped.
-    Raises OptionError when no scheduler answers at the address.
-
-    Parameters
-    ----------
-    workers : int
-        Processes to start on this machine; 0 runs in-process.
-    scheduler : str
-        Address of a Dask scheduler, whose workers have this package and see the same files.
+    ``workers`` and ``scheduler`` as for `run_each`; the workers of a cluster see the same files.
     """
     done = Done()
     waiting = []
