@@ -245,6 +245,7 @@ def _write_messages(
 ) -> None:
     """Write images and telemetry in order of time; at one stamp the attitude is first."""
     messages: list[Iterable[tuple[int, int, Any]]] = [((file.time_ns, 2, file) for file in files)]
+    rows_upward = any(attitudes.rows_upward for attitudes in trackers.values())
     for topic, attitudes in trackers.items():
         near = _near(attitudes, files)
         to_topic = zip(repeat(topic), near.icrf_from_star_tracker_xyzw)
@@ -263,7 +264,7 @@ def _write_messages(
                 )
             wanted = _options_of(content.path, options)
             pixels = guard.call(content.path, image_files.pixels_of, content.path, wanted, scale)
-            if attitudes.rows_upward and content.path.name.lower().endswith(FITS_ENDINGS):
+            if rows_upward and content.path.name.lower().endswith(FITS_ENDINGS):
                 pixels = pixels[::-1]
             writer.write_image(IMAGE_TOPIC, Image(time_ns, pixels), 'camera')
             on_image()
