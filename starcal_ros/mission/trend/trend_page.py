@@ -89,9 +89,9 @@ def _camera(name: str, group: Sequence[Row]) -> dict[str, object]:
         'active': [_active(one, group, new) for one in active],
         'versions': [
             (
-                utc_text(group[v.recorded].time_ns)[:10],
-                group[v.recorded].software,
-                group[v.computed].software,
+                utc_text(group[v.against].time_ns)[:10],
+                group[v.against].software,
+                group[v.row].software,
                 f'{v.line_of_sight_px:.3f}',
             )
             for v in versions(group)
