@@ -48,7 +48,7 @@ from starcal_ros.studies.simulation.rendering import fixed_pattern, render
 from starcal_ros.studies.simulation.scenario import attitude_samples, Scenario, scenario, scene
 from starcal_ros.studies.study_figures import removed_terms
 from starcal_ros.studies.summary import StudyResult
-from starcal_ros.studies.trials import PAPER_ESTIMATE
+from starcal_ros.studies.trials import PAPER_ESTIMATE, rms
 
 NIGHT = 'paper'
 CALIBRATED_WITH = 15
@@ -75,16 +75,13 @@ class Judged:
     def rms_px(self, images: Sequence[int]) -> float:
         """RMS per axis over the stars of some images, without outliers."""
         here = self.fits & np.isin(self.image, images)
-        return float(np.sqrt(np.mean(self.residual_px[here] ** 2)))
+        return rms(self.residual_px[here])
 
     def std_of_images_px(self) -> Floats:
         """Standard deviation (m, 2) of u and v of each image, without outliers."""
-        return np.array(
-            [
-                self.residual_px[self.fits & (self.image == k)].std(axis=0)
-                for k in range(int(self.image.max()) + 1)
-            ]
-        )
+        images = range(int(self.image.max()) + 1)
+        fitting = (self.residual_px[self.fits & (self.image == k)] for k in images)
+        return np.array([residual_px.std(axis=0) for residual_px in fitting])
 
 
 @dataclass(frozen=True)
@@ -96,8 +93,8 @@ class PaperStudy:
     ----------
     camera, true_camera : CameraModel
         Estimated by ``per_image``, the paper's Method 1, from `CALIBRATED_WITH` images; and true.
-    used : tuple of int
-        Indices of those images, evenly spread over the night.
+    used, others : tuple of int
+        Indices of those images, evenly spread over the night, and of the other measured ones.
     judged : Judged
         Residuals of all images with the estimated camera.
     noise_rms_px : float
@@ -117,6 +114,7 @@ class PaperStudy:
     camera: CameraModel
     true_camera: CameraModel
     used: tuple[int, ...]
+    others: tuple[int, ...]
     judged: Judged
     noise_rms_px: float
     methods: tuple[Row, ...]
@@ -199,20 +197,18 @@ def study(observations: Sequence[StarObservations], table1: StudyResult, seed: i
     limit = setup.calibration.outlier_sigma
 
     def solve(chosen: Sequence[int], **changed: object) -> Estimate:
-        options = dataclasses.replace(
-            setup.calibration,
-            min_images=2,
-            **changed,  # type: ignore[arg-type]
-        )
+        options = dataclasses.replace(setup.calibration, min_images=2, **changed)  # type: ignore[arg-type]
         ensemble = Ensemble(tuple(images[k] for k in chosen))
         return estimate_calibration(ensemble, setup.prior, options)
 
+    def rest(chosen: Sequence[int]) -> tuple[int, ...]:
+        return tuple(sorted(set(range(count)) - set(chosen)))
+
     def row(estimate: Estimate, chosen: Sequence[int]) -> Row:
         camera = estimate.geometry.camera
-        others = sorted(set(range(count)) - set(chosen))
         return {
-            'used_px': float(np.sqrt(np.mean(estimate.residual_px[estimate.kept] ** 2))),
-            'others_px': judge(camera, images, limit).rms_px(others),
+            'used_px': rms(estimate.residual_px[estimate.kept]),
+            'others_px': judge(camera, images, limit).rms_px(rest(chosen)),
             'map_error_px': map_error_px(camera, truth.camera),
             'scatter_arcsec': estimate.alignment_scatter_arcsec,
             'sigma_fx_px': float(np.sqrt(estimate.covariance[0, 0])),
@@ -221,7 +217,6 @@ def study(observations: Sequence[StarObservations], table1: StudyResult, seed: i
     used = spread(min(CALIBRATED_WITH, count - 1), count)  # the others judge the result
     estimates = {method: solve(used, method=method) for method in METHODS}
     camera = estimates['per_image'].geometry.camera
-    others = sorted(set(range(count)) - set(used))
     return PaperStudy(
         seed=seed,
         images=len(observations),
@@ -230,8 +225,9 @@ def study(observations: Sequence[StarObservations], table1: StudyResult, seed: i
         camera=camera,
         true_camera=truth.camera,
         used=used,
+        others=rest(used),
         judged=judge(camera, images, limit),
-        noise_rms_px=judge(truth.camera, images, limit).rms_px(others),
+        noise_rms_px=judge(truth.camera, images, limit).rms_px(rest(used)),
         methods=tuple({'method': m, **row(e, used)} for m, e in estimates.items()),
         counts=tuple(
             {'images': n, **row(solve(spread(n, count), method='per_image'), spread(n, count))}
@@ -247,8 +243,8 @@ def numbers(found: PaperStudy) -> Mapping[str, object]:
     """Numbers on the page, by name."""
     distortion = np.hypot(*distortion_px(found.camera, pixel_grid(found.camera, 60, 48)).T)
     judged = found.judged
-    others = sorted(set(range(found.images - found.refused)) - set(found.used))
-    of_others = judged.fits & np.isin(judged.image, others)
+    of_others = judged.fits & np.isin(judged.image, found.others)
+    image_std_px = judged.std_of_images_px()
     all_terms_px = found.removals[0].residual_rms_px
     return {
         'seed': found.seed,
@@ -256,15 +252,12 @@ def numbers(found: PaperStudy) -> Mapping[str, object]:
         'refused': found.refused,
         'stars': found.stars,
         'used': len(found.used),
-        'others': len(others),
+        'others': len(found.others),
         'distortion_px': (float(distortion.min()), float(distortion.max())),
         'others_std_px': judged.residual_px[of_others].std(axis=0).tolist(),
-        'others_rms_px': judged.rms_px(others),
+        'others_rms_px': judged.rms_px(found.others),
         'noise_rms_px': found.noise_rms_px,
-        'image_std_px': (
-            float(judged.std_of_images_px().min()),
-            float(judged.std_of_images_px().max()),
-        ),
+        'image_std_px': (float(image_std_px.min()), float(image_std_px.max())),
         'outliers': int((~judged.fits).sum()),
         'methods': found.methods,
         'counts': found.counts,

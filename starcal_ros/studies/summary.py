@@ -46,26 +46,17 @@ def conclude(design: Design, rows: Iterable[Row]) -> StudyResult:
 
 def content(result: StudyResult, software: str) -> str:
     """JSON text of a result: design, summary rows, and all trials as columns."""
-    columns = list(dict.fromkeys(name for row in result.rows for name in row))
+    columns = dict.fromkeys(name for row in result.rows for name in row)
     parameters = dataclasses.asdict(result.design)
-    lines = [
-        f' {json.dumps(name)}: {json.dumps(value, allow_nan=False)}'
-        for name, value in (
-            ('software', software),
-            ('study', parameters.pop('study')),
-            ('seed', parameters.pop('seed')),
-            ('parameters', parameters),
-        )
-    ]
-    summary = [f'  {json.dumps(row, allow_nan=False)}' for row in result.summary]
-    trials = [
-        f'  {json.dumps(name)}: '
-        + json.dumps([row.get(name) for row in result.rows], allow_nan=False)
-        for name in columns
-    ]
-    lines.append(' "summary": [\n' + ',\n'.join(summary) + '\n ]')
-    lines.append(' "trials": {\n' + ',\n'.join(trials) + '\n }')
-    return '{\n' + ',\n'.join(lines) + '\n}\n'
+    content = {
+        'software': software,
+        'study': parameters.pop('study'),
+        'seed': parameters.pop('seed'),
+        'parameters': parameters,
+        'summary': result.summary,
+        'trials': {name: [row.get(name) for row in result.rows] for name in columns},
+    }
+    return json.dumps(content, indent=1, allow_nan=False) + '\n'
 
 
 def _groups(rows: Sequence[Row], *names: str) -> Iterable[tuple[Row, list[Row]]]:
@@ -82,14 +73,6 @@ def column(rows: Sequence[Row], name: str) -> Floats:
     return np.array([row[name] for row in rows], np.float64)
 
 
-def _relative_error_of_rms(values: Floats) -> float:
-    """1-sigma of the RMS of a sample, relative to it."""
-    squares = values**2
-    if len(squares) < 2:
-        return math.inf
-    return float(0.5 * squares.std(ddof=1) / squares.mean() / math.sqrt(len(squares)))
-
-
 def _ratio(rows: Sequence[Row], name: str, to: str) -> float:
     return rms(column(rows, name)) / rms(column(rows, to))
 
@@ -102,17 +85,11 @@ def _interval(parameters: int, trials: int) -> tuple[float, float]:
 
 
 def _common(rows: Sequence[Row]) -> Row:
-    map_px = column(rows, 'map_px')
-    return {
-        'trials': len(rows),
-        'map_px': rms(map_px),
-        'map_px_sigma': _sigma_or_zero(rms(map_px) * _relative_error_of_rms(map_px)),
-    }
-
-
-def _sigma_or_zero(sigma: float) -> float:
-    """Replace the infinite sigma of a single trial, which JSON cannot hold, by 0."""
-    return sigma if math.isfinite(sigma) else 0.0
+    """Number of trials, and RMS of the map error with its 1-sigma; 0 for a single trial."""
+    n, rms_px = len(rows), rms(column(rows, 'map_px'))
+    squares = column(rows, 'map_px') ** 2
+    relative = 0.5 * squares.std(ddof=1) / squares.mean() / math.sqrt(n) if n > 1 else 0.0
+    return {'trials': n, 'map_px': rms_px, 'map_px_sigma': rms_px * float(relative)}
 
 
 def _table1_summary(rows: Sequence[Row]) -> Iterable[Row]:

@@ -25,6 +25,7 @@ from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, refused_image
+from starcal_ros.studies.simulation.centroids import scaled_inverse
 from starcal_ros.studies.simulation.scenario import Scenario, scenario
 
 CENTROID_SIGMA_PX = 0.1
@@ -73,15 +74,12 @@ class StarField:
     def part(self, first: int, count: int, stars: int) -> StarField:
         """Consecutive images with the first stars of each."""
         m, n = slice(first, first + count), slice(stars)
+        by_star = ('pixel_px', 'direction_icrf', 'centroid_error_px', 'outlier_draw', 'outlier_px')
         return dataclasses.replace(
             self,
             camera_from_icrf=self.camera_from_icrf[m],
-            pixel_px=self.pixel_px[m, n],
-            direction_icrf=self.direction_icrf[m, n],
-            centroid_error_px=self.centroid_error_px[m, n],
             tracker_error=self.tracker_error[m],
-            outlier_draw=self.outlier_draw[m, n],
-            outlier_px=self.outlier_px[m, n],
+            **{name: getattr(self, name)[m, n] for name in by_star},
         )
 
 
@@ -166,26 +164,20 @@ def bound(method: str, blocks: Floats, tracker_arcsec: float) -> MapCovariance:
     f = len(_FREE)
     covariance = np.zeros((13, 13))
     if method == 'single':
-        covariance[np.ix_(ESTIMATED, ESTIMATED)] = _inverse(N.sum(axis=0))
+        covariance[np.ix_(ESTIMATED, ESTIMATED)] = scaled_inverse(N.sum(axis=0))
         return MapCovariance(covariance)
     A, B, C = N[:, :f, :f].sum(axis=0), N[:, f:, :f], N[:, f:, f:]
     if method == 'per_image':
         S = A - np.einsum('mqi,mqj->ij', B, np.linalg.solve(C, B))
-        covariance[np.ix_(_FREE, _FREE)] = _inverse(S)
+        covariance[np.ix_(_FREE, _FREE)] = scaled_inverse(S)
         return MapCovariance(covariance)
     tracker = np.eye(3) / (max(tracker_arcsec, LEAST_TRACKER_ARCSEC) * ARCSECOND_RAD) ** 2
     B = np.concatenate([B, np.broadcast_to(-tracker, C.shape)], axis=2)
     S = np.zeros((f + 3, f + 3))
     S[:f, :f], S[f:, f:] = A, len(blocks) * tracker
     S -= np.einsum('mqi,mqj->ij', B, np.linalg.solve(C + tracker, B))
-    covariance[np.ix_(ESTIMATED, ESTIMATED)] = _inverse(S)
+    covariance[np.ix_(ESTIMATED, ESTIMATED)] = scaled_inverse(S)
     return MapCovariance(covariance)
-
-
-def _inverse(information: Floats) -> Floats:
-    scale = 1.0 / np.sqrt(np.diag(information))
-    scaled = np.linalg.inv(information * np.outer(scale, scale))
-    return np.asarray(scaled * np.outer(scale, scale))
 
 
 def map_bound_px(camera: CameraModel, covariance: MapCovariance) -> float:

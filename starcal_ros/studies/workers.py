@@ -7,31 +7,26 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError, FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 import contextlib
-from dataclasses import dataclass
 import functools
 import logging
 import os
 import re
-import signal
 import threading
-from types import FrameType
-from typing import Any, TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar
 
 from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.child_process import ChildProcess, ProcessEnded
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.studies.monte_carlo import Design, Row, run_trial
 
-if TYPE_CHECKING:
-    from distributed import Client
-
 Item = TypeVar('Item')
 Result = TypeVar('Result')
+# Submits an item; items submitted at a time; exception of an item whose processes ended.
+Tasks = tuple[Callable[[Any], 'Future[Any]'], int, type[Exception]]
 
 _CONNECT_S = 10.0
-_POLL_S = 0.2  # interval of checks for an interrupt
-_TRIES = 3  # of an item whose process ends, the last of them alone
-_AHEAD = 8  # trials submitted ahead for each worker thread of a cluster
+_TRIES = 3  # of an item whose process ends: the first with others, then at the end, alone
+_AHEAD = 8  # items submitted ahead for each thread of a cluster: cancelling 100,000 is slow
 _ADDRESS = re.compile(r'(tcp|tls)://[^/\s]+:\d{1,5}')
 
 
@@ -101,20 +96,47 @@ def stream_each(
         return
     # Here and not in the worker processes: those of a cluster are not ours.
     function = functools.partial(_on_one_thread, function)
-    if not scheduler and workers == 0:
+    if not scheduler and not workers:
         for number, item in enumerate(items):
             try:
                 yield number, function(item)
             except Exception as error:
                 yield number, error
         return
-    with contextlib.ExitStack() as stack:
-        stop = stack.enter_context(_interrupts_wait())
-        if scheduler:
-            tasks = stack.enter_context(_cluster(scheduler, function))
-        else:
-            tasks = stack.enter_context(_processes(function, min(workers, len(items))))
-        yield from _as_completed(tasks, items, stop)
+    if scheduler:
+        tasks = _cluster(scheduler, function)
+    else:
+        tasks = _processes(function, min(workers, len(items)))
+    with tasks as (submit, ahead, ended):
+        yield from _as_completed(submit, ahead, ended, items)
+
+
+def _as_completed(
+    submit: Callable[[Item], Future[Result]],
+    ahead: int,
+    ended: type[Exception],
+    items: Sequence[Item],
+) -> Iterator[tuple[int, Result | Exception]]:
+    """Results as they come, with ``ahead`` items submitted at a time."""
+    waiting, again, deaths = deque(range(len(items))), deque[int](), Counter[int]()
+    running: dict[Future[Result], int] = {}
+    while waiting or again or running:
+        if not waiting and not running:
+            # Alone: where memory is short, the system may have ended the wrong process.
+            waiting.append(again.popleft())
+        while waiting and len(running) < ahead:
+            number = waiting.popleft()
+            running[submit(items[number])] = number
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            number, error = running.pop(future), future.exception()
+            if not isinstance(error, ended):
+                yield number, error if isinstance(error, Exception) else future.result()
+                continue
+            deaths[number] += 1
+            if deaths[number] == _TRIES:
+                yield number, StarcalError(f'{error}, the last of {_TRIES} times: out of memory?')
+            else:
+                again.append(number)
 
 
 def _on_one_thread(function: Callable[[Item], Result], item: Item) -> Result:
@@ -123,154 +145,57 @@ def _on_one_thread(function: Callable[[Item], Result], item: Item) -> Result:
         return function(item)
 
 
-@dataclass(frozen=True)
-class _Tasks:
-    """
-    Submission of items to processes.
-
-    Attributes
-    ----------
-    submit : callable
-        Returns the future of an item.
-    ahead : int
-        Items submitted at a time: cancelling 100,000 of them is slow.
-    ended : type
-        Exception of an item whose process ended.
-    end_idle : callable
-        Ends the processes that have no item.
-    """
-
-    submit: Callable[[Any], Future[Any]]
-    ahead: int
-    ended: type[Exception]
-    end_idle: Callable[[], None] = lambda: None
-
-
-def _as_completed(
-    tasks: _Tasks, items: Sequence[Item], stop: threading.Event
-) -> Iterator[tuple[int, Any]]:
-    """
-    Results as they come.
-
-    An item whose process ends is tried again in another and, if that ends too, at the end, alone:
-    where memory is short, the system may end the wrong process.
-    """
-    waiting, last = deque(range(len(items))), deque[int]()
-    deaths: Counter[int] = Counter()
-    running: dict[Future[Any], int] = {}
-    while waiting or last or running:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        if last and not (waiting or running):
-            tasks.end_idle()
-            waiting.append(last.popleft())
-        while waiting and len(running) < tasks.ahead:
-            number = waiting.popleft()
-            running[tasks.submit(items[number])] = number
-        for future in wait(running, _POLL_S, FIRST_COMPLETED).done:
-            number, error = running.pop(future), future.exception()
-            if not isinstance(error, tasks.ended):
-                yield number, future.result() if error is None else error
-                continue
-            deaths[number] += 1
-            if deaths[number] == _TRIES:
-                yield number, StarcalError(f'{error}, the last of {_TRIES} times: out of memory?')
-            else:
-                (last if deaths[number] == _TRIES - 1 else waiting).append(number)
-
-
 @contextlib.contextmanager
-def _processes(function: Callable[[Item], Result], workers: int) -> Iterator[_Tasks]:
+def _processes(function: Callable[[Item], Result], workers: int) -> Iterator[Tasks]:
     """Tasks in so many processes of this machine, each called from a thread of its own."""
-    idle: list[ChildProcess] = []
-    busy: set[ChildProcess] = set()
-    lock, is_open = threading.Lock(), True
+    processes: dict[int, ChildProcess] = {}  # by thread
+    stopping = threading.Event()
 
     def call(item: Item) -> Result:
-        with lock:
-            if not is_open:
-                raise CancelledError
-            process = idle.pop() if idle else ChildProcess()
-            busy.add(process)
+        thread = threading.get_ident()
+        process = processes.get(thread) or processes.setdefault(thread, ChildProcess())
+        # After the process is among those that are killed at the end.
+        if stopping.is_set():
+            raise CancelledError
         try:
             return process.call(function, item)
         except ProcessEnded as error:
-            with lock:
-                busy.remove(process)
+            del processes[thread]
             raise ProcessEnded(f'a worker process ended with status {error}') from error
-        finally:
-            with lock:
-                if process in busy:
-                    busy.remove(process)
-                    idle.append(process)
-
-    def end_idle() -> None:
-        while idle:
-            idle.pop().end()
 
     threads = ThreadPoolExecutor(workers)
     try:
-        yield _Tasks(lambda item: threads.submit(call, item), workers, ProcessEnded, end_idle)
+        yield lambda item: threads.submit(call, item), workers, ProcessEnded
     finally:
-        with lock:
-            is_open = False
-            for process in (*idle, *busy):
-                process.kill()
+        stopping.set()
+        for process in list(processes.values()):
+            process.kill()
         threads.shutdown()
-        end_idle()
+        for process in processes.values():
+            process.end()
 
 
 @contextlib.contextmanager
-def _cluster(address: str, function: Callable[[Item], Result]) -> Iterator[_Tasks]:
-    """Tasks on a running Dask cluster."""
+def _cluster(address: str, function: Callable[[Item], Result]) -> Iterator[Tasks]:
+    """Tasks on a running Dask cluster, which tries an item again whose worker ends."""
     import dask
-    from distributed import KilledWorker
+    from distributed import Client, KilledWorker
 
-    settings = {'logging': {'distributed': 'critical'}}
-    with dask.config.set(settings), _quiet(), _client(address) as client:
-        threads = sum(client.nthreads().values())
-        executor = client.get_executor(pure=False, retries=2)
-        submit = functools.partial(executor.submit, function)
-        yield _Tasks(submit, _AHEAD * max(1, threads), KilledWorker)
-
-
-@contextlib.contextmanager
-def _interrupts_wait() -> Iterator[threading.Event]:
-    """
-    Ctrl-C sets an event; a second one raises `KeyboardInterrupt` at once.
-
-    An exception raised inside the Dask client can leave a lock held, on which closing the client
-    would wait forever.
-    """
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-
-    def note(number: int, frame: FrameType | None) -> None:
-        if stop.is_set():
-            signal.default_int_handler(number, frame)
-        stop.set()
-
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _client(address: str) -> Client:
-    from distributed import Client
-
-    # Of another scheme Dask prints a traceback after the time-out.
+    # For another scheme Dask prints a traceback after the time-out.
     if not _ADDRESS.fullmatch(address):
         raise OptionError(f'--scheduler: {address}: not tcp://HOST:PORT or tls://HOST:PORT')
-    try:
-        return Client(  # type: ignore[no-untyped-call]
-            address, timeout=_CONNECT_S, set_as_default=False
-        )
-    except (OSError, ValueError, TypeError) as error:
-        raise OptionError(f'--scheduler: {address}: {error}') from error
+    settings = {'logging': {'distributed': 'critical'}}
+    with dask.config.set(settings), _quiet():
+        try:
+            client: Any = Client(  # type: ignore[no-untyped-call]
+                address, timeout=_CONNECT_S, set_as_default=False
+            )
+        except (OSError, ValueError, TypeError) as error:
+            raise OptionError(f'--scheduler: {address}: {error}') from error
+        with client:
+            threads = max(1, sum(client.nthreads().values()))
+            executor = client.get_executor(pure=False, retries=2)
+            yield functools.partial(executor.submit, function), _AHEAD * threads, KilledWorker
 
 
 @contextlib.contextmanager

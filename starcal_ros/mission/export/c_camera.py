@@ -45,11 +45,7 @@ _BYTES_A_LINE = 20
 
 
 def c_files(calibration: Calibration) -> dict[str, str]:
-    """
-    Texts of header and source by name.
-
-    Raises OptionError for a field with more waves than the C code has room for.
-    """
+    """Texts of header and source by name; raises as `c_table`."""
     table = c_table(calibration)
     lines = (
         ', '.join(map(str, table[k : k + _BYTES_A_LINE])) + ','
@@ -75,12 +71,14 @@ def c_table(calibration: Calibration) -> bytes:
         raise OptionError(
             f'--to c: the field has {terms.max() + 1} waves along an axis, over {_MOST_WAVES}'
         )
-    triangle = _columns(field.remainder, 2 * len(terms))
     common = common_rotation(camera)
-    # A field without a remainder has a triangle of zeros.
-    units = field.remainder_unit_px if len(field.remainder_unit_px) else np.zeros(2 * len(terms))
-    root = np.zeros((len(common[0]), 2 * len(terms)))
-    root[len(root) - 2 * len(terms) :] = triangle * units[:, None]
+    count = 2 * len(terms)
+    triangle, units = np.zeros((count, count)), np.zeros(count)
+    if len(field.remainder):
+        triangle[np.tril_indices(count)] = field.remainder
+        units[:] = field.remainder_unit_px
+    root = np.zeros((len(common[0]), count))
+    root[len(root) - count :] = triangle * units[:, None]
     turned = common @ np.concatenate([field.covariance_factor, root], axis=1)
     vectors = np.array(list(_vectors(calibration, common)))
     numbers = [
@@ -148,14 +146,6 @@ def _terms(calibration: Calibration) -> NDArray[np.int64]:
     if field.family == 'cosine':
         return cosine_terms(field.width, field.height, field.degree)[0]
     return degrees(field.degree)
-
-
-def _columns(remainder: NDArray[np.int16], count: int) -> Floats:
-    """Lower triangle (count, count) of its rows."""
-    triangle = np.zeros((count, count))
-    if len(remainder):
-        triangle[np.tril_indices(count)] = remainder
-    return triangle
 
 
 def _temperature(calibration: Calibration) -> list[float]:

@@ -87,7 +87,7 @@ def write_ck(
         icrf_from_frame = icrf_from_frame * camera.inv()
     structure = names.star_tracker_id or names.camera_id
     q = np.roll(icrf_from_frame.inv().as_quat(), 1, axis=1)
-    with loaded(kernels, ', '.join(map(str, kernels))) as spice:
+    with loaded(kernels) as spice:
         try:
             ticks = np.array(
                 [spice.sce2c(names.spacecraft_id, ephemeris_time(spice, t)) for t in times_ns]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+import dataclasses
 from dataclasses import dataclass
 import functools
 from pathlib import Path
@@ -108,13 +109,12 @@ def export(
         write_lookup_table(sights, path)
         return Exported((path,), 0.0, temperature_losses(calibration))
     if kind == 'ros':
-        found = fitted(calibration, calibration.geometry.camera.model, ('skew',))
         path = folder / CAMERA_INFO_FILE
         write_camera_info(calibration.geometry.camera, path, calibration.child_frame)
-        written = _of_fit(
-            folder, {'alignment.yaml': camera_models.transform_yaml(calibration)}, found
-        )
-        return Exported((path, *written.files), written.worst_px, written.losses)
+        found = fitted(calibration, calibration.geometry.camera.model, ('skew',))
+        texts = {'alignment.yaml': camera_models.transform_yaml(calibration)}
+        done = _written(folder, texts, found.worst_px, found.losses)
+        return dataclasses.replace(done, files=(path, *done.files))
     makers: Mapping[str, tuple[str, Callable[[Calibration], tuple[str, Fitted]]]] = {
         'opencv': ('opencv.yaml', camera_models.opencv_yaml),
         'kalibr': ('camchain.yaml', functools.partial(camera_models.kalibr_yaml, topic=topic)),
@@ -123,11 +123,7 @@ def export(
     }
     name, make = makers[kind]
     text, found = make(calibration)
-    return _of_fit(folder, {name: text}, found)
-
-
-def _of_fit(folder: Path, texts: dict[str, str], found: Fitted) -> Exported:
-    return _written(folder, texts, found.worst_px, found.losses)
+    return _written(folder, {name: text}, found.worst_px, found.losses)
 
 
 def _written(

@@ -17,9 +17,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import CameraModel, project
+from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import ros_distortion
-from starcal_ros.mission.export.losses import about, Fitted, fitted, Loss, sampled
+from starcal_ros.mission.export.losses import about, Fitted, fitted, GRID, Loss
 from starcal_ros.mission.export.spice import kernel_text, SpiceNames
 from starcal_ros.records import Calibration
 
@@ -101,7 +101,7 @@ def radial_directions(intrinsics: Floats, k: Floats, pixels: Floats) -> Floats:
 
 def _radial(camera: CameraModel) -> tuple[Floats, Floats, float]:
     """Best intrinsics (5,) and k (2,) over the detector, and the largest error of a pixel."""
-    pixels, _ = sampled(camera)
+    pixels = pixel_grid(camera, GRID, GRID)
 
     def error_px(p: Floats) -> Floats:
         return np.asarray(project(camera, radial_directions(p[:5], p[5:], pixels)) - pixels)

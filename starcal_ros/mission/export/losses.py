@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.camera.conversion import nearest_camera
 from starcal_ros.constants import utc_text
@@ -22,7 +21,7 @@ PIXEL_CONVENTION = (
     'Pixel (u, v) = (column, row); the centre of the first pixel is (0, 0).',
     'Camera frame: +Z along the optical axis, +X along u, +Y along v.',
 )
-_GRID = 25  # pixels a side, as in the fits of `camera`
+GRID = 25  # pixels a side, as in the fits of `camera`
 
 
 @dataclass(frozen=True)
@@ -76,29 +75,23 @@ def _alone(camera: CameraModel, model: str, zero: tuple[str, ...]) -> float:
     return nearest_camera(camera, model, zero)[1]
 
 
-def sampled(camera: CameraModel) -> tuple[Floats, Floats]:
-    """Pixels (n, 2) of a grid over the detector, and their lines of sight (n, 3)."""
-    pixels = pixel_grid(camera, _GRID, _GRID)
-    return pixels, line_of_sight(camera, pixels)
-
-
 def temperature_losses(calibration: Calibration) -> tuple[Loss, ...]:
     """Changes with temperature, as errors per degree Celsius."""
     terms = calibration.temperature
     if terms is None:
         return ()
-    camera = calibration.geometry.camera
-    pixels, directions = sampled(dataclasses.replace(camera, field=None))
+    lens = dataclasses.replace(calibration.geometry.camera, field=None)
+    pixels = pixel_grid(lens, GRID, GRID)
     losses = []
     if terms.focal_per_degc:
-        from_axis = pixels - camera.intrinsics[3:5]
+        from_axis = pixels - lens.intrinsics[3:5]
         cost = float(np.linalg.norm(terms.focal_per_degc[0] * from_axis, axis=1).max())
         losses.append(Loss('change of the focal length per degC', cost))
     if terms.alignment_rate_rad_per_degc:
         rate = np.array(terms.alignment_rate_rad_per_degc)
+        directions = line_of_sight(lens, pixels)
         # A passive small rotation takes directions to d - rate x d.
         moved = directions - np.cross(rate, directions)
-        lens = dataclasses.replace(camera, field=None)
         cost = float(np.nanmax(np.linalg.norm(project(lens, moved) - pixels, axis=1)))
         losses.append(Loss('change of the alignment per degC', cost))
     return tuple(losses)

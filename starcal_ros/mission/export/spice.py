@@ -151,14 +151,14 @@ def _frame_kernel(
     about: list[str],
 ) -> str:
     number = names.camera_id
-    sigma = calibration.sigma[-3:] / ARCSECOND_RAD
+    sigmas = ', '.join(f'{sigma:.3f}' for sigma in calibration.sigma[-3:] / ARCSECOND_RAD)
     comments = [
         f'{camera_frame} is fixed in {tracker_frame}. TKFRAME_{number}_Q takes vectors of the',
         'camera frame to the star tracker frame (SPICE quaternion, scalar first).',
         '',
         *PIXEL_CONVENTION,
         '',
-        f'1-sigma of the alignment about the camera axes, arcsec: {_three(sigma)}.',
+        f'1-sigma of the alignment about the camera axes, arcsec: {sigmas}.',
         f'Names of the calibration: {calibration.child_frame} in {calibration.parent_frame}.',
         '',
         *about,
@@ -179,10 +179,6 @@ def _frame_kernel(
     data += _assignment(f'TKFRAME_{number}_Q', [w, x, y, z])
     data += ['', f"   NAIF_BODY_NAME += '{camera_frame}'", f'   NAIF_BODY_CODE += {number}']
     return _kernel('FK', f'Frame of the camera {camera_frame}', comments, data)
-
-
-def _three(values: Floats) -> str:
-    return ', '.join(f'{value:.3f}' for value in values)
 
 
 def _frame(name: str, number: int, kind: int, center: int) -> list[str]:
@@ -355,10 +351,7 @@ def _wrapped(text: str) -> list[str]:
     # Only the first blanks of a line are its indent; a backslash would open a data block.
     text = text.replace('\\', '/').encode('ascii', 'replace').decode()
     indent = ' ' * (len(text) - len(text.lstrip()))
+    below = indent + '  '
     return textwrap.wrap(
-        text,
-        _COMMENT_COLUMNS,
-        subsequent_indent=indent + '  ',
-        break_on_hyphens=False,
-        drop_whitespace=True,
+        text, _COMMENT_COLUMNS, subsequent_indent=below, break_on_hyphens=False
     ) or ['']

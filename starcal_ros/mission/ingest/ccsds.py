@@ -22,8 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.constants import AU_M, NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.errors import IngestError
-from starcal_ros.formats.images.time_systems import from_text, system_of, TimeError
+from starcal_ros.formats.images.time_systems import from_text, system_of
 from starcal_ros.mission.ingest import mission_records
 from starcal_ros.mission.ingest.navigation_messages import read_segments, Segment
 from starcal_ros.sky.astrometry import tt_julian_date
@@ -60,33 +59,31 @@ def read_aem(path: Path, star_tracker: str = '') -> mission_records.Attitudes:
     Raises IngestError when the file cannot be read, is no AEM, or names a time system or frames
     that cannot be converted.
     """
-    where = str(path)
     segments = read_segments(path, 'AEM')
-    bodies = dict.fromkeys(_frames(segment, where)[1] for segment in segments)
-    chosen = star_tracker.upper() or next(iter(bodies))
-    if chosen not in bodies or (len(bodies) > 1 and not star_tracker):
-        raise IngestError(
-            f'{where}: body frames {", ".join(bodies)}: choose one with --star-tracker'
+    with mission_records.naming(path):
+        bodies = dict.fromkeys(_frames(segment)[1] for segment in segments)
+        chosen = star_tracker.upper() or next(iter(bodies))
+        if chosen not in bodies or (len(bodies) > 1 and not star_tracker):
+            raise ValueError(f'body frames {", ".join(bodies)}: choose one with --star-tracker')
+        stamps: list[Indices] = []
+        quaternions: list[Floats] = []
+        notes: list[str] = []
+        for segment in segments:
+            inertial, body, is_forward = _frames(segment)
+            if body != chosen:
+                continue
+            notes += mission_records.frame_notes(inertial)
+            system = _system(segment)
+            q, is_a_to_b = _quaternions(segment)
+            at = _stamps(segment, system)
+            keep = _useable(segment, at, system)
+            stamps.append(at[keep])
+            quaternions.append(q[keep] if is_forward == is_a_to_b else q[keep] * _CONJUGATE)
+            if system != 'UTC':
+                notes.append(f'times converted from {system} to UTC')
+        return mission_records.in_order(
+            np.concatenate(stamps), np.concatenate(quaternions), tuple(dict.fromkeys(notes))
         )
-    stamps: list[Indices] = []
-    quaternions: list[Floats] = []
-    notes: list[str] = []
-    for segment in segments:
-        inertial, body, is_forward = _frames(segment, where)
-        if body != chosen:
-            continue
-        notes += mission_records.frame_notes(inertial, where)
-        system = _system(segment, where)
-        q, is_a_to_b = _quaternions(segment, where)
-        at = _stamps(segment, system, where)
-        keep = _useable(segment, at, system, where)
-        stamps.append(at[keep])
-        quaternions.append(q[keep] if is_forward == is_a_to_b else q[keep] * _CONJUGATE)
-        if system != 'UTC':
-            notes.append(f'times converted from {system} to UTC')
-    return mission_records.in_order(
-        np.concatenate(stamps), np.concatenate(quaternions), where, tuple(dict.fromkeys(notes))
-    )
 
 
 def read_oem(path: Path, at_ns: Sequence[int]) -> mission_records.Velocities:
@@ -97,143 +94,132 @@ def read_oem(path: Path, at_ns: Sequence[int]) -> mission_records.Velocities:
     Raises IngestError when the file cannot be read, does not cover a stamp, or names a centre, a
     time system or a frame that cannot be converted.
     """
-    where = str(path)
-    at = np.array(at_ns, np.int64)
-    found = np.full((len(at), 3), np.nan)
-    notes: list[str] = []
-    for segment in read_segments(path, 'OEM'):
-        notes += mission_records.frame_notes(_keyword(segment, 'REF_FRAME', where), where)
-        system = _system(segment, where)
-        stamps = _stamps(segment, system, where)
-        states = _numbers(segment, _STATE_NUMBERS, where)
-        if len(stamps) < 2 or not (np.diff(stamps) > 0).all():
-            raise IngestError(f'{where}: a segment has fewer than two states, or is out of order')
-        inside = (at >= stamps[0]) & (at <= stamps[-1]) & _useable(segment, at, system, where)
-        # Seconds since the first state: those since 1970 have a resolution of 0.1 us.
-        seconds = (stamps - stamps[0]) / NANOSECONDS_PER_SECOND
-        orbit = CubicHermiteSpline(seconds, states[:, :3], states[:, 3:6])
-        since_s = (at[inside] - stamps[0]) / NANOSECONDS_PER_SECOND
-        center = _keyword(segment, 'CENTER_NAME', where)
-        found[inside] = orbit(since_s, 1) * _KM + _center_velocity(center, at[inside], where)
-    missing = ~np.isfinite(found[:, 0])
-    if missing.any():
-        raise IngestError(
-            f'{where}: no velocity for {int(missing.sum())} of {len(at)} images, '
-            f'the first at {utc_text(int(at[missing][0]))}'
-        )
-    return mission_records.Velocities(at, found, tuple(dict.fromkeys(notes)))
+    segments = read_segments(path, 'OEM')
+    with mission_records.naming(path):
+        at = np.array(at_ns, np.int64)
+        found = np.full((len(at), 3), np.nan)
+        notes: list[str] = []
+        for segment in segments:
+            notes += mission_records.frame_notes(_keyword(segment, 'REF_FRAME'))
+            system = _system(segment)
+            stamps = _stamps(segment, system)
+            states = _numbers(segment, _STATE_NUMBERS)
+            if len(stamps) < 2 or not (np.diff(stamps) > 0).all():
+                raise ValueError('a segment has fewer than two states, or is out of order')
+            inside = (at >= stamps[0]) & (at <= stamps[-1]) & _useable(segment, at, system)
+            # Seconds since the first state: those since 1970 have a resolution of 0.1 us.
+            seconds = (stamps - stamps[0]) / NANOSECONDS_PER_SECOND
+            orbit = CubicHermiteSpline(seconds, states[:, :3], states[:, 3:6])
+            since_s = (at[inside] - stamps[0]) / NANOSECONDS_PER_SECOND
+            center = _keyword(segment, 'CENTER_NAME')
+            found[inside] = orbit(since_s, 1) * _KM + _center_velocity(center, at[inside])
+        missing = ~np.isfinite(found[:, 0])
+        if missing.any():
+            raise ValueError(
+                f'no velocity for {int(missing.sum())} of {len(at)} images, '
+                f'the first at {utc_text(int(at[missing][0]))}'
+            )
+        return mission_records.Velocities(at, found, tuple(dict.fromkeys(notes)))
 
 
-def _keyword(segment: Segment, key: str, where: str, *values: str) -> str:
+def _keyword(segment: Segment, key: str, *values: str) -> str:
     """Value of a keyword that is needed, one of ``values`` if there are any."""
     found = segment.metadata.get(key, '').upper()
     if not found or (values and found not in values):
         expected = f' {" or ".join(values)}' if values else ''
-        raise IngestError(
-            f'{where}: keyword {key} is {found or "missing"}, and version {segment.version} needs'
+        raise ValueError(
+            f'keyword {key} is {found or "missing"}, and version {segment.version} needs'
             f' it{expected}: ask who wrote the file'
         )
     return found
 
 
-def _frames(segment: Segment, where: str) -> tuple[str, str, bool]:
+def _frames(segment: Segment) -> tuple[str, str, bool]:
     """Inertial frame, body frame, and whether frame A is the inertial one."""
-    a, b = (_keyword(segment, f'REF_FRAME_{name}', where) for name in 'AB')
+    a, b = (_keyword(segment, f'REF_FRAME_{name}') for name in 'AB')
     if mission_records.is_inertial(a) == mission_records.is_inertial(b):
-        raise IngestError(
-            f'{where}: frames {a} and {b}: one must be ICRF or EME2000, the other the star tracker'
+        raise ValueError(
+            f'frames {a} and {b}: one must be ICRF or EME2000, the other the star tracker'
         )
     return (a, b, True) if mission_records.is_inertial(a) else (b, a, False)
 
 
-def _quaternions(segment: Segment, where: str) -> tuple[Floats, bool]:
+def _quaternions(segment: Segment) -> tuple[Floats, bool]:
     """Quaternions (n, 4), scalar last, and whether they are from A to B."""
     is_old = segment.version == '1.0'
-    is_a_to_b = not is_old or _keyword(segment, 'ATTITUDE_DIR', where, 'A2B', 'B2A') == 'A2B'
-    kind = _keyword(segment, 'ATTITUDE_TYPE', where)
+    is_a_to_b = not is_old or _keyword(segment, 'ATTITUDE_DIR', 'A2B', 'B2A') == 'A2B'
+    kind = _keyword(segment, 'ATTITUDE_TYPE')
     if kind in _EULER_TYPES[segment.version]:
-        return _of_euler_angles(segment, _EULER_TYPES[segment.version][kind], where), is_a_to_b
+        return _of_euler_angles(segment, _EULER_TYPES[segment.version][kind]), is_a_to_b
     if kind not in _TYPES[segment.version]:
-        raise IngestError(
-            f'{where}: attitudes of type {kind}, not QUATERNION or EULER_ANGLE: convert them'
-        )
+        raise ValueError(f'attitudes of type {kind}, not QUATERNION or EULER_ANGLE: convert them')
     if segment.is_xml:
-        return _numbers(segment, (4,), where), is_a_to_b
-    values = _numbers(segment, (_TYPES[segment.version][kind],), where)[:, :4]
-    if is_old and _keyword(segment, 'QUATERNION_TYPE', where, 'FIRST', 'LAST') == 'FIRST':
+        return _numbers(segment, (4,)), is_a_to_b
+    values = _numbers(segment, (_TYPES[segment.version][kind],))[:, :4]
+    if is_old and _keyword(segment, 'QUATERNION_TYPE', 'FIRST', 'LAST') == 'FIRST':
         values = np.roll(values, -1, axis=1)
     return values, is_a_to_b
 
 
-def _of_euler_angles(segment: Segment, count: int, where: str) -> Floats:
+def _of_euler_angles(segment: Segment, count: int) -> Floats:
     """
     Quaternions (n, 4) of Euler angles.
 
     The frame is turned about each of its own axes in turn, so the composition of the rotations
     in this order takes coordinates in the last frame to those in the first.
     """
-    sequence = _keyword(segment, 'EULER_ROT_SEQ', where).translate(_AXES)
+    sequence = _keyword(segment, 'EULER_ROT_SEQ').translate(_AXES)
     if not _SEQUENCE.fullmatch(sequence):
-        raise IngestError(f'{where}: EULER_ROT_SEQ = {sequence[:20]} is not a sequence as ZXZ')
-    angles = _numbers(segment, (count,), where)[:, :3]
+        raise ValueError(f'EULER_ROT_SEQ = {sequence[:20]} is not a sequence as ZXZ')
+    angles = _numbers(segment, (count,))[:, :3]
     return np.asarray(Rotation.from_euler(sequence, angles, degrees=True).as_quat())
 
 
-def _numbers(segment: Segment, counts: Sequence[int], where: str) -> Floats:
+def _numbers(segment: Segment, counts: Sequence[int]) -> Floats:
     """Numbers (n, k) of a segment, k one of ``counts`` and the same for each epoch."""
     if not segment.values:
-        raise IngestError(f'{where}: a segment without data')
+        raise ValueError('a segment without data')
     count = len(segment.values[0])
     odd = [k for k, values in enumerate(segment.values) if len(values) != count]
     if odd or count not in counts:
         k = odd[0] if odd else 0
-        raise IngestError(
-            f'{where}: {len(segment.values[k])} numbers at {segment.epochs[k]}, expected '
+        raise ValueError(
+            f'{len(segment.values[k])} numbers at {segment.epochs[k]}, expected '
             f'{" or ".join(map(str, counts))}'
         )
     values = np.array(segment.values)
     if not np.isfinite(values).all():
         k = int(np.argmin(np.isfinite(values).all(axis=1)))
-        raise IngestError(f'{where}: a number at {segment.epochs[k]} is not finite')
+        raise ValueError(f'a number at {segment.epochs[k]} is not finite')
     return values
 
 
-def _system(segment: Segment, where: str) -> str:
-    try:
-        return system_of(_keyword(segment, 'TIME_SYSTEM', where))
-    except TimeError as error:
-        raise IngestError(f'{where}: {error}') from error
+def _system(segment: Segment) -> str:
+    return system_of(_keyword(segment, 'TIME_SYSTEM'))
 
 
-def _stamps(segment: Segment, system: str, where: str) -> Indices:
-    return np.array([_stamp(epoch, system, where) for epoch in segment.epochs], np.int64)
+def _stamps(segment: Segment, system: str) -> Indices:
+    return np.array([from_text(epoch, system) for epoch in segment.epochs], np.int64)
 
 
-def _useable(segment: Segment, at: Indices, system: str, where: str) -> NDArray[np.bool_]:
+def _useable(segment: Segment, at: Indices, system: str) -> NDArray[np.bool_]:
     """Stamps within the useable span of a segment; the other states are for interpolation."""
     keep = np.ones(len(at), np.bool_)
     if 'USEABLE_START_TIME' in segment.metadata:
-        keep &= at >= _stamp(segment.metadata['USEABLE_START_TIME'], system, where)
+        keep &= at >= from_text(segment.metadata['USEABLE_START_TIME'], system)
     if 'USEABLE_STOP_TIME' in segment.metadata:
-        keep &= at <= _stamp(segment.metadata['USEABLE_STOP_TIME'], system, where)
+        keep &= at <= from_text(segment.metadata['USEABLE_STOP_TIME'], system)
     return keep
 
 
-def _stamp(epoch: str, system: str, where: str) -> int:
-    try:
-        return from_text(epoch, system)
-    except TimeError as error:
-        raise IngestError(f'{where}: {error}') from error
-
-
-def _center_velocity(center: str, at_ns: Indices, where: str) -> Floats:
+def _center_velocity(center: str, at_ns: Indices) -> Floats:
     """Barycentric velocities (n, 3) of the centre of an ephemeris, m/s, ICRF axes."""
     name = center.strip().upper()
     if name in ('SOLAR SYSTEM BARYCENTER', 'SSB', 'SOLAR_SYSTEM_BARYCENTER'):
         return np.zeros((len(at_ns), 3))
     if name not in ('EARTH', 'SUN'):
-        raise IngestError(
-            f'{where}: centre {center!r} is not EARTH, SUN or SOLAR SYSTEM BARYCENTER; give the '
+        raise ValueError(
+            f'centre {center!r} is not EARTH, SUN or SOLAR SYSTEM BARYCENTER; give the '
             'velocity as SPK kernels with a planetary ephemeris'
         )
     velocity = []

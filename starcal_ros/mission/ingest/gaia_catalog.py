@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 import warnings
 
+import erfa
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -134,8 +135,7 @@ def _check(path: Path, stars: Mapping[str, NDArray[Any]], bundled: StarCatalog) 
 
 def _direction(stars: Mapping[str, NDArray[Any]]) -> Floats:
     """Unit vectors (n, 3) of stars."""
-    ra, dec = stars['ra_rad'], stars['dec_rad']
-    return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
+    return np.asarray(erfa.s2c(stars['ra_rad'], stars['dec_rad']))
 
 
 def _close(direction: Floats, magnitude: Floats) -> NDArray[np.bool_]:

@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
-from starcal_ros.mission.ingest.mission_records import Attitudes, in_order, start_of, Velocities
+from starcal_ros.mission.ingest import mission_records
+from starcal_ros.mission.ingest.mission_records import Attitudes, naming, Velocities
 
 _MAGIC = (b'DAF/', b'NAIF/DAF', b'KPL/')
 # A CK is sampled beside each image too: a stamp offset of the camera may be applied later.
@@ -30,7 +31,7 @@ _KM = 1000.0
 
 def is_kernel(path: Path) -> bool:
     """True if a file begins as a SPICE kernel."""
-    return start_of(path).startswith(_MAGIC)
+    return mission_records.start_of(path).startswith(_MAGIC)
 
 
 def read_ck(paths: Sequence[Path], frame: str, at_ns: Sequence[int]) -> Attitudes:
@@ -47,23 +48,22 @@ def read_ck(paths: Sequence[Path], frame: str, at_ns: Sequence[int]) -> Attitude
     frame : str
         Name of the star tracker frame, or its CK identifier.
     """
-    where = ', '.join(map(str, paths))
-    if not frame:
-        raise IngestError(f'{where}: name the star tracker frame of the CK with --star-tracker')
     stamps: list[int] = []
     quaternions: list[Floats] = []
-    with loaded(paths, where) as spice:
+    with naming(_names(paths)), loaded(paths) as spice:
+        if not frame:
+            raise ValueError('name the star tracker frame of the CK with --star-tracker')
         for time_ns in sorted({t + beside for t in at_ns for beside in _BESIDE_NS}):
-            matrix = _icrf_from_frame(spice, frame, time_ns, where)
+            matrix = _icrf_from_frame(spice, frame, time_ns)
             if matrix is not None:
                 stamps.append(time_ns)
                 quaternions.append(Rotation.from_matrix(matrix).as_quat())
-    if not stamps:
-        raise IngestError(
-            f'{where}: no attitude of {frame} from {utc_text(min(at_ns))} to '
-            f'{utc_text(max(at_ns))}: the CK does not cover the images'
-        )
-    return in_order(stamps, quaternions, where, ())
+        if not stamps:
+            raise ValueError(
+                f'no attitude of {frame} from {utc_text(min(at_ns))} to '
+                f'{utc_text(max(at_ns))}: the CK does not cover the images'
+            )
+        return mission_records.in_order(stamps, quaternions)
 
 
 def read_spk(paths: Sequence[Path], body: str, at_ns: Sequence[int]) -> Velocities:
@@ -73,32 +73,35 @@ def read_spk(paths: Sequence[Path], body: str, at_ns: Sequence[int]) -> Velociti
     Raises IngestError when a kernel cannot be read, the body is not known or a stamp is not
     covered.
     """
-    where = ', '.join(map(str, paths))
-    if not body:
-        raise IngestError(f'{where}: name the spacecraft of the SPK with --spacecraft')
     velocities = []
-    with loaded(paths, where) as spice:
+    with naming(_names(paths)), loaded(paths) as spice:
+        if not body:
+            raise ValueError('name the spacecraft of the SPK with --spacecraft')
         for time_ns in at_ns:
             try:
                 et = ephemeris_time(spice, time_ns)
                 state, _ = spice.spkezr(body, et, 'J2000', 'NONE', 'SOLAR SYSTEM BARYCENTER')
             except spice.SpiceyError as error:
-                raise IngestError(
-                    f'{where}: no velocity of {body} about the solar system barycentre at '
+                raise ValueError(
+                    f'no velocity of {body} about the solar system barycentre at '
                     f'{utc_text(time_ns)}: {_short(error)}'
                 ) from error
             velocities.append(np.array(state[3:]) * _KM)
     return Velocities(np.array(at_ns, np.int64), np.array(velocities).reshape(-1, 3))
 
 
+def _names(paths: Sequence[Path]) -> str:
+    return ', '.join(map(str, paths))
+
+
 @contextlib.contextmanager
-def loaded(paths: Sequence[Path], where: str) -> Iterator[Any]:
+def loaded(paths: Sequence[Path]) -> Iterator[Any]:
     """SPICE with only these kernels loaded; earlier ones are loaded again afterwards."""
     try:
         import spiceypy
     except ModuleNotFoundError as error:
         raise IngestError(
-            f"{where}: SPICE kernels need spiceypy: pip install 'starcal_ros[mission]'"
+            f"{_names(paths)}: SPICE kernels need spiceypy: pip install 'starcal_ros[mission]'"
         ) from error
     before = [spiceypy.kdata(k, 'ALL')[0] for k in range(spiceypy.ktotal('ALL'))]
     spiceypy.kclear()
@@ -109,7 +112,9 @@ def loaded(paths: Sequence[Path], where: str) -> Iterator[Any]:
             except spiceypy.SpiceyError as error:
                 raise IngestError(f'{path}: not loaded by SPICE: {_short(error)}') from error
         if not spiceypy.expool('DELTET/DELTA_AT'):
-            raise IngestError(f'{where}: no leap seconds kernel (LSK) among them: add naif*.tls')
+            raise IngestError(
+                f'{_names(paths)}: no leap seconds kernel (LSK) among them: add naif*.tls'
+            )
         yield spiceypy
     finally:
         spiceypy.kclear()
@@ -117,7 +122,7 @@ def loaded(paths: Sequence[Path], where: str) -> Iterator[Any]:
             spiceypy.furnsh(name)
 
 
-def _icrf_from_frame(spice: Any, frame: str, time_ns: int, where: str) -> Floats | None:
+def _icrf_from_frame(spice: Any, frame: str, time_ns: int) -> Floats | None:
     """Rotation (3, 3) from a frame to the ICRF; None where the CK has none."""
     et = ephemeris_time(spice, time_ns)
     try:
@@ -134,7 +139,7 @@ def _icrf_from_frame(spice: Any, frame: str, time_ns: int, where: str) -> Floats
         # Both stand for a CK without data at the time.
         if error.short in ('SPICE(NOFRAMECONNECT)', 'SPICE(FRAMEDATANOTFOUND)'):
             return None
-        raise IngestError(f'{where}: frame {frame}: {_short(error)}') from error
+        raise ValueError(f'frame {frame}: {_short(error)}') from error
 
 
 def ephemeris_time(spice: Any, time_ns: int) -> float:

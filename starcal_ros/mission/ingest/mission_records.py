@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import IngestError
-from starcal_ros.untrusted import read_text
+from starcal_ros.formats.images.time_systems import TimeError
+from starcal_ros.untrusted import read_text, regular_file
 
 # The frames whose axes are taken as those of the ICRF; the second set differs by the frame bias.
 ICRF_NAMES = ('ICRF', 'ICRF1', 'ICRF2', 'ICRF3', 'GCRF', 'ICRS', 'GCRS')
@@ -55,43 +58,37 @@ class Velocities:
     notes: tuple[str, ...] = ()
 
 
-def text_of(path: Path) -> str:
-    """
-    Text of a file in UTF-8.
-
-    Raises IngestError when it cannot be read, is too large or no text.
-    """
+@contextlib.contextmanager
+def naming(where: object) -> Iterator[None]:
+    """Raise IngestError naming a file, for what its reader raises about its content."""
     try:
-        return read_text(path, _TEXT_BYTES).removeprefix('\ufeff')  # byte-order mark
+        yield
     except OSError as error:
-        raise IngestError(f'{path}: cannot be read: {error.strerror}') from error
-    except ValueError as error:
-        raise IngestError(f'{path}: {error}') from error
+        raise IngestError(f'{where}: cannot be read: {error.strerror}') from error
+    except (ValueError, TimeError) as error:
+        raise IngestError(f'{where}: {error}') from error
+
+
+def text_of(path: Path) -> str:
+    """Text of a file in UTF-8; raises IngestError when it cannot be read or is too large."""
+    with naming(path):
+        return read_text(path, _TEXT_BYTES).removeprefix('\ufeff')  # byte-order mark
 
 
 def start_of(path: Path) -> bytes:
-    """
-    First 2 kB of a regular file, by which its format is known.
-
-    Raises IngestError when it cannot be read.
-    """
-    if path.exists() and not path.is_file():  # opening a pipe would wait for whoever writes to it
-        raise IngestError(f'{path}: not a regular file')
-    try:
-        with path.open('rb') as file:
-            return file.read(_START_BYTES)
-    except OSError as error:
-        raise IngestError(f'{path}: cannot be read: {error.strerror}') from error
+    """First 2 kB of a regular file, by which its format is known; raises as `text_of`."""
+    with naming(path), regular_file(path) as file:
+        return file.read(_START_BYTES)
 
 
-def frame_notes(name: str, where: str) -> tuple[str, ...]:
-    """Notes on an inertial frame; raises IngestError for a frame that is not ICRF or EME2000."""
+def frame_notes(name: str) -> tuple[str, ...]:
+    """Notes on an inertial frame; raises ValueError for a frame that is not ICRF or EME2000."""
     known = name.strip().upper()
     if known in ICRF_NAMES:
         return ()
     if known in EME2000_NAMES:
         return (EME2000_NOTE,)
-    raise IngestError(f'{where}: frame {name!r} is neither ICRF nor EME2000: convert it first')
+    raise ValueError(f'frame {name!r} is neither ICRF nor EME2000: convert it first')
 
 
 def is_inertial(name: str) -> bool:
@@ -99,21 +96,21 @@ def is_inertial(name: str) -> bool:
     return name.strip().upper() in (*ICRF_NAMES, *EME2000_NAMES)
 
 
-def in_order(time_ns: ArrayLike, xyzw: ArrayLike, where: str, notes: tuple[str, ...]) -> Attitudes:
+def in_order(time_ns: ArrayLike, xyzw: ArrayLike, notes: tuple[str, ...] = ()) -> Attitudes:
     """
     Attitudes sorted by time, each stamp once (of equal stamps the first), scaled to unit length.
 
-    Raises IngestError when there are none, or a quaternion is not of unit length.
+    Raises ValueError when there are none, or a quaternion is not of unit length.
     """
     stamps, first = np.unique(np.asarray(time_ns, np.int64), return_index=True)
     if not len(stamps):
-        raise IngestError(f'{where}: no attitudes')
+        raise ValueError('no attitudes')
     quaternions = np.asarray(xyzw, np.float64)[first]
     norm = np.linalg.norm(quaternions, axis=1)
     wrong = ~(np.abs(norm - 1.0) <= 1e-3)  # single precision keeps 1e-7; this is no rounding
     if wrong.any():
-        raise IngestError(
-            f'{where}: attitude {int(wrong.argmax()) + 1} is not a unit quaternion '
+        raise ValueError(
+            f'attitude {int(wrong.argmax()) + 1} is not a unit quaternion '
             f'(length {norm[wrong][0]:.4f}); {int(wrong.sum())} of {len(norm)}'
         )
     return Attitudes(stamps, quaternions / norm[:, None], notes)

@@ -11,16 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+import io
 from pathlib import Path
 import re
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 from starcal_ros.errors import IngestError
 from starcal_ros.mission.ingest.mission_records import text_of
 
 _VERSION = re.compile(r'CCSDS_([A-Z]+)_VERS\s*=\s*(\S*)')
-_CHUNK = 1 << 16  # characters of XML whose elements are held at a time
 _ALL = (
     'OBJECT_NAME OBJECT_ID CENTER_NAME TIME_SYSTEM START_TIME USEABLE_START_TIME'
     ' USEABLE_STOP_TIME STOP_TIME INTERPOLATION_DEGREE'
@@ -109,6 +109,8 @@ def read_segments(path: Path, kind: str) -> list[Segment]:
             raise ValueError('no segment')
         for segment in segments:
             _check(segment, kind)
+    except ElementTree.ParseError as error:
+        raise IngestError(f'{path}: not XML: {error}') from error
     except ValueError as error:
         raise IngestError(f'{path}: not readable as CCSDS {kind}: {error}') from error
     return segments
@@ -171,7 +173,7 @@ def _xml_segments(text: str, kind: str) -> Iterator[Segment]:
     version = ''
     messages: list[str] = []  # of a combined instantiation, in their order
     segment = Segment('', is_xml=True)
-    for event, element in _xml_events(text):
+    for event, element in ElementTree.iterparse(io.StringIO(text), ('start', 'end')):
         tag = element.tag.rpartition('}')[2]
         if event == 'start':
             if element.get('id', '').startswith('CCSDS_'):
@@ -193,18 +195,6 @@ def _xml_segments(text: str, kind: str) -> Iterator[Segment]:
             element.clear()
     if kind not in messages:
         raise ValueError(f'the message is {" and ".join(messages) or "none of CCSDS"}')
-
-
-def _xml_events(text: str) -> Iterator[tuple[str, ElementTree.Element]]:
-    """Starts and ends of elements, while the text is read."""
-    parser: ElementTree.XMLPullParser[Any] = ElementTree.XMLPullParser(('start', 'end'))
-    try:
-        for at in range(0, len(text), _CHUNK):
-            parser.feed(text[at : at + _CHUNK])
-            yield from parser.read_events()  # type: ignore[misc]
-        parser.close()
-    except ElementTree.ParseError as error:
-        raise ValueError(f'not XML: {error}') from error
 
 
 def _add_state(segment: Segment, state: ElementTree.Element, units: Mapping[str, str]) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 import warnings
 
+import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -30,7 +31,7 @@ _GRID = 5  # points a side, between which the attitude balances the distortion o
 
 def is_solution(path: Path) -> bool:
     """True if a file is FITS: an image, or a header alone."""
-    return path.name.lower().endswith(FITS_ENDINGS) or start_of(path).startswith(_MAGIC)
+    return _is_fits(path) or start_of(path).startswith(_MAGIC)
 
 
 def read_wcs(paths: Sequence[Path], images: Sequence[ImageFile]) -> Attitudes:
@@ -92,8 +93,7 @@ def _attitude(path: Path, image: ImageFile) -> tuple[Rotation, bool]:
 
 def _directions(wcs: Any, pixels: Any, path: Path) -> Any:
     """Unit vectors (n, 3) of pixels (n, 2), the centre of the first one (0, 0)."""
-    ra, dec = np.radians(np.asarray(wcs.all_pix2world(pixels, 0)).T)
-    found = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
+    found = erfa.s2c(*np.radians(np.asarray(wcs.all_pix2world(pixels, 0)).T))
     if not np.isfinite(found).all():
         raise IngestError(f'{path}: the WCS does not reach the corners of the image')
     return found

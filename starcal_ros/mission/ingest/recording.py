@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import heapq
 from itertools import repeat
 import json
@@ -65,7 +65,7 @@ class Recorded:
 
     bag: Path
     params: Path | None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...]
 
 
 def look_at_all(
@@ -107,8 +107,7 @@ def check_place(bag: Path, inputs: Sequence[Path], camera: Path | None = None) -
     """
     record, params, copied = _files_beside(bag)
     product_files.check_not_inputs([BagWriter(bag).file, record, params], inputs)
-    others = [params, copied] if camera else []
-    others = [path for path in others if not same_as_one_of(path, filter(None, [camera]))]
+    others = [p for p in (params, copied) if camera and not same_as_one_of(p, [camera])]
     check_replaceable(bag, record, others, 'scale', 'an imported bag')
 
 
@@ -156,11 +155,11 @@ def write_bag(
         'bayer': options.bayer,
         'notes': list(dict.fromkeys(notes)),
     }
-    prior_files = (
-        {}
-        if prior is None
-        else _prior_files(prior, params, copied, files, scale, attitudes.by_stars, tuple(others))
-    )
+    prior_files = {}
+    if prior is not None:
+        prior_files = _prior_files(
+            prior, params, copied, files, scale, attitudes.by_stars, tuple(others)
+        )
     with writer:
         trackers = {ATTITUDE_TOPIC: attitudes}
         trackers |= {f'/{frame}/attitude': one for frame, one in others.items()}
@@ -246,6 +245,7 @@ def _write_messages(
 ) -> None:
     """Write images and telemetry in order of time; at one stamp the attitude is first."""
     messages: list[Iterable[tuple[int, int, Any]]] = [((file.time_ns, 2, file) for file in files)]
+    rows_upward = any(attitudes.rows_upward for attitudes in trackers.values())
     for topic, attitudes in trackers.items():
         near = _near(attitudes, files)
         to_topic = zip(repeat(topic), near.icrf_from_star_tracker_xyzw)
@@ -264,7 +264,7 @@ def _write_messages(
                 )
             wanted = _options_of(content.path, options)
             pixels = guard.call(content.path, image_files.pixels_of, content.path, wanted, scale)
-            if attitudes.rows_upward and content.path.name.lower().endswith(FITS_ENDINGS):
+            if rows_upward and content.path.name.lower().endswith(FITS_ENDINGS):
                 pixels = pixels[::-1]
             writer.write_image(IMAGE_TOPIC, Image(time_ns, pixels), 'camera')
             on_image()

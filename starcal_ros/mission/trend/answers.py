@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import dataclasses
 from dataclasses import dataclass
 import hashlib
@@ -69,9 +70,10 @@ def _answer(task: Task, path: Path) -> Row | Seen:
     version, key = software_version() if task.is_bag else '', ''
     try:
         if task.is_bag and not task.params:
-            settings: tuple[str | Path, ...] = (path.with_name(calibration_json.CALIBRATION_FILE),)
-            if not _is_older(path.with_name(calibration_json.CALIBRATION_FILE), version):
+            beside = path.with_name(calibration_json.CALIBRATION_FILE)
+            if not _is_older(beside, version):
                 return Seen()
+            settings: tuple[str | Path, ...] = (beside,)
         else:
             settings = task.settings
         # By content: a copy counts once, a tree may move, and what is repaired is another task.
@@ -121,8 +123,7 @@ def _calibrated(task: Task, path: Path, key: str) -> Row:
     chosen = topics.choose_topics([path], topics.Topics(), setup)
     records = list(topics.read([path], chosen, setup))
     calibration = solve.solve(solve.ensemble_of(records, setup), setup)
-    mean = _mean([record.temperature_degc for record in records])
-    return row_of(calibration, key, task.url, COMPUTED, mean)
+    return row_of(calibration, key, task.url, COMPUTED, _mean_temperature(records))
 
 
 def _setup_beside(bag: Path) -> Setup:
@@ -159,9 +160,10 @@ def _temperature(observations: Path) -> float:
         records: list[StarObservations] = list(reader.read_observations([observations], topic))
     except StarcalError:
         return math.nan
-    return _mean([record.temperature_degc for record in records if not record.refusal])
+    return _mean_temperature([record for record in records if not record.refusal])
 
 
-def _mean(temperatures: list[float]) -> float:
-    known = [value for value in temperatures if not math.isnan(value)]
-    return float(np.mean(known)) if known else math.nan
+def _mean_temperature(records: Sequence[StarObservations]) -> float:
+    degc = np.array([record.temperature_degc for record in records])
+    known = degc[~np.isnan(degc)]
+    return float(np.mean(known)) if len(known) else math.nan

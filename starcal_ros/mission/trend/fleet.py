@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import contextlib
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import time
 
 from starcal_ros.mission.trend.answers import compute, failed, Seen, START
@@ -18,7 +18,7 @@ from starcal_ros.studies.workers import stream_each
 _PAUSES_S = (1.0, 10.0)  # before a file that could not be reached is tried again
 
 
-@dataclass(frozen=True)
+@dataclass
 class Done:
     """How many tasks were computed, failed, were in the table before, or repeat another one."""
 
@@ -26,6 +26,26 @@ class Done:
     failed: int = 0
     known: int = 0
     repeated: int = 0
+    _starts: set[str] = field(default_factory=set, compare=False, repr=False)
+
+    def count_known(self, start: str) -> None:
+        """Count a file whose row, named by the start of its key, is in the table."""
+        if start:
+            self.known += start not in self._starts
+            self.repeated += start in self._starts
+            self._starts.add(start)
+
+    def count(self, table: Table, task: Task, answer: Row | Seen) -> None:
+        """Put an answer into the table, and count it."""
+        if isinstance(answer, Seen):
+            table.add_seen(task.stamp, answer)
+            self.count_known(answer.key)
+        elif table.add(answer):
+            self.computed += not answer.error
+            self.failed += bool(answer.error)
+            self._starts.add(answer.key[:START])
+        else:
+            self.count_known(answer.key[:START])
 
 
 def update(
@@ -41,20 +61,14 @@ def update(
     A task that ends its worker process on every attempt becomes the row of a failure; the others
     go on.  A file that cannot be reached is tried again after the others, with a pause.
     What is computed is on disk within a batch, so a run that was stopped starts where it stopped.
-    Raises OptionError when no scheduler answers at the address.
-
-    Parameters
-    ----------
-    workers : int
-        Processes to start on this machine; 0 runs in-process.
-    scheduler : str
-        Address of a Dask scheduler, whose workers have this package and see the same files.
+    ``workers`` and ``scheduler`` as for `run_each`; the workers of a cluster see the same files.
     """
-    count = _Count()
+    done = Done()
     waiting = []
     for task in tasks:
-        if table.has(task):
-            count.same(table.start_of(task))
+        start = table.start_of(task)
+        if start is not None:
+            done.count_known(start)
         else:
             waiting.append(dataclasses.replace(task, known=table.likely(task)))
     with table:
@@ -68,37 +82,10 @@ def update(
                     if isinstance(answer, Row) and answer.is_passing and pause_s is not None:
                         again.append(task)
                         continue
-                    count.note(table, task, answer)
+                    done.count(table, task, answer)
                     on_row()
             if not again or pause_s is None:
                 break
             time.sleep(pause_s)
             waiting = again
-    return Done(count.computed, count.failed, count.known, count.repeated)
-
-
-class _Count:
-    """Numbers of `Done` while the answers come."""
-
-    def __init__(self) -> None:
-        self.computed = self.failed = self.known = self.repeated = 0
-        self._starts: set[str] = set()
-
-    def same(self, start: str) -> None:
-        """Count a file whose row, named by the start of its key, is in the table."""
-        if start:
-            self.known += start not in self._starts
-            self.repeated += start in self._starts
-            self._starts.add(start)
-
-    def note(self, table: Table, task: Task, answer: Row | Seen) -> None:
-        """Put an answer into the table, and count it."""
-        if isinstance(answer, Seen):
-            table.add_seen(task.stamp, answer)
-            self.same(answer.key)
-        elif table.add(answer):
-            self.computed += not answer.error
-            self.failed += bool(answer.error)
-            self._starts.add(answer.key[:START])
-        else:
-            self.same(answer.key[:START])
+    return done

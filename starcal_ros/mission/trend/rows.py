@@ -44,12 +44,8 @@ class Row:
         That made the calibration, or that failed to.
     time_ns, first_ns, last_ns : int
         Middle, first and last image.
-    number, active_since_ns : int
-        As in `Calibration`; 0 where it was not activated.
-    accepted, forced : bool
-    reasons : str
-    parent_frame, child_frame, lens_model : str
-    width, height, images, stars : int
+    active_since_ns : int
+        0 where it was not activated.
     residual_rms_px, temperature_degc : float
         NaN where not known.
     names : tuple of str

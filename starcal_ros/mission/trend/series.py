@@ -56,7 +56,7 @@ class Active:
 @dataclass(frozen=True)
 class Change:
     """
-    Change by a calibration against the one that was active then.
+    Change by a calibration against another one, such as that which was active then.
 
     ``line_of_sight_px`` is the largest change of a line of sight in the star tracker frame,
     ``shape_px`` that with the common rotation removed; px at the focal length.
@@ -66,15 +66,6 @@ class Change:
     against: int
     line_of_sight_px: float
     shape_px: float
-
-
-@dataclass(frozen=True)
-class Versions:
-    """The change of the same observations by a newer version: indices of the rows, and px."""
-
-    recorded: int
-    computed: int
-    line_of_sight_px: float
 
 
 def series_of(rows: Sequence[Row]) -> list[Series]:
@@ -144,35 +135,30 @@ def changes(rows: Sequence[Row], active: Sequence[Active]) -> list[Change]:
     found = []
     for k, row in enumerate(rows):
         then = [one for one in active if one.since_ns <= row.last_ns and one.row != k]
-        if not then:
-            continue
-        against = then[-1].row
-        total_px, shape_px = _apart_px(rows[against].geometry, row.geometry)
-        found.append(Change(k, against, total_px, shape_px))
+        if then:
+            found.append(_change(rows, k, then[-1].row))
     return found
 
 
-def _apart_px(before: CameraGeometry, after: CameraGeometry) -> tuple[float, float]:
+def _change(rows: Sequence[Row], row: int, against: int) -> Change:
+    before, after = rows[against].geometry, rows[row].geometry
     if (before.camera.width, before.camera.height) != (after.camera.width, after.camera.height):
-        return math.inf, math.inf
+        return Change(row, against, math.inf, math.inf)
     old, new = (lines_of_sight(geometry, *_GRID) for geometry in (before, after))
     moved_rad = np.linalg.norm(new - old, axis=1).max()
     _, left_px = movement(before, after, *_GRID)
-    return float(moved_rad * after.camera.parameters[0]), float(left_px.max())
+    total_px = float(moved_rad * after.camera.parameters[0])
+    return Change(row, against, total_px, float(left_px.max()))
 
 
-def versions(rows: Sequence[Row]) -> list[Versions]:
-    """Pairs of a recorded calibration and the one of the same images by this version."""
-    recorded = {
-        (row.first_ns, row.last_ns): k for k, row in enumerate(rows) if row.kind != COMPUTED
-    }
-    found = []
-    for k, row in enumerate(rows):
-        before = recorded.get((row.first_ns, row.last_ns))
-        if row.kind == COMPUTED and before is not None:
-            total_px, _ = _apart_px(rows[before].geometry, row.geometry)
-            found.append(Versions(before, k, total_px))
-    return found
+def versions(rows: Sequence[Row]) -> list[Change]:
+    """Change by this version against the recorded calibration of the same images."""
+    recorded = {_images(row): k for k, row in enumerate(rows) if row.kind != COMPUTED}
+    return [
+        _change(rows, k, recorded[_images(row)])
+        for k, row in enumerate(rows)
+        if row.kind == COMPUTED and _images(row) in recorded
+    ]
 
 
 def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import csv
 from dataclasses import dataclass, field
 import fnmatch
+import functools
 import hashlib
 import os
 from pathlib import Path
@@ -79,7 +80,7 @@ def find(root: str, cameras: Cameras) -> Iterator[Task]:
     cannot be read.
     """
     listed = {entry.name: entry for entry in places.entries(root)}
-    version, settings = software_version(), _Settings()
+    version, settings_of = software_version(), functools.cache(_settings)
     for name, entry in listed.items():
         if posixpath.basename(name) == CALIBRATION_FILE:
             observations = listed.get(posixpath.join(posixpath.dirname(name), OBSERVATIONS_FILE))
@@ -92,25 +93,16 @@ def find(root: str, cameras: Cameras) -> Iterator[Task]:
         calibration = listed.get(posixpath.join(folder, CALIBRATION_FILE))
         params = cameras.params_of(name)
         if params and calibration is None:
-            decides = settings.of(params)
-            yield _task(root, name, files, cameras, version, params, decides)
+            yield _task(root, name, files, cameras, version, params, settings_of(params))
         elif calibration is not None and posixpath.basename(name) == OBSERVATIONS_FILE:
             yield _task(root, name, files, cameras, version, others=(calibration,))
 
 
-class _Settings:
-    """Files that a parameter file names, and their digest, each read once."""
-
-    def __init__(self) -> None:
-        self._found: dict[str, tuple[tuple[str, ...], str]] = {}
-
-    def of(self, params: str) -> tuple[tuple[str, ...], str]:
-        """Absolute paths of a parameter file and those that it names, and their digest."""
-        if params not in self._found:
-            files = (Path(params), *files_of(read_setup(Path(params)).frames).values())
-            paths = tuple(map(os.path.abspath, files))
-            self._found[params] = paths, digest(paths)
-        return self._found[params]
+def _settings(params: str) -> tuple[tuple[str, ...], str]:
+    """Absolute paths of a parameter file and those that it names, and their digest."""
+    files = (Path(params), *files_of(read_setup(Path(params)).frames).values())
+    paths = tuple(map(os.path.abspath, files))
+    return paths, digest(paths)
 
 
 def digest(files: Sequence[str | Path], version: str = '') -> str:

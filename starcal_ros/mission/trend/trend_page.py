@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from datetime import datetime, timezone
 import math
 from pathlib import Path
@@ -49,33 +48,8 @@ _MARGIN_NS = 30 * 86400 * NANOSECONDS_PER_SECOND  # one calibration alone has da
 _TICKS = 6
 _DIGITS = 1e4  # a number with more of them than a label holds is drawn as a difference
 _STEPS_MONTHS = (1, 2, 3, 6, 12, 24, 60, 120, 240)
+_PER = {'drift': ' per year', 'temperature': ' per degC', 'step': ''}
 _LEAST_PX = 1e-4  # a smaller change is drawn as this one on the logarithmic axis
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A row of the table of findings."""
-
-    series: str
-    kind: str
-    size: str
-    p_value: str
-    when: str
-
-
-@dataclass(frozen=True)
-class Camera:
-    """The part of the page on one camera."""
-
-    name: str
-    is_stable: bool
-    verdict: Sequence[str]
-    rows: Sequence[Row]
-    findings: Sequence[Finding]
-    charts: Sequence[Chart]
-    active: Sequence[tuple[str, str, str, str]]
-    versions: Sequence[tuple[str, str, str, str]]
-    assumed: bool
 
 
 def write_page(rows: Sequence[Row], folder: str, root: str) -> str:
@@ -96,7 +70,8 @@ def write_page(rows: Sequence[Row], folder: str, root: str) -> str:
 
 
 @np.errstate(all='ignore')  # a refused camera may be wild: no line of sight is not drawn
-def _camera(name: str, group: Sequence[Row]) -> Camera:
+def _camera(name: str, group: Sequence[Row]) -> dict[str, object]:
+    """The part of the page on one camera."""
     rows = newest_of_each(group)
     active = activations(group)
     shown = series_of(rows)
@@ -104,25 +79,25 @@ def _camera(name: str, group: Sequence[Row]) -> Camera:
     charts = [_change_chart(group, new)] if new else []
     charts += [_chart(one, rows) for one in shown]
     is_stable, verdict = verdict_of(group, active, new, shown)
-    return Camera(
-        name=name,
-        is_stable=is_stable,
-        verdict=verdict,
-        rows=rows,
-        findings=[_finding(one, term, rows) for one in shown for term in one.trend.terms],
-        charts=charts,
-        active=[_active(one, group, new) for one in active],
-        versions=[
+    return {
+        'name': name,
+        'is_stable': is_stable,
+        'verdict': verdict,
+        'rows': rows,
+        'findings': [_finding(one, term, rows) for one in shown for term in one.trend.terms],
+        'charts': charts,
+        'active': [_active(one, group, new) for one in active],
+        'versions': [
             (
-                utc_text(group[v.recorded].time_ns)[:10],
-                group[v.recorded].software,
-                group[v.computed].software,
+                utc_text(group[v.against].time_ns)[:10],
+                group[v.against].software,
+                group[v.row].software,
                 f'{v.line_of_sight_px:.3f}',
             )
             for v in versions(group)
         ],
-        assumed=any(one.assumed for one in active),
-    )
+        'assumed': any(one.assumed for one in active),
+    }
 
 
 def verdict_of(
@@ -147,17 +122,23 @@ def verdict_of(
     return px <= _RECALIBRATE_PX, (newest, text)
 
 
-def _finding(series: Series, term: Term, rows: Sequence[Row]) -> Finding:
+def _finding(series: Series, term: Term, rows: Sequence[Row]) -> dict[str, str]:
+    """A row of the table of findings."""
     unit = series.unit and f' {series.unit}'
-    per = {'drift': ' per year', 'temperature': ' per degC', 'step': ''}[term.kind]
     when = 'throughout'
     if term.kind == 'step':
         last, first = (rows[series.row[k]].time_ns for k in (term.after, term.after + 1))
         when = f'between {utc_text(last)[:10]} and {utc_text(first)[:10]}'
     sign = '\N{MINUS SIGN}' if term.size < 0 else '+'
-    size = f'{sign}{abs(term.size):.3g} ± {term.sigma:.2g}{unit}{per}'
+    size = f'{sign}{abs(term.size):.3g} ± {term.sigma:.2g}{unit}{_PER[term.kind]}'
     p_value = f'{term.p_value:.1e}' if term.p_value > 1e-12 else 'below 1e-12'
-    return Finding(series.name, term.kind, size, p_value, when)
+    return {
+        'series': series.name,
+        'kind': term.kind,
+        'size': size,
+        'p_value': p_value,
+        'when': when,
+    }
 
 
 def _active(one: Active, rows: Sequence[Row], new: Sequence[Change]) -> tuple[str, str, str, str]:
@@ -181,10 +162,7 @@ def _chart(series: Series, rows: Sequence[Row]) -> Chart:
 def _words(term: Term, series: Series) -> str:
     unit = series.unit and f' {series.unit}'
     size = f'{term.size:.3g}'.replace('-', '\N{MINUS SIGN}')
-    if term.kind == 'step':
-        return f'step of {size}{unit}'
-    per = 'year' if term.kind == 'drift' else 'degC'
-    return f'{term.kind} of {size}{unit} per {per}'
+    return f'{term.kind} of {size}{unit}{_PER[term.kind]}'
 
 
 def _change_chart(rows: Sequence[Row], new: Sequence[Change]) -> Chart:
@@ -194,7 +172,7 @@ def _change_chart(rows: Sequence[Row], new: Sequence[Change]) -> Chart:
         f'Largest change of a line of sight that each calibration would have made: up to '
         f'{worst:.3g} px, {over} of {len(new)} over {_RECALIBRATE_PX:g} px (dashed).'
     )
-    return Chart('Change by a recalibration', change_figure(new, rows, _RECALIBRATE_PX), text)
+    return Chart('Change by a recalibration', change_figure(new, rows), text)
 
 
 def span_years(rows: Sequence[Row]) -> float:
@@ -238,7 +216,7 @@ def series_figure(series: Series, rows: Sequence[Row]) -> Drawing:
     )
 
 
-def change_figure(new: Sequence[Change], rows: Sequence[Row], limit_px: float) -> Drawing:
+def change_figure(new: Sequence[Change], rows: Sequence[Row]) -> Drawing:
     """Largest change that each calibration would have made, px, over time; logarithmic."""
     at = _times([rows[change.row] for change in new])
     curves = [
@@ -251,7 +229,7 @@ def change_figure(new: Sequence[Change], rows: Sequence[Row], limit_px: float) -
             strict=True,
         )
     ]
-    curves.append(Curve(_date_ends(at), [limit_px, limit_px], MUTED, dash='5 3'))
+    curves.append(Curve(_date_ends(at), [_RECALIBRATE_PX, _RECALIBRATE_PX], MUTED, dash='5 3'))
     return _over_dates(at, curves, 'change against the active one (px)', 'y')
 
 

@@ -12,6 +12,7 @@ A crash leaves complete files only.  Rows are unique by their key; of several th
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+import contextlib
 import dataclasses
 import posixpath
 import time
@@ -48,9 +49,13 @@ _TYPES: dict[Any, pa.DataType] = {
     tuple[str, ...]: pa.list_(pa.string()),
     tuple[float, ...]: pa.list_(pa.float64()),
 }
-_FIELDS = {field.name: field for field in dataclasses.fields(Row)}
+_DEFAULTS = {
+    field.name: field.default
+    for field in dataclasses.fields(Row)
+    if field.default is not dataclasses.MISSING
+}
 SCHEMA = pa.schema(
-    [(name, _TYPES[kind]) for name, kind in get_type_hints(Row).items() if name in _FIELDS],
+    [(name, _TYPES[kind]) for name, kind in get_type_hints(Row).items()],
     metadata={'starcal_trend_schema': SCHEMA_VERSION},
 )
 _SEEN_SCHEMA = pa.schema([('stamp', pa.string()), ('key', pa.string())])
@@ -81,17 +86,18 @@ class Table:
         self._pending: list[Row] = []
         self._pending_seen: dict[str, str] = {}
         self._known: dict[str, _Known] = {}
+        self._keys: dict[str, list[str]] = {}  # by part
         self._stamps: dict[str, str] = {}
-        self._starts: dict[str, list[str]] = {}  # of digests, by size; by path of earlier versions
-        self._left: set[str] = set()  # folders of cameras that a row has left
+        self._by_size: dict[int, list[str]] = {}
         self._new_parts = 0
         try:
             places.make_folder(self.folder)
         except OSError as error:
             raise ProductError(f'{self.folder}: cannot be created: {error.strerror}') from error
-        for part in self._parts():
+        parts, seen = self._parts()
+        for part in parts:
             self._note(part)
-        self._note_seen()
+        self._note_seen(seen)
 
     def __enter__(self) -> Table:
         """Return the table."""
@@ -102,23 +108,15 @@ class Table:
         self.flush()
         self._sort_in()
 
-    def __contains__(self, key: object) -> bool:
-        """True if a row with a key was added."""
-        return key in self._known
-
-    def has(self, task: Task) -> bool:
-        """True if a task has its row, or needs none."""
-        return task.stamp in self._stamps
-
-    def start_of(self, task: Task) -> str:
-        """Start of the key of the row of a task; empty where none is due."""
-        return self._stamps[task.stamp]
+    def start_of(self, task: Task) -> str | None:
+        """Start of the key of the row of a task; empty where none is due, None if not known."""
+        return self._stamps.get(task.stamp)
 
     def likely(self, task: Task) -> tuple[str, ...]:
         """Starts of the digests of rows whose content may be that of a task."""
-        found = [*self._starts.get(str(task.size), ()), *self._starts.get(task.url, ())]
-        same = [key for key in found if key in self._known and self._is_of(task, key)]
-        return tuple(key[:START] for key in same) if len(same) <= _MOST_KNOWN else ()
+        same = self._by_size.get(task.size, ())
+        found = [key[:START] for key in same if key in self._known and self._is_of(task, key)]
+        return tuple(found) if len(found) <= _MOST_KNOWN else ()
 
     def _is_of(self, task: Task, key: str) -> bool:
         """True if a row has the names of its task; the metadata of a bag may add some."""
@@ -131,11 +129,9 @@ class Table:
         if before and before.camera == camera:
             self.add_seen(row.stamp, Seen(row.key))
             return False
-        if before:
-            self._left.add(_folder_of(*before.camera))
         failed_with = row.software if row.error else ''
         self._known[row.key] = _Known('', row.stamp, camera, failed_with, row.is_passing)
-        self._index(row.key, row.stamp, row.size_bytes, row.path)
+        self._index(row.key, row.stamp, row.size_bytes)
         self._pending.append(row)
         if len(self._pending) >= _BATCH:
             self.flush()
@@ -169,122 +165,118 @@ class Table:
             if row.failed_with
             and (row.is_passing or row.stamp not in but or row.failed_with != software)
         }
-        for part in {row.part for row in gone.values()}:
-            left = self._arrow(part)
-            self._write(_folder(part, self.folder), _without(left, gone))
-            self._remove(part)
         for key, row in gone.items():
             del self._known[key]
             self._stamps.pop(row.stamp, None)
         starts = {key[:START] for key in gone}
         self._stamps = {s: key for s, key in self._stamps.items() if key not in starts}
+        if gone:
+            self._sort_in()
 
     def rows(self) -> list[Row]:
         """All rows on disk, in order of time."""
         found: dict[str, Row] = {}
-        for part in self._parts():
+        for part in self._parts()[0]:
+            camera = self._camera_of(part)
             with _naming(part):
-                found |= {row.key: row for row in self._rows_of(part)}
+                for batch in _opened(part).iter_batches(_BATCH):
+                    for content in batch.to_pylist():
+                        row = read_record(Row, {**content, **camera})
+                        found[row.key] = row
         return sorted(found.values(), key=lambda row: (row.time_ns, row.key))
 
-    def _rows_of(self, part: str) -> Iterator[Row]:
-        """Rows of a file, which need not be one of ours."""
-        camera = _camera_of(part, self.folder)
-        for batch in _opened(part).iter_batches(_BATCH):
-            for content in batch.to_pylist():
-                yield read_record(Row, {**content, **camera})
-
-    def _parts(self) -> list[str]:
-        """Files with rows: those of version 1, then the sorted ones, then the new ones."""
+    def _parts(self) -> tuple[list[str], list[str]]:
+        """Files with rows: those of version 1, the sorted ones, the new ones; those of stamps."""
         try:
-            found = [e for e in places.entries(self.folder) if e.name.endswith('.parquet')]
+            found = [entry.url for entry in places.entries(self.folder)]
         except FileNotFoundError:
-            return []
+            return [], []
         except OSError as error:
             raise ProductError(f'{self.folder}: cannot be read: {error.strerror}') from error
-        found = [entry for entry in found if not entry.name.startswith(f'{_SEEN}/')]
-        rank = {_NEW: 2, '': 0}
-        found.sort(key=lambda e: (rank.get(posixpath.dirname(e.name), 1), e.name))
-        return [places.join(self.folder, entry.name) for entry in found]
+        parts = [url for url in found if url.endswith('.parquet') and self._folder(url) != _SEEN]
+        rank = {'': 0, _NEW: 2}
+        parts.sort(key=lambda url: (rank.get(self._folder(url), 1), url))
+        return parts, [url for url in found if self._folder(url) == _SEEN]
 
     def _note(self, part: str) -> None:
         """Note the keys of a file in memory."""
-        camera = _camera_of(part, self.folder)
+        camera = self._camera_of(part)
         with _naming(part):
             file = _opened(part)
             there = [name for name in _STATE if name in file.schema_arrow.names]
             for row in file.read(there).to_pylist():
-                row = {**_EMPTY_STATE, **row, **camera}
+                row = {**_DEFAULTS, **row, **camera}
                 who = (str(row['spacecraft']), str(row['camera']))
                 failed_with = str(row['software'] or '-') if row['error'] else ''
                 key, stamp = str(row['key']), str(row['stamp'])
                 self._known[key] = _Known(part, stamp, who, failed_with, bool(row['is_passing']))
-                self._index(key, stamp, int(row['size_bytes']), str(row['path']))
-        self._new_parts += _folder(part, self.folder) == _NEW
+                self._keys.setdefault(part, []).append(key)
+                self._index(key, stamp, int(row['size_bytes']))
+        self._new_parts += self._folder(part) == _NEW
 
-    def _index(self, key: str, stamp: str, size: int, path: str) -> None:
+    def _index(self, key: str, stamp: str, size: int) -> None:
         if stamp:
             self._stamps[stamp] = key[:START]
-        self._starts.setdefault(str(size) if size else path, []).append(key)
+        self._by_size.setdefault(size, []).append(key)
 
-    def _note_seen(self) -> None:
+    def _note_seen(self, parts: list[str]) -> None:
         starts = {key[:START] for key in self._known}
-        for part in self._seen_parts():
+        for part in parts:
             with _naming(part):
                 for line in _opened(part).read().to_pylist():
                     if not line['key'] or line['key'] in starts:
                         self._stamps.setdefault(line['stamp'], line['key'])
 
-    def _seen_parts(self) -> list[str]:
-        folder = places.join(self.folder, _SEEN)
-        try:
-            return [entry.url for entry in places.entries(folder)]
-        except FileNotFoundError:
-            return []
-
     def _sort_in(self) -> None:
-        """Move new rows into the files of their cameras."""
-        parts = self._parts()
-        new = [part for part in parts if _folder(part, self.folder) in ('', _NEW)]
-        if new:
-            table = pa.concat_tables([self._arrow(part) for part in new])
-            newest = {key: k for k, key in enumerate(table['key'].to_pylist())}
-            table = table.take(pa.array(sorted(newest.values())))
-            self._replace(table, [part for part in parts if part not in new])
-            for part in new:
-                self._remove(part)
-        seen = self._seen_parts()
+        """Write new rows into the files of their cameras; rows that are gone are left out."""
+        parts, seen = self._parts()
+        parts = [part for part in parts if part in self._keys]  # others are of another run
+        new = {part for part in parts if self._folder(part) in ('', _NEW)}
+        grow = {_folder_of(*row.camera) for row in self._known.values() if row.part in new}
+        old = [
+            part
+            for part in parts
+            if part in new or self._folder(part) in grow or not self._is_current(part)
+        ]
+        if old:
+            rows = pa.concat_tables([self._current_rows(part) for part in old])
+            cameras = zip(*(rows[name].to_pylist() for name in PARTITIONS), strict=True)
+            of_camera: dict[str, list[int]] = {}
+            for k, camera in enumerate(cameras):
+                of_camera.setdefault(_folder_of(*camera), []).append(k)
+            for folder, own in of_camera.items():
+                self._write(folder, rows.take(own))
         if len(seen) > 1:
             with _naming(seen[0]):
                 merged = pa.concat_tables([_opened(part).read() for part in seen])
             self._write(_SEEN, merged)
-            for part in seen:
-                self._remove(part)
+            old += seen
+        for part in old:
+            try:
+                places.remove(part)
+            except OSError as error:
+                raise ProductError(f'{part}: cannot be removed: {error.strerror}') from error
         self._new_parts = 0
-        self._left = set()
 
-    def _replace(self, new: pa.Table, parts: list[str]) -> None:
-        """Write the files of the cameras of new rows, with the old rows that these leave."""
-        keys = set(new['key'].to_pylist())
-        cameras = list(zip(*(new[name].to_pylist() for name in PARTITIONS), strict=True))
-        rows: dict[str, list[int]] = {}
-        for k, who in enumerate(cameras):
-            rows.setdefault(_folder_of(*who), []).append(k)
-        old: dict[str, list[str]] = {folder: [] for folder in rows}
-        for part in parts:
-            folder = _folder(part, self.folder)
-            if folder in old or folder in self._left:
-                old.setdefault(folder, []).append(part)
-        for folder, before in old.items():
-            left = [self._arrow(part) for part in before]
-            own = new.take(pa.array(rows.get(folder, []), pa.int64()))
-            self._write(folder, pa.concat_tables([*(_without(t, keys) for t in left), own]))
-            for part in before:
-                self._remove(part)
+    def _is_current(self, part: str) -> bool:
+        """True if each row of a file counts."""
+        rows = [self._known.get(key) for key in self._keys[part]]
+        return all(row is not None and row.part == part for row in rows)
+
+    def _current_rows(self, part: str) -> pa.Table:
+        """Rows of a file that count, with all columns."""
+        table = self._arrow(part)
+        names = (table[name].to_pylist() for name in ('key', *PARTITIONS))
+        kept = []
+        for k, (key, *camera) in enumerate(zip(*names, strict=True)):
+            row = self._known.get(key)
+            if row is not None and (row.part, row.camera) == (part, tuple(camera)):
+                kept.append(k)
+        return table.take(pa.array(kept, pa.int64()))
 
     def _arrow(self, part: str) -> pa.Table:
         """A file with all columns of the schema, those of its folder and new ones added."""
-        camera = _camera_of(part, self.folder)
+        camera = self._camera_of(part)
         with _naming(part):
             table = _opened(part).read()
             columns = []
@@ -294,7 +286,7 @@ class Table:
                 elif field.name in table.column_names:
                     column = table[field.name].cast(field.type)
                 else:
-                    column = pa.array([_default(field.name)] * len(table), field.type)
+                    column = pa.array([_DEFAULTS[field.name]] * len(table), field.type)
                 columns.append(column)
             return pa.table(columns, schema=SCHEMA)
 
@@ -312,34 +304,33 @@ class Table:
         except OSError as error:
             raise ProductError(f'{url}: cannot be written: {error.strerror}') from error
         if folder != _SEEN:
-            for key in table['key'].to_pylist():
-                if key in self._known:
-                    self._known[key] = dataclasses.replace(self._known[key], part=url)
+            self._keys[url] = table['key'].to_pylist()
+            for key in self._keys[url]:
+                self._known[key] = dataclasses.replace(self._known[key], part=url)
 
-    def _remove(self, part: str) -> None:
-        try:
-            places.remove(part)
-        except OSError as error:
-            raise ProductError(f'{part}: cannot be removed: {error.strerror}') from error
+    def _folder(self, part: str) -> str:
+        """Folder of a file below the table."""
+        return posixpath.dirname(part.removeprefix(self.folder).lstrip('/'))
+
+    def _camera_of(self, part: str) -> dict[str, str]:
+        """Columns that the folder of a file has; empty for a new one."""
+        pairs = [name.partition('=') for name in self._folder(part).split('/')]
+        if tuple(name for name, _, _ in pairs) != PARTITIONS:
+            return {}
+        return {n: '' if v == _NONE else urllib.parse.unquote(v) for n, _, v in pairs}
 
 
-class _naming:
-    """Turns whatever reading a file raises into one line with its name."""
-
-    def __init__(self, part: str) -> None:
-        self._part = part
-
-    def __enter__(self) -> None:
-        """Do nothing."""
-
-    def __exit__(self, kind: object, error: BaseException | None, _: object) -> None:
-        """Raise ProductError; the exceptions of damaged Parquet have no common base class."""
-        if isinstance(error, Exception):
-            words = ' '.join(str(error).split())[:120]
-            raise ProductError(
-                f'{self._part}: not a table of starcal trend: {words}; remove the file to make '
-                'its rows again'
-            ) from error
+@contextlib.contextmanager
+def _naming(part: str) -> Iterator[None]:
+    """Raise ProductError in one line; damaged Parquet raises errors of no common base class."""
+    try:
+        yield
+    except Exception as error:
+        words = ' '.join(str(error).split())[:120]
+        raise ProductError(
+            f'{part}: not a table of starcal trend: {words}; remove the file to make '
+            'its rows again'
+        ) from error
 
 
 def _opened(part: str) -> pq.ParquetFile:
@@ -350,35 +341,7 @@ def _opened(part: str) -> pq.ParquetFile:
     return file
 
 
-def _without(table: pa.Table, keys: Collection[str]) -> pa.Table:
-    kept = [k for k, key in enumerate(table['key'].to_pylist()) if key not in keys]
-    return table.take(pa.array(kept, pa.int64()))
-
-
-def _default(name: str) -> Any:
-    default = _FIELDS[name].default
-    if default is dataclasses.MISSING:
-        raise ValueError(f'column {name} is missing')
-    return default
-
-
-_EMPTY_STATE = {name: _default(name) for name in _STATE if name not in ('key', 'path')}
-
-
-def _folder(part: str, root: str) -> str:
-    """Folder of a file below the table."""
-    return posixpath.dirname(part.removeprefix(root).lstrip('/'))
-
-
 def _folder_of(*camera: str) -> str:
     """Folder of a camera in the form of Hive, which readers of Parquet take columns from."""
     values = [urllib.parse.quote(value, safe=' ') or _NONE for value in camera]
     return '/'.join(f'{name}={value}' for name, value in zip(PARTITIONS, values, strict=True))
-
-
-def _camera_of(part: str, root: str) -> dict[str, str]:
-    """Columns that the folder of a file has; empty for a new one."""
-    pairs = [name.partition('=') for name in _folder(part, root).split('/')]
-    if tuple(name for name, _, _ in pairs) != PARTITIONS:
-        return {}
-    return {n: '' if v == _NONE else urllib.parse.unquote(v) for n, _, v in pairs}

@@ -11,10 +11,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, project_jacobians
-from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.records import Ensemble, refused_image, StarObservations
 from starcal_ros.sky.astrometry import GIVEN_SIGMA_M_S
 from starcal_ros.sky.attitude import rate_between
 from starcal_ros.sky.catalog import StarCatalog
@@ -26,7 +27,6 @@ from starcal_ros.studies.simulation.scenario import (
     random_stream,
     Scenario,
     Scene,
-    scene,
     scenes,
 )
 
@@ -41,13 +41,12 @@ def bound_names(camera: CameraModel) -> tuple[str, ...]:
 def true_observations(
     scenario: Scenario,
     centroid_sigma_px: float | None = None,
-    snr_limit: float = BOUND_SNR,
     centroid_noise: bool = True,
     attitude_noise: bool = True,
     catalog: StarCatalog | None = None,
 ) -> Ensemble:
     """
-    Observations of all stars on the detector above a signal-to-noise ratio.
+    Observations of all stars on the detector above `BOUND_SNR`.
 
     Parameters
     ----------
@@ -56,45 +55,45 @@ def true_observations(
     centroid_noise, attitude_noise : bool
         False: no errors are added; the covariances stay the same.
     """
-    ensemble = Ensemble()
-    for index in range(scenario.image_count):
-        shown = scene(scenario, index, catalog, attitude_noise)
+    images = []
+    for index, shown in enumerate(scenes(scenario, catalog, attitude_noise)):
+        covariance, snr, keep = _scene_bound(scenario, shown)
+        if centroid_sigma_px is not None:
+            covariance = np.broadcast_to(np.eye(2) * centroid_sigma_px**2, covariance.shape)
+        # Drawn before the selection, so that the error of a star does not depend on other stars.
         rng = random_stream(scenario.seed, CENTROID_STREAM, index)
-        observed = _observations(
-            scenario, shown, centroid_sigma_px, snr_limit, centroid_noise, rng
-        )
+        error = rng.normal(size=shown.pixel_px.shape) * centroid_noise
+        root = np.linalg.cholesky(covariance)
+        measured = shown.pixel_px + np.einsum('nij,nj->ni', root, error)
         # All samples about an image have one error.
         _, before, after, _ = attitude_samples(scenario, index)
-        ensemble = ensemble.add(
-            dataclasses.replace(observed, star_tracker_rate_rad_s=rate_between(before, after))
+        observed = _observations(scenario, shown, measured, covariance, snr)
+        rate_rad_s = rate_between(before, after)
+        images.append(
+            dataclasses.replace(observed.select(keep), star_tracker_rate_rad_s=rate_rad_s)
         )
-    return ensemble
+    return Ensemble(tuple(images))
+
+
+def _scene_bound(scenario: Scenario, shown: Scene) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Bounds and signal-to-noise ratios of stars, and which are used: bright, on the detector."""
+    camera = scenario.truth.camera
+    covariance, snr = centroid_bound(
+        shown.pixel_px, shown.flux_electrons, scenario.detector, (camera.height, camera.width)
+    )
+    inside = (shown.pixel_px > 0) & (shown.pixel_px < [camera.width - 1, camera.height - 1])
+    return covariance, snr, inside.all(axis=1) & (snr > BOUND_SNR)
 
 
 def _observations(
-    scenario: Scenario,
-    shown: Scene,
-    centroid_sigma_px: float | None,
-    snr_limit: float,
-    centroid_noise: bool,
-    rng: np.random.Generator,
+    scenario: Scenario, shown: Scene, measured_px: Floats, covariance: Floats, snr: Floats
 ) -> StarObservations:
     camera, detector = scenario.truth.camera, scenario.detector
-    covariance, snr = centroid_bound(
-        shown.pixel_px, shown.flux_electrons, detector, (camera.height, camera.width)
-    )
-    if centroid_sigma_px is not None:
-        covariance = np.broadcast_to(np.eye(2) * centroid_sigma_px**2, covariance.shape)
-    # Drawn before the selection, so that the error of a star does not depend on other stars.
-    error = rng.normal(size=shown.pixel_px.shape)
-    measured = shown.pixel_px.copy()
-    if centroid_noise:
-        measured += np.einsum('nij,nj->ni', np.linalg.cholesky(covariance), error)
-    inside = (shown.pixel_px > 0) & (shown.pixel_px < [camera.width - 1, camera.height - 1])
-    every = StarObservations(
-        time_ns=shown.time_ns,
-        width=camera.width,
-        height=camera.height,
+    signal_dn = detector.background_electrons / detector.electrons_per_dn
+    return refused_image(
+        shown.time_ns,
+        camera.width,
+        camera.height,
         refusal='',
         detail='',
         icrf_from_star_tracker_xyzw=shown.icrf_from_star_tracker_xyzw,
@@ -102,21 +101,16 @@ def _observations(
         catalog_id=shown.catalog_id,
         direction_icrf=shown.direction_icrf,
         magnitude=shown.magnitude.astype(np.float32),
-        measured_px=measured,
-        covariance_px2=np.stack(
-            [covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]], axis=-1
-        ),
+        measured_px=measured_px,
+        covariance_px2=covariance[:, [0, 0, 1], [0, 1, 1]],
         flux_dn=(shown.flux_electrons / detector.electrons_per_dn).astype(np.float32),
         snr=snr.astype(np.float32),
-        refused_stars={},
-        background_dn=detector.offset_dn
-        + detector.background_electrons / detector.electrons_per_dn,
+        background_dn=detector.offset_dn + signal_dn,
         noise_dn=detector.noise_electrons / detector.electrons_per_dn,
         psf_sigma_px=detector.psf_sigma_px,
         catalog_digest=shown.catalog_digest,
         velocity_sigma_m_s=GIVEN_SIGMA_M_S,
     )
-    return every.select(inside.all(axis=1) & (snr > snr_limit))
 
 
 def centroid_bound(
@@ -160,29 +154,18 @@ def centroid_bound(
     return covariance[:, :2, :2], 1 / np.sqrt(covariance[:, 2, 2])
 
 
-def cramer_rao_covariance(
-    scenario: Scenario,
-    names: tuple[str, ...] = (),
-    snr_limit: float = BOUND_SNR,
-    catalog: StarCatalog | None = None,
-) -> Floats:
+def cramer_rao_covariance(scenario: Scenario, catalog: StarCatalog | None = None) -> Floats:
     """
-    Cramer-Rao bound of the covariance of the named camera parameters.
+    Cramer-Rao bound of the covariance of the camera parameters named by `bound_names`.
 
-    Without ``names``, those of `bound_names`.
-
-    Every star above the signal-to-noise limit counts, with its own bound; the attitude of each
-    image is free and the parameters not named are held.
+    Every star above `BOUND_SNR` counts, with its own bound; the attitude of each image is free
+    and the parameters not named are held.
     """
     camera = scenario.truth.camera
-    columns = [camera.parameter_names.index(name) for name in names or bound_names(camera)]
+    columns = [camera.parameter_names.index(name) for name in bound_names(camera)]
     information = np.zeros((len(columns), len(columns)))
     for shown in scenes(scenario, catalog):
-        covariance, snr = centroid_bound(
-            shown.pixel_px, shown.flux_electrons, scenario.detector, (camera.height, camera.width)
-        )
-        inside = (shown.pixel_px > 0) & (shown.pixel_px < [camera.width - 1, camera.height - 1])
-        keep = inside.all(axis=1) & (snr > snr_limit)
+        covariance, _, keep = _scene_bound(scenario, shown)
         in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
         _, J_parameters, J_rotation = project_jacobians(camera, in_camera)
         W = np.linalg.inv(covariance[keep])
@@ -191,6 +174,11 @@ def cramer_rao_covariance(
         N_ca = np.einsum('nia,nij,njb->ab', J, W, G, optimize=True)
         N_aa = np.einsum('nia,nij,njb->ab', G, W, G, optimize=True)
         information += N_cc - N_ca @ np.linalg.solve(N_aa, N_ca.T)
-    scale = 1 / np.sqrt(np.diag(information))
-    covariance_scaled = np.linalg.inv(information * np.outer(scale, scale))
-    return np.asarray(covariance_scaled * np.outer(scale, scale))
+    return scaled_inverse(information)
+
+
+def scaled_inverse(information: Floats) -> Floats:
+    """Inverse of an information matrix whose parameters have different units."""
+    scale = 1.0 / np.sqrt(np.diag(information))
+    scaled = np.linalg.inv(information * np.outer(scale, scale))
+    return np.asarray(scaled * np.outer(scale, scale))

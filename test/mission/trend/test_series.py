@@ -80,7 +80,7 @@ def test_a_newer_version_of_the_same_images_is_compared_and_counts_once() -> Non
     new = dataclasses.replace(made(1, (5.0, 0, 0)), kind=COMPUTED, key='new', software='starcal 9')
     rows = [old, new, made(2)]
     (pair,) = versions(rows)
-    assert (pair.recorded, pair.computed) == (0, 1)
+    assert (pair.against, pair.row) == (0, 1)
     assert pair.line_of_sight_px == pytest.approx(5 * ARCSECOND_RAD * 3641.5, rel=0.05)
     assert [row.key for row in newest_of_each(rows)] == ['new', '2']
 
