@@ -25,6 +25,8 @@ exit status: 0 the command succeeded, and a calibration passed the gate; 3 the g
 calibration; 2 bad input, named in one line; 130 interrupted."""
 
 STUDIES = ('table1', 'images', 'terms', 'coverage', 'paper')
+_BAGS = 'an .mcap file or a bag folder'
+_BAGS_OR_IMAGES = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
 _INTRODUCTION = 'In-flight star calibration of spacecraft cameras.'
 _FIRST_STEPS = f"""\
 first steps:
@@ -184,15 +186,16 @@ def _output(command: argparse.ArgumentParser, metavar: str, what: str, **setting
     _add(command, '-o', '--output', type=_path, metavar=metavar, help=what, **settings)
 
 
-def _bags(command: argparse.ArgumentParser, name: str, **settings: Any) -> None:
-    what = 'an .mcap file or a bag folder'
+def _bags(command: argparse.ArgumentParser, what: str) -> None:
     completer = _files_of('.mcap')
-    _add(command, name, type=_path, metavar='BAG', help=what, completer=completer, **settings)
+    _add(command, 'bags', type=_path, metavar='BAG', nargs='+', help=what, completer=completer)
 
 
-def _params(command: argparse.ArgumentParser, what: str, required: bool) -> None:
+def _params(command: argparse.ArgumentParser, what: str = '') -> None:
+    """Parameter file, needed where no other meaning is given."""
+    text = what or 'ROS parameter file: prior camera, mounting and options'
     completer = _files_of('.yaml', '.yml')
-    _add(command, '--params', type=_path, metavar='FILE', help=what, required=required,
+    _add(command, '--params', type=_path, metavar='FILE', help=text, required=not what,
          completer=completer)  # fmt: skip
 
 
@@ -212,9 +215,7 @@ def _demo(command: argparse.ArgumentParser) -> None:
 
 
 def _init(command: argparse.ArgumentParser) -> None:
-    what = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
-    _add(command, 'bags', type=_path, metavar='BAG', help=what, completer=_files_of('.mcap'),
-         nargs='+')  # fmt: skip
+    _bags(command, _BAGS_OR_IMAGES)
     what = 'folder for params.yaml and camera.yaml, created if absent; no file is replaced'
     _output(command, 'DIR', what, required=True)
     _lens(command)
@@ -229,25 +230,23 @@ def _lens(command: argparse.ArgumentParser) -> None:
 
 
 def _inspect(command: argparse.ArgumentParser) -> None:
-    _bags(command, 'bags', nargs='+')
-    _params(command, 'ROS parameter file; with it the stars are measured too', required=False)
+    _bags(command, _BAGS)
+    _params(command, 'ROS parameter file; with it the stars are measured too')
     _topics(command)
     _json(command)
 
 
 def _diagnose(command: argparse.ArgumentParser) -> None:
-    _bags(command, 'bags', nargs='+')
-    _params(command, 'ROS parameter file: prior camera, mounting and options', required=True)
+    _bags(command, _BAGS)
+    _params(command)
     _topics(command)
     _json(command)
 
 
 def _calibrate(command: argparse.ArgumentParser) -> None:
-    what = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
-    _add(command, 'bags', type=_path, metavar='BAG', help=what, completer=_files_of('.mcap'),
-         nargs='+')  # fmt: skip
+    _bags(command, _BAGS_OR_IMAGES)
     what = 'ROS parameter file: prior camera, mounting and options; images need none'
-    _params(command, what, required=False)
+    _params(command, what)
     what = 'folder for the products, created if absent; existing products are replaced'
     _output(command, 'DIR', what, required=True)
     _add(
@@ -269,9 +268,8 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
 
 def _plan(command: argparse.ArgumentParser) -> None:
     what = 'images or observations so far: an .mcap file or a bag folder'
-    _add(command, 'bags', type=_path, metavar='BAG', help=what, completer=_files_of('.mcap'),
-         nargs='+')  # fmt: skip
-    _params(command, 'ROS parameter file: prior camera, mounting and options', required=True)
+    _bags(command, what)
+    _params(command)
     what = 'images that may be taken (default: 10)'
     _add(command, '--images', type=_number(int, 1, 1000), default=10, metavar='N', help=what)
     what = 'sigma to lower: line_of_sight (default), map, or a parameter such as fx or k1'
@@ -297,8 +295,7 @@ def _plan(command: argparse.ArgumentParser) -> None:
 def _report(command: argparse.ArgumentParser) -> None:
     what = 'folder with the products of starcal calibrate'
     _add(command, 'folder', type=_path, metavar='DIR', help=what)
-    what = 'write report.pdf too, to print and sign'
-    _add(command, '--pdf', action='store_true', help=what)
+    _add(command, '--pdf', action='store_true', help='write report.pdf too, to print and sign')
 
 
 def _compare(command: argparse.ArgumentParser) -> None:
@@ -311,8 +308,7 @@ def _compare(command: argparse.ArgumentParser) -> None:
 
 
 def _lookup(command: argparse.ArgumentParser) -> None:
-    what = 'calibration.json or its folder'
-    _add(command, 'calibration', type=_path, metavar='DIR', help=what)
+    _add(command, 'calibration', type=_path, metavar='DIR', help='calibration.json or its folder')
     what = 'table to write: .csv, .npz or .fits'
     _output(command, 'FILE', what, required=True)
     grid = command.add_mutually_exclusive_group()
@@ -327,7 +323,7 @@ def _remaps(command: argparse.ArgumentParser, what: str) -> None:
 
 
 def _play(command: argparse.ArgumentParser) -> None:
-    _bags(command, 'bag')
+    _add(command, 'bag', type=_path, metavar='BAG', help=_BAGS, completer=_files_of('.mcap'))
     what = 'playback speed; 1 is real time, 0 is as fast as stars are observed (default: 1)'
     _add(command, '--rate', type=_number(float, 0, 1e6), default=1.0, metavar='R', help=what)
     _remaps(command, 'publish topic A of the bag as B; may be repeated')
@@ -342,8 +338,7 @@ def _monitor(command: argparse.ArgumentParser) -> None:
 def _request(command: argparse.ArgumentParser) -> None:
     services = ('calibrate', 'solve', 'rollback', 'reset', 'lookup')
     command.add_argument('service', choices=services, help='service of the calibrator')
-    what = 'solve: activate nothing'
-    command.add_argument('--dry-run', action='store_true', help=what)
+    command.add_argument('--dry-run', action='store_true', help='solve: activate nothing')
     what = 'solve: activate the result despite the gate'
     command.add_argument('--force', action='store_true', help=what)
     what = 'file for the table of lookup (.csv, .npz, .fits)'
@@ -426,9 +421,13 @@ def _campaign(command: argparse.ArgumentParser) -> None:
     _add(command, '--methods', nargs='+', choices=methods, metavar='METHOD', help=what)
     what = 'star tracker 1-sigma assumed by the calibration, arcsec (default: the true one)'
     _add(command, '--tracker-assumed', type=arcsec, metavar='ARCSEC', help=what)
+    _workers(command, 'worker processes; 0 runs in-process (default: one per CPU)', None)
+
+
+def _workers(command: argparse.ArgumentParser, what: str, default: int | None) -> None:
     where = command.add_mutually_exclusive_group()
-    what = 'worker processes; 0 runs in-process (default: one per CPU)'
-    where.add_argument('--workers', type=_number(int, 0, 1024), metavar='N', help=what)
+    count = _number(int, 0, 1024)
+    where.add_argument('--workers', type=count, default=default, metavar='N', help=what)
     what = 'address of a Dask scheduler, e.g. tcp://host:8786'
     where.add_argument('--scheduler', default='', metavar='ADDRESS', help=what)
 
@@ -457,8 +456,7 @@ def _export(command: argparse.ArgumentParser) -> None:
     spice.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
     what = 'LSK and SCLK of the spacecraft, for ck'
     spice.add_argument('--kernels', nargs='+', type=Path, default=(), metavar='FILE', help=what)
-    what = 'image topic, for kalibr'
-    command.add_argument('--image-topic', default='', metavar='T', help=what)
+    command.add_argument('--image-topic', default='', metavar='T', help='image topic, for kalibr')
     what = 'binary table alone, for C code that is compiled already'
     command.add_argument('--table', action='store_true', help=what)
 
@@ -530,14 +528,8 @@ def _trend(command: argparse.ArgumentParser) -> None:
         'CSV file with columns path, spacecraft, camera, params'
     )
     command.add_argument('--cameras', default='', metavar='PATTERN', help=what)
-    what = 'try what failed before again'
-    command.add_argument('--retry', action='store_true', help=what)
-    where = command.add_mutually_exclusive_group()
-    what = 'worker processes (default: 0, in-process)'
-    most = _number(int, 0, 1024)
-    where.add_argument('--workers', type=most, default=0, metavar='N', help=what)
-    what = 'address of a Dask scheduler, e.g. tcp://host:8786'
-    where.add_argument('--scheduler', default='', metavar='ADDRESS', help=what)
+    command.add_argument('--retry', action='store_true', help='try what failed before again')
+    _workers(command, 'worker processes (default: 0, in-process)', 0)
 
 
 _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {

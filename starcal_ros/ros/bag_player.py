@@ -219,9 +219,7 @@ def _offer(topic: reader.Topic, is_image: bool) -> QoSProfile:
     return QoSProfile(depth=_IMAGE_DEPTH if is_image else _OTHER_DEPTH)
 
 
-def _listen(player: BagPlayer) -> None:
-    executor = SingleThreadedExecutor()
-    executor.add_node(player)
+def _listen(executor: SingleThreadedExecutor) -> None:
     with contextlib.suppress(ExternalShutdownException):
         executor.spin()
 
@@ -238,11 +236,14 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     player: BagPlayer | None = None
     listener: threading.Thread | None = None
+    executor: SingleThreadedExecutor | None = None  # destroyed after the end, as in `run`
 
     def work() -> int:
-        nonlocal player, listener
+        nonlocal player, listener, executor
         player = BagPlayer()
-        listener = threading.Thread(target=_listen, args=[player])
+        executor = SingleThreadedExecutor()
+        executor.add_node(player)
+        listener = threading.Thread(target=_listen, args=[executor])
         listener.start()
         return player.play()
 

@@ -285,7 +285,7 @@ def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path: Path) -> None
     psutil = pytest.importorskip('psutil')
     command = [sys.executable, '-m', 'starcal_ros.cli.main', 'demo', '-o', str(tmp_path)]
     tool = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while not (tmp_path / 'demo_client.log').exists():
+    while not (tmp_path / 'bag_player.log').exists():
         time.sleep(0.05)
     children = psutil.Process(tool.pid).children(recursive=True)
     assert len(children) == 3

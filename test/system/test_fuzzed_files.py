@@ -40,7 +40,7 @@ from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.pipeline.setup import load_setup, NODES
 from starcal_ros.records import Calibration, Ensemble, Image
 from starcal_ros.ros.kept.archive import Archive
-from starcal_ros.ros.kept.stored import Activation
+from starcal_ros.ros.kept.state import Activation
 from starcal_ros.studies.simulation.centroids import true_observations
 from starcal_ros.studies.simulation.scenario import scenario
 

@@ -10,12 +10,12 @@ import importlib.util
 import json
 import os
 from pathlib import Path
-import select
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import time
 from typing import NoReturn
 
 import numpy as np
@@ -23,6 +23,7 @@ import yaml
 
 from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.child_process import module_command
+from starcal_ros.cli.arguments import EXIT_ACCEPTED, EXIT_REFUSED
 from starcal_ros.cli.terminal import table_lines
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError, StarcalError
@@ -37,6 +38,9 @@ from starcal_ros.untrusted import json_value, PRODUCT_BYTES
 Process = subprocess.Popen[bytes]
 
 RATE = 5.0  # ten images in eight seconds
+_START_S = 30.0  # longest start of the nodes
+_QUIET_S = 10.0  # after the bag was played: no more images come
+_ANSWER_S = 60.0  # longest calibration
 _NODES = ('star_observer', 'calibrator')
 
 
@@ -106,9 +110,10 @@ def run(
     """
     Calibration of the nodes, None if refused, and the answer of their service.
 
-    Starts the nodes, plays the bag and calls the service.  Log files go to the folder.  All
-    processes have ended when this returns.  Raises NodeError when a node does not start, or ends
-    before the calibration.
+    Starts the nodes, plays the bag and calls the service; images and calibration are read from the
+    state folder of the calibrator, a temporary one.  Log files go to the folder.  All processes
+    have ended when this returns.  Raises NodeError when a node does not start, or ends before the
+    calibration.
     """
     params = folder / 'demo_params.yaml'  # not params.yaml: a user's may be there
     content = {'/**': {'ros__parameters': bag.parameters}}
@@ -116,42 +121,60 @@ def run(
     environment = {**os.environ, **_own_domain()}
     with contextlib.ExitStack() as stack:
         stack.enter_context(_ended_like_interrupted())
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        result = scratch / 'calibration.json'
+        state = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         nodes: dict[str, Process] = {}
-
-        def start(name: str, command: list[str], output: int | None = None) -> Process:
+        commands = {name: _node_command(name, params, state) for name in _NODES}
+        commands['bag_player'] = [
+            *player_command(bag.bag, RATE, []),
+            *('-p', 'wait_for_topic:=observations', '-p', f'wait_for_subscribers_s:={_START_S}'),
+        ]
+        for name, command in commands.items():
             log = stack.enter_context((folder / f'{name}.log').open('wb'))
             # Interrupted in here, the process would run on with nobody to end it.
             with _interrupts_wait():
-                process = subprocess.Popen(
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=log if output is None else output,
-                    stderr=log,
-                    env=environment,
-                    bufsize=0,  # select() does not see bytes that readline() has buffered
+                nodes[name] = subprocess.Popen(
+                    command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment
                 )
-                stack.callback(_stop, process)
-            return process
+                stack.callback(_stop, nodes[name])
+        _wait_for_images(bag.image_count, state / 'ensemble', nodes, folder, on_image)
+        asked = subprocess.run(
+            request_command('calibrate', [], _ANSWER_S, []),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            env=environment,
+            text=True,
+            check=False,
+        )
+        if asked.returncode not in (EXIT_ACCEPTED, EXIT_REFUSED):
+            raise NodeError(f'{asked.stderr.strip()} (see the log files in {folder})')
+        activated = next((state / 'calibrations').glob('*.json'), None)
+        return (read_calibration(activated) if activated else None), asked.stdout.strip()
 
-        for name in _NODES:
-            nodes[name] = start(name, _nodes_command(name, params))
-        client = start('demo_client', _client_command(bag, result), subprocess.PIPE)
-        for line in _lines(client, nodes):
-            word, _, rest = line.partition(' ')
-            if word == 'ready':
-                nodes['bag_player'] = start('bag_player', player_command(bag.bag, RATE, []))
-            elif word == 'collected':
-                on_image()
-            elif word == 'result':
-                client.wait()
-                return (read_calibration(result) if result.exists() else None), rest
-            elif word == 'failed':
-                raise NodeError(f'{rest} (see the log files in {folder})')
-        dead = next((name for name, node in nodes.items() if node.poll()), 'demo_client')
-        last = (folder / f'{dead}.log').read_text(errors='replace').strip().rpartition('\n')[2]
-        raise NodeError(f'{dead} ended before the calibration: {last}')
+
+def _wait_for_images(
+    count: int,
+    ensemble: Path,
+    nodes: dict[str, Process],
+    folder: Path,
+    on_image: Callable[[], None],
+) -> None:
+    """Wait until the calibrator has kept all images, or no more come after the bag was played."""
+    kept, since_s = 0, time.monotonic()
+    while kept < count:
+        for name, node in nodes.items():
+            if node.poll():  # the player ends by itself, with status 0
+                said = (folder / f'{name}.log').read_text(errors='replace').strip()
+                last = said.rpartition('\n')[2]
+                raise NodeError(f'{name} ended before the calibration: {last}')
+        found = len(list(ensemble.glob('*.mcap')))
+        if found > kept or nodes['bag_player'].poll() is None:
+            since_s = time.monotonic()
+        elif time.monotonic() > since_s + _QUIET_S:
+            return
+        for _ in range(found - kept):
+            on_image()
+        kept = found
+        time.sleep(0.05)
 
 
 def become(command: list[str]) -> NoReturn:
@@ -172,8 +195,7 @@ def become(command: list[str]) -> NoReturn:
 def player_command(path: Path, rate: float, remaps: Sequence[str]) -> list[str]:
     """Command line that plays a bag on the graph."""
     parameters = ['-p', f'bag:={path.resolve()}', '-p', f'rate:={rate!r}']
-    renamed = [part for remap in remaps for part in ('-r', remap)]
-    return [*_module_command('bag_player'), '--ros-args', *parameters, *renamed]
+    return [*_module_command('bag_player'), '--ros-args', *parameters, *_renamed(remaps)]
 
 
 def monitor_command(once_after_s: float | None, remaps: Sequence[str]) -> list[str]:
@@ -195,42 +217,19 @@ def _renamed(remaps: Sequence[str]) -> list[str]:
     return ['--ros-args', *renamed] if renamed else []
 
 
-def _nodes_command(name: str, params: Path) -> list[str]:
+def _node_command(name: str, params: Path, state: Path) -> list[str]:
     topics = {
         'image': simulated_bag.IMAGE_TOPIC,
         'attitude': simulated_bag.ATTITUDE_TOPIC,
         'velocity': simulated_bag.VELOCITY_TOPIC,
     }
     remaps = [part for name, topic in topics.items() for part in ('-r', f'{name}:={topic}')]
-    return [*_module_command(name), '--ros-args', '--params-file', str(params), *remaps]
-
-
-def _client_command(bag: DemoBag, result: Path) -> list[str]:
-    topics = [
-        '--image-topic',
-        simulated_bag.IMAGE_TOPIC,
-        '--attitude-topic',
-        simulated_bag.ATTITUDE_TOPIC,
-    ]
-    asked = ['--images', str(bag.image_count), '--output', str(result)]
-    return [*_module_command('demo_client'), *asked, *topics]
+    kept = ['-p', f'state_dir:={state}', '-p', 'state_report:=false']
+    return [*_module_command(name), '--ros-args', '--params-file', str(params), *kept, *remaps]
 
 
 def _module_command(name: str) -> list[str]:
     return [*module_command('starcal_ros.entry_points'), name]
-
-
-def _lines(client: Process, nodes: dict[str, Process]) -> Iterator[str]:
-    """Lines that the client prints, until it or a node ends."""
-    assert client.stdout is not None  # it was started with a pipe
-    while True:
-        if select.select([client.stdout], [], [], 0.2)[0]:
-            line = client.stdout.readline()
-            if not line:
-                return
-            yield line.decode(errors='replace').strip()
-        elif any(node.poll() for node in nodes.values()):
-            return  # the player ends by itself, with status 0
 
 
 @contextlib.contextmanager
@@ -269,8 +268,6 @@ def _stop(process: Process) -> None:
             process.send_signal(number)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(5.0)
-    if process.stdout is not None:
-        process.stdout.close()
 
 
 def _own_domain() -> dict[str, str]:

@@ -51,7 +51,7 @@ from starcal_ros.record_codec import json_object, read_record
 from starcal_ros.record_fields import Count
 from starcal_ros.records import Calibration, counted_refusal, Ensemble, StarObservations
 from starcal_ros.ros.kept.seal import CHECKSUMS, Seal
-from starcal_ros.ros.kept.stored import Activation
+from starcal_ros.ros.kept.state import Activation
 from starcal_ros.untrusted import read_bytes
 
 ARCHIVE_SCHEMA = 1

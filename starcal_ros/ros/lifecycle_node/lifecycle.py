@@ -324,9 +324,12 @@ def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | N
     0 after SIGINT or SIGTERM; 2 for bad parameters or files, with a one-line message.
     """
     node: StarcalNode | None = None
+    # Destroyed after the end, with the thread in which rclpy answers signals: the thread triggers
+    # a guard condition of each executor, and another signal may come while one is destroyed.
+    executor: MultiThreadedExecutor | None = None
 
     def work() -> int:
-        nonlocal node
+        nonlocal node, executor
         node = make_node()
         given = sys.argv if args is None else args
         for text in unread_sections(given, node.get_fully_qualified_name(), name):

@@ -24,7 +24,7 @@ from starcal_ros.formats.bag import reader as bag_reader
 from starcal_ros.records import Ensemble
 from starcal_ros.ros.kept.archive import Archive, TOPIC
 from starcal_ros.ros.kept.seal import Seal
-from starcal_ros.ros.kept.stored import Activation
+from starcal_ros.ros.kept.state import Activation
 
 WRITTEN_BY_0_1 = Path(__file__).resolve().parents[2] / 'data' / 'written_by_0_1'
 

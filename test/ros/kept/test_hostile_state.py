@@ -33,8 +33,7 @@ from starcal_ros.pipeline.node_options import CalibratorOptions
 from starcal_ros.records import Ensemble
 from starcal_ros.ros.kept.archive import Archive
 from starcal_ros.ros.kept.seal import CHECKSUMS, Seal
-from starcal_ros.ros.kept.state import CalibratorState
-from starcal_ros.ros.kept.stored import Activation
+from starcal_ros.ros.kept.state import Activation, CalibratorState
 
 pytestmark = pytest.mark.slow
 

@@ -206,6 +206,44 @@ def test_a_signal_leaves_no_lock_taken(argument: str, said: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, said, '')
 
 
+EXECUTOR_OF_A_NODE = """
+import os, signal, sys
+import rclpy
+from starcal_ros.ros import bag_player, calibrator
+from starcal_ros.ros.lifecycle_node import lifecycle
+
+def told_of(module, name):
+    kind = getattr(module, name)
+    def destroyed(executor):
+        print('executor destroyed')
+        kind.__del__(executor)
+    setattr(module, name, type(name, (kind,), {'__del__': destroyed}))
+
+shut_down = rclpy.try_shutdown
+def end():
+    shut_down()
+    print('signals answered no more')
+rclpy.try_shutdown = end
+told_of(lifecycle, 'MultiThreadedExecutor')
+told_of(bag_player, 'SingleThreadedExecutor')
+lifecycle._spin = lambda node, executor: os.kill(os.getpid(), signal.SIGTERM)
+bag_player.BagPlayer.play = lambda player: os.kill(os.getpid(), signal.SIGTERM) or 0
+node = {'calibrator': calibrator, 'bag_player': bag_player}[sys.argv.pop(1)]
+node.main(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize('name', ['calibrator', 'bag_player'])
+def test_an_executor_outlives_the_thread_that_answers_signals(name: str, tiny_bag: Path) -> None:
+    """The thread triggers a condition of each executor, and may find it half destroyed."""
+    parameters = ['-p', f'bag:={tiny_bag}'] if name == 'bag_player' else ['-p', 'autostart:=false']
+    command = [sys.executable, '-c', EXECUTOR_OF_A_NODE, name, '--ros-args', *parameters]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    lines = [line for line in done.stdout.splitlines() if line]
+    assert (done.returncode, done.stderr) == (0, '')
+    assert lines.index('executor destroyed') > lines.index('signals answered no more')
+
+
 @pytest.mark.parametrize('seed', range(4))
 def test_nodes_end_after_several_signals(
     client: Client, start_node: StartNode, tiny_bag: Path, seed: int
