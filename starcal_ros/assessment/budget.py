@@ -15,6 +15,7 @@ own term of A, the weights as they are.
 from __future__ import annotations
 
 from collections.abc import Sequence
+import dataclasses
 from dataclasses import dataclass
 import itertools
 import math
@@ -43,6 +44,7 @@ _UNKNOWNS = {
     'temperature': ('focal', 'rate'),
 }
 """Entries of the list of unknowns by cause."""
+_OF_TRACKERS = (TRACKER_NOISE, TRACKER_SLOW, 'mountings', 'stamps')
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,14 @@ class _Cause:
     assumption: str
 
 
-def sigma_budget(estimate: Estimate, options: CalibrationOptions) -> tuple[SigmaPart, ...]:
-    """Return the 1-sigma of lines of sight over the detector: the total, and by cause."""
+def sigma_budget(
+    estimate: Estimate, options: CalibrationOptions, has_alignment: bool = True
+) -> tuple[SigmaPart, ...]:
+    """
+    Return the 1-sigma of lines of sight over the detector: the total, and by cause.
+
+    Without an alignment no star tracker is a cause, and the pointing is that of the camera alone.
+    """
     errors = estimate.posterior.errors
     assert errors is not None
     seen, of_pixel = _squares(estimate)
@@ -88,7 +96,14 @@ def sigma_budget(estimate: Estimate, options: CalibrationOptions) -> tuple[Sigma
     ]
     total = _traces(seen[:, rows][:, :, rows], covariance) + unresolved
     parts = [_Cause(TOTAL, total, ''), *(cause for cause in causes if cause.assumption)]
-    return tuple(_part(cause) for cause in parts)
+    found = tuple(_part(cause) for cause in parts)
+    if has_alignment:
+        return found
+    return tuple(
+        dataclasses.replace(part, pointing_arcsec=part.map_arcsec)
+        for part in found
+        if part.cause not in _OF_TRACKERS
+    )
 
 
 def _part(cause: _Cause) -> SigmaPart:

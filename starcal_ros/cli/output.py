@@ -77,13 +77,15 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
 def _print_budget(calibration: Calibration) -> None:
     from starcal_ros.records import parts_that_matter
 
+    parts = parts_that_matter(calibration.sigma_budget)
+    columns = 4 if calibration.has_alignment else 3
     rows = [
         (part.cause, part.assumption, f'{part.map_arcsec:.3g}"', f'{part.pointing_arcsec:.3g}"')
-        for part in parts_that_matter(calibration.sigma_budget)
+        for part in parts
     ]
     if rows:
         header = ('1-sigma of lines of sight', '', 'camera alone', 'with alignment')
-        print_table(header, rows, left=2)
+        print_table(header[:columns], [row[:columns] for row in rows], left=2)
 
 
 def print_inspection(inspection: Inspection) -> None:

@@ -227,5 +227,7 @@ def _not_judged(
         ),
         model_checks=model_checks(result),
         field=factored_field(field, result.map_covariance) if field else None,
-        sigma_budget=sigma_budget(result, setup.calibration),
+        sigma_budget=sigma_budget(
+            result, setup.calibration, has_alignment=bool(setup.frames.star_tracker_frame)
+        ),
     )

@@ -256,15 +256,16 @@ def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Ch
     )
 
 
-def sigma_budget(parts: Sequence[SigmaPart]) -> Chart:
+def sigma_budget(parts: Sequence[SigmaPart], has_alignment: bool) -> Chart:
     """Share of the variance by cause as horizontal bars; the first part is the total."""
     total, causes = parts[0], parts[1:]
+    bars = 2 if has_alignment else 1
     curves = []
     for k, part in enumerate(causes):
         for name, colour, sigma, whole, shift in (
             ('camera alone', SERIES[0], part.map_arcsec, total.map_arcsec, -0.14),
             ('with alignment', SERIES[1], part.pointing_arcsec, total.pointing_arcsec, 0.14),
-        ):
+        )[:bars]:
             end = 100.0 * (sigma / whole) ** 2
             at = -k - shift
             curves.append(Curve([0.0, end], [at, at], colour, '' if k else name, width=8.0))

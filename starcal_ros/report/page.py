@@ -214,7 +214,7 @@ def charts_of(
         charts['line_of_sight'] = detector_figures.line_of_sight_sigma(maps, camera, False)
     if calibration.sigma_budget:
         parts = parts_that_matter(calibration.sigma_budget)
-        charts['budget'] = figures.sigma_budget(parts)
+        charts['budget'] = figures.sigma_budget(parts, calibration.has_alignment)
         charts['causes'] = detector_figures.budget_over_detector(parts, camera)
     if len(calibration.removals) > 1:
         charts['terms'] = figures.term_worth(calibration.removals)

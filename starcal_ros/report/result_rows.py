@@ -54,12 +54,13 @@ def tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
     maps = calibration.maps
     if maps is not None:
         total = next((part for part in calibration.sigma_budget if part.cause == TOTAL), None)
-        for name, sigma, rms, text in (
+        scopes = (
             ('Line of sight', maps.line_of_sight_sigma_arcsec, total and total.pointing_arcsec,
              'in the star tracker frame'),
             ('Camera alone', maps.shape_sigma_arcsec, total and total.map_arcsec,
              'common rotation removed'),
-        ):  # fmt: skip
+        )  # fmt: skip
+        for name, sigma, rms, text in scopes if calibration.has_alignment else scopes[1:]:
             worst = f'at most {sigma.max():.3g}″'
             if rms is None:
                 results.append((name, worst, f'1-sigma, {text}'))

@@ -71,11 +71,11 @@ def precision_sentences(calibration: Calibration) -> list[str]:
     maps, budget = calibration.maps, parts_that_matter(calibration.sigma_budget)
     if maps is None:
         return []
-    frame, sigma = f'In {calibration.parent_frame}', maps.line_of_sight_sigma_arcsec
-    return [
-        _precision('Camera alone', maps.shape_sigma_arcsec, budget, 'map_arcsec'),
-        _precision(frame, sigma, budget, 'pointing_arcsec'),
-    ]
+    sentences = [_precision('Camera alone', maps.shape_sigma_arcsec, budget, 'map_arcsec')]
+    if calibration.has_alignment:
+        frame, sigma = f'In {calibration.parent_frame}', maps.line_of_sight_sigma_arcsec
+        sentences.append(_precision(frame, sigma, budget, 'pointing_arcsec'))
+    return sentences
 
 
 def _precision(scope: str, sigma: Floats, budget: Sequence[SigmaPart], of: str) -> str:
@@ -103,7 +103,8 @@ def next_step(calibration: Calibration) -> str:
     if not causes:
         return ''
     steps = []
-    for scope, of in (('camera', 'map_arcsec'), ('alignment', 'pointing_arcsec')):
+    scopes = (('camera', 'map_arcsec'), ('alignment', 'pointing_arcsec'))
+    for scope, of in scopes if calibration.has_alignment else scopes[:1]:
         largest = max(causes, key=lambda part: getattr(part, of))
         remedy = _REMEDIES.get(largest.cause)
         if remedy:

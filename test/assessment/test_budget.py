@@ -216,3 +216,11 @@ def test_only_parts_that_matter_are_printed() -> None:
     found = [part.cause for part in parts_that_matter(budget_of)]
     assert found == ['total', 'star tracker noise', 'velocity']
     assert parts_that_matter([]) == []
+
+
+def test_without_an_alignment_no_star_tracker_is_a_cause() -> None:
+    found = {part.cause: part for part in sigma_budget(*estimate(RAM), has_alignment=False)}
+    whole = parts(RAM)
+    assert set(whole) - set(found) == {'star tracker noise', 'star tracker slow error'}
+    for cause, part in found.items():
+        assert part.map_arcsec == part.pointing_arcsec == whole[cause].map_arcsec

@@ -83,8 +83,12 @@ def test_a_bag_without_attitudes_is_calibrated_and_states_that_it_has_no_alignme
     difference, sigma = difference_and_sigma_arcsec(calibration)
     assert difference < 2 * sigma
     assert not calibration.has_alignment
-    assert 'none: attitudes from the stars' in capsys.readouterr().out
-    assert 'No alignment' in (tmp_path / 'out' / 'report.html').read_text()
+    said = capsys.readouterr().out
+    assert 'none: attitudes from the stars' in said
+    # No star tracker is a cause of its sigma, and no column is of an alignment.
+    assert 'star tracker' not in said and 'with alignment' not in said
+    page = (tmp_path / 'out' / 'report.html').read_text()
+    assert 'No alignment' in page and 'star tracker slow error' not in page
 
 
 @pytest.mark.slow
