@@ -36,9 +36,9 @@ _OURS = 'starcal, estimator'
 _STARS = 'no sigma, no alignment, no points at infinity'
 _SOLVER = 'a solver: camera and derivatives of starcal, sigma by hand'
 TOOLS = {
-    'starcal, bag to camera': Tool(starcal.whole, True, 'needs attitudes', True),
+    'starcal, bag to camera': Tool(starcal.whole, True, 'no alignment without attitudes', True),
     'tetra3rs': Tool(tetra3rs.whole, tetra3rs.INSTALLED, 'no sigma, no alignment', True),
-    _OURS: Tool(starcal.estimator, True, 'needs attitudes'),
+    _OURS: Tool(starcal.estimator, True, 'no alignment without attitudes'),
     'mrcal': Tool(solvers.mrcal, solvers.MRCAL.exists(), _STARS),
     'OpenCV': Tool(solvers.opencv, True, _STARS),
     'SciPy': Tool(partial(solvers.least_squares, solve=solve_scipy), True, _SOLVER),

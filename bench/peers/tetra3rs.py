@@ -19,7 +19,7 @@ from starcal_ros.camera import CameraModel
 INSTALLED = importlib.util.find_spec('tetra3rs') is not None
 _MODELS: list[dict[str, Any]] = [{'model': 'polynomial', 'order': k} for k in (3, 4, 5, 6)]
 _MODELS += [{'model': 'radial'}]
-# Best of those tried: the default of 5 sigma finds twice the stars, for errors 5 % larger.
+# Best of those tried: the default of 5 sigma finds twice the stars, for errors 10 % larger.
 _DETECTION = {'sigma_threshold': 10.0, 'matched_filter_sigma': 0.95, 'deblend': 'reject'}
 
 
