@@ -33,7 +33,7 @@ with open(sys.argv[1], 'rb') as stream:
 """
 
 # As the console script does.
-_TOOL = 'import sys; from starcal_ros.cli.entry_point import main; sys.exit(main())'
+TOOL = 'import sys; from starcal_ros.cli.entry_point import main; sys.exit(main())'
 
 # Cumulative times in the main thread; indented stages are parts of the one above.
 _STAGES = (
@@ -84,7 +84,7 @@ def compare(
         costs: dict[str, list[Cost]] = {'bare read with mcap': [], 'starcal calibrate': []}
         for _ in range(rounds):
             costs['bare read with mcap'].append(cost(['-c', _BARE, str(file)]))
-            costs['starcal calibrate'].append(cost(['-c', _TOOL, *calibrate]))
+            costs['starcal calibrate'].append(cost(['-c', TOOL, *calibrate]))
         profile = Path(folder, 'profile')
         profiled = ['-m', 'cProfile', '-o', str(profile), '-m', 'starcal_ros.cli.main']
         cost([*profiled, *calibrate])

@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
@@ -24,6 +25,7 @@ from starcal_ros.camera import PARAMETER_NAMES, project_jacobians, project_param
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.estimation.levenberg_marquardt import covariance
 from starcal_ros.estimation.minimise import minimise
 from starcal_ros.estimation.problem import Problem, State
 from starcal_ros.estimation.star_equations import arrange, star_table, StarTable
@@ -53,6 +55,11 @@ class Case:
         ends = np.cumsum([len(image) for image in self.ensemble.images])
         return [slice(int(a), int(b)) for a, b in zip(np.r_[0, ends[:-1]], ends, strict=True)]
 
+    @property
+    def sigma_px(self) -> Floats:
+        """1-sigma (n, 2) of the centroids along both axes."""
+        return np.asarray(np.sqrt(self.table.covariance_px2[:, [0, 2]]))
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -76,8 +83,8 @@ def make_ensemble(images: int) -> tuple[Ensemble, CameraGeometry]:
     return true_observations(campaign, centroid_sigma_px=SIGMA_PX), base.prior
 
 
-def make_case(ensemble: Ensemble, prior: CameraGeometry) -> Case:
-    """Data of an ensemble for the solvers."""
+def make_case(ensemble: Ensemble, prior: CameraGeometry, free: NDArray[np.int64] = FREE) -> Case:
+    """Data of an ensemble for the solvers, which estimate the free camera parameters."""
     m = len(ensemble.images)
     star_tracker_from_icrf = Rotation.from_quat(
         np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
@@ -85,7 +92,7 @@ def make_case(ensemble: Ensemble, prior: CameraGeometry) -> Case:
     problem = Problem(
         method='per_image',
         model='plumb_bob',
-        free=FREE,
+        free=free,
         prior_parameters=prior.camera.parameters,
         prior_sigma=np.full(10, np.inf),
         star_tracker_from_icrf=star_tracker_from_icrf,
@@ -105,6 +112,18 @@ def solve_starcal(case: Case) -> Answer:
     assert solution.converged
     rotations = solution.state.camera_from_icrf.as_matrix()
     return Answer(solution.state.parameters, rotations, solution.iterations)
+
+
+def covariance_of(case: Case, answer: Answer, scaled: bool = True) -> Floats:
+    """Covariance (f, f) of the free parameters at a minimum, scaled by chi^2 per degree or not."""
+    f, m = len(case.problem.free), case.table.image_count
+    rotations = Rotation.from_matrix(answer.camera_from_icrf)
+    state = State(answer.parameters, case.start.camera_from_star_tracker, rotations)
+    keep = np.ones(len(case.table), bool)
+    measurements = arrange(case.table, keep, case.table.covariance_px2)
+    normal = minimise(case.problem, state, measurements).normal
+    factor = 2.0 * normal.cost / (2 * len(case.table) - f - 3 * m) if scaled else 1.0
+    return np.asarray(factor * covariance(normal)[0][:f, :f])
 
 
 def estimate_starcal(case: Case) -> Answer:
@@ -138,7 +157,8 @@ def _rotation_jacobian(theta: Floats) -> tuple[Floats, Floats]:
 def solve_scipy(case: Case) -> Answer:
     """SciPy's trust region with a sparse analytic Jacobian."""
     table, m = case.table, case.table.image_count
-    f, n = len(FREE), len(table)
+    free, sigma_px = case.problem.free, case.sigma_px
+    f, n = len(free), len(table)
     base = np.einsum(
         'nij,nj->ni', case.start.camera_from_icrf.as_matrix()[table.image], table.direction_icrf
     )
@@ -149,27 +169,27 @@ def solve_scipy(case: Case) -> Answer:
 
     def parameters_of(x: Floats) -> Floats:
         parameters = case.start.parameters.copy()
-        parameters[FREE] = x[:f]
+        parameters[free] = x[:f]
         return parameters
 
     def residuals(x: Floats) -> Floats:
         rotation, _ = _rotation_jacobian(x[f:].reshape(m, 3))
         directions = np.einsum('nij,nj->ni', rotation[table.image], base)
         predicted = project_parameters('plumb_bob', parameters_of(x), directions)
-        return np.asarray((predicted - table.measured_px).ravel() / SIGMA_PX)
+        return np.asarray(((predicted - table.measured_px) / sigma_px).ravel())
 
     def jacobian(x: Floats) -> csr_matrix:
         rotation, L = _rotation_jacobian(x[f:].reshape(m, 3))
         directions = np.einsum('nij,nj->ni', rotation[table.image], base)
         camera = dataclasses.replace(case.prior.camera, parameters=parameters_of(x))
         _, J_parameters, J_rotation = project_jacobians(camera, directions)
-        J = np.concatenate([J_parameters[..., FREE], J_rotation @ L[table.image]], axis=-1)
-        J /= SIGMA_PX
+        J = np.concatenate([J_parameters[..., free], J_rotation @ L[table.image]], axis=-1)
+        J /= sigma_px[..., None]
         return csr_matrix((J.ravel(), columns.ravel(), rows), (2 * n, f + 3 * m))
 
     found = least_squares(
         residuals,
-        np.concatenate([case.start.parameters[FREE], np.zeros(3 * m)]),
+        np.concatenate([case.start.parameters[free], np.zeros(3 * m)]),
         jacobian,
         method='trf',
         x_scale='jac',
@@ -191,7 +211,7 @@ def solve_ceres(case: Case) -> Answer:
     import pyceres
 
     table, prior = case.table, case.prior.camera
-    held = case.start.parameters
+    held, free = case.start.parameters, case.problem.free
     rotations = case.start.camera_from_icrf.as_matrix()
 
     class Stars(pyceres.CostFunction):  # type: ignore[misc]
@@ -201,13 +221,14 @@ def solve_ceres(case: Case) -> Answer:
             super().__init__()
             self.base = table.direction_icrf[stars] @ rotation.T
             self.measured_px = table.measured_px[stars]
+            self.sigma_px = case.sigma_px[stars]
             self.set_num_residuals(self.measured_px.size)
-            self.set_parameter_block_sizes([len(FREE), 3])
+            self.set_parameter_block_sizes([len(free), 3])
 
         def Evaluate(self, blocks: Any, residuals: Floats, jacobians: Any) -> bool:
             """Write residuals in sigma, and derivatives if requested."""
             parameters = held.copy()
-            parameters[FREE] = blocks[0]
+            parameters[free] = blocks[0]
             rotation, L = _rotation_jacobian(blocks[1])
             directions = self.base @ rotation.T
             if jacobians is None:
@@ -216,14 +237,16 @@ def solve_ceres(case: Case) -> Answer:
                 camera = dataclasses.replace(prior, parameters=parameters)
                 predicted_px, J_parameters, J_rotation = project_jacobians(camera, directions)
                 if jacobians[0] is not None:
-                    jacobians[0][:] = J_parameters[..., FREE].ravel() / SIGMA_PX
+                    by_parameters = J_parameters[..., free] / self.sigma_px[..., None]
+                    jacobians[0][:] = by_parameters.ravel()
                 if jacobians[1] is not None:
-                    jacobians[1][:] = (J_rotation @ L).ravel() / SIGMA_PX
-            residuals[:] = (predicted_px - self.measured_px).ravel() / SIGMA_PX
+                    by_angles = J_rotation @ L / self.sigma_px[..., None]
+                    jacobians[1][:] = by_angles.ravel()
+            residuals[:] = ((predicted_px - self.measured_px) / self.sigma_px).ravel()
             return True
 
     problem = pyceres.Problem()
-    shared = held[FREE].copy()
+    shared = held[free].copy()
     angles = np.zeros((table.image_count, 3))
     costs = [
         Stars(stars, rotation)
@@ -240,18 +263,27 @@ def solve_ceres(case: Case) -> Answer:
     summary = pyceres.SolverSummary()
     pyceres.solve(options, problem, summary)
     parameters = held.copy()
-    parameters[FREE] = shared
+    parameters[free] = shared
     rotation, _ = _rotation_jacobian(angles)
     iterations = summary.num_successful_steps + summary.num_unsuccessful_steps
     return Answer(parameters, rotation @ rotations, iterations)
 
 
 def solve_opencv(case: Case) -> Answer:
-    """
-    OpenCV calibration of a camera from points in space.
+    """OpenCV calibration with five distortion coefficients, the principal point held."""
+    # Its normal matrix is dense; the default, singular values, takes twice as long.
+    K, D, rotations = calibrate_opencv(case, cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_USE_LU)
+    k1, k2, p1, p2, k3 = D[:5]
+    parameters = np.array([K[0, 0], 0.0, K[1, 1], K[0, 2], K[1, 2], k1, k2, k3, p1, p2])
+    return Answer(parameters, rotations, 0)
 
-    A star stands at two depths, as its calibration places the camera as well as turns it: at one
-    depth a shift would be as good as a rotation.  Its points are of single precision.
+
+def calibrate_opencv(case: Case, flags: int) -> tuple[Floats, Floats, Floats]:
+    """
+    Calibration of a camera from points in space: K (3, 3), D (d,), and camera_from_icrf (m, 3, 3).
+
+    A star stands at two depths, as OpenCV places the camera as well as turns it: at one depth a
+    shift would be as good as a rotation.  Its points are of single precision.
     """
     table, prior = case.table, case.prior.camera
     start = case.start.camera_from_icrf.as_matrix()
@@ -261,8 +293,6 @@ def solve_opencv(case: Case) -> Answer:
         points.append(np.concatenate([near, 2.0 * near]).astype(np.float32))
         pixels.append(np.concatenate([table.measured_px[stars]] * 2).astype(np.float32))
     k1, k2, k3, p1, p2 = prior.distortion
-    # Its normal matrix is dense; the default, singular values, takes twice as long.
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_USE_LU
     _, K, D, turns, _, _, _, _ = cv2.calibrateCameraExtended(
         points,
         pixels,
@@ -275,10 +305,8 @@ def solve_opencv(case: Case) -> Answer:
             ]
         ),
         np.array([k1, k2, p1, p2, k3]),
-        flags=flags,
+        flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, TOLERANCE),
     )
-    k1, k2, p1, p2, k3 = D.ravel()[:5]
-    parameters = np.array([K[0, 0], 0.0, K[1, 1], K[0, 2], K[1, 2], k1, k2, k3, p1, p2])
     rotation = Rotation.from_rotvec(np.array(turns).reshape(-1, 3)).as_matrix()
-    return Answer(parameters, rotation @ start, 0)
+    return np.asarray(K, np.float64), np.ravel(D).astype(np.float64), rotation @ start

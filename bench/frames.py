@@ -3,20 +3,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import dataclasses
 from pathlib import Path
 import tempfile
 
+import numpy as np
 import yaml
 
+from starcal_ros.arrays import Floats
+from starcal_ros.constants import SPEED_OF_LIGHT_M_S
+from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.options import read_parameter_file
+from starcal_ros.pipeline import observe, solve
 from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.records import AttitudeSample, Image
+from starcal_ros.records import AttitudeSample, Ensemble, Image
+from starcal_ros.sky.astrometry import observer_at
 from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.studies.simulation import rendering, simulated_bag
 from starcal_ros.studies.simulation import scenario as synthetic
 from starcal_ros.studies.simulation.scenario import Scenario
+
+Frame = tuple[Image, list[AttitudeSample]]
 
 
 def write_set_up(scenario: Scenario, folder: Path, **values: object) -> Path:
@@ -41,7 +50,7 @@ def paper_scenario(magnitude_limit: float) -> Scenario:
     return dataclasses.replace(synthetic.scenario('paper'), magnitude_limit=magnitude_limit)
 
 
-def render_frame(scenario: Scenario, index: int) -> tuple[Image, list[AttitudeSample]]:
+def render_frame(scenario: Scenario, index: int) -> Frame:
     """Frame and the star-tracker samples around it."""
     image = rendering.render(scenario, synthetic.scene(scenario, index), index)
     return image, list(synthetic.attitude_samples(scenario, index))
@@ -53,3 +62,31 @@ def history(samples: list[AttitudeSample]) -> AttitudeHistory:
     for sample in samples:
         attitudes.add(sample.time_ns, sample)
     return attitudes
+
+
+def earth_velocity_m_s(time_ns: int) -> Floats:
+    """Velocity of the observer of simulated frames (3,), ICRF axes."""
+    return np.asarray(observer_at(time_ns).velocity_c * SPEED_OF_LIGHT_M_S)
+
+
+def observed(frames: Iterable[Frame], setup: Setup) -> Ensemble:
+    """Stars of frames that starcal measures in turn, given the velocity of the observer."""
+    track, ensemble = observe.Track(setup.prior), Ensemble()
+    for image, samples in frames:
+        velocity_m_s = earth_velocity_m_s(image.time_ns)
+        attitudes = history(samples)
+        found, track = observe.observe_next(image, attitudes, setup, track, velocity_m_s)
+        ensemble = solve.add_to_ensemble(ensemble, found, setup)
+    return ensemble
+
+
+def write_bag(frames: Iterable[Frame], path: Path) -> None:
+    """Write frames with the star tracker's samples around each and the velocities then."""
+    with BagWriter(path) as writer:
+        for image, samples in frames:
+            for sample in samples:
+                time_ns, xyzw = sample.time_ns, sample.icrf_from_star_tracker_xyzw
+                velocity_m_s = earth_velocity_m_s(time_ns)
+                writer.write_velocity(simulated_bag.VELOCITY_TOPIC, time_ns, velocity_m_s, 'icrf')
+                writer.write_attitude(simulated_bag.ATTITUDE_TOPIC, time_ns, xyzw, 'icrf')
+            writer.write_image(simulated_bag.IMAGE_TOPIC, image, 'camera')

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from bench.competitors import (
     Answer,
     Case,
+    covariance_of,
     estimate_starcal,
     FREE,
     make_case,
@@ -36,9 +37,6 @@ from bench.competitors import (
 )
 from bench.table import Table, verdict
 from starcal_ros.arrays import Floats
-from starcal_ros.estimation.levenberg_marquardt import covariance
-from starcal_ros.estimation.minimise import minimise
-from starcal_ros.estimation.problem import State
 from starcal_ros.estimation.star_equations import arrange, normal_blocks, RESIDUAL, ROTATION
 from starcal_ros.records import CameraGeometry, Ensemble
 
@@ -81,15 +79,7 @@ def cost_of(case: Case, answer: Answer, steps: int = 0) -> float:
 
 def parameter_sigma(case: Case, answer: Answer) -> Floats:
     """1-sigma (8,) of the free parameters."""
-    state = State(
-        answer.parameters,
-        case.start.camera_from_star_tracker,
-        Rotation.from_matrix(answer.camera_from_icrf),
-    )
-    keep = np.ones(len(case.table), bool)
-    measurements = arrange(case.table, keep, case.table.covariance_px2)
-    at_end = minimise(case.problem, state, measurements)
-    return np.asarray(np.sqrt(np.diag(covariance(at_end.normal)[0]))[: len(FREE)])
+    return np.asarray(np.sqrt(np.diag(covariance_of(case, answer, scaled=False))))
 
 
 def least_s(repeats: int, call: Callable[..., object], *args: object) -> float:

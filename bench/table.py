@@ -1,11 +1,14 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Result tables of benches, as aligned text and as plain values."""
+"""Result tables of benches, as aligned text and as plain values, and the time of a call."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+import time
+from typing import TypeVar
 
+ResultT = TypeVar('ResultT')
 Cell = str | int | float | bool | None
 
 
@@ -50,6 +53,13 @@ class Table:
         """The table as a JSON object."""
         rows = [dict(zip(self.columns, row, strict=True)) for row in self.rows]
         return {'title': self.title, 'rows': rows, 'notes': self.notes}
+
+
+def timed(call: Callable[[], ResultT]) -> tuple[ResultT, float]:
+    """Return the result of a call and the processor time of it, in seconds."""
+    start_s = time.process_time()
+    result = call()
+    return result, time.process_time() - start_s
 
 
 def verdict(ratio: float, target: float) -> str:

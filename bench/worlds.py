@@ -146,16 +146,20 @@ def compare(made: Campaign, estimate: Calibration) -> tuple[float, float, float]
     pixels = pixel_grid(made.truth.camera, GRID, GRID)
     table = line_of_sight_table(camera, estimate.map_covariance, pixels)
     estimated = table.direction_camera
-    common, _ = Rotation.align_vectors(made.true_directions, estimated)
     to_tracker = Rotation.from_quat(estimate.geometry.star_tracker_from_camera_xyzw)
-    shape = np.linalg.norm(common.apply(estimated) - made.true_directions, axis=1)
     off = to_tracker.apply(estimated) - made.true_star_tracker_directions
-    sigma_arcsec = _rms(table.shape_sigma_arcsec)
+    sigma_arcsec = rms(table.shape_sigma_arcsec)
     return (
-        _rms(shape) / ARCSECOND_RAD / sigma_arcsec,
-        _rms(np.linalg.norm(off, axis=1)) / ARCSECOND_RAD / _rms(table.sigma_arcsec),
+        shape_error_arcsec(made.true_directions, estimated) / sigma_arcsec,
+        rms(np.linalg.norm(off, axis=1)) / ARCSECOND_RAD / rms(table.sigma_arcsec),
         sigma_arcsec,
     )
+
+
+def shape_error_arcsec(true: Floats, estimated: Floats) -> float:
+    """RMS angle between unit vectors (n, 3), the best common rotation removed."""
+    common, _ = Rotation.align_vectors(true, estimated)
+    return rms(np.linalg.norm(common.apply(estimated) - true, axis=1)) / ARCSECOND_RAD
 
 
 def bound_arcsec(made: Campaign, options: CalibrationOptions) -> float:
@@ -180,10 +184,11 @@ def bound_arcsec(made: Campaign, options: CalibrationOptions) -> float:
     covariance[:p, :p] = np.linalg.inv(information * unit) * unit
     pixels = pixel_grid(camera, GRID, GRID)
     table = line_of_sight_table(camera, MapCovariance(covariance), pixels)
-    return _rms(table.shape_sigma_arcsec)
+    return rms(table.shape_sigma_arcsec)
 
 
-def _rms(values: Floats | Sequence[float]) -> float:
+def rms(values: Floats | Sequence[float]) -> float:
+    """Root of the mean square; NaN without values."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan
 
 
@@ -208,10 +213,10 @@ def limits_met(name: str, scores: Sequence[Score]) -> str:
         low, high = 0.4, 1.4
     missed = []
     shape, pointing = [s.shape for s in accepted], [s.pointing for s in accepted]
-    if not low <= _rms(shape) <= high or max(shape) > worst:
+    if not low <= rms(shape) <= high or max(shape) > worst:
         missed.append('map')
     # The slow error of the star tracker that few images show stays in the sigma of the pointing.
-    if _rms(pointing) > high or max(pointing) > worst:
+    if rms(pointing) > high or max(pointing) > worst:
         missed.append('pointing')
     if sound:
         images = WORLDS[name].images
@@ -248,9 +253,9 @@ def table_of(names: Sequence[str], seeds: Sequence[int]) -> Table:
         table.add(
             name,
             f'{len(accepted)} of {len(seeds)}',
-            _rms(shape),
+            rms(shape),
             max(shape, default=math.nan),
-            _rms(pointing),
+            rms(pointing),
             max(pointing, default=math.nan),
             float(np.median([s.over_bound for s in scores])) if scores else math.nan,
             float(np.median([s.seconds for s in scores])) if scores else math.nan,

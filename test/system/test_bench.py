@@ -73,6 +73,27 @@ def test_ensemble_bench(tmp_path: Path) -> None:
         assert streamed['sigma by all'] < rows['at random, mean']['sigma by all']
 
 
+def test_peers_bench(tmp_path: Path) -> None:
+    """Every tool that is installed has a row; errors of starcal are within 2 sigma."""
+    (errors, times), said = found_by('peers', tmp_path)
+    rows = {(row['campaign'], row['tool']): row for row in errors['rows']}
+    kinds = {kind for kind, _ in rows}
+    assert len(kinds) == 4
+    for kind in kinds:
+        ours, scipy = rows[kind, 'starcal, estimator'], rows[kind, 'SciPy']
+        assert ours['best variants'] == 'accepted' and ours['error/sigma'] < 2.0
+        # A lens that its model does not describe is not in the sigma of a solver.
+        assert (scipy['error/sigma'] > 4.0) == ('ripple' in kind)
+        assert rows[kind, 'OpenCV']['sigma "'] is None
+        for name in ('tetra3rs', 'mrcal', 'Ceres'):
+            skipped = f'{name} is not installed: skipped' in said
+            images_only = name == 'tetra3rs' and kind.startswith('stars')
+            assert ((kind, name) in rows) == (not skipped and not images_only)
+    whole = rows['images, sound', 'starcal, bag to camera']
+    assert whole['frames'] == 5 and whole['by ours'] == pytest.approx(1.0, abs=1e-3)
+    assert [row['frames found'] for row in times['rows']] == [4] * len(times['rows'])
+
+
 def test_acquisition_bench() -> None:
     """Scrambled fields are refused, and easy true fields are found."""
     refused = acquisition.scrambled(1, 8)
