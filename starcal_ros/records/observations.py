@@ -57,6 +57,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'other': 'refused by the sender for a reason that this version does not have',
 }
 """Reasons to refuse an image: stable name -> meaning."""
+_REFUSAL = OneOf(('', *IMAGE_REFUSALS))  # Sphinx cannot show a star within an annotation
 
 
 def counted_refusal(refusal: str) -> str:
@@ -199,7 +200,7 @@ class StarObservations:
     time_ns: Stamp
     width: _Side
     height: _Side
-    refusal: Annotated[str, OneOf(('', *IMAGE_REFUSALS))]
+    refusal: Annotated[str, _REFUSAL]
     detail: str
     icrf_from_star_tracker_xyzw: Annotated[_Attitude, Named('attitude')]
     attitude_gap_s: _FiniteOrNaN
