@@ -105,7 +105,7 @@ def field_amplitudes(
         On the coefficients, scaled to a prior of 1 px for each octave, all else eliminated.
     octave : (q,)
     near : Amplitudes, optional
-        Of the round before: the search starts there and from one other place.
+        Amplitudes of the round before: the search starts there and from one other place.
     """
     count = int(octave.max()) + 1
     mean, precision = octave_prior(count)

@@ -109,16 +109,17 @@ class Estimate:
     ----------
     geometry : CameraGeometry
     covariance : (p + 3, p + 3)
-        Of the p camera parameters and the alignment angles.
+        Covariance of the p camera parameters and the alignment angles.
     joint_covariance : (p + 3 + 2 t, p + 3 + 2 t)
-        Of these and of the coefficients of the field of the camera, those of u, then those of v.
+        The same with the coefficients of the field, those of u, then those of v.
     pixel_sigma_px : float
         1-sigma per axis of structure finer than the field: it is part of any line of sight.
     information : (k, k)
         On the estimated camera parameters, focal terms, alignment and its rate, the images
         eliminated; ``information_names`` are their names.
     shared_covariance : (s, s)
-        Of camera parameters, focal terms, alignment, rate and mountings: ``shared_names``.
+        Covariance of camera parameters, focal terms, alignment, rate and mountings, which are
+        ``shared_names``.
     problem, state, layout, posterior
         At the last linearisation: the state is the one before the last step.
     sums : StarSums
@@ -129,9 +130,9 @@ class Estimate:
     kept : (n,) bool
         Observations used.
     residual_px : (n, 2)
-        Of all observations, all unknowns at their means.
+        Residuals of all observations, with all unknowns at their means.
     covariance_px2 : (n, 3)
-        Of each observation: noise, and the errors it shares with others.
+        Variance of each observation: noise, and the errors it shares with others.
     variance : CentroidVariance
         How the centroid covariances were corrected.
     variance_factor : float

@@ -3,8 +3,8 @@
 Alignment of the camera to each of several star trackers, and their drift.
 
 The search estimates the alignment A to the first star tracker and, for each further one, a small
-rotation h of the camera frame by which its mounting M is wrong (`methods.problem`): its alignment
-is ``exp(-[h x]) A M``.  Of small rotations a of A, that alignment turns by ``a + h``.
+rotation h of the camera frame by which its mounting M is wrong (`estimation.problem`): its
+alignment is ``exp(-[h x]) A M``.  A small rotation a of A turns that alignment by ``a + h``.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ class AttitudeErrors:
     error_rad : (m, 3)
         About the axes of the star tracker of the image.
     variance_rad2 : (m, 3)
-        Of that, from the centroids.
+        Its variance from the centroids.
     tracker_sigma_rad : (3,)
         1-sigma of a star tracker.
     seen : (m,) bool
-        Whether the image shows one that fits.
+        True if the stars of the image show an attitude that fits.
     """
 
     time_ns: NDArray[np.int64]
@@ -69,9 +69,9 @@ def star_tracker_alignments(
     Parameters
     ----------
     names : tuple of str
-        Of `star_tracker_names`.
+        From `star_tracker_names`.
     covariance : (3 + 3 s, 3 + 3 s)
-        Of alignment and mountings of the s further ones.
+        Covariance of the alignment and of the mountings of the s further star trackers.
     errors : AttitudeErrors
         Each about the axes of its own star tracker.
     """

@@ -65,9 +65,9 @@ class ErrorParts:
     Attributes
     ----------
     root : (P, r)
-        Of the covariance under the working weights, that of `common_shape` aside.
+        Root of the covariance under the working weights, without that of `common_shape`.
     excess : (r, r)
-        Of the errors as they are, less that of the working weights.
+        Covariance of the actual errors less that of the working weights.
     shared : mapping of (r, r)
         Whole variance of each error that observations share, and of the star trackers.
     """
@@ -92,20 +92,20 @@ class Posterior:
     own, back : (m, b), (m, b, P)
         The unknowns of an image are ``own - back mean``.
     image_covariance : (m, b, b)
-        Of them, the shared ones known.
+        Covariance of the unknowns of an image, the shared ones known.
     estimated : (e,) int
         Shared unknowns that are estimated; the others are held.
     field, shape : Amplitudes
     last_octave : (s,), (s,)
         Posterior of the logarithm of the finest amplitude of the field, with weights.
     shape_sigma_px : (3,)
-        Of scale, stretch and shear of an image: those that stand for their posterior.
+        Amplitudes of scale, stretch and shear of an image that stand for their posterior.
     resolved : float
         Number of unknowns that the data determine, those of images aside.
     common_shape_px2 : (3,)
         Part of ``covariance``: of scale, stretch and shear that all images share.
     information, gradient : (P, P), (P,)
-        Of the stars and the star trackers, without priors, the images eliminated.
+        From the stars and the star trackers, without priors, the images eliminated.
     errors : ErrorParts or None
         None before `with_shared_errors`.
     """
@@ -355,12 +355,12 @@ class Weights:
     Attributes
     ----------
     variance_px2 : (n,)
-        Of each observation per axis.
+        Variance of each observation per axis.
     inflation_px2 : (n,)
         Variance per axis that the working weights have beyond that of each observation.
     from_sky : (n, 2, 2)
     predicted_px : (n, 2)
-        Of `equations.star_sums`.
+        As for `equations.star_sums`.
     errors : tuple of SharedError
     attitudes : tuple of (images, groups, covariance, independent)
         Images (k,) of each star tracker, their groups (k,) and the covariance (g, g) of errors of

@@ -11,12 +11,12 @@ With R_k = camera_from_icrf of image k, the attitude error of the star tracker i
 ``eta_k = -Log(A' R_k T_k')``, a small rotation in the star tracker frame, where A =
 camera_from_star_tracker and T_k = star_tracker_from_icrf as measured.
 
-Where terms of temperature are estimated (`thermal`), parameters and A are those of the image, and
-the derivatives by what is shared follow by the chain rule, one small matrix for each image.
+With terms of temperature (`estimation.temperature`), parameters and A are those of the image; the
+derivatives by the shared unknowns follow by the chain rule, with one small matrix for each image.
 
-Of several star trackers, each has axes of its own: T_k is that of the one that gave the attitude,
-and A that of the first, turned by its mounting M (first from this one) and by the small rotation h
-of the camera frame by which the mounting is wrong: ``exp(-[h x]) A M``.
+Several star trackers have different axes.  T_k is then that of the tracker that gave the attitude.
+Its alignment is A of the first tracker, turned by its mounting M (first from this one) and by the
+small rotation h of the camera frame by which the mounting is wrong: ``exp(-[h x]) A M``.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ METHODS = ('hierarchical', 'per_image', 'single')
 
 @dataclass(frozen=True)
 class State:
-    """Where the search stands: camera parameters, alignment and the rotation of every image."""
+    """Point of the search: camera parameters, alignment and the rotation of every image."""
 
     parameters: Floats  # (p,)
     camera_from_star_tracker: Rotation
@@ -131,7 +131,7 @@ def mounting_errors_rad(problem: Problem, state: State) -> Floats:
 def image_blocks(
     problem: Problem, state: State, measurements: Measurements, loss_scale: float = np.inf
 ) -> tuple[float, Floats]:
-    """Cost and the matrices of `normal_equations.normal_blocks` at a state."""
+    """Cost and the matrices of `star_equations.normal_blocks` at a state."""
     return normal_blocks(
         measurements,
         problem.model,

@@ -52,7 +52,7 @@ class SharedError:
     ----------
     name : str
     group : (n,) int
-        Of each observation.
+        Number of the group of each observation.
     variance_px2 : float
         Posterior mean, per axis.
     likelihood_ratio : float
@@ -136,7 +136,7 @@ def shared_errors(
     weight : (n,)
         Reciprocal variance of each residual per axis, 1/px^2; 0: not used.
     groups : sequence of Groups
-        Of `observation_groups`.
+        From `observation_groups`.
     from_sky : (n, 2, 2)
         Rotation of a displacement fixed to the star into pixel axes.
     last_octave : (s,), (s,)

@@ -82,7 +82,7 @@ class Unknown:
     functions : Scalars or None
         q is twice their number: those of u, then those of v.
     octave : (q,) or None
-        Of each coefficient of those functions.
+        Octave of each coefficient of those functions.
     tracker : (m, 3, q) or None
         Rotation of the camera, as the star tracker of each image predicts it.
     widest : float
@@ -176,11 +176,11 @@ class Assumptions:
     Attributes
     ----------
     velocity_m_s : float
-        Of each component of the velocity of the observer.
+        Each component of the velocity of the observer.
     readout_s : float, float
-        Of the time from the first to the last row: its mean and 1-sigma.
+        Time from the first to the last row: mean and 1-sigma.
     stamp_s : float
-        Of the offset of all stamps against the attitudes.
+        Offset of all stamps against the attitudes.
     refraction : Refraction or None
         About a zenith that is not known exactly; None: in space, or corrected.
     """
@@ -368,7 +368,7 @@ def _of_timing(rates_rad_s: Floats, height: int, assumed: Assumptions) -> list[U
     """Return the entries of the read-out and of the stamps: what a camera that turns shows."""
     mean_s, sigma_s = assumed.readout_s
     if not np.isfinite(rates_rad_s).all():
-        # Of a rolling shutter by its data sheet, at a rate that is not known.
+        # A rolling shutter by its data sheet, at a rate that is not known.
         turn_rad = abs(mean_s) * _UNKNOWN_RATE_RAD_S
         axes: Floats = np.broadcast_to(np.eye(3), (len(rates_rad_s), 3, 3))
         labels = ('readout_x_rad', 'readout_y_rad', 'readout_z_rad')
