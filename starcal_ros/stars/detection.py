@@ -398,6 +398,8 @@ def _parabola_vertex(
 def windows_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Pixels:
     """Square windows (n, 2 radius + 1, 2 radius + 1) about integer pixels (n, 2), all inside."""
     side = 2 * radius + 1
+    if len(centre) == 0:  # of an image that may be smaller than a window
+        return np.empty((0, side, side), pixels.dtype)
     # The type stubs of NumPy drop the type of the pixels here.
     every: Any = np.lib.stride_tricks.sliding_window_view(pixels, (side, side))
     windows: Pixels = every[centre[:, 1] - radius, centre[:, 0] - radius]
@@ -419,9 +421,11 @@ def stamps_at_edges(
     """
     shape = (pixels.shape[0], pixels.shape[1])
     largest = np.array([shape[1] - 1, shape[0] - 1])
-    stamps = stamps_about(pixels, np.clip(centre, radius, largest - radius), radius)
+    stamps = np.empty((len(centre), 2 * radius + 1, 2 * radius + 1))
     outside = np.zeros(stamps.shape, bool)
-    leaves = np.nonzero(~windows_inside(shape, centre, radius))[0]
+    inside = windows_inside(shape, centre, radius)
+    stamps[inside] = windows_about(pixels, centre[inside], radius)
+    leaves = np.nonzero(~inside)[0]
     if len(leaves):
         reach = np.arange(-radius, radius + 1)
         u, v = (centre[leaves, axis, None] + reach for axis in (0, 1))

@@ -174,3 +174,13 @@ def test_pictures_without_stars_are_refused_with_the_frames_to_take(tmp_path: Pa
     flat = [rng.normal(100, 3, (300, 400)).astype(np.uint8) for _ in range(3)]
     with pytest.raises(NotFromStars, match=r'no stars: .* take 20 frames'):
         starcal_ros.calibrate_images(write_pngs(flat, tmp_path / 'night'))
+
+
+@pytest.mark.parametrize('side', [3, 8, 17])
+def test_pictures_smaller_than_a_star_are_pictures_without_stars(
+    tmp_path: Path, side: int
+) -> None:
+    rng = np.random.default_rng(side)
+    pixels = [rng.integers(0, 255, (side, side + 3), np.uint8) for _ in range(4)]
+    with pytest.raises(NotFromStars, match='no stars'):
+        starcal_ros.calibrate_images(write_pngs(pixels, tmp_path / 'night'))

@@ -60,8 +60,6 @@ def bright_sources(pixels: Pixels) -> BrightSources:
     found = detect(pixels, background, _DETECTION_SIGMA)
     centre = np.rint(found.xy_px[:_MEASURED]).astype(np.int64)
     shape = (pixels.shape[0], pixels.shape[1])
-    if min(shape) <= 2 * _STAMP_PX:
-        centre = centre[:0]
     stamps, outside = stamps_at_edges(pixels, centre, _STAMP_PX)
     level = sample_mesh(background.level_mesh, shape, centre.astype(np.float64))
     noise = sample_mesh(background.noise_mesh, shape, centre.astype(np.float64))
