@@ -17,7 +17,15 @@ FILES = sorted(
 LONGEST_FUNCTION_LINES = 95
 SUBJECTS = {  # tests of several modules together
     *('activations', 'awkward_frames', 'diagnostics', 'faults', 'icd_client', 'kills'),
-    *('lens_models', 'motion', 'nodes', 'observer_threads', 'set_up_mistakes', 'star_trackers'),
+    *(
+        'lens_models',
+        'motion',
+        'nodes',
+        'object_store',
+        'observer_threads',
+        'set_up_mistakes',
+        'star_trackers',
+    ),
     *('trend', 'worlds'),
 }
 

@@ -18,7 +18,6 @@ import posixpath
 import tempfile
 from typing import Any, TYPE_CHECKING
 
-from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.untrusted import read_bytes
 
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
 _ETAGS = ('ETag', 'etag', 'md5Hash')  # of S3, Google and Azure
 _TIMES = ('LastModified', 'last_modified', 'updated', 'mtime', 'created')
 _LONGEST_REASON = 200
+_OBJECT_STORES = {'s3', 'gs', 'abfs'}
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,18 @@ def entries(root: str) -> list[Entry]:
 
 
 def make_folder(folder: str) -> None:
-    """Make a folder where there is none; raises OSError."""
+    """
+    Make a folder where there is none; raises OSError.
+
+    A remote one is written to, so that a wrong bucket or missing rights end a run at its start.
+    """
     if not is_remote(folder):
         os.makedirs(folder, exist_ok=True)
+        return
+    probe = join(folder, '_probe')
+    write(probe, b'')
+    with contextlib.suppress(FileNotFoundError):  # another run has removed it
+        remove(probe)
 
 
 def exists(place: str) -> bool:
@@ -104,9 +113,10 @@ def read(url: str, most_bytes: int) -> bytes:
     if not is_remote(url):
         return read_bytes(Path(url), most_bytes)
     with _remote(url) as (fs, path):
-        if fs.size(path) > most_bytes:
-            raise ValueError(f'larger than {most_bytes // 1024} kB')
-        return bytes(fs.cat_file(path))
+        content = fs.cat_file(path) if fs.size(path) <= most_bytes else None
+    if content is None:
+        raise ValueError(f'larger than {most_bytes // 1024} kB')
+    return bytes(content)
 
 
 def write(url: str, content: bytes) -> None:
@@ -116,7 +126,9 @@ def write(url: str, content: bytes) -> None:
         write_atomically(Path(url), content)
         return
     with _remote(url) as (fs, path):
-        fs.makedirs(posixpath.dirname(path), exist_ok=True)
+        # An object store has no folders, and would make the bucket of a mistyped URL.
+        if not _OBJECT_STORES.intersection(_protocols(fs)):
+            fs.makedirs(posixpath.dirname(path), exist_ok=True)
         fs.pipe_file(path, content)
 
 
@@ -175,16 +187,17 @@ def _remote(url: str) -> Iterator[tuple[AbstractFileSystem, str]]:
     import fsspec
 
     try:
-        fs, path = fsspec.core.url_to_fs(url)
-    except (ImportError, ValueError) as error:
-        raise OptionError(f'{url}: {_reason(error)}') from error
-    try:
-        yield fs, path
-    except (OSError, ValueError, OptionError):
-        raise
-    # Each client of an object store has exceptions of its own.
+        yield fsspec.core.url_to_fs(url)
+    # Each client of an object store has exceptions of its own, or leaves out the reason.
     except Exception as error:
-        raise OSError(errno.EIO, _reason(error), url) from error
+        if isinstance(error, OSError) and error.strerror:
+            raise
+        code = errno.ENOENT if isinstance(error, FileNotFoundError) else errno.EIO
+        raise OSError(code, _reason(error), url) from error
+
+
+def _protocols(fs: AbstractFileSystem) -> tuple[str, ...]:
+    return (fs.protocol,) if isinstance(fs.protocol, str) else tuple(fs.protocol)
 
 
 def _reason(error: Exception) -> str:

@@ -1,0 +1,209 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""The command against an S3 server: bags, table and page by URL, and a store that fails."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import importlib.util
+import io
+import os
+from pathlib import Path
+import re
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+
+from mission_files import TINY  # type: ignore[import-not-found]
+import pyarrow.parquet as pq
+import pytest
+
+_MISSING = [name for name in ('moto', 'flask', 's3fs') if importlib.util.find_spec(name) is None]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        bool(_MISSING), reason=f'needs pip install moto[server] s3fs: no {", ".join(_MISSING)}'
+    ),
+]
+
+_RUN = 'import sys; from starcal_ros.cli.main import main; sys.exit(main())'
+_BAGS = ['s3://archive/fleet/0', 's3://archive/fleet/1']
+_START_S = 60.0
+# With the content type of a form the server loses the content; without a key it gives none.
+_HEADERS = {'Content-Type': 'application/octet-stream', 'Authorization': 'AWS a:b'}
+
+
+class Proxy:
+    """A TCP proxy before the server, which notes requests, delays them and drops connections."""
+
+    def __init__(self, port: int) -> None:
+        self.drop = ''  # pattern of the first line of requests whose connection is closed
+        self.delay_s = 0.0
+        self.requests: list[str] = []
+        self._port = port
+        self._listener = socket.create_server(('127.0.0.1', 0))
+        self.url = f'http://127.0.0.1:{self._listener.getsockname()[1]}'
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def close(self) -> None:
+        # close() alone does not wake the thread in accept().
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                client, _ = self._listener.accept()
+                threading.Thread(target=self._serve, args=(client,), daemon=True).start()
+
+    def _serve(self, client: socket.socket) -> None:
+        with client, socket.create_connection(('127.0.0.1', self._port)) as server:
+            back = threading.Thread(target=_copy, args=(server, client), daemon=True)
+            back.start()
+            with contextlib.suppress(OSError):
+                while data := client.recv(65536):
+                    line = data.partition(b'\r\n')[0].decode(errors='replace')
+                    if line.endswith('HTTP/1.1'):
+                        self.requests.append(line)
+                        if self.drop and re.search(self.drop, line):
+                            break
+                    time.sleep(self.delay_s)
+                    server.sendall(data)
+            with contextlib.suppress(OSError):
+                server.shutdown(socket.SHUT_RDWR)
+            back.join()
+
+
+def _copy(server: socket.socket, client: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        while data := server.recv(65536):
+            client.sendall(data)
+        client.shutdown(socket.SHUT_RDWR)
+
+
+class Store:
+    """A server with two bags in the bucket `archive`."""
+
+    def __init__(self, url: str, proxy: Proxy, folder: Path) -> None:
+        self.url, self.proxy, self.folder = url, proxy, folder
+
+    def request(self, method: str, path: str, content: bytes = b'') -> bytes:
+        body = None if method == 'GET' else content  # an empty one has a length, 0
+        request = urllib.request.Request(f'{self.url}/{path}', body, _HEADERS, method=method)
+        with urllib.request.urlopen(request, timeout=_START_S) as answer:
+            return bytes(answer.read())
+
+    def names(self, bucket: str = 'archive') -> list[str]:
+        listing = self.request('GET', f'{bucket}?list-type=2').decode()
+        return re.findall('<Key>(.*?)</Key>', listing)
+
+    def bags_in_table(self) -> list[str]:
+        found = []
+        for name in self.names():
+            if name.endswith('.parquet'):
+                file = pq.ParquetFile(io.BytesIO(self.request('GET', f'archive/{name}')))
+                found += file.read(['path'])['path'].to_pylist()
+        return sorted(found)
+
+    def trend(
+        self,
+        root: str = 's3://archive/fleet',
+        output: str = 's3://archive/trend',
+        **environment: str,
+    ) -> subprocess.CompletedProcess[str]:
+        settings = {
+            'AWS_ACCESS_KEY_ID': 'a',
+            'AWS_SECRET_ACCESS_KEY': 'b',
+            'AWS_DEFAULT_REGION': 'us-east-1',
+            'AWS_ENDPOINT_URL': self.proxy.url,
+            'AWS_MAX_ATTEMPTS': '1',
+            **environment,
+        }
+        line = ['trend', root, '-o', output, '--params', str(TINY / 'params.yaml')]
+        done = subprocess.run(
+            [sys.executable, '-c', _RUN, *line, '--workers', '2'],
+            cwd=self.folder,
+            env={**os.environ, **settings},
+            capture_output=True,
+            text=True,
+            timeout=240,
+        )
+        assert 'Traceback' not in done.stdout + done.stderr
+        return done
+
+
+@pytest.fixture(scope='module')
+def server() -> Iterator[tuple[str, int]]:
+    with socket.create_server(('127.0.0.1', 0)) as free:
+        port = free.getsockname()[1]
+    command = [sys.executable, '-m', 'moto.server', '-H', '127.0.0.1', '-p', str(port)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    end_s = time.monotonic() + _START_S
+    while time.monotonic() < end_s:
+        with contextlib.suppress(OSError), socket.create_connection(('127.0.0.1', port), 1):
+            break
+        time.sleep(0.1)
+    yield f'http://127.0.0.1:{port}', port
+    process.kill()
+    process.wait()
+
+
+@pytest.fixture
+def store(server: tuple[str, int], tmp_path: Path) -> Iterator[Store]:
+    url, port = server
+    proxy = Proxy(port)
+    made = Store(url, proxy, tmp_path)
+    made.request('POST', 'moto-api/reset')
+    made.request('PUT', 'archive')
+    content = (TINY / 'tiny_0.mcap').read_bytes()
+    for k in range(2):
+        changed = content.replace(b'starcal', b'%07d' % k, 1)  # in the header, which nothing reads
+        made.request('PUT', f'archive/fleet/{k}/tiny_0.mcap', changed)
+        metadata = (TINY / 'metadata.yaml').read_bytes()
+        made.request('PUT', f'archive/fleet/{k}/metadata.yaml', metadata)
+    yield made
+    proxy.close()
+
+
+def test_a_second_run_from_another_folder_reads_no_bag(store: Store) -> None:
+    store.proxy.delay_s = 0.05
+    assert '2 new, 0 known before, 0 failed' in store.trend().stdout
+    assert store.bags_in_table() == _BAGS and 'trend/trend.html' in store.names()
+    assert not any('_probe' in name or '_new' in name for name in store.names())
+    store.proxy.requests.clear()
+    store.folder = store.folder / 'elsewhere'
+    store.folder.mkdir()
+    assert '0 new, 2 known before, 0 failed' in store.trend().stdout
+    assert not any('.mcap' in line for line in store.proxy.requests)
+    assert list(store.folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('root', 'output', 'endpoint', 'words'),
+    [
+        ('s3://none/fleet', 's3://archive/trend', '', 's3://none/fleet: no such folder'),
+        ('s3://archive/fleet', 's3://none/trend', '', 'bucket does not exist'),
+        ('s3://archive/fleet', 's3://archive/trend', '127.0.0.1:9', 'Invalid endpoint'),
+        ('s3://archive/fleet', 's3://archive/trend', 'http://127.0.0.1:9', 'Could not connect'),
+    ],
+)
+def test_a_wrong_place_is_one_line(
+    store: Store, root: str, output: str, endpoint: str, words: str
+) -> None:
+    done = store.trend(root, output, AWS_ENDPOINT_URL=endpoint or store.proxy.url)
+    assert done.returncode == 2 and words in done.stderr and done.stderr.count('\n') == 1
+    assert not any('.mcap' in line for line in store.proxy.requests)
+    assert b'<Name>none</Name>' not in store.request('GET', '')
+
+
+def test_wrong_credentials_are_one_line(store: Store) -> None:
+    store.request('POST', 'moto-api/reset-auth', b'0')
+    try:
+        done = store.trend()
+    finally:
+        store.request('POST', 'moto-api/reset-auth', b'inf')
+    assert done.returncode == 2 and done.stderr.count('\n') == 1
+    assert 's3://archive/fleet: cannot be read: PermissionError: Forbidden' in done.stderr
