@@ -207,3 +207,27 @@ def test_wrong_credentials_are_one_line(store: Store) -> None:
         store.request('POST', 'moto-api/reset-auth', b'inf')
     assert done.returncode == 2 and done.stderr.count('\n') == 1
     assert 's3://archive/fleet: cannot be read: PermissionError: Forbidden' in done.stderr
+
+
+def test_a_bag_that_cannot_be_reached_is_done_by_the_next_run(store: Store) -> None:
+    store.proxy.drop = 'GET /archive/fleet/1/.*mcap'
+    done = store.trend()
+    assert '1 new, 0 known before, 1 failed' in done.stdout and done.stderr == ''
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith('failed: ')]
+    assert 's3://archive/fleet/1: ' in line and 'cannot be read: ' in line
+    store.proxy.drop = ''
+    assert '1 new, 1 known before, 0 failed' in store.trend().stdout
+    assert store.bags_in_table() == _BAGS
+
+
+@pytest.mark.parametrize(
+    'drop', ['PUT .*/_new/', 'PUT .*/camera(=|%3D)', 'DELETE .*/_new/', 'PUT .*html']
+)
+def test_a_write_that_fails_is_made_good_by_the_next_run(store: Store, drop: str) -> None:
+    store.proxy.drop = drop
+    done = store.trend()
+    assert done.returncode == 2 and done.stderr.count('\n') == 1
+    assert 's3://archive/trend/' in done.stderr and 'onnection' in done.stderr
+    store.proxy.drop = ''
+    assert ' 0 failed' in store.trend().stdout
+    assert store.bags_in_table() == _BAGS
