@@ -14,6 +14,7 @@ import numpy as np
 
 from bench.competitors import make_ensemble
 from bench.table import Table
+from bench.worlds import rms
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import (
     image_information,
@@ -107,22 +108,22 @@ def measure(
         (
             count,
             f'best of {random_choices} at random',
-            min(at_random, key=lambda s: _rms(s / everything)),
+            min(at_random, key=lambda s: rms(s / everything)),
         ),
         (count, 'at random, mean', np.mean(at_random, axis=0)),
     ]
     for images, name, sigma in choices:
         ratio = sigma / everything
-        by_best = _rms(ratio) / least
+        by_best = rms(ratio) / least
         judged = ''
         if 'streamed' in name:
             judged = f'<= {TARGET:g}: ' + ('met' if by_best <= TARGET else 'MISSED')
         table.add(
             images,
             name,
-            _rms(ratio),
+            rms(ratio),
             float(ratio.max()),
-            _rms(ratio) / np.sqrt(m / images),
+            rms(ratio) / np.sqrt(m / images),
             None if images == m else by_best,
             judged,
         )
@@ -144,7 +145,3 @@ def run(quick: bool) -> list[Table]:
     for table in tables:
         print(table.text())
     return tables
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -35,7 +35,7 @@ from bench.table import Table
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
-from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.constants import ARCSECOND_RAD, AU_M, SPEED_OF_LIGHT_M_S
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.pipeline import observe, solve
 from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, Image
@@ -50,8 +50,6 @@ SEEDS = 10
 IMAGES = 14
 COPIES = 30
 _GRID = 25
-_SPEED_OF_LIGHT_M_S = 299792458.0
-_AU_PER_DAY_M_S = 149597870700.0 / 86400.0
 _WANDER_IMAGES = 10.0  # correlation length of the star tracker that wanders
 _ABBBA = (0, 1, 1, 1, 0)
 _LENSES = {'two lenses': (0, 1), 'two lenses as ABBBA': _ABBBA}  # by image
@@ -155,25 +153,23 @@ def _summary(world: World, found: list[Outcome]) -> tuple[str | float | int, ...
     unnamed = [
         one for one in refused if not any(c in r for r in one.reasons for c in world.causes)
     ]
-    rms = _rms(shape)
-    honest = not accepted or (_HONEST[0] <= rms <= _HONEST[1] and float(shape.max()) <= _NEVER)
+    of_shape = worlds.rms(shape)
+    honest = not accepted or (
+        _HONEST[0] <= of_shape <= _HONEST[1] and float(shape.max()) <= _NEVER
+    )
     verdict = 'honest' if honest and not unnamed else 'NOT HONEST' if not honest else 'UNNAMED'
     return (
         world.name,
         world.size,
         world.unit,
         f'{len(accepted)} of {len(found)}',
-        rms,
+        of_shape,
         float(shape.max(initial=0.0)),
-        _rms(pointing),
-        _rms(np.array([one.error_arcsec for one in accepted])),
+        worlds.rms(pointing),
+        worlds.rms(np.array([one.error_arcsec for one in accepted])),
         verdict,
         '; '.join(reason[:90] for reason, _ in names.most_common(1)),
     )
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
 
 
 def _trial(job: tuple[World, int]) -> Outcome:
@@ -212,9 +208,9 @@ def trial(world: World, seed: int) -> Outcome:
     return Outcome(
         found.accepted,
         found.reasons,
-        _rms(np.array(shape_rad)) / ARCSECOND_RAD / _rms(table.shape_sigma_arcsec),
-        _rms(np.array(pointing_rad)) / ARCSECOND_RAD / _rms(table.sigma_arcsec),
-        _rms(np.array(shape_rad)) / ARCSECOND_RAD,
+        worlds.rms(np.array(shape_rad)) / ARCSECOND_RAD / worlds.rms(table.shape_sigma_arcsec),
+        worlds.rms(np.array(pointing_rad)) / ARCSECOND_RAD / worlds.rms(table.sigma_arcsec),
+        worlds.rms(np.array(shape_rad)) / ARCSECOND_RAD,
     )
 
 
@@ -320,7 +316,7 @@ def _seen_at(world: World, scenario: Scenario, shown: Scene, index: int) -> Floa
     if world.name == 'aberration reversed':
         e = shown.direction_icrf
         _, barycentric = erfa.epv00(*tt_julian_date(shown.time_ns))
-        beta = barycentric['v'] * _AU_PER_DAY_M_S / _SPEED_OF_LIGHT_M_S
+        beta = barycentric['v'] * (AU_M / 86400.0) / SPEED_OF_LIGHT_M_S
         seen = e - 2.0 * (beta - e * (e @ beta)[:, None])
         return np.asarray(project(camera, seen @ shown.camera_from_icrf.T))
     return np.asarray(pixels + displacement(world, scenario)(pixels))
