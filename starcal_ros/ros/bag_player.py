@@ -220,8 +220,15 @@ def _offer(topic: reader.Topic, is_image: bool) -> QoSProfile:
 
 
 def _listen(executor: SingleThreadedExecutor) -> None:
+    """
+    Answer messages until ROS is shut down.
+
+    The thread of rclpy that answers a signal wakes the executors before it shuts ROS down: one
+    that is quick to wait again is not woken another time, so no wait is without an end.
+    """
     with contextlib.suppress(ExternalShutdownException):
-        executor.spin()
+        while executor.context.ok():
+            executor.spin_once(timeout_sec=1.0)
 
 
 def _timeout() -> Duration:

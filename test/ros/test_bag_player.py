@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+import threading
 from typing import Any, TYPE_CHECKING
 
 import cv2
@@ -16,12 +17,15 @@ pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
 
 from mission_files import attitudes, images  # type: ignore[import-not-found]
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 
 from starcal.msg import StarObservations
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_fields import make_header, quaternion_to_message
 from starcal_ros.formats.messages.types import COMPRESSED_TYPE, POSE_TYPE
+from starcal_ros.ros import bag_player
 
 pytestmark = pytest.mark.nodes
 
@@ -65,3 +69,24 @@ def test_compressed_images_are_paced(
     client.until(lambda: len(found) == len(images()))
     assert [one.refusal for one in found] == [''] * len(found)
     assert 'playing anyway' not in player.said()
+
+
+def test_a_shutdown_that_wakes_nothing_ends_the_player() -> None:
+    """
+    An executor may wait again between the two steps by which rclpy answers a signal.
+
+    It wakes the executors, then shuts ROS down; here only the second step comes.
+    """
+    context = Context()
+    context.init()
+    executor = SingleThreadedExecutor(context=context)
+    runs = threading.Event()
+    executor.create_task(runs.set)
+    listener = threading.Thread(target=bag_player._listen, args=[executor], daemon=True)
+    listener.start()
+    assert runs.wait(60.0)
+    handle: Any = context.handle
+    handle.shutdown()
+    listener.join(60.0)  # the wait has an end after 1 s; the rest is for a busy machine
+    assert not listener.is_alive()
+    executor.shutdown()
