@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.equations import star_sums, StarSums
+from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.problem import Problem, State
 from starcal_ros.estimation.star_equations import arrange, Measurements, StarTable
 from starcal_ros.estimation.unknowns import Assumptions, Layout, unknowns_of
@@ -60,11 +60,16 @@ class Small:
         """Stars that are used, weighted by their covariances."""
         return arrange(self.table, self.keep, self.table.covariance_px2)
 
+    def linear(self) -> Linearisation:
+        """Linearisation at the state."""
+        measurements = self.measurements()
+        return Linearisation(
+            self.problem, self.state, self.layout, measurements, self.predicted_px
+        )
+
     def sums(self) -> StarSums:
         """Sums over the stars at the state."""
-        return star_sums(
-            self.measurements(), self.problem, self.state, self.layout, self.predicted_px
-        )
+        return star_sums(self.linear())
 
     def named(self, x: Floats) -> dict[str, Floats]:
         """Shared unknowns by the name of their entry."""

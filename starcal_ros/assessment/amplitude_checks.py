@@ -91,7 +91,7 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     estimate without the prior: what contradicts a narrow prior moves other unknowns, first the
     field and the shapes of the images, and hardly its own.
     """
-    found, layout, problem = estimate.posterior, estimate.layout, estimate.problem
+    found, layout, problem = estimate.posterior, estimate.linear.layout, estimate.linear.problem
     terms = []
     camera = np.arange(layout.count)[layout.places['camera']]
     for k in np.setdiff1d(camera, found.estimated):
@@ -100,7 +100,7 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
         if information <= 1e-9 * cross[k]:
             continue
         step = float(found.gradient[k] - cross @ found.mean) / information
-        held = float(estimate.state.parameters[k - camera[0]])
+        held = float(estimate.linear.state.parameters[k - camera[0]])
         terms.append(HeldTerm(layout.labels[k], held, held + step, information**-0.5))
     total, working = np.diag(found.covariance), found.working_variance
     first = layout.places['mountings'].start if 'mountings' in layout else layout.count
@@ -109,9 +109,7 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
         tested = np.isin(at, found.estimated) & (layout.prior_precision[at] > 0)
         if entry.name not in _STATED or not tested.any():
             continue
-        means, variances = without_prior(
-            estimate.sums, problem, estimate.state, layout, entry.name
-        )
+        means, variances = without_prior(estimate.sums, estimate.linear, entry.name)
         for k, mean, variance in zip(at[tested], means[tested], variances[tested], strict=True):
             if not np.isfinite(variance):
                 continue

@@ -79,7 +79,7 @@ def sigma_budget(
     covariance = estimate.joint_covariance
     held = _traces(seen[:, rows][:, :, rows], covariance - estimate.posterior.covariance[part])
     shapes = _known_shapes(estimate, errors)
-    common = common_shape(estimate.layout, estimate.posterior.common_shape_px2)
+    common = common_shape(estimate.linear.layout, estimate.posterior.common_shape_px2)
     causes = [
         _Cause('stars', _noise(estimate, errors, shapes, in_root), _of_stars(estimate)),
         *_unknowns(estimate, options, errors, in_root),
@@ -121,7 +121,7 @@ def _squares(estimate: Estimate) -> tuple[Floats, Floats]:
     means, of_pixel = mean_squares(estimate)
     camera = estimate.geometry.camera
     found = Derivatives.at(camera, pixel_grid(camera, BUDGET_COLUMNS, BUDGET_ROWS))
-    J = np.zeros((len(found.J), 3, estimate.layout.count))
+    J = np.zeros((len(found.J), 3, estimate.linear.layout.count))
     J[:, :, _rows(estimate)] = np.nan_to_num(found.of_shape(camera))
     by_pixel = np.nan_to_num((found.by_pixel**2).sum(axis=(1, 2)))
     squares = np.concatenate([means, J.transpose(0, 2, 1) @ J])
@@ -134,7 +134,7 @@ def mean_squares(estimate: Estimate) -> tuple[Floats, float]:
 
     By the shared unknowns; with that of a displacement of the pixel along both axes.
     """
-    camera, layout = estimate.geometry.camera, estimate.layout
+    camera, layout = estimate.geometry.camera, estimate.linear.layout
     found = Derivatives.at(camera, pixel_grid(camera, GRID, GRID))
     seen = np.isfinite(found.directions[:, 0])
     squares = np.zeros((2, layout.count, layout.count))
@@ -147,7 +147,7 @@ def mean_squares(estimate: Estimate) -> tuple[Floats, float]:
 
 def _rows(estimate: Estimate) -> Indices:
     """Return the places of the numbers of `lookup.Derivatives` among the shared unknowns."""
-    return estimate.layout.of(['camera', 'alignment', 'field'])
+    return estimate.linear.layout.of(['camera', 'alignment', 'field'])
 
 
 def _traces(squares: Floats, covariance: Floats) -> Floats:
@@ -168,7 +168,7 @@ def _gain(errors: ErrorParts, T: Floats, squares: Floats) -> Floats:
 
 def _known(errors: ErrorParts, estimate: Estimate, names: Sequence[str]) -> Floats:
     """Return T (r, s) of an estimator that is given some shared unknowns."""
-    rows = errors.root[estimate.layout.of(names)]
+    rows = errors.root[estimate.linear.layout.of(names)]
     size = np.linalg.norm(rows, axis=1, keepdims=True)
     rows = (rows / np.where(size > 0, size, 1.0))[size[:, 0] > 0]
     return np.asarray(null_space(rows)) if len(rows) else np.eye(errors.root.shape[1])
@@ -176,8 +176,7 @@ def _known(errors: ErrorParts, estimate: Estimate, names: Sequence[str]) -> Floa
 
 def _known_shapes(estimate: Estimate, errors: ErrorParts) -> Floats:
     """Return T (r, r) of an estimator that is given the shapes of the images."""
-    given = (estimate.sums, estimate.problem, estimate.state, estimate.layout)
-    without = equations(*given, np.full(3, _KNOWN_SHAPE_PX))
+    without = equations(estimate.sums, estimate.linear, np.full(3, _KNOWN_SHAPE_PX))
     hidden = errors.root.T @ (without.information - estimate.posterior.information) @ errors.root
     values, vectors = np.linalg.eigh(hidden)
     return np.asarray((vectors * (1.0 + values.clip(0.0)) ** -0.5) @ vectors.T)
@@ -198,7 +197,7 @@ def _unknowns(
     estimate: Estimate, options: CalibrationOptions, errors: ErrorParts, squares: Floats
 ) -> list[_Cause]:
     """Return the causes that are unknowns with a prior, or without one."""
-    layout, field = estimate.layout, estimate.posterior.field
+    layout, field = estimate.linear.layout, estimate.posterior.field
 
     def text(name: str) -> str:
         sigma = float(layout[name].sigma[0])
@@ -257,7 +256,7 @@ def _estimated(rms_px: float, likelihood_ratio: float) -> str:
 
 def _field_px(estimate: Estimate) -> float:
     """Return the RMS of the field over the detector, what is not known of it included."""
-    place = estimate.layout.places['field']
+    place = estimate.linear.layout.places['field']
     square = estimate.posterior.mean[place] ** 2 + np.diag(estimate.posterior.covariance)[place]
     return math.sqrt(0.5 * float(square.sum()))
 
@@ -301,7 +300,7 @@ def _of_slow(estimate: Estimate, options: CalibrationOptions) -> str:
 
 def _of_held(estimate: Estimate) -> str:
     """Return the parameters that are held and have a sigma; empty if there are none."""
-    problem = estimate.problem
+    problem = estimate.linear.problem
     held = np.setdiff1d(np.flatnonzero(np.isfinite(problem.prior_sigma)), problem.free)
     names = [f'{problem.parameter_names[k]} {problem.prior_sigma[k]:.3g}' for k in held]
     return f'1-sigma of the prior: {", ".join(names)}' if names else ''

@@ -29,7 +29,7 @@ from starcal_ros.errors import OptionError
 from starcal_ros.estimation.attitude_errors import whitened_attitude_errors
 from starcal_ros.estimation.calibrate import Estimate, problem_of, start_of
 from starcal_ros.estimation.calibration_options import CalibrationOptions
-from starcal_ros.estimation.equations import chain, seen_by_stars, star_columns, tracker_turns
+from starcal_ros.estimation.equations import Linearisation, star_rows, tracker_turns
 from starcal_ros.estimation.problem import Problem, State
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.unknowns import Assumptions, IMAGE_ROTATION, unknowns_of
@@ -69,7 +69,7 @@ def target(estimate: Estimate, name: str) -> Target:
 
     Raises OptionError if nothing that is estimated has this name.
     """
-    layout = estimate.layout
+    layout = estimate.linear.layout
     if name in (MAP, LINE_OF_SIGHT):
         (of_map, of_pointing), of_pixel = mean_squares(estimate)
         unresolved = of_pixel * estimate.pixel_sigma_px**2
@@ -165,37 +165,24 @@ def _information(
     """Return the information (c, r, r) of candidates in the columns of a root (P, r)."""
     problem, state = _as_estimated(estimate, candidates, options)
     camera = estimate.geometry.camera
-    velocity_m_s = float('velocity' in estimate.layout)  # the columns of what is in the list
+    # The columns of what is in the list.
+    velocity_m_s = float('velocity' in estimate.linear.layout)
     assumed = Assumptions(velocity_m_s, (0.0, 0.0), 0.0)
     at_rest = np.zeros((len(candidates), 3))
     layout = unknowns_of(problem, state, at_rest, (camera.width, camera.height), assumed)
-    place = [estimate.layout.labels.index(label) for label in layout.labels]
+    place = [estimate.linear.layout.labels.index(label) for label in layout.labels]
     table = star_table(candidates)
     measurements = arrange(table, np.ones(len(table), bool), table.covariance_px2)
-    E = chain(problem, layout, len(candidates))[:, :-1, :-1]
-    at = seen_by_stars(layout)
-    field = np.arange(layout.count)[layout.places['field']]
-    functions = layout['field'].functions
-    assert functions is not None
+    linear = Linearisation(problem, state, layout, measurements, table.measured_px)
     _, J = whitened_attitude_errors(problem, state)
     turning, turns = tracker_turns(layout)
-    c, b = E.shape[1], E.shape[2] - len(at)
     information = np.zeros((len(candidates), root.shape[1], root.shape[1]))
-    for chunk, Z in star_columns(measurements, problem, state, layout):
-        m, _, n = chunk.direction_icrf.shape
-        of_stars, of_tracker, of_shape = np.split(
-            np.arange(2 * n + b), [2 * n, 2 * n + IMAGE_ROTATION.stop]
-        )
-        shared = np.zeros((m, 2 * n + b, layout.count))
-        own = np.zeros((m, 2 * n + b, b))  # rotation and shape of each image
-        by_columns = Z[:, :c].reshape(2, c, m, n).transpose(2, 0, 3, 1).reshape(m, 2 * n, c)
-        columns = by_columns @ E[chunk.image]
-        shared[:, of_stars[:, None], at], own[:, of_stars] = np.split(columns, [len(at)], axis=2)
-        phi = functions(chunk.measured_px).reshape(-1, m, n).transpose(1, 2, 0)
-        wuu, wuv, wvv = chunk.whitener.reshape(3, m, n, 1)
-        u, v = np.split(field, 2)
-        shared[:, :n, u], shared[:, :n, v] = wuu * phi, wuv * phi
-        shared[:, n : 2 * n, v] = wvv * phi
+    for chunk, by_shared, by_own, _ in star_rows(linear):
+        _, stars, b = by_own.shape
+        # Of the star tracker, and of the prior of the shape.
+        shared = np.pad(by_shared, ((0, 0), (0, b), (0, 0)))
+        own = np.pad(by_own, ((0, 0), (0, b), (0, 0)))
+        of_tracker, of_shape = np.split(np.arange(stars, stars + b), [IMAGE_ROTATION.stop])
         shared[:, of_tracker[:, None], turning] = -J[chunk.image] @ turns[chunk.image]
         own[:, of_tracker, IMAGE_ROTATION] = J[chunk.image]
         own[:, of_shape, layout.places['shape']] = np.diag(1.0 / estimate.posterior.shape_sigma_px)
@@ -210,10 +197,10 @@ def _as_estimated(
 ) -> tuple[Problem, State]:
     """Return problem and state of candidates: the camera, and star trackers as the images have."""
     problem = problem_of(Ensemble(tuple(candidates)), estimate.geometry, options)
-    sigma_rad = np.median(estimate.problem.star_tracker_sigma_rad, axis=0)
+    sigma_rad = np.median(estimate.linear.problem.star_tracker_sigma_rad, axis=0)
     problem = dataclasses.replace(
         problem, star_tracker_sigma_rad=np.tile(sigma_rad, (len(candidates), 1))
     )
-    found = estimate.state
+    found = estimate.linear.state
     state = start_of(problem, estimate.geometry, len(found.focal), bool(len(found.rate)))
     return problem, dataclasses.replace(state, focal=found.focal, rate=found.rate)

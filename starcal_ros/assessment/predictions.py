@@ -22,7 +22,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.equations import chain, seen_by_stars, star_columns
+from starcal_ros.estimation.equations import star_rows
 from starcal_ros.estimation.levenberg_marquardt import inverse
 from starcal_ros.estimation.posterior import common_shape
 from starcal_ros.records import ResidualBin
@@ -73,9 +73,9 @@ def predicted_residuals(estimate: Estimate) -> tuple[Floats, Floats]:
     expected: Floats = np.full(len(estimate.table), np.nan)
     posterior = estimate.posterior
     # The sidereal time of an image that is left out is not known from the others: kept as found.
-    part = np.setdiff1d(posterior.estimated, estimate.layout.of(['site']))
+    part = np.setdiff1d(posterior.estimated, estimate.linear.layout.of(['site']))
     # A change that all images share moves no prediction of one from the others.
-    shared = common_shape(estimate.layout, posterior.common_shape_px2)
+    shared = common_shape(estimate.linear.layout, posterior.common_shape_px2)
     covariance = (posterior.covariance - shared)[np.ix_(part, part)]
     shown = np.flatnonzero(np.diag(covariance) > 0)
     part, covariance = part[shown], covariance[np.ix_(shown, shown)]
@@ -84,7 +84,7 @@ def predicted_residuals(estimate: Estimate) -> tuple[Floats, Floats]:
     part, covariance = part[follow], covariance[np.ix_(follow, follow)]
     information = inverse(covariance)
     of_image = np.zeros(estimate.posterior.own.shape[1])
-    of_image[estimate.layout.places['shape']] = estimate.posterior.shape_sigma_px**-2
+    of_image[estimate.linear.layout.places['shape']] = estimate.posterior.shape_sigma_px**-2
     for rows, columns, own, residual in _images(estimate, part):
         predicted = _predicted(columns, own, residual, information, np.diag(of_image))
         if predicted is not None:
@@ -94,7 +94,7 @@ def predicted_residuals(estimate: Estimate) -> tuple[Floats, Floats]:
 
 def _followed(estimate: Estimate, part: Indices) -> Indices:
     """Return which unknowns move pixels by more than a thousandth of the noise of a star."""
-    layout = estimate.layout
+    layout = estimate.linear.layout
     variance = np.diag(estimate.posterior.covariance)[part]
     weight = np.zeros(layout.count)
     weight[layout.places['field']] = np.diag(estimate.sums.field_information)
@@ -104,36 +104,15 @@ def _followed(estimate: Estimate, part: Indices) -> Indices:
 
 def _images(estimate: Estimate, part: Indices) -> Iterator[tuple[Indices, Floats, Floats, Floats]]:
     """Yield rows, columns (2 n, d), own columns (2 n, b) and residuals (2 n,) of each image."""
-    problem, state, layout = estimate.problem, estimate.state, estimate.layout
-    E = chain(problem, layout, estimate.table.image_count)
-    at = seen_by_stars(layout)
-    common = len(at)
-    field = layout.places['field']
-    functions = layout['field'].functions
-    assert functions is not None
-    for chunk, Z in star_columns(estimate.measurements, problem, state, layout):
+    found = estimate.posterior
+    for chunk, shared, own, residual in star_rows(estimate.linear):
+        left = residual - shared @ found.mean
+        left -= np.einsum('mij,mj->mi', own, found.of_images[chunk.image])
         m, _, n = chunk.direction_icrf.shape
-        c = Z.shape[1]
-        by_image = Z.reshape(2, c, m, n).transpose(2, 0, 3, 1)
-        phi = functions(estimate.weights.predicted_px[chunk.row].T).T.reshape(m, n, -1)
-        t = phi.shape[2]
-        whitener = chunk.whitener.reshape(3, m, n)
-        rows = chunk.row.reshape(m, n)
-        for i, image in enumerate(chunk.image):
-            real = whitener[0, i] > 0
-            count = int(real.sum())
-            star = by_image[i][:, real] @ E[image]
-            columns = np.zeros((2, count, layout.count))
-            columns[:, :, at] = star[:, :, :common]
-            wuu, wuv, wvv = (one[:, None] for one in whitener[:, i, real])
-            columns[0, :, field] = np.hstack([wuu * phi[i][real], wuv * phi[i][real]])
-            columns[1, :, field] = np.hstack([np.zeros((count, t)), wvv * phi[i][real]])
-            own = star[:, :, common:-1].reshape(2 * count, -1)
-            residual = star[:, :, -1].reshape(2 * count)
-            flat = columns.reshape(2 * count, -1)
-            left = residual - flat @ estimate.posterior.mean
-            left = left - own @ estimate.posterior.of_images[image]
-            yield rows[i][real], flat[:, part], own, left
+        real = chunk.whitener[0].reshape(m, n) > 0
+        for i, rows in enumerate(chunk.row.reshape(m, n)):
+            used = np.tile(real[i], 2)
+            yield rows[real[i]], shared[i, used][:, part], own[i, used], left[i, used]
 
 
 def _predicted(

@@ -39,7 +39,7 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
     """
     # Unknowns outside of the search (field, shapes, velocity) keep their estimates.
     estimate = _with_search_alone(estimate)
-    problem, state = estimate.problem, estimate.state
+    problem, state = estimate.linear.problem, estimate.linear.state
     measurements = arrange(estimate.table, estimate.kept, estimate.covariance_px2)
     solution = minimise(problem, state, measurements, least_gain=_LEAST_GAIN)
     cost = solution.normal.cost
@@ -58,7 +58,8 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
             break
         if not solution.converged:
             break
-        rise = 2.0 * (solution.normal.cost - cost) + _of_prior(names, estimate.problem, problem)
+        rise = 2.0 * (solution.normal.cost - cost)
+        rise += _of_prior(names, estimate.linear.problem, problem)
         removals.append(
             _removal(
                 estimate,
@@ -77,9 +78,9 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
 
 def _with_search_alone(estimate: Estimate) -> Estimate:
     """Return the estimate whose stars are where camera and rotations of the state put them."""
-    problem = estimate.problem
-    layout, found = estimate.layout, estimate.posterior
-    state = moved(problem, estimate.state, layout, found.mean, found.of_images[:, IMAGE_ROTATION])
+    linear, found = estimate.linear, estimate.posterior
+    problem, own = linear.problem, found.of_images[:, IMAGE_ROTATION]
+    state = moved(problem, linear.state, linear.layout, found.mean, own)
     rotations = state.camera_from_icrf.as_matrix()
     table = estimate.table
     explained = residuals_px(table, problem.model, image_parameters(problem, state), rotations)
@@ -89,7 +90,7 @@ def _with_search_alone(estimate: Estimate) -> Estimate:
         estimate,
         geometry=dataclasses.replace(estimate.geometry, camera=camera),
         table=dataclasses.replace(table, measured_px=measured_px),
-        state=state,
+        linear=dataclasses.replace(linear, state=state),
     )
 
 

@@ -30,7 +30,7 @@ from starcal_ros.estimation.calibration_options import (
     estimated_parameters,
 )
 from starcal_ros.estimation.centroid_noise import CentroidVariance
-from starcal_ros.estimation.equations import star_sums, StarSums
+from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.minimise import minimise, Minimum
 from starcal_ros.estimation.mountings import (
@@ -120,11 +120,10 @@ class Estimate:
     shared_covariance : (s, s)
         Covariance of camera parameters, focal terms, alignment, rate and mountings, which are
         ``shared_names``.
-    problem, state, layout, posterior
-        At the last linearisation: the state is the one before the last step.
+    linear : Linearisation
+        The last one: the state is the one before the last step.
     sums : StarSums
-    measurements : Measurements
-        The stars that were used, with the working weights.
+    posterior : Posterior
     weights : Weights
     table : StarTable
     kept : (n,) bool
@@ -165,12 +164,9 @@ class Estimate:
     information_names: tuple[str, ...]
     shared_covariance: Floats
     shared_names: tuple[str, ...]
-    problem: Problem
-    state: State
-    layout: Layout
-    posterior: Posterior
+    linear: Linearisation
     sums: StarSums
-    measurements: Measurements
+    posterior: Posterior
     weights: Weights
     table: StarTable
     kept: Mask
@@ -323,59 +319,68 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
         whole = k > 0
         if not judged.kept.any():
             raise NotObservable('no image has three stars that fit')
-        problem = weighted_attitudes(problem, data, judged.attitudes)
-        rates_rad_s = state.camera_from_star_tracker.apply(data.rates_rad_s)
-        size = camera.width, camera.height
-        layout = unknowns_of(problem, state, rates_rad_s, size, _assumed(data), whole)
-        inflation_px2 = judged.inflation_px2(table)
-        measurements = arrange(table, judged.kept, judged.working_px2(table))
-        predicted_px = table.measured_px - residual_px
-        sums = star_sums(measurements, problem, state, layout, predicted_px)
-        found = posterior(sums, problem, state, layout, shape_px, whole, near)
-        near = found if whole else None
-        after_step = moved(problem, state, layout, found.mean, found.of_images[:, IMAGE_ROTATION])
-        residual_px = _residuals_px(problem, after_step, table, layout, found, camera)
-        freedom = degrees_of_freedom(
-            found, measurements, problem, state, layout, table, judged.kept
+        last = _round(data, problem, state, judged, residual_px, shape_px, whole, near)
+        after = judge(
+            data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes
         )
-        attitudes = tracker_attitudes(
-            data, problem, state, after_step, sums, layout, found, judged.attitudes
-        )
-        after = judge(data, from_sky, residual_px, freedom, judged, found, attitudes)
-        shape_px = np.maximum(found.shape_sigma_px, _FIRST_SHAPE_PX)
+        near = last.posterior if whole else None
+        residual_px = last.residual_px
+        shape_px = np.maximum(last.posterior.shape_sigma_px, _FIRST_SHAPE_PX)
         iterations += 1
-        if whole and _step_sigma(layout, found) < _STEP_SIGMA and agree(judged, after, table):
+        step_sigma = _step_sigma(last.linear.layout, last.posterior)
+        if whole and step_sigma < _STEP_SIGMA and agree(judged, after, table):
             termination = 'converged'
             break
         if k < _ROUNDS - 1:
-            state, judged = after_step, after
+            state, judged = last.after, after
     weights = Weights(
         judged.covariance_px2(table)[:, [0, 2]].mean(axis=1),
-        inflation_px2,
+        judged.inflation_px2(table),
         from_sky,
-        predicted_px,
         judged.errors,
-        tracker_covariances(problem, data, attitudes),
+        tracker_covariances(last.linear.problem, data, last.attitudes),
     )
-    found = with_shared_errors(found, sums, measurements, problem, state, layout, weights)
-    return _result(
-        data,
-        ensemble,
-        problem,
-        state,
-        after_step,
-        layout,
-        found,
-        sums,
-        measurements,
-        weights,
-        judged,
-        attitudes,
-        residual_px,
-        freedom,
-        iterations,
-        termination,
-    )
+    return _result(data, ensemble, last, judged, weights, iterations, termination)
+
+
+@dataclass(frozen=True)
+class _Round:
+    """A linearisation, its posterior, and what the state after its step leaves of the data."""
+
+    linear: Linearisation
+    sums: StarSums
+    posterior: Posterior
+    after: State
+    residual_px: Floats
+    freedom: Floats
+    attitudes: Attitudes
+
+
+def _round(
+    data: Data,
+    problem: Problem,
+    state: State,
+    judged: Judged,
+    residual_px: Floats,
+    shape_px: Floats,
+    whole: bool,
+    near: Posterior | None,
+) -> _Round:
+    """Return a step from a state, where the residuals are (n, 2), with the weights judged."""
+    table, camera = data.table, data.prior.camera
+    problem = weighted_attitudes(problem, data, judged.attitudes)
+    rates_rad_s = state.camera_from_star_tracker.apply(data.rates_rad_s)
+    size = camera.width, camera.height
+    layout = unknowns_of(problem, state, rates_rad_s, size, _assumed(data), whole)
+    measurements = arrange(table, judged.kept, judged.working_px2(table))
+    linear = Linearisation(problem, state, layout, measurements, table.measured_px - residual_px)
+    sums = star_sums(linear)
+    found = posterior(sums, linear, shape_px, whole, near)
+    after = moved(problem, state, layout, found.mean, found.of_images[:, IMAGE_ROTATION])
+    left_px = _residuals_px(problem, after, table, layout, found, camera)
+    freedom = degrees_of_freedom(found, linear, table, judged.kept)
+    attitudes = tracker_attitudes(data, linear, sums, found, after, judged.attitudes)
+    return _Round(linear, sums, found, after, left_px, freedom, attitudes)
 
 
 def _assumed(data: Data) -> Assumptions:
@@ -461,25 +466,18 @@ def _residuals_px(
 def _result(
     data: Data,
     ensemble: Ensemble,
-    problem: Problem,
-    state: State,
-    after: State,
-    layout: Layout,
-    found: Posterior,
-    sums: StarSums,
-    measurements: Measurements,
-    weights: Weights,
+    last: _Round,
     judged: Judged,
-    attitudes: Attitudes,
-    residual_px: Floats,
-    freedom: Floats,
+    weights: Weights,
     iterations: int,
     termination: str,
 ) -> Estimate:
-    """Return the estimate of the last round."""
+    """Return the estimate of the last round, which was made with the weights judged."""
     table, options, prior = data.table, data.options, data.prior
     size = prior.camera.width, prior.camera.height
-    kept = judged.kept
+    linear, after, attitudes, kept = last.linear, last.after, last.attitudes, judged.kept
+    problem, layout, residual_px = linear.problem, linear.layout, last.residual_px
+    found = with_shared_errors(last.posterior, last.sums, linear, weights)
     camera = dataclasses.replace(prior.camera, field=field_of(layout, found, size)).replace(
         **{problem.parameter_names[i]: float(after.parameters[i]) for i in problem.free}
     )
@@ -517,19 +515,16 @@ def _result(
         information_names=tuple(layout.labels[k] for k in asked),
         shared_covariance=covariance[np.ix_(shared, shared)],
         shared_names=names,
-        problem=problem,
-        state=state,
-        layout=layout,
+        linear=linear,
+        sums=last.sums,
         posterior=found,
-        sums=sums,
-        measurements=measurements,
         weights=weights,
         table=table,
         kept=kept,
         residual_px=residual_px,
         covariance_px2=judged.covariance_px2(table),
         variance=judged.variance,
-        variance_factor=float(chi2_given / max(float(freedom[kept].sum()), 1e-9)),
+        variance_factor=float(chi2_given / max(float(last.freedom[kept].sum()), 1e-9)),
         star_tracker_sigma_rad=noise * data.stated_rad,
         misfit_image=attitudes.misfit | lost,
         dropped_catalog_id=dropped_stars(table, kept),

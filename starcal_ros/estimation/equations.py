@@ -28,6 +28,24 @@ from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout, Unknown
 
 
 @dataclass(frozen=True)
+class Linearisation:
+    """
+    The list of unknowns of a problem at a state, and the stars that are used.
+
+    ``measurements`` have the working weights; ``predicted_px`` (n, 2) are the places of all
+    observations without their noise, where the functions of the field are taken: at the measured
+    places they would correlate with the residuals, by more than the stars show of a field that is
+    nearly a change of the camera.
+    """
+
+    problem: Problem
+    state: State
+    layout: Layout
+    measurements: Measurements
+    predicted_px: Floats
+
+
+@dataclass(frozen=True)
 class StarSums:
     """
     Sums over the stars of m images.
@@ -81,12 +99,7 @@ class Equations:
     covariance: Floats
 
 
-def star_columns(
-    measurements: Measurements,
-    problem: Problem,
-    state: State,
-    layout: Layout,
-) -> Iterator[tuple[Chunk, Floats]]:
+def star_columns(linear: Linearisation) -> Iterator[tuple[Chunk, Floats]]:
     """
     Yield each chunk with its whitened columns (2, c, m n).
 
@@ -98,11 +111,12 @@ def star_columns(
     NotObservable
         If the camera model has no image of a star.
     """
+    problem, state = linear.problem, linear.state
     p = problem.camera_count
     own = image_parameters(problem, state)
     rotations = state.camera_from_icrf.as_matrix()
-    turning = [entry for entry in layout.shared if entry.turn is not None]
-    for chunk, J in whitened_chunks(measurements, problem.model, own, rotations):
+    turning = [entry for entry in linear.layout.shared if entry.turn is not None]
+    for chunk, J in whitened_chunks(linear.measurements, problem.model, own, rotations):
         if J is None:
             raise NotObservable('a star has no image')
         n = chunk.direction_icrf.shape[2]
@@ -119,6 +133,31 @@ def star_columns(
         yield chunk, np.concatenate([J[:, :p], *turned, J[:, p : p + 4]], axis=1)
 
 
+def star_rows(linear: Linearisation) -> Iterator[tuple[Chunk, Floats, Floats, Floats]]:
+    """
+    Yield each chunk with its whitened derivatives and residuals, u before v.
+
+    Derivatives (m, 2 n, P) by the shared unknowns and (m, 2 n, b) by those of each image, and the
+    residuals (m, 2 n).  The layout has a field.
+    """
+    layout = linear.layout
+    E = chain(linear.problem, layout, linear.measurements.image_count)
+    at, field = seen_by_stars(layout), layout.of(['field'])
+    functions = layout['field'].functions
+    assert functions is not None
+    of_u, of_v = np.split(field, 2)
+    for chunk, Z in star_columns(linear):
+        m, _, n = chunk.direction_icrf.shape
+        rows = Z.reshape(2, -1, m, n).transpose(2, 0, 3, 1).reshape(m, 2 * n, -1) @ E[chunk.image]
+        shared = np.zeros((m, 2 * n, layout.count))
+        shared[:, :, at] = rows[:, :, : len(at)]
+        phi = functions(linear.predicted_px[chunk.row].T).reshape(-1, m, n).transpose(1, 2, 0)
+        wuu, wuv, wvv = chunk.whitener.reshape(3, m, n, 1)
+        shared[:, :n, of_u], shared[:, :n, of_v] = wuu * phi, wuv * phi
+        shared[:, n:, of_v] = wvv * phi
+        yield chunk, shared, rows[:, :, len(at) : -1], rows[:, :, -1]
+
+
 def _predicted_px(chunk: Chunk, residual: Floats) -> Floats:
     """
     Return the predicted pixels (2, m n) of a chunk from its whitened residuals (2, m n).
@@ -131,26 +170,15 @@ def _predicted_px(chunk: Chunk, residual: Floats) -> Floats:
     return np.asarray(chunk.measured_px - np.stack([(residual[0] - wuv * v) / wuu, v]))
 
 
-def star_sums(
-    measurements: Measurements,
-    problem: Problem,
-    state: State,
-    layout: Layout,
-    predicted_px: Floats,
-) -> StarSums:
-    """
-    Return the sums over the stars at a state.
-
-    ``predicted_px`` (n, 2) are the places of all observations without their noise, where the
-    functions of the field are taken: at the measured places they would correlate with the
-    residuals, by more than the stars show of a field that is nearly a change of the camera.
-    """
+def star_sums(linear: Linearisation) -> StarSums:
+    """Return the sums over the stars at a state."""
+    layout, measurements = linear.layout, linear.measurements
     functions = layout['field'].functions if 'field' in layout else None
     t = len(layout['field']) // 2 if functions is not None else 0
     blocks: Floats = np.empty((0, 0, 0))
     cross = blocks
     uu, uv, vv = np.zeros((3, t, t))
-    for chunk, Z in star_columns(measurements, problem, state, layout):
+    for chunk, Z in star_columns(linear):
         c = Z.shape[1]
         m, _, n = chunk.direction_icrf.shape
         if not blocks.size:
@@ -160,7 +188,7 @@ def star_sums(
         blocks[chunk.image] = (by_image @ by_image.transpose(0, 1, 3, 2)).sum(axis=0)
         if functions is None:
             continue
-        phi = functions(predicted_px[chunk.row].T)
+        phi = functions(linear.predicted_px[chunk.row].T)
         wuu, wuv, wvv = chunk.whitener
         of_image = phi.reshape(t, m, n).transpose(1, 0, 2)
         for part, columns in (
@@ -175,7 +203,8 @@ def star_sums(
             mixed = phi * wuv
             uv += of_u @ mixed.T
             vv += mixed @ mixed.T
-    return _chained(blocks, np.block([[uu, uv], [uv.T, vv]]), cross, problem, layout)
+    information = np.block([[uu, uv], [uv.T, vv]])
+    return _chained(blocks, information, cross, linear.problem, layout)
 
 
 def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> NormalEquations:
@@ -204,11 +233,10 @@ def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> Nor
     return NormalEquations(0.0, A, a, B, C, c)
 
 
-def equations(
-    sums: StarSums, problem: Problem, state: State, layout: Layout, shape_sigma_px: Floats
-) -> Equations:
+def equations(sums: StarSums, linear: Linearisation, shape_sigma_px: Floats) -> Equations:
     """Return the normal equations of `arrow` with the images eliminated."""
-    return eliminated(arrow(sums, problem, state, layout), layout, shape_sigma_px)
+    normal = arrow(sums, linear.problem, linear.state, linear.layout)
+    return eliminated(normal, linear.layout, shape_sigma_px)
 
 
 def eliminated(normal: NormalEquations, layout: Layout, shape_sigma_px: Floats) -> Equations:

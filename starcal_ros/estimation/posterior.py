@@ -29,19 +29,17 @@ from starcal_ros.estimation.amplitudes import (
 from starcal_ros.estimation.attitude_errors import whitened_attitude_errors
 from starcal_ros.estimation.equations import (
     arrow,
-    chain,
     chain_columns,
     eliminated,
     Equations,
+    Linearisation,
     seen_by_stars,
-    star_columns,
+    star_rows,
     StarSums,
     tracker_turns,
 )
 from starcal_ros.estimation.levenberg_marquardt import inverse
-from starcal_ros.estimation.problem import Problem, State
 from starcal_ros.estimation.shared_errors import GroupSums, SharedError
-from starcal_ros.estimation.star_equations import Measurements
 from starcal_ros.estimation.unknowns import (
     FIELD_OCTAVES,
     FOCAL_PARAMETERS,
@@ -140,9 +138,7 @@ class Posterior:
 
 def posterior(
     sums: StarSums,
-    problem: Problem,
-    state: State,
-    layout: Layout,
+    linear: Linearisation,
     before: Floats,
     whole: bool,
     near: Posterior | None = None,
@@ -159,7 +155,8 @@ def posterior(
     near : Posterior, optional
         A whole one at a state near this one: the search of amplitudes begins with its own.
     """
-    normal = arrow(sums, problem, state, layout)
+    layout = linear.layout
+    normal = arrow(sums, linear.problem, linear.state, layout)
     start = eliminated(normal, layout, before)
     solver = _Solver(layout, whole)
     base = solver.amplitudes(start, near.field if near else None)
@@ -191,9 +188,7 @@ def posterior(
     )
 
 
-def without_prior(
-    sums: StarSums, problem: Problem, state: State, layout: Layout, name: str
-) -> tuple[Floats, Floats]:
+def without_prior(sums: StarSums, linear: Linearisation, name: str) -> tuple[Floats, Floats]:
     """
     Return mean and variance (q,) of the unknowns of an entry without its prior.
 
@@ -203,11 +198,12 @@ def without_prior(
     wide = Layout(
         tuple(
             dataclasses.replace(one, sigma=_without_prior(one)) if one.name == name else one
-            for one in layout.entries
+            for one in linear.layout.entries
         )
     )
-    found = posterior(sums, problem, state, wide, np.full(3, _SMALL_SHAPE_PX), True)
-    at = layout.of([name])
+    linear = dataclasses.replace(linear, layout=wide)
+    found = posterior(sums, linear, np.full(3, _SMALL_SHAPE_PX), True)
+    at = wide.of([name])
     precision, off = wide.prior_precision[at], wide.prior_offset[at]
     with np.errstate(divide='ignore', invalid='ignore'):
         shown = 1.0 / found.working_variance[at] - precision
@@ -359,8 +355,6 @@ class Weights:
     inflation_px2 : (n,)
         Variance per axis that the working weights have beyond that of each observation.
     from_sky : (n, 2, 2)
-    predicted_px : (n, 2)
-        As for `equations.star_sums`.
     errors : tuple of SharedError
     attitudes : tuple of (images, groups, covariance, independent)
         Images (k,) of each star tracker, their groups (k,) and the covariance (g, g) of errors of
@@ -371,25 +365,19 @@ class Weights:
     variance_px2: Floats
     inflation_px2: Floats
     from_sky: Floats
-    predicted_px: Floats
     errors: tuple[SharedError, ...]
     attitudes: tuple[tuple[Indices, Indices, Floats, float], ...]
 
 
 def with_shared_errors(
-    found: Posterior,
-    sums: StarSums,
-    measurements: Measurements,
-    problem: Problem,
-    state: State,
-    layout: Layout,
-    weights: Weights,
+    found: Posterior, sums: StarSums, linear: Linearisation, weights: Weights
 ) -> Posterior:
     """Return the posterior with the covariance under the errors that observations share."""
+    layout = linear.layout
     covariance = found.covariance - common_shape(layout, found.common_shape_px2)
     root, held = _root(covariance, found.estimated, sums, layout)
-    excess, shared = _of_observations(found, measurements, problem, state, layout, weights, root)
-    of_attitudes, by_tracker = _of_attitudes(found, problem, state, layout, weights, root)
+    excess, shared = _of_observations(found, linear, weights, root)
+    of_attitudes, by_tracker = _of_attitudes(found, linear, weights, root)
     excess += of_attitudes
     none = (0, held.shape[1])  # errors of the modes that priors hold
     return dataclasses.replace(
@@ -432,13 +420,7 @@ def _root(
 
 
 def _of_observations(
-    found: Posterior,
-    measurements: Measurements,
-    problem: Problem,
-    state: State,
-    layout: Layout,
-    weights: Weights,
-    root: Floats,
+    found: Posterior, linear: Linearisation, weights: Weights, root: Floats
 ) -> tuple[Floats, dict[str, Floats]]:
     """
     Return ``L' X' W (V - 1/W) W X L`` (r, r) of the observations, the images eliminated.
@@ -451,31 +433,13 @@ def _of_observations(
     )
     if not groups.own_px2.any():  # the errors are those of the working weights
         return groups.own, {}
-    at = seen_by_stars(layout)
-    field = layout.places['field']
-    t = (field.stop - field.start) // 2
-    functions = layout['field'].functions
-    assert functions is not None
-    with_field = bool(root[field].any())
-    E = chain(problem, layout, measurements.image_count)
-    stars, own_columns, _ = chain_columns(layout)
     to_images = found.back @ root
-    # In the columns of the sums: camera, turns, rotation; the shapes are the camera's.
-    by_columns = np.einsum('mcd,dr->mcr', E[:, :-1, stars], root[at]) - np.einsum(
-        'mcd,mdr->mcr', E[:, :-1, own_columns], to_images
-    )
-    for chunk, Z in star_columns(measurements, problem, state, layout):
+    for chunk, shared, own, _ in star_rows(linear):
         m, _, n = chunk.direction_icrf.shape
-        c = Z.shape[1] - 1
-        own = Z[:, :c].reshape(2, c, m, n).transpose(2, 0, 3, 1).reshape(m, 2 * n, c)
-        X = (own @ by_columns[chunk.image]).reshape(m, 2, n, r).transpose(1, 0, 2, 3)
-        X = X.reshape(2, m * n, r)
+        X = (shared @ root - own @ to_images[chunk.image]).reshape(m, 2, n, r)
+        u, v = X.transpose(1, 0, 2, 3).reshape(2, m * n, r)
         wuu, wuv, wvv = (one[:, None] for one in chunk.whitener)
-        if with_field:
-            phi = functions(weights.predicted_px[chunk.row].T).T
-            u, v = phi @ root[field][:t], phi @ root[field][t:]
-            X = X + np.stack([wuu * u + wuv * v, wvv * v])
-        Y = np.stack([wuu * X[0], wuv * X[0] + wvv * X[1]], axis=1)
+        Y = np.stack([wuu * u, wuv * u + wvv * v], axis=1)
         real = chunk.whitener[0] > 0
         groups.add(chunk.row[real], Y[real])
     whole = groups.whole()
@@ -483,16 +447,11 @@ def _of_observations(
 
 
 def _of_attitudes(
-    found: Posterior,
-    problem: Problem,
-    state: State,
-    layout: Layout,
-    weights: Weights,
-    root: Floats,
+    found: Posterior, linear: Linearisation, weights: Weights, root: Floats
 ) -> tuple[Floats, dict[str, Floats]]:
     """Return the same (r, r) of the star-tracker attitudes, by noise and slow errors."""
-    _, J = whitened_attitude_errors(problem, state)
-    at, turns = tracker_turns(layout)
+    _, J = whitened_attitude_errors(linear.problem, linear.state)
+    at, turns = tracker_turns(linear.layout)
     rows = J @ (-(turns @ root[at]) - found.back[:, IMAGE_ROTATION] @ root)
     r = root.shape[1]
     working, noise, slow = np.zeros((3, r, r))

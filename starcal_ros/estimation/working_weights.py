@@ -22,7 +22,13 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.attitude_errors import attitude_errors
 from starcal_ros.estimation.calibration_options import CalibrationOptions, tracker_sigma_is_given
 from starcal_ros.estimation.centroid_noise import CentroidVariance, estimate_variance
-from starcal_ros.estimation.equations import chain, chain_columns, seen_by_stars, StarSums
+from starcal_ros.estimation.equations import (
+    chain,
+    chain_columns,
+    Linearisation,
+    seen_by_stars,
+    StarSums,
+)
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.posterior import Posterior
 from starcal_ros.estimation.problem import image_alignment, image_parameters, Problem, State
@@ -36,12 +42,7 @@ from starcal_ros.estimation.shared_errors import (
     shared_errors,
     SharedError,
 )
-from starcal_ros.estimation.star_equations import (
-    Measurements,
-    ROTATION,
-    StarTable,
-    whitened_chunks,
-)
+from starcal_ros.estimation.star_equations import ROTATION, StarTable, whitened_chunks
 from starcal_ros.estimation.tracker_errors import (
     Correlations,
     correlations_of,
@@ -140,15 +141,10 @@ def tracker_covariances(
 
 
 def degrees_of_freedom(
-    found: Posterior,
-    measurements: Measurements,
-    problem: Problem,
-    state: State,
-    layout: Layout,
-    table: StarTable,
-    kept: Mask,
+    found: Posterior, linear: Linearisation, table: StarTable, kept: Mask
 ) -> Floats:
     """Degrees of freedom (n,) that the fit leaves each observation, of two."""
+    problem, state, layout = linear.problem, linear.state, linear.layout
     leverage = np.zeros(len(table))
     E = chain(problem, layout, table.image_count)
     _, own, _ = chain_columns(layout)
@@ -157,7 +153,7 @@ def degrees_of_freedom(
     used_rows = np.concatenate([rows[: problem.camera_count], rows[ROTATION]])
     of_image, c = E[:, used_rows, own], len(used_rows)
     given = image_parameters(problem, state), state.camera_from_icrf.as_matrix()
-    for chunk, J in whitened_chunks(measurements, problem.model, *given):
+    for chunk, J in whitened_chunks(linear.measurements, problem.model, *given):
         assert J is not None  # as in the sums
         m, _, n = chunk.direction_icrf.shape
         columns = J[:, :c].reshape(2, c, m, n).transpose(2, 0, 3, 1).reshape(m, 2 * n, c)
@@ -173,24 +169,22 @@ def degrees_of_freedom(
 
 def tracker_attitudes(
     data: Data,
-    problem: Problem,
-    state: State,
-    after: State,
+    linear: Linearisation,
     sums: StarSums,
-    layout: Layout,
     found: Posterior,
+    after: State,
     before: Attitudes | None,
 ) -> Attitudes:
     """
-    Return the errors of the star trackers as the stars alone show them.
+    Return the errors of the star trackers as the stars alone show them, at the state ``after``.
 
     ``before`` are those of the round before.  Of the same images they have the same correlations:
     the attitudes change by arcseconds from round to round.
     """
-    m = data.table.image_count
+    m, problem = data.table.image_count, linear.problem
     stated = data.stated_rad
-    rotation, covariance, seen = _rotations_of_stars(sums, layout, found)
-    by_stars = Rotation.from_rotvec(-rotation) * state.camera_from_icrf
+    rotation, covariance, seen = _rotations_of_stars(sums, linear.layout, found)
+    by_stars = Rotation.from_rotvec(-rotation) * linear.state.camera_from_icrf
     error = attitude_errors(problem, after, by_stars)
     tracker_from_camera = np.swapaxes(image_alignment(problem, after).as_matrix(), -1, -2)
     covariance = tracker_from_camera @ covariance @ np.swapaxes(tracker_from_camera, -1, -2)

@@ -273,7 +273,7 @@ def _common_camera(
     images = tuple(_observations(*one, catalog, camera) for one in found.items())
     geometry = CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
     fit = estimate_calibration(Ensemble(images), geometry, options)
-    rotations = dict(zip(found, fit.state.camera_from_icrf.inv(), strict=True))
+    rotations = dict(zip(found, fit.linear.state.camera_from_icrf.inv(), strict=True))
     return dataclasses.replace(fit.geometry.camera, field=None), rotations
 
 

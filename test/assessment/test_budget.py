@@ -139,7 +139,7 @@ def test_a_slow_error_is_the_fall_of_an_estimate_that_has_none() -> None:
 @pytest.mark.parametrize('names', [['velocity'], ['field'], ['velocity', 'field']])
 def test_known_unknowns_leave_their_schur_complement(names: list[str]) -> None:
     found, _ = estimate(RAM)
-    errors, layout = found.posterior.errors, found.layout
+    errors, layout = found.posterior.errors, found.linear.layout
     assert errors is not None
     bare = dataclasses.replace(errors, excess=np.zeros_like(errors.excess))
     T = budget._known(errors, found, names)
@@ -158,7 +158,7 @@ def test_known_unknowns_do_not_depend_on_their_units() -> None:
     errors = found.posterior.errors
     assert errors is not None
     scale = np.ones((len(errors.root), 1))
-    scale[found.layout.places['velocity'].start] = 1e-24
+    scale[found.linear.layout.places['velocity'].start] = 1e-24
     rescaled = dataclasses.replace(errors, root=errors.root * scale)
     T, again = (budget._known(one, found, ['velocity']) for one in (errors, rescaled))
     np.testing.assert_allclose(again @ again.T, T @ T.T, atol=1e-9)
@@ -170,7 +170,7 @@ def test_known_shapes_add_the_information_that_they_hide() -> None:
     errors = found.posterior.errors
     assert errors is not None
     T = budget._known_shapes(found, errors)
-    given = (found.sums, found.problem, found.state, found.layout)
+    given = found.sums, found.linear
     hidden = equations(*given, np.full(3, 1e-7)).information
     hidden = hidden - equations(*given, found.posterior.shape_sigma_px).information
     C = errors.root @ errors.root.T
@@ -196,7 +196,7 @@ def test_the_covariance_is_the_root_with_its_parts() -> None:
             found.posterior,
             covariance=found.posterior.covariance - errors.root @ errors.excess @ errors.root.T,
         ),
-        found.sums, found.measurements, found.problem, found.state, found.layout,
+        found.sums, found.linear,
         dataclasses.replace(found.weights, errors=()),
     )  # fmt: skip
     assert again.errors is not None

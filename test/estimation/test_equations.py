@@ -40,7 +40,7 @@ def truth() -> Dense:
 
 @pytest.fixture(scope='module')
 def arrow(given: Small) -> Equations:
-    return equations(given.sums(), given.problem, given.state, given.layout, SHAPE)
+    return equations(given.sums(), given.linear(), SHAPE)
 
 
 def scaled(difference: Floats, matrix: NDArray[np.floating]) -> float:
@@ -98,7 +98,8 @@ def test_an_image_that_nothing_holds_stays_and_adds_nothing(given: Small) -> Non
     sigma[2] = np.inf
     problem = dataclasses.replace(given.problem, star_tracker_sigma_rad=sigma)
     without = dataclasses.replace(given, keep=keep, problem=problem)
-    arrow = equations(without.sums(), problem, given.state, given.layout, SHAPE)
+    linear = dataclasses.replace(without.linear(), problem=problem)
+    arrow = equations(without.sums(), linear, SHAPE)
     assert not arrow.own[2].any() and not arrow.back[2].any()
     assert arrow.covariance[2] == pytest.approx(np.diag(np.r_[1.0, 1.0, 1.0, SHAPE**2]))
     assert arrow.back[1].any()
@@ -115,7 +116,7 @@ def test_an_image_that_nothing_holds_stays_and_adds_nothing(given: Small) -> Non
 def test_an_image_that_its_star_tracker_alone_holds_follows_it(given: Small) -> None:
     keep = given.keep & (given.table.image != 1)
     without = dataclasses.replace(given, keep=keep)
-    arrow = equations(without.sums(), given.problem, given.state, given.layout, SHAPE)
+    arrow = equations(without.sums(), without.linear(), SHAPE)
     at = given.layout.of(['alignment'])
     # Its rotation is that of the alignment in the camera frame of its temperature.
     entry = given.layout['alignment'].tracker
@@ -153,9 +154,7 @@ def test_a_star_behind_the_camera_is_named(given: Small) -> None:
     table = dataclasses.replace(given.table, direction_icrf=direction)
     behind = dataclasses.replace(given, table=table)
     with pytest.raises(NotObservable, match='a star has no image'):
-        star_sums(
-            behind.measurements(), given.problem, given.state, given.layout, given.predicted_px
-        )
+        star_sums(behind.linear())
 
 
 def test_the_chain_turns_camera_columns_into_unknowns(given: Small) -> None:
@@ -197,9 +196,8 @@ def test_the_information_of_the_images_without_field_and_shapes_is_the_dense_one
         difference = (each[k] - expected) / np.outer(size[at], size[at])
         assert np.abs(difference).max() < EXACT
     # The same arrow, from the sums of the whole list.
-    arrow = equations(
-        stars_alone(blocks, given.problem, layout), given.problem, given.state, layout, SHAPE
-    )
+    linear = dataclasses.replace(given.linear(), layout=layout)
+    arrow = equations(stars_alone(blocks, given.problem, layout), linear, SHAPE)
     size = np.diag(each.sum(axis=0))
     assert arrow.information / np.sqrt(np.outer(size, size)) == pytest.approx(
         each.sum(axis=0) / np.sqrt(np.outer(size, size)), abs=1e-9

@@ -88,8 +88,10 @@ def test_without_noise_the_truth_comes_back(model: str) -> None:
     assert found.termination == 'converged' and found.kept.all()
     assert np.abs(found.residual_px).max() < 1e-6
     assert map_error_px(found.geometry.camera, made.truth.camera) < 1e-6
-    held = np.setdiff1d(np.arange(len(found.problem.prior_parameters)), found.problem.free)
-    before, after = found.problem.prior_parameters, found.geometry.camera.parameters
+    held = np.setdiff1d(
+        np.arange(len(found.linear.problem.prior_parameters)), found.linear.problem.free
+    )
+    before, after = found.linear.problem.prior_parameters, found.geometry.camera.parameters
     np.testing.assert_array_equal(after[held], before[held])
 
 
@@ -103,7 +105,7 @@ def test_errors_are_those_of_the_reported_covariance(model: str) -> None:
         found = estimate_of(made, model, ensemble)
         p = len(found.geometry.camera.parameters)
         assert found.covariance.shape == (p + 3, p + 3)
-        free = [*found.problem.free, p, p + 1, p + 2]
+        free = [*found.linear.problem.free, p, p + 1, p + 2]
         turn = (
             Rotation.from_quat(made.truth.star_tracker_from_camera_xyzw).inv()
             * Rotation.from_quat(found.geometry.star_tracker_from_camera_xyzw)

@@ -55,7 +55,7 @@ def test_the_noise_of_the_centroids_is_no_time_of_readout() -> None:
     in_sigma = []
     for seed in range(8):
         found = estimated(simulate(dataclasses.replace(ROLLING, row_s=0.0), seed))
-        (at,) = np.arange(found.layout.count)[found.layout.places['readout']]
+        (at,) = np.arange(found.linear.layout.count)[found.linear.layout.places['readout']]
         in_sigma.append(found.posterior.mean[at] / math.sqrt(found.posterior.covariance[at, at]))
     assert np.sqrt(np.mean(np.square(in_sigma))) < 1.3
 
@@ -83,7 +83,7 @@ def test_without_a_rate_of_every_image_neither_is_unknown(missing: slice) -> Non
         dataclasses.replace(one, star_tracker_rate_rad_s=unknown) for one in images[missing]
     ]
     found = estimated(dataclasses.replace(made, ensemble=Ensemble(tuple(images))))
-    assert 'readout' not in found.layout and 'stamps' not in found.layout
+    assert 'readout' not in found.linear.layout and 'stamps' not in found.linear.layout
 
 
 @pytest.mark.parametrize(
@@ -107,6 +107,6 @@ def test_the_velocity_is_as_uncertain_as_the_least_certain_image(
     ]
     made = dataclasses.replace(made, ensemble=Ensemble(tuple(images)))
     found = estimated(made, velocity_sigma_m_s=asked)
-    assert ('velocity' in found.layout) == (sigma_m_s > 0)
+    assert ('velocity' in found.linear.layout) == (sigma_m_s > 0)
     if sigma_m_s:
-        np.testing.assert_array_equal(found.layout['velocity'].sigma, sigma_m_s)
+        np.testing.assert_array_equal(found.linear.layout['velocity'].sigma, sigma_m_s)

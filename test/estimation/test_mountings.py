@@ -145,7 +145,7 @@ def test_a_star_tracker_that_drops_out_costs_nothing() -> None:
     given, both = campaign(2, [0] * 6 + [1] * 6)
     _, first = campaign(2, [0] * 12)
     found, alone = estimated(given, both), estimated(given, first)
-    own = found.problem.camera_count
+    own = found.linear.problem.camera_count
     shape, before = (np.sqrt(np.diag(one.covariance))[:own] for one in (found, alone))
     known = before > 0
     np.testing.assert_allclose(shape[known], before[known], rtol=0.05)  # of the attitudes alone

@@ -53,7 +53,7 @@ def truth() -> Dense:
 
 
 def solved(given: Small, whole: bool) -> Posterior:
-    return posterior(given.sums(), given.problem, given.state, given.layout, SHAPE, whole)
+    return posterior(given.sums(), given.linear(), SHAPE, whole)
 
 
 def assert_same(found: Posterior, mean: Floats, covariance: Floats) -> None:
@@ -288,20 +288,12 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Weights, dict
                 V['star places'][i, :, j] = place_px**2 * common @ from_sky[i] @ from_sky[j].T
             if cells[i] == cells[j]:
                 V['cells'][i, :, j] = cell_px**2 * common
-    weights = Weights(variance, inflation, from_sky, given.predicted_px, errors, tuple(trackers))
+    weights = Weights(variance, inflation, from_sky, errors, tuple(trackers))
     return weights, {name: one.reshape(2 * n, 2 * n) for name, one in V.items()}
 
 
 def widened(given: Small, found: Posterior, weights: Weights) -> Posterior:
-    return with_shared_errors(
-        found,
-        given.sums(),
-        given.measurements(),
-        given.problem,
-        given.state,
-        given.layout,
-        weights,
-    )
+    return with_shared_errors(found, given.sums(), given.linear(), weights)
 
 
 def propagated(
@@ -402,7 +394,6 @@ def test_independent_errors_of_the_working_weights_change_nothing(given: Small) 
         np.ones(n),
         np.zeros(n),
         np.tile(np.eye(2), (n, 1, 1)),
-        given.predicted_px,
         (SharedError('alone', np.arange(n), 1.0, 0.0, False, 1.0),),
         ((np.arange(IMAGES), np.arange(IMAGES), np.eye(IMAGES), 1.0),),
     )
@@ -423,7 +414,6 @@ def test_star_trackers_beyond_the_stars_only_enter_the_alignment(given: Small) -
         np.ones(n),
         np.zeros(n),
         np.tile(np.eye(2), (n, 1, 1)),
-        plain.predicted_px,
         (),
         ((np.arange(IMAGES), np.arange(IMAGES), shared_all, 1.0),),
     )

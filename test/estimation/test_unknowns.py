@@ -58,8 +58,7 @@ def star_matrix(given: Small) -> tuple[Floats, Floats]:
     image = table.image
     rotations = given.state.camera_from_icrf.as_matrix()[image]
     e = np.einsum('nij,nj->ni', rotations, table.direction_icrf)
-    measurements = given.measurements()
-    for chunk, Z in star_columns(measurements, given.problem, given.state, given.layout):
+    for chunk, Z in star_columns(given.linear()):
         real = chunk.whitener[0] > 0
         rows = chunk.row[real]
         white = np.zeros((len(rows), 2, 2))
