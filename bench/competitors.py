@@ -130,8 +130,8 @@ def estimate_starcal(case: Case) -> Answer:
     """Complete estimate: robust search, outlier tests, variance components, covariance."""
     options = CalibrationOptions(method='per_image', star_tracker_sigma_arcsec=(20.0,) * 3)
     found = estimate_calibration(case.ensemble, case.prior, options)
-    rotations = found.state.camera_from_icrf.as_matrix()
-    return Answer(found.state.parameters, rotations, found.iterations)
+    rotations = found.linear.state.camera_from_icrf.as_matrix()
+    return Answer(found.linear.state.parameters, rotations, found.iterations)
 
 
 def _rotation_jacobian(theta: Floats) -> tuple[Floats, Floats]:

@@ -45,7 +45,8 @@ def start(
     node: str = '',
 ) -> subprocess.Popen[bytes]:
     """Start a node process with parameters."""
-    arguments = ['-m', f'starcal_ros.ros.{name}', '--ros-args', '--params-file', str(params)]
+    arguments = ['-m', 'starcal_ros.entry_points', name]
+    arguments += ['--ros-args', '--params-file', str(params)]
     arguments += [word for value in values for word in ('-p', value)]
     arguments += ['-r', f'__node:={node or name}', '--log-level', 'warn']
     with log.open('ab') as output:

@@ -22,7 +22,6 @@ import pytest
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
-NODES = 'starcal_ros.ros.'
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 
 
@@ -69,7 +68,7 @@ class NodeProcess:
         self._log = log
         with log.open('wb') as output:
             self.process = subprocess.Popen(
-                [sys.executable, '-m', NODES + name, *arguments],
+                [sys.executable, '-m', 'starcal_ros.entry_points', name, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,

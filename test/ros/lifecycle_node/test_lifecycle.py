@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from pathlib import Path
 import random
 import signal
@@ -242,6 +243,39 @@ def test_an_executor_outlives_the_thread_that_answers_signals(name: str, tiny_ba
     lines = [line for line in done.stdout.splitlines() if line]
     assert (done.returncode, done.stderr) == (0, '')
     assert lines.index('executor destroyed') > lines.index('signals answered no more')
+
+
+ARENAS_OF_A_NODE = """
+import ctypes, sys, threading, types
+from starcal_ros import entry_points
+libc = ctypes.CDLL(None)
+libc.malloc.restype = ctypes.c_void_p
+
+def main():
+    import rclpy
+    rclpy.init()
+    for _ in range(8):
+        threads = [threading.Thread(target=libc.malloc, args=[100_000]) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    libc.malloc_info(0, ctypes.c_void_p.in_dll(libc, 'stdout'))
+    libc.fflush(None)
+    return 0
+
+sys.modules['starcal_ros.ros.calibrator'] = types.SimpleNamespace(main=main)
+entry_points.calibrator()
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), 'malloc_info'), reason='glibc alone has it')
+def test_threads_share_one_arena_of_memory() -> None:
+    """Otherwise the memory of a node grows with the threads on which it has solved."""
+    command = [sys.executable, '-c', ARENAS_OF_A_NODE]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout.count('<heap nr=') == 1
 
 
 @pytest.mark.parametrize('seed', range(4))
