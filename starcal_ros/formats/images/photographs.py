@@ -1,13 +1,14 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Photographs of any camera: JPEG, PNG, TIFF and FITS, with the facts in EXIF or the header."""
+"""Photographs: JPEG, PNG, TIFF, FITS and camera raw, with the facts that the files state."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, replace
 from datetime import datetime
 import glob
+import importlib
 import io
 import math
 from pathlib import Path
@@ -30,10 +31,12 @@ from starcal_ros.formats.images.image_files import (
 )
 from starcal_ros.formats.images.time_systems import TimeError
 
-ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', *FITS_ENDINGS)
+_RAW = ('.dng', '.cr2', '.cr3', '.nef', '.arw', '.orf', '.rw2', '.raf', '.pef')
+ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', *_RAW, *FITS_ENDINGS)
 _DIAGONAL_35_MM = 43.2666  # of 36 mm x 24 mm
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # FocalPlaneResolutionUnit, Exif 2.32
 _EXIF, _GPS = 0x8769, 0x8825
+_FOCAL_LENGTH = 0x920A
 _GREEN = 1
 _SAME_STAMP_NS = NANOSECONDS_PER_SECOND  # file times are often equal; stamps must differ
 
@@ -74,16 +77,20 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
 
 
 def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> Photograph:
-    """Facts of a file; a given focal length replaces its own.  Raises IngestError."""
+    """Facts of a file; a given length or pixel size replaces its own.  Raises IngestError."""
     if path.name.lower().endswith(FITS_ENDINGS):
         values, header = read_fits(path, '')
         stated = _of_fits(path, values, header)
-        stated_um = number(header, 'PIXSIZE1', 'XPIXSZ')
+        stated_mm, stated_um = number(header, 'FOCALLEN'), number(header, 'PIXSIZE1', 'XPIXSZ')
     else:
-        stated, stated_um = _of_picture(path)
-    pixel_um = pixel_um or stated_um
-    given_px = _focal_px(focal_length_mm, pixel_um)
-    return stated if math.isnan(given_px) else replace(stated, focal_px=given_px)
+        is_raw = path.name.lower().endswith(_RAW)
+        tags, gps, width, height = (_facts_of_raw if is_raw else _facts_of_picture)(path)
+        stated = _of_tags(path, tags, gps, width, height)
+        stated_mm, stated_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
+    given_px = _focal_px(focal_length_mm or stated_mm, pixel_um or stated_um)
+    if math.isnan(given_px) or not (focal_length_mm or pixel_um):
+        return stated
+    return replace(stated, focal_px=given_px)
 
 
 def in_order(photographs: Sequence[Photograph]) -> list[Photograph]:
@@ -109,9 +116,12 @@ def pixels_of_photograph(path: Path) -> Pixels:
     """
     Light of each pixel (height, width), as the sensor has it: not turned by the EXIF orientation.
 
-    Green of a colour image.  The sRGB curve of 8-bit colour is undone into 16 bit.
+    Green of a colour image, interpolated in one of camera raw.  The sRGB curve of 8-bit colour is
+    undone into 16 bit.
     """
-    if path.name.lower().endswith(FITS_ENDINGS):
+    if path.name.lower().endswith(_RAW):
+        values = _linear(path)
+    elif path.name.lower().endswith(FITS_ENDINGS):
         values = read_fits(path, '')[0]
     else:
         values = decoded(path, content_of(path))  # the EXIF orientation is not applied
@@ -138,14 +148,14 @@ def _srgb_to_light() -> NDArray[np.uint16]:
 _SRGB_TO_LIGHT = _srgb_to_light()
 
 
-def _of_picture(path: Path) -> tuple[Photograph, float]:
-    """Facts of EXIF, and the size of a pixel, micrometres, NaN where it has none."""
-    try:
-        from PIL import Image
-    except ModuleNotFoundError as error:
-        raise IngestError(
-            f"{path}: photographs need Pillow: pip install 'starcal_ros[report]'"
-        ) from error
+_Tags = Mapping[int, Any]
+
+
+def _facts_of_picture(path: Path) -> tuple[_Tags, _Tags, int, int]:
+    """Tags of EXIF and GPS, width and height."""
+    Image = _library(
+        'PIL.Image', path, "photographs need Pillow: pip install 'starcal_ros[report]'"
+    )
     try:
         # Opened, not decoded: size and tags only.
         with Image.open(io.BytesIO(content_of(path))) as image:
@@ -159,31 +169,81 @@ def _of_picture(path: Path) -> tuple[Photograph, float]:
         raise IngestError(f'{path}: not readable: {" ".join(str(error).split())[:160]}') from error
     if width * height > MOST_VALUES:
         raise IngestError(f'{path}: claims {width} x {height} pixels')
+    return tags, gps, width, height
+
+
+def _facts_of_raw(path: Path) -> tuple[_Tags, _Tags, int, int]:
+    """Return the same of camera raw, as far as LibRaw reads them."""
+    with _raw(path) as raw:
+        sizes, stated, lens = raw.sizes, raw.other, raw.lens
+    # LibRaw takes the digits of the camera's clock as local time of this machine.
+    taken = stated.timestamp
+    tags = {
+        0x829A: stated.shutter_speed,
+        _FOCAL_LENGTH: stated.focal_length,
+        0x9003: f'{taken:%Y:%m:%d %H:%M:%S}' if taken else '',
+        0xA434: f'{lens.make} {lens.model}'.strip(),
+    }
+    return tags, {}, sizes.width, sizes.height
+
+
+def _linear(path: Path) -> NDArray[Any]:
+    """Colours (height, width, 3) of camera raw in 16 bit, linear in light, one factor for all."""
+    rawpy = _rawpy(path)
+    with _raw(path) as raw:
+        return np.asarray(
+            raw.postprocess(
+                # Other algorithms follow edges, and change the shape of a star.
+                demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
+                gamma=(1, 1),
+                no_auto_bright=True,
+                adjust_maximum_thr=0.0,  # white is that of the camera, not of the image
+                user_wb=[1.0] * 4,
+                output_color=rawpy.ColorSpace.raw,
+                output_bps=16,
+                user_flip=0,
+            )
+        )
+
+
+@contextlib.contextmanager
+def _raw(path: Path) -> Iterator[Any]:
+    """An open file of camera raw; raises IngestError."""
+    rawpy = _rawpy(path)
+    try:
+        with rawpy.imread(io.BytesIO(content_of(path))) as raw:
+            yield raw
+    except rawpy.LibRawError as error:
+        why = error.args[0] if error.args else b''
+        raise IngestError(f'{path}: not readable: {why.decode(errors="replace")}') from error
+
+
+def _rawpy(path: Path) -> Any:
+    return _library('rawpy', path, "camera raw needs rawpy: pip install 'starcal_ros[raw]'")
+
+
+def _library(name: str, path: Path, remedy: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise IngestError(f'{path}: {remedy}') from error
+
+
+def _of_tags(path: Path, tags: _Tags, gps: _Tags, width: int, height: int) -> Photograph:
+    """Facts of tags of EXIF."""
     time_ns, dated, utc = _exif_time(path, tags)
     # Make, Model, BodySerialNumber, LensModel
     names = (tags.get(tag) for tag in (0x010F, 0x0110, 0xA431, 0xA434))
     words = [str(name).strip('\0 ') for name in names if name]
-    focal_mm, pixel_um = _real(tags.get(0x920A)), _pixel_um(tags, width)
+    focal_mm, pixel_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
     if words and focal_mm > 0:
         words.append(f'{focal_mm:g} mm')
     focal_px = _focal_px(focal_mm, pixel_um)
     equivalent_mm = _real(tags.get(0xA405))  # FocalLengthIn35mmFilm; 0: unknown
     if math.isnan(focal_px) and equivalent_mm > 0:
         focal_px = math.hypot(width, height) * equivalent_mm / _DIAGONAL_35_MM
-    return (
-        Photograph(
-            path,
-            time_ns,
-            dated,
-            utc,
-            width,
-            height,
-            focal_px,
-            _exif_site(gps),
-            ' '.join(words),
-        ),
-        pixel_um,
-    )
+    site, camera = _exif_site(gps), ' '.join(words)
+    return Photograph(path, time_ns, dated, utc, width, height, focal_px, site, camera)
 
 
 def _real(value: object) -> float:

@@ -8,11 +8,14 @@ from collections.abc import Mapping
 import math
 import os
 from pathlib import Path
+import struct
+import time
 
 from astropy.io import fits
 import cv2
 import numpy as np
-from PIL import Image
+from numpy.typing import NDArray
+from PIL import Image, TiffImagePlugin
 import pytest
 
 from starcal_ros.errors import IngestError
@@ -128,3 +131,71 @@ def test_a_damaged_file_is_refused_with_its_name(tmp_path: Path) -> None:
     (tmp_path / 'a.jpg').write_bytes(b'\xff\xd8\xff' + bytes(200))
     with pytest.raises(IngestError, match=r'a\.jpg: not readable'):
         look_at(tmp_path / 'a.jpg')
+
+
+def dng(path: Path, mosaic: NDArray[np.uint16]) -> Path:
+    """Write a mosaic with red at the top left as DNG 1.4: a TIFF by Pillow, its kind changed."""
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    one = TiffImagePlugin.IFDRational(1, 1)
+    short, byte, text, long_, ratio, signed = 3, 1, 2, 4, 5, 10
+    values: dict[int, tuple[int, object]] = {
+        306: (text, '2024:03:09 23:10:00'),
+        33421: (short, (2, 2)),  # size and colours of the pattern
+        33422: (byte, bytes([0, 1, 1, 2])),
+        33434: (ratio, TiffImagePlugin.IFDRational(8, 1)),  # s of exposure
+        37386: (ratio, TiffImagePlugin.IFDRational(50, 1)),  # mm
+        50706: (byte, bytes([1, 4, 0, 0])),
+        50708: (text, 'Canon EOS R6'),
+        50714: (short, 512),  # black and white level
+        50717: (long_, 16383),
+        50721: (signed, tuple(one * int(i % 4 == 0) for i in range(9))),
+    }
+    for tag, (kind, value) in values.items():
+        tags.tagtype[tag], tags[tag] = kind, value
+    Image.fromarray(mosaic).save(path, format='TIFF', tiffinfo=tags)
+    kind_of_picture = struct.Struct('<HHII')
+    gray, mosaic_of_colours = (kind_of_picture.pack(262, 3, 1, k) for k in (1, 32803))
+    path.write_bytes(path.read_bytes().replace(gray, mosaic_of_colours))
+    return path
+
+
+@pytest.mark.parametrize('zone', ['UTC', 'America/New_York'])
+def test_camera_raw_has_the_facts_of_its_tags(
+    tmp_path: Path, zone: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clock of the camera has no zone, and that of this machine does not count."""
+    pytest.importorskip('rawpy')
+    monkeypatch.setenv('TZ', zone)
+    time.tzset()
+    one = look_at(dng(tmp_path / 'a.DNG', np.full((80, 120), 600, np.uint16)), pixel_um=5.0)
+    monkeypatch.undo()
+    time.tzset()
+    assert (one.width, one.height) == (120, 80)
+    assert one.focal_px == pytest.approx(10000.0)
+    assert one.time_ns == (calendar.timegm((2024, 3, 9, 23, 10, 0)) + 4) * 10**9
+    assert one.dated and not one.utc
+
+
+def test_green_of_camera_raw_is_linear_in_light(tmp_path: Path) -> None:
+    pytest.importorskip('rawpy')
+    mosaic = np.full((80, 120), 612, np.uint16)
+    mosaic[::2, ::2] = mosaic[1::2, 1::2] = 9000  # red and blue
+    mosaic[40, 61] = 4612
+    light = pixels_of_photograph(dng(tmp_path / 'a.dng', mosaic)).astype(float)
+    # LibRaw rounds each value to an integer before it scales it, and once more.
+    unit = 65535 / (16383 - 512)
+    assert light[40, 61] == pytest.approx(4100 * unit, abs=2 * unit)
+    assert light[10, 10] == light[11, 10] == pytest.approx(100 * unit, abs=2 * unit)
+    assert light[40, 62] == pytest.approx((3 * 100 + 4100) / 4 * unit, abs=2 * unit)
+
+
+def test_a_damaged_raw_file_is_one_line(tmp_path: Path) -> None:
+    pytest.importorskip('rawpy')
+    path = tmp_path / 'a.nef'
+    path.write_bytes(b'x' * 5000)
+    with pytest.raises(IngestError, match='a.nef: not readable: Unsupported file format'):
+        look_at(path)
+    whole = dng(tmp_path / 'b.dng', np.full((80, 120), 600, np.uint16))
+    whole.write_bytes(whole.read_bytes()[:-5000])
+    with pytest.raises(IngestError, match='b.dng: not readable: '):
+        pixels_of_photograph(whole)
