@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 import contextlib
+import functools
+import sys
 import threading
 from typing import Any
 
@@ -30,7 +32,7 @@ def one_blas_thread() -> Iterator[None]:
     global _inside, _before
     with _lock:
         if not _inside:
-            libraries = _blas()
+            libraries = _blas(len(sys.modules))
             _before = [(library, library.get_num_threads()) for library in libraries]
             _set_threads((library, 1) for library, _ in _before)
         _inside += 1
@@ -43,7 +45,9 @@ def one_blas_thread() -> Iterator[None]:
                 _set_threads(_before)
 
 
-def _blas() -> list[Any]:
+@functools.lru_cache(maxsize=1)
+def _blas(_modules: int) -> list[Any]:
+    """Return the libraries of BLAS; looked for again once a module has been imported."""
     if ThreadpoolController is None:
         return []
     return list(ThreadpoolController().select(user_api='blas').lib_controllers)
