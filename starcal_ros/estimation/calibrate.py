@@ -92,7 +92,7 @@ from starcal_ros.records import (
 _START_FLOOR_PX = 0.05  # until the residuals show it: of the order of what is left in good images
 _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the weight is lost
 _ROBUST_GAIN = 1e-3  # a step of 0.04 sigma: the posterior goes on from there
-_ROUNDS = 8  # the set of rejected stars settles in three or four
+_ROUNDS = 16  # three or four are usual; principal points that stars hardly show take ten
 _STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
 _FIRST_SHAPE_PX = 1e-4
 _SPACE_VELOCITY_M_S = 8000.0  # an orbit about the Earth
