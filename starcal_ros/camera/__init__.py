@@ -19,22 +19,3 @@ from starcal_ros.camera.projection import (
     project_parameters,
     rotation_jacobian,
 )
-
-__all__ = [
-    'ALL_PARAMETER_NAMES',
-    'INTRINSIC_NAMES',
-    'MAX_SIDE_PX',
-    'PARAMETER_NAMES',
-    'CameraModel',
-    'check_plausible',
-    'distortion_px',
-    'field_radius_rad',
-    'line_of_sight',
-    'model_of',
-    'parameter_names',
-    'pixel_grid',
-    'project',
-    'project_jacobians',
-    'project_parameters',
-    'rotation_jacobian',
-]
