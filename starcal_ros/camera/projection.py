@@ -204,11 +204,22 @@ def distortion_px(camera: CameraModel, pixels: Floats) -> Floats:
 
     The ideal lens is a pinhole; for ``equidistant`` the radius is proportional to the angle.
     """
+    distorted = distort(camera.model, _plane_points(camera, pixels), camera.distortion)
+    return _pixels(camera.intrinsics, distorted) - pixels
+
+
+def _pixels(intrinsics: Floats, distorted: Floats) -> Floats:
+    """Pixels (..., 2) of distorted points (..., 2) of the image plane."""
+    fx, skew, fy, cx, cy = intrinsics
+    xd, yd = distorted[..., 0], distorted[..., 1]
+    return np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1)
+
+
+def _plane_points(camera: CameraModel, pixels: Floats) -> Floats:
+    """Distorted points (..., 2) of the image plane of pixels (..., 2): inverse of `_pixels`."""
     fx, skew, fy, cx, cy = camera.intrinsics
-    y = (pixels[:, 1] - cy) / fy
-    x = (pixels[:, 0] - cx - skew * y) / fx
-    xd, yd = distort(camera.model, np.stack([x, y], axis=-1), camera.distortion).T
-    return np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1) - pixels
+    yd = (pixels[..., 1] - cy) / fy
+    return np.stack([(pixels[..., 0] - cx - skew * yd) / fx, yd], axis=-1)
 
 
 def project_parameters(model: str, parameters: Floats, directions_camera: Floats) -> Floats:
@@ -220,10 +231,7 @@ def project_parameters(model: str, parameters: Floats, directions_camera: Floats
     directions pass through, for complex-step derivatives.
     """
     distorted = distort(model, ideal_points(model, directions_camera), parameters[5:])
-    fx, skew, fy, cx, cy = parameters[:5]
-    u = fx * distorted[..., 0] + skew * distorted[..., 1] + cx
-    v = fy * distorted[..., 1] + cy
-    return np.stack([u, v], axis=-1)
+    return _pixels(parameters[:5], distorted)
 
 
 def project(camera: CameraModel, directions_camera: Floats) -> Floats:
@@ -264,11 +272,10 @@ def project_jacobians(
     J_rotation : (..., 2, 3)
         By the passive small rotation ``dtheta`` of the camera frame, rad (Eqs. 31, 34-37).
     """
-    xy = _image_plane(camera.model, directions_camera)
-    fx, skew, fy, cx, cy = camera.intrinsics
+    xy = _ideal_in_front(camera.model, directions_camera)
+    fx, skew, fy, _, _ = camera.intrinsics
     distorted = distort(camera.model, xy, camera.distortion)
     xd, yd = distorted[..., 0], distorted[..., 1]
-    pixels = np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1)
 
     J_parameters = np.zeros((*xd.shape, 2, len(camera.parameters)))
     J_parameters[..., 0, 0] = xd
@@ -281,6 +288,7 @@ def project_jacobians(
         J_parameters[..., 0, k] = fx * column_x + skew * column_y
         J_parameters[..., 1, k] = fy * column_y
 
+    pixels = _pixels(camera.intrinsics, distorted)
     return pixels, J_parameters, _rotation_jacobian(camera, xy)
 
 
@@ -290,11 +298,11 @@ def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
 
     Directions (..., 3) in the camera frame; Z > 0 for a perspective model.
     """
-    return _rotation_jacobian(camera, _image_plane(camera.model, directions_camera))
+    return _rotation_jacobian(camera, _ideal_in_front(camera.model, directions_camera))
 
 
-def _image_plane(model: str, directions_camera: Floats) -> Floats:
-    """Ideal points (..., 2) of directions (..., 3)."""
+def _ideal_in_front(model: str, directions_camera: Floats) -> Floats:
+    """Ideal points (..., 2) of directions (..., 3), none of them behind a perspective lens."""
     e = np.asarray(directions_camera, np.float64)
     if model == 'equidistant':
         return ideal_points(model, e)
@@ -327,10 +335,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     pixels = np.asarray(pixels, np.float64)
     if (field := camera.moving_field) is not None:
         pixels = pixels - field.displacement_px(pixels)
-    fx, skew, fy, cx, cy = camera.intrinsics
-    yd = (pixels[..., 1] - cy) / fy
-    xd = (pixels[..., 0] - cx - skew * yd) / fx
-    target = np.stack([xd, yd], axis=-1)
+    target = _plane_points(camera, pixels)
     # Newton squares no error beyond a fold or a pole; a start and steps inside stay inside.
     guarded = model != 'plumb_bob'
     xy = _inside(0.0 * target, target, fold2) if guarded else target.copy()
