@@ -40,6 +40,7 @@ from starcal_ros.sky.catalog import cone
 from starcal_ros.stars.detection import (
     Background,
     brightest_near,
+    DETECTION_SIGMA,
     measure_background,
     sample_background,
 )
@@ -169,7 +170,8 @@ def _find_rotation(
     rim = reach_px + 4.0
     inside = ((xy > rim) & (xy < [camera.width - 1 - rim, camera.height - 1 - rim])).all(axis=1)
     guides = np.nonzero(inside)[0][:_GUIDES]
-    place_px, found = brightest_near(pixels, background, xy[guides], reach_px)
+    place_px, snr = brightest_near(pixels, background, xy[guides], reach_px)
+    found = snr > DETECTION_SIGMA
     guides, place_px = guides[found], place_px[found]
     lost = ImageRefused('no_match', f'{len(guides)} of the brightest stars match a source')
     if len(guides) < 4:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.stars.detection import Background, sample_mesh, windows_about
+from starcal_ros.stars.detection import Background, windows_about
 
 _GROUP = 256  # stars of one mean: its noise is 0.06 of that of a star
 # Of the least signal-to-noise ratio, 3 mag: a star of a dark group that is measured nevertheless
@@ -36,8 +36,9 @@ def detectable_count(pixels: Pixels, xy_px: Floats, background: Background, min_
     windows[:, 1:-1, 1:-1] = 0.0
     border_pixels = 4 * (2 * _RADIUS_PX)
     light = core - _CORE_PIXELS / border_pixels * windows.sum(axis=(1, 2))
-    noise_dn = sample_mesh(background.noise_mesh, (height, width), xy_px)
-    noise = noise_dn * np.sqrt(_CORE_PIXELS * (1.0 + _CORE_PIXELS / border_pixels))
+    noise = background.noise_at(xy_px) * np.sqrt(
+        _CORE_PIXELS * (1.0 + _CORE_PIXELS / border_pixels)
+    )
     snr = np.clip(light / noise, -_MOST_SNR, _MOST_SNR)
     groups = len(snr) // _GROUP
     mean = snr[: groups * _GROUP].reshape(groups, _GROUP).mean(axis=1)

@@ -107,7 +107,6 @@ def model_image(
     unknown = ImageModel(
         background, None, PixelNoise(gain or 1.0, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
     )
-    shape = (pixels.shape[0], pixels.shape[1])
     bright = sources.xy_px[sources.snr > 15.0][:400]
     nearest = np.rint(bright).astype(np.int64)
     bright = bright[pixels[nearest[:, 1], nearest[:, 0]] < saturation_dn]
@@ -119,14 +118,14 @@ def model_image(
     for _ in range(6):
         radius = stamp_radius_px(sigma)
         centre = np.rint(xy).astype(np.int64)
-        inside = detection.windows_inside(shape, centre, radius)
+        inside = detection.windows_inside(pixels.shape, centre, radius)
         xy, centre = xy[inside], centre[inside]
-        stamps = detection.stamps_about(pixels, centre, radius)
+        stamps = detection.windows_about(pixels, centre, radius).astype(np.float64)
         clean = stamps.max(axis=(1, 2)) < saturation_dn
         xy, centre, stamps = xy[clean], centre[clean], stamps[clean]
         if len(xy) < 5:
             return unknown
-        noise_dn = detection.sample_mesh(background.noise_mesh, shape, xy)
+        noise_dn = background.noise_at(xy)
         fit = fit_psf(stamps, sigma, noise_dn, noise_model)
         change = median(fit.shape_change[:, :2].mean(axis=1))
         sigma_before = sigma
@@ -141,7 +140,7 @@ def model_image(
     for _ in range(3):
         fit = fit_psf(stamps, sigma, noise_dn, noise_model)
         noise_model = noise_sums(fit, noise_dn, noise_model).pixel_noise(gain)
-    psf = uniform_width(sigma, shape[1], shape[0])
+    psf = uniform_width(sigma, pixels.shape[1], pixels.shape[0])
     noise_model = _at_least_sky(noise_model, background)
     return ImageModel(background, psf, noise_model, saturation_dn, shape_median, shape_scatter)
 
@@ -158,9 +157,8 @@ def known_model(
 
     ``predicted_px`` (n, 2) are sorted, brightest first: only these stars can be saturated.
     """
-    shape = (pixels.shape[0], pixels.shape[1])
     centre = np.rint(predicted_px).astype(np.int64)
-    centre = centre[detection.windows_inside(shape, centre, 2)][:_BRIGHTEST]
+    centre = centre[detection.windows_inside(pixels.shape, centre, 2)][:_BRIGHTEST]
     cores = detection.windows_about(pixels, centre, 2)
     saturation_dn = saturation_level(cores, options)
     if saturation_dn == 0 and _BELOW_PLATEAU * cores.max(initial=0) <= known.saturation_dn:

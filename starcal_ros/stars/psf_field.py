@@ -15,7 +15,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Indices
 from starcal_ros.robust_statistics import centre_and_scatter
 from starcal_ros.stars.pixel_noise import NoiseSums, PixelNoise
 from starcal_ros.stars.psf_fit import noise_sums, PsfFit, select
@@ -41,7 +41,7 @@ class PsfWidth:
     width: int
     height: int
 
-    def at(self, xy_px: Floats) -> Floats:
+    def at(self, xy_px: Floats | Indices) -> Floats:
         """Width (n,), px, at pixels (n, 2), limited to a factor of 1.5 of that in the middle."""
         middle = float(self.coefficients[0])
         if not self.coefficients[1:].any():
@@ -76,7 +76,7 @@ def uniform_width(sigma_px: float, width: int, height: int) -> PsfWidth:
     return PsfWidth(np.array([sigma_px**2, 0.0, 0.0, 0.0, 0.0, 0.0]), width, height)
 
 
-def width_basis(xy_px: Floats, width: int, height: int) -> Floats:
+def width_basis(xy_px: Floats | Indices, width: int, height: int) -> Floats:
     """Terms (n, 6) of the polynomial of `PsfWidth` at pixels (n, 2)."""
     u = 2.0 * xy_px[:, 0] / max(width - 1, 1) - 1.0
     v = 2.0 * xy_px[:, 1] / max(height - 1, 1) - 1.0

@@ -37,7 +37,7 @@ def pull_of_a_neighbour(
 
 def image_model(noise_dn: float) -> ImageModel:
     mesh = np.zeros((1, 1), np.float32)
-    background = Background(mesh, mesh + np.float32(noise_dn), 0.0, noise_dn)
+    background = Background(mesh, mesh + np.float32(noise_dn), 0.0, noise_dn, (0, 0))
     noise = PixelNoise(4.0, 0.0)
     psf = uniform_width(SIGMA_PX, 33, 33)
     return ImageModel(background, psf, noise, 4095.0, np.zeros(3), np.zeros(3))

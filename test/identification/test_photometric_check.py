@@ -31,7 +31,7 @@ MIN_SNR = 5.0
 ZERO_POINT = 17.0  # a star of that magnitude gives 1 DN
 MESH = np.ones((1, 1), np.float32)
 MODEL = ImageModel(
-    Background(0.0 * MESH, 2.0 * MESH, 0.0, 2.0),
+    Background(0.0 * MESH, 2.0 * MESH, 0.0, 2.0, (0, 0)),
     uniform_width(0.95, SHAPE[1], SHAPE[0]),
     PixelNoise(4.0, 0.0),
     4095.0,

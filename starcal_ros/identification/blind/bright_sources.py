@@ -11,15 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.stars.detection import (
-    Background,
-    detect,
-    measure_background,
-    sample_mesh,
-    stamps_at_edges,
-)
+from starcal_ros.stars.detection import Background, detect, measure_background, stamps_at_edges
 
-_DETECTION_SIGMA = 5.0
 _STAMP_PX = 7  # half width of a window; it holds a saturated star of 10 px
 LONGEST_STREAK_PX = 2.0 * _STAMP_PX - 1  # that a window shows whole, its ends blurred
 _APART_PX = 10.0  # the fainter of two sources nearer than this counts as a part of the other
@@ -57,14 +50,11 @@ def bright_sources(pixels: Pixels) -> BrightSources:
     good to a few tenths of a pixel.
     """
     background = measure_background(pixels)
-    found = detect(pixels, background, _DETECTION_SIGMA)
+    found = detect(pixels, background)
     centre = np.rint(found.xy_px[:_MEASURED]).astype(np.int64)
-    shape = (pixels.shape[0], pixels.shape[1])
     stamps, outside = stamps_at_edges(pixels, centre, _STAMP_PX)
-    level = sample_mesh(background.level_mesh, shape, centre.astype(np.float64))
-    noise = sample_mesh(background.noise_mesh, shape, centre.astype(np.float64))
-    light = stamps - level[:, None, None]
-    light[outside | (light < 3.0 * noise[:, None, None])] = 0.0
+    light = stamps - background.level_at(centre)[:, None, None]
+    light[outside | (light < 3.0 * background.noise_at(centre)[:, None, None])] = 0.0
     reach = np.arange(-_STAMP_PX, _STAMP_PX + 1)
     # Two rounds: the second is centred on the first centroid, which reduces neighbours at the rim.
     offset = np.zeros((len(centre), 2))
