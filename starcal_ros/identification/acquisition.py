@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import bdtr, pdtrc
@@ -197,7 +196,7 @@ def _refine_rotation(
     centre = camera.parameters[3:5]
     half_diagonal_px = 0.5 * np.hypot(camera.width, camera.height)
     rotation, scale, cubic = start, 1.0, 0.0
-    pairs: NDArray[np.int64] = np.empty((0, 2), np.int64)
+    pairs: Indices = np.empty((0, 2), np.int64)
 
     def placed() -> tuple[Floats, Floats, Floats]:
         directions = rotation.apply(prediction.direction_camera)
@@ -252,11 +251,7 @@ def _match(
         if len(pairs) < 4:
             break
         correction, _ = fit_warp(
-            xy[bright[pairs[:, 0]]],
-            seen.xy_px[pairs[:, 1]],
-            np.full(len(pairs), 0.2),
-            xy,
-            half_px,
+            xy[bright[pairs[:, 0]]], seen.xy_px[pairs[:, 1]], np.full(len(pairs), 0.2), xy, half_px
         )
         pairs = _pairs((xy + correction)[bright], seen.xy_px, radius_px)
     if len(pairs) >= 4:

@@ -106,9 +106,7 @@ class Exposure:
 
 
 def observe_stars(
-    exposure: Exposure,
-    geometry: CameraGeometry,
-    search: StarSearch,
+    exposure: Exposure, geometry: CameraGeometry, search: StarSearch
 ) -> tuple[StarObservations, Instrument | None]:
     """
     Observations of one image without a track, and the PSF and gain measured from them.
@@ -276,10 +274,7 @@ def realigned(geometry: CameraGeometry, observations: StarObservations) -> Camer
 
 
 def _find(
-    pixels: Pixels,
-    background: Background,
-    prediction: Prediction,
-    geometry: CameraGeometry,
+    pixels: Pixels, background: Background, prediction: Prediction, geometry: CameraGeometry
 ) -> tuple[Floats, Sources]:
     """
     Predicted pixels (n, 2) corrected to match the sources of the image, and those sources.
@@ -291,12 +286,7 @@ def _find(
     """
     camera = geometry.camera
     inside = in_image(prediction.xy_px, camera.width, camera.height)
-    near = detect_near(
-        pixels,
-        background,
-        prediction.xy_px[inside][:_NEAREST],
-        SEARCH_RADIUS_PX,
-    )
+    near = detect_near(pixels, background, prediction.xy_px[inside][:_NEAREST], SEARCH_RADIUS_PX)
     try:
         reach_px = float(SEARCH_RADIUS_PX)
         return acquire(prediction, near, geometry, reach_px, _NEAREST_ROLL_RAD), near

@@ -89,9 +89,7 @@ def start_tracking(
 
 
 def track_stars(
-    exposure: Exposure,
-    before: TrackedCamera,
-    search: StarSearch,
+    exposure: Exposure, before: TrackedCamera, search: StarSearch
 ) -> tuple[StarObservations, TrackedCamera]:
     """
     Observations of the next image, and the updated track.

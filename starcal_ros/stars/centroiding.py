@@ -169,11 +169,7 @@ class _Windows(NamedTuple):
 
 
 def _windows(
-    pixels: Pixels,
-    centre: Indices,
-    model: ImageModel,
-    psf: PsfWidth,
-    hot_pixels: Indices,
+    pixels: Pixels, centre: Indices, model: ImageModel, psf: PsfWidth, hot_pixels: Indices
 ) -> _Windows:
     """Windows for a fit about pixels (n, 2), without pixels that show no light of the star."""
     radius = psf_fit.stamp_radius_px(psf.sigma_px)

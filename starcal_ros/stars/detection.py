@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from starcal_ros.arrays import Floats, Indices, Mask, Pixels
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels, Singles
 from starcal_ros.robust_statistics import median, medians
 
 DETECTION_SIGMA = 5.0  # noise alone exceeds it at 0.6 places of a megapixel
@@ -50,8 +50,8 @@ class Background:
     ``shape`` (height, width); ``level_dn`` and ``noise_dn`` are their medians.
     """
 
-    level_mesh: NDArray[np.float32]
-    noise_mesh: NDArray[np.float32]
+    level_mesh: Singles
+    noise_mesh: Singles
     level_dn: float
     noise_dn: float
     shape: tuple[int, ...]
@@ -123,9 +123,7 @@ def sample_background(pixels: Pixels) -> Background:
     return background if steepest <= _MOST_SLOPE else measure_background(pixels)
 
 
-def _noise_above(
-    ascending: NDArray[np.float32], level: NDArray[np.float32], zeros: Indices
-) -> NDArray[np.float32]:
+def _noise_above(ascending: Singles, level: Singles, zeros: Indices) -> Singles:
     """
     Noise (k,) of the sorted rows (k, n) that the converter clips at 0 DN; 0 for other rows.
 
@@ -138,9 +136,7 @@ def _noise_above(
     return np.where(zeros > _CUT_OFF * count, noise, np.float32(0.0))
 
 
-def _without_slope(
-    noise: NDArray[np.float32], level_mesh: NDArray[np.float32], pixels: Pixels
-) -> NDArray[np.float32]:
+def _without_slope(noise: Singles, level_mesh: Singles, pixels: Pixels) -> Singles:
     """Noise (k,) of the cells, from differences where the slope of the background exceeds it."""
     down, across = mesh_slope(_smooth_mesh(level_mesh), pixels.shape)
     cell_v, cell_u = np.array(pixels.shape) / level_mesh.shape
@@ -152,9 +148,7 @@ def _without_slope(
     return np.where(steep, np.minimum(from_differences, noise), noise)
 
 
-def _difference_noise(
-    pixels: Pixels, cell_px: int, step_px: tuple[int, int]
-) -> NDArray[np.float32]:
+def _difference_noise(pixels: Pixels, cell_px: int, step_px: tuple[int, int]) -> Singles:
     """Noise (k,) of the cells from differences of pixels two columns apart, almost slope-free."""
     samples, mesh_shape = _cells(pixels, cell_px, step_px)
     beside, _ = _cells(pixels[:, 2:], cell_px, step_px, mesh_shape)
@@ -166,9 +160,7 @@ def _difference_noise(
     return np.asarray(noise / math.sqrt(2.0), np.float32)
 
 
-def mesh_slope(
-    mesh: NDArray[np.float32], shape: tuple[int, ...]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def mesh_slope(mesh: Singles, shape: tuple[int, ...]) -> tuple[Singles, Singles]:
     """Slopes (rows, cols) of a mesh over an image of ``shape``, down and across, per pixel."""
     rows, cols = mesh.shape
     down, across = np.zeros_like(mesh), np.zeros_like(mesh)
@@ -179,7 +171,7 @@ def mesh_slope(
     return down, across
 
 
-def _quantile(ascending: NDArray[np.float32], part: float, first: Indices) -> NDArray[np.float32]:
+def _quantile(ascending: Singles, part: float, first: Indices) -> Singles:
     """Quantiles (k,) of the sorted rows (k, n), each from its element ``first`` (k,) on."""
     count = ascending.shape[1]
     rank = first + ((count - first) * part).astype(np.int64)
@@ -187,16 +179,14 @@ def _quantile(ascending: NDArray[np.float32], part: float, first: Indices) -> ND
     return np.asarray(ascending[row, np.minimum(rank, count - 1)])
 
 
-def _gap_above_zero(ascending: NDArray[np.float32], zeros: Indices) -> Mask:
+def _gap_above_zero(ascending: Singles, zeros: Indices) -> Mask:
     """Mask (k,) of the sorted rows that hold 0 DN far below the noise of their other samples."""
     level = _quantile(ascending, 0.5, zeros)
     spread = level - _quantile(ascending, 0.1587, zeros)
     return np.asarray((zeros > 0) & (level > GAP_SIGMA * np.maximum(spread, 1.0)))
 
 
-def _filled(
-    values: NDArray[np.float32], has_pixels: Mask, mesh_shape: tuple[int, int]
-) -> NDArray[np.float32]:
+def _filled(values: Singles, has_pixels: Mask, mesh_shape: tuple[int, int]) -> Singles:
     """Values (k,) of the cells; a cell without pixels takes that of the nearest cell with some."""
     if has_pixels.all() or not has_pixels.any():
         return values
@@ -211,7 +201,7 @@ def _cells(
     cell_px: int,
     step_px: tuple[int, int],
     mesh_shape: tuple[int, int] | None = None,
-) -> tuple[NDArray[np.float32], tuple[int, int]]:
+) -> tuple[Singles, tuple[int, int]]:
     """Thinned pixels of equal cells of an image, a row for each cell; (rows, columns) of cells."""
     height, width = pixels.shape
     rows, cols = mesh_shape or (max(1, height // cell_px), max(1, width // cell_px))
@@ -223,10 +213,8 @@ def _cells(
 
 
 def _clipped(
-    samples: NDArray[np.float32],
-    spread: NDArray[np.float32],
-    valid: Mask | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    samples: Singles, spread: Singles, valid: Mask | None = None
+) -> tuple[Singles, Singles]:
     """Mean and 1-sigma of each row of samples about zero, without values beyond three spreads."""
     inside = np.abs(samples) <= 3.0 * np.maximum(spread, 1.0)[:, None]
     if valid is not None:
@@ -240,10 +228,7 @@ def _clipped(
 
 
 def _background(
-    level: NDArray[np.float32],
-    noise: NDArray[np.float32],
-    mesh_shape: tuple[int, int],
-    shape: tuple[int, ...],
+    level: Singles, noise: Singles, mesh_shape: tuple[int, int], shape: tuple[int, ...]
 ) -> Background:
     """Smoothed level and noise of the cells; the noise is at least that of rounding to DN."""
     level_mesh = _smooth_mesh(level.reshape(mesh_shape))
@@ -251,15 +236,13 @@ def _background(
     return Background(level_mesh, noise_mesh, median(level_mesh), median(noise_mesh), shape)
 
 
-def _smooth_mesh(mesh: NDArray[np.float32]) -> NDArray[np.float32]:
+def _smooth_mesh(mesh: Singles) -> Singles:
     """Return the mesh after a 3 x 3 median, which removes cells with a bright star."""
     mesh = np.ascontiguousarray(mesh, np.float32)
     return np.asarray(cv2.medianBlur(mesh, 3), np.float32) if min(mesh.shape) >= 3 else mesh
 
 
-def sample_mesh(
-    mesh: NDArray[np.float32], shape: tuple[int, ...], xy_px: Floats | Indices
-) -> Floats:
+def sample_mesh(mesh: Singles, shape: tuple[int, ...], xy_px: Floats | Indices) -> Floats:
     """Values (n,) of a mesh over an image of ``shape`` at pixels (n, 2), bilinear."""
     rows, cols = mesh.shape
     row = (xy_px[:, 1] + 0.5) * rows / shape[0] - 0.5
@@ -279,8 +262,8 @@ def detect(
     """
     height, width = pixels.shape
     level = cv2.resize(background.level_mesh, (width, height), interpolation=cv2.INTER_LINEAR)
-    image: NDArray[np.float32] = np.subtract(pixels, level, dtype=np.float32)
-    filtered: NDArray[np.float32] = np.asarray(
+    image: Singles = np.subtract(pixels, level, dtype=np.float32)
+    filtered: Singles = np.asarray(
         cv2.GaussianBlur(image, (0, 0), _DETECTION_SIGMA_PX, borderType=cv2.BORDER_REFLECT),
         np.float32,
     )

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from starcal_ros.arrays import Pixels
+from starcal_ros.arrays import Indices, Mask, Pixels, Singles
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
@@ -81,15 +81,15 @@ class RowSample:
     segments that hold noise; ``constant`` (k, m) mask of the segments with a single pixel value.
     """
 
-    row: NDArray[np.int64]
+    row: Indices
     step: int
     pixels: Pixels
     below: Pixels
-    noisy: NDArray[np.bool_]
-    constant: NDArray[np.bool_]
+    noisy: Mask
+    constant: Mask
 
     @functools.cached_property
-    def distinctive(self) -> NDArray[np.bool_]:
+    def distinctive(self) -> Mask:
         """Mask (k,) of the rows that no other row equals by chance."""
         return np.asarray(self.noisy.mean(axis=1) >= 0.5)
 
@@ -126,7 +126,7 @@ def _segments(rows: Pixels) -> Pixels:
     return rows[:, : count * length].reshape(k, count, length)
 
 
-def _mean_of_each(segments: NDArray[Any]) -> NDArray[np.float32]:
+def _mean_of_each(segments: NDArray[Any]) -> Singles:
     """Means (k, m) of (k, m, length)."""
     length = segments.shape[2]
     # As a product: NumPy takes ten times as long for sums of many short rows of integers.
@@ -231,7 +231,7 @@ def _refuse_incomplete(
         raise ImageRefused('incomplete', f'{lost:.0%} of it is constant')
 
 
-def _repeats_below(sample: RowSample) -> NDArray[np.bool_]:
+def _repeats_below(sample: RowSample) -> Mask:
     """Mask (k,) of the rows that equal the row below; none where chance may do that."""
     equal = sample.pixels[:, ::_BELOW_STEP_PX] == sample.below
     repeats = equal.all(axis=1)
@@ -240,7 +240,7 @@ def _repeats_below(sample: RowSample) -> NDArray[np.bool_]:
     return np.asarray(repeats & (by_chance < _BY_CHANCE))
 
 
-def _off_level(sample: RowSample, alive: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _off_level(sample: RowSample, alive: Mask) -> Mask:
     """Mask (k, m) of the segments that differ from the nearest live one beyond the noise."""
     level = np.median(_segments(sample.pixels), axis=2)
     nearest = distance_transform_edt(~alive, return_distances=False, return_indices=True)
@@ -252,7 +252,7 @@ def _off_level(sample: RowSample, alive: NDArray[np.bool_]) -> NDArray[np.bool_]
     return np.asarray(np.abs(level - level[tuple(nearest)]) > 5.0 * noise_dn)
 
 
-def _noise_dn(sample: RowSample, alive: NDArray[np.bool_]) -> float:
+def _noise_dn(sample: RowSample, alive: Mask) -> float:
     """1-sigma noise of a pixel, from differences to the pixel below, which are free of slopes."""
     # One pixel of each segment: 2500 of five megapixels give the noise to 2 %.
     here = _segments(sample.pixels)[:, :, 0].astype(np.int32)
@@ -311,7 +311,7 @@ def _sorted_cells(rows: Pixels, step: int) -> NDArray[Any]:
     return np.sort(cells.reshape(down, m, -1), axis=2)
 
 
-def _middle_mean(ascending: NDArray[Any]) -> NDArray[np.float32]:
+def _middle_mean(ascending: NDArray[Any]) -> Singles:
     """Means (down, across) of middle halves: dead rows, stuck columns and stars are outside."""
     count = ascending.shape[2]
     return _mean_of_each(ascending[:, :, count // 4 : count - count // 4])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Indices, Pixels
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels
 from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 
@@ -115,16 +115,14 @@ def _single_lit(
     return np.asarray((v * width + u)[single][:_MOST], np.int64)
 
 
-def lit_alone(
-    pixels: Pixels, v: Indices, u: Indices, background_dn: float | Floats
-) -> NDArray[np.bool_]:
+def lit_alone(pixels: Pixels, v: Indices, u: Indices, background_dn: float | Floats) -> Mask:
     """Mask (k,) of pixels, none at the rim, that exceed the adjacent ones by more than a star."""
     beside = pixels[v + _BESIDE[0], u + _BESIDE[1]].sum(axis=0, dtype=np.float64)
     peak = pixels[v, u] - background_dn
     return np.asarray(0.25 * beside - background_dn < SPILT * peak)
 
 
-def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> NDArray[np.bool_]:
+def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> Mask:
     """Mask (n, 2 radius + 1, 2 radius + 1) of the hot pixels in windows about pixels (n, 2)."""
     side = 2 * radius + 1
     found = np.zeros((len(centre), side, side), bool)

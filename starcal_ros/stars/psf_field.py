@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.robust_statistics import centre_and_scatter
 from starcal_ros.stars.pixel_noise import NoiseSums, PixelNoise
 from starcal_ros.stars.psf_fit import noise_sums, PsfFit, select
@@ -68,7 +67,7 @@ class MeasuredStars:
     fit: PsfFit
     sigma_px: Floats
     noise_dn: Floats
-    usable: NDArray[np.bool_]
+    usable: Mask
 
 
 def uniform_width(sigma_px: float, width: int, height: int) -> PsfWidth:

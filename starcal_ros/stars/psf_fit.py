@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf, ndtr
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.stars.hot_pixels import CORE_PX, SPILT
 from starcal_ros.stars.pixel_noise import NoiseSums, PixelNoise
 
@@ -55,7 +55,7 @@ class PsfFit:
     freedom: Floats
 
 
-def select(fit: PsfFit, stars: NDArray[np.intp] | NDArray[np.bool_]) -> PsfFit:
+def select(fit: PsfFit, stars: NDArray[np.intp] | Mask) -> PsfFit:
     """Return the fits of some stars, by row number or mask."""
     return PsfFit(**{field.name: getattr(fit, field.name)[stars] for field in fields(fit)})
 
@@ -85,7 +85,7 @@ class Stamps:
     data_dn: Floats
     sigma_px: Floats
     noise2_dn2: Floats
-    out: NDArray[np.bool_] | None = None
+    out: Mask | None = None
 
     def __len__(self) -> int:
         """Return the number of stars."""
@@ -102,7 +102,7 @@ class Stamps:
         return self.data_dn.reshape(len(self), self.width**2)
 
     @property
-    def valid(self) -> NDArray[np.bool_] | None:
+    def valid(self) -> Mask | None:
         """Mask (n, w * w) of the pixels to be fitted; None: all."""
         return None if self.out is None else ~self.out.reshape(len(self), self.width**2)
 

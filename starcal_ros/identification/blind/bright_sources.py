@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.stars.detection import Background, detect, measure_background, stamps_at_edges
 
 _STAMP_PX = 7  # half width of a window; it holds a saturated star of 10 px
@@ -103,7 +102,7 @@ def smear(sources: BrightSources) -> tuple[float, float] | None:
     return length_px, 0.5 * float(np.angle(double))
 
 
-def _extents(light: Floats, reach: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
+def _extents(light: Floats, reach: Indices) -> tuple[Floats, Floats, Floats]:
     """Longest and shortest 1-sigma extent (n,) in windows, and the direction of the longest."""
     flux = np.maximum(light.sum(axis=(1, 2)), 1e-9)
     u = (light.sum(axis=1) * reach).sum(axis=1) / flux
@@ -119,7 +118,7 @@ def _extents(light: Floats, reach: NDArray[np.int64]) -> tuple[Floats, Floats, F
     )
 
 
-def _apart(xy_px: Floats) -> NDArray[np.int64]:
+def _apart(xy_px: Floats) -> Indices:
     """Rows of the points (n, 2), brightest first, without a brighter one nearby."""
     kept = np.ones(len(xy_px), bool)
     if len(xy_px):

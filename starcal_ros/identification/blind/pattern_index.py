@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats, Indices, Singles
 from starcal_ros.sky.catalog import StarCatalog
 
 _SMALLEST_DEG = 1.6
@@ -174,7 +174,7 @@ class ShapeGrid:
     (m + 1,): row of the first shape of each of the m cells, the last place counting fastest.
     """
 
-    shape: NDArray[np.float32]
+    shape: Singles
     low: Floats
     cells: Indices
     first: NDArray[np.int32]
@@ -220,9 +220,7 @@ def equal_shapes(
     return query[equal], row[equal]
 
 
-def _rows_between(
-    query: Indices, begin: NDArray[np.int32], end: NDArray[np.int32]
-) -> NDArray[np.int64]:
+def _rows_between(query: Indices, begin: NDArray[np.int32], end: NDArray[np.int32]) -> Indices:
     """Each query (n,) with each of its rows from begin to end (n,): (2, m)."""
     count = (end - begin).astype(np.int64)
     before = np.cumsum(count) - count
