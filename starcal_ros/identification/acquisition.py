@@ -9,8 +9,6 @@ without a significant match is refused.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -60,9 +58,7 @@ def acquire(
     for depth in (len(sources.snr), *_DEPTHS):
         if depth < _FEWEST_SOURCES or (depth in _DEPTHS and depth >= len(sources.snr)):
             continue
-        brightest = dataclasses.replace(
-            sources, xy_px=sources.xy_px[:depth], snr=sources.snr[:depth]
-        )
+        brightest = sources.brightest(depth)
         try:
             turn = _vote(prediction, brightest, geometry, reach_px, roll_rad)
             found_px = _match(prediction, brightest, geometry, turn)
@@ -243,8 +239,7 @@ def _match(
     camera = geometry.camera
     # Equal numbers of predictions and sources: the fainter surplus has no counterpart.
     bright = np.arange(min(len(prediction.xy_px), 4 * len(sources.snr), 400))
-    first = 4 * len(bright)
-    seen = dataclasses.replace(sources, xy_px=sources.xy_px[:first], snr=sources.snr[:first])
+    seen = sources.brightest(4 * len(bright))
     xy, pairs = _refine_rotation(prediction, seen, geometry, rotation, bright)
     half_px = 0.5 * max(camera.width, camera.height)
     for radius_px in (max(4.0, 0.003 * half_px * 2), 3.0, 2.0):

@@ -139,9 +139,8 @@ def separate(
     unlisted_px = np.where(
         unlisted, unlisted_pull_px(magnitude, faintest, prediction.px_per_rad), 0.0
     )
-    sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
     size_px = np.sqrt((pulls.uncertain_px**2).sum(axis=1) + 2.0 * unlisted_px**2)
-    beyond = size_px > max_blend_sigma * sigma_px
+    beyond = size_px > max_blend_sigma * centroids.sigma_px
     refusal = centroids.refusal.copy()
     refusal[(pulls.swamped | beyond) & (refusal == StarRefusal.NONE)] = StarRefusal.BLEND
     # Its light was attributed to the brighter star.
@@ -154,4 +153,4 @@ def separate(
         + np.stack([u * u + unlisted_px**2, u * v, v * v + unlisted_px**2], axis=-1),
         refusal=refusal,
     )
-    return separated, size_px < _ALONE_SIGMA * sigma_px
+    return separated, size_px < _ALONE_SIGMA * centroids.sigma_px

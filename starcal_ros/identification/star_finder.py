@@ -306,16 +306,14 @@ def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) ->
     Displacements are relative to a smooth correction fitted to the measured stars.
     """
     refusal = centroids.refusal.copy()
-    sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
     good = np.nonzero(refusal == StarRefusal.NONE)[0]
     if len(good) < 4:
         return refusal
     expected_px, measured_px = predicted_px[good], centroids.xy_px[good]
-    correction, scatter_px = fit_warp(
-        expected_px, measured_px, sigma_px[good], expected_px, 0.5 * width
-    )
+    sigma_px = centroids.sigma_px[good]
+    correction, scatter_px = fit_warp(expected_px, measured_px, sigma_px, expected_px, 0.5 * width)
     off_px = np.hypot(*(measured_px - expected_px - correction).T)
-    limit_px = np.maximum(5.0 * np.hypot(sigma_px[good], 0.75 * scatter_px), 0.3)
+    limit_px = np.maximum(5.0 * np.hypot(sigma_px, 0.75 * scatter_px), 0.3)
     refusal[good[off_px > np.minimum(limit_px, 2.0)]] = StarRefusal.AMBIGUOUS
     return refusal
 
@@ -327,8 +325,9 @@ def _refuse_line_loss(predicted_px: Floats, centroids: Centroids, shape: tuple[i
     Raises ImageRefused ``incomplete``.
     """
     good = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
-    variance_px2 = 0.5 * (centroids.covariance_px2[good, 0] + centroids.covariance_px2[good, 2])
-    loss = find_line_loss(predicted_px[good], centroids.xy_px[good], np.sqrt(variance_px2), shape)
+    loss = find_line_loss(
+        predicted_px[good], centroids.xy_px[good], centroids.sigma_px[good], shape
+    )
     if loss is not None:
         u, v = loss.off_px
         detail = f'stars below row {loss.row} are displaced by ({u:+.1f}, {v:+.1f}) px'

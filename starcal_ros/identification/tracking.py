@@ -129,10 +129,8 @@ def track_stars(
 def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> Prediction:
     """Apparent catalog stars in the field, brightest first."""
     camera = before.geometry.camera
-    icrf_from_camera = (
-        Rotation.from_quat(exposure.icrf_from_star_tracker_xyzw)
-        * Rotation.from_quat(before.geometry.star_tracker_from_camera_xyzw)
-    ).as_matrix()
+    attitude = before.geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw)
+    icrf_from_camera = attitude.as_matrix()
     # The catalog, and so the rows of a cone, are sorted by magnitude.
     catalog, limit = search.catalog, search.identification.magnitude_limit
     index = cone(catalog, icrf_from_camera[:, 2], before.field_radius_rad, limit)
@@ -204,7 +202,8 @@ def _find_rotation(
 def _fits(geometry: CameraGeometry, rotation: Rotation, observations: StarObservations) -> bool:
     """Return True if the rotated camera predicts the stars within the systematic limit."""
     bright = _bright(observations)
-    camera_from_icrf = rotation * _icrf_from_camera(geometry, observations).inv()
+    attitude = geometry.icrf_from_camera(observations.icrf_from_star_tracker_xyzw)
+    camera_from_icrf = rotation * attitude.inv()
     directions = observations.direction_icrf[bright] @ camera_from_icrf.as_matrix().T
     off_px = observations.measured_px[bright] - project(geometry.camera, directions)
     return _rms_px(off_px) < _SYSTEMATIC_PX
@@ -213,7 +212,7 @@ def _fits(geometry: CameraGeometry, rotation: Rotation, observations: StarObserv
 def _corrected(geometry: CameraGeometry, observations: StarObservations) -> CameraGeometry:
     """Geometry aligned to the stars of an image; its camera is corrected if it does not fit."""
     camera = geometry.camera
-    icrf_from_camera = _icrf_from_camera(geometry, observations)
+    icrf_from_camera = geometry.icrf_from_camera(observations.icrf_from_star_tracker_xyzw)
     directions = observations.direction_icrf @ icrf_from_camera.as_matrix()
     variance_px2 = 0.5 * (observations.covariance_px2[:, 0] + observations.covariance_px2[:, 2])
     bright = _bright(observations)
@@ -236,12 +235,6 @@ def _bright(observations: StarObservations) -> Mask:
     """Mask (n,) of the stars that correct a prediction; all if too few are bright."""
     bright = observations.snr > _GOOD_SNR
     return np.asarray(bright | (np.count_nonzero(bright) < 4))
-
-
-def _icrf_from_camera(geometry: CameraGeometry, observations: StarObservations) -> Rotation:
-    return Rotation.from_quat(observations.icrf_from_star_tracker_xyzw) * Rotation.from_quat(
-        geometry.star_tracker_from_camera_xyzw
-    )
 
 
 def _rms_px(off_px: Floats) -> float:

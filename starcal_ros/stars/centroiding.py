@@ -55,6 +55,11 @@ class Centroids:
     noise_dn: Floats
     modelled: Mask
 
+    @property
+    def sigma_px(self) -> Floats:
+        """1-sigma (n,) per axis, the root of the mean variance of both axes."""
+        return np.sqrt(0.5 * (self.covariance_px2[:, 0] + self.covariance_px2[:, 2]))
+
 
 def measure_stars(
     pixels: Pixels,

@@ -77,6 +77,10 @@ class Sources:
     snr: Floats
     searched_px2: float
 
+    def brightest(self, count: int) -> Sources:
+        """Return the brightest ``count`` sources of the same area."""
+        return Sources(self.xy_px[:count], self.snr[:count], self.searched_px2)
+
 
 def measure_background(pixels: Pixels) -> Background:
     """

@@ -118,7 +118,6 @@ def find_sky(
     camera: CameraModel,
     catalog: StarCatalog,
     try_mirrored: bool = False,
-    max_log10_p_value: float = MAX_LOG10_P_VALUE,
     rounds: Sequence[tuple[int, int]] = ROUNDS,
     deadline_s: float = math.inf,
 ) -> SkyMatch | NotFound:
@@ -127,8 +126,8 @@ def find_sky(
 
     ``camera`` is the prior: focal length within 25 %, principal point within 5 % of the width,
     distortion within 3 % of the radius.  The catalog is sorted by magnitude.  With
-    ``try_mirrored`` the mirror image is searched too.  Of `ROUNDS`, those asked for are searched,
-    until the processor time of the thread reaches ``deadline_s``.
+    ``try_mirrored`` the mirror image is searched too.  ``rounds`` is a part of `ROUNDS`; the
+    search ends when the processor time of the thread reaches ``deadline_s``.
     """
     if len(xy_px) < 5:
         return NotFound(f'{len(xy_px)} star-like sources, at least 5 are needed')
@@ -146,7 +145,7 @@ def find_sky(
                     log10_p, radius_px = log10_p_value(image, catalog, fit)
                     log10_p += math.log10(len(images))
                     least = min(least, log10_p)
-                    if log10_p < max_log10_p_value:
+                    if log10_p < MAX_LOG10_P_VALUE:
                         return _result(image, catalog, fit, radius_px, log10_p, bool(mirrored))
                 if time.thread_time() > deadline_s:
                     return NotFound('the time given for the search is over', least)
