@@ -10,7 +10,6 @@ from starcal_ros.camera.projection import (
     INTRINSIC_NAMES,
     line_of_sight,
     MAX_SIDE_PX,
-    model_of,
     PARAMETER_NAMES,
     parameter_names,
     pixel_grid,

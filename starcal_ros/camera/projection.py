@@ -49,18 +49,6 @@ def parameter_names(model: str) -> tuple[str, ...]:
     return INTRINSIC_NAMES + COEFFICIENTS[model]
 
 
-def model_of(names: tuple[str, ...]) -> str:
-    """
-    Lens model whose parameters have these names, in this order.
-
-    Raises ValueError when no model has them.
-    """
-    for model in COEFFICIENTS:
-        if names == parameter_names(model):
-            return model
-    raise ValueError(f'{", ".join(names) or "none"} are not the parameters of a lens model')
-
-
 PARAMETER_NAMES = parameter_names('plumb_bob')
 # Those of `tilted` are those of all.
 ALL_PARAMETER_NAMES = parameter_names('tilted')
