@@ -39,7 +39,7 @@ MAX_SIDE_PX = 65536
 _MAX_FOCAL_PX = 1e8  # 0.002 arcsec per pixel
 _MIN_FOCAL_OF_SIDE = 0.15  # of a perspective lens: 147 degrees from side to side
 _MAX_COEFFICIENT = 1e15
-_SEEN = 0.5  # part of the detector that must have a line of sight
+_SEEN = 0.5  # smallest part of the detector with lines of sight
 
 INTRINSIC_NAMES = ('fx', 'skew', 'fy', 'cx', 'cy')
 
@@ -50,14 +50,11 @@ def parameter_names(model: str) -> tuple[str, ...]:
 
 
 PARAMETER_NAMES = parameter_names('plumb_bob')
-# Those of `tilted` are those of all.
 ALL_PARAMETER_NAMES = parameter_names('tilted')
-"""Every name that a parameter of any lens model has."""
+"""Names of the parameters of all lens models; `tilted` has them all."""
 
-_INVERSE_STEPS = (
-    50  # Newton squares the error at each step: 6 do in the field, the rest is for far corners
-)
-# A field changes by under 0.1 px from pixel to pixel: each step takes off nine tenths and more.
+_INVERSE_STEPS = 50  # of Newton's method: 6 suffice in the field, far corners need more
+# A field changes by less than 0.1 px per pixel, so each step reduces the error tenfold.
 _FIELD_STEPS = 12
 _INVERSE_TOLERANCE = 1e-14  # of the ideal image plane: 4e-11 px at a focal length of 4000 px
 
@@ -68,9 +65,9 @@ class CameraModel:
     A camera: image size in pixels, parameters and lens model.
 
     ``parameters`` is (p,) in the order of `parameter_names`; ``model`` a key of
-    `lens.COEFFICIENTS`; ``field`` what the detector shows beyond the lens model. Raises ValueError
-    for an unknown model, when the parameters are not p finite numbers, or when a focal length is
-    not positive.
+    `lens.COEFFICIENTS`; ``field`` a displacement that the lens model does not describe.  Raises
+    ValueError for an unknown model, for parameters that are not p finite numbers, and for a focal
+    length that is not positive.
     """
 
     width: int
@@ -226,7 +223,7 @@ def project(camera: CameraModel, directions_camera: Floats) -> Floats:
     """
     Pixels (..., 2) of directions (..., 3) in the camera frame; NaN where there is none.
 
-    The field of the camera is a function of the pixel that comes out, so it is iterated.
+    The field is a function of the resulting pixel, so the projection is iterated.
     """
     directions = np.asarray(directions_camera, np.float64)
     ideal = project_parameters(camera.model, camera.parameters, directions)
@@ -315,8 +312,8 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     """
     Unit directions (..., 3) in the camera frame of pixels (..., 2): the inverse of `project`.
 
-    Newton iteration on the distortion with its analytic Jacobian.  NaN where it does not converge
-    to the branch that holds the optical axis: there the model folds over and has no inverse.
+    Newton iteration on the distortion with its analytic Jacobian.  NaN beyond the fold of the
+    model, where it has no inverse on the branch of the optical axis.
     """
     model, distortion = camera.model, camera.distortion
     fold2 = fold_radius2(model, distortion)
@@ -324,7 +321,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     if (field := camera.moving_field) is not None:
         pixels = pixels - field.displacement_px(pixels)
     target = _plane_points(camera, pixels)
-    # Newton squares no error beyond a fold or a pole; a start and steps inside stay inside.
+    # Newton's method does not return from beyond a fold or a pole: start and steps stay inside.
     guarded = model != 'plumb_bob'
     xy = _inside(0.0 * target, target, fold2) if guarded else target.copy()
     error = np.full(target.shape, np.inf)
@@ -343,7 +340,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
                 ],
                 axis=-1,
             )
-            # A step longer than the radius itself has left the branch: halve its way out.
+            # A step much longer than the radius has left the branch of the axis: it is shortened.
             reach = 0.5 + np.hypot(xy[..., 0], xy[..., 1])
             length = np.hypot(step[..., 0], step[..., 1])
             step *= np.minimum(1.0, reach / np.maximum(length, 1e-300))[..., None]
@@ -351,7 +348,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
         xy = _inside(xy, moved, fold2) if guarded else moved
     J = distort_jacobian(model, xy, distortion)
     determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-    # Past its summit the distorted radius falls: what lies there is another branch.
+    # Beyond the fold the distorted radius decreases: solutions there belong to another branch.
     r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
     found = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
     xy[~found | (determinant <= 0) | (r2 > fold2)] = np.nan
@@ -382,8 +379,8 @@ def field_radius_rad(camera: CameraModel, margin_px: float = 0.0) -> float:
     """
     Largest angle between the optical axis and the edge of the detector plus a margin, rad.
 
-    The larger of two, with and without distortion: the second replaces the first where the model
-    has no inverse, and an estimated distortion may lie between them.
+    The larger of the angles with and without distortion.  Without distortion every pixel has one,
+    and an estimated distortion may lie between the two.
     """
     w, h, m = camera.width - 1, camera.height - 1, margin_px
     edge = np.concatenate(

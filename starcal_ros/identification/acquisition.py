@@ -27,10 +27,10 @@ from starcal_ros.stars.detection import Sources
 _VOTERS = 100
 # Where noise or artefacts outnumber the stars, the brightest sources alone are stars.
 _DEPTHS = (60, 30, 15)
-_PAIRS_OF_CUBIC = 8  # that carry a cubic radial distortion besides rotation and scale
-_MOST_CUBIC = 0.15  # of the half diagonal: displacement of the corner of the image
-_SOUND_SHARE = 0.75  # of the brightest sources met by a match that needs no other attempt
-_MET_PX = 2.0  # between a source and the star that it is
+_PAIRS_OF_CUBIC = 8  # fewest pairs with which a cubic radial distortion is fitted too
+_MOST_CUBIC = 0.15  # its largest displacement in the corner of the image, half diagonals
+_SOUND_SHARE = 0.75  # of the brightest sources: a match with so many needs no other attempt
+_MET_PX = 2.0  # largest distance between a source and its star
 _FEWEST_SOURCES = 6  # fewer cannot pass the test against chance
 _SIDE = 3  # parts of the image along each side, in which a match must hold
 PARTS = _SIDE**2
@@ -111,7 +111,7 @@ def _vote(
     rolls_rad = [k * roll_step for k in sorted(range(-roll_steps, roll_steps + 1), key=abs)]
 
     centre = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    # Sources of the image against the predictions of its area and of the margin about it.
+    # Predictions fill the image and a margin about it: twice as many of them take part.
     stars = prediction.xy_px[: min(_VOTERS, 2 * len(sources.snr))] - centre
     seen = sources.xy_px[:_VOTERS] - centre
     votes, roll, low = _fullest_block(stars, seen, cell_px, half_cells, rolls_rad)
@@ -251,19 +251,19 @@ def _match(
         pairs = _pairs((xy + correction)[bright], seen.xy_px, radius_px)
     if len(pairs) >= 4:
         xy = xy + correction
-    # Rotation, scale, cubic and warp were fitted to the pairs: two parameters can buy one pair.
-    bought = 3 + len(warp_powers(len(pairs)))
-    _check_beyond_chance(xy[bright], seen, bought, camera.width, camera.height)
+    # Rotation, scale, cubic and warp were fitted: two parameters can make one false pair match.
+    false_pairs = 3 + len(warp_powers(len(pairs)))
+    _check_beyond_chance(xy[bright], seen, false_pairs, camera.width, camera.height)
     return xy
 
 
 def _check_beyond_chance(
-    predicted_px: Floats, sources: Sources, fitted_pairs: int, width: int, height: int
+    predicted_px: Floats, sources: Sources, false_pairs: int, width: int, height: int
 ) -> None:
     """
     Refuse the match if the number of predictions (n, 2) on a source is consistent with chance.
 
-    ``fitted_pairs`` is the number of false pairs that the fit itself can make.
+    ``false_pairs`` is the number of false pairs that the fit itself can make.
 
     Raises ImageRefused ``no_match``.
     """
@@ -274,8 +274,8 @@ def _check_beyond_chance(
     density = len(sources.snr) / sources.searched_px2
     tried = int(np.count_nonzero(inside))
     expected = tried * -np.expm1(-density * np.pi * radius_px**2)
-    few = max(6, 1 + fitted_pairs)
-    if matched < few or pdtrc(matched - 1 - fitted_pairs, expected) > _MAX_P_VALUE:
+    few = max(6, 1 + false_pairs)
+    if matched < few or pdtrc(matched - 1 - false_pairs, expected) > _MAX_P_VALUE:
         raise ImageRefused(
             'no_match',
             f'{matched} of {tried} predicted stars match a source, {expected:.0f} expected by'
@@ -289,9 +289,9 @@ def _matched_in_part(sources: Sources, met: Indices, width: int, height: int) ->
     """
     Return True if bright sources are matched in one part of the image but not in most others.
 
-    ``met`` are the matched sources.  In a crowded field a wrong scale or distortion can be right
-    in one part and still pass the test over the whole image.  A part without sources, e.g. behind
-    a cloud, is not counted.
+    ``met`` are the matched sources.  In a crowded field a match with a wrong scale or distortion
+    can hold in one part and still pass the test over the whole image.  A part without sources,
+    e.g. behind a cloud, is not counted.
     """
     bright = sources.snr >= median(sources.snr[met])
     meets = np.zeros(len(sources.snr), bool)

@@ -20,7 +20,7 @@ from starcal_ros.stars.psf_fit import neighbour_pull_px, stamp_radius_px
 
 _PULL_UNCERTAINTY = 0.25  # relative, of a neighbour's flux from its V magnitude: colours differ
 _MODELLED_UNCERTAINTY = 0.05  # relative, of a measured neighbour's flux: the PSF is not Gaussian
-_NEAR_SIGMA = 5.0  # a bright unmeasured neighbour within this swamps the star
+_NEAR_SIGMA = 5.0  # distance to a bright unmeasured neighbour below which a star is swamped
 _ALONE_SIGMA = 0.1  # stars pulled by less than this are used to fit the PSF
 
 
@@ -55,7 +55,7 @@ def neighbour_pulls(
     ``flux_dn`` (n,) is measured and includes light of neighbours; the flux of a neighbour follows
     from the difference of the magnitudes.  For an unresolved pair the pull is from the star to the
     common centre of light.  The light of ``modelled`` (n,) stars is already subtracted.  Only the
-    ``measured`` (n,) stars get a pull: in a wide field most are too faint to have a place.
+    ``measured`` (n,) stars get a pull: most stars of a wide field are too faint to be measured.
     """
     sigma_px = model.psf_sigma_px or 1.0
     reach_px = stamp_radius_px(sigma_px) * math.sqrt(2.0) + 2.0 * sigma_px
@@ -129,7 +129,7 @@ def separate(
     catalog flags but does not list.
     """
     magnitude = catalog.magnitude[prediction.catalog_index]
-    # The search for lost lines looks at the places of stars that were not found where they belong.
+    # The search for lost lines also uses the stars measured far from their predictions.
     measured = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
     pulls = neighbour_pulls(
         prediction.xy_px, magnitude, centroids.flux_dn, model, centroids.modelled, measured

@@ -94,7 +94,7 @@ def refuse_by_brightness(
 def _alone_in_part(
     refusal: NDArray[np.uint8], seen: Mask, predicted_px: Floats, shape: tuple[int, int]
 ) -> Mask:
-    """Mask (n,) of the good stars in parts that lack almost all stars that are to be ``seen``."""
+    """Mask (n,) of the good stars in parts of the image that lack most of the ``seen`` stars."""
     kept = refusal == StarRefusal.NONE
     gone = seen & ((refusal == StarRefusal.NOT_DETECTED) | (refusal == StarRefusal.AMBIGUOUS))
     if np.count_nonzero(gone) < _FEWEST - 1:

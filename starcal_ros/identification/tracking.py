@@ -98,7 +98,7 @@ def track_stars(
     """
     pixels = exposure.image.pixels
     prediction = _predict(exposure, before, search)
-    # Moments depend on the local background; a PSF fit estimates its own level.
+    # The moment method needs the local background; a PSF fit estimates its own level.
     fitted = search.centroid.centroid == 'psf'
     background = sample_background(pixels) if fitted else measure_background(pixels)
     rotation_rad = _find_rotation(pixels, background, prediction, before.geometry.camera, search)

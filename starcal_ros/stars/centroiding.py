@@ -29,9 +29,9 @@ _MASK_RADIUS_PX = 3.0
 _MASK_THRESHOLD_SIGMA = 3.0  # above the background
 _MIN_MASK_PIXELS = 4
 _MODELLED_SNR = 4.0  # of stars that are modelled, to subtract their light from their neighbours
-SWAMPED_SIGMA = 3.0  # a star with a brighter one nearer than this cannot be separated from it
+SWAMPED_SIGMA = 3.0  # distance to a brighter star below which a star cannot be separated
 _NEIGHBOUR_NOISE = 0.2  # of the pixel noise; less light of a neighbour is neglected
-_IN_PLACE_PX = 1.5  # from the brightest pixel; a fit that ends farther away is not of the star
+_IN_PLACE_PX = 1.5  # from the brightest pixel; a fit that ends farther away shows another source
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,7 @@ def measure_stars(
 
 
 def with_faint(measured: Centroids, predicted_px: Floats) -> Centroids:
-    """
-    Centroids of predicted stars (n, 2) of which the first were measured and the others are faint.
-
-    The PSF fit is not in the result, as the others have none.
-    """
+    """Measured stars and, as faint ones, the rest of the predicted (n, 2); without the PSF fit."""
     more = len(predicted_px) - len(measured.refusal)
 
     def extended(values: Floats, value: float) -> Floats:

@@ -32,7 +32,7 @@ _ROWS = 64
 _GOLDEN = 0.618034
 _BELOW_STEP_PX = 8  # the row below is only compared: every eighth pixel is enough
 _SEGMENT_PX = 64  # a piece of a row: as wide as a cell of the background
-_BY_CHANCE = 1e-6  # probability of equal rows above which a row like the one below is no fault
+_BY_CHANCE = 1e-6  # largest probability of equal adjacent rows at which they count as a fault
 # Error of a slope by central differences between cells, interpolated to the middle of two:
 # (1/6 + 1/8) of its second difference.
 _SLOPE_LEFT = 7.0 / 24.0
@@ -111,8 +111,8 @@ def sample_rows(pixels: Pixels) -> RowSample:
         pixels=picked,
         below=pixels[np.minimum(row + 1, height - 1), ::_BELOW_STEP_PX],
         step=step,
-        # A quarter, less the rounding of a mean: noise of a third of the quantisation step makes
-        # so many pixels differ, a star or two do not.
+        # A quarter, less the rounding of a mean.  Noise of a third of the quantisation step makes
+        # this many pixels differ; one or two stars do not.
         noisy=unlike > 0.249,
         constant=unlike == 0.0,
     )
@@ -179,12 +179,12 @@ def _saturation_dn(sample: RowSample, saturation_dn: float) -> int:
     peak = int(sample.pixels.max())
     if not saturation_dn:
         saturation_dn = 0.98 * peak if peak in _ENDS_DN else peak + 1.0
-    # An integer: compared with a float, every pixel would be converted.
+    # An integer, since a comparison with a float converts every pixel.
     return math.ceil(saturation_dn)
 
 
 def _refuse_overexposed(sample: RowSample, least_dn: int) -> None:
-    """Refuse a frame of which too much is saturated."""
+    """Refuse a frame with too many saturated pixels."""
     part = np.count_nonzero(sample.pixels >= least_dn) / sample.pixels.size
     if part > _MAX_SATURATED_FRACTION:
         raise ImageRefused('overexposed', f'{part:.0%} of the pixels are at {least_dn}')
@@ -268,16 +268,16 @@ def _refuse_glare(sample: RowSample, least_dn: int, dark: Pixels | None) -> None
     if slope > _MAX_SLOPE:
         raise ImageRefused(
             'glare',
-            f'the background is uneven within {_SEGMENT_PX} px: a slope of {slope:.2f} of its'
-            ' noise per pixel is left of it',
+            f'the background is uneven within {_SEGMENT_PX} px: its slope is {slope:.2f} of the'
+            f' noise per pixel, over {_MAX_SLOPE}',
         )
 
 
 def slope_left(sample: RowSample, least_dn: int, dark: Pixels | None = None) -> float:
     """
-    Median slope that is left once the background in cells is subtracted, in noise per pixel.
+    Median slope of the image minus its background in cells, in noise per pixel.
 
-    Cells with pixels saturated from ``least_dn`` on are left out.  A remaining slope g pulls the
+    Cells with pixels of ``least_dn`` or more are left out as saturated.  A slope g pulls the
     centroid of a star of any flux by up to 5 sigma_px^2 g of its own sigma (Gaussian of width
     sigma_px, white noise).
     """

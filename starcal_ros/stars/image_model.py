@@ -177,7 +177,7 @@ def _at_least_sky(noise: PixelNoise, background: detection.Background) -> PixelN
     """Pixel noise, raised to the noise of the sky if the converter clips it at 0 DN."""
     if background.level_dn >= _CUT_OFF_BELOW_DN:
         return noise
-    # Clipped pixels have no scatter: with it the sigmas of faint stars would be too small.
+    # Clipped pixels do not scatter: their noise would make the sigmas of faint stars too small.
     return dataclasses.replace(noise, background=max(noise.background, 1.0))
 
 

@@ -45,7 +45,10 @@ from starcal_ros.sky.catalog import StarCatalog
 
 MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of false matches
 ROUNDS = ((0, 12), (12, 18), (18, 24))
-"""Brightest sources of which patterns are formed, with one of each range, round by round."""
+"""
+(first, last) of each round: patterns of the ``last`` brightest sources, with at least one source
+after the ``first`` brightest.
+"""
 _REFINED = 32  # number of best candidates of a lookup that are refined
 _GUESSED = 0.2  # largest shift of a guess, half diagonals
 _ALIKE = 0.03  # largest shift of one star to the next, half diagonals
@@ -122,7 +125,7 @@ def find_sky(
     deadline_s: float = math.inf,
 ) -> SkyMatch | NotFound:
     """
-    Identified stars among sources (n, 2), brightest first, or why there are none.
+    Identified stars among sources (n, 2), brightest first, or the reason why there are none.
 
     ``camera`` is the prior: focal length within 25 %, principal point within 5 % of the width,
     distortion within 3 % of the radius.  The catalog is sorted by magnitude.  With
@@ -148,8 +151,8 @@ def find_sky(
                     if log10_p < MAX_LOG10_P_VALUE:
                         return _result(image, catalog, fit, radius_px, log10_p, bool(mirrored))
                 if time.thread_time() > deadline_s:
-                    return NotFound('the time given for the search is over', least)
-    return NotFound('no pattern of the sources is one of the catalog beyond chance', least)
+                    return NotFound('the search has reached its time limit', least)
+    return NotFound('no pattern of the sources matches the catalog beyond chance', least)
 
 
 def confirm_sky(
@@ -302,7 +305,7 @@ def _gains(
     """
     Log-likelihood ratio (n,) of the sources with a candidate to that by chance.
 
-    Also the part of it that the four stars of a pattern alone give.
+    Also the ratio that the four stars of a pattern give alone.
     """
     half = math.tan(image.half_diagonal_rad)
     finite = plane[np.isfinite(plane[:, 0])]
@@ -346,7 +349,7 @@ def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTr
     """Search trees of points all over the sky and of the stars that discs of a radius need."""
     radius_rad = math.radians(radius_deg)
     points = sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
-    # Where the sky is emptiest a disc has half of the mean: still most of the stars looked at.
+    # The emptiest discs hold half of the mean number, which is still most of the stars tested.
     enough = int(5 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
     return cKDTree(points), cKDTree(catalog.direction_icrs[:enough])
 

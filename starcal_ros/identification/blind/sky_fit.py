@@ -27,18 +27,10 @@ from starcal_ros.sky.catalog import StarCatalog
 FOCAL_RANGE = 0.25  # half range of the logarithm of the focal length
 CENTRE_RANGE = 0.05  # half range of the principal point, in widths
 DISTORTION_RANGE = 0.03  # half range of the distortion in the corners, over the radius
-_CLOSING_IN = (
-    0.05,
-    0.04,
-    0.03,
-    0.022,
-    0.015,
-    0.01,
-    0.007,
-    0.005,
-)  # radii of matching, in half diagonals
+# Radii of matching, in half diagonals.
+_CLOSING_IN = (0.05, 0.04, 0.03, 0.022, 0.015, 0.01, 0.007, 0.005)
 _CROWDED = 0.15  # largest probability that a source lies by chance within the radius of matching
-_TELLING = 0.08  # largest such probability at which a candidate is judged by its matches
+_TELLING = 0.08  # largest such probability at which matches decide about a candidate
 _MOST_STARS = 200
 _JUDGED_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5)  # radii of matching for the p-value
 _DEPTHS = (6, 8, 11, 15, 20, 30, 50, 80, 130, 200)  # numbers of brightest predictions for it
@@ -125,9 +117,9 @@ def _like_chance(image: SourceImage, rank: Indices, radius_px: float, sources: i
     """
     True if chance puts so many sources near predictions, of which ``rank`` (k,) have one.
 
-    Told only at radii at which few places are near a source: at larger ones sources without a
-    star, such as the structure of a corona, hide those that have one.  From there on, the fits
-    accepted of six stars among twelve false sources were below the limit by a factor of two.
+    Judged only at radii at which few random places are near a source: at larger ones, sources
+    without a star (such as the structure of a corona) hide the others.  Accepted fits of six stars
+    among twelve false sources stayed below the limit by a factor of two.
     """
     if len(rank) < 5:
         return True
