@@ -43,18 +43,10 @@ def refuse_by_brightness(
     be bright enough becomes ``not_detected``.  If one part of the image lacks almost all expected
     stars while another part has them, the few stars found in such parts become ``ambiguous`` too.
 
-    Raises ImageRefused ``no_match`` if the brightnesses of most stars contradict the match.
+    ``magnitude`` (n,) and ``predicted_px`` (n, 2) are from the catalog.  Stars below ``min_snr``
+    are faint; ``max_scatter_mag`` is the largest scatter of a true match.
 
-    Parameters
-    ----------
-    magnitude, predicted_px : (n,), (n, 2)
-        Catalog magnitudes and predicted pixels.
-    min_snr : float
-        Signal-to-noise ratio below which a star is faint.
-    max_scatter_mag : float
-        Largest scatter of a true match.
-    shape : (int, int)
-        Height and width of the image.
+    Raises ImageRefused ``no_match`` if the brightnesses of most stars contradict the match.
     """
     refusal = centroids.refusal.copy()
     good = np.flatnonzero(refusal == StarRefusal.NONE)

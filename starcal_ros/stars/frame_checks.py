@@ -153,16 +153,11 @@ def screen(
     """
     Refuse a frame that cannot be measured.
 
-    Raises ImageRefused ``overexposed``, ``blank``, ``frozen``, ``incomplete`` or ``glare``.
+    ``before`` is the previous frame, used or not.  Pixels of ``saturation_dn`` or more are
+    saturated; 0 stands for the end of the converter's range.  Slopes of the frame ``dark``
+    (height, width) do not count as glare.
 
-    Parameters
-    ----------
-    before : Fingerprint or None
-        Previous frame, used or not.
-    saturation_dn : float
-        Pixel value from which a pixel counts as saturated; 0: the end of the converter's range.
-    dark : (height, width) or None
-        Dark frame; its slopes do not count as glare.
+    Raises ImageRefused ``overexposed``, ``blank``, ``frozen``, ``incomplete`` or ``glare``.
     """
     least_dn = _saturation_dn(sample, saturation_dn)
     _refuse_overexposed(sample, least_dn)

@@ -123,20 +123,14 @@ def learn(
     """
     PSF, pixel noise and saturation after one more image; ``before`` if it has too few stars.
 
-    Parameters
-    ----------
-    expected : PixelNoise
-        Noise model used in the fits.
-    saturation_dn : float
-        Level of saturation found in the image; 0 if none.
-    size : (int, int)
-        Width and height of the detector.
+    ``expected`` is the noise model of the fits, ``saturation_dn`` the level of saturation in the
+    image (0 if none), ``size`` width and height of the detector.
     """
     usable = np.nonzero(stars.usable)[0]
     bright = usable[stars.fit.snr[usable] > _BRIGHT_SNR][:_MOST]
     if len(bright) < _FEWEST:
         return before
-    # Bright stars alone do not tell photon noise from a PSF error, which fainter ones do not show.
+    # Fainter stars show no PSF error: with them photon noise is distinguished from it.
     shown = usable[:_MOST]
     noise = noise_sums(select(stars.fit, shown), stars.noise_dn[shown], expected)
     fit = select(stars.fit, bright)

@@ -118,25 +118,14 @@ class Stamps:
         )
 
 
-def fit_psf(
-    stamps: Floats, sigma_px: float | Floats, noise_dn: Floats, pixel_noise: PixelNoise
-) -> PsfFit:
+def fit_psf(stamps: Floats, sigma_px: float, noise_dn: Floats, pixel_noise: PixelNoise) -> PsfFit:
     """
-    Weighted least-squares fit of the pixel-integrated Gaussian to every stamp at once.
+    Weighted least-squares fit of the pixel-integrated Gaussian to every stamp (n, w, w), DN.
 
-    Parameters
-    ----------
-    stamps : (n, w, w)
-        Pixel values, DN; the star within a pixel or so of the centre.
-    sigma_px : float or (n,)
-        Width of the PSF, at each star.
-    noise_dn : (n,)
-        Pixel noise at each star, without the photon noise of the star.
-    pixel_noise : PixelNoise
-        Increase of the noise with the signal.
+    Each star is within about a pixel of the centre.  ``sigma_px`` is the width of the PSF,
+    ``noise_dn`` (n,) the pixel noise without the photon noise of the star.
     """
-    sigma_px = np.broadcast_to(np.asarray(sigma_px, np.float64), (len(stamps),))
-    windows = Stamps(stamps, sigma_px, noise_dn[:, None] ** 2)
+    windows = Stamps(stamps, np.full(len(stamps), sigma_px), noise_dn[:, None] ** 2)
     guess = first_guess(windows, border_level_dn(stamps))
     return fit_at(windows, approach(windows, guess, pixel_noise), pixel_noise)
 
@@ -311,15 +300,8 @@ def neighbour_pull_px(
     """
     Shift (k, 2) of the fitted position of a star by the light of a neighbour.
 
-    It is the position that the fit finds in the noise-free light of both stars.
-
-    Parameters
-    ----------
-    flux_dn, neighbour_flux_dn : (k,)
-    offset_px : (k, 2)
-        From the star to its neighbour.
-    sigma_px, noise_dn, pixel_noise
-        Width of the PSF, and noise as in `fit_psf`.
+    It is the position that the fit finds in the noise-free light of both stars.  ``offset_px``
+    (k, 2) points from the star to its neighbour; PSF and noise are those of `fit_psf`.
     """
     width = 2 * stamp_radius_px(sigma_px) + 1
     count = len(flux_dn)
