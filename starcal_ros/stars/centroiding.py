@@ -120,15 +120,13 @@ def _measure_by_psf(
         model.pixel_noise,
     )
     fit = psf_fit.fit_at(stamps, parameters, model.pixel_noise)
-    refusal = np.full(len(predicted_px), StarRefusal.NONE, np.uint8)
-    for bad, reason in (
+    refusal = _first_reason(
         (~inside, StarRefusal.BORDER),
         (windows.saturated_pixels > options.max_saturated_pixels, StarRefusal.SATURATED),
         ((fit.snr < options.min_snr) | ~np.isfinite(fit.snr), StarRefusal.FAINT),
         (np.abs(fit.parameters[:, :2]).max(axis=1) > _IN_PLACE_PX, StarRefusal.NOT_DETECTED),
         (_misshapen(fit, model), StarRefusal.ELONGATED),
-    ):
-        refusal[bad & (refusal == StarRefusal.NONE)] = reason
+    )
     return Centroids(
         xy_px=centre + fit.parameters[:, :2],
         covariance_px2=fit.covariance[:, [0, 0, 1], [0, 1, 1]],
@@ -140,6 +138,12 @@ def _measure_by_psf(
         noise_dn=windows.noise_dn,
         modelled=modelled,
     )
+
+
+def _first_reason(*reasons: tuple[Mask, StarRefusal]) -> NDArray[np.uint8]:
+    """Codes (n,) of the first of the reasons whose mask (n,) holds; 0 without any."""
+    masks, codes = zip(*reasons, strict=True)
+    return np.select(masks, codes, StarRefusal.NONE).astype(np.uint8)
 
 
 def _brightest_beside(
@@ -323,10 +327,8 @@ def _measure_by_moments(
     height, width = pixels.shape
     radius = int(np.ceil(_MASK_RADIUS_PX))
     n = len(predicted_px)
-    refusal = np.full(n, StarRefusal.NONE, np.uint8)
     centre = np.rint(np.nan_to_num(predicted_px, nan=-1e6)).astype(np.int64)
     inside = detection.windows_inside(pixels.shape, centre, 2 * radius)
-    refusal[~inside] = StarRefusal.BORDER
     centre = np.clip(centre, 2 * radius, [width - 2 * radius - 1, height - 2 * radius - 1])
     w = 2 * radius + 1
     best = detection.windows_about(pixels, centre, radius).reshape(n, w * w).argmax(axis=1)
@@ -344,15 +346,14 @@ def _measure_by_moments(
     variance = np.where(mask, of_pixel, 0.0)
     place_px, covariance_px2, ellipticity = _moments(weight, variance, offsets)
     snr = flux / np.sqrt(np.maximum(variance.sum(axis=(1, 2)), 1e-12))
-    # A mask of one pixel would give a covariance of zero.
-    count = mask.sum(axis=(1, 2))
-    for bad, reason in (
+    refusal = _first_reason(
+        (~inside, StarRefusal.BORDER),
         (stamps.max(axis=(1, 2)) >= model.saturation_dn, StarRefusal.SATURATED),
         (snr < options.min_snr, StarRefusal.FAINT),
-        (count < _MIN_MASK_PIXELS, StarRefusal.TOO_FEW_PIXELS),
+        # A mask of one pixel would give a covariance of zero.
+        (mask.sum(axis=(1, 2)) < _MIN_MASK_PIXELS, StarRefusal.TOO_FEW_PIXELS),
         (ellipticity > MAX_SHAPE_CHANGE, StarRefusal.ELONGATED),
-    ):
-        refusal[bad & (refusal == StarRefusal.NONE)] = reason
+    )
     return Centroids(
         xy_px=centre + place_px,
         covariance_px2=covariance_px2,
