@@ -274,7 +274,7 @@ def project_jacobians(
         J_parameters[..., 1, k] = fy * column_y
 
     pixels = _pixels(camera.intrinsics, distorted)
-    return pixels, J_parameters, _rotation_jacobian(camera, xy)
+    return pixels, J_parameters, rotation_jacobian(camera, directions_camera)
 
 
 def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
@@ -283,20 +283,7 @@ def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
 
     Directions (..., 3) in the camera frame; Z > 0 for a perspective model.
     """
-    return _rotation_jacobian(camera, _ideal_in_front(camera.model, directions_camera))
-
-
-def _ideal_in_front(model: str, directions_camera: Floats) -> Floats:
-    """Ideal points (..., 2) of directions (..., 3), none of them behind a perspective lens."""
-    e = np.asarray(directions_camera, np.float64)
-    if model == 'equidistant':
-        return ideal_points(model, e)
-    z_inverse = 1.0 / e[..., 2]
-    return np.asarray(e[..., :2] * z_inverse[..., None])
-
-
-def _rotation_jacobian(camera: CameraModel, xy: Floats) -> Floats:
-    """Derivative (..., 2, 3) of pixels by a small rotation, at ideal points (..., 2)."""
+    xy = _ideal_in_front(camera.model, directions_camera)
     fx, skew, fy, _, _ = camera.intrinsics
     J_xy = distort_jacobian(camera.model, xy, camera.distortion)
     J_u = fx * J_xy[..., 0, :] + skew * J_xy[..., 1, :]
@@ -306,6 +293,15 @@ def _rotation_jacobian(camera: CameraModel, xy: Floats) -> Floats:
     J[..., 0, :] = J_u[..., 0, None] * x_theta + J_u[..., 1, None] * y_theta
     J[..., 1, :] = J_v[..., 0, None] * x_theta + J_v[..., 1, None] * y_theta
     return J
+
+
+def _ideal_in_front(model: str, directions_camera: Floats) -> Floats:
+    """Ideal points (..., 2) of directions (..., 3), none of them behind a perspective lens."""
+    e = np.asarray(directions_camera, np.float64)
+    if model == 'equidistant':
+        return ideal_points(model, e)
+    z_inverse = 1.0 / e[..., 2]
+    return np.asarray(e[..., :2] * z_inverse[..., None])
 
 
 def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
