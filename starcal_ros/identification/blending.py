@@ -21,6 +21,7 @@ from starcal_ros.stars.psf_fit import neighbour_pull_px, stamp_radius_px
 _PULL_UNCERTAINTY = 0.25  # relative, of a neighbour's flux from its V magnitude: colours differ
 _MODELLED_UNCERTAINTY = 0.05  # relative, of a measured neighbour's flux: the PSF is not Gaussian
 _NEAR_SIGMA = 5.0  # distance to a bright unmeasured neighbour below which a star is swamped
+MAX_BLEND_SIGMA = 3.0  # of the centroid; a larger uncertainty of a blend refuses the star
 _ALONE_SIGMA = 0.1  # stars pulled by less than this are used to fit the PSF
 
 
@@ -115,17 +116,13 @@ def _alone(direction: Floats, tested: Mask) -> Mask:
 
 
 def separate(
-    prediction: Prediction,
-    catalog: StarCatalog,
-    centroids: Centroids,
-    model: ImageModel,
-    max_blend_sigma: float,
+    prediction: Prediction, catalog: StarCatalog, centroids: Centroids, model: ImageModel
 ) -> tuple[Centroids, Mask]:
     """
     Centroids corrected for catalog neighbours, and a mask (n,) of the isolated stars.
 
     The pull is subtracted and its uncertainty added to the covariance; a star with an uncertainty
-    above ``max_blend_sigma`` is refused as a blend.  The same applies to close companions that the
+    above `MAX_BLEND_SIGMA` is refused as a blend.  The same applies to close companions that the
     catalog flags but does not list.
     """
     magnitude = catalog.magnitude[prediction.catalog_index]
@@ -140,7 +137,7 @@ def separate(
         unlisted, unlisted_pull_px(magnitude, faintest, prediction.px_per_rad), 0.0
     )
     size_px = np.sqrt((pulls.uncertain_px**2).sum(axis=1) + 2.0 * unlisted_px**2)
-    beyond = size_px > max_blend_sigma * centroids.sigma_px
+    beyond = size_px > MAX_BLEND_SIGMA * centroids.sigma_px
     refusal = centroids.refusal.copy()
     refusal[(pulls.swamped | beyond) & (refusal == StarRefusal.NONE)] = StarRefusal.BLEND
     # Its light was attributed to the brighter star.

@@ -55,7 +55,6 @@ from starcal_ros.stars.psf_fit import stamp_radius_px
 ACQUISITION_RADIUS_RAD = math.radians(1.5)
 ACQUISITION_ROLL_RAD = math.radians(5.0)
 SEARCH_RADIUS_PX = 12  # half width of the window around a predicted star, with a known alignment
-MAX_BLEND_SIGMA = 3.0  # of the centroid; a larger uncertainty of a blend refuses the star
 _MIN_STARS = 8  # in an image; fewer stars cannot confirm its attitude
 _NEAREST = 200  # brightest predictions, searched in windows first
 _NEAREST_ROLL_RAD = 0.01  # an aligned star tracker has smaller errors about any axis
@@ -168,9 +167,7 @@ def measure_predicted(
         exposure.image.pixels, shown.xy_px[:count], model, search.centroid, exposure.hot_pixels
     )
     # Faint stars are refused, but their light may pull the centroids of the others.
-    centroids, alone = separate(
-        shown, catalog, with_faint(measured, shown.xy_px), model, MAX_BLEND_SIGMA
-    )
+    centroids, alone = separate(shown, catalog, with_faint(measured, shown.xy_px), model)
     _refuse_line_loss(shown.xy_px, centroids, (height, width))
     psf_sigma_px = model.psf_sigma_px or 1.0
     refusal = refuse_on_hot_pixels(

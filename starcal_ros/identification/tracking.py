@@ -101,7 +101,7 @@ def track_stars(
     # The moment method needs the local background; a PSF fit estimates its own level.
     fitted = search.centroid.centroid == 'psf'
     background = sample_background(pixels) if fitted else measure_background(pixels)
-    rotation_rad = _find_rotation(pixels, background, prediction, before.geometry.camera, search)
+    rotation_rad = _find_rotation(pixels, background, prediction, before.geometry.camera)
     rotation = Rotation.from_rotvec(-rotation_rad)
     direction_camera = rotation.apply(prediction.direction_camera)
     prediction = dataclasses.replace(
@@ -150,11 +150,7 @@ def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> P
 
 
 def _find_rotation(
-    pixels: Pixels,
-    background: Background,
-    prediction: Prediction,
-    camera: CameraModel,
-    search: StarSearch,
+    pixels: Pixels, background: Background, prediction: Prediction, camera: CameraModel
 ) -> Floats:
     """
     Small passive rotation (3,) of the camera, rad, from the predictions to the stars.

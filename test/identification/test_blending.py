@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.identification.blending import neighbour_pulls, Pulls, unlisted_pull_px
-from starcal_ros.identification.star_finder import MAX_BLEND_SIGMA
+from starcal_ros.identification.blending import (
+    MAX_BLEND_SIGMA,
+    neighbour_pulls,
+    Pulls,
+    unlisted_pull_px,
+)
 from starcal_ros.stars.detection import Background
 from starcal_ros.stars.image_model import ImageModel
 from starcal_ros.stars.pixel_noise import PixelNoise
