@@ -100,8 +100,10 @@ def measure_background(pixels: Pixels) -> Background:
     samples -= level[:, None]
     mean, noise = _clipped(samples, spread, np.arange(samples.shape[1]) >= invalid[:, None])
     noise = np.maximum(noise, tail)
-    has_pixels = invalid < _MOSTLY_INVALID * samples.shape[1]
-    level, noise = (_filled(values, has_pixels, mesh_shape) for values in (mean + level, noise))
+    has_pixels = (invalid < _MOSTLY_INVALID * samples.shape[1]).reshape(mesh_shape)
+    level, noise = (
+        filled(values.reshape(mesh_shape), has_pixels).ravel() for values in (mean + level, noise)
+    )
     noise = np.maximum(_without_slope(noise, level.reshape(mesh_shape), pixels), tail)
     return _background(level, noise, mesh_shape, pixels.shape)
 
@@ -142,7 +144,7 @@ def _noise_above(ascending: Singles, level: Singles, zeros: Indices) -> Singles:
 
 def _without_slope(noise: Singles, level_mesh: Singles, pixels: Pixels) -> Singles:
     """Noise (k,) of the cells, from differences where the slope of the background exceeds it."""
-    down, across = mesh_slope(_smooth_mesh(level_mesh), pixels.shape)
+    down, across = mesh_slope(smooth_mesh(level_mesh), pixels.shape)
     cell_v, cell_u = np.array(pixels.shape) / level_mesh.shape
     ramp = (((down * cell_v) ** 2 + (across * cell_u) ** 2) / 12.0).ravel()
     steep = ramp > _STEEP_PART * noise**2
@@ -190,14 +192,12 @@ def _gap_above_zero(ascending: Singles, zeros: Indices) -> Mask:
     return np.asarray((zeros > 0) & (level > GAP_SIGMA * np.maximum(spread, 1.0)))
 
 
-def _filled(values: Singles, has_pixels: Mask, mesh_shape: tuple[int, int]) -> Singles:
-    """Values (k,) of the cells; a cell without pixels takes that of the nearest cell with some."""
-    if has_pixels.all() or not has_pixels.any():
+def filled(values: NDArray[Any], valid: Mask) -> NDArray[Any]:
+    """Values (rows, cols) with each invalid one replaced by the nearest valid one, if any."""
+    if valid.all() or not valid.any():
         return values
-    nearest = distance_transform_edt(
-        ~has_pixels.reshape(mesh_shape), return_distances=False, return_indices=True
-    )
-    return np.asarray(values.reshape(mesh_shape)[tuple(nearest)].ravel())
+    nearest = distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    return np.asarray(values[tuple(nearest)])
 
 
 def _cells(
@@ -235,12 +235,12 @@ def _background(
     level: Singles, noise: Singles, mesh_shape: tuple[int, int], shape: tuple[int, ...]
 ) -> Background:
     """Smoothed level and noise of the cells; the noise is at least that of rounding to DN."""
-    level_mesh = _smooth_mesh(level.reshape(mesh_shape))
-    noise_mesh = _smooth_mesh(np.maximum(noise, math.sqrt(1.0 / 12.0)).reshape(mesh_shape))
+    level_mesh = smooth_mesh(level.reshape(mesh_shape))
+    noise_mesh = smooth_mesh(np.maximum(noise, math.sqrt(1.0 / 12.0)).reshape(mesh_shape))
     return Background(level_mesh, noise_mesh, median(level_mesh), median(noise_mesh), shape)
 
 
-def _smooth_mesh(mesh: Singles) -> Singles:
+def smooth_mesh(mesh: Singles) -> Singles:
     """Return the mesh after a 3 x 3 median, which removes cells with a bright star."""
     mesh = np.ascontiguousarray(mesh, np.float32)
     return np.asarray(cv2.medianBlur(mesh, 3), np.float32) if min(mesh.shape) >= 3 else mesh

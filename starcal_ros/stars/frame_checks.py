@@ -16,10 +16,8 @@ import math
 from typing import Any
 import zlib
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from starcal_ros.arrays import Indices, Mask, Pixels, Singles
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
@@ -27,6 +25,7 @@ from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
 from starcal_ros.records import Image
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
+from starcal_ros.stars.detection import filled, smooth_mesh
 
 _ROWS = 64
 _GOLDEN = 0.618034
@@ -238,13 +237,12 @@ def _repeats_below(sample: RowSample) -> Mask:
 def _off_level(sample: RowSample, alive: Mask) -> Mask:
     """Mask (k, m) of the segments that differ from the nearest live one beyond the noise."""
     level = np.median(_segments(sample.pixels), axis=2)
-    nearest = distance_transform_edt(~alive, return_distances=False, return_indices=True)
     beside = alive[:, 1:] & alive[:, :-1]
     step = np.abs(np.diff(level, axis=1))[beside]
     # Neighbours of a compressed sky differ by its quantisation, which leaves no noise in a block.
     scatter_dn = MAD_TO_SIGMA * median(step) / math.sqrt(2.0) if step.size else 0.0
     noise_dn = max(_noise_dn(sample, alive), scatter_dn)
-    return np.asarray(np.abs(level - level[tuple(nearest)]) > 5.0 * noise_dn)
+    return np.asarray(np.abs(level - filled(level, alive)) > 5.0 * noise_dn)
 
 
 def _noise_dn(sample: RowSample, alive: Mask) -> float:
@@ -281,12 +279,11 @@ def slope_left(sample: RowSample, least_dn: int, dark: Pixels | None = None) -> 
     mesh[pixels[:, :, -pixels.shape[2] // 4] >= least_dn] = np.inf
     if min(mesh.shape) < 4:
         return 0.0  # too small to separate a slope from its stars
-    # A 3 x 3 median removes cells with a bright star.
-    mesh = np.asarray(cv2.medianBlur(mesh, 3), np.float32)
+    mesh = smooth_mesh(mesh)
     mesh[np.isinf(mesh)] = np.nan
     if dark is not None:
         glow = _middle_mean(_sorted_cells(dark[sample.row], sample.step))
-        mesh = mesh - np.asarray(cv2.medianBlur(glow, 3), np.float32)
+        mesh = mesh - smooth_mesh(glow)
     cell_v_px = sample.pixels.shape[0] * sample.step / len(mesh)
     down = np.diff(mesh, 3, axis=0)[:, 1:-2] / cell_v_px
     across = np.diff(mesh, 3, axis=1)[1:-2] / _SEGMENT_PX

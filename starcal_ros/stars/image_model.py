@@ -7,6 +7,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.options import option
@@ -19,6 +20,7 @@ from starcal_ros.stars.psf_fit import fit_psf, noise_sums, stamp_radius_px
 MAX_SHAPE_CHANGE = 0.35  # departure of second moments from the PSF's, a fraction: a blend
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by their sensitivity
 _BRIGHTEST = 60  # stars that may show the level of saturation
+_ISOLATED_PX = 12.0  # least distance to another source of the stars that give the PSF
 _MAX_PSF_SIGMA_PX = 4.0
 _CUT_OFF_BELOW_DN = 1.0  # many pixels of a lower background are clipped to 0 DN
 
@@ -110,7 +112,8 @@ def model_image(
     bright = sources.xy_px[sources.snr > 15.0][:400]
     nearest = np.rint(bright).astype(np.int64)
     bright = bright[pixels[nearest[:, 1], nearest[:, 0]] < saturation_dn]
-    xy = _isolated(bright, 12.0)[:80]
+    isolated = cKDTree(bright).query_ball_point(bright, _ISOLATED_PX, return_length=True) == 1
+    xy = bright[isolated][:80]
     sigma = 1.2
     if len(xy) < 5:
         return unknown
@@ -179,12 +182,3 @@ def _at_least_sky(noise: PixelNoise, background: detection.Background) -> PixelN
         return noise
     # Clipped pixels do not scatter: their noise would make the sigmas of faint stars too small.
     return dataclasses.replace(noise, background=max(noise.background, 1.0))
-
-
-def _isolated(xy_px: Floats, distance_px: float) -> Floats:
-    """Return the points that have no other point within a distance."""
-    if len(xy_px) < 2:
-        return xy_px
-    separation = np.linalg.norm(xy_px[:, None] - xy_px[None], axis=-1)
-    np.fill_diagonal(separation, np.inf)
-    return np.asarray(xy_px[separation.min(axis=1) > distance_px])

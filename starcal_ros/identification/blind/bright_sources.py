@@ -121,7 +121,5 @@ def _extents(light: Floats, reach: Indices) -> tuple[Floats, Floats, Floats]:
 def _apart(xy_px: Floats) -> Indices:
     """Rows of the points (n, 2), brightest first, without a brighter one nearby."""
     kept = np.ones(len(xy_px), bool)
-    if len(xy_px):
-        for first, second in cKDTree(xy_px).query_pairs(_APART_PX, output_type='ndarray'):
-            kept[max(first, second)] = False
+    kept[cKDTree(xy_px).query_pairs(_APART_PX, output_type='ndarray').max(axis=1)] = False
     return np.flatnonzero(kept)
