@@ -54,7 +54,7 @@ _EQUIDISTANT = 'equidistant'
 _WITH_PRISM = ('thin_prism', 'tilted')
 # Below this angle 1 - t / tan(t) loses digits; the terms left out of the series are under 1e-14.
 _SERIES_RAD = 0.2
-_NO_ROOT = 1e-100  # reciprocal of a squared radius: no detector reaches so far
+_NO_ROOT = 1e-100  # reciprocal of a squared radius beyond any detector
 
 
 def ideal_points(model: str, directions_camera: Floats) -> Floats:
@@ -284,7 +284,7 @@ def ros_distortion(model: str, coefficients: Floats) -> tuple[str, Floats]:
     ``distortion_model`` and ``D`` (c,) of a ``CameraInfo``.
 
     ROS has k3 after p1 and p2, and the name ``rational_polynomial`` for OpenCV's models of 8, 12
-    and 14 coefficients, which its readers hand on to OpenCV.
+    and 14 coefficients, which its readers pass to OpenCV.
     """
     if model == _EQUIDISTANT:
         return model, np.array(coefficients)

@@ -25,7 +25,7 @@ from starcal_ros.stars.detection import Sources
 
 # Number of the brightest predictions and sources that vote; all pairs fill one histogram.
 _VOTERS = 100
-# Where noise or artefacts outnumber the stars, the brightest sources alone are stars.
+# If noise or artefacts outnumber the stars, only the brightest sources are stars.
 _DEPTHS = (60, 30, 15)
 _PAIRS_OF_CUBIC = 8  # fewest pairs with which a cubic radial distortion is fitted too
 _MOST_CUBIC = 0.15  # its largest displacement in the corner of the image, half diagonals

@@ -133,7 +133,7 @@ def _noise_above(ascending: Singles, level: Singles, zeros: Indices) -> Singles:
     """
     Noise (k,) of the sorted rows (k, n) that the converter clips at 0 DN; 0 for other rows.
 
-    Clipping removes the lower half of the noise: the 2-sigma quantile of the upper half gives it.
+    Clipping removes the lower half of the noise: the upper half's 2-sigma quantile is used.
     Noise below 1 DN changes too few pixels to be measured: the result is at least 0.5 DN.
     """
     count = ascending.shape[1]
@@ -143,7 +143,7 @@ def _noise_above(ascending: Singles, level: Singles, zeros: Indices) -> Singles:
 
 
 def _without_slope(noise: Singles, level_mesh: Singles, pixels: Pixels) -> Singles:
-    """Noise (k,) of the cells, from differences where the slope of the background exceeds it."""
+    """Noise (k,) of the cells, from differences of pixels where the background is steep."""
     down, across = mesh_slope(smooth_mesh(level_mesh), pixels.shape)
     cell_v, cell_u = np.array(pixels.shape) / level_mesh.shape
     ramp = (((down * cell_v) ** 2 + (across * cell_u) ** 2) / 12.0).ravel()

@@ -24,7 +24,7 @@ _BRIGHT_SNR = 15.0  # of stars that determine the shape of the PSF
 _MOST = 60  # brightest of them; fainter ones add almost nothing
 MIN_PSF_SIGMA_PX = 0.3  # 82 % of the light in one pixel: a smaller width cannot be measured
 _FEWEST = 5  # such stars, or an image is not used
-_MAP_CHI2 = 30.0  # chi^2 of five terms by chance once in 80,000 times
+_MAP_CHI2 = 30.0  # of five terms: exceeded by chance once in 80,000 times
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def learn(
     bright = usable[stars.fit.snr[usable] > _BRIGHT_SNR][:_MOST]
     if len(bright) < _FEWEST:
         return before
-    # Fainter stars show no PSF error: with them photon noise is distinguished from it.
+    # Fainter stars show no PSF error, so that it can be separated from photon noise.
     shown = usable[:_MOST]
     noise = noise_sums(select(stars.fit, shown), stars.noise_dn[shown], expected)
     fit = select(stars.fit, bright)

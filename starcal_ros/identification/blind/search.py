@@ -52,10 +52,10 @@ after the ``first`` brightest.
 _REFINED = 32  # number of best candidates of a lookup that are refined
 _GUESSED = 0.2  # largest shift of a guess, half diagonals
 _ALIKE = 0.03  # largest shift of one star to the next, half diagonals
-_OF_A_GUESS = 40  # brightest stars and sources
+_OF_A_GUESS = 40  # brightest stars and sources compared with a guess
 _CANDIDATES = 20_000  # tested candidates of a lookup, drawn at random from more
 _TESTED = 16  # brightest predictions used to test a candidate
-_TABLED = 5000  # points all over the sky whose stars are kept: of discs of 9 degrees and more
+_TABLED = 5000  # most points whose stars are kept in memory: for discs of 9 degrees and more
 _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
 _NEAR, _FAR = 0.006, 0.02  # 1-sigma of the predictions of a candidate, in half diagonals
