@@ -365,16 +365,18 @@ def _profile(
     return value, first, (density[:, :-1] - density[:, 1:]) / sigma_px[:, None] ** 2
 
 
-def _psf_rows(
-    parameters: Floats, data: Floats, sigma_px: Floats, width: int, count: int
-) -> Floats:
+def _whitened_rows(
+    parameters: Floats, stamps: Stamps, pixel_noise: PixelNoise, count: int
+) -> tuple[Floats, Floats, Floats]:
     """
     Derivatives of stamps by x, y, flux, background, and as the last row their residual.
 
-    ``data`` is (n, width^2); the result (n, count + 1, width^2).  A count of 7 adds, after the
-    background, derivatives by the second moments xx, yy, xy as fractions of the PSF variance.
+    The rows (n, count + 1, p) are divided by the noise of each pixel, and 0 for pixels that are
+    left out.  A count of 7 adds, after the background, derivatives by the second moments xx, yy,
+    xy as fractions of the PSF variance.  Also returns the light (n, p) of the stars, and the
+    inverse (n, p) of that noise.
     """
-    n = len(parameters)
+    n, width, sigma_px = len(stamps), stamps.width, stamps.sigma_px
     x, y, flux, level = parameters.T
     value, first, second = _profile(
         np.concatenate([x, y]), np.concatenate([sigma_px, sigma_px]), width, count == 7
@@ -398,28 +400,8 @@ def _psf_rows(
         np.multiply(py1, flux_px1, out=rows[:, 6])
     residual = rows[:, count]
     np.multiply(rows[:, 2], -flux, out=residual)
-    residual += data
+    residual += stamps.flat_dn
     residual -= level[:, None]
-    return rows
-
-
-def _in_each_row(of_columns: Floats) -> Floats:
-    """Values (n, w) of columns, spread over the pixels (n, w * w) of a stamp."""
-    n, width = of_columns.shape
-    spread = np.empty((n, width, width))
-    spread[:] = of_columns[:, None, :]
-    return spread.reshape(n, width * width)
-
-
-def _whitened_rows(
-    parameters: Floats, stamps: Stamps, pixel_noise: PixelNoise, count: int
-) -> tuple[Floats, Floats, Floats]:
-    """
-    Rows of `_psf_rows` over the noise of each pixel, 0 for pixels that are left out.
-
-    Also the light (n, p) of the stars, and the inverse (n, p) of that noise.
-    """
-    rows = _psf_rows(parameters, stamps.flat_dn, stamps.sigma_px, stamps.width, count)
     light = np.maximum(parameters[:, 2, None], 0.0) * rows[:, 2]
     root_weight = light / pixel_noise.gain_e_per_dn
     root_weight += pixel_noise.background * stamps.noise2_dn2
@@ -428,6 +410,14 @@ def _whitened_rows(
     np.divide(1.0 if valid is None else valid, root_weight, out=root_weight)
     rows *= root_weight[:, None, :]
     return rows, light, root_weight
+
+
+def _in_each_row(of_columns: Floats) -> Floats:
+    """Values (n, w) of columns, spread over the pixels (n, w * w) of a stamp."""
+    n, width = of_columns.shape
+    spread = np.empty((n, width, width))
+    spread[:] = of_columns[:, None, :]
+    return spread.reshape(n, width * width)
 
 
 def _normal(rows: Floats) -> tuple[Floats, Floats]:
