@@ -34,7 +34,6 @@ def refuse_by_brightness(
     model: ImageModel,
     min_snr: float,
     max_scatter_mag: float,
-    shape: tuple[int, int],
 ) -> NDArray[np.uint8]:
     """
     Refusal reasons (n,) after a comparison of measured brightness with catalog magnitude.
@@ -79,12 +78,13 @@ def refuse_by_brightness(
     least_dn = 10.0 ** (0.4 * (faintest - magnitude.astype(np.float64)))
     seen = expected_snr(least_dn, psf_sigma_px, noise_dn, model.pixel_noise) > min_snr
     refusal[seen & (refusal == StarRefusal.FAINT)] = StarRefusal.NOT_DETECTED
-    refusal[_alone_in_part(refusal, seen, predicted_px, shape)] = StarRefusal.AMBIGUOUS
+    alone = _alone_in_part(refusal, seen, predicted_px, model.background.shape)
+    refusal[alone] = StarRefusal.AMBIGUOUS
     return refusal
 
 
 def _alone_in_part(
-    refusal: NDArray[np.uint8], seen: Mask, predicted_px: Floats, shape: tuple[int, int]
+    refusal: NDArray[np.uint8], seen: Mask, predicted_px: Floats, shape: tuple[int, ...]
 ) -> Mask:
     """Mask (n,) of the good stars in parts of the image that lack most of the ``seen`` stars."""
     kept = refusal == StarRefusal.NONE

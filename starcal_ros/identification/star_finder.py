@@ -187,7 +187,6 @@ def measure_predicted(
         model,
         search.centroid.min_snr,
         options.max_brightness_scatter_mag,
-        (height, width),
     )
     centroids = dataclasses.replace(centroids, refusal=refusal)
     observations = _observations(exposure, shown, catalog, centroids, model)
