@@ -55,7 +55,7 @@ def bright_sources(pixels: Pixels) -> BrightSources:
     light = stamps - background.level_at(centre)[:, None, None]
     light[outside | (light < 3.0 * background.noise_at(centre)[:, None, None])] = 0.0
     reach = np.arange(-_STAMP_PX, _STAMP_PX + 1)
-    # Two rounds: the second is centred on the first centroid, which reduces neighbours at the rim.
+    # The second round is centred on the first centroid: neighbours at the rim then count less.
     offset = np.zeros((len(centre), 2))
     for radius_px in (4.0, 5.0):
         u, v = (
