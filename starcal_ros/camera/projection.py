@@ -37,7 +37,7 @@ from starcal_ros.camera.lens import (
 
 MAX_SIDE_PX = 65536
 _MAX_FOCAL_PX = 1e8  # 0.002 arcsec per pixel
-_MIN_FOCAL_OF_SIDE = 0.15  # of a perspective lens: 147 degrees from side to side
+_MIN_FOCAL_OF_SIDE = 0.15  # shortest perspective lens: 147 degrees along the longer side
 _MAX_COEFFICIENT = 1e15
 _SEEN = 0.5  # smallest part of the detector with lines of sight
 
@@ -53,10 +53,10 @@ PARAMETER_NAMES = parameter_names('plumb_bob')
 ALL_PARAMETER_NAMES = parameter_names('tilted')
 """Names of the parameters of all lens models; `tilted` has them all."""
 
-_INVERSE_STEPS = 50  # of Newton's method: 6 suffice in the field, far corners need more
+_INVERSE_STEPS = 50  # Newton iterations: 6 suffice in the field, far corners need more
 # A field changes by less than 0.1 px per pixel, so each step reduces the error tenfold.
 _FIELD_STEPS = 12
-_INVERSE_TOLERANCE = 1e-14  # of the ideal image plane: 4e-11 px at a focal length of 4000 px
+_INVERSE_TOLERANCE = 1e-14  # on the ideal image plane: 4e-11 px at a focal length of 4000 px
 
 
 @dataclass(frozen=True)

@@ -29,14 +29,14 @@ _VOTERS = 100
 _DEPTHS = (60, 30, 15)
 _PAIRS_OF_CUBIC = 8  # fewest pairs with which a cubic radial distortion is fitted too
 _MOST_CUBIC = 0.15  # its largest displacement in the corner of the image, half diagonals
-_SOUND_SHARE = 0.75  # of the brightest sources: a match with so many needs no other attempt
+_SOUND_SHARE = 0.75  # share of the brightest sources whose match needs no other attempt
 _MET_PX = 2.0  # largest distance between a source and its star
 _FEWEST_SOURCES = 6  # fewer cannot pass the test against chance
 _SIDE = 3  # parts of the image along each side, in which a match must hold
 PARTS = _SIDE**2
 _FEWEST_IN_PART = 4  # points in a part for a significant share
-_PART_MAX_P_VALUE = 1e-3  # of the misses in a part, if the match is right
-_MAX_P_VALUE = 1e-9  # of the matched stars, if the match is wrong
+_PART_MAX_P_VALUE = 1e-3  # p-value of the misses in a part, given a right match
+_MAX_P_VALUE = 1e-9  # p-value of the matched stars, given a wrong match
 
 
 def acquire(

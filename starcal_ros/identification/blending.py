@@ -21,7 +21,7 @@ from starcal_ros.stars.psf_fit import neighbour_pull_px, stamp_radius_px
 _PULL_UNCERTAINTY = 0.25  # relative, of a neighbour's flux from its V magnitude: colours differ
 _MODELLED_UNCERTAINTY = 0.05  # relative, of a measured neighbour's flux: the PSF is not Gaussian
 _NEAR_SIGMA = 5.0  # distance to a bright unmeasured neighbour below which a star is swamped
-MAX_BLEND_SIGMA = 3.0  # of the centroid; a larger uncertainty of a blend refuses the star
+MAX_BLEND_SIGMA = 3.0  # largest uncertainty by neighbours, in sigmas of the centroid
 _ALONE_SIGMA = 0.1  # stars pulled by less than this are used to fit the PSF
 
 

@@ -24,7 +24,7 @@ _FEWEST = 4  # stars: fewer give no meaningful scatter or share
 # A camera's band is not V: stars of a real sky scatter by 0.15 to 0.3 mag, none of 2000 was off
 # by 1.5; a lens may dim its corners by 1.  Stars met by chance scatter by 1.0 to 1.7 mag.
 _BRIGHTEST = 20  # good stars, brightest in the catalog, that give a first zero point
-_MOST_OFF = 2.0  # of one star, in the largest scatter of all
+_MOST_OFF = 2.0  # largest deviation of a star, in units of the largest scatter
 
 
 def refuse_by_brightness(

@@ -49,15 +49,15 @@ from starcal_ros.stars.psf_field import Instrument
 
 _GUIDES = 24  # brightest predictions, searched in windows
 _NEIGHBOUR_PX = 3.0  # offsets of all guides agree to this under a roll of 0.1 degrees
-_MAX_P_VALUE = 1e-9  # of the matches in the windows, if the prediction is wrong
-_GOOD_SNR = 10.0  # of stars that correct the prediction
+_MAX_P_VALUE = 1e-9  # p-value of the matches in the windows, given a wrong prediction
+_GOOD_SNR = 10.0  # smallest signal-to-noise ratio of stars that correct the prediction
 _STEADY_PX = 1.0  # smaller rotations are left to the search in the next image
 _SYSTEMATIC_PX = 0.15  # rms from which the camera of the prediction is corrected
 # 1-sigma of the predicting camera about the one before: intrinsics as parts of the focal length,
 # and distortion for a lens with an inaccurate prior.
 _INTRINSIC_SIGMA = np.array([0.01, 1e-3, 0.01, 0.01, 0.01])
 _COEFFICIENT_SIGMA = {'k1': 0.05, 'k2': 0.1, 'k3': 0.1, 'k4': 0.05, 'k5': 0.1, 'k6': 0.1}
-_SMALL_SIGMA = 1e-3  # of the other coefficients: decentring, thin prism, tilt
+_SMALL_SIGMA = 1e-3  # 1-sigma of the other coefficients: decentring, thin prism, tilt
 
 
 @dataclass(frozen=True)

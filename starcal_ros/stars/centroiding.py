@@ -28,9 +28,9 @@ from starcal_ros.stars.psf_field import PsfWidth
 _MASK_RADIUS_PX = 3.0
 _MASK_THRESHOLD_SIGMA = 3.0  # above the background
 _MIN_MASK_PIXELS = 4
-_MODELLED_SNR = 4.0  # of stars that are modelled, to subtract their light from their neighbours
+_MODELLED_SNR = 4.0  # light of stars above this ratio is subtracted from their neighbours
 SWAMPED_SIGMA = 3.0  # distance to a brighter star below which a star cannot be separated
-_NEIGHBOUR_NOISE = 0.2  # of the pixel noise; less light of a neighbour is neglected
+_NEIGHBOUR_NOISE = 0.2  # light of a neighbour below this share of the pixel noise is neglected
 _IN_PLACE_PX = 1.5  # from the brightest pixel; a fit that ends farther away shows another source
 
 

@@ -369,7 +369,7 @@ def _parabola_vertex(
 def windows_about(pixels: Pixels, centre: Indices, radius: int) -> Pixels:
     """Square windows (n, 2 radius + 1, 2 radius + 1) about integer pixels (n, 2), all inside."""
     side = 2 * radius + 1
-    if len(centre) == 0:  # of an image that may be smaller than a window
+    if len(centre) == 0:  # the image may be smaller than a window
         return np.empty((0, side, side), pixels.dtype)
     # The type stubs of NumPy drop the type of the pixels here.
     every: Any = np.lib.stride_tricks.sliding_window_view(pixels, (side, side))

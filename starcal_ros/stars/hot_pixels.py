@@ -74,7 +74,7 @@ def learn_hot_pixels(
     focal_px: float,
 ) -> HotPixels:
     """
-    Hot pixels after one more image, of which one strip is scanned.
+    Hot pixels after one more image; one strip of it is scanned.
 
     ``pixels`` (height, width) are without the dark frame.  A strip is compared with its last scan
     once ``icrf_from_camera`` has moved the stars by more than a PSF.

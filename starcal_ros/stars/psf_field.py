@@ -20,11 +20,11 @@ from starcal_ros.stars.pixel_noise import NoiseSums, PixelNoise
 from starcal_ros.stars.psf_fit import noise_sums, PsfFit, select
 
 _MEMORY = 0.95  # weight of the earlier images at each new one: about twenty images count
-_BRIGHT_SNR = 15.0  # of stars that determine the shape of the PSF
-_MOST = 60  # brightest of them; fainter ones add almost nothing
+_BRIGHT_SNR = 15.0  # smallest signal-to-noise ratio of stars that determine the PSF
+_MOST = 60  # largest number of them, brightest first; fainter ones add almost nothing
 MIN_PSF_SIGMA_PX = 0.3  # 82 % of the light in one pixel: a smaller width cannot be measured
-_FEWEST = 5  # such stars, or an image is not used
-_MAP_CHI2 = 30.0  # of five terms: exceeded by chance once in 80,000 times
+_FEWEST = 5  # smallest number of them in an image that is used
+_MAP_CHI2 = 30.0  # chance gives five terms a larger chi^2 once in 80,000 times
 
 
 @dataclass(frozen=True)

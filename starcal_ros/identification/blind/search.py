@@ -60,7 +60,7 @@ _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
 _NEAR, _FAR = 0.006, 0.02  # 1-sigma of the predictions of a candidate, in half diagonals
 _SHOWN = 0.6  # expected share of the bright stars that a true candidate shows
-_LEAST_GAIN = 0.8  # of the gain of the four stars of a pattern alone
+_LEAST_GAIN = 0.8  # smallest gain, over that of the four stars of a pattern alone
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ _JUDGED_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5)  # radii of matching for the p
 _DEPTHS = (6, 8, 11, 15, 20, 30, 50, 80, 130, 200)  # numbers of brightest predictions for it
 _LOOKS = 10.0  # number of independent tests among these depths, which share most stars
 _ORDERED = 30  # brightest matches whose order is judged: more would not change a verdict
-_WIDEST_RAD = math.radians(80.0)  # of half a diagonal: sources are matched in a tangent plane
+_WIDEST_RAD = math.radians(80.0)  # largest half diagonal: sources are matched in a tangent plane
 _ALONE = 10.0  # radius about a star for the local density of sources, in radii of matching
 
 
@@ -115,7 +115,7 @@ def refined(
 
 def _like_chance(image: SourceImage, rank: Indices, radius_px: float, sources: int) -> bool:
     """
-    True if chance puts so many sources near predictions, of which ``rank`` (k,) have one.
+    True if chance explains that the predictions ``rank`` (k,) have a source nearby.
 
     Judged only at radii at which few random places are near a source: at larger ones, sources
     without a star (such as the structure of a corona) hide the others.  Accepted fits of six stars
@@ -133,7 +133,7 @@ def _like_chance(image: SourceImage, rank: Indices, radius_px: float, sources: i
 
 
 def _evenly(image: SourceImage, radius_px: float, sources: int) -> float:
-    """Probability that one of so many sources, spread evenly, lies within a radius."""
+    """Probability that one of a number of evenly spread sources lies within a radius."""
     return min(1.0, min(sources, len(image.xy_px)) * math.pi * radius_px**2 / image.area_px2)
 
 
