@@ -8,7 +8,6 @@ import dataclasses
 from pathlib import Path
 import tempfile
 
-import numpy as np
 import yaml
 
 from starcal_ros.arrays import Floats
@@ -19,7 +18,7 @@ from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe, solve
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import AttitudeSample, Ensemble, Image
-from starcal_ros.sky.astrometry import observer_at
+from starcal_ros.sky.astrometry import earth_velocity_c
 from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.studies.simulation import rendering, simulated_bag
 from starcal_ros.studies.simulation import scenario as synthetic
@@ -66,7 +65,7 @@ def history(samples: list[AttitudeSample]) -> AttitudeHistory:
 
 def earth_velocity_m_s(time_ns: int) -> Floats:
     """Velocity of the observer of simulated frames (3,), ICRF axes."""
-    return np.asarray(observer_at(time_ns).velocity_c * SPEED_OF_LIGHT_M_S)
+    return earth_velocity_c(time_ns) * SPEED_OF_LIGHT_M_S
 
 
 def observed(frames: Iterable[Frame], setup: Setup) -> Ensemble:

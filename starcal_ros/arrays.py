@@ -11,3 +11,4 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]  # (h, w) grey or (h, w, 3) BGR, for display
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]  # detector counts, indexed [v, u]
+Singles = NDArray[np.float32]  # for whole images, where double precision would take longer

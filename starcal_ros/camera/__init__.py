@@ -10,7 +10,6 @@ from starcal_ros.camera.projection import (
     INTRINSIC_NAMES,
     line_of_sight,
     MAX_SIDE_PX,
-    model_of,
     PARAMETER_NAMES,
     parameter_names,
     pixel_grid,
@@ -19,22 +18,3 @@ from starcal_ros.camera.projection import (
     project_parameters,
     rotation_jacobian,
 )
-
-__all__ = [
-    'ALL_PARAMETER_NAMES',
-    'INTRINSIC_NAMES',
-    'MAX_SIDE_PX',
-    'PARAMETER_NAMES',
-    'CameraModel',
-    'check_plausible',
-    'distortion_px',
-    'field_radius_rad',
-    'line_of_sight',
-    'model_of',
-    'parameter_names',
-    'pixel_grid',
-    'project',
-    'project_jacobians',
-    'project_parameters',
-    'rotation_jacobian',
-]

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Cameras in another form: without skew and field, of another lens model."""
+"""The camera of another lens model, or without some parameters, nearest to a given camera."""
 
 from __future__ import annotations
 
@@ -18,36 +18,26 @@ from starcal_ros.camera import (
 )
 from starcal_ros.camera.lens import COEFFICIENTS
 
-_HELD_PX = 1e-2  # what a fit pays for a coefficient of a rational polynomial that moves by one
+# Penalty of a fit for each unit by which a coefficient of a rational polynomial changes.
+_HELD_PX = 1e-2
 
 
 def ros_fit(camera: CameraModel) -> tuple[CameraModel, float]:
     """
-    Best camera without skew and field, for readers of ``camera_info``, and its cost.
+    Best camera without skew and field, for readers of ``camera_info``, and its worst error, px.
 
     ROS consumers ignore K[0,1], but their OpenCV has every lens model here.  Skew is a shear; half
-    of it is a rotation that only the alignment could carry, so some error stays.  Least squares
-    over a 25 x 25 grid of the detector.
-
-    Returns
-    -------
-    camera : CameraModel
-        Of the same lens model, with skew exactly 0.
-    worst_px : float
-        Largest pixel error over the grid.
+    of it is a rotation that only the alignment could carry, so some error stays.
     """
-    if camera.intrinsics[1] == 0.0 and not camera.has_field:
-        return _bare(camera), 0.0
-    free = [k for k, name in enumerate(camera.parameter_names) if name != 'skew']
-    return _fit(dataclasses.replace(camera.replace(skew=0.0), field=None), free, camera)
+    return nearest_camera(camera, camera.model, ('skew',))
 
 
 def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
     """
-    Best camera of a lens model for the lines of sight of another camera, and its cost.
+    Best camera of a lens model for the lines of sight of another camera, and its worst error.
 
-    Least squares over a 25 x 25 grid of the detector, from the coefficients that both models have.
-    Raises ValueError for an unknown model.
+    Least squares over a 25 x 25 grid of the detector, starting with the coefficients that both
+    models have.  Raises ValueError for an unknown model.
 
     Returns
     -------
@@ -56,7 +46,7 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
         Largest pixel error over the grid; infinite where the model cannot see all of it.
     """
     if model == camera.model and not camera.has_field:
-        return _bare(camera), 0.0
+        return dataclasses.replace(camera, field=None), 0.0
     if model not in COEFFICIENTS:
         raise ValueError(f'lens model: {model!r} is not one of {", ".join(COEFFICIENTS)}')
     names = parameter_names(model)
@@ -75,16 +65,9 @@ def nearest_camera(
     camera: CameraModel, model: str, zero: tuple[str, ...]
 ) -> tuple[CameraModel, float]:
     """
-    Best camera of a lens model with some parameters held at zero, without field, and its cost.
+    As `convert`, without field and with some parameters held at zero, for formats without them.
 
-    For formats that lack these parameters.  Least squares as of `convert`.  Raises ValueError for
-    an unknown model, or a name that is no parameter of it.
-
-    Returns
-    -------
-    camera : CameraModel
-    worst_px : float
-        Largest pixel error over the grid; infinite where the model cannot see all of it.
+    Raises ValueError for an unknown model, or a name that is not one of its parameters.
     """
     start = camera if model == camera.model else convert(camera, model)[0]
     start = dataclasses.replace(start.replace(**dict.fromkeys(zero, 0.0)), field=None)
@@ -93,10 +76,6 @@ def nearest_camera(
         return start, 0.0
     free = [k for k, name in enumerate(start.parameter_names) if name not in zero]
     return _fit(start, free, camera)
-
-
-def _bare(camera: CameraModel) -> CameraModel:
-    return camera if camera.field is None else dataclasses.replace(camera, field=None)
 
 
 def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[CameraModel, float]:
@@ -112,8 +91,8 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
         parameters[free] = x
         return dataclasses.replace(start, parameters=parameters)
 
-    # The numerator and the denominator of a rational polynomial trade: unheld, they run away
-    # together to coefficients of 10^4 for a gain of 1e-3 px.
+    # Numerator and denominator of a rational polynomial can grow together: without a penalty
+    # the coefficients reach 10^4 for a gain of 1e-3 px.
     held_px = np.diag(np.where(np.arange(len(start.parameters)) < 5, 0.0, _HELD_PX))[free][:, free]
     if start.model in ('plumb_bob', 'equidistant'):
         held_px = held_px[:0]

@@ -51,9 +51,10 @@ COEFFICIENTS: Mapping[str, tuple[str, ...]] = {
 """Name of a lens model -> names of its coefficients, in order."""
 
 _EQUIDISTANT = 'equidistant'
+_WITH_PRISM = ('thin_prism', 'tilted')
 # Below this angle 1 - t / tan(t) loses digits; the terms left out of the series are under 1e-14.
 _SERIES_RAD = 0.2
-_NO_ROOT = 1e-100  # reciprocal of a squared radius: no detector reaches so far
+_NO_ROOT = 1e-100  # reciprocal of a squared radius beyond any detector
 
 
 def ideal_points(model: str, directions_camera: Floats) -> Floats:
@@ -133,62 +134,58 @@ def distort(model: str, ideal: Floats, coefficients: Floats) -> Floats:
     """
     x, y = ideal[..., 0], ideal[..., 1]
     r2 = x * x + y * y
-    if model == 'plumb_bob':
-        k1, k2, k3, p1, p2 = coefficients
-        g = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd = g * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        yd = g * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    elif model == _EQUIDISTANT:
-        k1, k2, k3, k4 = coefficients
-        g = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
-        xd, yd = g * x, g * y
-    else:
-        k1, k2, k3, p1, p2, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y = _opencv(coefficients)
-        g = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        xd = g * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2)
-        yd = g * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4)
-        if model == 'tilted':
-            xd, yd = _tilt(xd, yd, tau_x, tau_y)[:2]
+    g, _, _ = _radial(model, r2, coefficients)
+    if model == _EQUIDISTANT:
+        return np.stack([g * x, g * y], axis=-1)
+    p1, p2 = coefficients[3:5]
+    xd = g * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = g * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    if model in _WITH_PRISM:
+        s1, s2, s3, s4 = coefficients[8:12]
+        xd, yd = xd + r2 * (s1 + r2 * s2), yd + r2 * (s3 + r2 * s4)
+    if model == 'tilted':
+        xd, yd, _ = _tilt(xd, yd, *coefficients[12:])
     return np.stack([xd, yd], axis=-1)
+
+
+def _radial(model: str, r2: Floats, coefficients: Floats) -> tuple[Floats, Floats, Floats | float]:
+    """Factor g of the radial distortion, its derivative by r2, and the denominator of g."""
+    k1, k2, k3 = coefficients[:3]
+    if model == _EQUIDISTANT:
+        k4 = coefficients[3]
+        g = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+        return g, k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4)), 1.0
+    g = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    g_r2 = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    if model == 'plumb_bob':
+        return g, g_r2, 1.0
+    k4, k5, k6 = coefficients[5:8]
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    g = g / denominator
+    return g, (g_r2 - g * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator, denominator
 
 
 def distort_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
     """Derivatives (..., 2, 2) of `distort` by the ideal points (Eqs. 36, 37)."""
     x, y = ideal[..., 0], ideal[..., 1]
     r2 = x * x + y * y
+    g, g_r2, _ = _radial(model, r2, coefficients)
+    x_by_x, cross, y_by_y = g + 2 * x * x * g_r2, 2 * x * y * g_r2, g + 2 * y * y * g_r2
+    if model != _EQUIDISTANT:
+        p1, p2 = coefficients[3:5]
+        x_by_x = x_by_x + 2 * p1 * y + 6 * p2 * x
+        cross = cross + 2 * p1 * x + 2 * p2 * y
+        y_by_y = y_by_y + 6 * p1 * y + 2 * p2 * x
     J = np.empty((*np.broadcast(x, y).shape, 2, 2), dtype=np.result_type(ideal, coefficients))
-    if model == 'plumb_bob':
-        k1, k2, k3, p1, p2 = coefficients
-        g = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        g_r2 = k1 + r2 * (2 * k2 + r2 * 3 * k3)
-        cross = 2 * x * y * g_r2 + 2 * p1 * x + 2 * p2 * y
-        J[..., 0, 0] = g + 2 * x * x * g_r2 + 2 * p1 * y + 6 * p2 * x
-        J[..., 0, 1] = cross
-        J[..., 1, 0] = cross
-        J[..., 1, 1] = g + 2 * y * y * g_r2 + 6 * p1 * y + 2 * p2 * x
-        return J
-    if model == _EQUIDISTANT:
-        k1, k2, k3, k4 = coefficients
-        g = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
-        g_r2 = k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4))
-        J[..., 0, 0] = g + 2 * x * x * g_r2
-        J[..., 0, 1] = J[..., 1, 0] = 2 * x * y * g_r2
-        J[..., 1, 1] = g + 2 * y * y * g_r2
-        return J
-    k1, k2, k3, p1, p2, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y = _opencv(coefficients)
-    D = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    g = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / D
-    g_r2 = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - g * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / D
-    cross = 2 * x * y * g_r2 + 2 * p1 * x + 2 * p2 * y
-    prism_x, prism_y = 2 * (s1 + 2 * s2 * r2), 2 * (s3 + 2 * s4 * r2)
-    J[..., 0, 0] = g + 2 * x * x * g_r2 + 2 * p1 * y + 6 * p2 * x + x * prism_x
-    J[..., 0, 1] = cross + y * prism_x
-    J[..., 1, 0] = cross + x * prism_y
-    J[..., 1, 1] = g + 2 * y * y * g_r2 + 6 * p1 * y + 2 * p2 * x + y * prism_y
+    J[..., 0, 0], J[..., 1, 1] = x_by_x, y_by_y
+    J[..., 0, 1] = J[..., 1, 0] = cross
+    if model in _WITH_PRISM:
+        s1, s2, s3, s4 = coefficients[8:12]
+        J[..., 0, :] += 2 * (s1 + 2 * s2 * r2)[..., None] * ideal
+        J[..., 1, :] += 2 * (s3 + 2 * s4 * r2)[..., None] * ideal
     if model == 'tilted':
-        untilted = np.concatenate([coefficients[:12], np.zeros_like(coefficients[12:])])
-        xd, yd = np.moveaxis(distort('thin_prism', ideal, untilted[:12]), -1, 0)
-        J = _tilt_jacobian(xd, yd, tau_x, tau_y) @ J
+        xd, yd = np.moveaxis(distort('thin_prism', ideal, coefficients[:12]), -1, 0)
+        J = _tilt_jacobian(xd, yd, *coefficients[12:]) @ J
     return J
 
 
@@ -201,16 +198,12 @@ def coefficient_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Flo
         for k in range(4):
             J[0, k], J[1, k] = x * r2 ** (k + 1), y * r2 ** (k + 1)
         return J
-    for k, column in enumerate((x * r2, x * r2**2, x * r2**3, 2 * x * y, r2 + 2 * x * x)):
-        J[0, k] = column
-    for k, column in enumerate((y * r2, y * r2**2, y * r2**3, r2 + 2 * y * y, 2 * x * y)):
-        J[1, k] = column
+    J[0, :5] = x * r2, x * r2**2, x * r2**3, 2 * x * y, r2 + 2 * x * x
+    J[1, :5] = y * r2, y * r2**2, y * r2**3, r2 + 2 * y * y, 2 * x * y
     if model == 'plumb_bob':
         return J
-    k1, k2, k3, _, _, k4, k5, k6, *_, tau_x, tau_y = _opencv(coefficients)
-    D = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    J[:, :3] /= D
-    g = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / D
+    g, _, denominator = _radial(model, r2, coefficients)
+    J[:, :3] /= denominator
     J[:, 5:8] = -g * J[:, :3]
     if model == 'rational_polynomial':
         return J
@@ -218,6 +211,7 @@ def coefficient_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Flo
     J[0, 9] = J[1, 11] = r2 * r2
     if model == 'thin_prism':
         return J
+    tau_x, tau_y = coefficients[12:]
     xd, yd = np.moveaxis(distort('thin_prism', ideal, coefficients[:12]), -1, 0)
     J[:, :12] = np.einsum('...ij,jk...->ik...', _tilt_jacobian(xd, yd, tau_x, tau_y), J[:, :12])
     sx, cx, sy, cy = np.sin(tau_x), np.cos(tau_x), np.sin(tau_y), np.cos(tau_y)
@@ -229,11 +223,6 @@ def coefficient_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Flo
     J[0, 13] = -xt * w_by_y / w
     J[1, 13] = (-sy * yd - sx * cy * xd - yt * w_by_y) / w
     return J
-
-
-def _opencv(coefficients: Floats) -> list[Floats]:
-    """Return the 14 coefficients of the OpenCV models; those that the model lacks are zero."""
-    return [*coefficients, *[np.zeros(())] * (14 - len(coefficients))]
 
 
 def _tilt(x: Floats, y: Floats, tau_x: Floats, tau_y: Floats) -> tuple[Floats, Floats, Floats]:
@@ -295,7 +284,7 @@ def ros_distortion(model: str, coefficients: Floats) -> tuple[str, Floats]:
     ``distortion_model`` and ``D`` (c,) of a ``CameraInfo``.
 
     ROS has k3 after p1 and p2, and the name ``rational_polynomial`` for OpenCV's models of 8, 12
-    and 14 coefficients, which its readers hand on to OpenCV.
+    and 14 coefficients, which its readers pass to OpenCV.
     """
     if model == _EQUIDISTANT:
         return model, np.array(coefficients)

@@ -37,9 +37,9 @@ from starcal_ros.camera.lens import (
 
 MAX_SIDE_PX = 65536
 _MAX_FOCAL_PX = 1e8  # 0.002 arcsec per pixel
-_MIN_FOCAL_OF_SIDE = 0.15  # of a perspective lens: 147 degrees from side to side
+_MIN_FOCAL_OF_SIDE = 0.15  # shortest perspective lens: 147 degrees along the longer side
 _MAX_COEFFICIENT = 1e15
-_SEEN = 0.5  # part of the detector that must have a line of sight
+_SEEN = 0.5  # smallest part of the detector with lines of sight
 
 INTRINSIC_NAMES = ('fx', 'skew', 'fy', 'cx', 'cy')
 
@@ -49,29 +49,14 @@ def parameter_names(model: str) -> tuple[str, ...]:
     return INTRINSIC_NAMES + COEFFICIENTS[model]
 
 
-def model_of(names: tuple[str, ...]) -> str:
-    """
-    Lens model whose parameters have these names, in this order.
-
-    Raises ValueError when no model has them.
-    """
-    for model in COEFFICIENTS:
-        if names == parameter_names(model):
-            return model
-    raise ValueError(f'{", ".join(names) or "none"} are not the parameters of a lens model')
-
-
 PARAMETER_NAMES = parameter_names('plumb_bob')
-# Those of `tilted` are those of all.
 ALL_PARAMETER_NAMES = parameter_names('tilted')
-"""Every name that a parameter of any lens model has."""
+"""Names of the parameters of all lens models; `tilted` has them all."""
 
-_INVERSE_STEPS = (
-    50  # Newton squares the error at each step: 6 do in the field, the rest is for far corners
-)
-# A field changes by under 0.1 px from pixel to pixel: each step takes off nine tenths and more.
+_INVERSE_STEPS = 50  # Newton iterations: 6 suffice in the field, far corners need more
+# A field changes by less than 0.1 px per pixel, so each step reduces the error tenfold.
 _FIELD_STEPS = 12
-_INVERSE_TOLERANCE = 1e-14  # of the ideal image plane: 4e-11 px at a focal length of 4000 px
+_INVERSE_TOLERANCE = 1e-14  # on the ideal image plane: 4e-11 px at a focal length of 4000 px
 
 
 @dataclass(frozen=True)
@@ -80,9 +65,9 @@ class CameraModel:
     A camera: image size in pixels, parameters and lens model.
 
     ``parameters`` is (p,) in the order of `parameter_names`; ``model`` a key of
-    `lens.COEFFICIENTS`; ``field`` what the detector shows beyond the lens model. Raises ValueError
-    for an unknown model, when the parameters are not p finite numbers, or when a focal length is
-    not positive.
+    `lens.COEFFICIENTS`; ``field`` a displacement that the lens model does not describe.  Raises
+    ValueError for an unknown model, for parameters that are not p finite numbers, and for a focal
+    length that is not positive.
     """
 
     width: int
@@ -204,11 +189,22 @@ def distortion_px(camera: CameraModel, pixels: Floats) -> Floats:
 
     The ideal lens is a pinhole; for ``equidistant`` the radius is proportional to the angle.
     """
+    distorted = distort(camera.model, _plane_points(camera, pixels), camera.distortion)
+    return _pixels(camera.intrinsics, distorted) - pixels
+
+
+def _pixels(intrinsics: Floats, distorted: Floats) -> Floats:
+    """Pixels (..., 2) of distorted points (..., 2) of the image plane."""
+    fx, skew, fy, cx, cy = intrinsics
+    xd, yd = distorted[..., 0], distorted[..., 1]
+    return np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1)
+
+
+def _plane_points(camera: CameraModel, pixels: Floats) -> Floats:
+    """Distorted points (..., 2) of the image plane of pixels (..., 2): inverse of `_pixels`."""
     fx, skew, fy, cx, cy = camera.intrinsics
-    y = (pixels[:, 1] - cy) / fy
-    x = (pixels[:, 0] - cx - skew * y) / fx
-    xd, yd = distort(camera.model, np.stack([x, y], axis=-1), camera.distortion).T
-    return np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1) - pixels
+    yd = (pixels[..., 1] - cy) / fy
+    return np.stack([(pixels[..., 0] - cx - skew * yd) / fx, yd], axis=-1)
 
 
 def project_parameters(model: str, parameters: Floats, directions_camera: Floats) -> Floats:
@@ -220,17 +216,14 @@ def project_parameters(model: str, parameters: Floats, directions_camera: Floats
     directions pass through, for complex-step derivatives.
     """
     distorted = distort(model, ideal_points(model, directions_camera), parameters[5:])
-    fx, skew, fy, cx, cy = parameters[:5]
-    u = fx * distorted[..., 0] + skew * distorted[..., 1] + cx
-    v = fy * distorted[..., 1] + cy
-    return np.stack([u, v], axis=-1)
+    return _pixels(parameters[:5], distorted)
 
 
 def project(camera: CameraModel, directions_camera: Floats) -> Floats:
     """
     Pixels (..., 2) of directions (..., 3) in the camera frame; NaN where there is none.
 
-    The field of the camera is a function of the pixel that comes out, so it is iterated.
+    The field is a function of the resulting pixel, so the projection is iterated.
     """
     directions = np.asarray(directions_camera, np.float64)
     ideal = project_parameters(camera.model, camera.parameters, directions)
@@ -264,11 +257,10 @@ def project_jacobians(
     J_rotation : (..., 2, 3)
         By the passive small rotation ``dtheta`` of the camera frame, rad (Eqs. 31, 34-37).
     """
-    xy = _image_plane(camera.model, directions_camera)
-    fx, skew, fy, cx, cy = camera.intrinsics
+    xy = _ideal_in_front(camera.model, directions_camera)
+    fx, skew, fy, _, _ = camera.intrinsics
     distorted = distort(camera.model, xy, camera.distortion)
     xd, yd = distorted[..., 0], distorted[..., 1]
-    pixels = np.stack([fx * xd + skew * yd + cx, fy * yd + cy], axis=-1)
 
     J_parameters = np.zeros((*xd.shape, 2, len(camera.parameters)))
     J_parameters[..., 0, 0] = xd
@@ -281,7 +273,8 @@ def project_jacobians(
         J_parameters[..., 0, k] = fx * column_x + skew * column_y
         J_parameters[..., 1, k] = fy * column_y
 
-    return pixels, J_parameters, _rotation_jacobian(camera, xy)
+    pixels = _pixels(camera.intrinsics, distorted)
+    return pixels, J_parameters, rotation_jacobian(camera, directions_camera)
 
 
 def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
@@ -290,20 +283,7 @@ def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
 
     Directions (..., 3) in the camera frame; Z > 0 for a perspective model.
     """
-    return _rotation_jacobian(camera, _image_plane(camera.model, directions_camera))
-
-
-def _image_plane(model: str, directions_camera: Floats) -> Floats:
-    """Ideal points (..., 2) of directions (..., 3)."""
-    e = np.asarray(directions_camera, np.float64)
-    if model == 'equidistant':
-        return ideal_points(model, e)
-    z_inverse = 1.0 / e[..., 2]
-    return np.asarray(e[..., :2] * z_inverse[..., None])
-
-
-def _rotation_jacobian(camera: CameraModel, xy: Floats) -> Floats:
-    """Derivative (..., 2, 3) of pixels by a small rotation, at ideal points (..., 2)."""
+    xy = _ideal_in_front(camera.model, directions_camera)
     fx, skew, fy, _, _ = camera.intrinsics
     J_xy = distort_jacobian(camera.model, xy, camera.distortion)
     J_u = fx * J_xy[..., 0, :] + skew * J_xy[..., 1, :]
@@ -315,23 +295,29 @@ def _rotation_jacobian(camera: CameraModel, xy: Floats) -> Floats:
     return J
 
 
+def _ideal_in_front(model: str, directions_camera: Floats) -> Floats:
+    """Ideal points (..., 2) of directions (..., 3), none of them behind a perspective lens."""
+    e = np.asarray(directions_camera, np.float64)
+    if model == 'equidistant':
+        return ideal_points(model, e)
+    z_inverse = 1.0 / e[..., 2]
+    return np.asarray(e[..., :2] * z_inverse[..., None])
+
+
 def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     """
     Unit directions (..., 3) in the camera frame of pixels (..., 2): the inverse of `project`.
 
-    Newton iteration on the distortion with its analytic Jacobian.  NaN where it does not converge
-    to the branch that holds the optical axis: there the model folds over and has no inverse.
+    Newton iteration on the distortion with its analytic Jacobian.  NaN beyond the fold of the
+    model, where it has no inverse on the branch of the optical axis.
     """
     model, distortion = camera.model, camera.distortion
     fold2 = fold_radius2(model, distortion)
     pixels = np.asarray(pixels, np.float64)
     if (field := camera.moving_field) is not None:
         pixels = pixels - field.displacement_px(pixels)
-    fx, skew, fy, cx, cy = camera.intrinsics
-    yd = (pixels[..., 1] - cy) / fy
-    xd = (pixels[..., 0] - cx - skew * yd) / fx
-    target = np.stack([xd, yd], axis=-1)
-    # Newton squares no error beyond a fold or a pole; a start and steps inside stay inside.
+    target = _plane_points(camera, pixels)
+    # Newton's method does not return from beyond a fold or a pole: start and steps stay inside.
     guarded = model != 'plumb_bob'
     xy = _inside(0.0 * target, target, fold2) if guarded else target.copy()
     error = np.full(target.shape, np.inf)
@@ -350,7 +336,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
                 ],
                 axis=-1,
             )
-            # A step longer than the radius itself has left the branch: halve its way out.
+            # A step much longer than the radius has left the branch of the axis: it is shortened.
             reach = 0.5 + np.hypot(xy[..., 0], xy[..., 1])
             length = np.hypot(step[..., 0], step[..., 1])
             step *= np.minimum(1.0, reach / np.maximum(length, 1e-300))[..., None]
@@ -358,7 +344,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
         xy = _inside(xy, moved, fold2) if guarded else moved
     J = distort_jacobian(model, xy, distortion)
     determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-    # Past its summit the distorted radius falls: what lies there is another branch.
+    # Beyond the fold the distorted radius decreases: solutions there belong to another branch.
     r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
     found = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
     xy[~found | (determinant <= 0) | (r2 > fold2)] = np.nan
@@ -389,8 +375,8 @@ def field_radius_rad(camera: CameraModel, margin_px: float = 0.0) -> float:
     """
     Largest angle between the optical axis and the edge of the detector plus a margin, rad.
 
-    The larger of two, with and without distortion: the second replaces the first where the model
-    has no inverse, and an estimated distortion may lie between them.
+    The larger of the angles with and without distortion.  Without distortion every pixel has one,
+    and an estimated distortion may lie between the two.
     """
     w, h, m = camera.width - 1, camera.height - 1, margin_px
     edge = np.concatenate(

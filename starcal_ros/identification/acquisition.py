@@ -9,10 +9,7 @@ without a significant match is refused.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import bdtr, pdtrc
@@ -28,18 +25,18 @@ from starcal_ros.stars.detection import Sources
 
 # Number of the brightest predictions and sources that vote; all pairs fill one histogram.
 _VOTERS = 100
-# Where noise or artefacts outnumber the stars, the brightest sources alone are stars.
+# If noise or artefacts outnumber the stars, only the brightest sources are stars.
 _DEPTHS = (60, 30, 15)
-_PAIRS_OF_CUBIC = 8  # that carry a cubic radial distortion besides rotation and scale
-_MOST_CUBIC = 0.15  # of the half diagonal: displacement of the corner of the image
-_SOUND_SHARE = 0.75  # of the brightest sources met by a match that needs no other attempt
-_MET_PX = 2.0  # between a source and the star that it is
+_PAIRS_OF_CUBIC = 8  # fewest pairs with which a cubic radial distortion is fitted too
+_MOST_CUBIC = 0.15  # its largest displacement in the corner of the image, half diagonals
+_SOUND_SHARE = 0.75  # share of the brightest sources whose match needs no other attempt
+_MET_PX = 2.0  # largest distance between a source and its star
 _FEWEST_SOURCES = 6  # fewer cannot pass the test against chance
 _SIDE = 3  # parts of the image along each side, in which a match must hold
 PARTS = _SIDE**2
 _FEWEST_IN_PART = 4  # points in a part for a significant share
-_PART_MAX_P_VALUE = 1e-3  # of the misses in a part, if the match is right
-_MAX_P_VALUE = 1e-9  # of the matched stars, if the match is wrong
+_PART_MAX_P_VALUE = 1e-3  # p-value of the misses in a part, given a right match
+_MAX_P_VALUE = 1e-9  # p-value of the matched stars, given a wrong match
 
 
 def acquire(
@@ -61,9 +58,7 @@ def acquire(
     for depth in (len(sources.snr), *_DEPTHS):
         if depth < _FEWEST_SOURCES or (depth in _DEPTHS and depth >= len(sources.snr)):
             continue
-        brightest = dataclasses.replace(
-            sources, xy_px=sources.xy_px[:depth], snr=sources.snr[:depth]
-        )
+        brightest = sources.brightest(depth)
         try:
             turn = _vote(prediction, brightest, geometry, reach_px, roll_rad)
             found_px = _match(prediction, brightest, geometry, turn)
@@ -116,7 +111,7 @@ def _vote(
     rolls_rad = [k * roll_step for k in sorted(range(-roll_steps, roll_steps + 1), key=abs)]
 
     centre = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    # Sources of the image against the predictions of its area and of the margin about it.
+    # Predictions fill the image and a margin about it: twice as many of them take part.
     stars = prediction.xy_px[: min(_VOTERS, 2 * len(sources.snr))] - centre
     seen = sources.xy_px[:_VOTERS] - centre
     votes, roll, low = _fullest_block(stars, seen, cell_px, half_cells, rolls_rad)
@@ -197,7 +192,7 @@ def _refine_rotation(
     centre = camera.parameters[3:5]
     half_diagonal_px = 0.5 * np.hypot(camera.width, camera.height)
     rotation, scale, cubic = start, 1.0, 0.0
-    pairs: NDArray[np.int64] = np.empty((0, 2), np.int64)
+    pairs: Indices = np.empty((0, 2), np.int64)
 
     def placed() -> tuple[Floats, Floats, Floats]:
         directions = rotation.apply(prediction.direction_camera)
@@ -244,36 +239,31 @@ def _match(
     camera = geometry.camera
     # Equal numbers of predictions and sources: the fainter surplus has no counterpart.
     bright = np.arange(min(len(prediction.xy_px), 4 * len(sources.snr), 400))
-    first = 4 * len(bright)
-    seen = dataclasses.replace(sources, xy_px=sources.xy_px[:first], snr=sources.snr[:first])
+    seen = sources.brightest(4 * len(bright))
     xy, pairs = _refine_rotation(prediction, seen, geometry, rotation, bright)
     half_px = 0.5 * max(camera.width, camera.height)
     for radius_px in (max(4.0, 0.003 * half_px * 2), 3.0, 2.0):
         if len(pairs) < 4:
             break
         correction, _ = fit_warp(
-            xy[bright[pairs[:, 0]]],
-            seen.xy_px[pairs[:, 1]],
-            np.full(len(pairs), 0.2),
-            xy,
-            half_px,
+            xy[bright[pairs[:, 0]]], seen.xy_px[pairs[:, 1]], np.full(len(pairs), 0.2), xy, half_px
         )
         pairs = _pairs((xy + correction)[bright], seen.xy_px, radius_px)
     if len(pairs) >= 4:
         xy = xy + correction
-    # Rotation, scale, cubic and warp were fitted to the pairs: two parameters can buy one pair.
-    bought = 3 + len(warp_powers(len(pairs)))
-    _check_beyond_chance(xy[bright], seen, bought, camera.width, camera.height)
+    # Rotation, scale, cubic and warp were fitted: two parameters can make one false pair match.
+    false_pairs = 3 + len(warp_powers(len(pairs)))
+    _check_beyond_chance(xy[bright], seen, false_pairs, camera.width, camera.height)
     return xy
 
 
 def _check_beyond_chance(
-    predicted_px: Floats, sources: Sources, fitted_pairs: int, width: int, height: int
+    predicted_px: Floats, sources: Sources, false_pairs: int, width: int, height: int
 ) -> None:
     """
     Refuse the match if the number of predictions (n, 2) on a source is consistent with chance.
 
-    ``fitted_pairs`` is the number of false pairs that the fit itself can make.
+    ``false_pairs`` is the number of false pairs that the fit itself can make.
 
     Raises ImageRefused ``no_match``.
     """
@@ -284,8 +274,8 @@ def _check_beyond_chance(
     density = len(sources.snr) / sources.searched_px2
     tried = int(np.count_nonzero(inside))
     expected = tried * -np.expm1(-density * np.pi * radius_px**2)
-    few = max(6, 1 + fitted_pairs)
-    if matched < few or pdtrc(matched - 1 - fitted_pairs, expected) > _MAX_P_VALUE:
+    few = max(6, 1 + false_pairs)
+    if matched < few or pdtrc(matched - 1 - false_pairs, expected) > _MAX_P_VALUE:
         raise ImageRefused(
             'no_match',
             f'{matched} of {tried} predicted stars match a source, {expected:.0f} expected by'
@@ -299,9 +289,9 @@ def _matched_in_part(sources: Sources, met: Indices, width: int, height: int) ->
     """
     Return True if bright sources are matched in one part of the image but not in most others.
 
-    ``met`` are the matched sources.  In a crowded field a wrong scale or distortion can be right
-    in one part and still pass the test over the whole image.  A part without sources, e.g. behind
-    a cloud, is not counted.
+    ``met`` are the matched sources.  In a crowded field a match with a wrong scale or distortion
+    can hold in one part and still pass the test over the whole image.  A part without sources,
+    e.g. behind a cloud, is not counted.
     """
     bright = sources.snr >= median(sources.snr[met])
     meets = np.zeros(len(sources.snr), bool)

@@ -20,7 +20,8 @@ from starcal_ros.stars.psf_fit import neighbour_pull_px, stamp_radius_px
 
 _PULL_UNCERTAINTY = 0.25  # relative, of a neighbour's flux from its V magnitude: colours differ
 _MODELLED_UNCERTAINTY = 0.05  # relative, of a measured neighbour's flux: the PSF is not Gaussian
-_NEAR_SIGMA = 5.0  # a bright unmeasured neighbour within this swamps the star
+_NEAR_SIGMA = 5.0  # distance to a bright unmeasured neighbour below which a star is swamped
+MAX_BLEND_SIGMA = 3.0  # largest uncertainty by neighbours, in sigmas of the centroid
 _ALONE_SIGMA = 0.1  # stars pulled by less than this are used to fit the PSF
 
 
@@ -55,7 +56,7 @@ def neighbour_pulls(
     ``flux_dn`` (n,) is measured and includes light of neighbours; the flux of a neighbour follows
     from the difference of the magnitudes.  For an unresolved pair the pull is from the star to the
     common centre of light.  The light of ``modelled`` (n,) stars is already subtracted.  Only the
-    ``measured`` (n,) stars get a pull: in a wide field most are too faint to have a place.
+    ``measured`` (n,) stars get a pull: most stars of a wide field are too faint to be measured.
     """
     sigma_px = model.psf_sigma_px or 1.0
     reach_px = stamp_radius_px(sigma_px) * math.sqrt(2.0) + 2.0 * sigma_px
@@ -115,21 +116,17 @@ def _alone(direction: Floats, tested: Mask) -> Mask:
 
 
 def separate(
-    prediction: Prediction,
-    catalog: StarCatalog,
-    centroids: Centroids,
-    model: ImageModel,
-    max_blend_sigma: float,
+    prediction: Prediction, catalog: StarCatalog, centroids: Centroids, model: ImageModel
 ) -> tuple[Centroids, Mask]:
     """
     Centroids corrected for catalog neighbours, and a mask (n,) of the isolated stars.
 
     The pull is subtracted and its uncertainty added to the covariance; a star with an uncertainty
-    above ``max_blend_sigma`` is refused as a blend.  The same applies to close companions that the
+    above `MAX_BLEND_SIGMA` is refused as a blend.  The same applies to close companions that the
     catalog flags but does not list.
     """
     magnitude = catalog.magnitude[prediction.catalog_index]
-    # The search for lost lines looks at the places of stars that were not found where they belong.
+    # The search for lost lines also uses the stars measured far from their predictions.
     measured = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
     pulls = neighbour_pulls(
         prediction.xy_px, magnitude, centroids.flux_dn, model, centroids.modelled, measured
@@ -139,9 +136,8 @@ def separate(
     unlisted_px = np.where(
         unlisted, unlisted_pull_px(magnitude, faintest, prediction.px_per_rad), 0.0
     )
-    sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
     size_px = np.sqrt((pulls.uncertain_px**2).sum(axis=1) + 2.0 * unlisted_px**2)
-    beyond = size_px > max_blend_sigma * sigma_px
+    beyond = size_px > MAX_BLEND_SIGMA * centroids.sigma_px
     refusal = centroids.refusal.copy()
     refusal[(pulls.swamped | beyond) & (refusal == StarRefusal.NONE)] = StarRefusal.BLEND
     # Its light was attributed to the brighter star.
@@ -154,4 +150,4 @@ def separate(
         + np.stack([u * u + unlisted_px**2, u * v, v * v + unlisted_px**2], axis=-1),
         refusal=refusal,
     )
-    return separated, size_px < _ALONE_SIGMA * sigma_px
+    return separated, size_px < _ALONE_SIGMA * centroids.sigma_px

@@ -24,7 +24,7 @@ _FEWEST = 4  # stars: fewer give no meaningful scatter or share
 # A camera's band is not V: stars of a real sky scatter by 0.15 to 0.3 mag, none of 2000 was off
 # by 1.5; a lens may dim its corners by 1.  Stars met by chance scatter by 1.0 to 1.7 mag.
 _BRIGHTEST = 20  # good stars, brightest in the catalog, that give a first zero point
-_MOST_OFF = 2.0  # of one star, in the largest scatter of all
+_MOST_OFF = 2.0  # largest deviation of a star, in units of the largest scatter
 
 
 def refuse_by_brightness(
@@ -34,7 +34,6 @@ def refuse_by_brightness(
     model: ImageModel,
     min_snr: float,
     max_scatter_mag: float,
-    shape: tuple[int, int],
 ) -> NDArray[np.uint8]:
     """
     Refusal reasons (n,) after a comparison of measured brightness with catalog magnitude.
@@ -43,18 +42,10 @@ def refuse_by_brightness(
     be bright enough becomes ``not_detected``.  If one part of the image lacks almost all expected
     stars while another part has them, the few stars found in such parts become ``ambiguous`` too.
 
-    Raises ImageRefused ``no_match`` if the brightnesses of most stars contradict the match.
+    ``magnitude`` (n,) and ``predicted_px`` (n, 2) are from the catalog.  Stars below ``min_snr``
+    are faint; ``max_scatter_mag`` is the largest scatter of a true match.
 
-    Parameters
-    ----------
-    magnitude, predicted_px : (n,), (n, 2)
-        Catalog magnitudes and predicted pixels.
-    min_snr : float
-        Signal-to-noise ratio below which a star is faint.
-    max_scatter_mag : float
-        Largest scatter of a true match.
-    shape : (int, int)
-        Height and width of the image.
+    Raises ImageRefused ``no_match`` if the brightnesses of most stars contradict the match.
     """
     refusal = centroids.refusal.copy()
     good = np.flatnonzero(refusal == StarRefusal.NONE)
@@ -87,14 +78,15 @@ def refuse_by_brightness(
     least_dn = 10.0 ** (0.4 * (faintest - magnitude.astype(np.float64)))
     seen = expected_snr(least_dn, psf_sigma_px, noise_dn, model.pixel_noise) > min_snr
     refusal[seen & (refusal == StarRefusal.FAINT)] = StarRefusal.NOT_DETECTED
-    refusal[_alone_in_part(refusal, seen, predicted_px, shape)] = StarRefusal.AMBIGUOUS
+    alone = _alone_in_part(refusal, seen, predicted_px, model.background.shape)
+    refusal[alone] = StarRefusal.AMBIGUOUS
     return refusal
 
 
 def _alone_in_part(
-    refusal: NDArray[np.uint8], seen: Mask, predicted_px: Floats, shape: tuple[int, int]
+    refusal: NDArray[np.uint8], seen: Mask, predicted_px: Floats, shape: tuple[int, ...]
 ) -> Mask:
-    """Mask (n,) of the good stars in parts that lack almost all stars that are to be ``seen``."""
+    """Mask (n,) of the good stars in parts of the image that lack most of the ``seen`` stars."""
     kept = refusal == StarRefusal.NONE
     gone = seen & ((refusal == StarRefusal.NOT_DETECTED) | (refusal == StarRefusal.AMBIGUOUS))
     if np.count_nonzero(gone) < _FEWEST - 1:

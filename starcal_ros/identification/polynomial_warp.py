@@ -21,8 +21,8 @@ def fit_warp(
     """
     Smooth correction (k, 2) at ``at_px`` from predicted to measured pixels, and robust scatter.
 
-    Robust fit of a polynomial in u and v, of degree 0 to 5 by the number of stars: the prior may
-    lack the distortion.  The correction serves the search only and enters no observation.
+    Robust fit of a polynomial in u and v, whose degree of 0 to 5 depends on the number of stars.
+    It absorbs a distortion that the prior lacks, serves the search only and enters no observation.
     """
     n = len(predicted_px)
     powers = warp_powers(n)

@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import field_radius_rad, line_of_sight, project
@@ -68,9 +67,7 @@ def predict(
     it.
     """
     camera = geometry.camera
-    icrf_from_camera = Rotation.from_quat(icrf_from_star_tracker_xyzw) * Rotation.from_quat(
-        geometry.star_tracker_from_camera_xyzw
-    )
+    icrf_from_camera = geometry.icrf_from_camera(icrf_from_star_tracker_xyzw)
     margin_px = margin_rad * float(camera.parameters[0])
     boresight_icrf = icrf_from_camera.apply([0.0, 0.0, 1.0])
     radius_rad = field_radius_rad(camera, margin_px)

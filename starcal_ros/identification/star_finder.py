@@ -55,7 +55,6 @@ from starcal_ros.stars.psf_fit import stamp_radius_px
 ACQUISITION_RADIUS_RAD = math.radians(1.5)
 ACQUISITION_ROLL_RAD = math.radians(5.0)
 SEARCH_RADIUS_PX = 12  # half width of the window around a predicted star, with a known alignment
-MAX_BLEND_SIGMA = 3.0  # of the centroid; a larger uncertainty of a blend refuses the star
 _MIN_STARS = 8  # in an image; fewer stars cannot confirm its attitude
 _NEAREST = 200  # brightest predictions, searched in windows first
 _NEAREST_ROLL_RAD = 0.01  # an aligned star tracker has smaller errors about any axis
@@ -106,9 +105,7 @@ class Exposure:
 
 
 def observe_stars(
-    exposure: Exposure,
-    geometry: CameraGeometry,
-    search: StarSearch,
+    exposure: Exposure, geometry: CameraGeometry, search: StarSearch
 ) -> tuple[StarObservations, Instrument | None]:
     """
     Observations of one image without a track, and the PSF and gain measured from them.
@@ -170,9 +167,7 @@ def measure_predicted(
         exposure.image.pixels, shown.xy_px[:count], model, search.centroid, exposure.hot_pixels
     )
     # Faint stars are refused, but their light may pull the centroids of the others.
-    centroids, alone = separate(
-        shown, catalog, with_faint(measured, shown.xy_px), model, MAX_BLEND_SIGMA
-    )
+    centroids, alone = separate(shown, catalog, with_faint(measured, shown.xy_px), model)
     _refuse_line_loss(shown.xy_px, centroids, (height, width))
     psf_sigma_px = model.psf_sigma_px or 1.0
     refusal = refuse_on_hot_pixels(
@@ -192,7 +187,6 @@ def measure_predicted(
         model,
         search.centroid.min_snr,
         options.max_brightness_scatter_mag,
-        (height, width),
     )
     centroids = dataclasses.replace(centroids, refusal=refusal)
     observations = _observations(exposure, shown, catalog, centroids, model)
@@ -276,10 +270,7 @@ def realigned(geometry: CameraGeometry, observations: StarObservations) -> Camer
 
 
 def _find(
-    pixels: Pixels,
-    background: Background,
-    prediction: Prediction,
-    geometry: CameraGeometry,
+    pixels: Pixels, background: Background, prediction: Prediction, geometry: CameraGeometry
 ) -> tuple[Floats, Sources]:
     """
     Predicted pixels (n, 2) corrected to match the sources of the image, and those sources.
@@ -291,12 +282,7 @@ def _find(
     """
     camera = geometry.camera
     inside = in_image(prediction.xy_px, camera.width, camera.height)
-    near = detect_near(
-        pixels,
-        background,
-        prediction.xy_px[inside][:_NEAREST],
-        SEARCH_RADIUS_PX,
-    )
+    near = detect_near(pixels, background, prediction.xy_px[inside][:_NEAREST], SEARCH_RADIUS_PX)
     try:
         reach_px = float(SEARCH_RADIUS_PX)
         return acquire(prediction, near, geometry, reach_px, _NEAREST_ROLL_RAD), near
@@ -316,16 +302,14 @@ def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) ->
     Displacements are relative to a smooth correction fitted to the measured stars.
     """
     refusal = centroids.refusal.copy()
-    sigma_px = np.sqrt(0.5 * (centroids.covariance_px2[:, 0] + centroids.covariance_px2[:, 2]))
     good = np.nonzero(refusal == StarRefusal.NONE)[0]
     if len(good) < 4:
         return refusal
     expected_px, measured_px = predicted_px[good], centroids.xy_px[good]
-    correction, scatter_px = fit_warp(
-        expected_px, measured_px, sigma_px[good], expected_px, 0.5 * width
-    )
+    sigma_px = centroids.sigma_px[good]
+    correction, scatter_px = fit_warp(expected_px, measured_px, sigma_px, expected_px, 0.5 * width)
     off_px = np.hypot(*(measured_px - expected_px - correction).T)
-    limit_px = np.maximum(5.0 * np.hypot(sigma_px[good], 0.75 * scatter_px), 0.3)
+    limit_px = np.maximum(5.0 * np.hypot(sigma_px, 0.75 * scatter_px), 0.3)
     refusal[good[off_px > np.minimum(limit_px, 2.0)]] = StarRefusal.AMBIGUOUS
     return refusal
 
@@ -337,8 +321,9 @@ def _refuse_line_loss(predicted_px: Floats, centroids: Centroids, shape: tuple[i
     Raises ImageRefused ``incomplete``.
     """
     good = np.isin(centroids.refusal, (StarRefusal.NONE, StarRefusal.NOT_DETECTED))
-    variance_px2 = 0.5 * (centroids.covariance_px2[good, 0] + centroids.covariance_px2[good, 2])
-    loss = find_line_loss(predicted_px[good], centroids.xy_px[good], np.sqrt(variance_px2), shape)
+    loss = find_line_loss(
+        predicted_px[good], centroids.xy_px[good], centroids.sigma_px[good], shape
+    )
     if loss is not None:
         u, v = loss.off_px
         detail = f'stars below row {loss.row} are displaced by ({u:+.1f}, {v:+.1f}) px'

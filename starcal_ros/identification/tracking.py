@@ -40,6 +40,7 @@ from starcal_ros.sky.catalog import cone
 from starcal_ros.stars.detection import (
     Background,
     brightest_near,
+    DETECTION_SIGMA,
     measure_background,
     sample_background,
 )
@@ -48,15 +49,15 @@ from starcal_ros.stars.psf_field import Instrument
 
 _GUIDES = 24  # brightest predictions, searched in windows
 _NEIGHBOUR_PX = 3.0  # offsets of all guides agree to this under a roll of 0.1 degrees
-_MAX_P_VALUE = 1e-9  # of the matches in the windows, if the prediction is wrong
-_GOOD_SNR = 10.0  # of stars that correct the prediction
+_MAX_P_VALUE = 1e-9  # p-value of the matches in the windows, given a wrong prediction
+_GOOD_SNR = 10.0  # smallest signal-to-noise ratio of stars that correct the prediction
 _STEADY_PX = 1.0  # smaller rotations are left to the search in the next image
 _SYSTEMATIC_PX = 0.15  # rms from which the camera of the prediction is corrected
 # 1-sigma of the predicting camera about the one before: intrinsics as parts of the focal length,
 # and distortion for a lens with an inaccurate prior.
 _INTRINSIC_SIGMA = np.array([0.01, 1e-3, 0.01, 0.01, 0.01])
 _COEFFICIENT_SIGMA = {'k1': 0.05, 'k2': 0.1, 'k3': 0.1, 'k4': 0.05, 'k5': 0.1, 'k6': 0.1}
-_SMALL_SIGMA = 1e-3  # of the other coefficients: decentring, thin prism, tilt
+_SMALL_SIGMA = 1e-3  # 1-sigma of the other coefficients: decentring, thin prism, tilt
 
 
 @dataclass(frozen=True)
@@ -88,9 +89,7 @@ def start_tracking(
 
 
 def track_stars(
-    exposure: Exposure,
-    before: TrackedCamera,
-    search: StarSearch,
+    exposure: Exposure, before: TrackedCamera, search: StarSearch
 ) -> tuple[StarObservations, TrackedCamera]:
     """
     Observations of the next image, and the updated track.
@@ -99,10 +98,10 @@ def track_stars(
     """
     pixels = exposure.image.pixels
     prediction = _predict(exposure, before, search)
-    # Moments depend on the local background; a PSF fit estimates its own level.
+    # The moment method needs the local background; a PSF fit estimates its own level.
     fitted = search.centroid.centroid == 'psf'
     background = sample_background(pixels) if fitted else measure_background(pixels)
-    rotation_rad = _find_rotation(pixels, background, prediction, before.geometry.camera, search)
+    rotation_rad = _find_rotation(pixels, background, prediction, before.geometry.camera)
     rotation = Rotation.from_rotvec(-rotation_rad)
     direction_camera = rotation.apply(prediction.direction_camera)
     prediction = dataclasses.replace(
@@ -130,10 +129,8 @@ def track_stars(
 def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> Prediction:
     """Apparent catalog stars in the field, brightest first."""
     camera = before.geometry.camera
-    icrf_from_camera = (
-        Rotation.from_quat(exposure.icrf_from_star_tracker_xyzw)
-        * Rotation.from_quat(before.geometry.star_tracker_from_camera_xyzw)
-    ).as_matrix()
+    attitude = before.geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw)
+    icrf_from_camera = attitude.as_matrix()
     # The catalog, and so the rows of a cone, are sorted by magnitude.
     catalog, limit = search.catalog, search.identification.magnitude_limit
     index = cone(catalog, icrf_from_camera[:, 2], before.field_radius_rad, limit)
@@ -153,11 +150,7 @@ def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> P
 
 
 def _find_rotation(
-    pixels: Pixels,
-    background: Background,
-    prediction: Prediction,
-    camera: CameraModel,
-    search: StarSearch,
+    pixels: Pixels, background: Background, prediction: Prediction, camera: CameraModel
 ) -> Floats:
     """
     Small passive rotation (3,) of the camera, rad, from the predictions to the stars.
@@ -169,7 +162,8 @@ def _find_rotation(
     rim = reach_px + 4.0
     inside = ((xy > rim) & (xy < [camera.width - 1 - rim, camera.height - 1 - rim])).all(axis=1)
     guides = np.nonzero(inside)[0][:_GUIDES]
-    place_px, found = brightest_near(pixels, background, xy[guides], reach_px)
+    place_px, snr = brightest_near(pixels, background, xy[guides], reach_px)
+    found = snr > DETECTION_SIGMA
     guides, place_px = guides[found], place_px[found]
     lost = ImageRefused('no_match', f'{len(guides)} of the brightest stars match a source')
     if len(guides) < 4:
@@ -204,7 +198,8 @@ def _find_rotation(
 def _fits(geometry: CameraGeometry, rotation: Rotation, observations: StarObservations) -> bool:
     """Return True if the rotated camera predicts the stars within the systematic limit."""
     bright = _bright(observations)
-    camera_from_icrf = rotation * _icrf_from_camera(geometry, observations).inv()
+    attitude = geometry.icrf_from_camera(observations.icrf_from_star_tracker_xyzw)
+    camera_from_icrf = rotation * attitude.inv()
     directions = observations.direction_icrf[bright] @ camera_from_icrf.as_matrix().T
     off_px = observations.measured_px[bright] - project(geometry.camera, directions)
     return _rms_px(off_px) < _SYSTEMATIC_PX
@@ -213,7 +208,7 @@ def _fits(geometry: CameraGeometry, rotation: Rotation, observations: StarObserv
 def _corrected(geometry: CameraGeometry, observations: StarObservations) -> CameraGeometry:
     """Geometry aligned to the stars of an image; its camera is corrected if it does not fit."""
     camera = geometry.camera
-    icrf_from_camera = _icrf_from_camera(geometry, observations)
+    icrf_from_camera = geometry.icrf_from_camera(observations.icrf_from_star_tracker_xyzw)
     directions = observations.direction_icrf @ icrf_from_camera.as_matrix()
     variance_px2 = 0.5 * (observations.covariance_px2[:, 0] + observations.covariance_px2[:, 2])
     bright = _bright(observations)
@@ -236,12 +231,6 @@ def _bright(observations: StarObservations) -> Mask:
     """Mask (n,) of the stars that correct a prediction; all if too few are bright."""
     bright = observations.snr > _GOOD_SNR
     return np.asarray(bright | (np.count_nonzero(bright) < 4))
-
-
-def _icrf_from_camera(geometry: CameraGeometry, observations: StarObservations) -> Rotation:
-    return Rotation.from_quat(observations.icrf_from_star_tracker_xyzw) * Rotation.from_quat(
-        geometry.star_tracker_from_camera_xyzw
-    )
 
 
 def _rms_px(off_px: Floats) -> float:

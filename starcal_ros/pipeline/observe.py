@@ -329,13 +329,12 @@ def _after_image(
     track: Track, exposure: Exposure, observations: StarObservations, setup: Setup
 ) -> Track:
     """Track with the stamp and the hot pixels of an image that has the alignment of the track."""
-    icrf_from_star_tracker = Rotation.from_quat(exposure.icrf_from_star_tracker_xyzw)
     hot = learn_hot_pixels(
         track.hot or setup.hot,
         exposure.image.pixels,
         observations.background_dn,
         observations.noise_dn,
-        icrf_from_star_tracker * Rotation.from_quat(track.geometry.star_tracker_from_camera_xyzw),
+        track.geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw),
         float(track.geometry.camera.parameters[0]),
     )
     return dataclasses.replace(track, latest_ns=exposure.image.time_ns, hot=hot)

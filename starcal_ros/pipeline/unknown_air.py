@@ -17,7 +17,6 @@ import math
 import operator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.camera import CameraModel, project_jacobians
@@ -183,10 +182,7 @@ def _images(used: Sequence[StarObservations], camera: CameraModel) -> list[_Seen
 
 def _seen(one: StarObservations, camera: CameraModel, first_ns: int) -> _Seen:
     start = realigned(CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0])), one)
-    icrf_from_camera = Rotation.from_quat(one.icrf_from_star_tracker_xyzw) * Rotation.from_quat(
-        start.star_tracker_from_camera_xyzw
-    )
-    camera_from_icrf = icrf_from_camera.as_matrix().T
+    camera_from_icrf = start.icrf_from_camera(one.icrf_from_star_tracker_xyzw).as_matrix().T
     e = one.direction_icrf @ camera_from_icrf.T
     xy, by_camera, by_rotation = project_jacobians(dataclasses.replace(camera, field=None), e)
     sigma = np.sqrt(one.covariance_px2[:, [0, 2]] + _FLOOR_PX**2)[..., None]

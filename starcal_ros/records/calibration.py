@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import dataclasses
 from dataclasses import dataclass
 import math
-from typing import Annotated
+from typing import Annotated, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.record_fields import Count, Finite, Named, Quaternion, Shape, Stamp
 from starcal_ros.records.calibration_parts import ModelChecks, SigmaPart, StarTrackerAlignment
 from starcal_ros.records.residual_field import MapCovariance, ResidualField
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
 
@@ -32,6 +35,14 @@ class CameraGeometry:
 
     camera: CameraModel
     star_tracker_from_camera_xyzw: Quaternion
+
+    def icrf_from_camera(self, icrf_from_star_tracker_xyzw: Floats) -> Rotation:
+        """Attitude of the camera for an attitude (4,) of the star tracker."""
+        from scipy.spatial.transform import Rotation  # half of the start of a short command
+
+        return Rotation.from_quat(icrf_from_star_tracker_xyzw) * Rotation.from_quat(
+            self.star_tracker_from_camera_xyzw
+        )
 
 
 @dataclass(frozen=True)

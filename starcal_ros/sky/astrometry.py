@@ -25,12 +25,13 @@ from starcal_ros.sky.catalog import StarCatalog
 
 _UNIX_EPOCH_JD = 2440587.5  # 1970-01-01T00:00 UTC, POSIX
 _DAY_S = 86400
+_AU_PER_DAY_C = AU_M / _DAY_S / SPEED_OF_LIGHT_M_S
 _TT_MINUS_TAI_S = 32.184  # IAU 1991 Resolution A4, recommendation IV
 _J2000_JD = 2451545.0  # IAU 1994, epoch J2000.0
 _JULIAN_YEAR_DAYS = 365.25  # IAU, definition
 _UTC_START_JD = 2436934.5  # 1960-01-01, where UTC and ERFA's dat begin
-# Refraction changes by under 0.1 % with the humidity, and by 1.4 % from 0.55 to 1 micrometre: 2
-# arcsec at 20 degrees of elevation, most of it common to all stars of an image.
+# Refraction changes by less than 0.1 % with the humidity.  From 0.55 to 1 micrometre it changes by
+# 1.4 %, or 2 arcsec at 20 degrees of elevation, most of it common to all stars of an image.
 RELATIVE_HUMIDITY = 0.5
 WAVELENGTH_UM = 0.55
 MIN_ELEVATION_DEG = 10.0  # nearer to the horizon the refraction model is off by over 1 arcsec
@@ -85,7 +86,7 @@ class Velocity:
     m_s : (3,) or None
         Velocity; None for that of the Earth.
     sigma_m_s : float
-        1-sigma of each component; NaN for the Earth's velocity in place of an unknown one.
+        1-sigma of each component; NaN if unknown: the Earth's velocity is then used.
     """
 
     m_s: Floats | None = None
@@ -93,8 +94,8 @@ class Velocity:
 
 
 EARTH = Velocity()
-"""Velocity of the Earth, in place of an unknown one."""
-# 1-sigma of telemetry: an orbit changes it by this much in a second, the age of the last sample.
+"""Velocity of the Earth, used where that of the observer is unknown."""
+# 1-sigma of telemetry: the change of an orbital velocity in a second, the age of the last sample.
 GIVEN_SIGMA_M_S = 10.0
 
 
@@ -105,31 +106,6 @@ def velocity_of(site: SiteOptions, measured_m_s: Floats | None) -> Velocity:
     if measured_m_s is None and any(site.observer_velocity_m_s):
         measured_m_s = np.array(site.observer_velocity_m_s)
     return EARTH if measured_m_s is None else Velocity(measured_m_s, GIVEN_SIGMA_M_S)
-
-
-@dataclass(frozen=True)
-class Observer:
-    """
-    Position and velocity of the observer at one time, along the axes of the ICRS.
-
-    Attributes
-    ----------
-    tdb_jyear : float
-        Julian epoch, for proper motion.
-    barycentric_au : (3,)
-        From the solar-system barycentre.
-    sun_direction : (3,)
-        Unit vector from the Sun to the observer.
-    sun_distance_au : float
-    velocity_c : (3,)
-        Barycentric velocity in units of the speed of light.
-    """
-
-    tdb_jyear: float
-    barycentric_au: Floats
-    sun_direction: Floats
-    sun_distance_au: float
-    velocity_c: Floats
 
 
 def tt_julian_date(time_unix_ns: int) -> tuple[float, float]:
@@ -159,43 +135,47 @@ def tt_julian_date(time_unix_ns: int) -> tuple[float, float]:
     return day_jd, rest_s / _DAY_S
 
 
-def observer_at(time_unix_ns: int, velocity_m_s: Floats | None = None) -> Observer:
-    """
-    Observer at the centre of the Earth, with its velocity or a given one.
+def earth_velocity_c(time_unix_ns: int) -> Floats:
+    """Barycentric velocity (3,) of the Earth, axes of the ICRS, in units of the speed of light."""
+    _, barycentric = erfa.epv00(*tt_julian_date(time_unix_ns))
+    return np.asarray(barycentric['v'] * _AU_PER_DAY_C)
 
-    The position affects parallax only: 6 mas for the nearest star at the distance of the Moon.
-    TT replaces TDB; they differ by at most 2 ms, or 60 m along the Earth's orbit.
+
+def apparent_directions(
+    stars: StarCatalog, time_unix_ns: int, observer_velocity_m_s: Floats | None = None
+) -> Floats:
+    """
+    Apparent directions of catalog stars: unit vectors (n, 3) along the axes of the ICRS.
+
+    Proper motion, parallax, light bending by the Sun and stellar aberration are applied; the
+    radial velocity is assumed zero.  Takes 0.05 ms plus 0.1 ms per thousand stars.
+
+    The observer is at the centre of the Earth: another position changes the parallax by 6 mas for
+    the nearest star at the distance of the Moon.  TT replaces TDB; they differ by at most 2 ms, or
+    60 m along the Earth's orbit.
 
     Parameters
     ----------
+    stars : StarCatalog
+        n stars.
     time_unix_ns : int
         As for `tt_julian_date`.
-    velocity_m_s : (3,), optional
-        Velocity of the observer relative to the solar-system barycentre along the axes of the
-        ICRS; default: the velocity of the Earth.
+    observer_velocity_m_s : (3,), optional
+        Barycentric velocity of the observer, axes of the ICRS; default: that of the Earth.
     """
-    jd = tt_julian_date(time_unix_ns)
-    heliocentric, barycentric = erfa.epv00(*jd)
-    if velocity_m_s is None:
-        velocity_c = barycentric['v'] * (AU_M / _DAY_S / SPEED_OF_LIGHT_M_S)
+    day_jd, rest_days = tt_julian_date(time_unix_ns)
+    heliocentric, barycentric = erfa.epv00(day_jd, rest_days)
+    if observer_velocity_m_s is None:
+        velocity_c = barycentric['v'] * _AU_PER_DAY_C
     else:
-        velocity_c = np.asarray(velocity_m_s, np.float64) / SPEED_OF_LIGHT_M_S
+        velocity_c = np.asarray(observer_velocity_m_s, np.float64) / SPEED_OF_LIGHT_M_S
         if velocity_c.shape != (3,) or not np.linalg.norm(velocity_c) < 1:
             raise ValueError(
-                f'velocity_m_s is {velocity_m_s!r}, expected three numbers below light speed'
+                f'observer_velocity_m_s is {observer_velocity_m_s!r}, expected three numbers below'
+                ' light speed'
             )
     sun_distance_au = float(np.linalg.norm(heliocentric['p']))
-    return Observer(
-        tdb_jyear=2000.0 + (jd[0] - _J2000_JD + jd[1]) / _JULIAN_YEAR_DAYS,
-        barycentric_au=np.asarray(barycentric['p']),
-        sun_direction=np.asarray(heliocentric['p']) / sun_distance_au,
-        sun_distance_au=sun_distance_au,
-        velocity_c=np.asarray(velocity_c),
-    )
-
-
-def directions_from(observer: Observer, stars: StarCatalog) -> Floats:
-    """Apparent directions (n, 3) of stars for an observer; see `apparent_directions`."""
+    tdb_jyear = 2000.0 + (day_jd - _J2000_JD + rest_days) / _JULIAN_YEAR_DAYS
     natural = erfa.pmpx(
         stars.ra_rad,
         stars.dec_rad,
@@ -204,12 +184,12 @@ def directions_from(observer: Observer, stars: StarCatalog) -> Floats:
         stars.pm_dec_rad_per_year,
         stars.parallax_rad / erfa.DAS2R,  # only parallax is in arcseconds
         0.0,
-        observer.tdb_jyear - stars.epoch_jyear,
-        observer.barycentric_au,
+        tdb_jyear - stars.epoch_jyear,
+        barycentric['p'],
     )
-    bent = erfa.ldsun(natural, observer.sun_direction, observer.sun_distance_au)
-    inverse_gamma = math.sqrt(1.0 - float(observer.velocity_c @ observer.velocity_c))
-    return np.asarray(erfa.ab(bent, observer.velocity_c, observer.sun_distance_au, inverse_gamma))
+    bent = erfa.ldsun(natural, heliocentric['p'] / sun_distance_au, sun_distance_au)
+    inverse_gamma = math.sqrt(1.0 - float(velocity_c @ velocity_c))
+    return np.asarray(erfa.ab(bent, velocity_c, sun_distance_au, inverse_gamma))
 
 
 def standard_pressure_hpa(height_m: float, temperature_degc: float) -> float:
@@ -269,24 +249,3 @@ def through_the_air(
     place = erfa.c2s(direction_icrf @ cirs_from_icrf.T)
     _, zenith_distance, _, dec, ra = erfa.atioq(*place, local)
     return np.asarray(erfa.s2c(ra, dec) @ cirs_from_icrf), np.asarray(np.pi / 2 - zenith_distance)
-
-
-def apparent_directions(
-    stars: StarCatalog, time_unix_ns: int, observer_velocity_m_s: Floats | None = None
-) -> Floats:
-    """
-    Apparent directions of catalog stars: unit vectors (n, 3) along the axes of the ICRS.
-
-    Proper motion, parallax, light bending by the Sun and stellar aberration are applied; the
-    radial velocity is assumed zero.  Takes 0.05 ms plus 0.1 ms per thousand stars.
-
-    Parameters
-    ----------
-    stars : StarCatalog
-        n stars.
-    time_unix_ns : int
-        UTC as a ROS stamp: integer nanoseconds since 1970, from 1960 on.
-    observer_velocity_m_s : (3,), optional
-        Barycentric velocity of the spacecraft, axes of the ICRS; default: that of the Earth.
-    """
-    return directions_from(observer_at(time_unix_ns, observer_velocity_m_s), stars)

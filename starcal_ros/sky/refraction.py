@@ -16,9 +16,9 @@ from starcal_ros.constants import ARCSECOND_RAD
 
 USUAL_ARCSEC = (52.0, 7.0)
 """A of sites between the sea and 2000 m, 0.55 micrometres: mean and 1-sigma."""
-_CUBIC = -0.00115  # B / A: of the heights of scale of the air and of the Earth's radius
+_CUBIC = -0.00115  # B / A, from the scale height of the air and the Earth's radius
 SIDEREAL_RAD_S = 7.292115e-5  # GRS 1980, rotation of the Earth
-LEAST_COSINE = 0.17  # of a zenith distance: 80 degrees, where the two terms are off by 1 arcsec
+LEAST_COSINE = 0.17  # 80 degrees of zenith distance, where the formula is off by 1 arcsec
 
 
 def refracted(direction_icrf: Floats, zenith_icrf: Floats, refraction_arcsec: float) -> Floats:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels
 from starcal_ros.records import StarRefusal
 from starcal_ros.stars import detection, psf_fit
 from starcal_ros.stars.hot_pixels import CORE_PX, hot_in_stamps, lit_alone, NO_HOT_PIXELS
@@ -28,10 +28,10 @@ from starcal_ros.stars.psf_field import PsfWidth
 _MASK_RADIUS_PX = 3.0
 _MASK_THRESHOLD_SIGMA = 3.0  # above the background
 _MIN_MASK_PIXELS = 4
-_MODELLED_SNR = 4.0  # of stars that are modelled, to subtract their light from their neighbours
-SWAMPED_SIGMA = 3.0  # a star with a brighter one nearer than this cannot be separated from it
-_NEIGHBOUR_NOISE = 0.2  # of the pixel noise; less light of a neighbour is neglected
-_IN_PLACE_PX = 1.5  # from the brightest pixel; a fit that ends farther away is not of the star
+_MODELLED_SNR = 4.0  # light of stars above this ratio is subtracted from their neighbours
+SWAMPED_SIGMA = 3.0  # distance to a brighter star below which a star cannot be separated
+_NEIGHBOUR_NOISE = 0.2  # light of a neighbour below this share of the pixel noise is neglected
+_IN_PLACE_PX = 1.5  # from the brightest pixel; a fit that ends farther away shows another source
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,12 @@ class Centroids:
     fit: psf_fit.PsfFit | None
     psf_sigma_px: Floats
     noise_dn: Floats
-    modelled: NDArray[np.bool_]
+    modelled: Mask
+
+    @property
+    def sigma_px(self) -> Floats:
+        """1-sigma (n,) per axis, the root of the mean variance of both axes."""
+        return np.sqrt(0.5 * (self.covariance_px2[:, 0] + self.covariance_px2[:, 2]))
 
 
 def measure_stars(
@@ -61,7 +66,7 @@ def measure_stars(
     predicted_px: Floats,
     model: ImageModel,
     options: CentroidOptions,
-    hot_pixels: NDArray[np.int64] = NO_HOT_PIXELS.index,
+    hot_pixels: Indices = NO_HOT_PIXELS.index,
 ) -> Centroids:
     """
     Centroids of the stars near predicted pixels (n, 2), by the method of the options.
@@ -75,11 +80,7 @@ def measure_stars(
 
 
 def with_faint(measured: Centroids, predicted_px: Floats) -> Centroids:
-    """
-    Centroids of predicted stars (n, 2) of which the first were measured and the others are faint.
-
-    The PSF fit is not in the result, as the others have none.
-    """
+    """Measured stars and, as faint ones, the rest of the predicted (n, 2); without the PSF fit."""
     more = len(predicted_px) - len(measured.refusal)
 
     def extended(values: Floats, value: float) -> Floats:
@@ -104,7 +105,7 @@ def _measure_by_psf(
     model: ImageModel,
     psf: PsfWidth,
     options: CentroidOptions,
-    hot_pixels: NDArray[np.int64],
+    hot_pixels: Indices,
 ) -> Centroids:
     """Centroids by `fit_psf`, in windows about the predicted pixels."""
     centre, inside = _brightest_beside(pixels, predicted_px, hot_pixels)
@@ -119,15 +120,13 @@ def _measure_by_psf(
         model.pixel_noise,
     )
     fit = psf_fit.fit_at(stamps, parameters, model.pixel_noise)
-    refusal = np.full(len(predicted_px), StarRefusal.NONE, np.uint8)
-    for bad, reason in (
+    refusal = _first_reason(
         (~inside, StarRefusal.BORDER),
         (windows.saturated_pixels > options.max_saturated_pixels, StarRefusal.SATURATED),
         ((fit.snr < options.min_snr) | ~np.isfinite(fit.snr), StarRefusal.FAINT),
         (np.abs(fit.parameters[:, :2]).max(axis=1) > _IN_PLACE_PX, StarRefusal.NOT_DETECTED),
-        (_misshapen(fit, model, options), StarRefusal.ELONGATED),
-    ):
-        refusal[bad & (refusal == StarRefusal.NONE)] = reason
+        (_misshapen(fit, model), StarRefusal.ELONGATED),
+    )
     return Centroids(
         xy_px=centre + fit.parameters[:, :2],
         covariance_px2=fit.covariance[:, [0, 0, 1], [0, 1, 1]],
@@ -141,17 +140,23 @@ def _measure_by_psf(
     )
 
 
+def _first_reason(*reasons: tuple[Mask, StarRefusal]) -> NDArray[np.uint8]:
+    """Codes (n,) of the first of the reasons whose mask (n,) holds; 0 without any."""
+    masks, codes = zip(*reasons, strict=True)
+    return np.select(masks, codes, StarRefusal.NONE).astype(np.uint8)
+
+
 def _brightest_beside(
-    pixels: Pixels, predicted_px: Floats, hot_pixels: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    pixels: Pixels, predicted_px: Floats, hot_pixels: Indices
+) -> tuple[Indices, Mask]:
     """The brightest pixel (n, 2) next to each predicted one, and a mask (n,) of those inside."""
-    shape = (pixels.shape[0], pixels.shape[1])
+    height, width = pixels.shape
     centre = np.rint(np.where(np.isnan(predicted_px), -1e6, predicted_px)).astype(np.int64)
-    inside = detection.windows_inside(shape, centre, 1)
-    innermost = np.array([shape[1] - 2, shape[0] - 2])
+    inside = detection.windows_inside(pixels.shape, centre, 1)
+    innermost = np.array([width - 2, height - 2])
     centre = np.minimum(np.maximum(centre, 1), innermost)
     near = detection.windows_about(pixels, centre, 1)
-    near[hot_in_stamps(hot_pixels, centre, 1, shape[1])] = 0
+    near[hot_in_stamps(hot_pixels, centre, 1, width)] = 0
     near = near.reshape(len(centre), 9)
     best = near.argmax(axis=1)
     best[near[:, 4] == near.max(axis=1)] = 4  # on a saturated plateau, the predicted pixel
@@ -165,30 +170,22 @@ class _Windows(NamedTuple):
     stamps: psf_fit.Stamps
     level_dn: Floats
     noise_dn: Floats
-    saturated_pixels: NDArray[np.int64]
+    saturated_pixels: Indices
 
 
 def _windows(
-    pixels: Pixels,
-    centre: NDArray[np.int64],
-    model: ImageModel,
-    psf: PsfWidth,
-    hot_pixels: NDArray[np.int64],
+    pixels: Pixels, centre: Indices, model: ImageModel, psf: PsfWidth, hot_pixels: Indices
 ) -> _Windows:
     """Windows for a fit about pixels (n, 2), without pixels that show no light of the star."""
-    shape = (pixels.shape[0], pixels.shape[1])
     radius = psf_fit.stamp_radius_px(psf.sigma_px)
     stamps, outside = detection.stamps_at_edges(pixels, centre, radius)
     saturated = (stamps >= model.saturation_dn) & ~outside
-    at_px = centre.astype(np.float64)
-    noise_dn = detection.sample_mesh(model.background.noise_mesh, shape, at_px)
-    invalid = (stamps == 0.0) & (
-        detection.sample_mesh(model.background.level_mesh, shape, at_px)
-        > detection.GAP_SIGMA * noise_dn
-    )[:, None, None]
+    noise_dn = model.background.noise_at(centre)
+    sky_dn = model.background.level_at(centre)
+    invalid = (stamps == 0.0) & (sky_dn > detection.GAP_SIGMA * noise_dn)[:, None, None]
     # The fit has a level and no slope: a slope in the data would bias faint stars.
-    stamps -= _slopes(model.background, shape, at_px, radius)
-    hot = hot_in_stamps(hot_pixels, centre, radius, shape[1]) & ~outside
+    stamps -= _slopes(model.background, centre, radius)
+    hot = hot_in_stamps(hot_pixels, centre, radius, pixels.shape[1]) & ~outside
     level_dn = psf_fit.border_level_dn(stamps)
     hot |= _single_pixels(pixels, stamps, centre, level_dn, noise_dn, model.pixel_noise)
     # The first guess uses all pixels; the fit leaves these out.
@@ -196,28 +193,24 @@ def _windows(
         stamps[hot] = level_dn[np.nonzero(hot)[0]]
     out = saturated | hot | outside | invalid
     return _Windows(
-        psf_fit.Stamps(stamps, psf.at(at_px), noise_dn[:, None] ** 2, out if out.any() else None),
+        psf_fit.Stamps(stamps, psf.at(centre), noise_dn[:, None] ** 2, out if out.any() else None),
         level_dn,
         noise_dn,
         np.count_nonzero(saturated & ~hot, axis=(1, 2)),
     )
 
 
-def _slopes(
-    background: detection.Background, shape: tuple[int, int], at_px: Floats, radius: int
-) -> Floats:
+def _slopes(background: detection.Background, centre: Indices, radius: int) -> Floats:
     """Slope of the background in windows about pixels (n, 2), DN, zero in their middles."""
     reach = np.arange(-radius, radius + 1).astype(np.float64)
     down, across = (
-        detection.sample_mesh(slope, shape, at_px)[:, None, None]
-        for slope in detection.mesh_slope(background.level_mesh, shape)
+        detection.sample_mesh(slope, background.shape, centre)[:, None, None]
+        for slope in detection.mesh_slope(background.level_mesh, background.shape)
     )
     return np.asarray(down * reach[:, None] + across * reach)
 
 
-def _misshapen(
-    fit: psf_fit.PsfFit, model: ImageModel, options: CentroidOptions
-) -> NDArray[np.bool_]:
+def _misshapen(fit: psf_fit.PsfFit, model: ImageModel) -> Mask:
     """Mask (n,) of the stars whose shape differs from the common one of the image."""
     departure = np.abs(fit.shape_change - model.shape_median)
     limit = np.maximum(MAX_SHAPE_CHANGE, 4.0 * model.shape_scatter)
@@ -229,10 +222,10 @@ def _without_neighbours(
     stamps: psf_fit.Stamps,
     parameters: Floats,
     predicted_px: Floats,
-    centre: NDArray[np.int64],
-    usable: NDArray[np.bool_],
+    centre: Indices,
+    usable: Mask,
     noise: PixelNoise,
-) -> tuple[psf_fit.Stamps, Floats, NDArray[np.bool_]]:
+) -> tuple[psf_fit.Stamps, Floats, Mask]:
     """
     Stamps without the light of the neighbours that can be modelled.
 
@@ -292,11 +285,11 @@ def _without_neighbours(
 def _single_pixels(
     pixels: Pixels,
     stamps: Floats,
-    centre: NDArray[np.int64],
+    centre: Indices,
     level_dn: Floats,
     noise_dn: Floats,
     noise: PixelNoise,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """
     Mask (n, w, w) of single lit pixels of the stamps away from the core of the star.
 
@@ -331,22 +324,19 @@ def _measure_by_moments(
     The window is centred on the brightest pixel of the region of interest; the mask holds the
     pixels within 3 px of it that are 3 times the noise above the background.
     """
-    shape = (pixels.shape[0], pixels.shape[1])
+    height, width = pixels.shape
     radius = int(np.ceil(_MASK_RADIUS_PX))
     n = len(predicted_px)
-    refusal = np.full(n, StarRefusal.NONE, np.uint8)
     centre = np.rint(np.nan_to_num(predicted_px, nan=-1e6)).astype(np.int64)
-    inside = detection.windows_inside(shape, centre, 2 * radius)
-    refusal[~inside] = StarRefusal.BORDER
-    centre = np.clip(centre, 2 * radius, [shape[1] - 2 * radius - 1, shape[0] - 2 * radius - 1])
+    inside = detection.windows_inside(pixels.shape, centre, 2 * radius)
+    centre = np.clip(centre, 2 * radius, [width - 2 * radius - 1, height - 2 * radius - 1])
     w = 2 * radius + 1
-    best = detection.stamps_about(pixels, centre, radius).reshape(n, w * w).argmax(axis=1)
+    best = detection.windows_about(pixels, centre, radius).reshape(n, w * w).argmax(axis=1)
     centre = centre + np.stack([best % w - radius, best // w - radius], axis=-1)
 
-    stamps = detection.stamps_about(pixels, centre, radius)
-    level = detection.sample_mesh(model.background.level_mesh, shape, centre.astype(np.float64))
-    noise_dn = detection.sample_mesh(model.background.noise_mesh, shape, centre.astype(np.float64))
-    signal = stamps - level[:, None, None]
+    stamps = detection.windows_about(pixels, centre, radius)
+    noise_dn = model.background.noise_at(centre)
+    signal = stamps - model.background.level_at(centre)[:, None, None]
     offsets = np.arange(-radius, radius + 1).astype(np.float64)
     disc = offsets[:, None] ** 2 + offsets[None, :] ** 2 <= _MASK_RADIUS_PX**2
     mask = disc & (signal > (_MASK_THRESHOLD_SIGMA * noise_dn)[:, None, None])
@@ -356,15 +346,14 @@ def _measure_by_moments(
     variance = np.where(mask, of_pixel, 0.0)
     place_px, covariance_px2, ellipticity = _moments(weight, variance, offsets)
     snr = flux / np.sqrt(np.maximum(variance.sum(axis=(1, 2)), 1e-12))
-    # A mask of one pixel would give a covariance of zero.
-    count = mask.sum(axis=(1, 2))
-    for bad, reason in (
+    refusal = _first_reason(
+        (~inside, StarRefusal.BORDER),
         (stamps.max(axis=(1, 2)) >= model.saturation_dn, StarRefusal.SATURATED),
         (snr < options.min_snr, StarRefusal.FAINT),
-        (count < _MIN_MASK_PIXELS, StarRefusal.TOO_FEW_PIXELS),
+        # A mask of one pixel would give a covariance of zero.
+        (mask.sum(axis=(1, 2)) < _MIN_MASK_PIXELS, StarRefusal.TOO_FEW_PIXELS),
         (ellipticity > MAX_SHAPE_CHANGE, StarRefusal.ELONGATED),
-    ):
-        refusal[bad & (refusal == StarRefusal.NONE)] = reason
+    )
     return Centroids(
         xy_px=centre + place_px,
         covariance_px2=covariance_px2,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels, Singles
 from starcal_ros.robust_statistics import median, medians
 
 DETECTION_SIGMA = 5.0  # noise alone exceeds it at 0.6 places of a megapixel
@@ -30,9 +30,8 @@ _MOSTLY_INVALID = 0.75  # a cell with more invalid pixels takes the level of its
 _SPARSE_PX = 256
 _MOST_SLOPE = 0.05  # in noise per pixel, of cells of 256 px: it pulls a star by 0.25 sigma at most
 _SPARSE_STEP_PX = (32, 8)  # memory is read row by row: few rows, many of their pixels
-_DETECTION_SIGMA_PX = (
-    1.0  # matched filter of detection; 0.7 to 1.5 px stars lose under 10 % of S/N
-)
+# Matched filter of detection; stars of 0.7 to 1.5 px lose under 10 % of S/N.
+_DETECTION_SIGMA_PX = 1.0
 # A Gaussian filter of sigma s leaves white noise at 1 / (2 s sqrt(pi)) of its strength.
 _NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
 _ALONG_U, _ALONG_V = np.array([[[1], [0]], [[0], [1]]])  # a step along either axis, (2, 1)
@@ -47,14 +46,23 @@ class Background:
     """
     Background level and 1-sigma noise, DN, on a coarse mesh and for the whole image.
 
-    ``level_mesh`` and ``noise_mesh`` are (rows, cols) float32 over equal parts of the image;
-    ``level_dn`` and ``noise_dn`` are their medians.
+    ``level_mesh`` and ``noise_mesh`` are (rows, cols) float32 over equal parts of the image of
+    ``shape`` (height, width); ``level_dn`` and ``noise_dn`` are their medians.
     """
 
-    level_mesh: NDArray[np.float32]
-    noise_mesh: NDArray[np.float32]
+    level_mesh: Singles
+    noise_mesh: Singles
     level_dn: float
     noise_dn: float
+    shape: tuple[int, ...]
+
+    def level_at(self, xy_px: Floats | Indices) -> Floats:
+        """Level (n,) at pixels (n, 2)."""
+        return sample_mesh(self.level_mesh, self.shape, xy_px)
+
+    def noise_at(self, xy_px: Floats | Indices) -> Floats:
+        """Noise (n,) at pixels (n, 2)."""
+        return sample_mesh(self.noise_mesh, self.shape, xy_px)
 
 
 @dataclass(frozen=True)
@@ -68,6 +76,10 @@ class Sources:
     xy_px: Floats
     snr: Floats
     searched_px2: float
+
+    def brightest(self, count: int) -> Sources:
+        """Return the brightest ``count`` sources of the same area."""
+        return Sources(self.xy_px[:count], self.snr[:count], self.searched_px2)
 
 
 def measure_background(pixels: Pixels) -> Background:
@@ -88,10 +100,12 @@ def measure_background(pixels: Pixels) -> Background:
     samples -= level[:, None]
     mean, noise = _clipped(samples, spread, np.arange(samples.shape[1]) >= invalid[:, None])
     noise = np.maximum(noise, tail)
-    has_pixels = invalid < _MOSTLY_INVALID * samples.shape[1]
-    level, noise = (_filled(values, has_pixels, mesh_shape) for values in (mean + level, noise))
+    has_pixels = (invalid < _MOSTLY_INVALID * samples.shape[1]).reshape(mesh_shape)
+    level, noise = (
+        filled(values.reshape(mesh_shape), has_pixels).ravel() for values in (mean + level, noise)
+    )
     noise = np.maximum(_without_slope(noise, level.reshape(mesh_shape), pixels), tail)
-    return _background(level, noise, mesh_shape)
+    return _background(level, noise, mesh_shape, pixels.shape)
 
 
 def sample_background(pixels: Pixels) -> Background:
@@ -102,28 +116,24 @@ def sample_background(pixels: Pixels) -> Background:
     sky is too steep for large cells, `measure_background` replaces the result.
     """
     samples, mesh_shape = _cells(pixels, _SPARSE_PX, _SPARSE_STEP_PX)
-    beside, _ = _cells(pixels[:, 2:], _SPARSE_PX, _SPARSE_STEP_PX, mesh_shape)
-    width = min(samples.shape[1], beside.shape[1])
-    noise = _difference_noise(samples[:, :width], beside[:, :width])
+    noise = _difference_noise(pixels, _SPARSE_PX, _SPARSE_STEP_PX)
     level = medians(samples[:, ::4].T).astype(np.float32)
     zeros = np.count_nonzero(samples == 0.0, axis=1)
     cut_off = np.flatnonzero(zeros > _CUT_OFF * samples.shape[1])
     if len(cut_off):
         tail = _noise_above(np.sort(samples[cut_off], axis=1), level[cut_off], zeros[cut_off])
         noise[cut_off] = np.maximum(noise[cut_off], tail)
-    background = _background(level, noise, mesh_shape)
+    background = _background(level, noise, mesh_shape, pixels.shape)
     down, across = mesh_slope(background.level_mesh, pixels.shape)
     steepest = (np.hypot(down, across) / background.noise_mesh).max()
     return background if steepest <= _MOST_SLOPE else measure_background(pixels)
 
 
-def _noise_above(
-    ascending: NDArray[np.float32], level: NDArray[np.float32], zeros: NDArray[np.int64]
-) -> NDArray[np.float32]:
+def _noise_above(ascending: Singles, level: Singles, zeros: Indices) -> Singles:
     """
     Noise (k,) of the sorted rows (k, n) that the converter clips at 0 DN; 0 for other rows.
 
-    Clipping removes the lower half of the noise: the 2-sigma quantile of the upper half gives it.
+    Clipping removes the lower half of the noise: the upper half's 2-sigma quantile is used.
     Noise below 1 DN changes too few pixels to be measured: the result is at least 0.5 DN.
     """
     count = ascending.shape[1]
@@ -132,37 +142,31 @@ def _noise_above(
     return np.where(zeros > _CUT_OFF * count, noise, np.float32(0.0))
 
 
-def _without_slope(
-    noise: NDArray[np.float32], level_mesh: NDArray[np.float32], pixels: Pixels
-) -> NDArray[np.float32]:
-    """Noise (k,) of the cells, from differences where the slope of the background exceeds it."""
-    down, across = mesh_slope(_smooth_mesh(level_mesh), pixels.shape)
+def _without_slope(noise: Singles, level_mesh: Singles, pixels: Pixels) -> Singles:
+    """Noise (k,) of the cells, from differences of pixels where the background is steep."""
+    down, across = mesh_slope(smooth_mesh(level_mesh), pixels.shape)
     cell_v, cell_u = np.array(pixels.shape) / level_mesh.shape
     ramp = (((down * cell_v) ** 2 + (across * cell_u) ** 2) / 12.0).ravel()
     steep = ramp > _STEEP_PART * noise**2
     if not steep.any():
         return noise
-    samples, mesh_shape = _cells(pixels, _MESH_PX, _MESH_STEP_PX)
-    beside, _ = _cells(pixels[:, 2:], _MESH_PX, _MESH_STEP_PX, mesh_shape)
+    from_differences = _difference_noise(pixels, _MESH_PX, _MESH_STEP_PX)
+    return np.where(steep, np.minimum(from_differences, noise), noise)
+
+
+def _difference_noise(pixels: Pixels, cell_px: int, step_px: tuple[int, int]) -> Singles:
+    """Noise (k,) of the cells from differences of pixels two columns apart, almost slope-free."""
+    samples, mesh_shape = _cells(pixels, cell_px, step_px)
+    beside, _ = _cells(pixels[:, 2:], cell_px, step_px, mesh_shape)
     width = min(samples.shape[1], beside.shape[1])
-    of_differences = _difference_noise(samples[:, :width], beside[:, :width])
-    return np.where(steep, np.minimum(of_differences, noise), noise)
-
-
-def _difference_noise(
-    samples: NDArray[np.float32], beside: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Noise (k,) from the differences of near pixels (k, n), almost free of slopes."""
-    apart = samples - beside
+    apart = samples[:, :width] - beside[:, :width]
     apart -= np.partition(apart, apart.shape[1] // 2, axis=1)[:, apart.shape[1] // 2, None]
     rank = int(apart.shape[1] * 0.6827)
     _, noise = _clipped(apart, np.partition(np.abs(apart), rank, axis=1)[:, rank])
     return np.asarray(noise / math.sqrt(2.0), np.float32)
 
 
-def mesh_slope(
-    mesh: NDArray[np.float32], shape: tuple[int, ...]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def mesh_slope(mesh: Singles, shape: tuple[int, ...]) -> tuple[Singles, Singles]:
     """Slopes (rows, cols) of a mesh over an image of ``shape``, down and across, per pixel."""
     rows, cols = mesh.shape
     down, across = np.zeros_like(mesh), np.zeros_like(mesh)
@@ -173,9 +177,7 @@ def mesh_slope(
     return down, across
 
 
-def _quantile(
-    ascending: NDArray[np.float32], part: float, first: NDArray[np.int64]
-) -> NDArray[np.float32]:
+def _quantile(ascending: Singles, part: float, first: Indices) -> Singles:
     """Quantiles (k,) of the sorted rows (k, n), each from its element ``first`` (k,) on."""
     count = ascending.shape[1]
     rank = first + ((count - first) * part).astype(np.int64)
@@ -183,23 +185,19 @@ def _quantile(
     return np.asarray(ascending[row, np.minimum(rank, count - 1)])
 
 
-def _gap_above_zero(ascending: NDArray[np.float32], zeros: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _gap_above_zero(ascending: Singles, zeros: Indices) -> Mask:
     """Mask (k,) of the sorted rows that hold 0 DN far below the noise of their other samples."""
     level = _quantile(ascending, 0.5, zeros)
     spread = level - _quantile(ascending, 0.1587, zeros)
     return np.asarray((zeros > 0) & (level > GAP_SIGMA * np.maximum(spread, 1.0)))
 
 
-def _filled(
-    values: NDArray[np.float32], has_pixels: NDArray[np.bool_], mesh_shape: tuple[int, int]
-) -> NDArray[np.float32]:
-    """Values (k,) of the cells; a cell without pixels takes that of the nearest cell with some."""
-    if has_pixels.all() or not has_pixels.any():
+def filled(values: NDArray[Any], valid: Mask) -> NDArray[Any]:
+    """Values (rows, cols) with each invalid one replaced by the nearest valid one, if any."""
+    if valid.all() or not valid.any():
         return values
-    nearest = distance_transform_edt(
-        ~has_pixels.reshape(mesh_shape), return_distances=False, return_indices=True
-    )
-    return np.asarray(values.reshape(mesh_shape)[tuple(nearest)].ravel())
+    nearest = distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    return np.asarray(values[tuple(nearest)])
 
 
 def _cells(
@@ -207,7 +205,7 @@ def _cells(
     cell_px: int,
     step_px: tuple[int, int],
     mesh_shape: tuple[int, int] | None = None,
-) -> tuple[NDArray[np.float32], tuple[int, int]]:
+) -> tuple[Singles, tuple[int, int]]:
     """Thinned pixels of equal cells of an image, a row for each cell; (rows, columns) of cells."""
     height, width = pixels.shape
     rows, cols = mesh_shape or (max(1, height // cell_px), max(1, width // cell_px))
@@ -219,10 +217,8 @@ def _cells(
 
 
 def _clipped(
-    samples: NDArray[np.float32],
-    spread: NDArray[np.float32],
-    valid: NDArray[np.bool_] | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    samples: Singles, spread: Singles, valid: Mask | None = None
+) -> tuple[Singles, Singles]:
     """Mean and 1-sigma of each row of samples about zero, without values beyond three spreads."""
     inside = np.abs(samples) <= 3.0 * np.maximum(spread, 1.0)[:, None]
     if valid is not None:
@@ -236,21 +232,21 @@ def _clipped(
 
 
 def _background(
-    level: NDArray[np.float32], noise: NDArray[np.float32], mesh_shape: tuple[int, int]
+    level: Singles, noise: Singles, mesh_shape: tuple[int, int], shape: tuple[int, ...]
 ) -> Background:
     """Smoothed level and noise of the cells; the noise is at least that of rounding to DN."""
-    level_mesh = _smooth_mesh(level.reshape(mesh_shape))
-    noise_mesh = _smooth_mesh(np.maximum(noise, math.sqrt(1.0 / 12.0)).reshape(mesh_shape))
-    return Background(level_mesh, noise_mesh, median(level_mesh), median(noise_mesh))
+    level_mesh = smooth_mesh(level.reshape(mesh_shape))
+    noise_mesh = smooth_mesh(np.maximum(noise, math.sqrt(1.0 / 12.0)).reshape(mesh_shape))
+    return Background(level_mesh, noise_mesh, median(level_mesh), median(noise_mesh), shape)
 
 
-def _smooth_mesh(mesh: NDArray[np.float32]) -> NDArray[np.float32]:
+def smooth_mesh(mesh: Singles) -> Singles:
     """Return the mesh after a 3 x 3 median, which removes cells with a bright star."""
     mesh = np.ascontiguousarray(mesh, np.float32)
     return np.asarray(cv2.medianBlur(mesh, 3), np.float32) if min(mesh.shape) >= 3 else mesh
 
 
-def sample_mesh(mesh: NDArray[np.float32], shape: tuple[int, int], xy_px: Floats) -> Floats:
+def sample_mesh(mesh: Singles, shape: tuple[int, ...], xy_px: Floats | Indices) -> Floats:
     """Values (n,) of a mesh over an image of ``shape`` at pixels (n, 2), bilinear."""
     rows, cols = mesh.shape
     row = (xy_px[:, 1] + 0.5) * rows / shape[0] - 0.5
@@ -270,8 +266,8 @@ def detect(
     """
     height, width = pixels.shape
     level = cv2.resize(background.level_mesh, (width, height), interpolation=cv2.INTER_LINEAR)
-    image: NDArray[np.float32] = np.subtract(pixels, level, dtype=np.float32)
-    filtered: NDArray[np.float32] = np.asarray(
+    image: Singles = np.subtract(pixels, level, dtype=np.float32)
+    filtered: Singles = np.asarray(
         cv2.GaussianBlur(image, (0, 0), _DETECTION_SIGMA_PX, borderType=cv2.BORDER_REFLECT),
         np.float32,
     )
@@ -281,9 +277,7 @@ def detect(
     inner = (u >= 2) & (u < width - 2) & (v >= 2) & (v < height - 2)
     v, u = v[inner], u[inner]
     centre = filtered[v, u]
-    noise = sample_mesh(
-        background.noise_mesh, (height, width), np.stack([u, v], axis=-1).astype(np.float64)
-    )
+    noise = background.noise_at(np.stack([u, v], axis=-1))
     keep = centre > detection_sigma * _NOISE_LEFT * noise
     for dv in (-1, 0, 1):
         for du in (-1, 0, 1):
@@ -303,11 +297,7 @@ def detect(
 
 
 def detect_near(
-    pixels: Pixels,
-    background: Background,
-    predicted_px: Floats,
-    reach_px: int,
-    detection_sigma: float = DETECTION_SIGMA,
+    pixels: Pixels, background: Background, predicted_px: Floats, reach_px: int
 ) -> Sources:
     """
     The brightest star-like source in a square window about each predicted pixel (n, 2).
@@ -316,48 +306,29 @@ def detect_near(
     Filter, threshold and rejection of single lit pixels are those of `detect`; a source in several
     windows is listed once.
     """
-    shape = (pixels.shape[0], pixels.shape[1])
     centre = np.rint(predicted_px).astype(np.int64)
-    inside = windows_inside(shape, centre, reach_px + _RIM_PX)
-    xy, snr = _brightest(pixels, background, centre[inside], reach_px)
-    good = snr > detection_sigma
-    nearest = np.rint(xy).astype(np.int64)
-    _, first = np.unique(nearest[:, 1] * shape[1] + nearest[:, 0], return_index=True)
-    once = np.zeros(len(xy), bool)
-    once[first] = True
-    good &= once
-    order = np.nonzero(good)[0]
-    order = order[np.argsort(-snr[order], kind='stable')]
-    area = min(len(xy) * (2 * reach_px + 1) ** 2, shape[0] * shape[1])
-    return Sources(xy[order], snr[order], float(area))
+    inside = windows_inside(pixels.shape, centre, reach_px + _RIM_PX)
+    xy, snr = brightest_near(pixels, background, predicted_px[inside], reach_px)
+    _, first = np.unique(np.rint(xy), axis=0, return_index=True)
+    kept = np.sort(first[snr[first] > DETECTION_SIGMA])
+    kept = kept[np.argsort(-snr[kept], kind='stable')]
+    area = min(len(xy) * (2 * reach_px + 1) ** 2, pixels.size)
+    return Sources(xy[kept], snr[kept], float(area))
 
 
 def brightest_near(
-    pixels: Pixels,
-    background: Background,
-    predicted_px: Floats,
-    reach_px: int,
-    detection_sigma: float = DETECTION_SIGMA,
-) -> tuple[Floats, NDArray[np.bool_]]:
+    pixels: Pixels, background: Background, predicted_px: Floats, reach_px: int
+) -> tuple[Floats, Floats]:
     """
-    Place (n, 2) of the brightest source near each predicted pixel, and a mask (n,) of detections.
+    Place (n, 2) and signal-to-noise (n,) of the brightest pixel near each predicted one.
 
-    Like `detect_near`, but with one row per window.  Windows must lie 4 px inside the image.
+    The signal-to-noise ratio is 0 where that pixel is not star-like.  Windows must lie 4 px inside
+    the image.
     """
     centre = np.rint(predicted_px).astype(np.int64)
-    xy, snr = _brightest(pixels, background, centre, reach_px)
-    return xy, snr > detection_sigma
-
-
-def _brightest(
-    pixels: Pixels, background: Background, centre: NDArray[np.int64], reach_px: int
-) -> tuple[Floats, Floats]:
-    """Place (n, 2) and signal-to-noise (n,) of the star-like maximum of each window; 0 if none."""
-    shape = (pixels.shape[0], pixels.shape[1])
     half = reach_px + _RIM_PX
     windows = windows_about(pixels, centre, half).astype(np.float32)
-    level = sample_mesh(background.level_mesh, shape, centre.astype(np.float64))
-    windows -= level[:, None, None].astype(np.float32)
+    windows -= background.level_at(centre)[:, None, None].astype(np.float32)
     filtered = np.zeros_like(windows)
     if len(windows):
         # One filter call for all windows, stacked in one image: the rim absorbs light that the
@@ -378,7 +349,7 @@ def _brightest(
         filtered[n, v - _ALONG_V, u - _ALONG_U], peak, filtered[n, v + _ALONG_V, u + _ALONG_U]
     )
     xy = centre + np.stack([u, v], axis=-1) - half
-    noise = sample_mesh(background.noise_mesh, shape, xy.astype(np.float64))
+    noise = background.noise_at(xy)
     # A maximum at the rim of the window is the flank of a source outside.
     star_like = (np.abs(xy - centre) < reach_px).all(axis=1)
     star_like &= windows[n, v, u] < _HOT_PEAK_RATIO * peak
@@ -395,10 +366,10 @@ def _parabola_vertex(
     return np.asarray(vertex.clip(-0.5, 0.5), np.float64)
 
 
-def windows_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Pixels:
+def windows_about(pixels: Pixels, centre: Indices, radius: int) -> Pixels:
     """Square windows (n, 2 radius + 1, 2 radius + 1) about integer pixels (n, 2), all inside."""
     side = 2 * radius + 1
-    if len(centre) == 0:  # of an image that may be smaller than a window
+    if len(centre) == 0:  # the image may be smaller than a window
         return np.empty((0, side, side), pixels.dtype)
     # The type stubs of NumPy drop the type of the pixels here.
     every: Any = np.lib.stride_tricks.sliding_window_view(pixels, (side, side))
@@ -406,40 +377,30 @@ def windows_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Pix
     return windows
 
 
-def stamps_about(pixels: Pixels, centre: NDArray[np.int64], radius: int) -> Floats:
-    """As `windows_about`, as float64."""
-    return windows_about(pixels, centre, radius).astype(np.float64)
-
-
-def stamps_at_edges(
-    pixels: Pixels, centre: NDArray[np.int64], radius: int
-) -> tuple[Floats, NDArray[np.bool_]]:
+def stamps_at_edges(pixels: Pixels, centre: Indices, radius: int) -> tuple[Floats, Mask]:
     """
-    As `stamps_about` for windows that may leave the image, and a mask of their pixels outside.
+    As `windows_about` for windows that may leave the image, and a mask of their pixels outside.
 
     Pixels outside repeat the pixel at the edge.
     """
-    shape = (pixels.shape[0], pixels.shape[1])
-    largest = np.array([shape[1] - 1, shape[0] - 1])
+    height, width = pixels.shape
     stamps = np.empty((len(centre), 2 * radius + 1, 2 * radius + 1))
     outside = np.zeros(stamps.shape, bool)
-    inside = windows_inside(shape, centre, radius)
+    inside = windows_inside(pixels.shape, centre, radius)
     stamps[inside] = windows_about(pixels, centre[inside], radius)
     leaves = np.nonzero(~inside)[0]
     if len(leaves):
         reach = np.arange(-radius, radius + 1)
-        u, v = (centre[leaves, axis, None] + reach for axis in (0, 1))
-        outside[leaves] = ((u < 0) | (u > largest[0]))[:, None] | ((v < 0) | (v > largest[1]))[
-            :, :, None
-        ]
-        u, v = np.clip(u, 0, largest[0]), np.clip(v, 0, largest[1])
-        stamps[leaves] = pixels[v[:, :, None], u[:, None]]
+        u, v = (
+            centre[leaves, 0, None, None] + reach,
+            centre[leaves, 1, None, None] + reach[:, None],
+        )
+        outside[leaves] = (u < 0) | (u >= width) | (v < 0) | (v >= height)
+        stamps[leaves] = pixels[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)]
     return stamps, outside
 
 
-def windows_inside(
-    shape: tuple[int, int], centre: NDArray[np.int64], radius: int
-) -> NDArray[np.bool_]:
+def windows_inside(shape: tuple[int, ...], centre: Indices, radius: int) -> Mask:
     """Mask (n,) of the integer pixels whose window lies within the image."""
     height, width = shape
     u, v = centre[:, 0], centre[:, 1]

@@ -1,18 +1,18 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Where the catalog goes deeper than the image: stars that no fit could measure."""
+"""Number of catalog stars that are bright enough to be measured in an image."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.stars.detection import Background, sample_mesh, windows_about
+from starcal_ros.stars.detection import Background, windows_about
 
 _GROUP = 256  # stars of one mean: its noise is 0.06 of that of a star
-# Of the least signal-to-noise ratio, 3 mag: a star of a dark group that is measured nevertheless
-# would be refused, as it is twenty times as bright as the catalog has it.
+# Share of the smallest signal-to-noise ratio, 3 mag.  A measurable star in a dark group would be
+# refused anyway, since it is twenty times as bright as in the catalog.
 _DARK = 0.05
-_MOST_SNR = 3.0  # of a star in a mean: a bright neighbour lies in the window or in its border
+_MOST_SNR = 3.0  # limits the effect of a bright neighbour on the mean of a group
 _RADIUS_PX = 3
 _CORE_PIXELS = 9
 
@@ -21,9 +21,9 @@ def detectable_count(pixels: Pixels, xy_px: Floats, background: Background, min_
     """
     Number of the stars at pixels (n, 2), brightest first, that may have ``min_snr``.
 
-    Groups of stars of similar brightness show together what no single one does: the light in the
-    3 x 3 pixels at each place, above the level of the border of its window.  The stars after the
-    first dark group are left out.
+    The signal-to-noise ratio of 3 x 3 pixels above the border of their window is averaged over
+    groups of stars of similar brightness, since noise hides a single faint star.  Stars after the
+    first dark group are not counted.
     """
     height, width = pixels.shape
     if len(xy_px) <= _GROUP:
@@ -36,8 +36,9 @@ def detectable_count(pixels: Pixels, xy_px: Floats, background: Background, min_
     windows[:, 1:-1, 1:-1] = 0.0
     border_pixels = 4 * (2 * _RADIUS_PX)
     light = core - _CORE_PIXELS / border_pixels * windows.sum(axis=(1, 2))
-    noise_dn = sample_mesh(background.noise_mesh, (height, width), xy_px)
-    noise = noise_dn * np.sqrt(_CORE_PIXELS * (1.0 + _CORE_PIXELS / border_pixels))
+    noise = background.noise_at(xy_px) * np.sqrt(
+        _CORE_PIXELS * (1.0 + _CORE_PIXELS / border_pixels)
+    )
     snr = np.clip(light / noise, -_MOST_SNR, _MOST_SNR)
     groups = len(snr) // _GROUP
     mean = snr[: groups * _GROUP].reshape(groups, _GROUP).mean(axis=1)

@@ -16,23 +16,22 @@ import math
 from typing import Any
 import zlib
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
-from starcal_ros.arrays import Pixels
+from starcal_ros.arrays import Indices, Mask, Pixels, Singles
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.options import option
 from starcal_ros.records import Image
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
+from starcal_ros.stars.detection import filled, smooth_mesh
 
 _ROWS = 64
 _GOLDEN = 0.618034
 _BELOW_STEP_PX = 8  # the row below is only compared: every eighth pixel is enough
 _SEGMENT_PX = 64  # a piece of a row: as wide as a cell of the background
-_BY_CHANCE = 1e-6  # probability of equal rows above which a row like the one below is no fault
+_BY_CHANCE = 1e-6  # largest probability of equal adjacent rows at which they count as a fault
 # Error of a slope by central differences between cells, interpolated to the middle of two:
 # (1/6 + 1/8) of its second difference.
 _SLOPE_LEFT = 7.0 / 24.0
@@ -81,15 +80,15 @@ class RowSample:
     segments that hold noise; ``constant`` (k, m) mask of the segments with a single pixel value.
     """
 
-    row: NDArray[np.int64]
+    row: Indices
     step: int
     pixels: Pixels
     below: Pixels
-    noisy: NDArray[np.bool_]
-    constant: NDArray[np.bool_]
+    noisy: Mask
+    constant: Mask
 
     @functools.cached_property
-    def distinctive(self) -> NDArray[np.bool_]:
+    def distinctive(self) -> Mask:
         """Mask (k,) of the rows that no other row equals by chance."""
         return np.asarray(self.noisy.mean(axis=1) >= 0.5)
 
@@ -111,8 +110,8 @@ def sample_rows(pixels: Pixels) -> RowSample:
         pixels=picked,
         below=pixels[np.minimum(row + 1, height - 1), ::_BELOW_STEP_PX],
         step=step,
-        # A quarter, less the rounding of a mean: noise of a third of the quantisation step makes
-        # so many pixels differ, a star or two do not.
+        # A quarter, less the rounding of a mean.  Noise of a third of the quantisation step makes
+        # this many pixels differ; one or two stars do not.
         noisy=unlike > 0.249,
         constant=unlike == 0.0,
     )
@@ -126,7 +125,7 @@ def _segments(rows: Pixels) -> Pixels:
     return rows[:, : count * length].reshape(k, count, length)
 
 
-def _mean_of_each(segments: NDArray[Any]) -> NDArray[np.float32]:
+def _mean_of_each(segments: NDArray[Any]) -> Singles:
     """Means (k, m) of (k, m, length)."""
     length = segments.shape[2]
     # As a product: NumPy takes ten times as long for sums of many short rows of integers.
@@ -153,16 +152,11 @@ def screen(
     """
     Refuse a frame that cannot be measured.
 
-    Raises ImageRefused ``overexposed``, ``blank``, ``frozen``, ``incomplete`` or ``glare``.
+    ``before`` is the previous frame, used or not.  Pixels of ``saturation_dn`` or more are
+    saturated; 0 stands for the end of the converter's range.  Slopes of the frame ``dark``
+    (height, width) do not count as glare.
 
-    Parameters
-    ----------
-    before : Fingerprint or None
-        Previous frame, used or not.
-    saturation_dn : float
-        Pixel value from which a pixel counts as saturated; 0: the end of the converter's range.
-    dark : (height, width) or None
-        Dark frame; its slopes do not count as glare.
+    Raises ImageRefused ``overexposed``, ``blank``, ``frozen``, ``incomplete`` or ``glare``.
     """
     least_dn = _saturation_dn(sample, saturation_dn)
     _refuse_overexposed(sample, least_dn)
@@ -179,12 +173,12 @@ def _saturation_dn(sample: RowSample, saturation_dn: float) -> int:
     peak = int(sample.pixels.max())
     if not saturation_dn:
         saturation_dn = 0.98 * peak if peak in _ENDS_DN else peak + 1.0
-    # An integer: compared with a float, every pixel would be converted.
+    # An integer, since a comparison with a float converts every pixel.
     return math.ceil(saturation_dn)
 
 
 def _refuse_overexposed(sample: RowSample, least_dn: int) -> None:
-    """Refuse a frame of which too much is saturated."""
+    """Refuse a frame with too many saturated pixels."""
     part = np.count_nonzero(sample.pixels >= least_dn) / sample.pixels.size
     if part > _MAX_SATURATED_FRACTION:
         raise ImageRefused('overexposed', f'{part:.0%} of the pixels are at {least_dn}')
@@ -231,7 +225,7 @@ def _refuse_incomplete(
         raise ImageRefused('incomplete', f'{lost:.0%} of it is constant')
 
 
-def _repeats_below(sample: RowSample) -> NDArray[np.bool_]:
+def _repeats_below(sample: RowSample) -> Mask:
     """Mask (k,) of the rows that equal the row below; none where chance may do that."""
     equal = sample.pixels[:, ::_BELOW_STEP_PX] == sample.below
     repeats = equal.all(axis=1)
@@ -240,19 +234,18 @@ def _repeats_below(sample: RowSample) -> NDArray[np.bool_]:
     return np.asarray(repeats & (by_chance < _BY_CHANCE))
 
 
-def _off_level(sample: RowSample, alive: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _off_level(sample: RowSample, alive: Mask) -> Mask:
     """Mask (k, m) of the segments that differ from the nearest live one beyond the noise."""
     level = np.median(_segments(sample.pixels), axis=2)
-    nearest = distance_transform_edt(~alive, return_distances=False, return_indices=True)
     beside = alive[:, 1:] & alive[:, :-1]
     step = np.abs(np.diff(level, axis=1))[beside]
     # Neighbours of a compressed sky differ by its quantisation, which leaves no noise in a block.
     scatter_dn = MAD_TO_SIGMA * median(step) / math.sqrt(2.0) if step.size else 0.0
     noise_dn = max(_noise_dn(sample, alive), scatter_dn)
-    return np.asarray(np.abs(level - level[tuple(nearest)]) > 5.0 * noise_dn)
+    return np.asarray(np.abs(level - filled(level, alive)) > 5.0 * noise_dn)
 
 
-def _noise_dn(sample: RowSample, alive: NDArray[np.bool_]) -> float:
+def _noise_dn(sample: RowSample, alive: Mask) -> float:
     """1-sigma noise of a pixel, from differences to the pixel below, which are free of slopes."""
     # One pixel of each segment: 2500 of five megapixels give the noise to 2 %.
     here = _segments(sample.pixels)[:, :, 0].astype(np.int32)
@@ -268,16 +261,16 @@ def _refuse_glare(sample: RowSample, least_dn: int, dark: Pixels | None) -> None
     if slope > _MAX_SLOPE:
         raise ImageRefused(
             'glare',
-            f'the background is uneven within {_SEGMENT_PX} px: a slope of {slope:.2f} of its'
-            ' noise per pixel is left of it',
+            f'the background is uneven within {_SEGMENT_PX} px: its slope is {slope:.2f} of the'
+            f' noise per pixel, over {_MAX_SLOPE}',
         )
 
 
 def slope_left(sample: RowSample, least_dn: int, dark: Pixels | None = None) -> float:
     """
-    Median slope that is left once the background in cells is subtracted, in noise per pixel.
+    Median slope of the image minus its background in cells, in noise per pixel.
 
-    Cells with pixels saturated from ``least_dn`` on are left out.  A remaining slope g pulls the
+    Cells with pixels of ``least_dn`` or more are left out as saturated.  A slope g pulls the
     centroid of a star of any flux by up to 5 sigma_px^2 g of its own sigma (Gaussian of width
     sigma_px, white noise).
     """
@@ -286,12 +279,11 @@ def slope_left(sample: RowSample, least_dn: int, dark: Pixels | None = None) -> 
     mesh[pixels[:, :, -pixels.shape[2] // 4] >= least_dn] = np.inf
     if min(mesh.shape) < 4:
         return 0.0  # too small to separate a slope from its stars
-    # A 3 x 3 median removes cells with a bright star.
-    mesh = np.asarray(cv2.medianBlur(mesh, 3), np.float32)
+    mesh = smooth_mesh(mesh)
     mesh[np.isinf(mesh)] = np.nan
     if dark is not None:
         glow = _middle_mean(_sorted_cells(dark[sample.row], sample.step))
-        mesh = mesh - np.asarray(cv2.medianBlur(glow, 3), np.float32)
+        mesh = mesh - smooth_mesh(glow)
     cell_v_px = sample.pixels.shape[0] * sample.step / len(mesh)
     down = np.diff(mesh, 3, axis=0)[:, 1:-2] / cell_v_px
     across = np.diff(mesh, 3, axis=1)[1:-2] / _SEGMENT_PX
@@ -311,7 +303,7 @@ def _sorted_cells(rows: Pixels, step: int) -> NDArray[Any]:
     return np.sort(cells.reshape(down, m, -1), axis=2)
 
 
-def _middle_mean(ascending: NDArray[Any]) -> NDArray[np.float32]:
+def _middle_mean(ascending: NDArray[Any]) -> Singles:
     """Means (down, across) of middle halves: dead rows, stuck columns and stars are outside."""
     count = ascending.shape[2]
     return _mean_of_each(ascending[:, :, count // 4 : count - count // 4])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Indices, Pixels
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels
 from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 
@@ -24,7 +24,7 @@ _MOVED_PX = 5.0  # the light of a star that has moved so far has left its pixels
 SPILT = 0.2  # mean of the four adjacent pixels over the peak: 0.24 for a star of 0.45 px
 _BESIDE = np.array([[1, -1, 0, 0], [0, 0, 1, -1]])[:, :, None]  # offsets in rows and columns
 CORE_PX = 1.5  # a hot pixel this near spoils the peak of a star
-_WIDE_PSF_PX = 1.5  # no pixel of such a star holds 7 % of its light: the fit can omit one
+_WIDE_PSF_PX = 1.5  # each pixel of such a star has under 7 % of its light: the fit can omit one
 # Above the background, in pixel noise: noise alone never reaches it.
 _HOT_SIGMA = 10.0
 _MOST = 100_000  # bounds the list; a detector with more has another fault
@@ -74,7 +74,7 @@ def learn_hot_pixels(
     focal_px: float,
 ) -> HotPixels:
     """
-    Hot pixels after one more image, of which one strip is scanned.
+    Hot pixels after one more image; one strip of it is scanned.
 
     ``pixels`` (height, width) are without the dark frame.  A strip is compared with its last scan
     once ``icrf_from_camera`` has moved the stars by more than a PSF.
@@ -103,9 +103,9 @@ def learn_hot_pixels(
 def _single_lit(
     pixels: Pixels, rows: tuple[int, int], background_dn: float, threshold_dn: float
 ) -> Indices:
-    """Flat indices of the pixels in some rows that are lit while their four neighbours are not."""
+    """Flat indices of the lit pixels in some rows whose four neighbours are dark."""
     height, width = pixels.shape
-    # An integer: compared with a float, every pixel would be converted.
+    # An integer, since a comparison with a float converts every pixel.
     floor_dn = min(max(math.floor(background_dn + threshold_dn), 0), np.iinfo(pixels.dtype).max)
     lit = np.flatnonzero(pixels[rows[0] : rows[1]] > floor_dn)
     v, u = np.divmod(lit + rows[0] * width, width)
@@ -115,16 +115,14 @@ def _single_lit(
     return np.asarray((v * width + u)[single][:_MOST], np.int64)
 
 
-def lit_alone(
-    pixels: Pixels, v: Indices, u: Indices, background_dn: float | Floats
-) -> NDArray[np.bool_]:
-    """Mask (k,) of pixels, none at the rim, that exceed the adjacent ones by more than a star."""
+def lit_alone(pixels: Pixels, v: Indices, u: Indices, background_dn: float | Floats) -> Mask:
+    """Mask (k,) of pixels, none at the rim, with less light beside them than a star has."""
     beside = pixels[v + _BESIDE[0], u + _BESIDE[1]].sum(axis=0, dtype=np.float64)
     peak = pixels[v, u] - background_dn
     return np.asarray(0.25 * beside - background_dn < SPILT * peak)
 
 
-def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> NDArray[np.bool_]:
+def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> Mask:
     """Mask (n, 2 radius + 1, 2 radius + 1) of the hot pixels in windows about pixels (n, 2)."""
     side = 2 * radius + 1
     found = np.zeros((len(centre), side, side), bool)

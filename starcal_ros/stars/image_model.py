@@ -7,6 +7,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.options import option
@@ -19,6 +20,7 @@ from starcal_ros.stars.psf_fit import fit_psf, noise_sums, stamp_radius_px
 MAX_SHAPE_CHANGE = 0.35  # departure of second moments from the PSF's, a fraction: a blend
 _BELOW_PLATEAU = 0.98  # pixels of a plateau differ by their sensitivity
 _BRIGHTEST = 60  # stars that may show the level of saturation
+_ISOLATED_PX = 12.0  # least distance to another source of the stars that give the PSF
 _MAX_PSF_SIGMA_PX = 4.0
 _CUT_OFF_BELOW_DN = 1.0  # many pixels of a lower background are clipped to 0 DN
 
@@ -107,11 +109,11 @@ def model_image(
     unknown = ImageModel(
         background, None, PixelNoise(gain or 1.0, 0.0), saturation_dn, np.zeros(3), np.zeros(3)
     )
-    shape = (pixels.shape[0], pixels.shape[1])
     bright = sources.xy_px[sources.snr > 15.0][:400]
     nearest = np.rint(bright).astype(np.int64)
     bright = bright[pixels[nearest[:, 1], nearest[:, 0]] < saturation_dn]
-    xy = _isolated(bright, 12.0)[:80]
+    isolated = cKDTree(bright).query_ball_point(bright, _ISOLATED_PX, return_length=True) == 1
+    xy = bright[isolated][:80]
     sigma = 1.2
     if len(xy) < 5:
         return unknown
@@ -119,14 +121,14 @@ def model_image(
     for _ in range(6):
         radius = stamp_radius_px(sigma)
         centre = np.rint(xy).astype(np.int64)
-        inside = detection.windows_inside(shape, centre, radius)
+        inside = detection.windows_inside(pixels.shape, centre, radius)
         xy, centre = xy[inside], centre[inside]
-        stamps = detection.stamps_about(pixels, centre, radius)
+        stamps = detection.windows_about(pixels, centre, radius).astype(np.float64)
         clean = stamps.max(axis=(1, 2)) < saturation_dn
         xy, centre, stamps = xy[clean], centre[clean], stamps[clean]
         if len(xy) < 5:
             return unknown
-        noise_dn = detection.sample_mesh(background.noise_mesh, shape, xy)
+        noise_dn = background.noise_at(xy)
         fit = fit_psf(stamps, sigma, noise_dn, noise_model)
         change = median(fit.shape_change[:, :2].mean(axis=1))
         sigma_before = sigma
@@ -141,7 +143,7 @@ def model_image(
     for _ in range(3):
         fit = fit_psf(stamps, sigma, noise_dn, noise_model)
         noise_model = noise_sums(fit, noise_dn, noise_model).pixel_noise(gain)
-    psf = uniform_width(sigma, shape[1], shape[0])
+    psf = uniform_width(sigma, pixels.shape[1], pixels.shape[0])
     noise_model = _at_least_sky(noise_model, background)
     return ImageModel(background, psf, noise_model, saturation_dn, shape_median, shape_scatter)
 
@@ -158,9 +160,8 @@ def known_model(
 
     ``predicted_px`` (n, 2) are sorted, brightest first: only these stars can be saturated.
     """
-    shape = (pixels.shape[0], pixels.shape[1])
     centre = np.rint(predicted_px).astype(np.int64)
-    centre = centre[detection.windows_inside(shape, centre, 2)][:_BRIGHTEST]
+    centre = centre[detection.windows_inside(pixels.shape, centre, 2)][:_BRIGHTEST]
     cores = detection.windows_about(pixels, centre, 2)
     saturation_dn = saturation_level(cores, options)
     if saturation_dn == 0 and _BELOW_PLATEAU * cores.max(initial=0) <= known.saturation_dn:
@@ -179,14 +180,5 @@ def _at_least_sky(noise: PixelNoise, background: detection.Background) -> PixelN
     """Pixel noise, raised to the noise of the sky if the converter clips it at 0 DN."""
     if background.level_dn >= _CUT_OFF_BELOW_DN:
         return noise
-    # Clipped pixels have no scatter: with it the sigmas of faint stars would be too small.
+    # Clipped pixels do not scatter: their noise would make the sigmas of faint stars too small.
     return dataclasses.replace(noise, background=max(noise.background, 1.0))
-
-
-def _isolated(xy_px: Floats, distance_px: float) -> Floats:
-    """Return the points that have no other point within a distance."""
-    if len(xy_px) < 2:
-        return xy_px
-    separation = np.linalg.norm(xy_px[:, None] - xy_px[None], axis=-1)
-    np.fill_diagonal(separation, np.inf)
-    return np.asarray(xy_px[separation.min(axis=1) > distance_px])

@@ -13,19 +13,18 @@ from dataclasses import dataclass
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.robust_statistics import centre_and_scatter
 from starcal_ros.stars.pixel_noise import NoiseSums, PixelNoise
 from starcal_ros.stars.psf_fit import noise_sums, PsfFit, select
 
 _MEMORY = 0.95  # weight of the earlier images at each new one: about twenty images count
-_BRIGHT_SNR = 15.0  # of stars that determine the shape of the PSF
-_MOST = 60  # brightest of them; fainter ones add almost nothing
+_BRIGHT_SNR = 15.0  # smallest signal-to-noise ratio of stars that determine the PSF
+_MOST = 60  # largest number of them, brightest first; fainter ones add almost nothing
 MIN_PSF_SIGMA_PX = 0.3  # 82 % of the light in one pixel: a smaller width cannot be measured
-_FEWEST = 5  # such stars, or an image is not used
-_MAP_CHI2 = 30.0  # chi^2 of five terms by chance once in 80,000 times
+_FEWEST = 5  # smallest number of them in an image that is used
+_MAP_CHI2 = 30.0  # chance gives five terms a larger chi^2 once in 80,000 times
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class PsfWidth:
     width: int
     height: int
 
-    def at(self, xy_px: Floats) -> Floats:
+    def at(self, xy_px: Floats | Indices) -> Floats:
         """Width (n,), px, at pixels (n, 2), limited to a factor of 1.5 of that in the middle."""
         middle = float(self.coefficients[0])
         if not self.coefficients[1:].any():
@@ -68,7 +67,7 @@ class MeasuredStars:
     fit: PsfFit
     sigma_px: Floats
     noise_dn: Floats
-    usable: NDArray[np.bool_]
+    usable: Mask
 
 
 def uniform_width(sigma_px: float, width: int, height: int) -> PsfWidth:
@@ -76,7 +75,7 @@ def uniform_width(sigma_px: float, width: int, height: int) -> PsfWidth:
     return PsfWidth(np.array([sigma_px**2, 0.0, 0.0, 0.0, 0.0, 0.0]), width, height)
 
 
-def width_basis(xy_px: Floats, width: int, height: int) -> Floats:
+def width_basis(xy_px: Floats | Indices, width: int, height: int) -> Floats:
     """Terms (n, 6) of the polynomial of `PsfWidth` at pixels (n, 2)."""
     u = 2.0 * xy_px[:, 0] / max(width - 1, 1) - 1.0
     v = 2.0 * xy_px[:, 1] / max(height - 1, 1) - 1.0
@@ -124,20 +123,14 @@ def learn(
     """
     PSF, pixel noise and saturation after one more image; ``before`` if it has too few stars.
 
-    Parameters
-    ----------
-    expected : PixelNoise
-        Noise model used in the fits.
-    saturation_dn : float
-        Level of saturation found in the image; 0 if none.
-    size : (int, int)
-        Width and height of the detector.
+    ``expected`` is the noise model of the fits, ``saturation_dn`` the level of saturation in the
+    image (0 if none), ``size`` width and height of the detector.
     """
     usable = np.nonzero(stars.usable)[0]
     bright = usable[stars.fit.snr[usable] > _BRIGHT_SNR][:_MOST]
     if len(bright) < _FEWEST:
         return before
-    # Bright stars alone do not tell photon noise from a PSF error, which fainter ones do not show.
+    # Fainter stars show no PSF error, so that it can be separated from photon noise.
     shown = usable[:_MOST]
     noise = noise_sums(select(stars.fit, shown), stars.noise_dn[shown], expected)
     fit = select(stars.fit, bright)

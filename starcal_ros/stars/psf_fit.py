@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf, ndtr
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.stars.hot_pixels import CORE_PX, SPILT
 from starcal_ros.stars.pixel_noise import NoiseSums, PixelNoise
 
@@ -55,7 +55,7 @@ class PsfFit:
     freedom: Floats
 
 
-def select(fit: PsfFit, stars: NDArray[np.intp] | NDArray[np.bool_]) -> PsfFit:
+def select(fit: PsfFit, stars: NDArray[np.intp] | Mask) -> PsfFit:
     """Return the fits of some stars, by row number or mask."""
     return PsfFit(**{field.name: getattr(fit, field.name)[stars] for field in fields(fit)})
 
@@ -85,7 +85,7 @@ class Stamps:
     data_dn: Floats
     sigma_px: Floats
     noise2_dn2: Floats
-    out: NDArray[np.bool_] | None = None
+    out: Mask | None = None
 
     def __len__(self) -> int:
         """Return the number of stars."""
@@ -102,7 +102,7 @@ class Stamps:
         return self.data_dn.reshape(len(self), self.width**2)
 
     @property
-    def valid(self) -> NDArray[np.bool_] | None:
+    def valid(self) -> Mask | None:
         """Mask (n, w * w) of the pixels to be fitted; None: all."""
         return None if self.out is None else ~self.out.reshape(len(self), self.width**2)
 
@@ -118,25 +118,14 @@ class Stamps:
         )
 
 
-def fit_psf(
-    stamps: Floats, sigma_px: float | Floats, noise_dn: Floats, pixel_noise: PixelNoise
-) -> PsfFit:
+def fit_psf(stamps: Floats, sigma_px: float, noise_dn: Floats, pixel_noise: PixelNoise) -> PsfFit:
     """
-    Weighted least-squares fit of the pixel-integrated Gaussian to every stamp at once.
+    Weighted least-squares fit of the pixel-integrated Gaussian to every stamp (n, w, w), DN.
 
-    Parameters
-    ----------
-    stamps : (n, w, w)
-        Pixel values, DN; the star within a pixel or so of the centre.
-    sigma_px : float or (n,)
-        Width of the PSF, at each star.
-    noise_dn : (n,)
-        Pixel noise at each star, without the photon noise of the star.
-    pixel_noise : PixelNoise
-        Increase of the noise with the signal.
+    Each star is within about a pixel of the centre.  ``sigma_px`` is the width of the PSF,
+    ``noise_dn`` (n,) the pixel noise without the photon noise of the star.
     """
-    sigma_px = np.broadcast_to(np.asarray(sigma_px, np.float64), (len(stamps),))
-    windows = Stamps(stamps, sigma_px, noise_dn[:, None] ** 2)
+    windows = Stamps(stamps, np.full(len(stamps), sigma_px), noise_dn[:, None] ** 2)
     guess = first_guess(windows, border_level_dn(stamps))
     return fit_at(windows, approach(windows, guess, pixel_noise), pixel_noise)
 
@@ -311,15 +300,8 @@ def neighbour_pull_px(
     """
     Shift (k, 2) of the fitted position of a star by the light of a neighbour.
 
-    It is the position that the fit finds in the noise-free light of both stars.
-
-    Parameters
-    ----------
-    flux_dn, neighbour_flux_dn : (k,)
-    offset_px : (k, 2)
-        From the star to its neighbour.
-    sigma_px, noise_dn, pixel_noise
-        Width of the PSF, and noise as in `fit_psf`.
+    It is the position that the fit finds in the noise-free light of both stars.  ``offset_px``
+    (k, 2) points from the star to its neighbour; PSF and noise are those of `fit_psf`.
     """
     width = 2 * stamp_radius_px(sigma_px) + 1
     count = len(flux_dn)
@@ -383,16 +365,18 @@ def _profile(
     return value, first, (density[:, :-1] - density[:, 1:]) / sigma_px[:, None] ** 2
 
 
-def _psf_rows(
-    parameters: Floats, data: Floats, sigma_px: Floats, width: int, count: int
-) -> Floats:
+def _whitened_rows(
+    parameters: Floats, stamps: Stamps, pixel_noise: PixelNoise, count: int
+) -> tuple[Floats, Floats, Floats]:
     """
     Derivatives of stamps by x, y, flux, background, and as the last row their residual.
 
-    ``data`` is (n, width^2); the result (n, count + 1, width^2).  A count of 7 adds, after the
-    background, derivatives by the second moments xx, yy, xy as fractions of the PSF variance.
+    The rows (n, count + 1, p) are divided by the noise of each pixel, and 0 for pixels that are
+    left out.  A count of 7 adds, after the background, derivatives by the second moments xx, yy,
+    xy as fractions of the PSF variance.  Also returns the light (n, p) of the stars, and the
+    inverse (n, p) of that noise.
     """
-    n = len(parameters)
+    n, width, sigma_px = len(stamps), stamps.width, stamps.sigma_px
     x, y, flux, level = parameters.T
     value, first, second = _profile(
         np.concatenate([x, y]), np.concatenate([sigma_px, sigma_px]), width, count == 7
@@ -416,28 +400,8 @@ def _psf_rows(
         np.multiply(py1, flux_px1, out=rows[:, 6])
     residual = rows[:, count]
     np.multiply(rows[:, 2], -flux, out=residual)
-    residual += data
+    residual += stamps.flat_dn
     residual -= level[:, None]
-    return rows
-
-
-def _in_each_row(of_columns: Floats) -> Floats:
-    """Values (n, w) of columns, spread over the pixels (n, w * w) of a stamp."""
-    n, width = of_columns.shape
-    spread = np.empty((n, width, width))
-    spread[:] = of_columns[:, None, :]
-    return spread.reshape(n, width * width)
-
-
-def _whitened_rows(
-    parameters: Floats, stamps: Stamps, pixel_noise: PixelNoise, count: int
-) -> tuple[Floats, Floats, Floats]:
-    """
-    Rows of `_psf_rows` over the noise of each pixel, 0 for pixels that are left out.
-
-    Also the light (n, p) of the stars, and the inverse (n, p) of that noise.
-    """
-    rows = _psf_rows(parameters, stamps.flat_dn, stamps.sigma_px, stamps.width, count)
     light = np.maximum(parameters[:, 2, None], 0.0) * rows[:, 2]
     root_weight = light / pixel_noise.gain_e_per_dn
     root_weight += pixel_noise.background * stamps.noise2_dn2
@@ -446,6 +410,14 @@ def _whitened_rows(
     np.divide(1.0 if valid is None else valid, root_weight, out=root_weight)
     rows *= root_weight[:, None, :]
     return rows, light, root_weight
+
+
+def _in_each_row(of_columns: Floats) -> Floats:
+    """Values (n, w) of columns, spread over the pixels (n, w * w) of a stamp."""
+    n, width = of_columns.shape
+    spread = np.empty((n, width, width))
+    spread[:] = of_columns[:, None, :]
+    return spread.reshape(n, width * width)
 
 
 def _normal(rows: Floats) -> tuple[Floats, Floats]:

@@ -12,7 +12,6 @@ from starcal_ros.camera import (
     CameraModel,
     field_radius_rad,
     line_of_sight,
-    model_of,
     PARAMETER_NAMES,
     parameter_names,
     pixel_grid,
@@ -356,10 +355,7 @@ def test_what_a_pinhole_cannot_see_costs_everything() -> None:
 
 def test_models_and_their_names() -> None:
     for model in COEFFICIENTS:
-        assert model_of(parameter_names(model)) == model
         assert set(parameter_names(model)) <= set(ALL_PARAMETER_NAMES)
-    with pytest.raises(ValueError, match='fx are not the parameters of a lens model'):
-        model_of(('fx',))
     with pytest.raises(ValueError, match='9 finite numbers'):
         CameraModel(10, 10, CAMERAS['paper'].parameters, 'equidistant')
     with pytest.raises(ValueError, match="lens model: 'brown' is not one of"):
@@ -390,7 +386,8 @@ def test_field_radius_of_a_camera_that_folds_over_is_finite() -> None:
 def test_without_skew_nothing_is_fitted() -> None:
     camera = CAMERAS['pinhole']
     fitted, worst_px = ros_fit(camera)
-    assert fitted is camera and worst_px == 0.0
+    np.testing.assert_array_equal(fitted.parameters, camera.parameters)
+    assert worst_px == 0.0
 
 
 @pytest.mark.parametrize('skew', [0.5, 2.0, -4.0])

@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.identification.blending import neighbour_pulls, Pulls, unlisted_pull_px
-from starcal_ros.identification.star_finder import MAX_BLEND_SIGMA
+from starcal_ros.identification.blending import (
+    MAX_BLEND_SIGMA,
+    neighbour_pulls,
+    Pulls,
+    unlisted_pull_px,
+)
 from starcal_ros.stars.detection import Background
 from starcal_ros.stars.image_model import ImageModel
 from starcal_ros.stars.pixel_noise import PixelNoise
@@ -37,7 +41,7 @@ def pull_of_a_neighbour(
 
 def image_model(noise_dn: float) -> ImageModel:
     mesh = np.zeros((1, 1), np.float32)
-    background = Background(mesh, mesh + np.float32(noise_dn), 0.0, noise_dn)
+    background = Background(mesh, mesh + np.float32(noise_dn), 0.0, noise_dn, (0, 0))
     noise = PixelNoise(4.0, 0.0)
     psf = uniform_width(SIGMA_PX, 33, 33)
     return ImageModel(background, psf, noise, 4095.0, np.zeros(3), np.zeros(3))

@@ -31,7 +31,7 @@ MIN_SNR = 5.0
 ZERO_POINT = 17.0  # a star of that magnitude gives 1 DN
 MESH = np.ones((1, 1), np.float32)
 MODEL = ImageModel(
-    Background(0.0 * MESH, 2.0 * MESH, 0.0, 2.0),
+    Background(0.0 * MESH, 2.0 * MESH, 0.0, 2.0, SHAPE),
     uniform_width(0.95, SHAPE[1], SHAPE[0]),
     PixelNoise(4.0, 0.0),
     4095.0,
@@ -62,7 +62,7 @@ def sky(count: int, scatter_mag: float, seed: int = 1) -> tuple[np.ndarray, np.n
 
 def judged(magnitude: np.ndarray, place: np.ndarray, centroids: Centroids) -> np.ndarray:
     most_mag = IdentificationOptions().max_brightness_scatter_mag
-    return refuse_by_brightness(magnitude, place, centroids, MODEL, MIN_SNR, most_mag, SHAPE)
+    return refuse_by_brightness(magnitude, place, centroids, MODEL, MIN_SNR, most_mag)
 
 
 @pytest.mark.parametrize('scatter_mag', [0.0, 0.15, 0.3])
@@ -83,9 +83,7 @@ def test_brightnesses_drawn_anew_are_no_match() -> None:
 
 
 def test_a_camera_far_from_the_band_of_the_catalog_need_not_be_asked() -> None:
-    assert (
-        refuse_by_brightness(*sky(60, 1.5), MODEL, MIN_SNR, 100.0, SHAPE) == StarRefusal.NONE
-    ).all()
+    assert (refuse_by_brightness(*sky(60, 1.5), MODEL, MIN_SNR, 100.0) == StarRefusal.NONE).all()
 
 
 def test_one_star_unlike_the_others_is_ambiguous() -> None:

@@ -310,7 +310,7 @@ def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure(
     before = observed(image, one.icrf_from_star_tracker_xyzw)
     exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
     after, _ = observe_stars(exposure, PRIOR, StarSearch(marked, CENTROIDS))
-    monkeypatch.setattr('starcal_ros.identification.star_finder.MAX_BLEND_SIGMA', 0.1)
+    monkeypatch.setattr('starcal_ros.identification.blending.MAX_BLEND_SIGMA', 0.1)
     fewer, _ = observe_stars(exposure, PRIOR, StarSearch(marked, CENTROIDS))
     assert fewer.refused_stars['blend'] > after.refused_stars['blend']
     both, i, j = np.intersect1d(before.catalog_id, after.catalog_id, return_indices=True)

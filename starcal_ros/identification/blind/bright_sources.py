@@ -7,19 +7,11 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.stars.detection import (
-    Background,
-    detect,
-    measure_background,
-    sample_mesh,
-    stamps_at_edges,
-)
+from starcal_ros.arrays import Floats, Indices, Pixels
+from starcal_ros.stars.detection import Background, detect, measure_background, stamps_at_edges
 
-_DETECTION_SIGMA = 5.0
 _STAMP_PX = 7  # half width of a window; it holds a saturated star of 10 px
 LONGEST_STREAK_PX = 2.0 * _STAMP_PX - 1  # that a window shows whole, its ends blurred
 _APART_PX = 10.0  # the fainter of two sources nearer than this counts as a part of the other
@@ -57,16 +49,13 @@ def bright_sources(pixels: Pixels) -> BrightSources:
     good to a few tenths of a pixel.
     """
     background = measure_background(pixels)
-    found = detect(pixels, background, _DETECTION_SIGMA)
+    found = detect(pixels, background)
     centre = np.rint(found.xy_px[:_MEASURED]).astype(np.int64)
-    shape = (pixels.shape[0], pixels.shape[1])
     stamps, outside = stamps_at_edges(pixels, centre, _STAMP_PX)
-    level = sample_mesh(background.level_mesh, shape, centre.astype(np.float64))
-    noise = sample_mesh(background.noise_mesh, shape, centre.astype(np.float64))
-    light = stamps - level[:, None, None]
-    light[outside | (light < 3.0 * noise[:, None, None])] = 0.0
+    light = stamps - background.level_at(centre)[:, None, None]
+    light[outside | (light < 3.0 * background.noise_at(centre)[:, None, None])] = 0.0
     reach = np.arange(-_STAMP_PX, _STAMP_PX + 1)
-    # Two rounds: the second is centred on the first centroid, which reduces neighbours at the rim.
+    # The second round is centred on the first centroid: neighbours at the rim then count less.
     offset = np.zeros((len(centre), 2))
     for radius_px in (4.0, 5.0):
         u, v = (
@@ -113,7 +102,7 @@ def smear(sources: BrightSources) -> tuple[float, float] | None:
     return length_px, 0.5 * float(np.angle(double))
 
 
-def _extents(light: Floats, reach: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
+def _extents(light: Floats, reach: Indices) -> tuple[Floats, Floats, Floats]:
     """Longest and shortest 1-sigma extent (n,) in windows, and the direction of the longest."""
     flux = np.maximum(light.sum(axis=(1, 2)), 1e-9)
     u = (light.sum(axis=1) * reach).sum(axis=1) / flux
@@ -129,10 +118,8 @@ def _extents(light: Floats, reach: NDArray[np.int64]) -> tuple[Floats, Floats, F
     )
 
 
-def _apart(xy_px: Floats) -> NDArray[np.int64]:
+def _apart(xy_px: Floats) -> Indices:
     """Rows of the points (n, 2), brightest first, without a brighter one nearby."""
     kept = np.ones(len(xy_px), bool)
-    if len(xy_px):
-        for first, second in cKDTree(xy_px).query_pairs(_APART_PX, output_type='ndarray'):
-            kept[max(first, second)] = False
+    kept[cKDTree(xy_px).query_pairs(_APART_PX, output_type='ndarray').max(axis=1)] = False
     return np.flatnonzero(kept)

@@ -19,14 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats, Indices, Singles
 from starcal_ros.sky.catalog import StarCatalog
 
 _SMALLEST_DEG = 1.6
 _STEP = math.sqrt(2.0)
 _SCALES = 10  # discs of 1.6 to 36 degrees of radius
-_SPACING = 0.7  # of disc centres, in disc radii: adjacent discs share two thirds of their area
-_STARS = (7, 8, 9, 10, 11, 12, 13, 14, 14, 14)  # of a disc: about a million patterns at most
+_SPACING = (
+    0.7  # distance of disc centres in disc radii: adjacent discs share two thirds of their area
+)
+_STARS = (7, 8, 9, 10, 11, 12, 13, 14, 14, 14)  # stars per disc: at most about a million patterns
 _DEPTH = 3.0  # stars indexed over the number needed for a sky of even density
 # Orders of A, B, C, D in which noise may show a canonical pattern.
 _ORDERS = np.array([[0, 1, 2, 3], [0, 1, 3, 2], [1, 0, 2, 3], [1, 0, 3, 2]])
@@ -174,7 +176,7 @@ class ShapeGrid:
     (m + 1,): row of the first shape of each of the m cells, the last place counting fastest.
     """
 
-    shape: NDArray[np.float32]
+    shape: Singles
     low: Floats
     cells: Indices
     first: NDArray[np.int32]
@@ -220,9 +222,7 @@ def equal_shapes(
     return query[equal], row[equal]
 
 
-def _rows_between(
-    query: Indices, begin: NDArray[np.int32], end: NDArray[np.int32]
-) -> NDArray[np.int64]:
+def _rows_between(query: Indices, begin: NDArray[np.int32], end: NDArray[np.int32]) -> Indices:
     """Each query (n,) with each of its rows from begin to end (n,): (2, m)."""
     count = (end - begin).astype(np.int64)
     before = np.cumsum(count) - count

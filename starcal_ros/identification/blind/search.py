@@ -45,19 +45,22 @@ from starcal_ros.sky.catalog import StarCatalog
 
 MAX_LOG10_P_VALUE = -3.0  # a bound, some orders of magnitude above the rate of false matches
 ROUNDS = ((0, 12), (12, 18), (18, 24))
-"""Brightest sources of which patterns are formed, with one of each range, round by round."""
+"""
+(first, last) of each round: patterns of the ``last`` brightest sources, with at least one source
+after the ``first`` brightest.
+"""
 _REFINED = 32  # number of best candidates of a lookup that are refined
 _GUESSED = 0.2  # largest shift of a guess, half diagonals
 _ALIKE = 0.03  # largest shift of one star to the next, half diagonals
-_OF_A_GUESS = 40  # brightest stars and sources
+_OF_A_GUESS = 40  # brightest stars and sources compared with a guess
 _CANDIDATES = 20_000  # tested candidates of a lookup, drawn at random from more
 _TESTED = 16  # brightest predictions used to test a candidate
-_TABLED = 5000  # points all over the sky whose stars are kept: of discs of 9 degrees and more
+_TABLED = 5000  # most points whose stars are kept in memory: for discs of 9 degrees and more
 _CHUNK = 5000  # candidates tested at once: 30 MB
 _MAP_SIDE = 128  # cells of the map of the sources along each side
 _NEAR, _FAR = 0.006, 0.02  # 1-sigma of the predictions of a candidate, in half diagonals
 _SHOWN = 0.6  # expected share of the bright stars that a true candidate shows
-_LEAST_GAIN = 0.8  # of the gain of the four stars of a pattern alone
+_LEAST_GAIN = 0.8  # smallest gain, over that of the four stars of a pattern alone
 
 
 @dataclass(frozen=True)
@@ -118,17 +121,16 @@ def find_sky(
     camera: CameraModel,
     catalog: StarCatalog,
     try_mirrored: bool = False,
-    max_log10_p_value: float = MAX_LOG10_P_VALUE,
     rounds: Sequence[tuple[int, int]] = ROUNDS,
     deadline_s: float = math.inf,
 ) -> SkyMatch | NotFound:
     """
-    Identified stars among sources (n, 2), brightest first, or why there are none.
+    Identified stars among sources (n, 2), brightest first, or the reason why there are none.
 
     ``camera`` is the prior: focal length within 25 %, principal point within 5 % of the width,
     distortion within 3 % of the radius.  The catalog is sorted by magnitude.  With
-    ``try_mirrored`` the mirror image is searched too.  Of `ROUNDS`, those asked for are searched,
-    until the processor time of the thread reaches ``deadline_s``.
+    ``try_mirrored`` the mirror image is searched too.  ``rounds`` is a part of `ROUNDS`; the
+    search ends when the processor time of the thread reaches ``deadline_s``.
     """
     if len(xy_px) < 5:
         return NotFound(f'{len(xy_px)} star-like sources, at least 5 are needed')
@@ -146,11 +148,11 @@ def find_sky(
                     log10_p, radius_px = log10_p_value(image, catalog, fit)
                     log10_p += math.log10(len(images))
                     least = min(least, log10_p)
-                    if log10_p < max_log10_p_value:
+                    if log10_p < MAX_LOG10_P_VALUE:
                         return _result(image, catalog, fit, radius_px, log10_p, bool(mirrored))
                 if time.thread_time() > deadline_s:
-                    return NotFound('the time given for the search is over', least)
-    return NotFound('no pattern of the sources is one of the catalog beyond chance', least)
+                    return NotFound('the search has reached its time limit', least)
+    return NotFound('no pattern of the sources matches the catalog beyond chance', least)
 
 
 def confirm_sky(
@@ -303,7 +305,7 @@ def _gains(
     """
     Log-likelihood ratio (n,) of the sources with a candidate to that by chance.
 
-    Also the part of it that the four stars of a pattern alone give.
+    Also the ratio that the four stars of a pattern give alone.
     """
     half = math.tan(image.half_diagonal_rad)
     finite = plane[np.isfinite(plane[:, 0])]
@@ -347,7 +349,7 @@ def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTr
     """Search trees of points all over the sky and of the stars that discs of a radius need."""
     radius_rad = math.radians(radius_deg)
     points = sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
-    # Where the sky is emptiest a disc has half of the mean: still most of the stars looked at.
+    # The emptiest discs hold half of the mean number, which is still most of the stars tested.
     enough = int(5 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
     return cKDTree(points), cKDTree(catalog.direction_icrs[:enough])
 

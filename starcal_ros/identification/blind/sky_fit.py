@@ -27,24 +27,16 @@ from starcal_ros.sky.catalog import StarCatalog
 FOCAL_RANGE = 0.25  # half range of the logarithm of the focal length
 CENTRE_RANGE = 0.05  # half range of the principal point, in widths
 DISTORTION_RANGE = 0.03  # half range of the distortion in the corners, over the radius
-_CLOSING_IN = (
-    0.05,
-    0.04,
-    0.03,
-    0.022,
-    0.015,
-    0.01,
-    0.007,
-    0.005,
-)  # radii of matching, in half diagonals
+# Radii of matching, in half diagonals.
+_CLOSING_IN = (0.05, 0.04, 0.03, 0.022, 0.015, 0.01, 0.007, 0.005)
 _CROWDED = 0.15  # largest probability that a source lies by chance within the radius of matching
-_TELLING = 0.08  # largest such probability at which a candidate is judged by its matches
+_TELLING = 0.08  # largest such probability at which matches decide about a candidate
 _MOST_STARS = 200
 _JUDGED_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5)  # radii of matching for the p-value
 _DEPTHS = (6, 8, 11, 15, 20, 30, 50, 80, 130, 200)  # numbers of brightest predictions for it
-_LOOKS = 10.0  # independent tests among them: most of their stars are common
+_LOOKS = 10.0  # number of independent tests among these depths, which share most stars
 _ORDERED = 30  # brightest matches whose order is judged: more would not change a verdict
-_WIDEST_RAD = math.radians(80.0)  # of half a diagonal: sources are matched in a tangent plane
+_WIDEST_RAD = math.radians(80.0)  # largest half diagonal: sources are matched in a tangent plane
 _ALONE = 10.0  # radius about a star for the local density of sources, in radii of matching
 
 
@@ -123,11 +115,11 @@ def refined(
 
 def _like_chance(image: SourceImage, rank: Indices, radius_px: float, sources: int) -> bool:
     """
-    True if chance puts so many sources near predictions, of which ``rank`` (k,) have one.
+    True if chance explains that the predictions ``rank`` (k,) have a source nearby.
 
-    Told only at radii at which few places are near a source: at larger ones sources without a
-    star, such as the structure of a corona, hide those that have one.  From there on, the fits
-    accepted of six stars among twelve false sources were below the limit by a factor of two.
+    Judged only at radii at which few random places are near a source: at larger ones, sources
+    without a star (such as the structure of a corona) hide the others.  Accepted fits of six stars
+    among twelve false sources stayed below the limit by a factor of two.
     """
     if len(rank) < 5:
         return True
@@ -141,7 +133,7 @@ def _like_chance(image: SourceImage, rank: Indices, radius_px: float, sources: i
 
 
 def _evenly(image: SourceImage, radius_px: float, sources: int) -> float:
-    """Probability that one of so many sources, spread evenly, lies within a radius."""
+    """Probability that one of a number of evenly spread sources lies within a radius."""
     return min(1.0, min(sources, len(image.xy_px)) * math.pi * radius_px**2 / image.area_px2)
 
 
@@ -180,7 +172,7 @@ def _mutual(
     seen = image.xy_px[:most_sources]
     if len(xy_px) == 0 or len(seen) == 0:
         return none, none, np.empty(0)
-    # Along each axis by itself: the sum over an axis of two numbers takes several times as long.
+    # Axis by axis: a sum over an axis of length two takes several times as long.
     apart = (xy_px[:, 0, None] - seen[:, 0]) ** 2
     apart += (xy_px[:, 1, None] - seen[:, 1]) ** 2
     source = apart.argmin(axis=1)
@@ -282,10 +274,11 @@ def _chance_of_one(image: SourceImage, xy_px: Floats, radius_px: float, sources:
 
 def _chance_of_order(source: Indices) -> float:
     """
-    Probability that chance sorts sources by brightness as well as those (k,) of stars so sorted.
+    Probability that matched sources are by chance as well sorted by brightness as these (k,).
 
-    Sources are numbered by brightness.  The measure is the number of pairs in the wrong order, of
-    which each permutation is equally likely (Kendall 1938, Biometrika 30, 81).
+    Sources are numbered by brightness and given in the order of their stars, brightest first.  The
+    measure is the number of pairs in wrong order, for which all permutations are equally likely by
+    chance (Kendall 1938, Biometrika 30, 81).
     """
     brightest = source[:_ORDERED]
     wrong = np.triu(brightest[:, None] > brightest[None], 1)

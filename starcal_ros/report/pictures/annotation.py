@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Picture, Pixels
 from starcal_ros.camera import project
@@ -97,9 +96,7 @@ def _mark_size(picture: Picture) -> float:
 
 def predicted_px(observations: StarObservations, geometry: CameraGeometry) -> Floats:
     """Pixels (n, 2) of the stars predicted by the geometry and the star tracker attitude."""
-    icrf_from_camera = Rotation.from_quat(
-        observations.icrf_from_star_tracker_xyzw
-    ) * Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
+    icrf_from_camera = geometry.icrf_from_camera(observations.icrf_from_star_tracker_xyzw)
     directions = icrf_from_camera.inv().as_matrix() @ observations.direction_icrf.T
     return project(geometry.camera, directions.T)
 

@@ -21,7 +21,7 @@ from starcal_ros.formats.bag.writer import BagWriter, check_replaceable
 from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import AttitudeSample, CameraGeometry
-from starcal_ros.sky.astrometry import observer_at
+from starcal_ros.sky.astrometry import earth_velocity_c
 from starcal_ros.studies.simulation import centroids
 from starcal_ros.studies.simulation.mistakes import Mistakes, NO_MISTAKES
 from starcal_ros.studies.simulation.rendering import images
@@ -149,8 +149,8 @@ def write_bag(
 
 
 def _write_telemetry(writer: BagWriter, sample: AttitudeSample, mistakes: Mistakes) -> None:
-    # The Earth's, which the simulated directions have.
-    velocity_m_s = observer_at(sample.time_ns).velocity_c * SPEED_OF_LIGHT_M_S
+    # The simulated directions have the aberration of the Earth's velocity.
+    velocity_m_s = earth_velocity_c(sample.time_ns) * SPEED_OF_LIGHT_M_S
     writer.write_velocity(VELOCITY_TOPIC, sample.time_ns, velocity_m_s, 'icrf')
     quaternion = mistakes.attitude(sample.icrf_from_star_tracker_xyzw)
     writer.write_attitude(ATTITUDE_TOPIC, sample.time_ns, quaternion, 'icrf')
