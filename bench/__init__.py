@@ -2,7 +2,7 @@
 """Benches of time, memory, accuracy and identification, some against other packages."""
 
 NAMES = ('solver', 'ensemble', 'measure', 'calibrate', 'observer', 'gate', 'onboard')
-"""The benches, each a module with ``run(quick)`` that prints its tables and returns them."""
+"""The benches, each a module with ``run(quick)`` that yields its tables."""
 
 LONG = (
     'accuracy',
@@ -11,7 +11,6 @@ LONG = (
     'acquisition',
     'lost_in_space',
     'night_sky',
-    'paper',
     'soak',
     'transport',
     'fleet',

@@ -10,7 +10,7 @@ draw scatters by about 30 %; the figure is the rms over the seeds.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 import dataclasses
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ CASES = (
 )
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Run every case over its seeds."""
     cases, seeds = (CASES[:1], 2) if quick else (CASES, SEEDS)
     table = Table(
@@ -82,8 +82,7 @@ def run(quick: bool) -> list[Table]:
             rows = list(pool.map(trial, [case] * seeds, range(1, seeds + 1)))
             table.add(*_summary(case, rows))
             print(*table.rows[-1], flush=True)
-    print(table.text())
-    return [table]
+    yield table
 
 
 def _cores() -> int:

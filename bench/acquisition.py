@@ -55,15 +55,12 @@ class Found:
     seconds: float
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Run scrambled fields, then true fields; takes ten minutes, or one."""
     share = QUICK / 100 if quick else 1.0
     images, attitudes = max(3, round(IMAGES * share)), max(4, round(ATTITUDES * share))
-    refused = scrambled(images, attitudes)
-    print(refused.text(), flush=True)
-    found = to_be_found(max(6, round(TRUE_FIELDS * share)))
-    print(found.text())
-    return [refused, found]
+    yield scrambled(images, attitudes)
+    yield to_be_found(max(6, round(TRUE_FIELDS * share)))
 
 
 def scrambled(images: int, attitudes: int) -> Table:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import dataclasses
 import os
 from pathlib import Path
@@ -59,15 +59,10 @@ class Cost(NamedTuple):
     peak_mb: float
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Compare with a bare read, then profile."""
-    if quick:
-        return compare('tiny', 10, None, None, 1)
-    return [
-        table
-        for name, images, most_s, most_ratio in SIZES
-        for table in compare(name, images, most_s, most_ratio, _ROUNDS)
-    ]
+    for size in (('tiny', 10, None, None),) if quick else SIZES:
+        yield from compare(*size, rounds=1 if quick else _ROUNDS)
 
 
 def compare(
@@ -91,8 +86,6 @@ def compare(
         stages = _stages(profile)
     height, width = scenario.truth.camera.height, scenario.truth.camera.width
     table = _compared(f'{images} images of {width} x {height}', costs, most_s, most_ratio)
-    for one in (table, stages):
-        print(one.text())
     return [table, stages]
 
 

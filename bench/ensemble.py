@@ -8,6 +8,7 @@ Sixty images have less information than 359.  The convex relaxation of the choic
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import dataclasses
 
 import numpy as np
@@ -130,18 +131,12 @@ def measure(
     return table
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Run images of the whole sky, and of one hour of the night of the paper."""
     m, count = (30, 8) if quick else (359, 60)
     options = CalibrationOptions(star_tracker_sigma_arcsec=(20.0, 20.0, 20.0), max_images=count)
     whole_sky, prior = make_ensemble(m)
     night = dataclasses.replace(scenario('paper'), image_count=m, magnitude_limit=6.65)
-    tables = [
-        measure(f'{count} of {m} images over the whole sky', whole_sky, prior, options),
-        measure(
-            f'{count} of {m} images of one hour', true_observations(night), night.prior, options
-        ),
-    ]
-    for table in tables:
-        print(table.text())
-    return tables
+    yield measure(f'{count} of {m} images over the whole sky', whole_sky, prior, options)
+    hour = true_observations(night)
+    yield measure(f'{count} of {m} images of one hour', hour, night.prior, options)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 import itertools
 import os
@@ -47,7 +48,7 @@ class Watch:
             self.killed += 1
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """One bag after another alone, then all on two workers."""
     count, alone = (8, 2) if quick else (500, 20)
     with tempfile.TemporaryDirectory(prefix='starcal-fleet-') as name:
@@ -84,8 +85,7 @@ def run(quick: bool) -> list[Table]:
         made.add(f'{who}, second tenth, MB', statistics.mean(values[tenth : 2 * tenth]))
         made.add(f'{who}, last tenth, MB', statistics.mean(values[-tenth:]))
     made.notes.append(f'efficiency {verdict(efficiency, LEAST_EFFICIENCY)}')
-    print(made.text())
-    return [made]
+    yield made
 
 
 def copy_bags(folder: Path, count: int) -> None:

@@ -70,11 +70,13 @@ class Frame:
     camera_from_icrf: Rotation
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Frames to be found, beside tetra3, then random points; half a day, or some minutes."""
     count, scrambled = (5, 20) if quick else (FRAMES, SCRAMBLED)
     catalog = load_catalog()
-    return [found(catalog, count), beside_tetra3(catalog, count), random_points(scrambled)]
+    yield found(catalog, count)
+    yield beside_tetra3(catalog, count)
+    yield random_points(scrambled)
 
 
 def found(catalog: StarCatalog, count: int) -> Table:
@@ -100,7 +102,6 @@ def found(catalog: StarCatalog, count: int) -> Table:
             median_s, p95_s = (float(np.percentile(times_s, p)) for p in (50, 95))
             table.add(name, width_deg, count, right, wrong, median_s, p95_s)
             print(*table.rows[-1], flush=True)
-    print(table.text(), flush=True)
     return table
 
 
@@ -135,7 +136,6 @@ def random_points(count: int) -> Table:
     lowest, rate = float(best.min()), tail_rate(best, MAX_LOG10_P_VALUE)
     each_s = float(took_s.mean())
     table.add('18, 30 and 60', '4 to 70', count, wrong, limit, lowest, rate, each_s)
-    print(table.text(), flush=True)
     return table
 
 
@@ -194,7 +194,6 @@ def beside_tetra3(catalog: StarCatalog, count: int) -> Table:
             times_s = [seconds for _, seconds in rows]
             median_s, p95_s = (float(np.percentile(times_s, p)) for p in (50, 95))
             table.add(name, width_deg, count, right, wrong, median_s, p95_s)
-    print(table.text(), flush=True)
     return table
 
 

@@ -9,6 +9,7 @@ where its lines of sight are off by more than five of their sigmas, and accepted
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import dataclasses
 import math
 from pathlib import Path
@@ -36,7 +37,7 @@ WRONG = 5.0  # in sigma
 _COLUMNS = ('camera', 'model', 'field deg', 'outcome', 'error arcsec', 'over sigma', 's')
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """One line for each camera, and their sum; an hour, or some minutes."""
     count = 4 if quick else CAMERAS
     table = Table('Cameras calibrated from images alone', _COLUMNS)
@@ -60,8 +61,8 @@ def run(quick: bool) -> list[Table]:
     rms = float(np.sqrt(np.mean(np.square(ratios)))) if ratios else math.nan
     total = Table('Sum', ('cameras', 'accepted', 'wrong', 'error / sigma rms'))
     total.add(count, len(ratios), wrong, rms)
-    print(total.text())
-    return [table, total]
+    yield table
+    yield total
 
 
 def camera_of(seed: int) -> tuple[Scenario, float]:

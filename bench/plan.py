@@ -9,6 +9,7 @@ images up to the target are counted; the predicted sigma is that of the plan whe
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import dataclasses
 
 import numpy as np
@@ -27,9 +28,8 @@ _FIRST, _RANDOM = 8, 16
 _SIGMAS = ('map', 'line_of_sight')
 
 
-def run(quick: bool) -> list[Table]:
-    """Print and return a table of missions for each sigma."""
-    tables = []
+def run(quick: bool) -> Iterator[Table]:
+    """A table of missions for each sigma."""
     for name in _SIGMAS[: 1 if quick else None]:
         table = Table(
             f'images to the {name} sigma of {_FIRST} + {_RANDOM} random images',
@@ -43,9 +43,7 @@ def run(quick: bool) -> list[Table]:
             f'plan/random, medians: {ratio:.2f}; predicted off by {np.median(np.abs(off)):.1%} '
             f'(median), {np.sqrt((off**2).mean()):.1%} (rms)'
         )
-        print(table.text())
-        tables.append(table)
-    return tables
+        yield table
 
 
 def _mission(seed: int, name: str) -> tuple[float, int, int, int, float]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Iterator
 import importlib.util
 import os
 from pathlib import Path
@@ -58,20 +59,19 @@ def at_10_hz(minutes: float) -> Case:
     return Case(paper_scenario(MAGNITUDE_LIMIT), 6, count, 10.0, 100_000_000, around_ns)
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Send the images of both cases; memory after a tenth of them and at the end."""
     if not importlib.util.find_spec('rclpy'):
         print('soak: no rclpy here: left out\n')
-        return []
-    return [_table(at_speed(150 if quick else 10_000)), _table(at_10_hz(0.05 if quick else 10.0))]
+        return
+    yield _table(at_speed(150 if quick else 10_000))
+    yield _table(at_10_hz(0.05 if quick else 10.0))
 
 
 def _table(case: Case) -> Table:
     graph.own_domain()
     with tempfile.TemporaryDirectory() as folder:
-        table = _soak(Path(folder), case)
-    print(table.text())
-    return table
+        return _soak(Path(folder), case)
 
 
 def _serialised(case: Case) -> list[tuple[bytes, Floats]]:
@@ -193,4 +193,4 @@ def _soak(folder: Path, case: Case) -> Table:
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description='Soak both nodes at 10 Hz of 2592 x 2048.')
     parser.add_argument('--minutes', type=float, default=10.0)
-    _table(at_10_hz(parser.parse_args().minutes))
+    print(_table(at_10_hz(parser.parse_args().minutes)).text())

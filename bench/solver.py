@@ -8,7 +8,7 @@ are from alternating runs in one process, memory from a separate process per sol
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 import importlib.util
@@ -205,7 +205,7 @@ def measure_growth(
     return table
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """
     Compare the solvers at several numbers of images, then the growth of starcal with them.
 
@@ -217,14 +217,11 @@ def run(quick: bool) -> list[Table]:
     try:
         spawn = multiprocessing.get_context('spawn')
         with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-            tables = pool.submit(measure, quick).result()
+            yield from pool.submit(measure, quick).result()
     finally:
         del os.environ['OPENBLAS_NUM_THREADS']
         if before is not None:
             os.environ['OPENBLAS_NUM_THREADS'] = before
-    for table in tables:
-        print(table.text())
-    return tables
 
 
 def measure(quick: bool) -> list[Table]:

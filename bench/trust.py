@@ -8,22 +8,18 @@ it with the default options.  The error of the lines of sight over the detector,
 rotation removed, is divided by the 1-sigma that the calibration reports.  A row is honest where
 the RMS of that ratio over the accepted calibrations is 0.7 to 1.5 and none exceeds 2, or where the
 gate refuses and names the cause.  The worlds of simulated observations follow (`bench.worlds`).
-
-``python -m bench.trust --seeds 5 --markdown FILE`` also writes the tables as Markdown.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 import dataclasses
 from dataclasses import dataclass
 import math
 import multiprocessing
 import os
-from pathlib import Path
 
 import erfa
 import numpy as np
@@ -88,9 +84,9 @@ WORLDS = (
 QUICK = ('sound', 'principal point', 'ripple', 'columns lost', 'tracker wanders')
 
 
-def run(quick: bool, seeds: int = SEEDS) -> list[Table]:
-    """Print and return the tables of all worlds."""
-    seeds = 2 if quick else seeds
+def run(quick: bool) -> Iterator[Table]:
+    """The tables of all worlds."""
+    seeds = 2 if quick else SEEDS
     rendered = [w for w in WORLDS if not quick or w.name in QUICK]
     if quick:
         names = [w.name for w in rendered]
@@ -118,19 +114,8 @@ def run(quick: bool, seeds: int = SEEDS) -> list[Table]:
     for world in rendered:
         found = [r for (w, _), r in zip(jobs, results, strict=True) if w is world]
         table.add(*_summary(world, found))
-    print(table.text(), flush=True)
-    return [table, *worlds.run(quick, seeds)]
-
-
-def main() -> None:
-    """Print the tables, and write them as Markdown."""
-    parser = argparse.ArgumentParser(prog='python -m bench.trust', description=__doc__)
-    parser.add_argument('--seeds', type=int, default=SEEDS, help='seeds 1 to this number')
-    parser.add_argument('--markdown', type=Path, help='file to write')
-    args = parser.parse_args()
-    tables = run(False, args.seeds)
-    if args.markdown:
-        args.markdown.write_text('\n'.join(table.markdown() for table in tables))
+    yield table
+    yield from worlds.run(quick)
 
 
 @dataclass(frozen=True)
@@ -399,7 +384,3 @@ def true_directions(world: World, scenario: Scenario, pixels: Floats, index: int
     for _ in range(60):  # the displacement is a contraction: 0.1 px of 10 px at most
         at = pixels - field(at)
     return line_of_sight(camera_at(world, scenario, index), at)
-
-
-if __name__ == '__main__':
-    main()
