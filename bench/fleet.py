@@ -64,8 +64,7 @@ def run(quick: bool) -> Iterator[Table]:
         used_s = (processor_s() - start_processor_s) / count
         after = one_bag_s(found[-alone:], folder / 'after')
         rows = Rows(folder / 'out').rows()
-    one_s = (before[0] + after[0]) / 2
-    one_used_s = (before[1] + after[1]) / 2
+    one_s, one_used_s = ((a + b) / 2 for a, b in zip(before, after, strict=True))
     efficiency = count * one_s / (_WORKERS * wall_s)
     stamps = Counter(row.stamp for row in rows)
     made = Table(f'starcal trend over {count} bags on {_WORKERS} workers', ('quantity', 'value'))

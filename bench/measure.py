@@ -25,9 +25,7 @@ from starcal_ros.arrays import Pixels
 from starcal_ros.pipeline import observe
 
 MAGNITUDE_LIMIT = 7.35  # leaves 122 stars
-AT_LEAST_S = (
-    0.1  # of calls in a row: a single call of 6 ms after another method would time the caches
-)
+AT_LEAST_S = 0.1  # of calls in a row: a call of 6 ms after another method times the caches
 DETECTION_SIGMA = 5.0
 ACQUISITION_DEG = 1.2
 
