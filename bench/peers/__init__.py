@@ -19,7 +19,7 @@ from bench.competitors import solve_ceres, solve_scipy
 from bench.peers import solvers, starcal, tetra3rs
 from bench.peers.campaigns import all_campaigns, Campaign, drifting, Result
 from bench.table import Table, timed
-from bench.worlds import rms, shape_error_arcsec
+from bench.trials import rms, shape_error_arcsec
 from starcal_ros.blas_threads import one_blas_thread
 
 
