@@ -101,11 +101,8 @@ def score(name: str, seed: int) -> tuple[Score, float]:
     made = campaign(name, seed)
     base = synthetic.scenario('paper' if WORLDS[name].pointing == 'paper' else 'small', seed)
     # The simulated camera's own file states its shutter: the default is to state none.
-    setup = load_set_up(
-        base,
-        star_tracker_sigma_arcsec=[made.star_tracker_sigma_arcsec] * 3,
-        shutter='unknown',
-    )
+    assumed_arcsec = [made.star_tracker_sigma_arcsec] * 3
+    setup = load_set_up(base, star_tracker_sigma_arcsec=assumed_arcsec, shutter='unknown')
     found = trials.score(made.ensemble, setup, made.truth, [made.true_directions])
     return found, found.sigma_arcsec / bound_arcsec(made, setup.calibration)
 
