@@ -262,7 +262,7 @@ print(json.dumps(answers))
 
 
 def _cedar(python: Path, made: list[Frame], width_deg: float) -> list[tuple[bool | None, float]]:
-    """Whether cedar-solve finds the direction of the middle of each frame, and its seconds."""
+    """True for each frame whose middle cedar-solve finds, None without a match; its seconds."""
     with tempfile.NamedTemporaryFile('w', suffix='.json') as file:
         content = {'frames': [frame.xy_px.tolist() for frame in made], 'size': SIZE}
         json.dump({**content, 'width_deg': width_deg}, file)
