@@ -31,12 +31,14 @@ def main() -> None:
         f'{platform.machine()}, {os.cpu_count()} cores, load {load:.1f}: times on a busy machine'
     )
     print('are too long; ratios are of alternating runs.\n')
-    found = {}
+    found: dict[str, list[dict[str, object]]] = {}
     for name in args.names or NAMES:
         start_s = time.perf_counter()
-        tables = importlib.import_module(f'bench.{name}').run(args.quick)
+        found[name] = []
+        for table in importlib.import_module(f'bench.{name}').run(args.quick):
+            print(table.text(), flush=True)
+            found[name].append(table.content())
         print(f'({name}: {time.perf_counter() - start_s:.0f} s)\n', flush=True)
-        found[name] = [table.content() for table in tables]
     if args.json:
         args.json.write_text(json.dumps(found, indent=1) + '\n')
 

@@ -10,24 +10,22 @@ draw scatters by about 30 %; the figure is the rms over the seeds.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator
 import dataclasses
 from dataclasses import dataclass
 import math
-import multiprocessing
-import os
 
 import numpy as np
 
-from bench.frames import history, load_set_up, render_frame
+from bench.frames import load_set_up, observed, render_frame
 from bench.table import Table
+from bench.trials import in_processes, rms
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.pipeline import observe, solve
-from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, StarObservations
-from starcal_ros.studies.simulation import centroids as simulated_centroids
+from starcal_ros.pipeline import solve
+from starcal_ros.records import CameraGeometry, MapCovariance, StarObservations
+from starcal_ros.studies.simulation import centroids
 from starcal_ros.studies.simulation import scenario as synthetic
 from starcal_ros.studies.simulation.scenario import Scenario
 from starcal_ros.studies.trials import map_bound_px
@@ -49,27 +47,22 @@ class Case:
 
 
 CASES = (
-    Case(20.0, 0.95, 20.0),
-    Case(20.0, 0.7, 20.0),
-    Case(20.0, 1.4, 20.0),
-    Case(20.0, 2.0, 20.0),
-    Case(6.0, 0.95, 5.0),
-    Case(6.0, 2.0, 5.0),
-    Case(12.0, 1.2, 60.0),
-    Case(40.0, 0.95, 20.0),
-    Case(40.0, 0.7, 5.0),
+    *(Case(20.0, psf_sigma_px, 20.0) for psf_sigma_px in (0.95, 0.7, 1.4, 2.0)),
+    *(Case(6.0, psf_sigma_px, 5.0) for psf_sigma_px in (0.95, 2.0)),
+    *(Case(12.0, 1.2, 60.0), Case(40.0, 0.95, 20.0), Case(40.0, 0.7, 5.0)),
 )
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Run every case over its seeds."""
     cases, seeds = (CASES[:1], 2) if quick else (CASES, SEEDS)
+    columns = (
+        'field deg, PSF px, tracker ", map / bound rms, median, worst, target, '
+        'its sigma / bound, star / bound, star / sigma, stars, not solved'
+    )
     table = Table(
         f'From pixels, {IMAGES} images of {SIZE[0]} x {SIZE[1]}, {seeds} seeds',
-        (
-            *('field deg', 'PSF px', 'tracker "', 'map / bound rms', 'median', 'worst', 'target'),
-            *('its sigma / bound', 'star / bound', 'star / sigma', 'stars', 'not solved'),
-        ),
+        columns.split(', '),
         notes=[
             'map: rms over the detector after the best common rotation; its sigma: the same from',
             'the covariance of the calibration.  star: rms error per axis over the bound of each',
@@ -77,40 +70,25 @@ def run(quick: bool) -> list[Table]:
             'not solved: campaigns without a calibration, not included in the other columns.',
         ],
     )
-    with ProcessPoolExecutor(_cores(), multiprocessing.get_context('spawn')) as pool:
-        for case in cases:
-            rows = list(pool.map(trial, [case] * seeds, range(1, seeds + 1)))
-            table.add(*_summary(case, rows))
-            print(*table.rows[-1], flush=True)
-    print(table.text())
-    return [table]
+    for case in cases:
+        rows = in_processes(trial, [case] * seeds, range(1, seeds + 1))
+        table.add(*_summary(case, np.array(rows)))
+        print(*table.rows[-1], flush=True)
+    yield table
 
 
-def _cores() -> int:
-    """Return how many cores this process may run on."""
-    return len(os.sched_getaffinity(0))
-
-
-def _summary(case: Case, rows: Iterable[Floats]) -> tuple[float | str, ...]:
-    table = np.array(list(rows))
+def _summary(case: Case, table: Floats) -> tuple[float | str, ...]:
     solved = np.isfinite(table).all(axis=1)
     unsolved = int(np.count_nonzero(~solved))
     before = (case.field_deg, case.psf_sigma_px, case.tracker_arcsec)
     if not solved.any():
         return (*before, *([math.nan] * 3), 'MISSED', *([math.nan] * 3), 0, unsolved)
     ratio, told_ratio, over_bound2, over_sigma2, stars = table[solved].T
-    rms = math.sqrt(float(np.mean(ratio**2)))
+    verdict = 'met' if rms(ratio) <= TARGET and not unsolved else 'MISSED'
     return (
-        *before,
-        rms,
-        float(np.median(ratio)),
-        float(ratio.max()),
-        'met' if rms <= TARGET and not unsolved else 'MISSED',
-        float(told_ratio.mean()),
-        math.sqrt(float(over_bound2.mean())),
-        math.sqrt(float(over_sigma2.mean())),
-        int(stars.mean()),
-        unsolved,
+        *(*before, rms(ratio), float(np.median(ratio)), float(ratio.max()), verdict),
+        *(float(told_ratio.mean()), math.sqrt(float(over_bound2.mean()))),
+        *(math.sqrt(float(over_sigma2.mean())), int(stars.mean()), unsolved),
     )
 
 
@@ -156,44 +134,36 @@ def trial(case: Case, seed: int) -> Floats:
     """
     scenario = scenario_of(case, seed)
     setup = load_set_up(scenario)
-    track = observe.Track(setup.prior)
-    ensemble, stars = Ensemble(), []
-    for index in range(scenario.image_count):
-        image, samples = render_frame(scenario, index)
-        observed, track = observe.observe_next(image, history(samples), setup, track)
-        ensemble = solve.add_to_ensemble(ensemble, observed, setup)
-        if len(observed):
-            stars.append(_star_errors(scenario, index, observed))
+    frames = [render_frame(scenario, index) for index in range(scenario.image_count)]
+    ensemble = observed(frames, setup, has_velocity=False)
+    index = {image.time_ns: k for k, (image, _) in enumerate(frames)}
+    stars = [_star_errors(scenario, index[one.time_ns], one) for one in ensemble.images]
     try:
         found = solve.solve(ensemble, setup)
     except TooFewObservations:
         return np.full(5, np.nan)
     bound = np.zeros((13, 13))
-    names = simulated_centroids.bound_names(scenario.truth.camera)
+    names = centroids.bound_names(scenario.truth.camera)
     columns = [found.parameter_names.index(name) for name in names]
-    bound[np.ix_(columns, columns)] = simulated_centroids.cramer_rao_covariance(scenario)
+    bound[np.ix_(columns, columns)] = centroids.cramer_rao_covariance(scenario)
     error_px = map_error_px(found.geometry.camera, scenario.truth.camera)
     over_bound2, over_sigma2 = np.concatenate(stars, axis=1).mean(axis=1)
     bound_px = map_bound_px(scenario.truth.camera, MapCovariance(bound))
     sigma_px = map_bound_px(found.geometry.camera, found.map_covariance)
-    return np.array(
-        [error_px / bound_px, sigma_px / bound_px, over_bound2, over_sigma2, found.stars_used]
-    )
+    over_px = (error_px / bound_px, sigma_px / bound_px)
+    return np.array([*over_px, over_bound2, over_sigma2, found.stars_used])
 
 
-def _star_errors(scenario: Scenario, index: int, observed: StarObservations) -> Floats:
+def _star_errors(scenario: Scenario, index: int, stars: StarObservations) -> Floats:
     """Squared errors (2, n) per axis by bound and by reported sigma, of the brighter stars."""
     shown = synthetic.scene(scenario, index)
     order = np.argsort(shown.catalog_id)
-    row = order[np.searchsorted(shown.catalog_id[order], observed.catalog_id)]
+    row = order[np.searchsorted(shown.catalog_id[order], stars.catalog_id)]
     camera = scenario.truth.camera
-    covariance, snr = simulated_centroids.centroid_bound(
-        shown.pixel_px[row],
-        shown.flux_electrons[row],
-        scenario.detector,
-        (camera.height, camera.width),
-    )
-    squared = (observed.measured_px - shown.pixel_px[row]) ** 2
+    stars_of_scene = (shown.pixel_px[row], shown.flux_electrons[row])
+    shape = (camera.height, camera.width)
+    covariance, snr = centroids.centroid_bound(*stars_of_scene, scenario.detector, shape)
+    squared = (stars.measured_px - shown.pixel_px[row]) ** 2
     by_bound = squared / covariance[:, [0, 1], [0, 1]]
-    by_sigma = squared / observed.covariance_px2[:, [0, 2]]
+    by_sigma = squared / stars.covariance_px2[:, [0, 2]]
     return np.stack([by_bound[snr > 10].mean(axis=1), by_sigma[snr > 10].mean(axis=1)])

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import dataclasses
 import os
 from pathlib import Path
@@ -16,6 +16,7 @@ import time
 from typing import NamedTuple
 
 from bench.table import Table
+from bench.trials import memory_mb
 from starcal_ros.studies.simulation import scenario as synthetic
 from starcal_ros.studies.simulation import simulated_bag
 
@@ -59,20 +60,16 @@ class Cost(NamedTuple):
     peak_mb: float
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Compare with a bare read, then profile."""
-    if quick:
-        return compare('tiny', 10, None, None, 1)
-    return [
-        table
-        for name, images, most_s, most_ratio in SIZES
-        for table in compare(name, images, most_s, most_ratio, _ROUNDS)
-    ]
+    rounds = 1 if quick else _ROUNDS
+    for name, images, most_s, most_ratio in (('tiny', 10, None, None),) if quick else SIZES:
+        yield from compare(name, images, most_s, most_ratio, rounds)
 
 
 def compare(
     name: str, images: int, most_s: float | None, most_ratio: float | None, rounds: int
-) -> list[Table]:
+) -> Iterator[Table]:
     """Alternate a bare read and a calibration of a rendered bag; shares of a profiled run."""
     print(f'calibrate: rendering {images} images of scenario {name}', flush=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -82,25 +79,21 @@ def compare(
         calibrate = ['calibrate', str(made.bag), '--params']
         calibrate += [str(made.params), '-o', str(Path(folder, 'out'))]
         costs: dict[str, list[Cost]] = {'bare read with mcap': [], 'starcal calibrate': []}
+        calls = (['-c', _BARE, str(file)], ['-c', TOOL, *calibrate])
         for _ in range(rounds):
-            costs['bare read with mcap'].append(cost(['-c', _BARE, str(file)]))
-            costs['starcal calibrate'].append(cost(['-c', TOOL, *calibrate]))
+            for runs, arguments in zip(costs.values(), calls, strict=True):
+                runs.append(cost(arguments))
         profile = Path(folder, 'profile')
         profiled = ['-m', 'cProfile', '-o', str(profile), '-m', 'starcal_ros.cli.main']
         cost([*profiled, *calibrate])
         stages = _stages(profile)
-    height, width = scenario.truth.camera.height, scenario.truth.camera.width
-    table = _compared(f'{images} images of {width} x {height}', costs, most_s, most_ratio)
-    for one in (table, stages):
-        print(one.text())
-    return [table, stages]
+    size = f'{scenario.truth.camera.width} x {scenario.truth.camera.height}'
+    yield _compared(f'{images} images of {size}', costs, most_s, most_ratio)
+    yield stages
 
 
 def _compared(
-    title: str,
-    costs: dict[str, list[Cost]],
-    most_s: float | None,
-    most_ratio: float | None,
+    title: str, costs: dict[str, list[Cost]], most_s: float | None, most_ratio: float | None
 ) -> Table:
     """Least and median of the runs, and the median ratio of the pairs."""
     bare, whole = costs.values()
@@ -114,9 +107,8 @@ def _compared(
             *(name, statistics.median(wall_s), min(wall_s)),
             *(statistics.median(processor_s), min(processor_s), max(peak_mb)),
         )
-    ratios = [
-        [b[k] / a[k] for a, b in zip(bare, whole, strict=True)] for k in range(2)
-    ]  # wall, processor
+    # Of wall and of processor times.
+    ratios = [[b[k] / a[k] for a, b in zip(bare, whole, strict=True)] for k in range(2)]
     cells = [cell for ratio in ratios for cell in (statistics.median(ratio), min(ratio))]
     table.add('ratio of a pair', *cells, None)
     if most_s is not None:
@@ -138,13 +130,10 @@ def cost(arguments: Sequence[str]) -> Cost:
     kept = {k: v for k, v in os.environ.items() if k != '_ROS_WHEELS_BOOTSTRAP_COMPLETE'}
     start_s = time.perf_counter()
     process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL, env=kept)
-    status = Path(f'/proc/{process.pid}/status')
-    peak_kb = 0
+    peak_mb = 0.0
     while True:
         # The ru_maxrss of a child includes the memory of its parent at the start: ask the kernel.
-        for line in status.read_text().splitlines():
-            if line.startswith('VmHWM'):
-                peak_kb = max(peak_kb, int(line.split()[1]))
+        peak_mb = max(peak_mb, memory_mb(process.pid, 'VmHWM'))
         done, code, usage = os.wait4(process.pid, os.WNOHANG)
         if done:
             break
@@ -153,7 +142,7 @@ def cost(arguments: Sequence[str]) -> Cost:
     process.returncode = os.waitstatus_to_exitcode(code)
     if process.returncode not in (0, 3):
         raise RuntimeError(f'{" ".join(arguments[:3])} ended with {process.returncode}')
-    return Cost(wall_s, usage.ru_utime + usage.ru_stime, peak_kb / 1024)
+    return Cost(wall_s, usage.ru_utime + usage.ru_stime, peak_mb)
 
 
 def _stages(profile: Path) -> Table:
@@ -163,15 +152,12 @@ def _stages(profile: Path) -> Table:
     total_s = stats.total_tt  # type: ignore[attr-defined]
     table = Table('Share of the time by stage, from cProfile', ('stage', 'calls', 's', 'share %'))
     for stage, module, function in _STAGES:
-        rows = [
-            (calls, cumulative_s)
-            for (file, _, name), (_, calls, _, cumulative_s, _) in found.items()
-            if name == function and _module(file) == module
-        ]
-        if not rows:
+        count = len(table.rows)
+        for (file, _, name), (_, calls, _, cumulative_s, _) in found.items():
+            if name == function and _module(file) == module:
+                table.add(stage, calls, cumulative_s, 100 * cumulative_s / total_s)
+        if len(table.rows) == count:
             raise LookupError(f'{module}.{function} was not called: is the stage still there?')
-        for calls, cumulative_s in rows:
-            table.add(stage, calls, cumulative_s, 100 * cumulative_s / total_s)
     table.add('all', None, total_s, 100.0)
     return table
 

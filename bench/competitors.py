@@ -28,7 +28,7 @@ from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.levenberg_marquardt import covariance
 from starcal_ros.estimation.minimise import minimise
 from starcal_ros.estimation.problem import Problem, State
-from starcal_ros.estimation.star_equations import arrange, star_table, StarTable
+from starcal_ros.estimation.star_equations import arrange, Measurements, star_table, StarTable
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.studies.simulation.centroids import true_observations
 from starcal_ros.studies.simulation.scenario import scenario
@@ -54,6 +54,17 @@ class Case:
         """Rows of the table, image by image."""
         ends = np.cumsum([len(image) for image in self.ensemble.images])
         return [slice(int(a), int(b)) for a, b in zip(np.r_[0, ends[:-1]], ends, strict=True)]
+
+    @property
+    def measurements(self) -> Measurements:
+        """All stars with their stated covariances."""
+        return arrange(self.table, np.ones(len(self.table), bool), self.table.covariance_px2)
+
+    def with_free(self, values: Floats) -> Floats:
+        """Camera parameters (10,) of the start with other values (f,) of the free ones."""
+        parameters = self.start.parameters.copy()
+        parameters[self.problem.free] = values
+        return parameters
 
     @property
     def sigma_px(self) -> Floats:
@@ -106,9 +117,7 @@ def make_case(ensemble: Ensemble, prior: CameraGeometry, free: NDArray[np.int64]
 
 def solve_starcal(case: Case) -> Answer:
     """Plain Levenberg-Marquardt of the package."""
-    keep = np.ones(len(case.table), bool)
-    measurements = arrange(case.table, keep, case.table.covariance_px2)
-    solution = minimise(case.problem, case.start, measurements)
+    solution = minimise(case.problem, case.start, case.measurements)
     assert solution.converged
     rotations = solution.state.camera_from_icrf.as_matrix()
     return Answer(solution.state.parameters, rotations, solution.iterations)
@@ -119,9 +128,7 @@ def covariance_of(case: Case, answer: Answer, scaled: bool = True) -> Floats:
     f, m = len(case.problem.free), case.table.image_count
     rotations = Rotation.from_matrix(answer.camera_from_icrf)
     state = State(answer.parameters, case.start.camera_from_star_tracker, rotations)
-    keep = np.ones(len(case.table), bool)
-    measurements = arrange(case.table, keep, case.table.covariance_px2)
-    normal = minimise(case.problem, state, measurements).normal
+    normal = minimise(case.problem, state, case.measurements).normal
     factor = 2.0 * normal.cost / (2 * len(case.table) - f - 3 * m) if scaled else 1.0
     return np.asarray(factor * covariance(normal)[0][:f, :f])
 
@@ -167,43 +174,29 @@ def solve_scipy(case: Case) -> Answer:
     columns[..., f:] = (f + 3 * table.image[:, None] + np.arange(3))[:, None]
     rows = np.arange(0, (f + 3) * (2 * n) + 1, f + 3)
 
-    def parameters_of(x: Floats) -> Floats:
-        parameters = case.start.parameters.copy()
-        parameters[free] = x[:f]
-        return parameters
-
     def residuals(x: Floats) -> Floats:
         rotation, _ = _rotation_jacobian(x[f:].reshape(m, 3))
         directions = np.einsum('nij,nj->ni', rotation[table.image], base)
-        predicted = project_parameters('plumb_bob', parameters_of(x), directions)
+        predicted = project_parameters('plumb_bob', case.with_free(x[:f]), directions)
         return np.asarray(((predicted - table.measured_px) / sigma_px).ravel())
 
     def jacobian(x: Floats) -> csr_matrix:
         rotation, L = _rotation_jacobian(x[f:].reshape(m, 3))
         directions = np.einsum('nij,nj->ni', rotation[table.image], base)
-        camera = dataclasses.replace(case.prior.camera, parameters=parameters_of(x))
+        camera = dataclasses.replace(case.prior.camera, parameters=case.with_free(x[:f]))
         _, J_parameters, J_rotation = project_jacobians(camera, directions)
         J = np.concatenate([J_parameters[..., free], J_rotation @ L[table.image]], axis=-1)
         J /= sigma_px[..., None]
         return csr_matrix((J.ravel(), columns.ravel(), rows), (2 * n, f + 3 * m))
 
-    found = least_squares(
-        residuals,
-        np.concatenate([case.start.parameters[free], np.zeros(3 * m)]),
-        jacobian,
-        method='trf',
-        x_scale='jac',
-        ftol=TOLERANCE,
-        xtol=TOLERANCE,
-        gtol=TOLERANCE,
-        tr_options={
-            'atol': 1e-9,
-            'btol': 1e-9,
-        },  # otherwise its steps are inexact: 6 iterations instead of 4
-    )
+    start = np.concatenate([case.start.parameters[free], np.zeros(3 * m)])
+    tolerances = dict.fromkeys(('ftol', 'xtol', 'gtol'), TOLERANCE)
+    inner = {'atol': 1e-9, 'btol': 1e-9}  # else its steps are inexact: 6 iterations instead of 4
+    search = {'method': 'trf', 'x_scale': 'jac', 'tr_options': inner, **tolerances}
+    found = least_squares(residuals, start, jacobian, **search)
     rotation, _ = _rotation_jacobian(found.x[f:].reshape(m, 3))
     rotations = rotation @ case.start.camera_from_icrf.as_matrix()
-    return Answer(parameters_of(found.x), rotations, found.njev)
+    return Answer(case.with_free(found.x[:f]), rotations, found.njev)
 
 
 def solve_ceres(case: Case) -> Answer:
@@ -211,7 +204,7 @@ def solve_ceres(case: Case) -> Answer:
     import pyceres
 
     table, prior = case.table, case.prior.camera
-    held, free = case.start.parameters, case.problem.free
+    free = case.problem.free
     rotations = case.start.camera_from_icrf.as_matrix()
 
     class Stars(pyceres.CostFunction):  # type: ignore[misc]
@@ -227,8 +220,7 @@ def solve_ceres(case: Case) -> Answer:
 
         def Evaluate(self, blocks: Any, residuals: Floats, jacobians: Any) -> bool:
             """Write residuals in sigma, and derivatives if requested."""
-            parameters = held.copy()
-            parameters[free] = blocks[0]
+            parameters = case.with_free(blocks[0])
             rotation, L = _rotation_jacobian(blocks[1])
             directions = self.base @ rotation.T
             if jacobians is None:
@@ -236,22 +228,16 @@ def solve_ceres(case: Case) -> Answer:
             else:
                 camera = dataclasses.replace(prior, parameters=parameters)
                 predicted_px, J_parameters, J_rotation = project_jacobians(camera, directions)
-                if jacobians[0] is not None:
-                    by_parameters = J_parameters[..., free] / self.sigma_px[..., None]
-                    jacobians[0][:] = by_parameters.ravel()
-                if jacobians[1] is not None:
-                    by_angles = J_rotation @ L / self.sigma_px[..., None]
-                    jacobians[1][:] = by_angles.ravel()
+                for k, J in enumerate((J_parameters[..., free], J_rotation @ L)):
+                    if jacobians[k] is not None:
+                        jacobians[k][:] = (J / self.sigma_px[..., None]).ravel()
             residuals[:] = ((predicted_px - self.measured_px) / self.sigma_px).ravel()
             return True
 
     problem = pyceres.Problem()
-    shared = held[free].copy()
+    shared = case.start.parameters[free].copy()
     angles = np.zeros((table.image_count, 3))
-    costs = [
-        Stars(stars, rotation)
-        for stars, rotation in zip(case.rows_of_images, rotations, strict=True)
-    ]
+    costs = list(map(Stars, case.rows_of_images, rotations))
     for cost, angle in zip(costs, angles, strict=True):
         problem.add_residual_block(cost, None, [shared, angle])
     options = pyceres.SolverOptions()
@@ -262,11 +248,9 @@ def solve_ceres(case: Case) -> Answer:
     options.num_threads = 1  # the callbacks are Python: more threads would wait for each other
     summary = pyceres.SolverSummary()
     pyceres.solve(options, problem, summary)
-    parameters = held.copy()
-    parameters[free] = shared
     rotation, _ = _rotation_jacobian(angles)
     iterations = summary.num_successful_steps + summary.num_unsuccessful_steps
-    return Answer(parameters, rotation @ rotations, iterations)
+    return Answer(case.with_free(shared), rotation @ rotations, iterations)
 
 
 def solve_opencv(case: Case) -> Answer:
@@ -293,18 +277,10 @@ def calibrate_opencv(case: Case, flags: int) -> tuple[Floats, Floats, Floats]:
         points.append(np.concatenate([near, 2.0 * near]).astype(np.float32))
         pixels.append(np.concatenate([table.measured_px[stars]] * 2).astype(np.float32))
     k1, k2, k3, p1, p2 = prior.distortion
+    fx, _, fy, cx, cy = prior.intrinsics
     _, K, D, turns, _, _, _, _ = cv2.calibrateCameraExtended(
-        points,
-        pixels,
-        (prior.width, prior.height),
-        np.array(
-            [
-                [prior.intrinsics[0], 0, prior.intrinsics[3]],
-                [0, prior.intrinsics[2], prior.intrinsics[4]],
-                [0, 0, 1],
-            ]
-        ),
-        np.array([k1, k2, p1, p2, k3]),
+        *(points, pixels, (prior.width, prior.height)),
+        *(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array([k1, k2, p1, p2, k3])),
         flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, TOLERANCE),
     )

@@ -8,13 +8,14 @@ Sixty images have less information than 359.  The convex relaxation of the choic
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import dataclasses
 
 import numpy as np
 
 from bench.competitors import make_ensemble
 from bench.table import Table
-from bench.worlds import rms
+from bench.trials import rms
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.observability import (
     image_information,
@@ -62,28 +63,17 @@ def least_mean_variance(information: Floats, count: int, unit: Floats) -> float:
 
 
 def measure(
-    title: str,
-    ensemble: Ensemble,
-    prior: CameraGeometry,
-    options: CalibrationOptions,
-    random_choices: int = RANDOM_CHOICES,
+    title: str, ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions
 ) -> Table:
     """Rms and worst sigma of choices of ``max_images``, relative to all and to the best choice."""
     m, count = len(ensemble.images), options.max_images
     everything = predicted_sigma(ensemble, prior, options)
     information = image_information(ensemble.images, prior, options)
     least = np.sqrt(least_mean_variance(information, count, everything))
+    columns = 'images, choice, sigma by all, worst, by sqrt(count), by best possible, target'
     table = Table(
         title,
-        (
-            'images',
-            'choice',
-            'sigma by all',
-            'worst',
-            'by sqrt(count)',
-            'by best possible',
-            'target',
-        ),
+        columns.split(', '),
         notes=[
             f'sigma by all: rms over {len(everything)} unknowns of sigma over that of all images.',
             f'by sqrt(count): the same, over sqrt({m}/{count}), that of images all alike.',
@@ -91,57 +81,35 @@ def measure(
         ],
     )
     rng = np.random.default_rng(1)
-    chosen = [rng.choice(m, count, replace=False) for _ in range(random_choices)]
+    chosen = [rng.choice(m, count, replace=False) for _ in range(RANDOM_CHOICES)]
     at_random = [np.sqrt(np.diag(np.linalg.inv(information[rows].sum(axis=0)))) for rows in chosen]
-    choices = [
-        (m, 'all', everything),
-        (
-            count,
-            'streamed, one by one',
-            predicted_sigma(stream(ensemble, prior, options), prior, options),
-        ),
-        (
-            count,
-            'from all at once',
-            predicted_sigma(keep_most_informative(ensemble, prior, options), prior, options),
-        ),
-        (
-            count,
-            f'best of {random_choices} at random',
-            min(at_random, key=lambda s: rms(s / everything)),
-        ),
-        (count, 'at random, mean', np.mean(at_random, axis=0)),
-    ]
-    for images, name, sigma in choices:
-        ratio = sigma / everything
+    streamed = stream(ensemble, prior, options)
+    at_once = keep_most_informative(ensemble, prior, options)
+    choices = {
+        'all': everything,
+        'streamed, one by one': predicted_sigma(streamed, prior, options),
+        'from all at once': predicted_sigma(at_once, prior, options),
+        f'best of {RANDOM_CHOICES} at random': min(at_random, key=lambda s: rms(s / everything)),
+        'at random, mean': np.mean(at_random, axis=0),
+    }
+    for name, sigma in choices.items():
+        ratio, images = sigma / everything, m if name == 'all' else count
         by_best = rms(ratio) / least
         judged = ''
         if 'streamed' in name:
             judged = f'<= {TARGET:g}: ' + ('met' if by_best <= TARGET else 'MISSED')
-        table.add(
-            images,
-            name,
-            rms(ratio),
-            float(ratio.max()),
-            rms(ratio) / np.sqrt(m / images),
-            None if images == m else by_best,
-            judged,
-        )
+        by_count = rms(ratio) / np.sqrt(m / images)
+        ratios = (rms(ratio), float(ratio.max()), by_count, None if images == m else by_best)
+        table.add(images, name, *ratios, judged)
     return table
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Run images of the whole sky, and of one hour of the night of the paper."""
     m, count = (30, 8) if quick else (359, 60)
     options = CalibrationOptions(star_tracker_sigma_arcsec=(20.0, 20.0, 20.0), max_images=count)
     whole_sky, prior = make_ensemble(m)
     night = dataclasses.replace(scenario('paper'), image_count=m, magnitude_limit=6.65)
-    tables = [
-        measure(f'{count} of {m} images over the whole sky', whole_sky, prior, options),
-        measure(
-            f'{count} of {m} images of one hour', true_observations(night), night.prior, options
-        ),
-    ]
-    for table in tables:
-        print(table.text())
-    return tables
+    yield measure(f'{count} of {m} images over the whole sky', whole_sky, prior, options)
+    hour = true_observations(night)
+    yield measure(f'{count} of {m} images of one hour', hour, night.prior, options)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 import itertools
 import os
@@ -47,7 +48,7 @@ class Watch:
             self.killed += 1
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """One bag after another alone, then all on two workers."""
     count, alone = (8, 2) if quick else (500, 20)
     with tempfile.TemporaryDirectory(prefix='starcal-fleet-') as name:
@@ -63,8 +64,7 @@ def run(quick: bool) -> list[Table]:
         used_s = (processor_s() - start_processor_s) / count
         after = one_bag_s(found[-alone:], folder / 'after')
         rows = Rows(folder / 'out').rows()
-    one_s = (before[0] + after[0]) / 2
-    one_used_s = (before[1] + after[1]) / 2
+    one_s, one_used_s = ((a + b) / 2 for a, b in zip(before, after, strict=True))
     efficiency = count * one_s / (_WORKERS * wall_s)
     stamps = Counter(row.stamp for row in rows)
     made = Table(f'starcal trend over {count} bags on {_WORKERS} workers', ('quantity', 'value'))
@@ -84,8 +84,7 @@ def run(quick: bool) -> list[Table]:
         made.add(f'{who}, second tenth, MB', statistics.mean(values[tenth : 2 * tenth]))
         made.add(f'{who}, last tenth, MB', statistics.mean(values[-tenth:]))
     made.notes.append(f'efficiency {verdict(efficiency, LEAST_EFFICIENCY)}')
-    print(made.text())
-    return [made]
+    yield made
 
 
 def copy_bags(folder: Path, count: int) -> None:

@@ -68,11 +68,11 @@ def earth_velocity_m_s(time_ns: int) -> Floats:
     return earth_velocity_c(time_ns) * SPEED_OF_LIGHT_M_S
 
 
-def observed(frames: Iterable[Frame], setup: Setup) -> Ensemble:
-    """Stars of frames that starcal measures in turn, given the velocity of the observer."""
+def observed(frames: Iterable[Frame], setup: Setup, has_velocity: bool = True) -> Ensemble:
+    """Stars of frames that starcal measures in turn, given the velocity of the observer or not."""
     track, ensemble = observe.Track(setup.prior), Ensemble()
     for image, samples in frames:
-        velocity_m_s = earth_velocity_m_s(image.time_ns)
+        velocity_m_s = earth_velocity_m_s(image.time_ns) if has_velocity else None
         attitudes = history(samples)
         found, track = observe.observe_next(image, attitudes, setup, track, velocity_m_s)
         ensemble = solve.add_to_ensemble(ensemble, found, setup)

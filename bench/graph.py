@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import os
 from pathlib import Path
@@ -14,6 +14,11 @@ import subprocess
 import sys
 import time
 from typing import Any
+
+from bench.frames import Frame
+from starcal_ros.formats.messages.image_messages import image_to_message
+from starcal_ros.formats.messages.telemetry import attitude_to_message
+from starcal_ros.ros.lifecycle_node.message_factory import make_message
 
 START_S = 60.0  # a node starts in 2 s; much slower on a busy machine
 
@@ -38,11 +43,7 @@ def _free_domain() -> int:
 
 
 def start(
-    name: str,
-    params: Path,
-    log: Path,
-    *values: str,
-    node: str = '',
+    name: str, params: Path, log: Path, *values: str, node: str = ''
 ) -> subprocess.Popen[bytes]:
     """Start a node process with parameters."""
     arguments = ['-m', 'starcal_ros.entry_points', name]
@@ -136,21 +137,53 @@ class Client:
 
     def collect(self, kind: Any, topic: str, take: Callable[[Any], None], latched: bool) -> Any:
         """Subscribe to a topic."""
-        from rclpy.qos import DurabilityPolicy, QoSProfile
-
-        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-        qos = QoSProfile(depth=1 if latched else 5000, durability=durability)
+        qos = _qos(1 if latched else 5000, latched)
         return self.node.create_subscription(kind, topic, take, qos)
 
     def publisher(self, kind: Any, topic: str, depth: int = 1000, latched: bool = False) -> Any:
         """Publisher with at least one matched subscriber."""
-        from rclpy.qos import DurabilityPolicy, QoSProfile
-
-        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-        qos = QoSProfile(depth=depth, durability=durability)
-        publisher = self.node.create_publisher(kind, topic, qos)
+        publisher = self.node.create_publisher(kind, topic, _qos(depth, latched))
         self.until(publisher.get_subscription_count, f'a listener of {topic}')
         return publisher
+
+
+def _qos(depth: int, latched: bool) -> Any:
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+    return QoSProfile(depth=depth, durability=durability)
+
+
+class Sender:
+    """
+    Sends frames in turn, each as a serialised message and with its own attitude.
+
+    Camera and star tracker are participants of their own, as on a spacecraft: Fast DDS delays a
+    small message by up to its heartbeat, 3 s, when its participant sends a large one just after.
+    """
+
+    def __init__(self, camera: Client, tracker: Client, frames: Sequence[Frame]) -> None:
+        from geometry_msgs.msg import QuaternionStamped
+        from rclpy.serialization import serialize_message
+        from sensor_msgs.msg import Image
+
+        self._ready = [
+            (
+                serialize_message(image_to_message(image, 'camera', make_message)),
+                samples[1].icrf_from_star_tracker_xyzw,
+            )
+            for image, samples in frames
+        ]
+        self._images = camera.publisher(Image, 'image', 20)
+        self._attitudes = tracker.publisher(QuaternionStamped, 'attitude')
+
+    def send(self, k: int, time_ns: int, around_ns: Sequence[int]) -> None:
+        """Publish frame ``k`` with another stamp, and attitudes at times about it."""
+        content, xyzw = self._ready[k % len(self._ready)]
+        for offset_ns in around_ns:
+            message = attitude_to_message(time_ns + offset_ns, xyzw, 'icrf', make_message)
+            self._attitudes.publish(message)
+        self._images.publish(stamped(content, time_ns))
 
 
 def stamped(content: bytes, time_ns: int) -> bytes:
@@ -158,12 +191,6 @@ def stamped(content: bytes, time_ns: int) -> bytes:
     # The stamp is first in the message, after four bytes of encoding.
     stamp = struct.pack('=iI', *divmod(time_ns, 10**9))
     return b''.join((content[:4], stamp, memoryview(content)[12:]))
-
-
-def resident_mb(number: int) -> float:
-    """Memory of a process."""
-    pages = int(Path(f'/proc/{number}/statm').read_text().split()[1])
-    return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
 def processor_s(number: int) -> float:

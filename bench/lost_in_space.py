@@ -13,25 +13,23 @@ not at all.  Seeds are fixed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 import functools
 import json
 import math
-import multiprocessing
 from pathlib import Path
 import subprocess
 import sys
 import tempfile
-import time
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import beta, gamma
+from scipy.stats import binomtest, gamma
 
-from bench.table import Table
+from bench.table import Table, timed
+from bench.trials import in_processes
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, field_radius_rad, project
 from starcal_ros.identification.blind.search import find_sky, MAX_LOG10_P_VALUE, SkyMatch
@@ -70,38 +68,67 @@ class Frame:
     camera_from_icrf: Rotation
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Frames to be found, beside tetra3, then random points; half a day, or some minutes."""
     count, scrambled = (5, 20) if quick else (FRAMES, SCRAMBLED)
     catalog = load_catalog()
-    return [found(catalog, count), beside_tetra3(catalog, count), random_points(scrambled)]
+    yield found(catalog, count)
+    yield beside_tetra3(catalog, count)
+    yield random_points(scrambled)
+
+
+def _rates(
+    title: str,
+    note: str,
+    catalog: StarCatalog,
+    widths_deg: Sequence[int],
+    count: int,
+    search: Callable[[list[Frame], float], list[tuple[bool | None, float]]],
+) -> Table:
+    """
+    Rate and time of a search for each width and kind of frame.
+
+    The search returns for each frame whether it is right, or None without a match, and its time.
+    """
+    columns = ('frame', 'width deg', 'tried', 'found', 'wrong', 'median s', 'p95 s')
+    table = Table(title, columns, notes=[note])
+    for name, kind in KINDS.items():
+        for width_deg in widths_deg:
+            found = search(list(frames(catalog, width_deg, *kind, count)), width_deg)
+            verdicts = [verdict for verdict, _ in found]
+            median_s, p95_s = np.percentile([s for _, s in found], [50, 95]).tolist()
+            rates = (verdicts.count(True), verdicts.count(False))
+            table.add(name, width_deg, count, *rates, median_s, p95_s)
+            print(*table.rows[-1], flush=True)
+    return table
 
 
 def found(catalog: StarCatalog, count: int) -> Table:
     """Rate and time for each width and kind of frame."""
-    table = Table(
-        'Frames identified without attitude',
-        ('frame', 'width deg', 'tried', 'found', 'wrong', 'median s', 'p95 s'),
-        notes=['Processor time of one thread; the index, made once, is not in it.'],
-    )
-    for name, kind in KINDS.items():
-        for width_deg in WIDTHS_DEG:
-            right, wrong, times_s = 0, 0, []
-            made = frames(catalog, width_deg, *kind, count)
-            warm = next(frames(catalog, width_deg, 20, 10, 0.0, 1))
-            find_sky(warm.xy_px, warm.prior, catalog)
-            for frame in made:
-                start_s = time.process_time()
-                sky = find_sky(frame.xy_px, frame.prior, catalog)
-                times_s.append(time.process_time() - start_s)
-                if isinstance(sky, SkyMatch):
-                    good = _is_right(frame, sky, catalog)
-                    right, wrong = right + good, wrong + (not good)
-            median_s, p95_s = (float(np.percentile(times_s, p)) for p in (50, 95))
-            table.add(name, width_deg, count, right, wrong, median_s, p95_s)
-            print(*table.rows[-1], flush=True)
-    print(table.text(), flush=True)
-    return table
+
+    def search(made: list[Frame], width_deg: float) -> list[tuple[bool | None, float]]:
+        warm = next(frames(catalog, width_deg, 20, 10, 0.0, 1))
+        find_sky(warm.xy_px, warm.prior, catalog)
+        return [judged(frame) for frame in made]
+
+    def judged(frame: Frame) -> tuple[bool | None, float]:
+        sky, took_s = timed(lambda: find_sky(frame.xy_px, frame.prior, catalog))
+        return _is_right(frame, sky, catalog) if isinstance(sky, SkyMatch) else None, took_s
+
+    note = 'Processor time of one thread; the index, made once, is not in it.'
+    title = 'Frames identified without attitude'
+    return _rates(title, note, catalog, WIDTHS_DEG, count, search)
+
+
+def beside_tetra3(catalog: StarCatalog, count: int) -> Table:
+    """The same frames for cedar-solve, which is installed in a folder of its own."""
+    title = 'The same frames for tetra3 (cedar-solve, its default database, 10 to 30 degrees)'
+    note = 'Told the field to 25 %, 5 s for each frame; its other options as they come.'
+    python = _cedar_python()
+    if python is None:
+        return Table(title, (), notes=[note, 'cedar-solve could not be installed.'])
+    search = functools.partial(_cedar, python)
+    return _rates(title, note, catalog, CEDAR_WIDTHS_DEG, count, search)
 
 
 def random_points(count: int) -> Table:
@@ -113,38 +140,32 @@ def random_points(count: int) -> Table:
     it says, or one that falls faster; its upper 95 % limit gives the rate at which frames would
     reach the limit of acceptance.
     """
+    columns = 'points, widths deg, tried, identified, 95 % limit, lowest log10 E, rate by the tail'
     table = Table(
         'Random points that must not be identified',
-        (
-            'points', 'widths deg', 'tried', 'identified', '95 % limit', 'lowest log10 E',
-            'rate by the tail', 's each',
-        ),
+        (*columns.split(', '), 's each'),
         notes=[
             '95 % limit: Clopper and Pearson, one-sided; with none it is 3 in those tried.',
             'One process for each processor; s each: processor time.',
         ],
-    )  # fmt: skip
+    )
     rng = np.random.default_rng([SEED, 99])
     points = [rng.uniform([0, 0], SIZE, ((18, 30, 60)[k % 3], 2)) for k in range(count)]
     widths_deg = [WIDTHS_DEG[k % len(WIDTHS_DEG)] for k in range(count)]
-    with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')) as pool:
-        found = list(pool.map(_searched, points, widths_deg, chunksize=max(1, count // 200)))
-    best, identified, took_s = np.array(found).T
+    best, identified, took_s = np.array(in_processes(_searched, points, widths_deg)).T
     wrong = int(identified.sum())
-    limit = float(beta.ppf(0.95, wrong + 1, count - wrong))
+    limit = float(binomtest(wrong, count, alternative='less').proportion_ci().high)
     lowest, rate = float(best.min()), tail_rate(best, MAX_LOG10_P_VALUE)
     each_s = float(took_s.mean())
     table.add('18, 30 and 60', '4 to 70', count, wrong, limit, lowest, rate, each_s)
-    print(table.text(), flush=True)
     return table
 
 
 def _searched(points: Floats, width_deg: float) -> tuple[float, bool, float]:
     """Best log10 E of points (n, 2), whether they are taken for stars, and processor time, s."""
     catalog = _catalog()
-    start_s = time.process_time()
-    sky = find_sky(points, camera(width_deg), catalog)
-    return sky.log10_p_value, isinstance(sky, SkyMatch), time.process_time() - start_s
+    sky, took_s = timed(lambda: find_sky(points, camera(width_deg), catalog))
+    return sky.log10_p_value, isinstance(sky, SkyMatch), took_s
 
 
 @functools.lru_cache(maxsize=1)
@@ -169,35 +190,6 @@ def tail_rate(best: Floats, limit: float) -> float:
     return few / len(best) * math.exp(-max(lowest[-1] - limit, 0.0) / mean)
 
 
-def beside_tetra3(catalog: StarCatalog, count: int) -> Table:
-    """The same frames for cedar-solve, which is installed in a folder of its own."""
-    table = Table(
-        'The same frames for tetra3 (cedar-solve, its default database, 10 to 30 degrees)',
-        ('frame', 'width deg', 'tried', 'found', 'wrong', 'median s', 'p95 s'),
-        notes=['Told the field to 25 %, 5 s for each frame; its other options as they come.'],
-    )
-    python = _cedar_python()
-    if python is None:
-        table.notes.append('cedar-solve could not be installed.')
-        return table
-    for name, kind in KINDS.items():
-        for width_deg in CEDAR_WIDTHS_DEG:
-            made = list(frames(catalog, width_deg, *kind, count))
-            rows = _cedar(python, made, width_deg)
-            right = wrong = 0
-            for frame, (direction, _) in zip(made, rows, strict=True):
-                if direction is not None:
-                    true = frame.camera_from_icrf.as_matrix()[2]
-                    # Its boresight is that of the middle of the image: the centre may be 5 % off.
-                    near = float(true @ direction) > math.cos(math.radians(0.1 * width_deg))
-                    right, wrong = right + near, wrong + (not near)
-            times_s = [seconds for _, seconds in rows]
-            median_s, p95_s = (float(np.percentile(times_s, p)) for p in (50, 95))
-            table.add(name, width_deg, count, right, wrong, median_s, p95_s)
-    print(table.text(), flush=True)
-    return table
-
-
 def camera(width_deg: float) -> CameraModel:
     """A camera without distortion of so wide a field."""
     width, height = SIZE
@@ -218,13 +210,9 @@ def frames(
         focal_px = float(prior.parameters[0]) * math.exp(off * rng.uniform(-0.223, 0.223))
         shift_px = rng.normal(size=2)
         shift_px *= off * rng.uniform() * 0.05 * SIZE[0] / math.hypot(*shift_px)
-        true = prior.replace(
-            fx=focal_px,
-            fy=focal_px,
-            cx=float(prior.parameters[3] + shift_px[0]),
-            cy=float(prior.parameters[4] + shift_px[1]),
-            k1=off * rng.uniform(-0.03, 0.03) * (focal_px / half_px) ** 2,
-        )
+        cx, cy = (prior.parameters[3:5] + shift_px).tolist()
+        k1 = off * rng.uniform(-0.03, 0.03) * (focal_px / half_px) ** 2
+        true = prior.replace(fx=focal_px, fy=focal_px, cx=cx, cy=cy, k1=k1)
         rotation = Rotation.random(random_state=rng)
         axis = rotation.as_matrix()[2]
         rows = cone(catalog, axis, field_radius_rad(true, 60.0))
@@ -238,12 +226,8 @@ def frames(
         shown = np.argsort(magnitude)[:stars]
         faint = rng.choice(magnitude[shown], false) + 0.3 * rng.normal(size=false)
         order = np.argsort(np.r_[magnitude[shown], faint])
-        places = np.concatenate(
-            [
-                xy_px[shown] + 0.3 * rng.normal(size=(stars, 2)),
-                rng.uniform([0, 0], SIZE, (false, 2)),
-            ]
-        )
+        xy_px = xy_px[shown] + 0.3 * rng.normal(size=(stars, 2))
+        places = np.concatenate([xy_px, rng.uniform([0, 0], SIZE, (false, 2))])
         star = np.r_[rows[shown], np.full(false, -1)]
         made += 1
         yield Frame(places[order], star[order], prior, rotation)
@@ -277,23 +261,25 @@ print(json.dumps(answers))
 """
 
 
-def _cedar(python: Path, made: list[Frame], width_deg: float) -> list[tuple[Floats | None, float]]:
-    """Direction of the middle of each frame as cedar-solve finds it, and its seconds."""
+def _cedar(python: Path, made: list[Frame], width_deg: float) -> list[tuple[bool | None, float]]:
+    """True for each frame whose middle cedar-solve finds, None without a match; its seconds."""
     with tempfile.NamedTemporaryFile('w', suffix='.json') as file:
         content = {'frames': [frame.xy_px.tolist() for frame in made], 'size': SIZE}
         json.dump({**content, 'width_deg': width_deg}, file)
         file.flush()
         command = [str(python), '-c', _CEDAR_SCRIPT, file.name]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
-    rows: list[tuple[Floats | None, float]] = []
-    for ra_deg, dec_deg, seconds in json.loads(done.stdout.splitlines()[-1]):
-        direction = None
+    rows: list[tuple[bool | None, float]] = []
+    answers = json.loads(done.stdout.splitlines()[-1])
+    for frame, (ra_deg, dec_deg, took_s) in zip(made, answers, strict=True):
+        is_right = None
         if ra_deg is not None:
             ra, dec = math.radians(ra_deg), math.radians(dec_deg)
-            direction = np.array(
-                [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
-            )
-        rows.append((direction, float(seconds)))
+            z = [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
+            cosine = float(frame.camera_from_icrf.as_matrix()[2] @ z)
+            # Its boresight is that of the middle of the image: the centre may be 5 % off.
+            is_right = cosine > math.cos(math.radians(0.1 * width_deg))
+        rows.append((is_right, float(took_s)))
     return rows
 
 

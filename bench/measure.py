@@ -8,7 +8,7 @@ every star.  All use the same mono16 frame of 2592 x 2048.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import dataclasses
 import importlib.util
 import math
@@ -25,14 +25,12 @@ from starcal_ros.arrays import Pixels
 from starcal_ros.pipeline import observe
 
 MAGNITUDE_LIMIT = 7.35  # leaves 122 stars
-AT_LEAST_S = (
-    0.1  # of calls in a row: a single call of 6 ms after another method would time the caches
-)
+AT_LEAST_S = 0.1  # of calls in a row: a call of 6 ms after another method times the caches
 DETECTION_SIGMA = 5.0
 ACQUISITION_DEG = 1.2
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Time each method on one frame, alternating."""
     scenario = paper_scenario(MAGNITUDE_LIMIT)
     setup = load_set_up(scenario, magnitude_limit=MAGNITUDE_LIMIT)
@@ -76,8 +74,7 @@ def run(quick: bool) -> list[Table]:
     ours_ms = min(took_ms['starcal, tracking'])
     for name, ms in took_ms.items():
         table.add(name, stars[name], min(ms), statistics.median(ms), f'{min(ms) / ours_ms:.1f}')
-    print(table.text())
-    return [table]
+    yield table
 
 
 def _sep(pixels: Pixels) -> int:

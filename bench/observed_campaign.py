@@ -18,9 +18,10 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
-from bench.lens_departures import Field, Lens, no_departure, unit
+from bench.lens_departures import Lens, no_departure, unit
+from bench.trials import GRID
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, pixel_grid, project
+from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.sky.astrometry import apparent_directions, GIVEN_SIGMA_M_S
@@ -28,7 +29,6 @@ from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
 from starcal_ros.studies.simulation import scenario as synthetic
 from starcal_ros.studies.simulation.scenario import Scenario
 
-GRID = 25
 MEMORY = math.exp(-0.1)  # correlation of neighbouring images: ten images
 _START_NS = 1786160160 * 10**9
 _CADENCE_NS = 60 * 10**9
@@ -84,8 +84,8 @@ class Campaign:
 
     Attributes
     ----------
-    true_directions, true_star_tracker_directions : (GRID * GRID, 3)
-        Lines of sight of the pixels of a grid in the camera and the star tracker frame.
+    true_directions : (GRID * GRID, 3)
+        Lines of sight of the pixels of a grid in the camera frame.
     rate_rad_s : (m, 3)
         Angular rate of the camera at each image, camera frame.
     velocity_m_s : (3,)
@@ -97,7 +97,6 @@ class Campaign:
     truth: CameraGeometry
     star_tracker_sigma_arcsec: float
     true_directions: Floats
-    true_star_tracker_directions: Floats
     rate_rad_s: Floats
     velocity_m_s: Floats
 
@@ -107,18 +106,11 @@ def simulate(world: World, seed: int, images: int | None = None) -> Campaign:
     drawn = _draw(dataclasses.replace(world, images=images or world.images), seed)
     camera = drawn.truth.camera
     grid = pixel_grid(camera, GRID, GRID)
-    directions = line_of_sight(camera, grid - drawn.field(_half_widths(camera, grid)))
-    to_tracker = Rotation.from_quat(drawn.truth.star_tracker_from_camera_xyzw)
-    return Campaign(
-        Ensemble(tuple(_image(drawn, k) for k in range(drawn.world.images))),
-        drawn.base.prior,
-        drawn.truth,
-        world.tracker_arcsec,
-        directions,
-        to_tracker.apply(directions),
-        drawn.rate_rad_s,
-        drawn.velocity_m_s,
-    )
+    directions = line_of_sight(camera, grid - drawn.displacement_px(grid))
+    ensemble = Ensemble(tuple(_image(drawn, k) for k in range(drawn.world.images)))
+    motion = (drawn.rate_rad_s, drawn.velocity_m_s)
+    geometries = (drawn.base.prior, drawn.truth)
+    return Campaign(ensemble, *geometries, world.tracker_arcsec, directions, *motion)
 
 
 @dataclass(frozen=True)
@@ -134,7 +126,13 @@ class _Drawn:
     reported_xyzw: Floats  # (m, 4) icrf_from_star_tracker at the stamps
     focal_scale: Floats  # (m,)
     star_offset_rad: Floats  # (n, 3) of the stars of the catalog
-    field: Field
+
+    def displacement_px(self, pixels: Floats) -> Floats:
+        """Displacement of stars at pixels (n, 2) by the departure of the lens."""
+        camera = self.truth.camera
+        middle = np.array([camera.width - 1, camera.height - 1]) / 2.0
+        half_widths = np.asarray((pixels - middle) / (camera.width / 2.0))
+        return self.world.lens(_stream(self.base.seed, _LENS), half_widths)
 
 
 def _draw(world: World, seed: int) -> _Drawn:
@@ -149,27 +147,15 @@ def _draw(world: World, seed: int) -> _Drawn:
     errors = Rotation.from_rotvec(_tracker_errors_rad(world, seed, camera_from_icrf))
     camera_from_tracker = Rotation.from_quat(truth.star_tracker_from_camera_xyzw).inv()
     change = _walk(_stream(seed, _CHANGE), world.images, 1, world.memory)[:, 0]
-    return _Drawn(
-        world,
-        base,
-        truth,
-        velocity_m_s,
-        camera_from_icrf,
-        rate_rad_s,
-        (at_stamp.inv() * camera_from_tracker * errors).as_quat(),
-        1.0 + world.breathing * change,
-        _star_offsets_rad(world, base, camera_from_icrf),
-        world.lens(_stream(seed, _LENS)),
-    )
+    reported_xyzw = (at_stamp.inv() * camera_from_tracker * errors).as_quat()
+    offset_rad = _star_offsets_rad(world, base, camera_from_icrf)
+    motion = (velocity_m_s, camera_from_icrf, rate_rad_s)
+    focal_scale = 1.0 + world.breathing * change
+    return _Drawn(world, base, truth, *motion, reported_xyzw, focal_scale, offset_rad)
 
 
 def _stream(seed: int, *purpose: int) -> Generator:
     return np.random.default_rng([seed, *purpose])
-
-
-def _half_widths(camera: CameraModel, pixels: Floats) -> Floats:
-    middle = np.array([camera.width - 1, camera.height - 1]) / 2.0
-    return np.asarray((pixels - middle) / (camera.width / 2.0))
 
 
 def _attitudes(world: World, base: Scenario, velocity_m_s: Floats) -> Rotation:
@@ -320,7 +306,7 @@ def _pixels(drawn: _Drawn, k: int, in_camera: Floats) -> Floats:
     for _ in range(_PIXEL_STEPS):
         after_s = drawn.world.row_s * (pixels[:, 1] - (camera.height - 1) / 2.0)
         turned = project(camera, in_camera + moved_per_s * after_s[:, None])
-        pixels = turned + drawn.field(_half_widths(camera, pixels))
+        pixels = turned + drawn.displacement_px(pixels)
     return pixels
 
 

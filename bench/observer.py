@@ -10,6 +10,7 @@ stamp.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 import importlib.util
 import multiprocessing
 from pathlib import Path
@@ -19,9 +20,9 @@ import time
 from typing import Any
 
 from bench import graph, transport
-from bench.frames import paper_scenario, render_frame, write_set_up
+from bench.frames import Frame, paper_scenario, render_frame, write_set_up
 from bench.table import Table
-from starcal_ros.records import AttitudeSample, Image
+from bench.trials import memory_mb
 
 MAGNITUDE_LIMIT = 9.0  # the default of the node: 300 to 400 stars in a frame
 FRAMES = 6
@@ -31,20 +32,19 @@ LATE_S = 10.0  # longest wait for the last observations
 _FIRST_NS = 1_778_829_600_000_000_000
 _AROUND_NS = 20_000_000  # from an image to the attitudes before and after it
 
-Frame = tuple[Image, list[AttitudeSample]]
 
-
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Feed the node at 5 and at 10 frames a second."""
     if not importlib.util.find_spec('rclpy'):
         print('observer: no rclpy here: left out\n')
-        return []
+        return
+    columns = (
+        'Fast DDS, Hz sent, frames, observed, refused, lost, stars, latency ms, worst ms, '
+        'RSS MB first, after 50, after all, CPU ms/frame'
+    )
     table = Table(
         'star_observer: 2592 x 2048 mono16, reliable, three processes',
-        (
-            *('Fast DDS', 'Hz sent', 'frames', 'observed', 'refused', 'lost', 'stars'),
-            *('latency ms', 'worst ms', 'RSS MB first', 'after 50', 'after all', 'CPU ms/frame'),
-        ),
+        columns.split(', '),
         notes=[
             'latency: from just before the image is published until its observations',
             'are received; median and worst.  CPU: user and system time of the node, all threads.',
@@ -59,15 +59,11 @@ def run(quick: bool) -> list[Table]:
         with tempfile.TemporaryDirectory() as folder, transport.profile(profile):
             params = write_set_up(scenario, Path(folder), magnitude_limit=MAGNITUDE_LIMIT)
             table.add(profile, rate_hz, *_feed(params, frames, rate_hz, 10 if quick else 120))
-    print(table.text())
-    return [table]
+    yield table
 
 
 def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tuple[Any, ...]:
     """Send frames and collect observations; return the cells of a row after the rate."""
-    import rclpy
-    from rclpy.executors import SingleThreadedExecutor
-
     from starcal.msg import StarObservations
 
     graph.own_domain()
@@ -75,105 +71,58 @@ def _feed(params: Path, frames: list[Frame], rate_hz: float, count: int) -> tupl
     started: list[int] = []
     resident_mb: dict[int, float] = {}
 
-    with (
-        graph.running('star_observer', params, params.with_name('log')) as process,
-        rclpy.Context() as context,
-    ):
-        process_id = process.pid
-        node = rclpy.create_node('bench', context=context)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
+    def take(message: Any) -> None:
+        time_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        if time_ns < _FIRST_NS:
+            if not started:
+                started.append(time_ns)
+                ours.send('somebody listens')
+            return
+        arrived[time_ns] = (time.monotonic(), message.refusal, len(message.catalog_id))
+        resident_mb[len(arrived)] = memory_mb(process.pid)
 
-        def take(message: Any) -> None:
-            time_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-            if time_ns < _FIRST_NS:
-                if not started:
-                    started.append(time_ns)
-                    ours.send('somebody listens')
-                return
-            arrived[time_ns] = (time.monotonic(), message.refusal, len(message.catalog_id))
-            resident_mb[len(arrived)] = graph.resident_mb(process_id)
-
+    log = params.with_name('log')
+    with graph.running('star_observer', params, log) as process, graph.Client() as client:
         spawn = multiprocessing.get_context('spawn')
         ours, theirs = spawn.Pipe()
-        node.create_subscription(StarObservations, 'observations', take, 1000)
+        client.collect(StarObservations, 'observations', take, latched=False)
         publisher = spawn.Process(target=_publish, args=(frames, rate_hz, count, theirs))
         publisher.start()
-        start_s, start_cpu_s = time.monotonic(), graph.processor_s(process_id)
-        deadline_s = start_s + 2 * START_S + count / rate_hz
-        while not ours.poll() and time.monotonic() < deadline_s:
-            executor.spin_once(timeout_sec=0.02)
-        if not ours.poll():
+        start_cpu_s = graph.processor_s(process.pid)
+        if not client.holds(ours.poll, 2 * START_S + count / rate_hz):
             publisher.kill()
             raise RuntimeError('the publisher did not finish')
         sent_s: dict[int, float] = ours.recv()
-        deadline_s = time.monotonic() + LATE_S
-        while len(arrived) < count and time.monotonic() < deadline_s:
-            executor.spin_once(timeout_sec=0.02)
+        client.holds(lambda: len(arrived) >= count, LATE_S)
         publisher.terminate()  # it stays to resend its last images
         publisher.join()
         if not arrived:
             raise RuntimeError('no answer from the star observer')
-        processor_ms = 1e3 * (graph.processor_s(process_id) - start_cpu_s) / len(arrived)
-        executor.shutdown()
-        node.destroy_node()
+        processor_ms = 1e3 * (graph.processor_s(process.pid) - start_cpu_s) / len(arrived)
     for number, time_ns in enumerate(sent_s):
         if time_ns not in arrived:
             print(f'observer: frame {number} of {count} was not answered', flush=True)
     late_ms = [1e3 * (arrived[t][0] - sent_s[t]) for t in sent_s if t in arrived]
     refusals = Counter(refusal for _, refusal, _ in arrived.values())
     refused = ', '.join(f'{n} {name}' for name, n in refusals.items() if name) or '0'
+    lost = len(sent_s.keys() - arrived.keys())
+    stars = int(statistics.median(stars for _, _, stars in arrived.values()))
     return (
-        len(sent_s),
-        refusals[''],
-        refused,
-        len(sent_s.keys() - arrived.keys()),
-        int(statistics.median(stars for _, _, stars in arrived.values())),
-        statistics.median(late_ms),
-        max(late_ms),
-        resident_mb[1],
-        resident_mb.get(min(50, count)),
-        resident_mb[len(arrived)],
-        processor_ms,
+        *(len(sent_s), refusals[''], refused, lost, stars),
+        *(statistics.median(late_ms), max(late_ms), resident_mb[1]),
+        *(resident_mb.get(min(50, count)), resident_mb[len(arrived)], processor_ms),
     )
 
 
 def _publish(frames: list[Frame], rate_hz: float, count: int, pipe: Any) -> None:
     """In a separate process: send frames at a steady rate and report their times."""
-    from geometry_msgs.msg import QuaternionStamped
-    import rclpy
-    from rclpy.serialization import serialize_message
-    from sensor_msgs.msg import Image as ImageMessage
-
-    from starcal_ros.formats.messages.image_messages import image_to_message
-    from starcal_ros.formats.messages.telemetry import attitude_to_message
-    from starcal_ros.ros.lifecycle_node.message_factory import make_message
-
     sent_s: dict[int, float] = {}
-    # Serialised once, to leave the processor to the node.
-    ready = [
-        (serialize_message(image_to_message(image, 'camera', make_message)), attitudes[1])
-        for image, attitudes in frames
-    ]
-    # Camera and star tracker are participants of their own, as on a spacecraft: Fast DDS delays a
-    # small message by up to its heartbeat, 3 s, when its participant sends a large one just after.
-    with rclpy.Context() as camera_context, rclpy.Context() as tracker_context:
-        camera = rclpy.create_node('camera', context=camera_context)
-        tracker = rclpy.create_node('star_tracker', context=tracker_context)
-        images = camera.create_publisher(ImageMessage, 'image', 10)
-        attitudes = tracker.create_publisher(QuaternionStamped, 'attitude', 100)
-        while not (images.get_subscription_count() and attitudes.get_subscription_count()):
-            time.sleep(0.05)
+    with graph.Client('camera') as camera, graph.Client('star_tracker') as tracker:
+        sender = graph.Sender(camera, tracker, frames)
 
         def send(k: int, time_ns: int) -> None:
-            content, attitude = ready[k % len(ready)]
-            message = graph.stamped(content, time_ns)
-            xyzw = attitude.icrf_from_star_tracker_xyzw
             sent_s[time_ns] = time.monotonic()
-            for around_ns in (-_AROUND_NS, _AROUND_NS):
-                stamp_ns = time_ns + around_ns
-                attitudes.publish(attitude_to_message(stamp_ns, xyzw, 'icrf', make_message))
-            images.publish(message)
+            sender.send(k, time_ns, (-_AROUND_NS, _AROUND_NS))
 
         # Discovery is not symmetric: wait for an answer.
         for k in range(round(START_S)):

@@ -9,6 +9,7 @@ images up to the target are counted; the predicted sigma is that of the plan whe
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import dataclasses
 
 import numpy as np
@@ -27,9 +28,8 @@ _FIRST, _RANDOM = 8, 16
 _SIGMAS = ('map', 'line_of_sight')
 
 
-def run(quick: bool) -> list[Table]:
-    """Print and return a table of missions for each sigma."""
-    tables = []
+def run(quick: bool) -> Iterator[Table]:
+    """A table of missions for each sigma."""
     for name in _SIGMAS[: 1 if quick else None]:
         table = Table(
             f'images to the {name} sigma of {_FIRST} + {_RANDOM} random images',
@@ -43,9 +43,7 @@ def run(quick: bool) -> list[Table]:
             f'plan/random, medians: {ratio:.2f}; predicted off by {np.median(np.abs(off)):.1%} '
             f'(median), {np.sqrt((off**2).mean()):.1%} (rms)'
         )
-        print(table.text())
-        tables.append(table)
-    return tables
+        yield table
 
 
 def _mission(seed: int, name: str) -> tuple[float, int, int, int, float]:
@@ -58,27 +56,19 @@ def _mission(seed: int, name: str) -> tuple[float, int, int, int, float]:
     start = _ensemble(base, first)
     planned = plan_pointings(start, setup, Request(_RANDOM, name))
     steps = [step.pointing for step in planned.steps]
-    by_plan, reached = _images_to(goal, base, setup, first, steps, name)
-    by_raster, _ = _images_to(goal, base, setup, first, _raster(2 * _RANDOM), name)
-    predicted = planned.steps[by_plan - 1].sigma / reached
-    return goal, _RANDOM, by_raster, by_plan, predicted
 
+    def images_to_goal(more: list[Pointing]) -> tuple[int, float]:
+        """Return the number of more images that reach the goal, and the sigma then."""
+        sigma = np.inf
+        for k in range(1, len(more) + 1):
+            sigma = _reached(base, setup, [*first, *more[:k]], name)
+            if sigma <= goal:
+                return k, sigma
+        return len(more), sigma
 
-def _images_to(
-    goal: float,
-    base: Scenario,
-    setup: Setup,
-    first: list[Pointing],
-    more: list[Pointing],
-    name: str,
-) -> tuple[int, float]:
-    """Return the number of more images at which the goal is first reached, and the sigma then."""
-    sigma = np.inf
-    for k in range(1, len(more) + 1):
-        sigma = _reached(base, setup, [*first, *more[:k]], name)
-        if sigma <= goal:
-            return k, sigma
-    return len(more), sigma
+    by_plan, reached = images_to_goal(steps)
+    by_raster, _ = images_to_goal(_raster(2 * _RANDOM))
+    return goal, _RANDOM, by_raster, by_plan, planned.steps[by_plan - 1].sigma / reached
 
 
 def _reached(base: Scenario, setup: Setup, pointings: list[Pointing], name: str) -> float:

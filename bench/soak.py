@@ -12,9 +12,11 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Iterator
 import importlib.util
 import os
 from pathlib import Path
+import subprocess
 import tempfile
 import time
 from typing import Any, NamedTuple
@@ -22,9 +24,7 @@ from typing import Any, NamedTuple
 from bench import graph
 from bench.frames import paper_scenario, render_frame, write_set_up
 from bench.table import Table
-from starcal_ros.arrays import Floats
-from starcal_ros.formats.messages.image_messages import image_to_message
-from starcal_ros.formats.messages.telemetry import attitude_to_message
+from bench.trials import memory_mb
 from starcal_ros.studies.simulation.scenario import Scenario, scenario
 
 MAX_IMAGES = 50
@@ -58,36 +58,13 @@ def at_10_hz(minutes: float) -> Case:
     return Case(paper_scenario(MAGNITUDE_LIMIT), 6, count, 10.0, 100_000_000, around_ns)
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Send the images of both cases; memory after a tenth of them and at the end."""
     if not importlib.util.find_spec('rclpy'):
         print('soak: no rclpy here: left out\n')
-        return []
-    return [_table(at_speed(150 if quick else 10_000)), _table(at_10_hz(0.05 if quick else 10.0))]
-
-
-def _table(case: Case) -> Table:
-    graph.own_domain()
-    with tempfile.TemporaryDirectory() as folder:
-        table = _soak(Path(folder), case)
-    print(table.text())
-    return table
-
-
-def _serialised(case: Case) -> list[tuple[bytes, Floats]]:
-    """Return messages of frames, and the attitude of each."""
-    from rclpy.serialization import serialize_message
-
-    from starcal_ros.ros.lifecycle_node.message_factory import make_message
-
-    frames = [render_frame(case.scenario, index) for index in range(case.frames)]
-    return [
-        (
-            serialize_message(image_to_message(image, 'camera', make_message)),
-            samples[1].icrf_from_star_tracker_xyzw,
-        )
-        for image, samples in frames
-    ]
+        return
+    yield _soak(at_speed(150 if quick else 10_000))
+    yield _soak(at_10_hz(0.05 if quick else 10.0))
 
 
 def _title(case: Case) -> str:
@@ -99,21 +76,35 @@ def _title(case: Case) -> str:
     )
 
 
-def _soak(folder: Path, case: Case) -> Table:
-    from geometry_msgs.msg import QuaternionStamped
-    from sensor_msgs.msg import Image
+def _soak(case: Case) -> Table:
+    graph.own_domain()
+    limit = f'max_images:={MAX_IMAGES}'
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        state, log = f'state_dir:={folder / "state"}', folder / 'log'
+        params = write_set_up(case.scenario, folder, magnitude_limit=case.scenario.magnitude_limit)
+        with (
+            graph.running('star_observer', params, log) as observer,
+            graph.running('calibrator', params, log, limit, state) as calibrator,
+            graph.Client() as client,
+            graph.Client('star_tracker') as tracker,
+        ):
+            return _flown(case, client, tracker, (observer, calibrator))
+
+
+def _flown(
+    case: Case,
+    client: graph.Client,
+    tracker: graph.Client,
+    nodes: tuple[subprocess.Popen[bytes], ...],
+) -> Table:
+    """Send the images, with a solve after each tenth of them."""
     from std_srvs.srv import Trigger
 
     from starcal.msg import EnsembleStatus, StarObservations
-    from starcal_ros.ros.lifecycle_node.message_factory import make_message
 
-    params = write_set_up(case.scenario, folder, magnitude_limit=case.scenario.magnitude_limit)
-    ready = _serialised(case)
     answers: Counter[str] = Counter()
     collected = [0]
-    limit = f'max_images:={MAX_IMAGES}'
-    state = f'state_dir:={folder / "state"}'
-    memory_mb: dict[int, tuple[float, float]] = {}
 
     def take(message: Any) -> None:
         answers[message.refusal] += 1
@@ -121,76 +112,54 @@ def _soak(folder: Path, case: Case) -> Table:
     def take_status(message: Any) -> None:
         collected[0] = message.images
 
-    with (
-        graph.running('star_observer', params, folder / 'log') as observer,
-        graph.running('calibrator', params, folder / 'log', limit, state) as calibrator,
-        graph.Client() as client,
-        # A small message waits behind a large one of the same participant: use a second one.
-        graph.Client('star_tracker') as tracker,
-    ):
-        client.collect(StarObservations, 'observations', take, latched=False)
-        client.collect(EnsembleStatus, 'ensemble_status', take_status, latched=True)
-        images = client.publisher(Image, 'image', 20)
-        attitudes = tracker.publisher(QuaternionStamped, 'attitude')
-        client.until(lambda: client.node.count_subscribers('observations') >= 2, 'calibrator')
-        calibrate = client.node.create_client(Trigger, 'calibrator/calibrate')
-        client.until(calibrate.service_is_ready, 'calibrator/calibrate')
-        start_s = time.monotonic()
-        marks = {case.images // 10 * k for k in range(1, 11)}
-        solves = []
-        for k in range(case.images):
-            content, xyzw = ready[k % len(ready)]
-            time_ns = _FIRST_NS + k * case.step_ns
-            for around_ns in case.around_ns:
-                attitudes.publish(
-                    attitude_to_message(time_ns + around_ns, xyzw, 'icrf', make_message)
-                )
-            images.publish(graph.stamped(content, time_ns))
-            sent = k + 1
-            if case.rate_hz:
-                due_s = start_s + sent / case.rate_hz
-                client.holds(lambda: time.monotonic() >= due_s, _LATE_S)  # noqa: B023
-            elif not client.holds(lambda: sent - answers.total() < _IN_FLIGHT, _LATE_S):  # noqa: B023
-                break
-            if sent in marks:
-                memory_mb[sent] = (
-                    graph.resident_mb(observer.pid),
-                    graph.resident_mb(calibrator.pid),
-                )
-                solves.append(calibrate.call_async(Trigger.Request()))
-                if not case.rate_hz:
-                    client.until(solves[-1].done, 'calibrator/calibrate')
-                print(f'soak: {sent} images, {time.monotonic() - start_s:.0f} s,', end=' ')
-                print(
-                    'observer {:.1f} MB, calibrator {:.1f} MB'.format(*memory_mb[sent]), flush=True
-                )
-        took_s = time.monotonic() - start_s
-        client.holds(lambda: answers.total() >= sent, _LATE_S)
-        client.holds(lambda: collected[0] >= min(MAX_IMAGES, answers['']), _LATE_S)
-        client.holds(lambda: all(solve.done() for solve in solves), _LATE_S)
-        accepted = sum(bool(solve.done() and solve.result().success) for solve in solves)
-        died = sum(process.poll() is not None for process in (observer, calibrator))
-    table = Table(
-        _title(case),
-        (
-            *('images', 'answered', 'lost', 'refused', 'in the ensemble', 'solves', 'accepted'),
-            *('died', 'images/s', 'observer MB at 10 %', 'at the end', 'growth %'),
-            *('calibrator MB at 10 %', 'at its end', 'its growth %'),
-        ),
-        notes=[f'refused: {count} {name}' for name, count in answers.items() if name],
+    client.collect(StarObservations, 'observations', take, latched=False)
+    client.collect(EnsembleStatus, 'ensemble_status', take_status, latched=True)
+    frames = [render_frame(case.scenario, index) for index in range(case.frames)]
+    sender = graph.Sender(client, tracker, frames)
+    client.until(lambda: client.node.count_subscribers('observations') >= 2, 'calibrator')
+    calibrate = client.node.create_client(Trigger, 'calibrator/calibrate')
+    client.until(calibrate.service_is_ready, 'calibrator/calibrate')
+    start_s = time.monotonic()
+    resident_mb, solves = [], []
+    for sent in range(1, case.images + 1):
+        sender.send(sent - 1, _FIRST_NS + (sent - 1) * case.step_ns, case.around_ns)
+        if case.rate_hz:
+            due_s = start_s + sent / case.rate_hz
+            client.holds(lambda: time.monotonic() >= due_s, _LATE_S)  # noqa: B023
+        elif not client.holds(lambda: sent - answers.total() < _IN_FLIGHT, _LATE_S):  # noqa: B023
+            break
+        if sent % (case.images // 10) == 0:
+            resident_mb.append([memory_mb(node.pid) for node in nodes])
+            solves.append(calibrate.call_async(Trigger.Request()))
+            if not case.rate_hz:
+                client.until(solves[-1].done, 'calibrator/calibrate')
+            print(f'soak: {sent} images, {time.monotonic() - start_s:.0f} s,', end=' ')
+            print('observer {:.1f} MB, calibrator {:.1f} MB'.format(*resident_mb[-1]), flush=True)
+    took_s = time.monotonic() - start_s
+    client.holds(lambda: answers.total() >= sent, _LATE_S)
+    client.holds(lambda: collected[0] >= min(MAX_IMAGES, answers['']), _LATE_S)
+    client.holds(lambda: all(solve.done() for solve in solves), _LATE_S)
+    accepted = sum(bool(solve.done() and solve.result().success) for solve in solves)
+    died = sum(node.poll() is not None for node in nodes)
+    columns = (
+        'images, answered, lost, refused, in the ensemble, solves, accepted, died, images/s, '
+        'observer MB at 10 %, at the end, growth %, calibrator MB at 10 %, at its end, '
+        'its growth %'
     )
-    cells: list[Any] = []
-    for first, last in zip(memory_mb[min(memory_mb)], memory_mb[max(memory_mb)], strict=True):
-        cells += [first, last, 100.0 * (last / first - 1.0)]
-    refused = answers.total() - answers['']
-    table.add(
-        *(sent, answers.total(), sent - answers.total(), refused, collected[0], len(solves)),
-        *(accepted, died, sent / took_s, *cells),
-    )
+    notes = [f'refused: {count} {name}' for name, count in answers.items() if name]
+    table = Table(_title(case), columns.split(', '), notes=notes)
+    answered, refused = answers.total(), answers.total() - answers['']
+    cells = [
+        cell
+        for first, last in zip(resident_mb[0], resident_mb[-1], strict=True)
+        for cell in (first, last, 100.0 * (last / first - 1.0))
+    ]
+    counts = (sent, answered, sent - answered, refused, collected[0], len(solves), accepted, died)
+    table.add(*counts, sent / took_s, *cells)
     return table
 
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description='Soak both nodes at 10 Hz of 2592 x 2048.')
     parser.add_argument('--minutes', type=float, default=10.0)
-    _table(at_10_hz(parser.parse_args().minutes))
+    print(_soak(at_10_hz(parser.parse_args().minutes)).text())

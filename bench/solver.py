@@ -8,12 +8,10 @@ are from alternating runs in one process, memory from a separate process per sol
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 import importlib.util
 import multiprocessing
-import os
 from pathlib import Path
 import time
 from typing import Any
@@ -36,8 +34,8 @@ from bench.competitors import (
     solve_starcal,
 )
 from bench.table import Table, verdict
-from starcal_ros.arrays import Floats
-from starcal_ros.estimation.star_equations import arrange, normal_blocks, RESIDUAL, ROTATION
+from bench.trials import in_processes, memory_mb
+from starcal_ros.estimation.star_equations import normal_blocks, RESIDUAL, ROTATION
 from starcal_ros.records import CameraGeometry, Ensemble
 
 LIMIT_S = 60.0  # longest wait for a competitor
@@ -46,40 +44,25 @@ TARGETS = {'pyceres': 20.0, 'scipy': 10.0, 'opencv': 12.0}
 TARGET_PASS_NS = 100.0
 TARGET_MEMORY_MB = 40.0
 
-SOLVERS: dict[str, Callable[[Case], Answer]] = {
-    'starcal': solve_starcal,
-    'estimate': estimate_starcal,
-    'pyceres': solve_ceres,
-    'scipy': solve_scipy,
-    'opencv': solve_opencv,
-}
-LABELS = {
-    'starcal': 'starcal, search alone',
-    'estimate': 'starcal, whole estimate',
-    'pyceres': 'Ceres (pyceres), DENSE_SCHUR',
-    'scipy': 'SciPy trf, sparse Jacobian',
-    'opencv': 'OpenCV calibrateCamera',
+SOLVERS: dict[str, tuple[str, Callable[[Case], Answer]]] = {
+    'starcal': ('starcal, search alone', solve_starcal),
+    'estimate': ('starcal, whole estimate', estimate_starcal),
+    'pyceres': ('Ceres (pyceres), DENSE_SCHUR', solve_ceres),
+    'scipy': ('SciPy trf, sparse Jacobian', solve_scipy),
+    'opencv': ('OpenCV calibrateCamera', solve_opencv),
 }
 
 
 def cost_of(case: Case, answer: Answer, steps: int = 0) -> float:
     """Least-squares cost of a result, after Gauss-Newton steps of the rotations only."""
-    keep = np.ones(len(case.table), bool)
-    measurements = arrange(case.table, keep, case.table.covariance_px2)
     rotations = Rotation.from_matrix(answer.camera_from_icrf)
+    held = (case.measurements, 'plumb_bob', answer.parameters)
     for _ in range(steps):
-        _, blocks = normal_blocks(
-            measurements, 'plumb_bob', answer.parameters, rotations.as_matrix()
-        )
+        _, blocks = normal_blocks(*held, rotations.as_matrix())
         gradient = blocks[:, ROTATION, RESIDUAL, None]
         step = np.linalg.solve(blocks[:, ROTATION, ROTATION], gradient)[..., 0]
         rotations = Rotation.from_rotvec(-step) * rotations
-    return normal_blocks(measurements, 'plumb_bob', answer.parameters, rotations.as_matrix())[0]
-
-
-def parameter_sigma(case: Case, answer: Answer) -> Floats:
-    """1-sigma (8,) of the free parameters."""
-    return np.asarray(np.sqrt(np.diag(covariance_of(case, answer, scaled=False))))
+    return normal_blocks(*held, rotations.as_matrix())[0]
 
 
 def least_s(repeats: int, call: Callable[..., object], *args: object) -> float:
@@ -92,27 +75,29 @@ def least_s(repeats: int, call: Callable[..., object], *args: object) -> float:
     return min(took_s)
 
 
-def _resident_kb(field: str) -> int:
-    for line in Path('/proc/self/status').read_text().splitlines():
-        if line.startswith(field):
-            return int(line.split()[1])
-    return 0
+@dataclass
+class Result:
+    """Time, peak memory above the data, and result of a solver."""
+
+    best_s: float
+    peak_mb: float
+    answer: Answer
 
 
 def _solve_apart(name: str, case: Case, pipe: Any) -> None:
-    """In a separate process: seconds, peak resident memory above the data (MB), result."""
-    warm = make_case(Ensemble(case.ensemble.images[:5]), case.prior)
-    SOLVERS[name](warm)
+    """In a separate process: send the result through the pipe."""
+    _, solve = SOLVERS[name]
+    solve(make_case(Ensemble(case.ensemble.images[:5]), case.prior))
     Path('/proc/self/clear_refs').write_text('5')  # the peak counts from now (man 5 proc)
-    before_kb = _resident_kb('VmRSS')
+    before_mb = memory_mb('self')
     start_s = time.perf_counter()
-    answer = SOLVERS[name](case)
+    answer = solve(case)
     took_s = time.perf_counter() - start_s
-    pipe.send((took_s, (_resident_kb('VmHWM') - before_kb) / 1024, answer))
+    pipe.send(Result(took_s, memory_mb('self', 'VmHWM') - before_mb, answer))
 
 
-def solve_apart(name: str, case: Case) -> tuple[float, float, Answer] | None:
-    """Result of `_solve_apart`; None after the time limit."""
+def solve_apart(name: str, case: Case) -> Result | None:
+    """Result of a solver in a separate process; None after the time limit."""
     context = multiprocessing.get_context('spawn')
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_solve_apart, args=(name, case, sender))
@@ -127,56 +112,38 @@ def solve_apart(name: str, case: Case) -> tuple[float, float, Answer] | None:
         process.join()
 
 
-@dataclass
-class Result:
-    """Time, memory and result of a solver."""
-
-    best_s: float
-    peak_mb: float
-    answer: Answer
-
-
 def solve_all(case: Case, names: list[str], repeats: int) -> dict[str, Result]:
     """Results of the solvers within the time limit."""
-    results = {}
-    for name in names:
-        found = solve_apart(name, case)
-        if found is not None:
-            results[name] = Result(*found)
+    apart = {name: solve_apart(name, case) for name in names}
+    results = {name: result for name, result in apart.items() if result}
     for _ in range(repeats):
         for name, result in results.items():
             if name != 'opencv':  # which takes so long that once, apart, is enough
-                # starcal takes a fraction of the time of others: repeat it more often for the
-                # minimum.
-                calls = 3 if name == 'starcal' else 1
-                result.best_s = min(result.best_s, least_s(calls, SOLVERS[name], case))
+                calls = 3 if name == 'starcal' else 1  # its time is the shortest
+                result.best_s = min(result.best_s, least_s(calls, SOLVERS[name][1], case))
     return results
 
 
 def add_rows(table: Table, case: Case, names: list[str], results: dict[str, Result]) -> None:
     """Add a row for each solver, relative to starcal."""
     ours, m = results['starcal'], case.table.image_count
-    sigma, least = parameter_sigma(case, ours.answer), cost_of(case, ours.answer)
+    sigma = np.sqrt(np.diag(covariance_of(case, ours.answer, scaled=False)))
+    least = cost_of(case, ours.answer)
     for name in names:
-        result = results.get(name)
+        label, result = SOLVERS[name][0], results.get(name)
         ratio = (result.best_s if result else LIMIT_S) / ours.best_s
         judged = verdict(ratio, TARGETS[name]) if name in TARGETS and m >= TARGETS_FROM else ''
         if result is None:
-            table.add(m, LABELS[name], None, None, f'> {ratio:.0f}', judged, None, None, None)
+            table.add(m, label, None, None, f'> {ratio:.0f}', judged, None, None, None)
             continue
         off = (result.answer.parameters - ours.answer.parameters)[FREE] / sigma
         cost = cost_of(case, result.answer, 3 if name == 'opencv' else 0)
+        # The complete estimate rejects and reweights stars, so its cost is not comparable.
+        cost_off = None if name == 'estimate' else cost / least - 1.0
+        time_ms, iterations = 1e3 * result.best_s, result.answer.iterations or None
         table.add(
-            m,
-            LABELS[name],
-            result.answer.iterations or None,
-            1e3 * result.best_s,
-            f'{ratio:.1f}',
-            judged,
-            # The complete estimate rejects and reweights stars, so its cost is not comparable.
-            None if name == 'estimate' else cost / least - 1.0,
-            float(np.abs(off).max()),
-            result.peak_mb,
+            *(m, label, iterations, time_ms, f'{ratio:.1f}', judged),
+            *(cost_off, float(np.abs(off).max()), result.peak_mb),
         )
 
 
@@ -191,10 +158,8 @@ def measure_growth(
         ensemble, prior = ensembles.get(m) or ensembles[max(ensembles)]
         # The largest case repeats the previous one five times: only its time matters.
         case = make_case(Ensemble(ensemble.images * (m // len(ensemble.images))), prior)
-        n, keep = len(case.table), np.ones(len(case.table), bool)
-        measurements = arrange(case.table, keep, case.table.covariance_px2)
-        rotations = case.start.camera_from_icrf.as_matrix()
-        held = (measurements, 'plumb_bob', case.start.parameters, rotations)
+        n, rotations = len(case.table), case.start.camera_from_icrf.as_matrix()
+        held = (case.measurements, 'plumb_bob', case.start.parameters, rotations)
         pass_ns = 1e9 * least_s(3 * repeats, normal_blocks, *held) / n
         search_s = least_s(repeats, solve_starcal, case)
         iteration_ns = 1e9 * search_s / n / solve_starcal(case).iterations
@@ -205,26 +170,14 @@ def measure_growth(
     return table
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """
     Compare the solvers at several numbers of images, then the growth of starcal with them.
 
     All use one thread of linear algebra: on two shared cores more threads wait for each other,
     which makes SciPy up to five times slower and no solver faster.
     """
-    before = os.environ.get('OPENBLAS_NUM_THREADS')
-    os.environ['OPENBLAS_NUM_THREADS'] = '1'  # read when numpy is loaded: by a new process
-    try:
-        spawn = multiprocessing.get_context('spawn')
-        with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-            tables = pool.submit(measure, quick).result()
-    finally:
-        del os.environ['OPENBLAS_NUM_THREADS']
-        if before is not None:
-            os.environ['OPENBLAS_NUM_THREADS'] = before
-    for table in tables:
-        print(table.text())
-    return tables
+    yield from in_processes(measure, [quick])[0]
 
 
 def measure(quick: bool) -> list[Table]:
@@ -251,7 +204,7 @@ def measure(quick: bool) -> list[Table]:
         results = solve_all(case, names, repeats)
         add_rows(table, case, names, results)
         for name in [name for name in names if name not in results]:
-            table.notes.append(f'{LABELS[name]}: stopped after {LIMIT_S:.0f} s at m = {m}.')
+            table.notes.append(f'{SOLVERS[name][0]}: stopped after {LIMIT_S:.0f} s at m = {m}.')
             names.remove(name)  # more images would take longer yet
     if results['starcal'].peak_mb > TARGET_MEMORY_MB:
         table.notes.append(f'Memory of our search MISSED {TARGET_MEMORY_MB:.0f} MB at m = {m}.')

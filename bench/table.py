@@ -42,13 +42,6 @@ class Table:
             lines.append('  ' + '  '.join(cells).rstrip())
         return '\n'.join([*lines, *(f'  {note}' for note in self.notes), ''])
 
-    def markdown(self) -> str:
-        """Return the table with its title as Markdown."""
-        rows = [list(self.columns), ['---'] * len(self.columns)]
-        rows += [[_shown(cell) for cell in row] for row in self.rows]
-        lines = [f'| {" | ".join(row)} |' for row in rows]
-        return '\n'.join([f'{self.title}:', '', *lines, *self.notes, ''])
-
     def content(self) -> dict[str, object]:
         """The table as a JSON object."""
         rows = [dict(zip(self.columns, row, strict=True)) for row in self.rows]

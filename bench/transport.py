@@ -9,18 +9,19 @@ reader in another process.  Stock Fast DDS holds the small one back until its he
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 import contextlib
+from functools import partial
 import importlib.util
-import os
+import multiprocessing
 from pathlib import Path
 import statistics
-import subprocess
-import sys
 import time
 from typing import Any
 
 from bench import graph
 from bench.table import Table
+from bench.trials import environment
 
 PROFILE = Path(__file__).parents[1] / 'config' / 'fastdds.xml'
 FRAME_BYTES = 2592 * 2048 * 2
@@ -28,61 +29,39 @@ RATE_HZ = 5.0
 _LATE_S = 8.0
 
 
-def run(quick: bool) -> list[Table]:
+def run(quick: bool) -> Iterator[Table]:
     """Run both settings, reliable and best effort, alternating."""
     if not importlib.util.find_spec('rclpy'):
         print('transport: no rclpy here: left out\n')
-        return []
-    table = Table(
-        'An attitude and a frame of 10.6 MB just after it, by one participant, 5 a second',
-        (
-            *('profile', 'images', 'sent', 'images lost', 'median ms', 'worst ms'),
-            *('attitudes lost', 'attitude median ms', 'attitude worst ms'),
-        ),
+        return
+    columns = (
+        'profile, images, sent, images lost, median ms, worst ms, '
+        'attitudes lost, attitude median ms, attitude worst ms'
     )
+    title = 'An attitude and a frame of 10.6 MB just after it, by one participant, 5 a second'
+    table = Table(title, columns.split(', '))
     graph.own_domain()
     count = 10 if quick else 60
+    spawn = multiprocessing.get_context('spawn')
     for reliability in ('reliable', 'best_effort'):
-        for profile in ('stock', 'fastdds.xml'):
-            environment = {**os.environ, **settings(profile)}
-            command = [sys.executable, '-m', 'bench.transport']
-            sender = subprocess.Popen([*command, 'send', reliability, str(count)], env=environment)
-            done = subprocess.run(
-                [*command, 'take', reliability, str(count)],
-                env=environment,
-                check=True,
-                capture_output=True,
-                text=True,
-            )
-            sender.wait(60)
-            late = [[float(word) for word in line.split()] for line in done.stdout.splitlines()]
-            cells: list[Any] = []
+        for name in ('stock', 'fastdds.xml'):
+            with profile(name), ProcessPoolExecutor(2, mp_context=spawn) as pool:
+                sent = pool.submit(_send, reliability, count)
+                late = pool.submit(_take, reliability, count).result()
+                sent.result(60.0)
+            cells: list[float | None] = []
             for times_ms in late:
                 cells += [count - len(times_ms)]
                 cells += [statistics.median(times_ms), max(times_ms)] if times_ms else [None, None]
-            table.add(profile, reliability, count, *cells)
-    print(table.text())
-    return [table]
+            table.add(name, reliability, count, *cells)
+    yield table
 
 
-def settings(profile: str) -> dict[str, str]:
-    """Environment of a process with stock Fast DDS, or with the profile of the package."""
-    if profile == 'stock':
-        return {}
-    files = {f'{name}_DEFAULT_PROFILES_FILE': str(PROFILE) for name in ('FASTRTPS', 'FASTDDS')}
-    return {**files, 'RMW_FASTRTPS_USE_QOS_FROM_XML': '1'}
-
-
-@contextlib.contextmanager
-def profile(name: str) -> Iterator[None]:
-    """Context manager: processes started within it use a profile."""
-    values = settings(name)
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for value in values:
-            del os.environ[value]
+def profile(name: str) -> contextlib.AbstractContextManager[None]:
+    """Context manager: processes started within it use stock Fast DDS or the package's profile."""
+    files = {f'{dds}_DEFAULT_PROFILES_FILE': str(PROFILE) for dds in ('FASTRTPS', 'FASTDDS')}
+    values = {**files, 'RMW_FASTRTPS_USE_QOS_FROM_XML': '1'} if name != 'stock' else {}
+    return environment(**values)
 
 
 def _qos(reliability: str, depth: int) -> Any:
@@ -115,32 +94,22 @@ def _send(reliability: str, count: int) -> None:
         time.sleep(_LATE_S)
 
 
-def _take(reliability: str, count: int) -> None:
+def _take(reliability: str, count: int) -> tuple[list[float], list[float]]:
+    """Latencies of the images and of the attitudes, ms."""
     from sensor_msgs.msg import Image, Temperature
 
-    late_ms: dict[str, list[float]] = {'image': [], 'attitude': []}
+    images_ms: list[float] = []
+    attitudes_ms: list[float] = []
 
-    def take(kind: str, message: Any) -> None:
+    def note(late_ms: list[float], message: Any) -> None:
         stamp = message.header.stamp
-        late_ms[kind].append(1e3 * (time.time() - stamp.sec - stamp.nanosec * 1e-9))
+        late_ms.append(1e3 * (time.time() - stamp.sec - stamp.nanosec * 1e-9))
 
     with graph.Client('taker') as client:
-        for kind, cls, qos in (
-            ('image', Image, _qos(reliability, 10)),
-            ('attitude', Temperature, _qos('reliable', 100)),
-        ):
-            client.node.create_subscription(
-                cls,
-                kind,
-                lambda message, kind=kind: take(kind, message),  # type: ignore[misc]
-                qos,
-            )
-        client.holds(
-            lambda: min(map(len, late_ms.values())) >= count, 15.0 + _LATE_S + count / RATE_HZ
-        )
-    for times_ms in late_ms.values():
-        print(*times_ms)
-
-
-if __name__ == '__main__':
-    {'send': _send, 'take': _take}[sys.argv[1]](sys.argv[2], int(sys.argv[3]))
+        node, qos = client.node, _qos(reliability, 10)
+        node.create_subscription(Image, 'image', partial(note, images_ms), qos)
+        qos = _qos('reliable', 100)
+        node.create_subscription(Temperature, 'attitude', partial(note, attitudes_ms), qos)
+        most_s = 15.0 + _LATE_S + count / RATE_HZ
+        client.holds(lambda: min(len(images_ms), len(attitudes_ms)) >= count, most_s)
+    return images_ms, attitudes_ms

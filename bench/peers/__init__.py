@@ -8,7 +8,7 @@ lines of sight over the detector.  Each peer is scored by its best variant in ea
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 import math
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from bench.competitors import solve_ceres, solve_scipy
 from bench.peers import solvers, starcal, tetra3rs
 from bench.peers.campaigns import all_campaigns, Campaign, drifting, Result
 from bench.table import Table, timed
-from bench.worlds import rms, shape_error_arcsec
+from bench.trials import rms, shape_error_arcsec
 from starcal_ros.blas_threads import one_blas_thread
 
 
@@ -46,8 +46,8 @@ TOOLS = {
 }
 
 
-def run(quick: bool) -> list[Table]:
-    """Print and return the errors of each tool, and the processor time of frames."""
+def run(quick: bool) -> Iterator[Table]:
+    """The errors of each tool, and the processor time of frames."""
     tools = {name: tool for name, tool in TOOLS.items() if tool.installed}
     for name in TOOLS.keys() - tools.keys():
         print(f'peers: {name} is not installed: skipped')
@@ -61,9 +61,8 @@ def run(quick: bool) -> list[Table]:
             for name, runs in zip(chosen, zip(*found, strict=True), strict=True):
                 rows.setdefault((campaign.kind, name), []).append(_best(campaign, runs))
         times = _frame_time(4 if quick else 16, turns, 'tetra3rs' in tools)
-    errors = _table(rows, f'seeds 1 to {seeds}, {images} images each')
-    print(errors.text(), times.text(), sep='\n')
-    return [errors, times]
+    yield _table(rows, f'seeds 1 to {seeds}, {images} images each')
+    yield times
 
 
 def _best(campaign: Campaign, runs: tuple[list[Result], ...]) -> tuple[float, Result]:

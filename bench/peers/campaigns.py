@@ -15,7 +15,8 @@ import numpy as np
 from bench import trust, worlds
 from bench.competitors import Case, make_case
 from bench.frames import Frame, load_set_up, observed, render_frame
-from bench.observed_campaign import GRID, simulate, World
+from bench.observed_campaign import simulate, World
+from bench.trials import GRID
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import pixel_grid
 from starcal_ros.pipeline.setup import Setup
@@ -25,8 +26,8 @@ from starcal_ros.studies.simulation.scenario import Scenario
 
 # In sound campaigns the principal point is 2 px off the prior, as after any ground calibration.
 _RENDERED = {
-    'images, sound': trust.World('principal point', 2.0, 'px'),
-    'images, ripple of 0.3 px': trust.World('ripple', 0.3, 'px'),
+    'images, sound': trust.world('principal point', 2.0),
+    'images, ripple of 0.3 px': trust.world('ripple', 0.3),
 }
 _SIMULATED = {
     'stars, sound': World(principal_point_px=(1.2, -1.6)),

@@ -23,7 +23,7 @@ from bench import competitors, mrcal_process
 from bench.competitors import Answer, Case
 from bench.peers.campaigns import Campaign, Result
 from bench.table import timed
-from bench.worlds import rms
+from bench.trials import rms
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import line_of_sight
 from starcal_ros.records import MapCovariance
@@ -60,12 +60,9 @@ def opencv(campaign: Campaign) -> list[Result]:
         # By default OpenCV inverts its distortion in five steps only.
         pixels, same = campaign.pixels[:, None], np.eye(3)
         points = cv2.undistortPointsIter(pixels, K, D, same, same, _INVERSION)[:, 0]
-        used = (
-            np.insert(np.float64(points), 2, 1.0, axis=1),
-            case.table.image_count,
-            len(case.table),
-        )
-        results.append(Result(f'{len(D)} coefficients', *used, took_s))
+        seen = np.insert(np.float64(points), 2, 1.0, axis=1)
+        used = (case.table.image_count, len(case.table))
+        results.append(Result(f'{len(D)} coefficients', seen, *used, took_s))
     return results
 
 

@@ -10,7 +10,7 @@ from bench.calibrate import cost, TOOL
 from bench.frames import observed, write_bag, write_set_up
 from bench.peers.campaigns import Campaign, Result
 from bench.table import timed
-from bench.worlds import rms
+from bench.trials import rms
 from starcal_ros.api import read_calibration
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.pipeline.from_stars import from_stars, pinhole

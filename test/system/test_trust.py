@@ -8,15 +8,12 @@ import pytest
 from bench import trust
 
 ACCEPTED = (
-    trust.World('sound'),
-    trust.World('tilted detector', 1.0, 'px'),
-    trust.World('ripple', 0.1, 'px'),
-    trust.World('two lenses as ABBBA', 0.3, 'px'),
+    trust.world('sound'),
+    trust.world('tilted detector', 1.0),
+    trust.world('ripple', 0.1),
+    trust.world('two lenses as ABBBA', 0.3),
 )
-REFUSED = (
-    trust.World('two lenses as ABBBA', 1.0, 'px', ('image to image',)),
-    trust.World('aberration reversed', 0.5, 'year', ('velocity',)),
-)
+REFUSED = (trust.world('two lenses as ABBBA', 1.0), trust.world('aberration reversed', 0.5))
 
 
 @pytest.mark.slow
