@@ -253,7 +253,8 @@ exit status: 0 the set-up is right; 3 it is wrong, or the cause is unknown; 2 ba
         (
             'For narrow fields: adds the stars of a table of Gaia DR3 to the bundled catalog, '
             'which ends at V = 9. The table covers the sky of the images, with the columns '
-            'source_id, ra, dec, pmra, pmdec, parallax, phot_g_mean_mag and bp_rp, or their VizieR names.'
+            'source_id, ra, dec, pmra, pmdec, parallax, phot_g_mean_mag and bp_rp, or their '
+            'VizieR names.'
         ),
         """\
   # stars of one field, from the Gaia archive
