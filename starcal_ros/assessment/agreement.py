@@ -13,19 +13,19 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.records import CameraGeometry
 
-_SINGULAR = 1e-12  # eigenvalue of a correlation matrix that is zero but for rounding
+_SINGULAR = 1e-12  # smaller eigenvalues of a correlation matrix are rounding errors
 
 
 @dataclass(frozen=True)
 class ChiSquared:
-    """A squared length in the metric of a covariance, and its degrees of freedom; 0 for none."""
+    """A squared Mahalanobis distance and its degrees of freedom; both 0 if nothing is compared."""
 
     value: float
     degrees_of_freedom: int
 
     @property
     def p_value(self) -> float:
-        """Probability of a value as large from noise alone; 1 without degrees of freedom."""
+        """Probability that noise alone gives as large a value; 1 without degrees of freedom."""
         n = self.degrees_of_freedom
         return float(chdtrc(n, self.value)) if n else 1.0
 
@@ -35,7 +35,7 @@ def chi_squared(difference: Floats, covariance: Floats) -> ChiSquared:
     Squared length of a difference (k,) in the metric of its covariance (k, k) (Mahalanobis).
 
     Rows without a finite, positive variance are left out; directions in which the covariance is
-    singular are no degree of freedom.
+    singular do not count as degrees of freedom.
     """
     known = np.isfinite(covariance).all(axis=1) & (np.diag(covariance) > 0)
     if not known.any():
@@ -71,8 +71,8 @@ def movement(
     rotation_rad : float
         The rotation common to all pixels.
     left_px : (columns * rows,)
-        The remaining movement at a grid of pixels, in pixels at the centre.  Both are infinite
-        where a pixel no longer has a line of sight.
+        The remaining movement at a grid of pixels, in pixels at the centre.  Both results are
+        infinite if a pixel no longer has a line of sight.
     """
     old, new = (lines_of_sight(geometry, columns, rows) for geometry in (before, after))
     if not (np.isfinite(old).all() and np.isfinite(new).all()):

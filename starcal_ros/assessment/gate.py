@@ -24,7 +24,7 @@ from starcal_ros.records import (
 
 _DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
 _STEP_P_VALUE = 1e-6  # of a step of the detector among all places
-# What to do where the stars contradict what is assumed of an unknown, by the start of its label.
+# Remedy if the stars contradict the assumed value of an unknown, by the start of its label.
 _REMEDIES = {
     'velocity': 'the velocity or the clock is wrong, or air bends the light: check the velocity'
     ' topic, the stamps and the site',
@@ -32,7 +32,7 @@ _REMEDIES = {
     'stamp': 'check stamp_offset_s and the clocks of camera and star tracker',
     'mounting': 'check more_alignments, or widen star_tracker_mounting_sigma_arcsec',
 }
-_PART_TOLERANCE = 0.05  # of a normalised residual, within which a part of the data is as predicted
+_PART_TOLERANCE = 0.05  # largest accepted deviation of a normalised residual from 1
 _PART_SIGMAS = 3.5  # one of twelve parts exceeds it by noise in 1 of 200 calibrations
 
 
@@ -62,7 +62,7 @@ def judge(
     Returns
     -------
     tuple of GateCheck
-        Only the first two where a parameter or a variance is not finite: all others use them.
+        Only the first two if a parameter or a variance is not finite, because the others use them.
     """
     checks = (_solver(calibration), _numbers(calibration))
     if not checks[-1].passed:
@@ -78,7 +78,7 @@ def judge(
 
 
 def reasons_of(checks: Iterable[GateCheck]) -> tuple[str, ...]:
-    """A sentence for each check that failed; empty where none did."""
+    """A sentence for each failed check; empty if all passed."""
     return tuple(_reason(check) for check in checks if check.passed is False)
 
 
@@ -159,7 +159,7 @@ def _precision(calibration: Calibration, options: GateOptions) -> Iterator[GateC
         _map_sigma_px(calibration),
         'px',
     )
-    aligned = calibration.has_alignment  # else the common rotation has no meaning
+    aligned = calibration.has_alignment  # otherwise the common rotation has no meaning
     sigma_arcsec = maps.line_of_sight_sigma_arcsec if aligned else maps.shape_sigma_arcsec
     yield limit_check(
         options,
@@ -194,7 +194,7 @@ def _changes(
         f'largest {of_map} from the prior',
         float(left_px.max()),
         'px',
-        'the prior camera or its lens model is not of this lens (lens_model)',
+        'the prior camera or its lens model does not match this lens (lens_model)',
     )
     for parameter, name, found, unit in (
         ('max_rotation_deg', f'{of_sight} from the prior', math.degrees(rotation_rad), 'deg'),
@@ -207,7 +207,7 @@ def _changes(
 def _step(
     active: Calibration | None, calibration: Calibration
 ) -> tuple[float, float] | tuple[str, str]:
-    """Map change (px) and rotation (deg) from the active calibration, or why there is neither."""
+    """Map change (px) and rotation (deg) from the active calibration, or the reason for none."""
     if active is None:
         return ('no calibration was active',) * 2
     model = active.geometry.camera.model
@@ -279,12 +279,12 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
 
 
 def _predicted(bins: tuple[ResidualBin, ...], options: GateOptions) -> Iterator[GateCheck]:
-    """The part of the data whose residuals exceed their predicted sigma the most."""
+    """The part of the data with the largest ratio of residuals to their predicted sigma."""
     if not bins:
         return
 
     def excess(part: ResidualBin) -> float:
-        # No part fails for the noise of its few stars.
+        # The noise of a few stars must not fail a part.
         return part.normalised - _PART_SIGMAS * part.sigma
 
     worst = max(bins, key=excess)
@@ -302,7 +302,7 @@ def _predicted(bins: tuple[ResidualBin, ...], options: GateOptions) -> Iterator[
     passed = bool(check.passed) or excess(worst) <= options.max_cross_validated_residual
     note = f'not within {_PART_TOLERANCE:.0%} of 1: {", ".join(doubtful)}' if doubtful else ''
     if not passed:
-        note += '; the sigma does not hold there: look at the PSF, the lens model or those images'
+        note += '; the sigma is wrong there: check the PSF, the lens model or those images'
     yield dataclasses.replace(check, passed=passed, note=note)
 
 
@@ -316,7 +316,7 @@ def _significant(
     remedy: str,
     least_p_value: float,
 ) -> GateCheck:
-    """A check that fails where the value exceeds its limit and noise does not explain it."""
+    """A check that fails if the value exceeds its limit and is significant."""
     check = limit_check(options, option, name, found, unit)
     likely = not p_value < least_p_value
     note = f'the p-value is {p_value:.1g}'

@@ -82,7 +82,7 @@ def image_information(
 
 
 def estimated_names(options: CalibrationOptions, model: str) -> tuple[str, ...]:
-    """Names of all that is to be estimated: camera, terms of temperature, alignment, its rate."""
+    """Names of the estimated unknowns: camera, temperature terms, alignment, alignment rate."""
     estimated_names = set(estimated_parameters(options, model))
     rate = ALIGNMENT_NAMES if options.alignment_temperature else ()
     return (
@@ -109,13 +109,13 @@ def predicted_sigma(
     terms = _supported_terms(ensemble, options)
     found = _sigma_with(ensemble, prior, options, *terms)
     if not found and terms != (0, False):
-        # Sigmas of the others until images of more temperatures come.
+        # Sigmas without temperature terms, until images cover a wider range of temperatures.
         found = _sigma_with(ensemble, prior, options, 0, False)
     return np.array([found.get(name, np.inf) for name in names])
 
 
 def _supported_terms(ensemble: Ensemble, options: CalibrationOptions) -> tuple[int, bool]:
-    """Order of the focal terms and whether a rate, if requested and supported by the images."""
+    """Order of the focal terms, and True for an alignment rate: if requested and supported."""
     order, with_rate = options.focal_temperature_order, options.alignment_temperature
     temperatures_degc = np.array([image.temperature_degc for image in ensemble.images])
     if (order or with_rate) and why_unsupported(temperatures_degc, order):
@@ -130,7 +130,7 @@ def _at_the_prior(
     order: int,
     with_rate: bool,
 ) -> tuple[Problem, State, StarSums, bool]:
-    """Problem, initial state, sums over its stars, and whether all of them are in front."""
+    """Problem, initial state, sums over the stars, and True if all stars are before the camera."""
     problem = problem_of(ensemble, prior, options)
     state = start_of(problem, prior, order, with_rate)
     table = star_table(ensemble.images)
@@ -160,7 +160,7 @@ def _sigma_with(
         covariance = inverse(information)
     except (NotObservable, np.linalg.LinAlgError):
         return {}
-    # What is held with a prior sigma moves the others, as in the estimate.
+    # Held unknowns with a prior sigma widen the sigmas of the others, as in the estimate.
     first = layout.places['camera'].start
     held = np.setdiff1d(first + np.flatnonzero(np.isfinite(problem.prior_sigma)), kept)
     by_held = covariance @ whole[np.ix_(kept, held)] * problem.prior_sigma[held - first]
@@ -251,8 +251,8 @@ def map_error_px(found: CameraModel, true: CameraModel) -> float:
     """
     RMS difference over the detector of the lines of sight of two cameras, px at the focal length.
 
-    The rotation of all lines of sight that brings the two closest is removed: a calibration puts
-    it into the alignment.  Infinite where a pixel has no line of sight: a distortion folds.
+    The best common rotation is removed, because a calibration assigns it to the alignment.
+    Infinite if a pixel has no line of sight, where the distortion folds.
     """
     unturned = np.array([0.0, 0.0, 0.0, 1.0])
     before, after = CameraGeometry(found, unturned), CameraGeometry(true, unturned)
@@ -261,7 +261,7 @@ def map_error_px(found: CameraModel, true: CameraModel) -> float:
 
 
 def detector_maps(camera: CameraModel, covariance: MapCovariance, pixels: Floats) -> DetectorMaps:
-    """Maps of a camera with a covariance that is from stars at pixels (n, 2)."""
+    """Maps of a camera and its covariance, which stars at pixels (n, 2) determined."""
     table = line_of_sight_table(camera, covariance, pixel_grid(camera, MAP_COLS, MAP_ROWS))
     return DetectorMaps(
         stars_in_cells(pixels, camera),
@@ -280,7 +280,7 @@ def correlation(covariance: Floats, names: tuple[str, ...]) -> Correlation:
 
 def movement_px(camera: CameraModel, changes: Floats) -> Floats:
     """
-    Largest shift (k,) over the detector of the image of a direction, px.
+    Largest shift (k,) of a star image over the detector, px.
 
     For each k, only the k-th camera parameter is reduced, by ``changes[k]``.
     """

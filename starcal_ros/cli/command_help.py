@@ -9,7 +9,7 @@ HELP: dict[str, tuple[str, str, str]] = {
         'calibrate a small bag with the real ROS nodes',
         (
             'Starts the nodes, plays ten simulated images to them, requests a calibration through '
-            'the service and prints the result beside the truth.'
+            'the service and prints the result and the truth.'
         ),
         """\
   # write to the folder starcal_demo
@@ -20,12 +20,12 @@ HELP: dict[str, tuple[str, str, str]] = {
     'init': (
         'write the first parameter file of a bag or of photographs',
         (
-            'Finds the camera by its stars and, where the bag has attitudes, how they are meant '
-            'and the alignment; writes params.yaml and camera.yaml, and lists what was found and '
-            'what is left to state.'
+            'Finds the camera from the stars of the images, and if the bag has attitudes, their '
+            'direction and the alignment. Writes params.yaml and camera.yaml, and lists the '
+            'values that were found and those that you have to state.'
         ),
         """\
-  # the bag in the repository, with nothing known
+  # the bag in the repository, without prior knowledge
   starcal init bags/tiny -o first
   # photographs of the night sky
   starcal init 'night/*.jpg' -o first""",
@@ -34,7 +34,7 @@ HELP: dict[str, tuple[str, str, str]] = {
         'list the contents of a bag and the images a calibration would refuse',
         (
             'Lists topics, rates, stamps, encodings and gaps, and checks each image against the '
-            'attitudes as a calibration does. With --params the stars are measured as well.'
+            'attitudes as a calibration does. With --params it also measures the stars.'
         ),
         """\
   # check stamps and attitudes
@@ -44,7 +44,7 @@ HELP: dict[str, tuple[str, str, str]] = {
   # machine-readable output
   starcal inspect bags/tiny --json
 
-exit status: 0 the bag can be calibrated; 3 it cannot, and the reasons are listed; 2 bad input.""",
+exit status: 0 the bag can be calibrated; 3 it cannot, with the reasons; 2 bad input.""",
     ),
     'diagnose': (
         'find out why the images of a bag match no star',
@@ -54,12 +54,12 @@ exit status: 0 the bag can be calibrated; 3 it cannot, and the reasons are liste
             'and the lines of the parameter file that correct it.'
         ),
         """\
-  # no image matches: why?
+  # find the cause if no image matches
   starcal diagnose bags/tiny --params bags/tiny/params.yaml
-  # for a program
+  # machine-readable output
   starcal diagnose bags/tiny --params bags/tiny/params.yaml --json
 
-exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad input.""",
+exit status: 0 the set-up is right; 3 it is wrong, or the cause is unknown; 2 bad input.""",
     ),
     'calibrate': (
         'calibrate from bags, without a ROS graph',
@@ -72,11 +72,11 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
         """\
   # the bag in the repository
   starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out
-  # photographs of the night sky, and nothing else
+  # photographs of the night sky alone
   starcal calibrate 'night/*.jpg' -o out
   # the images of the first 30 s, and a comparison of its two halves
   starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out --to +30 --split-half
-  # two bags together, with several cameras in them
+  # one of several cameras, from two bags together
   starcal calibrate night1 night2.mcap --params camera1.yaml -o out --image-topic /camera1/image
   # repeat from the recorded observations, with other options and without images
   starcal calibrate out/observations.mcap --params bags/tiny/params.yaml -o again""",
@@ -84,7 +84,7 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
     'compare': (
         'compare two calibrations in pixels and sigmas',
         (
-            'A and B are each a calibration.json or a folder that holds one. Lines of sight are '
+            'A and B are calibration.json files or folders with one. Lines of sight are '
             'compared in the star tracker frame, before and after removing their common rotation. '
             'Differences are B minus A; their sigmas assume that A and B are independent.'
         ),
@@ -99,10 +99,10 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   starcal compare out/calibration.json again/calibration.json --json""",
     ),
     'plan': (
-        'say where to point the camera next',
+        'propose the next pointings of the camera',
         (
-            'Estimates from the images so far, and chooses from the allowed pointings those whose '
-            'stars lower a sigma most, one after the other, with the sigma to expect after each.'
+            'Calibrates from the images so far. Then it chooses the allowed pointings one by one, '
+            'each time the one that lowers a sigma most, and prints the sigma expected after it.'
         ),
         """\
   # the next ten images, anywhere on the sky
@@ -115,8 +115,8 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
         'rewrite report.html of a calibration',
         (
             'Makes one page from the files of a folder: gate verdict, parameters, residuals, '
-            'uncertainties, refused images and stars. The page needs no network. --pdf writes the '
-            'same as numbered pages with a block for signatures (extra pdf).'
+            'uncertainties, refused images and stars. The page needs no network. --pdf writes '
+            'it as numbered pages with a block for signatures (extra pdf).'
         ),
         """\
   # from the files of an earlier calibration, with pages to sign
@@ -127,7 +127,7 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
         (
             'Writes u_px, v_px, the unit vector x, y, z in the camera frame, shape_sigma_arcsec '
             '(1-sigma of the direction, common rotation removed) and sigma_arcsec (in the star '
-            'tracker frame), with the field beside the lens model if there is one.'
+            'tracker frame). The lines of sight include the residual field if there is one.'
         ),
         """\
   # 25 x 25 pixels over the detector
@@ -149,8 +149,8 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
     'monitor': (
         'show running nodes in the terminal',
         (
-            'Shows images and refusals by reason, coverage, the forecast sigma of each parameter '
-            'beside that of the active calibration, the gate and the health of the nodes. Keys '
+            'Shows images and refusals by reason, coverage, for each parameter the forecast sigma '
+            'and that of the active calibration, the gate and the health of the nodes. Keys '
             'request a calibration, a dry run, a roll-back or a reset.'
         ),
         """\
@@ -164,16 +164,16 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
     'request': (
         'call a service of the running calibrator',
         (
-            'Requests a calibration (calibrate, or solve with its options), the one before '
-            '(rollback), an empty ensemble (reset) or a table of lines of sight (lookup), and '
-            'prints the answer. Exit status 3: the calibrator declined.'
+            'Requests a calibration (calibrate, or solve with other options), the previous '
+            'calibration (rollback), an empty ensemble (reset) or a table of lines of sight '
+            '(lookup), and prints the response. Exit status 3: the calibrator declined.'
         ),
         """\
   # calibrate from the images collected so far
   starcal request calibrate
   # the same without activating the result
   starcal request solve --dry-run
-  # lines of sight of the active calibration of a calibrator in a namespace
+  # lines of sight of the active calibration, from a calibrator in a namespace
   starcal request lookup -o sights.csv --remap __ns:=/cam1""",
     ),
     'simulate': (
@@ -191,7 +191,7 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   starcal simulate -o sim2 --scenario small --seed 2
   # the camera of sim with other noise, twelve stars in each image
   starcal simulate -o sim3 --scenario small --seed 3 --camera-seed 1 --stars-per-image 12
-  # a mistake to rehearse
+  # a deliberate mistake, to practise the diagnosis
   starcal simulate -o mirrored --scenario tiny --flip""",
     ),
     'campaign': (
@@ -204,7 +204,7 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   starcal campaign table1 -o studies --trials 20 --tracker 0 20
   # the whole night of the paper from pixels, with its figures, in some minutes
   starcal campaign paper -o paper
-  # twelve frames of it, in a minute
+  # twelve frames of that night, in a minute
   starcal campaign paper -o paper --images 12 --trials 20""",
     ),
     'export': (
@@ -213,11 +213,11 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
             'Writes SPICE kernels (FK and IK, or CK with the attitude of each image), an ALE '
             'fragment and ISIS keywords, YAML of OpenCV, kalibr or ROS, arguments of GIANT, '
             'a model of mrcal, a table of lines of sight, or C99 source; prints the parts that '
-            'the format cannot hold and their cost in pixels. SPICE kernels, tables and C hold '
-            'everything.'
+            'the format cannot represent and the error in pixels that this causes. SPICE kernels, '
+            'tables and C represent the whole camera.'
         ),
         """\
-  # frame and instrument kernel; the star tracker frame is defined too
+  # frame and instrument kernel, including the star tracker frame
   starcal export out --to spice -o kernels --spacecraft-id -999 --star-tracker-id -999100
   # with the frame names of the mission, whose frame kernel defines the star tracker
   starcal export out --to spice -o kernels --spacecraft-id -999 --star-tracker-frame MSN_ST1
@@ -225,25 +225,25 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
   starcal export out --to ck -o kernels --spacecraft-id -999 --kernels naif.tls clock.tsc
   # for cv2.projectPoints
   starcal export out --to opencv -o opencv
-  # C99 for flight software; later calibrations as tables that starcal_load checks
+  # C99 for flight software, and a later calibration as a table for it
   starcal export out --to c -o src
   starcal export newer --to c --table -o uplink""",
     ),
     'import': (
         'make a bag from images and attitudes in the formats of a mission',
         (
-            'Images are FITS (tiled, scaled and floating point too), TIFF or PNG; attitudes, of '
-            'several star trackers too, CCSDS AEM, CSV, SPICE CK with SCLK and LSK, or the WCS '
-            'that a program such as astrometry.net wrote; velocities CCSDS OEM, CSV or SPK. '
-            'Times of UTC, TAI, TT, TDB and GPS become UTC. With --camera a parameter file to '
-            'calibrate the bag is written beside it.'
+            'Images are FITS (also tiled, scaled or floating point), TIFF or PNG. Attitudes of '
+            'one or more star trackers are CCSDS AEM, CSV, SPICE CK with SCLK and LSK, or the '
+            'WCS of a program such as astrometry.net. Velocities are CCSDS OEM, CSV or SPK. Times '
+            'in UTC, TAI, TT, TDB and GPS are converted to UTC. With --camera it also writes a '
+            'parameter file to calibrate the bag.'
         ),
         """\
   # FITS and an attitude ephemeris
   starcal import --images 'night/*.fits' --attitude attitude.aem -o bag --camera prior.yaml
   # SPICE kernels for attitude and velocity
   starcal import --images 'night/*.fits' --attitude ck.bc clk.tsc lsk.tls --star-tracker ST1 -o bag
-  # FITS solved by astrometry.net, which writes NAME.wcs beside NAME.fits
+  # FITS solved by astrometry.net, which writes NAME.wcs for NAME.fits
   starcal import --images 'night/*.fits' --attitude 'night/*.wcs' -o bag --camera prior.yaml
   # PNG with a table of times and one of attitudes
   starcal import --images 'night/*.png' --times times.csv --attitude attitude.csv -o bag""",
@@ -251,28 +251,29 @@ exit status: 0 nothing is wrong; 3 a cause was found, or none could be; 2 bad in
     'catalog': (
         'make a deeper star catalog from a table of Gaia',
         (
-            'Adds the stars of a table of Gaia DR3 to the bundled catalog, which ends at V = 9: '
-            'for narrow fields. The table is of the sky that is photographed, with source_id, '
-            'ra, dec, pmra, pmdec, parallax, phot_g_mean_mag and bp_rp, or their names in VizieR.'
+            'For narrow fields: adds the stars of a table of Gaia DR3 to the bundled catalog, '
+            'which ends at V = 9. The table covers the sky of the images, with the columns '
+            'source_id, ra, dec, pmra, pmdec, parallax, phot_g_mean_mag and bp_rp, or their '
+            'VizieR names.'
         ),
         """\
-  # stars about one field, from the Gaia archive
+  # stars of one field, from the Gaia archive
   starcal catalog gaia.vot -o deep.npz""",
     ),
     'trend': (
         'follow calibrations over years',
         (
-            'Reads every calibration.json and state folder under ROOT, calibrates bags with '
-            '--params, and observations of older versions again, into a Parquet table that grows; '
-            'writes trend.html: each parameter, boresight and alignment over time, steps and '
-            'drifts with p-values, and what a recalibration would have changed.'
+            'Adds every calibration.json and state folder under ROOT to a Parquet table. With '
+            '--params it calibrates bags too. Observations of older versions are calibrated '
+            'again. Writes trend.html: each parameter, boresight and alignment over time, steps '
+            'and drifts with p-values, and the change that a recalibration would have made.'
         ),
         """\
-  # all calibrations of a mission; run again, only what is new is computed
+  # all calibrations of a mission; another run adds only new ones
   starcal trend mission -o trend
   # a thousand bags on two processes
   starcal trend fleet -o trend --params camera.yaml --workers 2
-  # on a Dask cluster that sees the same files
+  # on a Dask cluster with access to the same files
   starcal trend /data/fleet -o trend --params camera.yaml --scheduler tcp://host:8786""",
     ),
 }

@@ -2,8 +2,8 @@
 """
 Set-up of a calibration from images alone: photographs, or bags without attitudes.
 
-Photographs become a bag, and the rotations that `from_stars` finds another: from there on the
-calibration is that of any bag.
+Photographs are written to one bag, and the rotations that `from_stars` finds to another.  The
+calibration of these bags is the same as that of any bag.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from starcal_ros.sky.catalog import load_catalog
 @dataclass(frozen=True)
 class NightSky:
     """
-    Bags and set-up of a calibration by the stars alone, and lines about them.
+    Bags and set-up of a calibration by the stars alone, and notes for the user.
 
-    ``is_located`` is False where neither the options nor the files state where the camera was.
+    ``is_located`` is False if neither the options nor the files state the site of the camera.
     """
 
     bags: tuple[Path, ...]
@@ -56,7 +56,7 @@ class NightSky:
     def through_air(
         self, observations: Sequence[StarObservations]
     ) -> tuple[list[StarObservations], str]:
-        """Observations as seen through the air, where nobody states it, and what was found."""
+        """Observations, refracted if the stars show it and no site is given, and a note on it."""
         if self.is_located:
             return list(observations), ''
         return with_air(observations, self.setup.prior.camera)
@@ -66,7 +66,7 @@ def photographs_of(
     paths: Sequence[Path], focal_length_mm: float = 0.0, pixel_um: float = 0.0
 ) -> tuple[list[Photograph], list[str]]:
     """
-    Photographs of one camera in order of time, and lines about the files left out.
+    Photographs of one camera in order of time, and notes on the omitted files.
 
     Raises NotFromStars when no file can be read.
     """
@@ -113,7 +113,7 @@ def camera_of_photographs(
     photographs: Sequence[Photograph], values: Mapping[str, object]
 ) -> FromStars:
     """
-    Camera and rotations of photographs, from the focal length that they state, if any.
+    Camera and rotations of photographs; the search starts at their stated focal length, if any.
 
     Raises NotFromStars when the stars give no camera.
     """
@@ -132,7 +132,7 @@ def from_bags(
     bags: Sequence[Path], asked: Topics, values: Mapping[str, object], folder: Path
 ) -> NightSky:
     """
-    Set-up of a calibration of bags without attitudes; those by the stars are written to a folder.
+    Set-up of a calibration of bags without attitudes; attitudes by the stars go into a folder.
 
     Raises NotFromStars when the stars give no camera, or the images are mirrored.
     """
@@ -161,7 +161,7 @@ def camera_of_bags(
 def _found(
     images: Iterator[Image], values: Mapping[str, object], hint: CameraModel | None
 ) -> FromStars:
-    """Camera and rotations; the camera file of the options goes before a hint."""
+    """Camera and rotations; the camera file of the options has priority over a hint."""
     if url := str(values.get('camera_info_url', '')):
         hint = read_camera_info(url)
     path = str(values.get('catalog', ''))
@@ -188,7 +188,7 @@ def _set_up(
 
 
 def site_of(photographs: Sequence[Photograph]) -> dict[str, object]:
-    """Options of the site, where all files state it with the date."""
+    """Options of the site, if all files have a position and a date."""
     sites = [one.site for one in photographs if one.site is not None and one.dated and one.utc]
     if len(sites) < len(photographs):
         return {}

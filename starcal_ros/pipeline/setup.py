@@ -68,8 +68,8 @@ class SetupOptions:
     )
     prior_alignment: tuple[float, ...] = option(
         (0.0, 0.0, 0.0, 0.0),
-        'prior orientation of the camera in the star tracker frame, a quaternion (x, y, z, w)'
-        ' within 1.5 degrees, and 5 degrees in roll; zeros: determined from the first images',
+        'prior orientation of the camera in the star tracker frame, a quaternion (x, y, z, w);'
+        ' its error may be 1.5 degrees, and 5 degrees in roll; zeros: found from the first images',
         length=4,
         basic=True,
     )
@@ -79,7 +79,7 @@ class SetupOptions:
     )
     image_channel: str = option(
         '',
-        'channel used from rgb, bgr and bayer images (bayer: at half the width and height);'
+        'channel of rgb, bgr and bayer images to use (bayer: at half the width and height);'
         ' empty: colour images are refused',
         choices=('', *CHANNELS),
     )
@@ -105,8 +105,8 @@ class Setup:
     """
     Options of every stage, with prior camera, catalog and detector frames loaded.
 
-    Without a prior alignment ``is_aligned`` is false and ``prior`` has the identity, until one is
-    determined.
+    Without a prior alignment ``is_aligned`` is false and ``prior`` has the identity until the
+    alignment is determined.
     """
 
     frames: SetupOptions
@@ -129,7 +129,7 @@ class Setup:
 
     @property
     def star_search(self) -> StarSearch:
-        """Catalog and options with which the stars of an image are found."""
+        """Catalog and options for the identification of the stars of an image."""
         return StarSearch(self.catalog, self.centroid, self.identification)
 
     def options(self) -> dict[str, OptionValue]:
@@ -163,16 +163,16 @@ def read_setup(params: Path) -> Setup:
 
 def read_values(params: Path) -> dict[str, object]:
     """
-    Options of a ROS parameter file by name, the camera file relative to it.
+    Options of a ROS parameter file by name; a relative camera file is relative to that file.
 
-    Raises OptionError when it is not one.
+    Raises OptionError when it is not a parameter file.
     """
     return dict(camera_yaml.with_camera_url_from(read_parameter_file(params, NODES), params))
 
 
 def files_of(frames: SetupOptions) -> dict[str, Path]:
     """
-    The files that options name, by option: prior camera, catalog and detector frames.
+    Paths of the files named by options: prior camera, catalog and detector frames.
 
     Raises ProductError for a camera URL that names no file.
     """
@@ -186,12 +186,12 @@ def files_of(frames: SetupOptions) -> dict[str, Path]:
 
 
 def _check_relative(files: Mapping[str, Path]) -> None:
-    """Raise OptionError for a relative path that leads to no file from the current folder."""
+    """Raise OptionError for a relative path without a file in the current folder."""
     for name, path in files.items():
         if not path.is_absolute() and not path.exists():
             raise OptionError(
-                f'{name}: {path}: No such file in {Path.cwd()}, the folder of this process; give'
-                ' its whole path'
+                f'{name}: {path}: no such file in {Path.cwd()}, the working folder; give'
+                ' the absolute path'
             )
 
 
@@ -201,8 +201,8 @@ def load_setup(
     """
     Setup from a mapping of option names to values, all checked.
 
-    ``others`` are option classes of the caller whose names the mapping may also hold; ``prior``
-    replaces the camera file and alignment of the options. Raises OptionError for an unknown name
+    ``others`` are further option classes whose names are also allowed; ``prior`` replaces the
+    camera file and alignment of the options. Raises OptionError for an unknown name
     or a bad value. Raises ProductError or CatalogError when the prior camera or the catalog cannot
     be read.
     """
@@ -242,7 +242,7 @@ def load_setup(
 
 
 def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
-    """A setup with the prior alignment that was found for it."""
+    """A copy of a setup with the prior alignment found from the images."""
     prior = CameraGeometry(setup.prior.camera, star_tracker_from_camera_xyzw)
     return dataclasses.replace(setup, prior=prior, is_aligned=True)
 
@@ -250,7 +250,7 @@ def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
 def _mountings(
     options: AttitudeOptions, setup: SetupOptions, prior: CameraGeometry, is_aligned: bool
 ) -> tuple[Mounting, ...]:
-    """The further star trackers, each in the frame of the first by the prior alignments."""
+    """The additional star trackers in the frame of the first, from the prior alignments."""
     frames = [frame for frame in options.more_star_trackers if frame]
     if not frames:
         return ()
@@ -259,14 +259,14 @@ def _mountings(
         if frame.lstrip('/') in taken:
             raise OptionError(
                 f'more_star_trackers: {shown(frame)} is given twice: each of them,'
-                ' star_tracker_frame and camera_frame need a name of their own'
+                ' star_tracker_frame and camera_frame need different names'
             )
         taken.add(frame.lstrip('/'))
         if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', frame):
             raise OptionError(f'more_star_trackers: {shown(frame)} is not a valid frame name')
     if not is_aligned:
         raise OptionError(
-            'more_star_trackers: prior_alignment is needed beside more_alignments: one of them'
+            'more_star_trackers: more_alignments needs prior_alignment too: it'
             ' cannot be found from the images'
         )
     if len(options.more_alignments) != 4 * len(frames):
@@ -285,7 +285,7 @@ def _unit_quaternion(option: str, values: Sequence[float]) -> Floats:
     quaternion = np.array(values)
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1.0) > 1e-3:
-        hint = '; angles in degrees are no quaternion' if np.abs(quaternion).max() > 2.0 else ''
+        hint = '; angles in degrees are not a quaternion' if np.abs(quaternion).max() > 2.0 else ''
         raise OptionError(
             f'{option}: {list(values)} is not a unit quaternion (x, y, z, w): its norm is'
             f' {norm:.6g}{hint}'
@@ -301,7 +301,7 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
         camera, worst_px = convert(camera, frames.lens_model)
         if not math.isfinite(worst_px):
             raise OptionError(
-                f'lens_model: {frames.lens_model} cannot see all of the field of the prior camera,'
+                f'lens_model: {frames.lens_model} does not cover the field of the prior camera,'
                 f' {frames.camera_info_url}'
             )
     set_up_checks.check_prior_camera(camera, frames.camera_info_url)

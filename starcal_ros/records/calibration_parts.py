@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Parts of a calibration: checks of its model, its star trackers, the budget of its sigma."""
+"""Parts of a calibration: model checks, star trackers, and the budget of the sigma."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from starcal_ros.record_fields import Count, Finite, Quaternion, Shape
 
 TOTAL = 'total'
 BUDGET_COLUMNS, BUDGET_ROWS = 9, 7
-_MATTERS = 0.05  # of the variance
+_MATTERS = 0.05  # fraction of the variance
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class HeldTerm:
 @dataclass(frozen=True)
 class DetectorStep:
     """
-    The most significant step between two parts of the detector, as lost columns cause.
+    The most significant step between two parts of the detector, as caused by lost columns.
 
     Stars beyond ``place_px`` on the axis ``across`` (u or v) are displaced by ``size_px`` along
     the axis ``moved``; ``p_value`` accounts for the number of places tested.
@@ -56,11 +56,12 @@ class ResidualBin:
     """
     Residuals of a group of stars, each predicted from the other data.
 
-    ``by`` is ``radius`` (px from the middle of the detector), ``magnitude`` or ``image`` (its
-    number in order of time) for images that others predict; ``star`` (its number of images) or
-    ``cell`` (px from the middle) for sums over stars and cells of the detector.  ``low`` and
-    ``high`` are the limits of the group.  ``normalised`` is the RMS of the residuals over their
-    predicted sigma, 1 where the model and its sigmas hold, and ``sigma`` its 1-sigma.
+    ``by`` names the quantity that defines the group.  Residuals of images predicted from other
+    images are grouped by ``radius`` (px from the middle of the detector), ``magnitude`` or
+    ``image`` (its number in order of time); sums over stars by ``star`` (its number of images),
+    sums over cells of the detector by ``cell`` (px from the middle).  ``low`` and ``high`` are the
+    limits of the group.  ``normalised`` is the RMS of the residuals over their predicted sigma, 1
+    if the model and its sigmas are right, and ``sigma`` its 1-sigma.
     """
 
     by: str
@@ -76,8 +77,8 @@ class Amplitude:
     """
     An estimated amplitude of errors that the model does not describe.
 
-    ``value`` is its 1-sigma in ``unit``; ``likelihood_ratio`` is twice the log likelihood ratio
-    against an amplitude of zero, which is only reported.
+    ``value`` is the 1-sigma of these errors in ``unit``; ``likelihood_ratio`` is twice the log
+    likelihood ratio against an amplitude of zero.  The ratio is reported only.
     """
 
     name: str
@@ -114,7 +115,7 @@ class StarTrackerAlignment:
     Attributes
     ----------
     frame : str
-        Name of the frame of the star tracker.
+        Frame of the star tracker.
     images : int
         Number of images with an attitude from this star tracker; with 0 the mounting is the prior.
     star_tracker_from_camera_xyzw : (4,)
@@ -127,7 +128,7 @@ class StarTrackerAlignment:
         Covariance of a small rotation of the mounting about the axes of the camera; zero for the
         first star tracker.
     drift_arcsec_per_hour : tuple of 3 float
-        Drift of its attitude against the stars, about its own axes.
+        Drift of the attitude against the stars, about the axes of the star tracker.
     drift_arcsec, drift_p_value : float
         Length of the drift over the time span of its images, and p-value of the hypothesis of no
         drift; NaN for fewer than four images.
@@ -147,10 +148,10 @@ class StarTrackerAlignment:
 @dataclass(frozen=True)
 class SigmaPart:
     """
-    Part of the 1-sigma of lines of sight that is due to one cause, RMS over the detector.
+    Contribution of one cause to the 1-sigma of lines of sight, RMS over the detector.
 
-    Its square is the variance that would be gone if the cause were known exactly, or absent.
-    Parts of correlated causes overlap: their squares need not sum to the total's.
+    Its square is the decrease of the variance if the cause were known exactly, or absent.
+    Contributions of correlated causes overlap: their squares need not add up to the total.
 
     Attributes
     ----------
@@ -175,7 +176,7 @@ class SigmaPart:
 
 
 def parts_that_matter(budget: Sequence[SigmaPart]) -> list[SigmaPart]:
-    """Return the total, and the causes of over 5 % of a variance, the largest first."""
+    """Return the total, then the causes of more than 5 % of a variance, the largest first."""
     if not budget:
         return []
     total = next(part for part in budget if part.cause == TOTAL)

@@ -30,31 +30,29 @@ from starcal_ros.record_fields import (
 
 IMAGE_REFUSALS: Mapping[str, str] = {
     'bad_encoding': 'the pixel encoding is not one of mono8, mono16, 8UC1, 16UC1',
-    'bad_layout': 'size, row step and data of the image message do not fit each other',
+    'bad_layout': 'size, row step and data length of the image message are inconsistent',
     'wrong_size': 'the image is not of the size of the prior camera',
-    'bad_attitude': 'the attitude about the image is not finite or not of unit length',
-    'frozen_attitude': 'the star tracker repeats an attitude of before, but the stars have moved',
+    'bad_attitude': 'the attitude near the image is not finite or not of unit length',
+    'frozen_attitude': 'the star tracker repeats an earlier attitude, but the stars have moved',
     'no_attitude': 'no attitude sample on both sides of the image',
-    'attitude_gap': 'the attitude samples about the image are too far apart',
-    'out_of_order': 'the image is stamped before, or at, one already taken',
-    'duplicate': 'the ensemble holds an image of the same stamp (reported by the calibrator)',
-    'overexposed': 'too large a part of the image is saturated',
+    'attitude_gap': 'the attitude samples before and after the image are too far apart',
+    'out_of_order': 'the stamp of the image is not later than that of the last image',
+    'duplicate': 'the ensemble has an image with the same stamp (reported by the calibrator)',
+    'overexposed': 'too large a fraction of the image is saturated',
     'blank': 'every pixel has the same value',
-    'frozen': 'the pixels are those of an earlier image with another stamp',
-    'incomplete': (
-        'a part of the image is constant, repeats itself, is shifted or is of an earlier image'
-    ),
-    'glare': 'the background bends too much over most of the image to be subtracted',
+    'frozen': 'the pixels are identical to an earlier image with another stamp',
+    'incomplete': ('part of the image is constant, repeated, shifted or from an earlier image'),
+    'glare': 'the background varies too strongly over most of the image to be subtracted',
     'no_stars': 'too few star-like sources in the image',
     'no_match': 'no rotation of the predicted stars explains the sources in the image',
-    'too_few_stars': 'fewer stars were measured well than an image needs',
+    'too_few_stars': 'too few stars were measured well',
     'bad_stamp': 'the stamp, with stamp_offset_s, is negative or beyond the range of ROS stamps',
     'bad_observations': (
-        'the observations hold values that no image or star can have (reported by the calibrator)'
+        'the observations contain impossible values (reported by the calibrator)'
     ),
     'overrun': 'images came faster than they could be measured',
     'internal_error': 'the measurement failed unexpectedly; the log of the node has the cause',
-    'other': 'refused by the sender for a reason that this version does not have',
+    'other': 'the sender gave a reason that this version does not have',
 }
 """Reasons to refuse an image: stable name -> meaning."""
 _REFUSAL = OneOf(('', *IMAGE_REFUSALS))  # Sphinx cannot show a star within an annotation
@@ -64,8 +62,8 @@ def counted_refusal(refusal: str) -> str:
     """
     Name under which a refused image is counted.
 
-    Unknown ones are one name: the counts are in every status and in a file, and must not grow with
-    the texts of a sender.
+    All unknown reasons share one name.  The counts are in every status and in a file, and must
+    not grow with texts that a sender invents.
     """
     return refusal if refusal in IMAGE_REFUSALS else 'other'
 
@@ -87,15 +85,15 @@ class StarRefusal(IntEnum):
         return member
 
     NONE = 0, 'the star is used'
-    AMBIGUOUS = 1, 'off the place or the brightness that the other stars give it'
+    AMBIGUOUS = 1, 'position or brightness contradicts the other stars'
     BLEND = 2, 'another catalog star or source is in the measuring window'
-    BORDER = 3, 'the core of the star, or its window by moments, leaves the image'
+    BORDER = 3, 'the core of the star, or its window for moments, extends beyond the image'
     ELONGATED = 4, 'not the shape of a star: smear, cosmic ray, hot pixel or galaxy'
     FAINT = 5, 'signal-to-noise below the limit'
     HOT_PIXEL = 6, 'the light of the star falls on a hot pixel'
-    NOT_DETECTED = 7, 'bright enough to be seen, but no source stands there'
+    NOT_DETECTED = 7, 'bright enough to be detected, but there is no source'
     SATURATED = 8, 'a pixel of the star is saturated'
-    TOO_FEW_PIXELS = 9, 'too few pixels stand above the noise'
+    TOO_FEW_PIXELS = 9, 'too few pixels are above the noise'
 
     @property
     def label(self) -> str:
@@ -132,7 +130,7 @@ class AttitudeSample:
 
 _Name = Annotated[str, Most(most_characters=100)]
 _Side = Annotated[int, Within(0, MAX_SIDE_PX)]
-_Attitude = Annotated[Quaternion, Unit(1e-3)]  # single precision and rounding leave less
+_Attitude = Annotated[Quaternion, Unit(1e-3)]  # rounding to single precision is smaller
 _FiniteOrNaN = Annotated[float, Within()]
 _FloatsOrNaN = Annotated[NDArray[np.float32], Within(), Shape(('n',))]
 
@@ -140,7 +138,7 @@ _FloatsOrNaN = Annotated[NDArray[np.float32], Within(), Shape(('n',))]
 @dataclass(frozen=True)
 class StarObservations:
     """
-    The stars measured and identified in one image, or why it was refused.
+    The stars measured and identified in one image, or the reason of its refusal.
 
     Attributes
     ----------
@@ -151,12 +149,12 @@ class StarObservations:
     refusal, detail : str
         Empty, or a name of `IMAGE_REFUSALS` and the finding in words.
     icrf_from_star_tracker_xyzw : (4,)
-        Star tracker attitude at ``time_ns``; identity where there is none.
+        Star tracker attitude at ``time_ns``; identity if there is none.
     star_tracker : str
         Frame of the star tracker that gave the attitude; empty: the first, or the only one.
     first_from_star_tracker_xyzw : (4,)
         Orientation of that star tracker in the frame of the first, as assumed; the identity for
-        the first.  ``icrf_from_star_tracker`` times it is the attitude that the star tracker gave.
+        the first.  ``icrf_from_star_tracker`` times it is the attitude as received.
     attitude_gap_s : float
         Time between the two samples around the image; NaN without a sample on both sides.
     catalog_id : (n,) int64
@@ -169,19 +167,19 @@ class StarObservations:
         uu, uv, vv of ``measured_px``.
     flux_dn, snr : (n,) float32
     refused_stars : mapping
-        Name of `STAR_REFUSALS` -> number of predicted stars left out for it.
+        Name of `STAR_REFUSALS` -> number of predicted stars refused for this reason.
     refused_catalog_id : (m,) int64
-        Those stars; empty in older recordings.
+        The refused stars; empty in older recordings.
     refused_px : (m, 2) float32
-        Expected (u, v) of each by the match of the others; for display, not for measurement.
+        Predicted (u, v) of each refused star; for display only.
     refused_reason : (m,) uint8
-        Which key of ``refused_stars``, counted from 0 in its order.
+        Index of the reason among the keys of ``refused_stars``.
     background_dn, noise_dn : float
         Median background and 1-sigma noise of one pixel.
     psf_sigma_px : float
         Gaussian width of the stars; 0 if unknown.
     catalog_digest : str
-        Which catalog the identifiers refer to.
+        Digest of the catalog of the identifiers.
     temperature_degc : float
         Temperature of the camera; NaN if unknown.
     star_tracker_rate_rad_s : (3,)
@@ -189,12 +187,12 @@ class StarObservations:
         tracker; NaN if unknown.
     velocity_sigma_m_s : float
         1-sigma of each component of the observer's velocity in ``direction_icrf``; 0 for a site on
-        the ground, NaN where none was given and the Earth's was taken.
+        the ground, NaN if no velocity was given and that of the Earth was used.
     zenith_icrf : (3,)
-        Zenith about which ``direction_icrf`` is refracted, where the stars showed it; NaN: in
-        space, or of a known site.
+        Zenith of the refraction in ``direction_icrf`` if it was found from the stars; NaN in space
+        and for a known site.
     refraction_arcsec : (2,)
-        Refraction at a zenith distance of 45 degrees then, and its 1-sigma; else zeros.
+        Refraction at a zenith distance of 45 degrees for that zenith, and its 1-sigma; else zeros.
     """
 
     time_ns: Stamp
@@ -246,7 +244,7 @@ class StarObservations:
         return len(self.catalog_id)
 
     def refused_places(self) -> dict[str, NDArray[np.float32]]:
-        """Places (k, 2) of the refused stars by the name of their reason, px."""
+        """Positions (k, 2) of the refused stars by the name of the reason, px."""
         return {
             name: self.refused_px[self.refused_reason == code]
             for code, name in enumerate(self.refused_stars)

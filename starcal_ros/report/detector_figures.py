@@ -33,17 +33,17 @@ from starcal_ros.records import (
 from starcal_ros.report import svg
 from starcal_ros.report.svg import Chart, Curve, Drawing, in_digits, Panel, Scale, SERIES, sheet
 
-FLAT = 0.02  # relative range below which a map is called flat
+FLAT = 0.02  # relative range below which a map counts as flat
 _MOST_HEIGHT = 400.0
 _ROUNDING_PX = 1e-9  # smaller displacements (px) and sigmas (arcsec) are rounding errors
 _LEVELS = 5
 _BAR = 84.0  # units of the view box beside a map, for the bar of its colours
 _TOP, _BELOW = 26.0, 40.0
-_DARK, _BRIGHT, _BAD = '#16202b', '#ffffff', '#a8251c'  # on maps, alike on a dark page
+_DARK, _BRIGHT, _BAD = '#16202b', '#ffffff', '#a8251c'  # on maps; the same on a dark page
 _BUDGET_MAPS = 6
-_BUDGET_SHARE = 0.1  # of the sigma: a cause of less is dark everywhere
+_BUDGET_SHARE = 0.1  # fraction of the sigma; the map of a smaller cause would be dark everywhere
 _GAP = 10.0
-_FOOTPRINTS = 200  # drawn on the sky
+_FOOTPRINTS = 200  # most footprints drawn on the sky
 
 
 def over_detector(camera: CameraModel, right: float = 12.0) -> Panel:
@@ -115,7 +115,7 @@ def distortion_contours(camera: CameraModel) -> Chart:
     return Chart(
         'Distortion magnitude',
         detector_map(np.hypot(*shift.T).reshape(48, 60), camera, ' px'),
-        'Contours of the length of the distortion vectors; a longer one has a thicker line.',
+        'Contours of the length of the distortion vectors; longer ones are thicker.',
     )
 
 
@@ -153,12 +153,12 @@ def mean_residuals(residuals: Residuals, camera: CameraModel) -> Chart:
 
 
 def field_vectors(field: DetectorField, camera: CameraModel) -> Chart:
-    """The residual field beside the lens model as arrows."""
+    """The residual field, which adds to the lens model, as arrows."""
     places = pixel_grid(camera, 17, 13)
     return Chart(
-        'Residual field beside the lens model',
+        'Residual field in addition to the lens model',
         arrows(camera, places, field.displacement_px(places)),
-        'Displacement of a star from its place by the lens model, enlarged to the scale of '
+        'Displacement of a star from its position by the lens model, enlarged to the scale of '
         'the arrow above the figure.',
     )
 
@@ -173,7 +173,7 @@ def arrows(camera: CameraModel, places: Floats, shift_px: Floats) -> Drawing:
 def _draw_arrows(
     panel: Panel, places: Floats, shift_px: Floats, colours: Sequence[str], columns: int
 ) -> None:
-    """Draw displacements, the longest as one of the columns of its places, and their scale."""
+    """Draw displacements, the longest as long as a grid column is wide, and their scale."""
     longest_px = float(np.nanmax(np.hypot(*shift_px.T), initial=0.0))
     if not longest_px > _ROUNDING_PX:
         panel.note('no displacement')
@@ -206,7 +206,7 @@ def line_of_sight_sigma(maps: DetectorMaps, camera: CameraModel, is_alone: bool)
 
 
 def budget_over_detector(parts: Sequence[SigmaPart], camera: CameraModel) -> Chart | None:
-    """1-sigma of the camera alone over the detector, whole and by cause, in one scale."""
+    """1-sigma of the camera alone over the detector, in total and by cause, on one scale."""
     shown = [part for part in parts if part.map_over_detector_arcsec]
     least = _BUDGET_SHARE * max((part.map_arcsec for part in shown), default=0.0)
     shown = [part for part in shown if part.map_arcsec > least][:_BUDGET_MAPS]
@@ -231,7 +231,7 @@ def budget_over_detector(parts: Sequence[SigmaPart], camera: CameraModel) -> Cha
     return Chart(
         'Causes over the detector',
         panels[0].drawing(height, *panels[1:], _bar(last, top, '″')),
-        f'1-sigma of the line of sight of each pixel, camera alone; the largest: {sizes}.',
+        f'1-sigma of the line of sight of each pixel, camera alone; largest values: {sizes}.',
     )
 
 
@@ -299,14 +299,14 @@ def _draw_contours(
 def _label_place(
     panel: Panel, lines: Sequence[Floats], others: Sequence[Floats], half: Floats
 ) -> Floats | None:
-    """Place on the lines of a level, within the frame and farthest from all others, or None."""
+    """Label position on the lines of a level, farthest from other labels; None: no room."""
     low, high = np.sort([[panel.x.start, panel.y.start], [panel.x.end, panel.y.end]], axis=0)
     places = np.concatenate([*lines, np.empty((0, 2))])
     places = places[((places > low + half) & (places < high - half)).all(axis=1)]
     if not len(places):
         return None
     crossing = np.concatenate([*others, np.full((1, 2), -1e4)])
-    # In units of the label: under 1 along both axes they overlap.
+    # In units of the label size: labels overlap if both components are below 1.
     apart = (abs(places[:, None] - crossing) / half).max(axis=-1).min(axis=1)
     best = int(np.argmax(apart))
     return np.asarray(places[best]) if apart[best] > 1.0 else None
@@ -330,7 +330,7 @@ def _coloured(levels: NDArray[Any]) -> NDArray[np.uint8]:
 
 @functools.cache
 def _viridis() -> NDArray[np.uint8]:
-    """Colours (256, 3) BGR; OpenCV makes its own table anew, in 10 ms, for each picture."""
+    """Colours (256, 3) BGR, cached because OpenCV rebuilds its table in 10 ms per picture."""
     shades = np.arange(256, dtype=np.uint8)[:, None]  # OpenCV 5 returns another shape for (256,)
     return np.asarray(cv2.applyColorMap(shades, cv2.COLORMAP_VIRIDIS)[:, 0], np.uint8)
 
@@ -361,7 +361,7 @@ def pointings(observations: Sequence[StarObservations], geometry: CameraGeometry
     for one in placed[::every]:
         seen = Rotation.from_quat(one.icrf_from_star_tracker_xyzw).apply(in_tracker)
         x, y = hammer(np.arctan2(seen[:, 1], seen[:, 0]), np.arcsin(np.clip(seen[:, 2], -1, 1)))
-        # Across the edge of the map a line would run through all of it.
+        # A line across the edge of the map would cross the whole map.
         x = np.where(np.abs(np.diff(x, prepend=x[:1])) > 2.0, np.nan, x)
         panel.curve(Curve(x, y, SERIES[1 if one.refusal else 0], width=1.2))
     below = Panel(panel.x, Scale(0.0, 1.0, bottom + 32.0, bottom + 6.0))
@@ -399,7 +399,7 @@ def write_comparison(found: Comparison, path: Path) -> None:
     """
     Draw the difference of two calibrations over the detector, with and without common rotation.
 
-    Colours and arrows are in pixels; the title has the largest length, in sigmas too if estimated.
+    Colours and arrows are in pixels; the title states the largest length, also in sigmas if known.
 
     Raises OptionError for an ending that is not .svg. Raises ProductError when the file cannot be
     written.

@@ -53,7 +53,7 @@ def slider(calibration: Calibration, residuals: Residuals | None) -> Mapping[str
         'height': camera.height,
         'count': count,
         'images': images,
-        # A typical residual is drawn as long as a fiftieth of the width.
+        # The length of a typical residual is a fiftieth of the width.
         'enlarge': round(float(np.clip(np.log10(0.02 * camera.width / typical_px), 0, 4)), 1),
     }
 
@@ -70,7 +70,7 @@ def refused_images(
     observations: Sequence[StarObservations],
     thumbnails: Sequence[Thumbnail],
 ) -> list[Mapping[str, object]]:
-    """For each reason: its count, the refused images and pictures of some."""
+    """For each reason its count, the refused images, and pictures of some of them."""
     pictures = {t.time_ns: t for t in thumbnails if not t.reason}
     groups: list[Mapping[str, object]] = []
     for reason, count in Counter(counts).most_common():
@@ -112,9 +112,9 @@ def refused_stars(
     observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
 ) -> list[Mapping[str, object]]:
     """
-    For each reason, the most frequent first: its meaning, its count and pictures of some.
+    For each reason, most frequent first: meaning, count, and pictures of some refused stars.
 
-    Each picture is with the stamp and the catalog number of its star.
+    Each picture has the stamp and the catalog number of its star.
     """
     by_time = {o.time_ns: o for o in observations}
     pictures = defaultdict(list)
@@ -137,7 +137,7 @@ def refused_stars(
 def used_images(
     observations: Sequence[StarObservations], thumbnails: Sequence[Thumbnail]
 ) -> list[tuple[Markup, str, int]]:
-    """Picture, stamp and number of stars of images that were used."""
+    """Picture, stamp and number of stars of each used image."""
     stars = {o.time_ns: len(o) for o in observations if not o.refusal}
     return [
         (picture(t), utc_text(t.time_ns), stars[t.time_ns])

@@ -15,7 +15,7 @@ from starcal_ros.report.svg import CHARACTER, Curve, Drawing, named, Panel, Scal
 HEIGHT = 340.0
 
 Range = tuple[float | None, float | None]
-"""Ends of an axis; None: those of the data."""
+"""Limits of an axis; None: the range of the data."""
 
 _MARGIN = 0.04  # of the range of the data, at each end of an axis
 
@@ -36,11 +36,11 @@ def plot(
     under: Callable[[Panel], None] | None = None,
 ) -> Drawing:
     """
-    Curves with axes and a legend, which has room above the curves unless the top is given.
+    Curves with axes and a legend.  The y axis leaves room for it unless its top is given.
 
-    ``log`` holds the letters of the logarithmic axes; ``x_ticks`` and ``y_ticks`` are values and
-    their names, else round numbers; ``is_left`` places the legend; ``under`` draws below the
-    curves.
+    ``log`` holds the letters of the logarithmic axes.  ``x_ticks`` and ``y_ticks`` are values and
+    labels (default: round numbers).  ``is_left`` puts the legend on the left; ``under`` draws
+    below the curves.
     """
     top = 28.0 if title else 10.0
     entries = sum(bool(curve.name) for curve in curves)
@@ -74,7 +74,7 @@ def plot(
 def _ends(
     data: Sequence[ArrayLike], given: Range, is_log: bool, room: float = 0.0
 ) -> tuple[float, float]:
-    """Ends of an axis: those given, else of the finite data with a margin, and room above."""
+    """Given limits of an axis, or those of the finite data with a margin and room above."""
     values = np.concatenate([np.ravel(one).astype(np.float64) for one in data] or [np.empty(0)])
     values = values[np.isfinite(values) & ((values > 0) | (not is_log))]
     low, high = (
@@ -83,7 +83,7 @@ def _ends(
     )
     if is_log:
         low, high = math.log10(low), math.log10(high)
-    # A range below the last digit of a number is none.
+    # A range below rounding errors counts as zero.
     if not high - low > 1e-12 * max(abs(low), abs(high)):
         low, high = low - 0.5 * (given[0] is None), high + 0.5
     span = high - low

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 from starcal.srv import Calibrate
 
 _SERVICES = {'c': 'calibrate', 's': 'solve', 'b': 'rollback', 'x': 'reset'}
-_TRIED = ('solve',)  # as a dry run: it changes nothing, so it is not asked back
+_TRIED = ('solve',)  # a dry run changes nothing, so it needs no confirmation
 HELP = 'c calibrate   s solve, dry run   b roll back   x reset   q quit'
 
 
@@ -43,9 +43,9 @@ class Keys:
         self._answer = ''
 
     def line(self) -> str:
-        """Text to show beside the panels; sends a request once the calibrator is there."""
+        """Text to show above the panels; sends a pending request once the service exists."""
         if self._asked:
-            return f'{self._asked}: press y to confirm, another key to leave it'
+            return f'{self._asked}: press y to confirm, any other key to cancel'
         if not self._wanted:
             return f'{HELP}\n{self._answer}' if self._answer else HELP
         client = self._clients[self._wanted]
@@ -63,7 +63,7 @@ class Keys:
         return f'{HELP}\n{self._answer}'
 
     def press(self, key: str) -> None:
-        """Take a key; others than those of `HELP` cancel a question."""
+        """Handle a key; a key that is not in `HELP` cancels a question."""
         asked, self._asked = self._asked, ''
         name = asked if key == 'y' else _SERVICES.get(key, '')
         if not name or (asked and key != 'y') or self._future is not None:
@@ -76,7 +76,7 @@ class Keys:
 
 @contextlib.contextmanager
 def single_keys() -> Iterator[bool]:
-    """The terminal gives each key at once, without echo; False where there is no terminal."""
+    """Set the terminal to unbuffered keys without echo; False if there is no terminal."""
     if not sys.stdin.isatty():
         yield False
         return

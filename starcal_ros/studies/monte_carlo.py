@@ -45,14 +45,14 @@ Row = dict[str, 'int | float | str']
 
 OUTLIER_SHARE = 0.02
 UNUSED_IMAGES = 20
-ENOUGH = 1.01  # ratio of the residual of unused images to that with the true camera
+ENOUGH = 1.01  # limit on the residual of unused images relative to that with the true camera
 NIGHT_S = 3590.0  # from the first image to the last (paper: 359 at ten seconds)
 
 
 @dataclass(frozen=True)
 class Design:
     """
-    Design of a study; its cells are all combinations of the lists.
+    Design of a study, which has one cell for each combination of the lists.
 
     ``assumed_arcsec`` is the star tracker sigma that the calibration assumes; None: the true one.
     """
@@ -101,7 +101,7 @@ STUDIES: Mapping[str, tuple[str, Design]] = {
 
 
 def check(design: Design) -> None:
-    """Raise OptionError for lists that repeat a value or that the study does not use."""
+    """Raise OptionError for duplicate values in a list, and for a list that the study ignores."""
     if design.study == 'terms' and design.stars:
         raise OptionError(
             '--stars: not applicable to the study terms, which uses the stars of the catalog'
@@ -125,7 +125,7 @@ def run_trial(design: Design, trial: int) -> tuple[Row, ...]:
 
 
 def _cells(design: Design, field: StarField) -> Iterable[tuple[Row, StarField]]:
-    """Numbers of images and stars of each cell, and its part of a field."""
+    """Numbers of images and stars of each cell, and the corresponding subset of a field."""
     for images, stars in itertools.product(design.images, design.stars):
         yield {'images': images, 'stars': stars}, field.part(0, images, stars)
 
@@ -133,7 +133,7 @@ def _cells(design: Design, field: StarField) -> Iterable[tuple[Row, StarField]]:
 def _solutions(
     design: Design, cell: Row, ensemble: Ensemble, field: StarField, tracker_arcsec: float
 ) -> Iterable[tuple[Row, Estimate]]:
-    """Key and errors, and estimate, of each method; without those with too few observations."""
+    """Key with errors, and estimate, of each method that has enough observations."""
     for method in design.methods:
         options = calibration_options(method, design.assumed(tracker_arcsec))
         try:
@@ -177,7 +177,7 @@ def _table1_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
 
 
 def _images_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
-    """Increasing numbers of images of one field, judged on images that were not used."""
+    """Increasing numbers of images of one field, tested on unused images."""
     most = max(design.images)
     field = draw_star_field(rng, most + UNUSED_IMAGES, max(design.stars))
     camera = field.truth.camera
@@ -198,7 +198,7 @@ def _images_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
 
 
 def _terms_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
-    """One night like the paper's: the stars drift past a camera fixed to the Earth."""
+    """One night as in the paper: stars drift through the field of a camera fixed to the Earth."""
     drawn = draw_scenario(rng)
     for images, tracker, method in itertools.product(
         design.images, design.tracker_arcsec, design.methods

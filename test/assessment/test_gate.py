@@ -234,7 +234,7 @@ def test_a_good_calibration_passes() -> None:
             (
                 'residual over predicted sigma at star 5 to 9 is 1.5, over the limit of 1.25 '
                 '(max_cross_validated_residual); not within 5% of 1: star 5 to 9: 1.500; the '
-                'sigma does not hold there: look at the PSF, the lens model or those images'
+                'sigma is wrong there: check the PSF, the lens model or those images'
             ),
         ),
     ],

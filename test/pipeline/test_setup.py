@@ -69,7 +69,7 @@ def test_another_lens_model_starts_from_the_prior_camera(
         640, 480, np.array([160, 0, 155, 322, 236, -0.02, 0.01, -0.004, 5e-4]), 'equidistant'
     )
     write_camera_info(fisheye, tmp_path / 'fisheye.yaml')
-    with pytest.raises(OptionError, match='lens_model: plumb_bob cannot see all of the field'):
+    with pytest.raises(OptionError, match='lens_model: plumb_bob does not cover the field'):
         load_setup(values(tmp_path / 'fisheye.yaml', lens_model='plumb_bob'))
 
 
@@ -199,7 +199,7 @@ def test_zeros_stand_for_an_alignment_not_given(camera_yaml: Path) -> None:
 def test_a_quaternion_of_another_norm_is_refused_with_it(camera_yaml: Path) -> None:
     with pytest.raises(OptionError, match=r'prior_alignment: .* its norm is 1\.1$'):
         load_setup(values(camera_yaml, prior_alignment=[0.0, 0.0, 0.0, 1.1]))
-    with pytest.raises(OptionError, match=r'norm is 90\.559.*angles in degrees are no quat'):
+    with pytest.raises(OptionError, match=r'norm is 90\.559.*angles in degrees are not a quat'):
         load_setup(values(camera_yaml, prior_alignment=[90.0, 0.0, 10.0, 1.0]))
 
 
@@ -231,7 +231,7 @@ def test_a_relative_path_that_leads_nowhere_names_folder_and_remedy(
     """The nodes run in a folder that their caller need not have in mind."""
     monkeypatch.chdir(tmp_path)
     given = {**values(camera_yaml), option: 'here/file'}
-    expected = f'{option}: here/file: No such file in {tmp_path}, .* give its whole path'
+    expected = f'{option}: here/file: no such file in {tmp_path}, .* give the absolute path'
     with pytest.raises(OptionError, match=expected):
         load_setup(given)
     given = {**values(camera_yaml), 'camera_info_url': camera_yaml.name}

@@ -157,10 +157,10 @@ def test_a_bag_without_any_attitude_is_refused(tmp_path: Path) -> None:
         # As star_tracker_frame and camera_frame, whose attitudes and transforms they would be.
         (
             {'more_star_trackers': ['/star_tracker']},
-            "'/star_tracker' is given twice: .* a name of th",
+            "'/star_tracker' is given twice: .* different names",
         ),
         ({'more_star_trackers': ['camera'], 'camera_frame': '/camera'}, "'camera' is given twice"),
-        ({'prior_alignment': 4 * [0.0]}, 'more_star_trackers: prior_alignment is needed'),
+        ({'prior_alignment': 4 * [0.0]}, 'more_alignments needs prior_alignment'),
     ],
 )
 def test_options_that_do_not_go_together(others: dict[str, object], says: str) -> None:

@@ -48,7 +48,7 @@ class Seen:
     health: Mapping[str, tuple[int, str]] = field(default_factory=dict)
 
     def with_image(self, observations: StarObservations) -> Seen:
-        """The same with one more image."""
+        """A copy with one more image."""
         refused = Counter(self.refused)
         if observations.refusal:
             refused[observations.refusal] += 1
@@ -58,7 +58,7 @@ class Seen:
 
 
 class Line(Text):
-    """A line in which characters that act on a terminal are escaped; names come from others."""
+    """A line with control characters escaped, because other processes choose the names."""
 
     def __init__(self, text: str = '', style: str = '') -> None:
         super().__init__(printable(text), style)
@@ -74,7 +74,7 @@ def _lines(lines: Iterable[Text]) -> Text:
 
 
 def view(seen: Seen, keys: str = '') -> Group:
-    """All panels below each other, keys on top if any; they fit in 80 columns."""
+    """All panels in one column of 80 characters, the keys on top if there are any."""
     return Group(
         *(Line(line, 'dim') for line in keys.splitlines()),
         Panel(_images(seen), title='images', title_align='left'),
@@ -131,7 +131,7 @@ def _ensemble(seen: Seen) -> Group | Text:
 
 
 def coverage_text(coverage: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Text:
-    """The detector as shades, two letters for a cell; empty cells in red."""
+    """Coverage of the detector as shades, two characters per cell; empty cells are red."""
     most = max(int(coverage.max(initial=0)), 1)
     lines = [Line(f'most in a cell: {most}')]
     for row in coverage:
@@ -187,7 +187,7 @@ def _calibration(seen: Seen) -> Group | Text:
 
 
 def _gate(calibration: Calibration) -> Table:
-    """Failed checks, then those nearest to their limit."""
+    """Failed checks, then the passed ones closest to their limits."""
     table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column('gate check')
     table.add_column('value', justify='right')
@@ -212,7 +212,7 @@ def _gate(calibration: Calibration) -> Table:
 
 
 def share_of_limit(check: GateCheck) -> float:
-    """How near a check is to its limit: 1 at the limit; 0 without a number or a limit."""
+    """Value of a check as a fraction of its limit; 0 without a number or a limit."""
     if not (np.isfinite(check.found) and np.isfinite(check.limit) and check.limit > 0):
         return 0.0
     if check.is_least:

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Images of a bag that a calibration is restricted to: --from, --to, --first, --every."""
+"""Selection of the images of a bag by --from, --to, --first and --every."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 
 @dataclass(frozen=True)
 class Time:
-    """A time of an option: ``seconds`` since 1970 UTC, or since the first image of the bag."""
+    """Value of a time option: ``seconds`` since 1970 UTC, or since the first image of the bag."""
 
     seconds: float
     since_first_image: bool
@@ -22,10 +22,10 @@ class Time:
 @dataclass
 class Selection:
     """
-    Which images are taken, asked in the order of the bag.
+    Selection of images, queried in the order of the bag.
 
-    Between the times ``start`` and ``end``, both included, every ``every``-th from the first of
-    them on, and ``first`` of those.
+    It takes every ``every``-th image between the times ``start`` and ``end``, both included, and
+    stops after ``first`` images.
     """
 
     start: Time | None = None
@@ -40,7 +40,7 @@ class Selection:
 
     def __call__(self, time_ns: int) -> bool:
         """True if the image of a stamp is taken."""
-        if time_ns not in self._answers:  # a stamp asked again has its answer
+        if time_ns not in self._answers:  # a repeated query gets the same answer
             self._answers[time_ns] = self._takes(time_ns)
         return self._answers[time_ns]
 
@@ -59,12 +59,12 @@ class Selection:
         return self.first is None or self._taken <= self.first
 
     def without_images(self) -> str:
-        """Sentence on a selection that has taken no image."""
+        """Error message for a selection without images."""
         if self._first_ns is None:
-            return '--from, --to, --every: there is no image to choose'
+            return '--from, --to, --every: the bag has no images'
         first, last = (utc_text(time_ns) for time_ns in (self._first_ns, self._last_ns))
         return (
-            f'--from, --to: no image is between these times: the images are of {first} to {last},'
+            f'--from, --to: no image is between these times: the images span {first} to {last},'
             f' +0 to +{(self._last_ns - self._first_ns) / NANOSECONDS_PER_SECOND:g} s'
         )
 
@@ -86,8 +86,8 @@ def parse_time(text: str) -> Time:
             read = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
         except ValueError as error:
             raise argparse.ArgumentTypeError(
-                f'{text!r} is no time: give 2026-05-15T07:20:00, seconds since 1970, or +seconds'
-                ' after the first image'
+                f'{text!r} is not a time: give 2026-05-15T07:20:00, seconds since 1970, or'
+                ' +seconds after the first image'
             ) from error
         with_zone = read if read.tzinfo else read.replace(tzinfo=timezone.utc)
         return Time(with_zone.timestamp(), False)
@@ -99,7 +99,7 @@ def parse_time(text: str) -> Time:
 def selection(
     start: Time | None, end: Time | None, first: int | None, every: int | None
 ) -> Selection | None:
-    """The images that options choose; None: all."""
+    """Selection by the options; None if they select all images."""
     if not (start or end or first or every):
         return None
     return Selection(start, end, first, every or 1)

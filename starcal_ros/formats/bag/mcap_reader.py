@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Intact messages of an MCAP file, damaged or not.
+Reader of the intact messages of an MCAP file, which may be damaged.
 
 A chunk with a wrong checksum is skipped.  If the bytes between chunks are damaged, reading
 continues at the next chunk listed in the summary; if the first chunk with the topic names is lost,
@@ -51,7 +51,7 @@ class RawMessage:
 
     @property
     def data(self) -> bytes:
-        """The message as bytes of its own, which middleware asks for."""
+        """A copy of the message as bytes, because middleware does not accept a view."""
         return bytes(self.view)
 
 
@@ -96,7 +96,7 @@ def read_messages(
             channel = channels.get(record.channel_id)
             schema = schemas.get(channel.schema_id) if channel else None
             if channel is None or schema is None or channel.message_encoding != 'cdr':
-                continue  # its channel was lost with a damaged chunk, or it is not ROS 2
+                continue  # its channel was in a damaged chunk, or it is not a ROS 2 message
             if wanted is None or channel.topic in wanted:
                 definition = schema.data.decode(errors='replace')
                 view = memoryview(record.data)
@@ -189,7 +189,7 @@ class _Pieces:
                 elif not self._has_chunks or isinstance(record, (Schema, Channel)):
                     yield record
                 elif isinstance(record, Message):
-                    # Recorders put all messages into chunks or none: these are damaged bytes.
+                    # Recorders put all messages into chunks or none, so these bytes are damaged.
                     self.report(f'damaged after byte {read_to} of {size}')
                     return self._start_after(read_to)
             self.report(f'damaged before byte {read_to} of {size}: no end-of-data record')
@@ -227,8 +227,8 @@ def _inside(data: bytes) -> Iterator[McapRecord]:
     """
     Records of a decompressed chunk.
 
-    The bytes of a message are a view: a copy of each image would be made under Python's lock,
-    which the other thread waits for.
+    The bytes of a message are a view: copying each image would hold Python's lock and stall the
+    other thread.
     """
     view = memoryview(data)
     start = 0

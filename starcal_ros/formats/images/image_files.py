@@ -1,9 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Images in FITS, TIFF and PNG files: times, pixels in 8 or 16 bit, and the scale of these.
+Images in FITS, TIFF and PNG files: times, pixels in 8 or 16 bit, and their scale.
 
-A ROS image has 8 or 16 bit per pixel.  Whole numbers that fit stay as they are; others, floating
-point above all, are mapped to 16 bit by one scale for all images, which is recorded.
+A ROS image has 8 or 16 bit per pixel.  Integers that fit are kept; other values, mostly floating
+point, are mapped to 16 bit with one recorded scale for all images.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from starcal_ros.untrusted import read_bytes
 
 FITS_ENDINGS = ('.fits', '.fit', '.fts', '.fits.gz', '.fit.gz', '.fits.fz', '.fz')
 _RGB, _GREY = 3, 2
-MOST_VALUES = 2**27  # of an image, all colours: as many as a node takes
+MOST_VALUES = 2**27  # per image, all colours; the nodes have the same limit
 MOST_BYTES = 2**31
 _ROWS = 256  # mapped at a time: an image in double precision can exceed the memory
-_FULL = 65000  # of 16 bit: below the end of the range, which means saturation
+_FULL = 65000  # of 16 bit; the end of the range means saturation
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,10 @@ class ImageOptions:
     """
     How the files are read.
 
-    ``time_key`` is a FITS keyword that holds the middle of the exposure, empty: the standard ones;
-    ``times`` stamps by file name, in place of it; ``hdu`` the FITS extension by number or name,
-    empty: the first image; ``channel`` red, green or blue of a colour image; ``bayer`` the pattern
-    of a mosaic; ``value_range`` the range that is mapped to 16 bit, None: that of the images.
+    ``time_key`` is the FITS keyword of the middle of the exposure (empty: the standard keywords);
+    ``times`` holds stamps by file name, which replace it.  ``hdu`` is the number or name of a FITS
+    extension (empty: the first image), ``channel`` red, green or blue of a colour image, ``bayer``
+    the pattern of a mosaic, ``value_range`` the range mapped to 16 bit (None: that of the images).
     """
 
     time_key: str = ''
@@ -87,7 +87,7 @@ class Scale:
 
     @property
     def is_none(self) -> bool:
-        """True if values are kept."""
+        """True if pixel values are not scaled."""
         return (self.offset, self.step) == (0.0, 1.0)
 
     def to_dn(self, values: NDArray[Any]) -> Pixels:
@@ -182,7 +182,7 @@ def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str,
         values = of_mosaic(values, options.bayer.lower(), options.channel)
     if values.ndim != _GREY or min(values.shape) < 2:
         raise IngestError(
-            f'{path}: of shape {values.shape}, neither an image nor three planes of colour: '
+            f'{path}: array of shape {values.shape}, neither an image nor three colour planes: '
             'write each image to a file of its own'
         )
     return values, header
@@ -196,7 +196,7 @@ def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
         raise IngestError(
             f"{path}: FITS files need astropy: pip install 'starcal_ros[mission]'"
         ) from error
-    if path.exists() and not path.is_file():  # opening a pipe would wait for its writer
+    if path.exists() and not path.is_file():  # opening a pipe would block until it has a writer
         raise IngestError(f'{path}: not a regular file')
     try:
         # Not mapped to memory: scaled data cannot be, and files are read one at a time.
@@ -222,7 +222,7 @@ def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
             values = np.asarray(unit.data)
     except (IngestError, MemoryError):
         raise
-    except Exception as error:  # a damaged file makes astropy raise anything
+    except Exception as error:  # astropy raises any exception on a damaged file
         words = ' '.join(str(error).split())[:160]
         raise IngestError(f'{path}: not readable as FITS: {words}') from error
     values = values.squeeze()
@@ -232,12 +232,12 @@ def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
 
 
 def _cards(header: Any) -> dict[str, Card]:
-    """Cards of a header of astropy, of equal keywords the first."""
+    """Cards of a header of astropy; the first of duplicate keywords counts."""
     found: dict[str, Card] = {}
     for card in header.cards:
         try:
             value = Card(card.value, card.comment)
-        except Exception:  # astropy cannot parse it: it matters where it is needed, as this text
+        except Exception:  # astropy cannot parse it: keep the text, fail only where it is used
             value = Card(str(card.image)[10:].strip())
         found.setdefault(card.keyword, value)
     return found
@@ -245,7 +245,7 @@ def _cards(header: Any) -> dict[str, Card]:
 
 @contextlib.contextmanager
 def _truncation_is_an_error() -> Iterator[None]:
-    """Raise where astropy only warns that a file was cut off; its other warnings are dropped."""
+    """Raise on astropy's warning of a truncated file, and drop its other warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')
         warnings.filterwarnings('error', message='File may have been truncated')
@@ -253,7 +253,7 @@ def _truncation_is_an_error() -> Iterator[None]:
 
 
 def read_values(path: Path) -> NDArray[Any]:
-    """Values (height, width) of an image file of one channel, as they are; raises IngestError."""
+    """Unscaled values (height, width) of a single-channel file; raises IngestError."""
     return _read(path, ImageOptions())[0]
 
 
@@ -264,12 +264,12 @@ def content_of(path: Path) -> bytes:
 
 
 def decoded(path: Path, content: bytes) -> NDArray[Any]:
-    """Values of an image file, not turned by EXIF, colour as BGR; raises IngestError."""
+    """Values of an image file without EXIF rotation, colour as BGR; raises IngestError."""
     values = None
     with contextlib.suppress(cv2.error):
         values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None:
-        raise IngestError(f'{path}: damaged, or of a kind that OpenCV does not read')
+        raise IngestError(f'{path}: damaged, or in a format that OpenCV cannot read')
     return np.asarray(values)
 
 
@@ -278,9 +278,9 @@ def _read_picture(path: Path) -> NDArray[Any]:
     header = png_header(content) or tiff_header(content)
     if header is None:
         raise IngestError(f'{path}: not an image in FITS (by its ending), TIFF or PNG')
-    # None is decoded before its size is known.
+    # The size is checked before anything is decoded.
     if header.width * header.height * header.channels > MOST_VALUES:
-        raise IngestError(f'{path}: claims {header.width} x {header.height} pixels')
+        raise IngestError(f'{path}: its header claims {header.width} x {header.height} pixels')
     if png_header(content) and has_surplus(content, header):
         raise IngestError(f'{path}: inflates to far more than its pixels')
     values = decoded(path, content)
@@ -301,6 +301,6 @@ def _time_ns(path: Path, header: Mapping[str, Card], options: ImageOptions) -> i
 
 
 def number(header: Mapping[str, Card], *keys: str) -> float:
-    """Value of the first of the keywords that has a number; NaN: none has."""
+    """Value of the first keyword with a number; NaN if there is none."""
     values = (header[key].value for key in keys if key in header)
     return next((float(one) for one in values if isinstance(one, (int, float))), math.nan)

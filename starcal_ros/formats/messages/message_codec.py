@@ -3,7 +3,7 @@
 Messages to the plain values of `record_codec` and back, by the types of a record's fields.
 
 The message of a record is ``starcal/msg/<its class>``; a field of the record is the field of that
-name, or of the one that it is `Named`, in these forms:
+name, or of the name given by `Named`, in these forms:
 
 =====================================  ==============================================
 record                                 message
@@ -58,7 +58,7 @@ def record_to_message(record: Any, make: Make) -> Message:
 
 def record_from_message(record_type: type[T], message: Message, path: str = '') -> T:
     """
-    The record of a message; ``path`` is the place of the message in another one.
+    The record of a message; ``path`` is its path within an outer message.
 
     Raises ValueError in one line with the path of the field, its value and what is allowed.
     """
@@ -71,7 +71,7 @@ def message_fields(
     """
     Fields of the message of a record.
 
-    ``values`` are of `plain_record`; a field without a value is left out.  ``frame_id`` is that of
+    ``values`` come from `plain_record`; fields without a value are omitted.  ``frame_id`` is for
     the header.
     """
     fields: dict[str, object] = {}
@@ -123,10 +123,9 @@ def plain_message(record_type: Any, message: Message) -> dict[str, Any]:
     """
     Plain values of the message of a record by the names of its fields; arrays have their shapes.
 
-    Left out are fields that the message does not have, because an older version recorded it.
+    Fields that a message of an older version lacks are omitted.
 
-    Raises ValueError with the name of an array that does not have the size that other fields
-    state.
+    Raises ValueError with the name of an array whose size contradicts other fields.
     """
     values: dict[str, Any] = {}
     sizes: dict[int | str, int] = {}
@@ -170,7 +169,7 @@ def _value(kind: FieldType, found: Any) -> Any:
 def _shaped(
     flat: NDArray[Any], kind: FieldType, field: str, sizes: Mapping[int | str, int]
 ) -> NDArray[Any]:
-    """The flat array of a message in its shape; sizes that nothing states follow from it."""
+    """A flat array of a message in its shape; unstated sizes follow from its length."""
     shape = [size if isinstance(size, int) else sizes.get(size, -1) for size in kind.dimensions]
     if shape.count(-1) == 1:
         known = math.prod(size for size in shape if size >= 0)

@@ -1,11 +1,11 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Calibrations as camera models of OpenCV, kalibr, ROS, NASA's GIANT and mrcal; none holds a field.
+Export to camera models of OpenCV, kalibr, ROS, NASA's GIANT and mrcal; all lose the field.
 
 GIANT's ``OpenCVModel`` is OpenCV's rational model with thin prism, skew (``alpha``) and a focal
 length that depends on temperature (``giant/camera_models/opencv_model.py``, its equations).
-mrcal has OpenCV's models of 5, 8 and 12 coefficients in OpenCV's order, without skew; pixels as
-here; its reference frame stands for the star tracker.
+mrcal has OpenCV's models of 5, 8 and 12 coefficients in OpenCV's order, without skew.  It has the
+pixel convention of starcal; its reference frame represents the star tracker.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from starcal_ros.records import Calibration
 
 # kalibr's word for a lens model, and the parameters that kalibr lacks.
 _KALIBR = {'plumb_bob': ('radtan', ('skew', 'k3')), 'equidistant': ('equidistant', ('skew',))}
-_OF_GIANT = ('plumb_bob', 'rational_polynomial', 'thin_prism')  # special cases of OpenCVModel
+_OF_GIANT = ('plumb_bob', 'rational_polynomial', 'thin_prism')  # within OpenCVModel
 _GIANT_NAMES = {'fx': 'fx', 'fy': 'fy', 'skew': 'alpha', 'cx': 'px', 'cy': 'py'}
 _MRCAL = {
     'plumb_bob': 'LENSMODEL_OPENCV5',
@@ -35,9 +35,9 @@ _MRCAL = {
 
 def opencv_yaml(calibration: Calibration) -> tuple[str, Fitted]:
     """
-    YAML for ``cv2.FileStorage``: camera matrix, distortion, rotation; and the camera in it.
+    YAML for ``cv2.FileStorage`` (camera matrix, distortion, rotation), and the exported camera.
 
-    ``distortion_coefficients`` are those of ``cv2.projectPoints``, of ``cv2.fisheye`` where
+    ``distortion_coefficients`` are for ``cv2.projectPoints``, or for ``cv2.fisheye`` if
     ``lens_model`` is ``fisheye``.
     """
     found = fitted(calibration, calibration.geometry.camera.model, ('skew',))
@@ -61,10 +61,10 @@ def opencv_yaml(calibration: Calibration) -> tuple[str, Fitted]:
 
 def kalibr_yaml(calibration: Calibration, topic: str) -> tuple[str, Fitted]:
     """
-    A camchain of kalibr with one camera, and the camera in it.
+    A camchain of kalibr with one camera, and the exported camera.
 
-    The star tracker stands for the IMU: ``T_cam_imu`` is the alignment without translation.  Of
-    ``radtan`` and ``equidistant``, the model with the smaller error.
+    The star tracker takes the place of the IMU: ``T_cam_imu`` is the alignment without
+    translation.  The model is ``radtan`` or ``equidistant``, whichever has the smaller error.
     """
     candidates = [(fitted(calibration, m, zero), word) for m, (word, zero) in _KALIBR.items()]
     found, word = min(candidates, key=lambda candidate: candidate[0].worst_px)
@@ -105,13 +105,13 @@ def transform_yaml(calibration: Calibration) -> str:
 
 def giant_json(calibration: Calibration) -> tuple[str, Fitted]:
     """
-    JSON whose ``OpenCVModel`` holds the keyword arguments of the model; and the camera in it.
+    JSON with the keyword arguments of GIANT's ``OpenCVModel``, and the exported camera.
 
-    ``star_tracker_from_camera_xyzw`` is beside them: GIANT has no alignment in a camera model.
+    ``star_tracker_from_camera_xyzw`` is a separate key: a camera model of GIANT has no alignment.
     """
     own = calibration.geometry.camera.model
     found = fitted(calibration, own if own in _OF_GIANT else 'thin_prism', ())
-    # GIANT has the change of the focal length with temperature: it is no loss.
+    # GIANT models the change of the focal length with temperature, so it is not a loss.
     losses = tuple(loss for loss in found.losses if 'focal' not in loss.part)
     found = dataclasses.replace(found, losses=losses)
     camera = found.camera
@@ -137,7 +137,7 @@ def giant_json(calibration: Calibration) -> tuple[str, Fitted]:
 
 
 def mrcal_cameramodel(calibration: Calibration) -> tuple[str, Fitted]:
-    """Text for ``mrcal.cameramodel``, and the camera in it; ``extrinsics`` are rt_cam_ref."""
+    """Text for ``mrcal.cameramodel``, and the exported camera; ``extrinsics`` are rt_cam_ref."""
     own = calibration.geometry.camera.model
     found = fitted(calibration, own if own in _MRCAL else 'thin_prism', ('skew',))
     camera = found.camera

@@ -2,10 +2,10 @@
 """
 CCSDS attitude and orbit ephemerides (AEM, OEM), KVN or XML.
 
-Sources: CCSDS 504.0-B (ADM) and 502.0-B (ODM).  A quaternion A to B of an AEM gives, as frame
-transformation, coordinates in B from those in A; as rotation operator, as in ROS and here, it
-takes coordinates in B to those in A.  AEM 1.0 states direction and order of its quaternions by
-keywords; in AEM 2.0 they are A to B, scalar last.
+Sources: CCSDS 504.0-B (ADM) and 502.0-B (ODM).  A quaternion A to B of an AEM is a frame
+transformation: it converts coordinates in A to coordinates in B.  Read as a rotation operator, as
+in ROS and in starcal, the same numbers convert coordinates in B to coordinates in A.  AEM 1.0 has
+keywords for direction and order of its quaternions; in AEM 2.0 they are A to B, scalar last.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _KVN = re.compile(rb'^\s*CCSDS_\w+_VERS\s*=', re.MULTILINE)
 # ATTITUDE_TYPE -> numbers of a line, of which four are the quaternion.
 _NUMBERS = {'QUATERNION': 4, 'QUATERNION/DERIVATIVE': 8}
 _TYPES = {'1.0': {**_NUMBERS, 'QUATERNION/RATE': 7}, '2.0': {**_NUMBERS, 'QUATERNION/ANGVEL': 7}}
-# Angles about the axes of EULER_ROT_SEQ in turn, deg; 1.0 writes XYZ as 123.
+# Angles about the successive axes of EULER_ROT_SEQ, deg; AEM 1.0 writes XYZ as 123.
 _EULER_TYPES = {
     '1.0': {'EULER_ANGLE': 3, 'EULER_ANGLE/RATE': 6},
     '2.0': {'EULER_ANGLE': 3, 'EULER_ANGLE/DERIVATIVE': 6, 'EULER_ANGLE/ANGVEL': 6},
@@ -54,9 +54,9 @@ def read_aem(path: Path, star_tracker: str = '') -> mission_records.Attitudes:
     """
     Attitudes of an AEM: quaternions or, in KVN, Euler angles.
 
-    ``star_tracker`` is the body frame, if it has several.
+    ``star_tracker`` selects the body frame if the file has several.
 
-    Raises IngestError when the file cannot be read, is no AEM, or names a time system or frames
+    Raises IngestError when the file cannot be read, is not an AEM, or has a time system or frames
     that cannot be converted.
     """
     segments = read_segments(path, 'AEM')
@@ -90,7 +90,7 @@ def read_oem(path: Path, at_ns: Sequence[int]) -> mission_records.Velocities:
     """
     Barycentric velocities at stamps (n,), interpolated in the segments of an OEM.
 
-    The velocity of the Earth or of the Sun is added where the ephemeris is about one of them.
+    The velocity of the Earth or of the Sun is added if it is the centre of the ephemeris.
     Raises IngestError when the file cannot be read, does not cover a stamp, or names a centre, a
     time system or a frame that cannot be converted.
     """
@@ -123,19 +123,19 @@ def read_oem(path: Path, at_ns: Sequence[int]) -> mission_records.Velocities:
 
 
 def _keyword(segment: Segment, key: str, *values: str) -> str:
-    """Value of a keyword that is needed, one of ``values`` if there are any."""
+    """Value of a required keyword; it must be one of ``values`` unless that is empty."""
     found = segment.metadata.get(key, '').upper()
     if not found or (values and found not in values):
         expected = f' {" or ".join(values)}' if values else ''
         raise ValueError(
-            f'keyword {key} is {found or "missing"}, and version {segment.version} needs'
-            f' it{expected}: ask who wrote the file'
+            f'keyword {key} is {found or "missing"}, but version {segment.version} requires'
+            f' it{expected}: ask the producer of the file'
         )
     return found
 
 
 def _frames(segment: Segment) -> tuple[str, str, bool]:
-    """Inertial frame, body frame, and whether frame A is the inertial one."""
+    """Inertial frame, body frame, and True if frame A is the inertial one."""
     a, b = (_keyword(segment, f'REF_FRAME_{name}') for name in 'AB')
     if mission_records.is_inertial(a) == mission_records.is_inertial(b):
         raise ValueError(
@@ -145,7 +145,7 @@ def _frames(segment: Segment) -> tuple[str, str, bool]:
 
 
 def _quaternions(segment: Segment) -> tuple[Floats, bool]:
-    """Quaternions (n, 4), scalar last, and whether they are from A to B."""
+    """Quaternions (n, 4), scalar last, and True if they are from A to B."""
     is_old = segment.version == '1.0'
     is_a_to_b = not is_old or _keyword(segment, 'ATTITUDE_DIR', 'A2B', 'B2A') == 'A2B'
     kind = _keyword(segment, 'ATTITUDE_TYPE')
@@ -165,18 +165,18 @@ def _of_euler_angles(segment: Segment, count: int) -> Floats:
     """
     Quaternions (n, 4) of Euler angles.
 
-    The frame is turned about each of its own axes in turn, so the composition of the rotations
-    in this order takes coordinates in the last frame to those in the first.
+    Each rotation is about an axis of the frame that the rotation before it produced, so their
+    product in this order converts coordinates in the last frame to coordinates in the first.
     """
     sequence = _keyword(segment, 'EULER_ROT_SEQ').translate(_AXES)
     if not _SEQUENCE.fullmatch(sequence):
-        raise ValueError(f'EULER_ROT_SEQ = {sequence[:20]} is not a sequence as ZXZ')
+        raise ValueError(f'EULER_ROT_SEQ = {sequence[:20]} is not a sequence such as ZXZ')
     angles = _numbers(segment, (count,))[:, :3]
     return np.asarray(Rotation.from_euler(sequence, angles, degrees=True).as_quat())
 
 
 def _numbers(segment: Segment, counts: Sequence[int]) -> Floats:
-    """Numbers (n, k) of a segment, k one of ``counts`` and the same for each epoch."""
+    """Numbers (n, k) of a segment; k is the same for all epochs and one of ``counts``."""
     if not segment.values:
         raise ValueError('a segment without data')
     count = len(segment.values[0])
@@ -203,7 +203,7 @@ def _stamps(segment: Segment, system: str) -> Indices:
 
 
 def _useable(segment: Segment, at: Indices, system: str) -> NDArray[np.bool_]:
-    """Stamps within the useable span of a segment; the other states are for interpolation."""
+    """Mask of stamps in the usable span of a segment; outer states are for interpolation only."""
     keep = np.ones(len(at), np.bool_)
     if 'USEABLE_START_TIME' in segment.metadata:
         keep &= at >= from_text(segment.metadata['USEABLE_START_TIME'], system)

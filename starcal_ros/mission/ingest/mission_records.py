@@ -39,7 +39,7 @@ class Attitudes:
     by_stars : bool
         The star tracker is the camera itself, and the attitudes are by its own stars.
     rows_upward : bool
-        The attitudes are of the FITS images turned upside down.
+        The attitudes are for FITS images with the order of their rows reversed.
     """
 
     time_ns: NDArray[np.int64]

@@ -2,9 +2,9 @@
 """
 Attitudes of images from their World Coordinate System: FITS headers, .wcs files of astrometry.net.
 
-The attitude is that of the camera, with its axis in the middle of the image.  The y axis of a FITS
-image usually points up, so that its rows, read as those of a camera, mirror the sky: such images
-are turned upside down.
+The attitude is that of the camera, with its axis in the middle of the image.  The first row of a
+FITS image is usually the lowest.  Read as an image of a camera, whose first row is the highest, it
+mirrors the sky, so the order of its rows is reversed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from starcal_ros.mission.ingest.mission_records import Attitudes, EME2000_NOTE, 
 from starcal_ros.pipeline.from_stars import pinhole
 
 _MAGIC = b'SIMPLE  ='
-_GRID = 5  # points a side, between which the attitude balances the distortion of the solution
+_GRID = 5  # points per side; the attitude fits them all, which averages the distortion
 
 
 def is_solution(path: Path) -> bool:
@@ -36,25 +36,27 @@ def is_solution(path: Path) -> bool:
 
 def read_wcs(paths: Sequence[Path], images: Sequence[ImageFile]) -> Attitudes:
     """
-    Attitudes of the camera at the stamps of images, from the files with the names of these.
+    Attitudes of the camera at the stamps of images, from files with the names of the images.
 
-    Raises IngestError when an image has no file of its name, or a file no celestial WCS.
+    Raises IngestError when an image has no such file, or a file has no celestial WCS.
     """
     by_name = {_name(path): path for path in paths}
     missing = [one.path for one in images if _name(one.path) not in by_name]
     if missing:
         raise IngestError(
-            f'{missing[0]}: no file of its name among those of --attitude ({len(missing)} of'
+            f'{missing[0]}: --attitude has no file of this name ({len(missing)} of'
             f' {len(images)} images): solve it, or leave it out of --images'
         )
     solved = [_attitude(by_name[_name(one.path)], one) for one in images]
-    # Programs turn a picture upside down for FITS: only the rows of FITS files are in question.
+    # Programs reverse the rows when they write FITS, so only FITS files can be affected.
     upward = {up for (_, up), one in zip(solved, images, strict=True) if _is_fits(one.path)}
     if len(upward) > 1:
-        raise IngestError('some FITS images mirror the sky and others do not: import each apart')
-    notes = ['the attitudes are by the stars of the images: no alignment is estimated']
+        raise IngestError(
+            'some FITS images mirror the sky and others do not: import them separately'
+        )
+    notes = ['the attitudes come from the stars of the images: no alignment is estimated']
     if True in upward:
-        notes.append('the rows of the FITS images count from the bottom: turned upside down')
+        notes.append('the rows of the FITS images count from the bottom: their order is reversed')
     return Attitudes(
         np.array([one.time_ns for one in images], np.int64),
         np.array([attitude.as_quat() for attitude, _ in solved]),
@@ -73,7 +75,7 @@ def _is_fits(path: Path) -> bool:
 
 
 def _attitude(path: Path, image: ImageFile) -> tuple[Rotation, bool]:
-    """The rotation ``icrf_from_camera``, and whether the rows of the image point up."""
+    """The rotation ``icrf_from_camera``, and True if the rows of the image count upwards."""
     wcs = _celestial(path)
     across, down = np.linspace(0, image.width - 1, _GRID), np.linspace(0, image.height - 1, _GRID)
     pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
@@ -110,16 +112,16 @@ def _celestial(path: Path) -> Any:
         ) from error
     try:
         with warnings.catch_warnings(), path.open('rb') as file:
-            warnings.simplefilter('ignore')  # of keywords that astropy mends
+            warnings.simplefilter('ignore')  # warnings about keywords that astropy repairs
             with fits.open(file, memmap=False) as units:
                 found = [WCS(unit.header) for unit in units if 'CTYPE1' in unit.header]
-    except Exception as error:  # astropy raises whatever a damaged file brings about
+    except Exception as error:  # astropy raises any exception on a damaged file
         words = ' '.join(str(error).split())[:160]
         raise IngestError(f'{path}: no WCS can be read: {words}') from error
     wcs = next((one.celestial for one in found if one.has_celestial), None)
     if wcs is None:
-        raise IngestError(f'{path}: no celestial WCS in it: solve the image first')
-    # astropy fills in the frame: FK5 with an equinox alone, ICRS with neither.
+        raise IngestError(f'{path}: has no celestial WCS: solve the image first')
+    # astropy adds a missing frame: FK5 if only an equinox is given, otherwise ICRS.
     axes, equinox = wcs.wcs.radesys, wcs.wcs.equinox
     kinds = [str(kind)[:2] for kind in wcs.wcs.ctype]
     if kinds != ['RA', 'DE'] or not (axes == 'ICRS' or (axes == 'FK5' and equinox == 2000.0)):

@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Quaternion order, direction and clock with which attitudes fit images of known rotation.
+Order, direction and clock of the attitudes, found from images of known rotation.
 
 Each attitude, with the rotation of the camera, gives the alignment of the camera.  In the right
 order, direction and clock, all attitudes give the same alignment.
@@ -26,11 +26,11 @@ from starcal_ros.pipeline.setup import Setup
 _AGREE_RAD = math.radians(0.5)  # alignments of one reading that agree
 CLOCK_SEARCH_S = 61.0
 _COARSE_STEP_S, _FINE_STEP_S = 0.25, 0.025
-_CLEAR = 3.0  # ratio of the scatters above which the better of two readings is the right one
+_CLEAR = 3.0  # least ratio of the scatters at which the better of two readings is accepted
 _CLOCK_LEAST_RAD = math.radians(0.02)  # a clock error causes more scatter than this
-_CLOCK_IMAGES = 3  # fewest: the shift itself takes part of what two images show
-_ALIKE_RAD = math.radians(0.003)  # a scatter under this is that of the stars
-_WRONG_ALIGNMENT_RAD = math.radians(25.0)  # chance alone comes so near in one case of 200
+_CLOCK_IMAGES = 3  # fewest: estimating the shift absorbs part of the information of two images
+_ALIKE_RAD = math.radians(0.003)  # a smaller scatter is due to the stars
+_WRONG_ALIGNMENT_RAD = math.radians(25.0)  # chance agreement is this close in one case of 200
 _DIRECTIONS = ('st_to_inertial', 'inertial_to_st')
 _ROLLS = [Rotation.from_euler('z', 90.0 * turns, degrees=True) for turns in range(4)]
 _NORM_TOLERANCE = 1e-3
@@ -38,14 +38,14 @@ _NORM_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class WireAttitudes:
-    """Attitudes as they were sent: stamps (n,), ns, and the four numbers (n, 4) in their order."""
+    """Attitudes as received: stamps (n,), ns, and four numbers (n, 4) in the order received."""
 
     time_ns: NDArray[np.int64]
     quaternion: Floats
 
 
 def wire_attitudes(stamps_ns: Sequence[int], quaternions: Sequence[Floats]) -> WireAttitudes:
-    """Attitudes that are rotations, in time order, their numbers as they were sent."""
+    """Valid rotations among the attitudes, in time order, the numbers as received."""
     numbers = np.array(quaternions, np.float64).reshape(-1, 4)
     norm = np.linalg.norm(numbers, axis=1)
     good = np.abs(norm - 1.0) <= _NORM_TOLERANCE  # false for NaN
@@ -55,7 +55,7 @@ def wire_attitudes(stamps_ns: Sequence[int], quaternions: Sequence[Floats]) -> W
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to read the attitudes, and the alignment (in the mean) that it gives."""
+    """One interpretation of the attitudes, and the mean alignment that follows."""
 
     order: str
     direction: str
@@ -68,13 +68,13 @@ class Reading:
         return f'{self.direction} ({", ".join(self.order)})'
 
     def off_by(self, prior: Rotation) -> tuple[float, float]:
-        """Errors of a prior alignment in pointing and in roll, given the one found, rad."""
+        """Errors of a prior alignment against the one found, in pointing and in roll, rad."""
         axes = (prior.inv() * self.star_tracker_from_camera).as_matrix()
         tilt_rad = math.acos(min(max(float(axes[2, 2]), -1.0), 1.0))
         return tilt_rad, math.atan2(float(axes[1, 0]), float(axes[0, 0]))
 
     def is_off(self, prior: Rotation) -> bool:
-        """True if a prior alignment is farther off than is searched."""
+        """True if a prior alignment is off by more than the search radius."""
         tilt_rad, roll_rad = self.off_by(prior)
         return tilt_rad > ACQUISITION_RADIUS_RAD or abs(roll_rad) > ACQUISITION_ROLL_RAD
 
@@ -96,7 +96,7 @@ def prior_alignment(setup: Setup) -> Rotation | None:
 
 
 def _ways(setup: Setup) -> list[tuple[str, str]]:
-    """Orders and directions of the attitudes, those set up first."""
+    """Orders and directions of the attitudes; the configured one is first."""
     given = setup.attitude.attitude_direction
     directions = sorted(_DIRECTIONS, key=lambda name: name != given)
     return [(order, direction) for order in ('xyzw', 'wxyz') for direction in directions]
@@ -104,7 +104,7 @@ def _ways(setup: Setup) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class Case:
-    """Images of known rotation, the attitudes sent about them, and the set-up."""
+    """Images of known rotation, the attitudes received near them, and the set-up."""
 
     solved: Sequence[Solved]
     attitudes: WireAttitudes
@@ -114,8 +114,8 @@ class Case:
         """
         Reading that fits at least one image, the configured one if it does; None if none fits.
 
-        Images that do not rotate fit every reading: then the prior alignment decides.  If it
-        supports none, the result is None.
+        If the images do not rotate, every reading fits and the prior alignment decides; the
+        result is None if it supports no reading.
         """
         fit = self._fitting(self.readings())
         least_rad = min((reading.scatter_rad for reading in fit), default=math.inf)
@@ -129,11 +129,11 @@ class Case:
         return self._likeliest(fit)
 
     def readings(self) -> list[Reading]:
-        """Every reading with the alignments it gives, the one set up first."""
+        """Every reading with its alignments; the configured one is first."""
         return [self._reading(way, 0.0) for way in _ways(self.setup)]
 
     def _fitting(self, found: Sequence[Reading]) -> list[Reading]:
-        """Readings under which most of the images agree, and about as many as under the best."""
+        """Readings supported by most images, and by about as many as the best reading."""
         images = len(self.solved)
         enough = images if images < 3 else max(3, math.ceil(0.6 * images))
         if self.setup.is_aligned and images == 3:
@@ -175,7 +175,7 @@ class Case:
         return _agreed(read.inv() * icrf_from_camera, way, shift_s)
 
     def _shifted(self) -> Reading | None:
-        """The reading and the shift of the stamps that most images agree under; None: none."""
+        """The reading and stamp shift that most images support; None if there is none."""
         coarse = np.arange(-CLOCK_SEARCH_S, CLOCK_SEARCH_S + 1e-9, _COARSE_STEP_S)
         fine = np.arange(-0.3, 0.3 + 1e-9, _FINE_STEP_S)
         found = []
@@ -189,9 +189,9 @@ class Case:
 
 def expected_rotations(attitudes: WireAttitudes, setup: Setup, time_ns: int) -> list[Rotation]:
     """
-    The rotations ``camera_from_icrf`` of an image by each reading, the one set up first.
+    Rotations ``camera_from_icrf`` of an image by each reading; the configured one is first.
 
-    With those of a camera that is rolled by quarter turns; none without a prior alignment.
+    They include cameras rolled by quarter turns.  Empty without a prior alignment.
     """
     prior = prior_alignment(setup)
     if prior is None:
@@ -218,9 +218,9 @@ def _read_at(
     attitudes: WireAttitudes, at_ns: NDArray[np.int64], way: tuple[str, str], setup: Setup
 ) -> tuple[Rotation | None, NDArray[np.bool_]]:
     """
-    Rotations ``icrf_from_star_tracker`` at those of the stamps (n,) that are marked.
+    Rotations ``icrf_from_star_tracker`` at the selected stamps of (n,).
 
-    Left out are stamps where no two samples are near enough; None if there is no other.
+    Stamps without two samples near enough are omitted; None if no stamp remains.
     """
     order, direction = way
     times = attitudes.time_ns
@@ -245,7 +245,7 @@ def _rank(reading: Reading) -> tuple[int, float]:
 
 
 def _middle_of_best(tried: Sequence[Reading]) -> Reading:
-    """The best of shifts; where a range is as good, as for a camera at rest, its middle."""
+    """The best shift; the middle of equally good ones, which a camera at rest has."""
     best = min(tried, key=_rank)
     limit_rad = max(1.2 * best.scatter_rad, _ALIKE_RAD)
     by_shift = sorted(tried, key=lambda r: r.shift_s)

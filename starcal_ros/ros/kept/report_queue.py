@@ -3,9 +3,9 @@
 Reports of a calibrator: folders with the files of ``starcal calibrate``, in its state folder.
 
 ``report/`` is for the active calibration, ``candidate_report/`` for the last one that the gate
-refused.  A thread writes the products; a separate process renders the page from them, so that
-neither a solve nor a message waits for a picture, and an error there reaches the node only as a
-sentence.
+refused.  A thread writes the products, and a separate process renders the page from them.
+Therefore neither a solve nor a message waits for a picture, and an error in the process reaches
+the node only as text.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from starcal_ros.records import Calibration, StarObservations
 
 ACTIVE, CANDIDATE = 'report', 'candidate_report'
 
-_METADATA_OF_0_1 = 'metadata.yaml'  # of observations.mcap, which has none any more
-_NICENESS = 10  # the star observer goes first
-_LONGEST_PAGE_S = 600.0  # a page takes seconds; a processor may be slow and a disk hang
+_METADATA_OF_0_1 = 'metadata.yaml'  # beside observations.mcap in version 0.1, no longer written
+_NICENESS = 10  # the star observer has priority
+_LONGEST_PAGE_S = 600.0  # a page takes seconds; a slow processor or a hanging disk takes longer
 _LONGEST_CLOSE_S = 5.0  # a disk that hangs must not hold the node
 
 
@@ -54,19 +54,19 @@ class CalibratorReports:
     Parameters
     ----------
     on_page : callable
-        Called from a separate thread with the path of a page and the reason why it is missing, in
-        one line; empty where it is there.
+        Called from a separate thread with the path of a page and one line with the reason why it
+        is missing; the line is empty if the page exists.
 
     Attributes
     ----------
     trouble : str
-        Why the last page is missing; empty where it is there.
+        Reason why the last page is missing; empty if it exists.
     """
 
     def __init__(self, on_page: Callable[[Path, str], None]) -> None:
         self.trouble = ''
         self._on_page = on_page
-        # For all below; never held while waiting for a disk or a process.
+        # Protects the attributes below; never held while waiting for a disk or a process.
         self._lock = threading.Lock()
         self._state_dir: Path | None = None
         self._frame_id = ''
@@ -175,12 +175,11 @@ def _replace(folder: Path, subject: Subject, frame_id: str) -> None:
     """
     Replace the folder by one with new products, without a page yet.
 
-    Raises ArchiveError when the folder holds other files than those of a report: they are not
-    removed.
+    Raises ArchiveError when the folder has files that are not of a report; they are kept.
     """
     foreign = sorted(_names_in(folder) - set(product_folder.PRODUCT_FILES) - {_METADATA_OF_0_1})
     if foreign:
-        raise ArchiveError(f'{folder}: holds {foreign[0]}, which is not of a report')
+        raise ArchiveError(f'{folder}: holds {foreign[0]}, which is not a file of a report')
     new, old = (folder.with_name(f'.{folder.name}.{which}') for which in ('new', 'old'))
     _tidy(folder, new, old)
     try:
@@ -197,14 +196,14 @@ def _replace(folder: Path, subject: Subject, frame_id: str) -> None:
 
 
 def _names_in(folder: Path) -> set[str]:
-    """Names of the files in a folder but unfinished ones; none if there is no such folder."""
+    """Names of the finished files in a folder; none if there is no such folder."""
     if not folder.is_dir():
         return set()
     return {path.name for path in folder.iterdir() if not path.name.endswith(PART)}
 
 
 def _tidy(folder: Path, new: Path, old: Path) -> None:
-    """Remove the temporary folders; restore the old one where there is no new one."""
+    """Remove the temporary folders; restore the old folder if there is no new one."""
     shutil.rmtree(new, ignore_errors=True)
     if old.exists() and not folder.exists():
         old.rename(folder)

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Subscriptions, and the publishers that they cannot connect to: reported, or adapted to."""
+"""Subscriptions of a node, which adapt to incompatible publishers or report them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Of a topic whose last message a later subscriber receives too."""
+"""Profile of a topic whose last message also reaches later subscribers."""
 
 
 def with_reliability(qos: QoSProfile, reliability: ReliabilityPolicy) -> QoSProfile:
@@ -46,8 +46,8 @@ class Inputs:
     The subscriptions of a node, each in a callback group of its own unless one is given.
 
     DDS does not connect a reliable subscription to a best-effort publisher. An adaptive
-    subscription is created again as best effort if a publisher offers no more; messages of
-    reliable publishers are then not sent again if lost.  The ROS parameter
+    subscription is created again as best effort if a publisher offers only that; lost messages of
+    reliable publishers are then not repeated.  The ROS parameter
     ``qos_overrides.<topic>.subscription.reliability`` fixes the reliability of such a
     subscription. Safe to use from several threads.
     """
@@ -88,7 +88,7 @@ class Inputs:
 
     def incompatible(self) -> list[str]:
         """
-        Adapt to the publishers there are; the topics of which something is not received, and why.
+        Adapt to the current publishers; return each topic with lost messages, and the reason.
 
         Topics have their names on the graph, after remapping.
         """
@@ -104,7 +104,7 @@ class Inputs:
             one.qos = lower
             self._node.destroy_subscription(one.subscription)
             self._subscribe(one)
-            self._node.get_logger().info(f'{name}: taken as best effort, as it is offered')
+            self._node.get_logger().info(f'{name}: received as best effort, as offered')
             refused = [qos for qos in refused if not _connects(qos, lower)]
         return [f'{name}: a publisher offers {_lacking(qos, one.qos)}' for qos in refused]
 
@@ -123,13 +123,13 @@ class Inputs:
 
 def _reliability_override(node: Node, topic: str) -> QoSOverridingOptions | None:
     """
-    Options that apply the user's override of the reliability of a subscription, if one is given.
+    Options that apply the user's override of the reliability of a subscription.
 
-    Without one nothing is declared: rclpy would take the default for the user's choice when an
-    adaptive subscription is created again.
+    Without an override nothing is declared.  Otherwise rclpy would mistake the default for the
+    user's choice when an adaptive subscription is created again.
     """
     name = f'qos_overrides.{node.resolve_topic_name(topic)}.subscription.reliability'
-    given = name in getattr(node, '_parameter_overrides', {})  # rclpy has no other access to it
+    given = name in getattr(node, '_parameter_overrides', {})  # rclpy has no public access to it
     return QoSOverridingOptions([QoSPolicyKind.RELIABILITY]) if given else None
 
 
@@ -138,7 +138,7 @@ def _connects(offered: QoSProfile, asked: QoSProfile) -> bool:
 
 
 def _lacking(offered: QoSProfile, asked: QoSProfile) -> str:
-    """The policies of an offer that does not suffice."""
+    """The insufficient policies of a publisher."""
     lacking = []
     if (asked.reliability, offered.reliability) == (
         ReliabilityPolicy.RELIABLE,

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Mistakes of a set-up, made on purpose in a simulated bag to rehearse how they are found."""
+"""Deliberate mistakes of a set-up in a simulated bag, to practise their diagnosis."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.records import CameraGeometry, Image
 
-_AXIS = (0.8, 0.6, 0.0)  # of a wrong alignment: across the line of sight
+_AXIS = (0.8, 0.6, 0.0)  # axis of the alignment error, perpendicular to the line of sight
 
 
 @dataclass(frozen=True)
 class Mistakes:
     """
-    Mistakes of a bag and its parameter file; the defaults are none.
+    Mistakes of a bag and its parameter file; none by default.
 
     Attributes
     ----------
@@ -28,15 +28,15 @@ class Mistakes:
     rotate_deg : int
         Images are turned counterclockwise by 90, 180 or 270 degrees.
     attitude_direction, quaternion_order : str
-        'inertial_to_st', 'wxyz': attitudes are sent so, and read as if they were not.
+        'inertial_to_st', 'wxyz': the attitudes of the bag, contrary to the parameter file.
     alignment_error_deg, focal_error_percent : float
-        Of the prior.
+        Errors of the prior.
     clock_error_s : float
-        Stamps of images are late by this.
+        Delay of the stamps of images.
     smear_px : int
-        Length of the streak that a star becomes, along +x.
+        Length of the streak of each star, along +x.
     gamma : float
-        Images are light to the power 1 / gamma.
+        Pixel values are proportional to light to the power 1 / gamma.
     """
 
     flip: str = ''
@@ -50,7 +50,7 @@ class Mistakes:
     gamma: float = 1.0
 
     def image(self, image: Image) -> Image:
-        """An image as it is written."""
+        """The image with its mistakes, as written to the bag."""
         pixels = image.pixels
         full = float(np.iinfo(pixels.dtype).max if pixels.itemsize == 1 else pixels.max())
         if self.smear_px > 1:
@@ -67,14 +67,14 @@ class Mistakes:
         return Image(image.time_ns + late_ns, turned.copy())
 
     def attitude(self, icrf_from_star_tracker_xyzw: Floats) -> Floats:
-        """An attitude as it is written."""
+        """The attitude with its mistakes, as written to the bag."""
         sent = np.asarray(icrf_from_star_tracker_xyzw)
         if self.attitude_direction == 'inertial_to_st':
             sent = sent * [-1.0, -1.0, -1.0, 1.0]
         return sent[[3, 0, 1, 2]] if self.quaternion_order == 'wxyz' else sent
 
     def prior(self, prior: CameraGeometry) -> CameraGeometry:
-        """The prior as it is written."""
+        """The prior with its mistakes, as written to the parameter file."""
         fx, fy = (float(prior.camera.parameters[k]) for k in (0, 2))
         grown = 1.0 + self.focal_error_percent / 100.0
         turn = Rotation.from_rotvec(math.radians(self.alignment_error_deg) * np.array(_AXIS))
@@ -94,7 +94,7 @@ def _smeared(pixels: Pixels, length_px: int) -> Floats:
 
 
 def _as_before(changed: Floats, before: Pixels, full: float) -> Pixels:
-    """Pixels of the type of those before, clipped at their end of range."""
+    """Pixels converted to the given type and clipped to its range."""
     clipped = np.clip(np.rint(changed), 0.0, full)
     return clipped.astype(np.uint8) if before.itemsize == 1 else clipped.astype(np.uint16)
 

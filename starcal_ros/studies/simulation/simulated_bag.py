@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Simulated scenarios as bags, with files of their truth and of the prior of a calibration."""
+"""Writer of simulated scenarios: a bag, its truth, and the files to calibrate it."""
 
 from __future__ import annotations
 
@@ -106,8 +106,8 @@ def write_bag(
 
     A bag folder holds ``truth.json``, ``params.yaml`` and ``camera.yaml``; for a single file
     ``NAME.mcap`` they are ``NAME.json``, ``NAME_params.yaml`` and ``NAME_camera.yaml``. Raises
-    BagError when a file cannot be written, or one that is not of a simulated bag would be
-    replaced.
+    BagError when a file cannot be written, or when it would replace a file that is not from a
+    simulated bag.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def write_bag(
     on_image : callable
         Called with the index of each image written.
     mistakes : Mistakes
-        Made in the bag and in the files to calibrate it; the truth file names them.
+        Mistakes of the bag and of the files to calibrate it, recorded in the truth file.
     """
     writer = BagWriter(path)
     if path.suffix == '.mcap':
@@ -141,7 +141,7 @@ def write_bag(
             for sample in (s for s in samples if s.time_ns > image.time_ns):
                 _write_telemetry(writer, sample, mistakes)
             on_image(index)
-        # Just before the bag replaces an older one, so that they replace theirs together.
+        # Just before the bag replaces an older one, so that all files are replaced together.
         write_atomically(truth, truth_text)
         write_camera_info(scenario.prior.camera, camera, 'opnav')
         write_atomically(params, text)
@@ -149,7 +149,7 @@ def write_bag(
 
 
 def _write_telemetry(writer: BagWriter, sample: AttitudeSample, mistakes: Mistakes) -> None:
-    # The simulated directions have the aberration of the Earth's velocity.
+    # The velocity of the Earth, as in the simulated directions.
     velocity_m_s = earth_velocity_c(sample.time_ns) * SPEED_OF_LIGHT_M_S
     writer.write_velocity(VELOCITY_TOPIC, sample.time_ns, velocity_m_s, 'icrf')
     quaternion = mistakes.attitude(sample.icrf_from_star_tracker_xyzw)

@@ -146,7 +146,7 @@ REFUSED_ATTITUDES = {
     'gmat without order': (aem('1.0', {'QUATERNION_TYPE': None}), 'QUATERNION_TYPE is missing'),
     'euler axes': (aem('1.0', {'ATTITUDE_TYPE': 'EULER_ANGLE', 'EULER_ROT_SEQ': '332'},
                        '1 2 3'), 'EULER_ROT_SEQ = ZZY is not a sequence'),
-    'order': (aem('1.0', {'QUATERNION_TYPE': 'SCALAR'}), 'needs it FIRST or LAST'),
+    'order': (aem('1.0', {'QUATERNION_TYPE': 'SCALAR'}), 'requires it FIRST or LAST'),
     'ccsds-ndm without direction': (aem('1.0', {'ATTITUDE_DIR': None}), 'ATTITUDE_DIR is missing'),
     # Only the keywords of the table (B-2, 4.2.3): the direction is always A to B there.
     'orekit direction': (aem('2.0', {'ATTITUDE_DIR': 'B2A'}), '2.0 has no keyword ATTITUDE_DIR'),

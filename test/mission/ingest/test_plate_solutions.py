@@ -77,7 +77,9 @@ def test_another_frame_is_refused(tmp_path: Path, change: dict[str, object], mes
 
 
 def test_an_image_that_was_not_solved_is_named(tmp_path: Path) -> None:
-    with pytest.raises(IngestError, match=r'b.png: no file of its name .* \(1 of 1 images\)'):
+    with pytest.raises(
+        IngestError, match=r'b.png: --attitude has no file of this name \(1 of 1 images\)'
+    ):
         read_wcs([tmp_path / 'a.wcs'], [image_file(tmp_path / 'b.png')])
 
 
@@ -101,7 +103,7 @@ def test_solved_fits_images_are_imported_and_calibrated(
     assert (
         main(['import', '--images', pattern, '--attitude', pattern, '-o', str(bag), *prior]) == 0
     )
-    assert 'turned upside down' in capsys.readouterr().out
+    assert 'their order is reversed' in capsys.readouterr().out
     out = tmp_path / 'out'
     params = ['--params', str(bag / 'params.yaml'), '--no-report']
     assert main(['calibrate', str(bag), *params, '-o', str(out)]) == 0
