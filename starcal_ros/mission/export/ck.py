@@ -20,12 +20,12 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import line_of_sight
 from starcal_ros.errors import ProductError
 from starcal_ros.estimation.temperature import camera_at
-from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.mission.export.losses import Loss
+from starcal_ros.mission.export.losses import Content, Loss
 from starcal_ros.mission.export.spice import SpiceNames
 from starcal_ros.mission.ingest.kernels import ephemeris_time, loaded
 from starcal_ros.records import Calibration, StarObservations
 
+CK_FILE = 'camera.bc'
 _LEAST_STARS = 3
 _OUTLIER = 4.5  # sigma, of the median: as `outlier_sigma` of a calibration by default
 _MEDIAN_OF_RAYLEIGH = 1.1774
@@ -59,15 +59,14 @@ def attitude_by_stars(
     return rotation, float(1.0 / np.sqrt(information[used].sum()))
 
 
-def write_ck(
+def ck_of_images(
     calibration: Calibration,
     observations: Iterable[StarObservations],
     names: SpiceNames,
     kernels: Sequence[Path],
-    path: Path,
-) -> tuple[Loss, ...]:
+) -> Content:
     """
-    Write the attitudes of images; ``kernels`` are the LSK and the SCLK of the spacecraft.
+    A CK of the attitudes of images; ``kernels`` are the LSK and the SCLK of the spacecraft.
 
     With a star tracker ID they are of its frame, in which the frame kernel of `spice_kernels` has
     the camera; else of the camera itself, by its instrument ID.  Raises ProductError if no image
@@ -95,10 +94,10 @@ def write_ck(
             data = _ck(spice, structure, ticks, q)
         except spice.SpiceyError as error:
             words = ' '.join(str(error).split())[:240]
-            raise ProductError(f'{path}: {words}') from error
-    write_atomically(path, data)
+            raise ProductError(f'{CK_FILE}: {words}') from error
     sigma_px = float(np.median([sigma_px for _, sigma_px in found.values()]))
-    return (Loss('1-sigma of the attitude of an image (median)', sigma_px),)
+    loss = Loss('1-sigma of the attitude of an image (median)', sigma_px)
+    return Content({CK_FILE: data}, losses=(loss,))
 
 
 def _ck(spice: Any, structure: int, ticks: Floats, q: Floats) -> bytes:
