@@ -82,6 +82,12 @@ def movement(
     return float(rotation.magnitude()), left_rad * after.camera.parameters[0]
 
 
+def parameter_difference(a: CameraGeometry, b: CameraGeometry) -> Floats:
+    """Parameters of a less those of b, (p,): camera, then `alignment_difference_rad`."""
+    of_camera = a.camera.parameters - b.camera.parameters
+    return np.concatenate([of_camera, alignment_difference_rad(a, b)])
+
+
 def alignment_difference_rad(a: CameraGeometry, b: CameraGeometry) -> Floats:
     """The passive small rotation (3,) of the camera frame that takes alignment b to a."""
     star_tracker_from_a = Rotation.from_quat(a.star_tracker_from_camera_xyzw)

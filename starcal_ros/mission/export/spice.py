@@ -117,11 +117,9 @@ def field_of_view(camera: CameraModel) -> tuple[Floats, Floats | None]:
     """
     w, h = camera.width, camera.height
     share = np.arange(_SIDE_POINTS) / _SIDE_POINTS
-    u, v = share * w - 0.5, share * h - 0.5
-    left, right, top, bottom = (np.full(_SIDE_POINTS, x) for x in (-0.5, w - 0.5, -0.5, h - 0.5))
-    edge = np.concatenate(
-        [np.c_[u, top], np.c_[right, v], np.c_[w - 1.0 - u, bottom], np.c_[left, h - 1.0 - v]]
-    )
+    ends = np.array([[0, 0], [w, 0], [w, h], [0, h]]) - 0.5
+    sides = np.roll(ends, -1, axis=0) - ends
+    edge = (ends[:, None] + share[:, None] * sides[:, None]).reshape(-1, 2)
     boresight = line_of_sight(camera, np.array([(w - 1) / 2, (h - 1) / 2]))
     corners = line_of_sight(camera, edge)
     if not (corners @ boresight > np.cos(_WIDEST_RAD)).all():  # NaN is not either
