@@ -9,6 +9,7 @@ runs a node in the same way.
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
 import signal
@@ -20,22 +21,8 @@ _REMEDY = (
 )
 
 
-def star_observer() -> int:
-    """Run the star observer; see `starcal_ros.ros.star_observer.main`."""
-    return _run('star_observer')
-
-
-def calibrator() -> int:
-    """Run the calibrator; see `starcal_ros.ros.calibrator.main`."""
-    return _run('calibrator')
-
-
-def bag_player() -> int:
-    """Run the bag player; see `starcal_ros.ros.bag_player.main`."""
-    return _run('bag_player')
-
-
 def _run(name: str) -> int:
+    """Run the function ``main`` of a module of `starcal_ros.ros`."""
     # Read when NumPy is imported: see `starcal_ros.blas_threads`, which a vehicle may not have.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     # Unless nohup or a shell ignores it; `main` sets the handler of the node.
@@ -57,6 +44,10 @@ def _run(name: str) -> int:
         return 2
     return int(module.main())
 
+
+star_observer = functools.partial(_run, 'star_observer')
+calibrator = functools.partial(_run, 'calibrator')
+bag_player = functools.partial(_run, 'bag_player')
 
 if __name__ == '__main__':
     sys.exit(_run(sys.argv.pop(1)))
