@@ -55,7 +55,7 @@ def true_observations(
     """
     images = []
     for index, shown in enumerate(scenes(scenario, attitude_noise)):
-        covariance, snr, keep = _scene_bound(scenario, shown)
+        covariance, snr, keep = scene_bound(scenario, shown)
         if centroid_sigma_px is not None:
             covariance = np.broadcast_to(np.eye(2) * centroid_sigma_px**2, covariance.shape)
         # Drawn before the selection, so that the error of a star does not depend on other stars.
@@ -73,7 +73,7 @@ def true_observations(
     return Ensemble(tuple(images))
 
 
-def _scene_bound(scenario: Scenario, shown: Scene) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def scene_bound(scenario: Scenario, shown: Scene) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Bounds and signal-to-noise ratios of stars, and which are used: bright, on the detector."""
     camera = scenario.truth.camera
     covariance, snr = centroid_bound(
@@ -163,7 +163,7 @@ def cramer_rao_covariance(scenario: Scenario) -> Floats:
     columns = [camera.parameter_names.index(name) for name in bound_names(camera)]
     information = np.zeros((len(columns), len(columns)))
     for shown in scenes(scenario):
-        covariance, _, keep = _scene_bound(scenario, shown)
+        covariance, _, keep = scene_bound(scenario, shown)
         in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
         _, J_parameters, J_rotation = project_jacobians(camera, in_camera)
         W = np.linalg.inv(covariance[keep])

@@ -47,10 +47,7 @@ def truth_content(scenario: Scenario, bag_name: str) -> dict[str, object]:
     true, prior = scenario.truth, scenario.prior
     stars = stars_above = 0
     for shown in scenes(scenario):
-        shape = (true.camera.height, true.camera.width)
-        _, snr = centroids.centroid_bound(
-            shown.pixel_px, shown.flux_electrons, scenario.detector, shape
-        )
+        _, snr, _ = centroids.scene_bound(scenario, shown)
         stars += len(snr)
         stars_above += int((snr > centroids.BOUND_SNR).sum())
     return {
