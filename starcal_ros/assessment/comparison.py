@@ -125,8 +125,7 @@ def _sound_lines_of_sight(geometry: CameraGeometry) -> Floats:
 
 def _map(moved: Floats, frame: CameraGeometry, sigma_rad: Floats) -> DifferenceMap:
     """Map of differences (GRID^2, 3) of unit vectors, star tracker frame; sigmas (GRID^2,)."""
-    camera_from_star_tracker = Rotation.from_quat(frame.star_tracker_from_camera_xyzw).inv()
-    in_camera = camera_from_star_tracker.apply(moved).reshape(GRID, GRID, 3)
+    in_camera = frame.star_tracker_from_camera.inv().apply(moved).reshape(GRID, GRID, 3)
     length_rad = np.linalg.norm(in_camera, axis=-1)
     focal_px: float = frame.camera.parameters[0]
     return DifferenceMap(

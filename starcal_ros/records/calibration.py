@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, check_plausible
@@ -32,6 +33,11 @@ class CameraGeometry:
 
     camera: CameraModel
     star_tracker_from_camera_xyzw: Quaternion
+
+    @property
+    def star_tracker_from_camera(self) -> Rotation:
+        """The alignment as a rotation."""
+        return Rotation.from_quat(self.star_tracker_from_camera_xyzw)
 
 
 @dataclass(frozen=True)

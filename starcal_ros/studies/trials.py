@@ -110,9 +110,8 @@ def draw_star_field(rng: np.random.Generator, images: int, stars: int) -> StarFi
 def observe(field: StarField, tracker_arcsec: float, outlier_share: float = 0.0) -> Ensemble:
     """Observations of a star field with the given star tracker noise about each axis."""
     camera = field.truth.camera
-    star_tracker_from_camera = Rotation.from_quat(field.truth.star_tracker_from_camera_xyzw)
     error = Rotation.from_rotvec(tracker_arcsec * ARCSECOND_RAD * field.tracker_error)
-    reported = (star_tracker_from_camera * field.camera_from_icrf).inv() * error
+    reported = (field.truth.star_tracker_from_camera * field.camera_from_icrf).inv() * error
     measured = field.pixel_px + field.centroid_error_px
     measured += (field.outlier_draw < outlier_share)[..., None] * field.outlier_px
     n = measured.shape[1]

@@ -17,7 +17,6 @@ import sys
 import zlib
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import common_rotation, Derivatives
@@ -82,7 +81,7 @@ def c_table(calibration: Calibration) -> bytes:
     numbers = [
         camera.parameters,
         [min(fold_radius2(camera.model, camera.distortion), _NO_FOLD)],
-        Rotation.from_quat(calibration.geometry.star_tracker_from_camera_xyzw).as_matrix(),
+        calibration.geometry.star_tracker_from_camera.as_matrix(),
         _temperature(calibration),
         [field.unresolved_px],
         field.coefficients,

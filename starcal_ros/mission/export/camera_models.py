@@ -14,7 +14,6 @@ import dataclasses
 import json
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 import yaml
 
 from starcal_ros.arrays import Floats
@@ -53,7 +52,9 @@ def opencv_yaml(calibration: Calibration) -> Content:
         f'lens_model: {"fisheye" if camera.model == "equidistant" else "pinhole"}',
         *_opencv_matrix('camera_matrix', camera.matrix),
         *_opencv_matrix('distortion_coefficients', D[None, :]),
-        *_opencv_matrix('rotation', _camera_from_star_tracker(calibration).as_matrix()),
+        *_opencv_matrix(
+            'rotation', calibration.geometry.star_tracker_from_camera.inv().as_matrix()
+        ),
         f'largest_error_px: {made.worst_px!r}',
     ]
     return dataclasses.replace(made, files={'opencv.yaml': '\n'.join(lines) + '\n'})
@@ -71,7 +72,7 @@ def kalibr_yaml(calibration: Calibration, topic: str) -> Content:
     fx, _, fy, cx, cy = camera.intrinsics.tolist()
     _, D = ros_distortion(camera.model, camera.distortion)
     T = np.eye(4)
-    T[:3, :3] = _camera_from_star_tracker(calibration).as_matrix()
+    T[:3, :3] = calibration.geometry.star_tracker_from_camera.inv().as_matrix()
     content = {
         'cam0': {
             'camera_model': 'pinhole',
@@ -153,7 +154,7 @@ def mrcal_cameramodel(calibration: Calibration) -> Content:
     camera, made = fitted(calibration, own if own in _MRCAL else 'thin_prism', ('skew',))
     fx, _, fy, cx, cy = camera.intrinsics.tolist()
     _, D = ros_distortion(camera.model, camera.distortion)
-    rt = [*_camera_from_star_tracker(calibration).as_rotvec().tolist(), 0.0, 0.0, 0.0]
+    rt = [*calibration.geometry.star_tracker_from_camera.inv().as_rotvec().tolist(), 0.0, 0.0, 0.0]
     lines = [
         *_commented(about(calibration, made)),
         '{',
@@ -164,10 +165,6 @@ def mrcal_cameramodel(calibration: Calibration) -> Content:
         '}',
     ]
     return dataclasses.replace(made, files={'camera.cameramodel': '\n'.join(lines) + '\n'})
-
-
-def _camera_from_star_tracker(calibration: Calibration) -> Rotation:
-    return Rotation.from_quat(calibration.geometry.star_tracker_from_camera_xyzw).inv()
 
 
 def _commented(lines: list[str]) -> list[str]:

@@ -82,8 +82,7 @@ def ck_of_images(
     times_ns = sorted(found)
     icrf_from_frame = Rotation.concatenate([found[time_ns][0] for time_ns in times_ns])
     if names.star_tracker_id:
-        camera = Rotation.from_quat(calibration.geometry.star_tracker_from_camera_xyzw)
-        icrf_from_frame = icrf_from_frame * camera.inv()
+        icrf_from_frame = icrf_from_frame * calibration.geometry.star_tracker_from_camera.inv()
     structure = names.star_tracker_id or names.camera_id
     q = np.roll(icrf_from_frame.inv().as_quat(), 1, axis=1)
     with loaded(kernels) as spice:

@@ -253,9 +253,7 @@ def _icrf_from_star_tracker_xyzw(
     scenario: Scenario, index: int, offset_s: float = 0.0, noise: bool = True
 ) -> Floats:
     """Reported star-tracker attitude (4,): the truth with one error for the whole image."""
-    camera_from_star_tracker = Rotation.from_quat(
-        scenario.truth.star_tracker_from_camera_xyzw
-    ).inv()
+    camera_from_star_tracker = scenario.truth.star_tracker_from_camera.inv()
     icrf_from_camera = Rotation.from_matrix(camera_from_icrf(scenario, index, offset_s)).inv()
     # The tracker's frame is off by small passive angles about its own axes.
     sigma_rad = np.array(scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD
