@@ -24,11 +24,11 @@ from starcal_ros.mission.export.losses import Content, Loss
 from starcal_ros.mission.export.spice import SpiceNames
 from starcal_ros.mission.ingest.kernels import ephemeris_time, loaded
 from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.robust_statistics import RAYLEIGH_TO_SIGMA
 
 CK_FILE = 'camera.bc'
 _LEAST_STARS = 3
 _OUTLIER = 4.5  # sigma, of the median: as `outlier_sigma` of a calibration by default
-_MEDIAN_OF_RAYLEIGH = 1.1774
 _INTERNAL_NAME = 'starcal: attitude of the calibrated camera'
 
 
@@ -55,7 +55,7 @@ def attitude_by_stars(
         )
         off = np.linalg.norm(rotation.apply(seen) - image.direction_icrf, axis=1)
         off = off * np.sqrt(information)
-        used = used & (off <= _OUTLIER / _MEDIAN_OF_RAYLEIGH * np.median(off[used]))
+        used = used & (off <= _OUTLIER * RAYLEIGH_TO_SIGMA * np.median(off[used]))
     return rotation, float(1.0 / np.sqrt(information[used].sum()))
 
 

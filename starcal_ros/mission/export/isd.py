@@ -19,10 +19,9 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import ros_distortion
 from starcal_ros.mission.export.losses import about, Content, fitted, GRID, Loss
-from starcal_ros.mission.export.spice import kernel_text, SpiceNames
+from starcal_ros.mission.export.spice import kernel_text, SpiceNames, UM_PER_MM
 from starcal_ros.records import Calibration
 
-_UM_PER_MM = 1000.0
 _HALF_PX = 0.5
 _ISIS_FIRST_PX = 1.0
 
@@ -37,7 +36,7 @@ def isd_files(calibration: Calibration, names: SpiceNames) -> Content:
     camera, made = fitted(calibration, 'plumb_bob', ())
     fx, skew, fy, cx, cy = camera.intrinsics.tolist()
     _, D = ros_distortion(camera.model, camera.distortion)
-    focal_px, pitch_mm = np.sqrt(fx * fy), names.pixel_size_um / _UM_PER_MM or 1.0
+    focal_px, pitch_mm = np.sqrt(fx * fy), names.pixel_size_um / UM_PER_MM or 1.0
     content = {
         'about': about(calibration, made),
         'name_model': 'USGS_ASTRO_FRAME_SENSOR_MODEL',
@@ -66,7 +65,7 @@ def _isis_kernel(calibration: Calibration, names: SpiceNames) -> tuple[str, Loss
     camera = calibration.geometry.camera
     intrinsics, k, worst_px = _radial(camera)
     fx, skew, fy, cx, cy = intrinsics.tolist()
-    pitch_mm = names.pixel_size_um / _UM_PER_MM or 1.0
+    pitch_mm = names.pixel_size_um / UM_PER_MM or 1.0
     focal_mm = np.sqrt(fx * fy) * pitch_mm
     to_pixel = np.array([[fx, skew], [0.0, fy]]) / focal_mm
     to_mm = np.linalg.inv(to_pixel)

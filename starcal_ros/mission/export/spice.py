@@ -40,7 +40,7 @@ Value = int | str | Sequence[float] | Sequence[str]
 _INSTRUMENTS_PER_SPACECRAFT = 1000  # NAIF: instrument ID = 1000 * spacecraft ID - number
 _SIDE_POINTS = 4  # vertices of the field of view on each side of the detector
 _WIDEST_RAD = np.radians(89.0)  # SPICE sees no polygon wider than a half space
-_UM_PER_MM = 1000.0
+UM_PER_MM = 1000.0
 
 _MODEL_IN_WORDS = {
     'plumb_bob': (
@@ -203,7 +203,7 @@ def _instrument_kernel(
     values |= _lens_values(camera)
     if names.pixel_size_um:
         mm = np.sqrt(camera.intrinsics[0] * camera.intrinsics[2]) * names.pixel_size_um
-        values |= {'FOCAL_LENGTH': [mm / _UM_PER_MM], 'PIXEL_SIZE': [names.pixel_size_um] * 2}
+        values |= {'FOCAL_LENGTH': [mm / UM_PER_MM], 'PIXEL_SIZE': [names.pixel_size_um] * 2}
     terms = calibration.temperature
     if terms is not None:
         values['REFERENCE_DEGC'] = [terms.reference_degc]
