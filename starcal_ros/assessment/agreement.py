@@ -56,8 +56,7 @@ def lines_of_sight(geometry: CameraGeometry, columns: int, rows: int) -> Floats:
     NaN where a pixel has no line of sight.
     """
     in_camera = line_of_sight(geometry.camera, pixel_grid(geometry.camera, columns, rows))
-    star_tracker_from_camera = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
-    return np.asarray(star_tracker_from_camera.apply(in_camera))
+    return np.asarray(geometry.star_tracker_from_camera.apply(in_camera))
 
 
 def movement(
@@ -82,9 +81,14 @@ def movement(
     return float(rotation.magnitude()), left_rad * after.camera.parameters[0]
 
 
+def parameter_difference(a: CameraGeometry, b: CameraGeometry) -> Floats:
+    """Parameters of a less those of b, (p,): camera, then `alignment_difference_rad`."""
+    of_camera = a.camera.parameters - b.camera.parameters
+    return np.concatenate([of_camera, alignment_difference_rad(a, b)])
+
+
 def alignment_difference_rad(a: CameraGeometry, b: CameraGeometry) -> Floats:
     """The passive small rotation (3,) of the camera frame that takes alignment b to a."""
-    star_tracker_from_a = Rotation.from_quat(a.star_tracker_from_camera_xyzw)
-    star_tracker_from_b = Rotation.from_quat(b.star_tracker_from_camera_xyzw)
     # a_from_b = exp(-[dtheta x]), so b_from_a has dtheta as its rotation vector.
-    return np.asarray((star_tracker_from_b.inv() * star_tracker_from_a).as_rotvec())
+    b_from_a = b.star_tracker_from_camera.inv() * a.star_tracker_from_camera
+    return np.asarray(b_from_a.as_rotvec())

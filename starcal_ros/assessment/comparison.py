@@ -10,15 +10,16 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import (
-    alignment_difference_rad,
     chi_squared,
     ChiSquared,
     lines_of_sight,
+    parameter_difference,
 )
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
+from starcal_ros.record_codec import json_object
 from starcal_ros.records import Calibration, CameraGeometry
 
 
@@ -89,12 +90,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         raise ProductError(
             f'A has the lens model {camera_a.model}, B {camera_b.model}: they cannot be compared'
         )
-    difference = np.concatenate(
-        [
-            camera_b.parameters - camera_a.parameters,
-            alignment_difference_rad(b.geometry, a.geometry),
-        ]
-    )
+    difference = parameter_difference(b.geometry, a.geometry)
     sigma = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
     old, new = (_sound_lines_of_sight(calibration.geometry) for calibration in (a, b))
     rotation, _ = Rotation.align_vectors(new, old)
@@ -129,8 +125,7 @@ def _sound_lines_of_sight(geometry: CameraGeometry) -> Floats:
 
 def _map(moved: Floats, frame: CameraGeometry, sigma_rad: Floats) -> DifferenceMap:
     """Map of differences (GRID^2, 3) of unit vectors, star tracker frame; sigmas (GRID^2,)."""
-    camera_from_star_tracker = Rotation.from_quat(frame.star_tracker_from_camera_xyzw).inv()
-    in_camera = camera_from_star_tracker.apply(moved).reshape(GRID, GRID, 3)
+    in_camera = frame.star_tracker_from_camera.inv().apply(moved).reshape(GRID, GRID, 3)
     length_rad = np.linalg.norm(in_camera, axis=-1)
     focal_px: float = frame.camera.parameters[0]
     return DifferenceMap(
@@ -180,9 +175,6 @@ def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) ->
 def content(comparison: Comparison) -> dict[str, object]:
     """A comparison as a JSON object; a number that is not finite is null."""
 
-    def plain(values: Floats) -> object:
-        return np.where(np.isfinite(values), values.astype(object), None).tolist()  # type: ignore[call-overload]
-
     def of_map(found: DifferenceMap) -> dict[str, object]:
         length_px = found.length_px
         known = found.sigmas[np.isfinite(found.sigmas)]
@@ -191,19 +183,19 @@ def content(comparison: Comparison) -> dict[str, object]:
             'rms_px': float(np.sqrt(np.mean(length_px**2))),
             'worst_sigmas': float(known.max()) if known.size else None,
             'rms_sigmas': float(np.sqrt(np.mean(known**2))) if known.size else None,
-            'difference_px': plain(found.difference_px),
-            'sigmas': plain(found.sigmas),
+            'difference_px': found.difference_px,
+            'sigmas': found.sigmas,
         }
 
     total = comparison.total
-    return {
-        'parameter_names': list(comparison.a.parameter_names),
-        'a': plain(comparison.a.geometry.camera.parameters),
-        'b': plain(comparison.b.geometry.camera.parameters),
-        'difference': plain(comparison.difference),
-        'sigma': plain(comparison.sigma),
-        'sigmas': plain(comparison.sigmas),
-        'alignment_arcsec': plain(comparison.difference[-3:] / ARCSECOND_RAD),
+    found = {
+        'parameter_names': comparison.a.parameter_names,
+        'a': comparison.a.geometry.camera.parameters,
+        'b': comparison.b.geometry.camera.parameters,
+        'difference': comparison.difference,
+        'sigma': comparison.sigma,
+        'sigmas': comparison.sigmas,
+        'alignment_arcsec': comparison.difference[-3:] / ARCSECOND_RAD,
         'common_rotation_arcsec': comparison.rotation_rad / ARCSECOND_RAD,
         'lines_of_sight': of_map(comparison.before),
         'without_common_rotation': of_map(comparison.after),
@@ -211,5 +203,6 @@ def content(comparison: Comparison) -> dict[str, object]:
         'degrees_of_freedom': total.degrees_of_freedom,
         'p_value': total.p_value if total.degrees_of_freedom else None,
         'accepted': [comparison.a.accepted, comparison.b.accepted],
-        'notes': list(comparison.notes),
+        'notes': comparison.notes,
     }
+    return json_object(found)

@@ -36,13 +36,17 @@ class CameraGeometry:
     camera: CameraModel
     star_tracker_from_camera_xyzw: Quaternion
 
-    def icrf_from_camera(self, icrf_from_star_tracker_xyzw: Floats) -> Rotation:
-        """Attitude of the camera for an attitude (4,) of the star tracker."""
+    @property
+    def star_tracker_from_camera(self) -> Rotation:
+        """The alignment as a rotation."""
         from scipy.spatial.transform import Rotation  # half of the start of a short command
 
-        return Rotation.from_quat(icrf_from_star_tracker_xyzw) * Rotation.from_quat(
-            self.star_tracker_from_camera_xyzw
-        )
+        return Rotation.from_quat(self.star_tracker_from_camera_xyzw)
+
+    def icrf_from_camera(self, icrf_from_star_tracker_xyzw: Floats) -> Rotation:
+        """Attitude of the camera for an attitude (4,) of the star tracker."""
+        alignment = self.star_tracker_from_camera
+        return type(alignment).from_quat(icrf_from_star_tracker_xyzw) * alignment
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import zlib
 
 import numpy as np
 
+from starcal_ros.assessment.agreement import parameter_difference
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.assessment.term_removal import removal_study
 from starcal_ros.camera import PARAMETER_NAMES
@@ -29,7 +30,6 @@ from starcal_ros.studies.trials import (
     calibration_options,
     draw_scenario,
     draw_star_field,
-    errors,
     ESTIMATED,
     information_blocks,
     map_bound_px,
@@ -113,14 +113,10 @@ def check(design: Design) -> None:
             raise OptionError(f'--{option}: duplicate values: {" ".join(map(str, values))}')
 
 
-def generator(design: Design, trial: int) -> np.random.Generator:
-    """Random number generator of one trial."""
-    return np.random.default_rng([design.seed, zlib.crc32(design.study.encode()), trial])
-
-
 def run_trial(design: Design, trial: int) -> tuple[Row, ...]:
     """Rows of one trial, one for each cell and method; none if no calibration was possible."""
-    rows = _TRIALS[design.study](design, generator(design, trial))
+    rng = np.random.default_rng([design.seed, zlib.crc32(design.study.encode()), trial])
+    rows = _TRIALS[design.study](design, rng)
     return tuple({'trial': trial, **row} for row in rows)
 
 
@@ -239,7 +235,7 @@ def _coverage_trial(design: Design, rng: np.random.Generator) -> Iterable[Row]:
             key: Row = {**cell, 'outlier_share': share}
             for row, estimate in _solutions(design, key, ensemble, field, tracker):
                 sigma = np.sqrt(np.diag(estimate.covariance))[ESTIMATED]
-                error = errors(estimate.geometry, field.truth)[ESTIMATED]
+                error = parameter_difference(estimate.geometry, field.truth)[ESTIMATED]
                 names = estimate.geometry.camera.parameter_names + ALIGNMENT_NAMES
                 yield {
                     **row,

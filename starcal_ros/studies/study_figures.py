@@ -46,16 +46,18 @@ def _cells(result: StudyResult, *names: str) -> Iterator[tuple[Row, list[Row], l
             yield key, _where(result.summary, **key), _where(result.rows, **key)
 
 
-def _by_method(rows: Sequence[Row], x: str, of: Callable[[Sequence[Row]], Floats],
-               sigma: Callable[[Sequence[Row]], Floats] | None = None) -> list[Curve]:  # fmt: skip
-    """A curve of each method against a column, with bars."""
+def _by_method(
+    rows: Sequence[Row], x: str, name: str, scale: float = 1.0, less: float = 0.0, sigma: str = ''
+) -> list[Curve]:
+    """A curve of each method against a column, scaled and less a constant, with 2-sigma bars."""
     curves = []
     for method in dict.fromkeys(str(row['method']) for row in rows):
         colour, mark, width = _LOOKS[method]
         own = _where(rows, method=method)
-        bars = sigma(own) if sigma else None
+        bars = 2 * scale * column(own, sigma) if sigma else None
         size = 2.0 + width / 2
-        curves.append(Curve(column(own, x), of(own), colour, method, mark, width, '', size, bars))
+        y = scale * (column(own, name) - less)
+        curves.append(Curve(column(own, x), y, colour, method, mark, width, '', size, bars))
     return curves
 
 
@@ -71,12 +73,11 @@ def _table1(result: StudyResult) -> Rows:
     above, below = [], []
     tracker, label = 'tracker_arcsec', 'star tracker noise per axis (arcsec)'
     for key, cell, trials in _cells(result, 'images', 'stars'):
-        curves = _by_method(cell, tracker, lambda rows: _MILLI * column(rows, 'map_px'),
-                            lambda rows: 2 * _MILLI * column(rows, 'map_px_sigma'))  # fmt: skip
+        curves = _by_method(cell, tracker, 'map_px', _MILLI, sigma='map_px_sigma')
         title = f'{key["images"]} images of {key["stars"]} stars'
         curves.append(_bound(trials, tracker, 'bound_px', _MILLI))
         above.append(plot(curves, label, 'map error, rms (0.001 px)', log='y', title=title))
-        curves = _by_method(cell, tracker, lambda rows: column(rows, 'pointing_arcsec'))
+        curves = _by_method(cell, tracker, 'pointing_arcsec')
         curves.append(_bound(trials, tracker, 'pointing_bound_arcsec', 1.0))
         below.append(plot(curves, label, 'pointing error, rms (arcsec)', log='y'))
     return [above, below]
@@ -86,8 +87,8 @@ def _images(result: StudyResult) -> Rows:
     """Map error and residual of unused images against the number of images."""
     rows = []
     for key, cell, trials in _cells(result, 'stars', 'tracker_arcsec'):
-        left = _by_method(cell, 'images', lambda rows: _MILLI * column(rows, 'map_px'))
-        right = _by_method(cell, 'images', lambda rows: 100 * (column(rows, 'unused_to_true') - 1))
+        left = _by_method(cell, 'images', 'map_px', _MILLI)
+        right = _by_method(cell, 'images', 'unused_to_true', 100, less=1)
         left.append(_bound(trials, 'images', 'bound_px', _MILLI))
         enough, ends = 100 * (ENOUGH - 1), column(cell, 'images')[[0, -1]]
         right.append(Curve(ends, [enough, enough], INK, f'{enough:.0f} %', width=1.0, dash='2 3'))

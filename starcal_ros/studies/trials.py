@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.agreement import alignment_difference_rad, chi_squared, lines_of_sight
+from starcal_ros.assessment.agreement import chi_squared, lines_of_sight, parameter_difference
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, pixel_grid, project
@@ -110,9 +110,8 @@ def draw_star_field(rng: np.random.Generator, images: int, stars: int) -> StarFi
 def observe(field: StarField, tracker_arcsec: float, outlier_share: float = 0.0) -> Ensemble:
     """Observations of a star field with the given star tracker noise about each axis."""
     camera = field.truth.camera
-    star_tracker_from_camera = Rotation.from_quat(field.truth.star_tracker_from_camera_xyzw)
     error = Rotation.from_rotvec(tracker_arcsec * ARCSECOND_RAD * field.tracker_error)
-    reported = (star_tracker_from_camera * field.camera_from_icrf).inv() * error
+    reported = (field.truth.star_tracker_from_camera * field.camera_from_icrf).inv() * error
     measured = field.pixel_px + field.centroid_error_px
     measured += (field.outlier_draw < outlier_share)[..., None] * field.outlier_px
     n = measured.shape[1]
@@ -197,16 +196,11 @@ def pointing_error_arcsec(found: CameraGeometry, true: CameraGeometry) -> float:
     return rms(np.linalg.norm(of_found - of_true, axis=1)) / ARCSECOND_RAD
 
 
-def errors(found: CameraGeometry, true: CameraGeometry) -> Floats:
-    """Found minus true (13,): camera parameters, then passive camera frame rotation, rad."""
-    rotation_rad = alignment_difference_rad(found, true)
-    return np.concatenate([found.camera.parameters - true.camera.parameters, rotation_rad])
-
-
 def normalised_error_squared(estimate: Estimate, true: CameraGeometry) -> float:
-    """Squared `errors` normalised by the reported covariance: chi^2, 11 degrees of freedom."""
+    """Squared errors normalised by the reported covariance: chi^2, 11 degrees of freedom."""
+    error = parameter_difference(estimate.geometry, true)
     covariance = estimate.covariance[np.ix_(ESTIMATED, ESTIMATED)]
-    return chi_squared(errors(estimate.geometry, true)[ESTIMATED], covariance).value
+    return chi_squared(error[ESTIMATED], covariance).value
 
 
 def unused_residual_px(camera: CameraModel, field: StarField) -> float:

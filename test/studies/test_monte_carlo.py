@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from starcal_ros.assessment.agreement import parameter_difference
 from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.cli import arguments, main
@@ -273,7 +274,7 @@ def test_a_prior_far_off_leads_to_the_same_minimum(method: str, outlier_share: f
         estimate_calibration(ensemble, prior, options)
         for prior in (truth, CameraGeometry(camera, turned.as_quat()))
     )
-    apart = trials.errors(far.geometry, near.geometry) / np.sqrt(np.diag(near.covariance))
+    apart = parameter_difference(far.geometry, near.geometry) / np.sqrt(np.diag(near.covariance))
     assert np.abs(apart).max() < 0.01
     wild = (field.outlier_draw < outlier_share).ravel()
     assert wild.any() == bool(outlier_share)

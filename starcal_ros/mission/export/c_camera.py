@@ -17,13 +17,10 @@ import sys
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import common_rotation, Derivatives
 from starcal_ros.camera import pixel_grid
-from starcal_ros.camera.detector_field import cosine_terms, degrees
 from starcal_ros.camera.lens import COEFFICIENTS, fold_radius2
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.temperature import camera_at
@@ -66,7 +63,7 @@ def c_table(calibration: Calibration) -> bytes:
     """
     camera = calibration.geometry.camera
     field = _factored(calibration)
-    terms = _terms(calibration)
+    terms = np.empty((0, 2), np.int64) if camera.field is None else camera.field.orders
     if terms.max(initial=0) >= _MOST_WAVES:
         raise OptionError(
             f'--to c: the field has {terms.max() + 1} waves along an axis, over {_MOST_WAVES}'
@@ -84,7 +81,7 @@ def c_table(calibration: Calibration) -> bytes:
     numbers = [
         camera.parameters,
         [min(fold_radius2(camera.model, camera.distortion), _NO_FOLD)],
-        Rotation.from_quat(calibration.geometry.star_tracker_from_camera_xyzw).as_matrix(),
+        calibration.geometry.star_tracker_from_camera.as_matrix(),
         _temperature(calibration),
         [field.unresolved_px],
         field.coefficients,
@@ -136,16 +133,6 @@ def _factored(calibration: Calibration) -> ResidualField:
     used = values > _NO_VARIANCE * max(values.max(), 0.0)
     factor = scale[:, None] * vectors[:, used] * np.sqrt(values[used])
     return ResidualField(0, np.empty((2, 0)), covariance_factor=factor)
-
-
-def _terms(calibration: Calibration) -> NDArray[np.int64]:
-    """Functions (t, 2) of the field along u and along v."""
-    field = calibration.geometry.camera.field
-    if field is None:
-        return np.empty((0, 2), np.int64)
-    if field.family == 'cosine':
-        return cosine_terms(field.width, field.height, field.degree)[0]
-    return degrees(field.degree)
 
 
 def _temperature(calibration: Calibration) -> list[float]:

@@ -14,12 +14,12 @@ import dataclasses
 import json
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 import yaml
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera.lens import ros_distortion
-from starcal_ros.mission.export.losses import about, Fitted, fitted, origin
+from starcal_ros.formats.products.camera_yaml import CAMERA_INFO_FILE, write_camera_info
+from starcal_ros.mission.export.losses import about, Content, Files, fitted, origin
 from starcal_ros.records import Calibration
 
 # kalibr's word for a lens model, and the parameters that kalibr lacks.
@@ -33,19 +33,18 @@ _MRCAL = {
 }
 
 
-def opencv_yaml(calibration: Calibration) -> tuple[str, Fitted]:
+def opencv_yaml(calibration: Calibration) -> Content:
     """
-    YAML for ``cv2.FileStorage`` (camera matrix, distortion, rotation), and the exported camera.
+    YAML for ``cv2.FileStorage``: camera matrix, distortion, rotation.
 
     ``distortion_coefficients`` are for ``cv2.projectPoints``, or for ``cv2.fisheye`` if
     ``lens_model`` is ``fisheye``.
     """
-    found = fitted(calibration, calibration.geometry.camera.model, ('skew',))
-    camera = found.camera
+    camera, made = fitted(calibration, calibration.geometry.camera.model, ('skew',))
     _, D = ros_distortion(camera.model, camera.distortion)
     lines = [
         '%YAML:1.0',
-        *_commented(about(calibration, found)),
+        *_commented(about(calibration, made)),
         '# rotation: camera_from_star_tracker',
         '---',
         f'image_width: {camera.width}',
@@ -53,26 +52,27 @@ def opencv_yaml(calibration: Calibration) -> tuple[str, Fitted]:
         f'lens_model: {"fisheye" if camera.model == "equidistant" else "pinhole"}',
         *_opencv_matrix('camera_matrix', camera.matrix),
         *_opencv_matrix('distortion_coefficients', D[None, :]),
-        *_opencv_matrix('rotation', _camera_from_star_tracker(calibration).as_matrix()),
-        f'largest_error_px: {found.worst_px!r}',
+        *_opencv_matrix(
+            'rotation', calibration.geometry.star_tracker_from_camera.inv().as_matrix()
+        ),
+        f'largest_error_px: {made.worst_px!r}',
     ]
-    return '\n'.join(lines) + '\n', found
+    return dataclasses.replace(made, files={'opencv.yaml': '\n'.join(lines) + '\n'})
 
 
-def kalibr_yaml(calibration: Calibration, topic: str) -> tuple[str, Fitted]:
+def kalibr_yaml(calibration: Calibration, topic: str) -> Content:
     """
-    A camchain of kalibr with one camera, and the exported camera.
+    A camchain of kalibr with one camera.
 
     The star tracker takes the place of the IMU: ``T_cam_imu`` is the alignment without
     translation.  The model is ``radtan`` or ``equidistant``, whichever has the smaller error.
     """
-    candidates = [(fitted(calibration, m, zero), word) for m, (word, zero) in _KALIBR.items()]
-    found, word = min(candidates, key=lambda candidate: candidate[0].worst_px)
-    camera = found.camera
+    candidates = [(*fitted(calibration, m, zero), word) for m, (word, zero) in _KALIBR.items()]
+    camera, made, word = min(candidates, key=lambda candidate: candidate[1].worst_px)
     fx, _, fy, cx, cy = camera.intrinsics.tolist()
     _, D = ros_distortion(camera.model, camera.distortion)
     T = np.eye(4)
-    T[:3, :3] = _camera_from_star_tracker(calibration).as_matrix()
+    T[:3, :3] = calibration.geometry.star_tracker_from_camera.inv().as_matrix()
     content = {
         'cam0': {
             'camera_model': 'pinhole',
@@ -86,11 +86,18 @@ def kalibr_yaml(calibration: Calibration, topic: str) -> tuple[str, Fitted]:
         }
     }
     note = '# T_cam_imu: camera_from_star_tracker; kalibr has no star tracker'
-    return '\n'.join([*_commented(about(calibration, found)), note, _yaml(content)]), found
+    text = '\n'.join([*_commented(about(calibration, made)), note, _yaml(content)])
+    return dataclasses.replace(made, files={'camchain.yaml': text})
 
 
-def transform_yaml(calibration: Calibration) -> str:
-    """A geometry_msgs/TransformStamped of the alignment, for a static transform publisher."""
+def ros_yaml(calibration: Calibration) -> Content:
+    """
+    The camera YAML of ROS, and ``alignment.yaml`` for a static transform publisher.
+
+    The alignment is a geometry_msgs/TransformStamped.
+    """
+    camera = calibration.geometry.camera
+    _, made = fitted(calibration, camera.model, ('skew',))
     x, y, z, w = calibration.geometry.star_tracker_from_camera_xyzw.tolist()
     content = {
         'header': {'frame_id': calibration.parent_frame},
@@ -100,21 +107,24 @@ def transform_yaml(calibration: Calibration) -> str:
             'rotation': {'x': x, 'y': y, 'z': z, 'w': w},
         },
     }
-    return '\n'.join([*_commented(origin(calibration)), _yaml(content)])
+    files: Files = {
+        CAMERA_INFO_FILE: lambda path: write_camera_info(camera, path, calibration.child_frame),
+        'alignment.yaml': '\n'.join([*_commented(origin(calibration)), _yaml(content)]),
+    }
+    return dataclasses.replace(made, files=files)
 
 
-def giant_json(calibration: Calibration) -> tuple[str, Fitted]:
+def giant_json(calibration: Calibration) -> Content:
     """
-    JSON with the keyword arguments of GIANT's ``OpenCVModel``, and the exported camera.
+    JSON whose ``OpenCVModel`` holds the keyword arguments of the model.
 
     ``star_tracker_from_camera_xyzw`` is a separate key: a camera model of GIANT has no alignment.
     """
     own = calibration.geometry.camera.model
-    found = fitted(calibration, own if own in _OF_GIANT else 'thin_prism', ())
-    # GIANT models the change of the focal length with temperature, so it is not a loss.
-    losses = tuple(loss for loss in found.losses if 'focal' not in loss.part)
-    found = dataclasses.replace(found, losses=losses)
-    camera = found.camera
+    camera, made = fitted(calibration, own if own in _OF_GIANT else 'thin_prism', ())
+    # GIANT has the change of the focal length with temperature: it is no loss.
+    losses = tuple(loss for loss in made.losses if 'focal' not in loss.part)
+    made = dataclasses.replace(made, losses=losses)
     named = zip(camera.parameter_names, camera.parameters.tolist(), strict=True)
     arguments = {_GIANT_NAMES.get(name, name): value for name, value in named}
     arguments |= {'n_rows': camera.height, 'n_cols': camera.width}
@@ -124,7 +134,7 @@ def giant_json(calibration: Calibration) -> tuple[str, Fitted]:
         arguments |= {f'a{k}': value for k, value in enumerate(terms.focal_per_degc, start=1)}
     content = {
         'about': [
-            *about(calibration, found),
+            *about(calibration, made),
             'from giant.camera_models import OpenCVModel; OpenCVModel(**content["OpenCVModel"])',
         ],
         'OpenCVModel': arguments,
@@ -133,19 +143,20 @@ def giant_json(calibration: Calibration) -> tuple[str, Fitted]:
             calibration.geometry.star_tracker_from_camera_xyzw.tolist()
         ),
     }
-    return json.dumps(content, indent=1) + '\n', found
+    return dataclasses.replace(
+        made, files={'giant_camera.json': json.dumps(content, indent=1) + '\n'}
+    )
 
 
-def mrcal_cameramodel(calibration: Calibration) -> tuple[str, Fitted]:
-    """Text for ``mrcal.cameramodel``, and the exported camera; ``extrinsics`` are rt_cam_ref."""
+def mrcal_cameramodel(calibration: Calibration) -> Content:
+    """Text for ``mrcal.cameramodel``; ``extrinsics`` are rt_cam_ref."""
     own = calibration.geometry.camera.model
-    found = fitted(calibration, own if own in _MRCAL else 'thin_prism', ('skew',))
-    camera = found.camera
+    camera, made = fitted(calibration, own if own in _MRCAL else 'thin_prism', ('skew',))
     fx, _, fy, cx, cy = camera.intrinsics.tolist()
     _, D = ros_distortion(camera.model, camera.distortion)
-    rt = [*_camera_from_star_tracker(calibration).as_rotvec().tolist(), 0.0, 0.0, 0.0]
+    rt = [*calibration.geometry.star_tracker_from_camera.inv().as_rotvec().tolist(), 0.0, 0.0, 0.0]
     lines = [
-        *_commented(about(calibration, found)),
+        *_commented(about(calibration, made)),
         '{',
         f"    'lensmodel':  '{_MRCAL[camera.model]}',",
         f"    'extrinsics': {rt!r},",
@@ -153,11 +164,7 @@ def mrcal_cameramodel(calibration: Calibration) -> tuple[str, Fitted]:
         f"    'imagersize': {[camera.width, camera.height]!r},",
         '}',
     ]
-    return '\n'.join(lines) + '\n', found
-
-
-def _camera_from_star_tracker(calibration: Calibration) -> Rotation:
-    return Rotation.from_quat(calibration.geometry.star_tracker_from_camera_xyzw).inv()
+    return dataclasses.replace(made, files={'camera.cameramodel': '\n'.join(lines) + '\n'})
 
 
 def _commented(lines: list[str]) -> list[str]:

@@ -20,15 +20,15 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import line_of_sight
 from starcal_ros.errors import ProductError
 from starcal_ros.estimation.temperature import camera_at
-from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.mission.export.losses import Loss
+from starcal_ros.mission.export.losses import Content, Loss
 from starcal_ros.mission.export.spice import SpiceNames
 from starcal_ros.mission.ingest.kernels import ephemeris_time, loaded
 from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.robust_statistics import RAYLEIGH_TO_SIGMA
 
+CK_FILE = 'camera.bc'
 _LEAST_STARS = 3
 _OUTLIER = 4.5  # sigma, of the median: as `outlier_sigma` of a calibration by default
-_MEDIAN_OF_RAYLEIGH = 1.1774
 _INTERNAL_NAME = 'starcal: attitude of the calibrated camera'
 
 
@@ -55,19 +55,18 @@ def attitude_by_stars(
         )
         off = np.linalg.norm(rotation.apply(seen) - image.direction_icrf, axis=1)
         off = off * np.sqrt(information)
-        used = used & (off <= _OUTLIER / _MEDIAN_OF_RAYLEIGH * np.median(off[used]))
+        used = used & (off <= _OUTLIER * RAYLEIGH_TO_SIGMA * np.median(off[used]))
     return rotation, float(1.0 / np.sqrt(information[used].sum()))
 
 
-def write_ck(
+def ck_of_images(
     calibration: Calibration,
     observations: Iterable[StarObservations],
     names: SpiceNames,
     kernels: Sequence[Path],
-    path: Path,
-) -> tuple[Loss, ...]:
+) -> Content:
     """
-    Write the attitudes of images; ``kernels`` are the LSK and the SCLK of the spacecraft.
+    A CK of the attitudes of images; ``kernels`` are the LSK and the SCLK of the spacecraft.
 
     With a star tracker ID they are of its frame, in which the frame kernel of `spice_kernels` has
     the camera; else of the camera itself, by its instrument ID.  Raises ProductError if no image
@@ -83,8 +82,7 @@ def write_ck(
     times_ns = sorted(found)
     icrf_from_frame = Rotation.concatenate([found[time_ns][0] for time_ns in times_ns])
     if names.star_tracker_id:
-        camera = Rotation.from_quat(calibration.geometry.star_tracker_from_camera_xyzw)
-        icrf_from_frame = icrf_from_frame * camera.inv()
+        icrf_from_frame = icrf_from_frame * calibration.geometry.star_tracker_from_camera.inv()
     structure = names.star_tracker_id or names.camera_id
     q = np.roll(icrf_from_frame.inv().as_quat(), 1, axis=1)
     with loaded(kernels) as spice:
@@ -95,10 +93,10 @@ def write_ck(
             data = _ck(spice, structure, ticks, q)
         except spice.SpiceyError as error:
             words = ' '.join(str(error).split())[:240]
-            raise ProductError(f'{path}: {words}') from error
-    write_atomically(path, data)
+            raise ProductError(f'{CK_FILE}: {words}') from error
     sigma_px = float(np.median([sigma_px for _, sigma_px in found.values()]))
-    return (Loss('1-sigma of the attitude of an image (median)', sigma_px),)
+    loss = Loss('1-sigma of the attitude of an image (median)', sigma_px)
+    return Content({CK_FILE: data}, losses=(loss,))
 
 
 def _ck(spice: Any, structure: int, ticks: Floats, q: Floats) -> bytes:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-import dataclasses
 from dataclasses import dataclass
 import functools
 from pathlib import Path
@@ -12,14 +11,13 @@ from pathlib import Path
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import OptionError
-from starcal_ros.formats.products.camera_yaml import CAMERA_INFO_FILE, write_camera_info
 from starcal_ros.formats.products.lookup_table import write_lookup_table
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.mission.export import camera_models
 from starcal_ros.mission.export.c_camera import c_files, c_table, TABLE_FILE
-from starcal_ros.mission.export.ck import write_ck
-from starcal_ros.mission.export.isd import isd_json, isis_kernel
-from starcal_ros.mission.export.losses import Fitted, fitted, Loss, temperature_losses
+from starcal_ros.mission.export.ck import ck_of_images
+from starcal_ros.mission.export.isd import isd_files
+from starcal_ros.mission.export.losses import Content, Loss, temperature_losses
 from starcal_ros.mission.export.spice import check_names, spice_kernels, SpiceNames
 from starcal_ros.record_codec import nearest
 from starcal_ros.records import Calibration, StarObservations
@@ -82,53 +80,37 @@ def export(
             f'--to {kind}: the calibration is of the camera alone, without the alignment that'
             f' {kind} needs; choose one of {others}'
         )
-    if kind == 'c':
-        made = {TABLE_FILE: c_table(calibration)} if table else c_files(calibration)
-        return _written(folder, made, 0.0, ())
     if kind in _OF_SPICE:
         if names is None:
             raise OptionError(f'--to {kind}: give the NAIF ID of the spacecraft, --spacecraft-id')
         check_names(names)
-    if kind == 'ck' and names:
-        path = folder / 'camera.bc'
-        return Exported((path,), 0.0, write_ck(calibration, observations, names, kernels, path))
-    if kind == 'isd' and names:
-        text, found = isd_json(calibration, names.pixel_size_um)
-        isis, loss = isis_kernel(calibration, names)
-        texts = {'camera_isd.json': text, 'camera_isis.ti': isis}
-        return _written(folder, texts, found.worst_px, (*found.losses, loss))
-    if kind == 'spice' and names:
-        fk, ik, losses = spice_kernels(calibration, names)
-        return _written(folder, {'camera.tf': fk, 'camera.ti': ik}, 0.0, losses)
-    if kind == 'csv':
-        camera = calibration.geometry.camera
-        sights = line_of_sight_table(
-            camera, calibration.map_covariance, pixel_grid(camera, CSV_POINTS, CSV_POINTS)
-        )
-        path = folder / 'lines_of_sight.csv'
-        write_lookup_table(sights, path)
-        return Exported((path,), 0.0, temperature_losses(calibration))
-    if kind == 'ros':
-        path = folder / CAMERA_INFO_FILE
-        write_camera_info(calibration.geometry.camera, path, calibration.child_frame)
-        found = fitted(calibration, calibration.geometry.camera.model, ('skew',))
-        texts = {'alignment.yaml': camera_models.transform_yaml(calibration)}
-        done = _written(folder, texts, found.worst_px, found.losses)
-        return dataclasses.replace(done, files=(path, *done.files))
-    makers: Mapping[str, tuple[str, Callable[[Calibration], tuple[str, Fitted]]]] = {
-        'opencv': ('opencv.yaml', camera_models.opencv_yaml),
-        'kalibr': ('camchain.yaml', functools.partial(camera_models.kalibr_yaml, topic=topic)),
-        'mrcal': ('camera.cameramodel', camera_models.mrcal_cameramodel),
-        'giant': ('giant_camera.json', camera_models.giant_json),
+    naif = names or SpiceNames(0)
+    makers: Mapping[str, Callable[[], Content]] = {
+        'spice': lambda: spice_kernels(calibration, naif),
+        'ck': lambda: ck_of_images(calibration, observations, naif, kernels),
+        'isd': lambda: isd_files(calibration, naif),
+        'opencv': lambda: camera_models.opencv_yaml(calibration),
+        'kalibr': lambda: camera_models.kalibr_yaml(calibration, topic),
+        'ros': lambda: camera_models.ros_yaml(calibration),
+        'giant': lambda: camera_models.giant_json(calibration),
+        'mrcal': lambda: camera_models.mrcal_cameramodel(calibration),
+        'csv': lambda: _csv(calibration),
+        'c': lambda: Content(
+            {TABLE_FILE: c_table(calibration)} if table else c_files(calibration)
+        ),
     }
-    name, make = makers[kind]
-    text, found = make(calibration)
-    return _written(folder, {name: text}, found.worst_px, found.losses)
+    made = makers[kind]()
+    for name, content in made.files.items():
+        if callable(content):
+            content(folder / name)
+        else:
+            write_atomically(folder / name, content)
+    return Exported(tuple(folder / name for name in made.files), made.worst_px, made.losses)
 
 
-def _written(
-    folder: Path, texts: Mapping[str, str | bytes], worst_px: float, losses: tuple[Loss, ...]
-) -> Exported:
-    for name, text in texts.items():
-        write_atomically(folder / name, text)
-    return Exported(tuple(folder / name for name in texts), worst_px, losses)
+def _csv(calibration: Calibration) -> Content:
+    camera = calibration.geometry.camera
+    pixels = pixel_grid(camera, CSV_POINTS, CSV_POINTS)
+    sights = line_of_sight_table(camera, calibration.map_covariance, pixels)
+    files = {'lines_of_sight.csv': functools.partial(write_lookup_table, sights)}
+    return Content(files, losses=temperature_losses(calibration))

@@ -10,7 +10,6 @@ ISIS.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 import numpy as np
@@ -19,28 +18,27 @@ from scipy.optimize import least_squares
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import ros_distortion
-from starcal_ros.mission.export.losses import about, Fitted, fitted, GRID, Loss
-from starcal_ros.mission.export.spice import kernel_text, SpiceNames
+from starcal_ros.mission.export.losses import about, Content, fitted, GRID, Loss
+from starcal_ros.mission.export.spice import kernel_text, SpiceNames, UM_PER_MM
 from starcal_ros.records import Calibration
 
-_UM_PER_MM = 1000.0
 _HALF_PX = 0.5
 _ISIS_FIRST_PX = 1.0
 
 
-def isd_json(calibration: Calibration, pixel_size_um: float) -> tuple[str, Fitted]:
+def isd_files(calibration: Calibration, names: SpiceNames) -> Content:
     """
-    JSON with the keys of a frame camera in an ISD that a calibration determines; and the camera.
+    JSON with the keys of a frame camera in an ISD that a calibration determines; and an ISIS IK.
 
-    ``pixel_size_um`` 0: a pixel counts as 1 mm; lines of sight do not depend on it.
+    Without a pixel size a pixel counts as 1 mm; lines of sight do not depend on it.
     """
-    found = fitted(calibration, 'plumb_bob', ())
-    camera = found.camera
+    isis, loss = _isis_kernel(calibration, names)
+    camera, made = fitted(calibration, 'plumb_bob', ())
     fx, skew, fy, cx, cy = camera.intrinsics.tolist()
     _, D = ros_distortion(camera.model, camera.distortion)
-    focal_px, pitch_mm = np.sqrt(fx * fy), pixel_size_um / _UM_PER_MM or 1.0
+    focal_px, pitch_mm = np.sqrt(fx * fy), names.pixel_size_um / UM_PER_MM or 1.0
     content = {
-        'about': about(calibration, found),
+        'about': about(calibration, made),
         'name_model': 'USGS_ASTRO_FRAME_SENSOR_MODEL',
         'image_lines': camera.height,
         'image_samples': camera.width,
@@ -54,10 +52,11 @@ def isd_json(calibration: Calibration, pixel_size_um: float) -> tuple[str, Fitte
         'focal2pixel_lines': [0.0, 0.0, fy / focal_px / pitch_mm],
         'optical_distortion': {'radtan': {'coefficients': D.tolist()}},
     }
-    return json.dumps(content, indent=1) + '\n', found
+    files = {'camera_isd.json': json.dumps(content, indent=1) + '\n', 'camera_isis.ti': isis}
+    return Content(files, made.worst_px, (*made.losses, loss))
 
 
-def isis_kernel(calibration: Calibration, names: SpiceNames) -> tuple[str, Loss]:
+def _isis_kernel(calibration: Calibration, names: SpiceNames) -> tuple[str, Loss]:
     """
     IK with ISIS's keywords of a camera with radial distortion, and its largest error.
 
@@ -66,7 +65,7 @@ def isis_kernel(calibration: Calibration, names: SpiceNames) -> tuple[str, Loss]
     camera = calibration.geometry.camera
     intrinsics, k, worst_px = _radial(camera)
     fx, skew, fy, cx, cy = intrinsics.tolist()
-    pitch_mm = names.pixel_size_um / _UM_PER_MM or 1.0
+    pitch_mm = names.pixel_size_um / UM_PER_MM or 1.0
     focal_mm = np.sqrt(fx * fy) * pitch_mm
     to_pixel = np.array([[fx, skew], [0.0, fy]]) / focal_mm
     to_mm = np.linalg.inv(to_pixel)
@@ -83,9 +82,8 @@ def isis_kernel(calibration: Calibration, names: SpiceNames) -> tuple[str, Loss]
         'OD_K': [0.0, *(k / focal_mm ** np.array([2.0, 4.0])).tolist()],
     }
     loss = Loss('ISIS: all but radial distortion', worst_px)
-    found = Fitted(dataclasses.replace(camera, field=None), worst_px, (loss,))
     comments = ['Keywords of ISIS; its first pixel has its centre at (1, 1).', '']
-    comments += about(calibration, found)
+    comments += about(calibration, Content({}, worst_px, (loss,)))
     return kernel_text('Camera for ISIS', comments, prefix, values), loss
 
 

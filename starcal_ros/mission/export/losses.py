@@ -7,8 +7,10 @@ With its origin they are the comment of an exported file, in ASCII.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +23,7 @@ PIXEL_CONVENTION = (
     'Pixel (u, v) = (column, row); the centre of the first pixel is (0, 0).',
     'Camera frame: +Z along the optical axis, +X along u, +Y along v.',
 )
+Files = Mapping[str, str | bytes | Callable[[Path], None]]
 GRID = 25  # pixels a side, as in the fits of `camera`
 
 
@@ -38,19 +41,27 @@ class Loss:
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """A camera that a format can hold, its largest error over the detector, and the reasons."""
+class Content:
+    """
+    Files of an export: content by name, or a function that writes the file to a path.
 
-    camera: CameraModel
-    worst_px: float
-    losses: tuple[Loss, ...]
+    ``worst_px`` is the largest error of a pixel in them against the calibration, ``losses`` its
+    parts.
+    """
+
+    files: Files
+    worst_px: float = 0.0
+    losses: tuple[Loss, ...] = ()
 
 
-def fitted(calibration: Calibration, model: str, zero: tuple[str, ...]) -> Fitted:
+def fitted(
+    calibration: Calibration, model: str, zero: tuple[str, ...]
+) -> tuple[CameraModel, Content]:
     """
     Best camera of a lens model without some parameters, without field and temperature terms.
 
-    ``worst_px`` is infinite where the model cannot see the whole detector.
+    The content has its losses, and no file yet.  ``worst_px`` is infinite where the model cannot
+    see the whole detector.
     """
     camera = calibration.geometry.camera
     found, worst_px = nearest_camera(camera, model, zero)
@@ -68,7 +79,7 @@ def fitted(calibration: Calibration, model: str, zero: tuple[str, ...]) -> Fitte
         for name in zero
         if lens.parameters[lens.parameter_names.index(name)] != 0
     ]
-    return Fitted(found, worst_px, (*losses, *temperature_losses(calibration)))
+    return found, Content({}, worst_px, (*losses, *temperature_losses(calibration)))
 
 
 def _alone(camera: CameraModel, model: str, zero: tuple[str, ...]) -> float:
@@ -117,12 +128,12 @@ def ascii_line(text: str) -> str:
     return ' '.join(text.split()).encode('ascii', 'replace').decode()
 
 
-def about(calibration: Calibration, found: Fitted) -> list[str]:
+def about(calibration: Calibration, made: Content) -> list[str]:
     """Lines of a comment: origin, error of the exported camera, and that of each missing part."""
-    lines = [f'Largest error of a pixel against the calibration: {found.worst_px:.3g} px.']
-    if found.losses:
+    lines = [f'Largest error of a pixel against the calibration: {made.worst_px:.3g} px.']
+    if made.losses:
         lines.append('Left out, with the error that each alone would cause:')
-        lines += [f'  {loss.part}: {loss.cost_px:.3g} px' for loss in found.losses]
+        lines += [f'  {loss.part}: {loss.cost_px:.3g} px' for loss in made.losses]
     else:
         lines.append('Nothing is left out.')
     return [*origin(calibration), *lines, *PIXEL_CONVENTION]

@@ -24,6 +24,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.mission.export.losses import (
     ascii_line,
+    Content,
     Loss,
     origin,
     PIXEL_CONVENTION,
@@ -39,7 +40,7 @@ Value = int | str | Sequence[float] | Sequence[str]
 _INSTRUMENTS_PER_SPACECRAFT = 1000  # NAIF: instrument ID = 1000 * spacecraft ID - number
 _SIDE_POINTS = 4  # vertices of the field of view on each side of the detector
 _WIDEST_RAD = np.radians(89.0)  # SPICE sees no polygon wider than a half space
-_UM_PER_MM = 1000.0
+UM_PER_MM = 1000.0
 
 _MODEL_IN_WORDS = {
     'plumb_bob': (
@@ -84,15 +85,12 @@ class SpiceNames:
         return self.instrument_id or _INSTRUMENTS_PER_SPACECRAFT * self.spacecraft_id - 1
 
 
-def spice_kernels(
-    calibration: Calibration, names: SpiceNames
-) -> tuple[str, str, tuple[Loss, ...]]:
+def spice_kernels(calibration: Calibration, names: SpiceNames) -> Content:
     """
-    Texts of the FK and of the IK of a calibration, and what they cannot hold.
+    The FK and the IK of a calibration.
 
-    Raises OptionError for identifiers or frame names that SPICE does not allow.
+    Raises OptionError for frame names that SPICE does not allow.
     """
-    check_names(names)
     camera_frame = _frame_name(names.camera_frame or calibration.child_frame, '--camera-frame')
     tracker_frame = _frame_name(
         names.star_tracker_frame or calibration.parent_frame, '--star-tracker-frame'
@@ -107,7 +105,7 @@ def spice_kernels(
     about = [*origin(calibration), '', *missing]
     fk = _frame_kernel(calibration, names, camera_frame, tracker_frame, about)
     ik = _instrument_kernel(calibration, names, camera_frame, boresight, corners, about)
-    return fk, ik, losses
+    return Content({'camera.tf': fk, 'camera.ti': ik}, losses=losses)
 
 
 def field_of_view(camera: CameraModel) -> tuple[Floats, Floats | None]:
@@ -119,11 +117,9 @@ def field_of_view(camera: CameraModel) -> tuple[Floats, Floats | None]:
     """
     w, h = camera.width, camera.height
     share = np.arange(_SIDE_POINTS) / _SIDE_POINTS
-    u, v = share * w - 0.5, share * h - 0.5
-    left, right, top, bottom = (np.full(_SIDE_POINTS, x) for x in (-0.5, w - 0.5, -0.5, h - 0.5))
-    edge = np.concatenate(
-        [np.c_[u, top], np.c_[right, v], np.c_[w - 1.0 - u, bottom], np.c_[left, h - 1.0 - v]]
-    )
+    ends = np.array([[0, 0], [w, 0], [w, h], [0, h]]) - 0.5
+    sides = np.roll(ends, -1, axis=0) - ends
+    edge = (ends[:, None] + share[:, None] * sides[:, None]).reshape(-1, 2)
     boresight = line_of_sight(camera, np.array([(w - 1) / 2, (h - 1) / 2]))
     corners = line_of_sight(camera, edge)
     if not (corners @ boresight > np.cos(_WIDEST_RAD)).all():  # NaN is not either
@@ -164,31 +160,25 @@ def _frame_kernel(
         *about,
     ]
     data: list[str] = []
-    tracker_id = names.star_tracker_id
+    tracker_id, center = names.star_tracker_id, names.spacecraft_id
     if tracker_id:
         comments += ['', f'{tracker_frame} is a CK frame: its attitude is in a C kernel.']
-        data += _frame(tracker_frame, tracker_id, 3, names.spacecraft_id)
-        data += _assignment(f'CK_{tracker_id}_SCLK', names.spacecraft_id)
-        data += [*_assignment(f'CK_{tracker_id}_SPK', names.spacecraft_id), '']
+        clock: dict[str, Value] = {f'CK_{tracker_id}_SCLK': center, f'CK_{tracker_id}_SPK': center}
+        data += [*_assignments(_frame(tracker_frame, tracker_id, 3, center) | clock), '']
     else:
         comments += ['', f'{tracker_frame} must be defined by the frame kernel of the mission.']
     x, y, z, w = calibration.geometry.star_tracker_from_camera_xyzw
-    data += _frame(camera_frame, number, 4, names.spacecraft_id)
-    data += _assignment(f'TKFRAME_{number}_RELATIVE', tracker_frame)
-    data += _assignment(f'TKFRAME_{number}_SPEC', 'QUATERNION')
-    data += _assignment(f'TKFRAME_{number}_Q', [w, x, y, z])
+    fixed: dict[str, Value] = {'RELATIVE': tracker_frame, 'SPEC': 'QUATERNION', 'Q': [w, x, y, z]}
+    data += _assignments(_frame(camera_frame, number, 4, center))
+    data += _assignments(fixed, f'TKFRAME_{number}_')
     data += ['', f"   NAIF_BODY_NAME += '{camera_frame}'", f'   NAIF_BODY_CODE += {number}']
     return _kernel('FK', f'Frame of the camera {camera_frame}', comments, data)
 
 
-def _frame(name: str, number: int, kind: int, center: int) -> list[str]:
-    return [
-        *_assignment(f'FRAME_{name}', number),
-        *_assignment(f'FRAME_{number}_NAME', name),
-        *_assignment(f'FRAME_{number}_CLASS', kind),
-        *_assignment(f'FRAME_{number}_CLASS_ID', number),
-        *_assignment(f'FRAME_{number}_CENTER', center),
-    ]
+def _frame(name: str, number: int, kind: int, center: int) -> dict[str, Value]:
+    start = f'FRAME_{number}_'
+    values = {f'{start}CLASS': kind, f'{start}CLASS_ID': number, f'{start}CENTER': center}
+    return {f'FRAME_{name}': number, f'{start}NAME': name, **values}
 
 
 def _instrument_kernel(
@@ -213,7 +203,7 @@ def _instrument_kernel(
     values |= _lens_values(camera)
     if names.pixel_size_um:
         mm = np.sqrt(camera.intrinsics[0] * camera.intrinsics[2]) * names.pixel_size_um
-        values |= {'FOCAL_LENGTH': [mm / _UM_PER_MM], 'PIXEL_SIZE': [names.pixel_size_um] * 2}
+        values |= {'FOCAL_LENGTH': [mm / UM_PER_MM], 'PIXEL_SIZE': [names.pixel_size_um] * 2}
     terms = calibration.temperature
     if terms is not None:
         values['REFERENCE_DEGC'] = [terms.reference_degc]
@@ -299,8 +289,7 @@ def kernel_text(
     title: str, comments: Iterable[str], prefix: str, values: Mapping[str, Value]
 ) -> str:
     """Text of an IK with comments and assignments."""
-    data = [line for key, value in values.items() for line in _assignment(prefix + key, value)]
-    return _kernel('IK', title, comments, data)
+    return _kernel('IK', title, comments, _assignments(values, prefix))
 
 
 def _kernel(kind: str, title: str, comments: Iterable[str], data: Iterable[str]) -> str:
@@ -311,22 +300,25 @@ def _kernel(kind: str, title: str, comments: Iterable[str], data: Iterable[str])
     return '\n'.join(lines)
 
 
-def _assignment(name: str, value: Value) -> list[str]:
+def _assignments(values: Mapping[str, Value], prefix: str = '') -> list[str]:
     """
-    Lines that give a pool variable a whole number, a string, or a list of numbers or strings.
+    Lines that give pool variables a whole number, a string, or a list of numbers or strings.
 
     Floating-point numbers have all digits; SPICE's reader may be off by two in the last bit.
-    Raises OptionError when the name is longer than SPICE allows: the identifier in it has too many
+    Raises OptionError when a name is longer than SPICE allows: the identifier in it has too many
     digits.
     """
-    if len(name) > _LONGEST_NAME:
-        raise OptionError(f'{name}: over {_LONGEST_NAME} characters, use a shorter NAIF ID')
-    if isinstance(value, int):
-        return [f'   {name} = {value}']
-    if isinstance(value, str):
-        return [f'   {name} = {_quoted(value)}']
-    items = [_quoted(item) if isinstance(item, str) else repr(float(item)) for item in value]
-    return [f'   {name} = (', *(f'      {item}' for item in items), '   )']
+    lines = []
+    for key, value in values.items():
+        name = prefix + key
+        if len(name) > _LONGEST_NAME:
+            raise OptionError(f'{name}: over {_LONGEST_NAME} characters, use a shorter NAIF ID')
+        if isinstance(value, (int, str)):
+            lines.append(f'   {name} = {_quoted(value) if isinstance(value, str) else value}')
+            continue
+        items = [_quoted(item) if isinstance(item, str) else repr(float(item)) for item in value]
+        lines += [f'   {name} = (', *(f'      {item}' for item in items), '   )']
+    return lines
 
 
 def _frame_name(text: str, option: str) -> str:

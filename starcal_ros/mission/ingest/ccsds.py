@@ -31,13 +31,12 @@ _KM = 1000.0
 _DAY_S = 86400.0
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 _KVN = re.compile(rb'^\s*CCSDS_\w+_VERS\s*=', re.MULTILINE)
-# ATTITUDE_TYPE -> numbers of a line, of which four are the quaternion.
-_NUMBERS = {'QUATERNION': 4, 'QUATERNION/DERIVATIVE': 8}
-_TYPES = {'1.0': {**_NUMBERS, 'QUATERNION/RATE': 7}, '2.0': {**_NUMBERS, 'QUATERNION/ANGVEL': 7}}
-# Angles about the successive axes of EULER_ROT_SEQ, deg; AEM 1.0 writes XYZ as 123.
-_EULER_TYPES = {
-    '1.0': {'EULER_ANGLE': 3, 'EULER_ANGLE/RATE': 6},
-    '2.0': {'EULER_ANGLE': 3, 'EULER_ANGLE/DERIVATIVE': 6, 'EULER_ANGLE/ANGVEL': 6},
+# ATTITUDE_TYPE -> numbers of a line: of which four are the quaternion, or three the angles about
+# the axes of EULER_ROT_SEQ in turn, deg; 1.0 writes XYZ as 123.
+_BOTH = {'QUATERNION': 4, 'QUATERNION/DERIVATIVE': 8, 'EULER_ANGLE': 3}
+_TYPES = {
+    '1.0': {**_BOTH, 'QUATERNION/RATE': 7, 'EULER_ANGLE/RATE': 6},
+    '2.0': {**_BOTH, 'QUATERNION/ANGVEL': 7, 'EULER_ANGLE/DERIVATIVE': 6, 'EULER_ANGLE/ANGVEL': 6},
 }
 _AXES = str.maketrans('123', 'XYZ')
 _SEQUENCE = re.compile(r'(?!(.)\1|.(.)\2)[XYZ]{3}')
@@ -149,13 +148,14 @@ def _quaternions(segment: Segment) -> tuple[Floats, bool]:
     is_old = segment.version == '1.0'
     is_a_to_b = not is_old or _keyword(segment, 'ATTITUDE_DIR', 'A2B', 'B2A') == 'A2B'
     kind = _keyword(segment, 'ATTITUDE_TYPE')
-    if kind in _EULER_TYPES[segment.version]:
-        return _of_euler_angles(segment, _EULER_TYPES[segment.version][kind]), is_a_to_b
-    if kind not in _TYPES[segment.version]:
+    count = _TYPES[segment.version].get(kind)
+    if count is None:
         raise ValueError(f'attitudes of type {kind}, not QUATERNION or EULER_ANGLE: convert them')
+    if kind.startswith('EULER_ANGLE'):
+        return _of_euler_angles(segment, count), is_a_to_b
     if segment.is_xml:
         return _numbers(segment, (4,)), is_a_to_b
-    values = _numbers(segment, (_TYPES[segment.version][kind],))[:, :4]
+    values = _numbers(segment, (count,))[:, :4]
     if is_old and _keyword(segment, 'QUATERNION_TYPE', 'FIRST', 'LAST') == 'FIRST':
         values = np.roll(values, -1, axis=1)
     return values, is_a_to_b

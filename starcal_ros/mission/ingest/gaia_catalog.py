@@ -76,15 +76,25 @@ def write_deep_catalog(table: Path, output: Path) -> DeepCatalog:
     Raises CatalogError when the table cannot be read, lacks a column, or is not of Gaia DR3.
     """
     made = deep_catalog(table)
+    write_atomically(output, catalog_file(made.columns))
+    return made
+
+
+def catalog_file(columns: Mapping[str, NDArray[np.generic]]) -> bytes:
+    """
+    Content of a catalog file.
+
+    Equal stars give equal bytes, since numpy dates archive members 1980, except that Python 3.10
+    writes another archive version than 3.11 and later.  The digest covers only the stars.
+    """
     content = io.BytesIO()
     np.savez_compressed(
         content,
         format=np.array(CATALOG_FORMAT),
-        digest=np.array(column_digest(made.columns)),
-        **made.columns,  # type: ignore[arg-type]  # no column is named allow_pickle
+        digest=np.array(column_digest(columns)),
+        **columns,  # type: ignore[arg-type]  # no column is named allow_pickle
     )
-    write_atomically(output, content.getvalue())
-    return made
+    return content.getvalue()
 
 
 def deep_catalog(path: Path) -> DeepCatalog:
@@ -99,8 +109,18 @@ def deep_catalog(path: Path) -> DeepCatalog:
         name: np.concatenate([values[new], getattr(bundled, name)[kept]])
         for name, values in stars.items()
     }
-    values['close_pair'] = _close(_direction(values), values['magnitude'])
+    pairs = close_pairs(_direction(values))
+    values['close_pair'] = marked_close(pairs, values['magnitude'])
     values['close_pair'][int(new.sum()) :] |= bundled.close_pair[kept]
+    return DeepCatalog(
+        integer_columns(values),
+        int(new.sum()),
+        float(stars['magnitude'][new].max(initial=0.0)),
+    )
+
+
+def integer_columns(values: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Columns of a catalog file of those of a `StarCatalog`, by magnitude, then number."""
     units = {
         'ra': ('ra_rad', ANGLE_UNIT_RAD),
         'dec': ('dec_rad', ANGLE_UNIT_RAD),
@@ -110,16 +130,14 @@ def deep_catalog(path: Path) -> DeepCatalog:
         'magnitude': ('magnitude', MAGNITUDE_UNIT),
         'colour_bp_rp': ('colour_bp_rp', MAGNITUDE_UNIT),
     }
-    for name, (of, unit) in units.items():
-        whole = np.rint(values[of] / unit)
-        values[name] = np.where(np.isnan(whole), NO_COLOUR, whole).astype(np.int64)
-    values['ra'] %= 2**32
-    order = np.lexsort([values['id'], values['magnitude']])
-    return DeepCatalog(
-        {name: values[name][order].astype(kind) for name, kind in COLUMN_TYPES.items()},
-        int(new.sum()),
-        float(stars['magnitude'][new].max(initial=0.0)),
-    )
+    whole = {name: np.rint(values[of] / unit) for name, (of, unit) in units.items()}
+    whole['colour_bp_rp'][np.isnan(whole['colour_bp_rp'])] = NO_COLOUR
+    whole['ra'] %= 2**32
+    order = np.lexsort([values['id'], whole['magnitude']])
+    return {
+        name: (whole if name in whole else values)[name][order].astype(kind)
+        for name, kind in COLUMN_TYPES.items()
+    }
 
 
 def _check(path: Path, stars: Mapping[str, NDArray[Any]], bundled: StarCatalog) -> None:
@@ -138,17 +156,22 @@ def _direction(stars: Mapping[str, NDArray[Any]]) -> Floats:
     return np.asarray(erfa.s2c(stars['ra_rad'], stars['dec_rad']))
 
 
-def _close(direction: Floats, magnitude: Floats) -> NDArray[np.bool_]:
-    """Mask of stars with a neighbour within 20 arcsec and 5 magnitudes."""
-    pairs = cKDTree(direction).query_pairs(2 * np.sin(CLOSE_PAIR_RAD / 2), output_type='ndarray')
+def close_pairs(direction: Floats) -> NDArray[np.intp]:
+    """Rows (k, 2) of the stars within 20 arcsec of each other."""
+    reach = 2 * np.sin(CLOSE_PAIR_RAD / 2)
+    return np.asarray(cKDTree(direction).query_pairs(reach, output_type='ndarray'))
+
+
+def marked_close(pairs: NDArray[np.intp], magnitude: Floats) -> NDArray[np.bool_]:
+    """Mask of stars (n,) that are in a pair with one at most 5 magnitudes fainter."""
     fainter_by = magnitude[pairs[:, 1]] - magnitude[pairs[:, 0]]
-    marked = np.zeros(len(direction), np.bool_)
+    marked = np.zeros(len(magnitude), np.bool_)
     marked[pairs[fainter_by <= _CLOSE_PAIR_MAGNITUDES, 0]] = True
     marked[pairs[-fainter_by <= _CLOSE_PAIR_MAGNITUDES, 1]] = True
     return marked
 
 
-def _johnson_v(g: Floats, bp_rp: Floats) -> Floats:
+def johnson_v(g: Floats, bp_rp: Floats) -> Floats:
     """V from G and BP - RP, Gaia DR3 documentation section 5.5.1; without a colour, G + 0.15."""
     c = np.clip(bp_rp, -0.5, 5.0)  # its range
     v = g - (-0.02704 + 0.01424 * c - 0.2156 * c**2 + 0.01426 * c**3)
@@ -170,7 +193,7 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
         'pm_ra_cosdec_rad_per_year': motion[:, 0],
         'pm_dec_rad_per_year': motion[:, 1],
         'parallax_rad': np.nan_to_num(table['parallax']).clip(0) * _MAS_RAD,
-        'magnitude': _johnson_v(table['g'], table['colour']),
+        'magnitude': johnson_v(table['g'], table['colour']),
         'colour_bp_rp': table['colour'],
         'motion_source': np.where(has_motion, MotionSource.GAIA, MotionSource.UNKNOWN),
     }

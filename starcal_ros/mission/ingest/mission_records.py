@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starcal_ros.arrays import Floats
-from starcal_ros.errors import IngestError
+from starcal_ros.errors import errors_as, IngestError
 from starcal_ros.formats.images.time_systems import TimeError
 from starcal_ros.untrusted import read_text, regular_file
 
@@ -62,10 +62,9 @@ class Velocities:
 def naming(where: object) -> Iterator[None]:
     """Raise IngestError naming a file, for what its reader raises about its content."""
     try:
-        yield
-    except OSError as error:
-        raise IngestError(f'{where}: cannot be read: {error.strerror}') from error
-    except (ValueError, TimeError) as error:
+        with errors_as(IngestError, where):
+            yield
+    except TimeError as error:
         raise IngestError(f'{where}: {error}') from error
 
 

@@ -19,7 +19,7 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.camera import line_of_sight
+from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.errors import IngestError
 from starcal_ros.formats.images.image_files import FITS_ENDINGS, ImageFile
 from starcal_ros.mission.ingest.mission_records import Attitudes, EME2000_NOTE, start_of
@@ -77,14 +77,13 @@ def _is_fits(path: Path) -> bool:
 def _attitude(path: Path, image: ImageFile) -> tuple[Rotation, bool]:
     """The rotation ``icrf_from_camera``, and True if the rows of the image count upwards."""
     wcs = _celestial(path)
-    across, down = np.linspace(0, image.width - 1, _GRID), np.linspace(0, image.height - 1, _GRID)
-    pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
     middle = np.array([image.width - 1, image.height - 1]) / 2
     # A pixel to the right of the middle and one below it: size of a pixel, and handedness.
     about = _directions(wcs, middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), path)
     sides = about[1:] - about[0]
     turn = float(about[0] @ np.cross(*sides))
     camera = pinhole((image.width, image.height), 1.0 / math.sqrt(max(abs(turn), 1e-30)))
+    pixels = pixel_grid(camera, _GRID, _GRID)
     rows_upward = turn < 0
     directions = _directions(wcs, pixels, path)
     lines = image.height - 1 - pixels[:, 1] if rows_upward else pixels[:, 1]

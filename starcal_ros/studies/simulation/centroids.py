@@ -18,7 +18,6 @@ from starcal_ros.camera import CameraModel, project_jacobians
 from starcal_ros.records import Ensemble, refused_image, StarObservations
 from starcal_ros.sky.astrometry import GIVEN_SIGMA_M_S
 from starcal_ros.sky.attitude import rate_between
-from starcal_ros.sky.catalog import StarCatalog
 from starcal_ros.studies.simulation.rendering import pixel_stamps
 from starcal_ros.studies.simulation.scenario import (
     attitude_samples,
@@ -43,7 +42,6 @@ def true_observations(
     centroid_sigma_px: float | None = None,
     centroid_noise: bool = True,
     attitude_noise: bool = True,
-    catalog: StarCatalog | None = None,
 ) -> Ensemble:
     """
     Observations of all stars on the detector above `BOUND_SNR`.
@@ -56,8 +54,8 @@ def true_observations(
         False: no errors are added; the covariances stay the same.
     """
     images = []
-    for index, shown in enumerate(scenes(scenario, catalog, attitude_noise)):
-        covariance, snr, keep = _scene_bound(scenario, shown)
+    for index, shown in enumerate(scenes(scenario, attitude_noise)):
+        covariance, snr, keep = scene_bound(scenario, shown)
         if centroid_sigma_px is not None:
             covariance = np.broadcast_to(np.eye(2) * centroid_sigma_px**2, covariance.shape)
         # Drawn before the selection, so that the error of a star does not depend on other stars.
@@ -75,7 +73,7 @@ def true_observations(
     return Ensemble(tuple(images))
 
 
-def _scene_bound(scenario: Scenario, shown: Scene) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def scene_bound(scenario: Scenario, shown: Scene) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Bounds and signal-to-noise ratios of stars, and which are used: bright, on the detector."""
     camera = scenario.truth.camera
     covariance, snr = centroid_bound(
@@ -154,7 +152,7 @@ def centroid_bound(
     return covariance[:, :2, :2], 1 / np.sqrt(covariance[:, 2, 2])
 
 
-def cramer_rao_covariance(scenario: Scenario, catalog: StarCatalog | None = None) -> Floats:
+def cramer_rao_covariance(scenario: Scenario) -> Floats:
     """
     Cramer-Rao bound of the covariance of the camera parameters named by `bound_names`.
 
@@ -164,8 +162,8 @@ def cramer_rao_covariance(scenario: Scenario, catalog: StarCatalog | None = None
     camera = scenario.truth.camera
     columns = [camera.parameter_names.index(name) for name in bound_names(camera)]
     information = np.zeros((len(columns), len(columns)))
-    for shown in scenes(scenario, catalog):
-        covariance, _, keep = _scene_bound(scenario, shown)
+    for shown in scenes(scenario):
+        covariance, _, keep = scene_bound(scenario, shown)
         in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
         _, J_parameters, J_rotation = project_jacobians(camera, in_camera)
         W = np.linalg.inv(covariance[keep])

@@ -78,7 +78,7 @@ class Mistakes:
         fx, fy = (float(prior.camera.parameters[k]) for k in (0, 2))
         grown = 1.0 + self.focal_error_percent / 100.0
         turn = Rotation.from_rotvec(math.radians(self.alignment_error_deg) * np.array(_AXIS))
-        alignment = Rotation.from_quat(prior.star_tracker_from_camera_xyzw) * turn
+        alignment = prior.star_tracker_from_camera * turn
         return CameraGeometry(
             prior.camera.replace(fx=grown * fx, fy=grown * fy), alignment.as_quat()
         )

@@ -18,7 +18,6 @@ from scipy.special import erf
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.records import Image
-from starcal_ros.sky.catalog import StarCatalog
 from starcal_ros.studies.simulation.scenario import (
     Detector,
     PATTERN_STREAM,
@@ -124,8 +123,8 @@ def render(scenario: Scenario, shown: Scene, index: int, pattern: Floats | None 
     return Image(shown.time_ns, expose(mean, detector, rng))
 
 
-def images(scenario: Scenario, catalog: StarCatalog | None = None) -> Iterator[Image]:
+def images(scenario: Scenario) -> Iterator[Image]:
     """All images of a scenario, rendered on demand."""
     pattern = fixed_pattern(scenario)
     for index in range(scenario.image_count):
-        yield render(scenario, scene(scenario, index, catalog), index, pattern)
+        yield render(scenario, scene(scenario, index), index, pattern)

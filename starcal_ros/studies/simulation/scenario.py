@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 import functools
 import math
+from typing import Any
 
 import erfa
 import numpy as np
@@ -157,55 +158,41 @@ _TINY_FIELDS = (
 )
 _HOUSTON = EarthFixed(latitude_deg=29.76, longitude_deg=-95.37, roll_deg=20.0)
 _HERCULES_NS = 1778829600 * NANOSECONDS_PER_SECOND  # 2026-05-15 07:20 UTC: 16.5 h sidereal there
-SCENARIOS: Mapping[str, str] = {
-    'tiny': '10 images of 640 x 512, ten star fields, 4 s apart: the bag in the repository',
-    'small': '24 images of 1296 x 1024, zenith over Houston at 60 s',
-    'paper': '359 images of 2592 x 2048, zenith over Houston at 10 s (Christian et al. 2016)',
+_NIGHT: Mapping[str, Any] = {
+    'detector': Detector(),
+    'star_tracker_sigma_arcsec': (20.0, 20.0, 20.0),
+    'pointing': _HOUSTON,
+    'start_s': 0.0,
 }
-"""Descriptions of the scenarios by name."""
+SCENARIOS: Mapping[str, Mapping[str, Any]] = {
+    # The bag in the repository: a coarse quantisation keeps the noise near 1 DN, so that it
+    # compresses well.
+    'tiny': {
+        'size': (640, 512),
+        'cadence_s': 4.0,
+        'image_count': 10,
+        'detector': Detector(electrons_per_dn=8.0, offset_dn=32.0, zero_point_electrons=2e5),
+        'star_tracker_sigma_arcsec': (10.0, 10.0, 40.0),
+        'pointing': Inertial(_TINY_FIELDS),
+    },
+    'small': {'size': (1296, 1024), 'cadence_s': 60.0, 'image_count': 24, 'start_s': 1200.0},
+    'paper': {'size': (2592, 2048), 'cadence_s': 10.0, 'image_count': 359},
+}
+"""Size of the detector and fields of the scenarios by name, in which they differ from a night."""
 
 
 def scenario(name: str, seed: int = 1) -> Scenario:
     """
     Scenario by name; the seed determines its truth and all its noise.
 
-    Raises ValueError if no scenario has that name.
+    The camera has a field of 20 x 16 degrees.  The prior is its calibration on the ground; launch
+    has changed it.  Raises ValueError if no scenario has that name.
     """
-    if name == 'tiny':
-        # A coarse quantisation keeps the noise near 1 DN, so that the bag compresses well.
-        return _scenario(
-            name,
-            seed,
-            size=(640, 512),
-            detector=Detector(electrons_per_dn=8.0, offset_dn=32.0, zero_point_electrons=2e5),
-            star_tracker_sigma_arcsec=(10.0, 10.0, 40.0),
-            pointing=Inertial(_TINY_FIELDS),
-            cadence_s=4.0,
-            image_count=10,
-        )
-    if name == 'small':
-        return _scenario(
-            name, seed, size=(1296, 1024), start_s=1200.0, cadence_s=60.0, image_count=24
-        )
-    if name == 'paper':
-        return _scenario(name, seed, size=(2592, 2048), cadence_s=10.0, image_count=359)
-    raise ValueError(f'scenario: {name!r} is not one of {", ".join(SCENARIOS)}')
-
-
-def _scenario(
-    name: str,
-    seed: int,
-    size: tuple[int, int],
-    cadence_s: float,
-    image_count: int,
-    start_s: float = 0.0,
-    detector: Detector = Detector(),
-    star_tracker_sigma_arcsec: tuple[float, float, float] = (20.0, 20.0, 20.0),
-    pointing: EarthFixed | Inertial = _HOUSTON,
-) -> Scenario:
-    """Scenario with a 20 x 16 degree camera: ground calibration as prior, changed after launch."""
+    if name not in SCENARIOS:
+        raise ValueError(f'scenario: {name!r} is not one of {", ".join(SCENARIOS)}')
+    given = {**_NIGHT, **SCENARIOS[name]}
+    width, height = given.pop('size')
     rng = random_stream(seed, TRUTH_STREAM)
-    width, height = size
     focal_px = 35.0 / 0.0048 * width / 2592  # 35 mm lens; 4.8 um pixels at full resolution
     nominal = CameraModel(
         width,
@@ -232,12 +219,8 @@ def _scenario(
         seed=seed,
         truth=CameraGeometry(true, (mounting * shift).as_quat()),
         prior=CameraGeometry(nominal, mounting.as_quat()),
-        detector=detector,
-        star_tracker_sigma_arcsec=star_tracker_sigma_arcsec,
-        pointing=pointing,
-        start_ns=_HERCULES_NS + round(start_s * NANOSECONDS_PER_SECOND),
-        cadence_s=cadence_s,
-        image_count=image_count,
+        start_ns=_HERCULES_NS + round(given.pop('start_s') * NANOSECONDS_PER_SECOND),
+        **given,
     )
 
 
@@ -270,9 +253,7 @@ def _icrf_from_star_tracker_xyzw(
     scenario: Scenario, index: int, offset_s: float = 0.0, noise: bool = True
 ) -> Floats:
     """Reported star-tracker attitude (4,): the truth with one error for the whole image."""
-    camera_from_star_tracker = Rotation.from_quat(
-        scenario.truth.star_tracker_from_camera_xyzw
-    ).inv()
+    camera_from_star_tracker = scenario.truth.star_tracker_from_camera.inv()
     icrf_from_camera = Rotation.from_matrix(camera_from_icrf(scenario, index, offset_s)).inv()
     # The tracker's frame is off by small passive angles about its own axes.
     sigma_rad = np.array(scenario.star_tracker_sigma_arcsec) * ARCSECOND_RAD
@@ -303,12 +284,9 @@ def stamp_half_px(psf_sigma_px: float) -> int:
     return math.ceil(_STAMP_SIGMAS * psf_sigma_px)
 
 
-def scene(
-    scenario: Scenario, index: int, catalog: StarCatalog | None = None, attitude_noise: bool = True
-) -> Scene:
-    """Stars of an image; default: the bundled catalog down to the magnitude limit."""
-    if catalog is None:
-        catalog = _bundled_catalog(scenario.magnitude_limit)
+def scene(scenario: Scenario, index: int, attitude_noise: bool = True) -> Scene:
+    """Stars of an image, of the bundled catalog down to the magnitude limit."""
+    catalog = _bundled_catalog(scenario.magnitude_limit)
     camera, time_ns = scenario.truth.camera, scenario.time_ns(index)
     R = camera_from_icrf(scenario, index)
     margin_px = stamp_half_px(scenario.detector.psf_sigma_px * (1 + scenario.detector.psf_growth))
@@ -344,9 +322,7 @@ def scene(
     )
 
 
-def scenes(
-    scenario: Scenario, catalog: StarCatalog | None = None, attitude_noise: bool = True
-) -> Iterator[Scene]:
+def scenes(scenario: Scenario, attitude_noise: bool = True) -> Iterator[Scene]:
     """Scenes of all images."""
     for index in range(scenario.image_count):
-        yield scene(scenario, index, catalog, attitude_noise)
+        yield scene(scenario, index, attitude_noise)

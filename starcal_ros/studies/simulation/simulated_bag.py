@@ -14,7 +14,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 import yaml
 
-from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.formats.bag.writer import BagWriter, check_replaceable
@@ -47,10 +46,7 @@ def truth_content(scenario: Scenario, bag_name: str) -> dict[str, object]:
     true, prior = scenario.truth, scenario.prior
     stars = stars_above = 0
     for shown in scenes(scenario):
-        shape = (true.camera.height, true.camera.width)
-        _, snr = centroids.centroid_bound(
-            shown.pixel_px, shown.flux_electrons, scenario.detector, shape
-        )
+        _, snr, _ = centroids.scene_bound(scenario, shown)
         stars += len(snr)
         stars_above += int((snr > centroids.BOUND_SNR).sum())
     return {
@@ -64,8 +60,8 @@ def truth_content(scenario: Scenario, bag_name: str) -> dict[str, object]:
         'd_true': true.camera.distortion.tolist(),
         'k_prior': prior.camera.intrinsics.tolist(),
         'd_prior': prior.camera.distortion.tolist(),
-        'A_true': _camera_from_star_tracker(true).tolist(),
-        'A_prior': _camera_from_star_tracker(prior).tolist(),
+        'A_true': true.star_tracker_from_camera.inv().as_matrix().tolist(),
+        'A_prior': prior.star_tracker_from_camera.inv().as_matrix().tolist(),
         'sigma_st_arcsec': max(scenario.star_tracker_sigma_arcsec),
         'sigma_st_axes_arcsec': list(scenario.star_tracker_sigma_arcsec),
         'images': scenario.image_count,
@@ -87,11 +83,6 @@ def true_geometry(content: Mapping[str, Any]) -> CameraGeometry:
     camera = CameraModel(content['width'], content['height'], parameters, model)
     star_tracker_from_camera = Rotation.from_matrix(np.array(content['A_true']).T)
     return CameraGeometry(camera, star_tracker_from_camera.as_quat())
-
-
-def _camera_from_star_tracker(geometry: CameraGeometry) -> Floats:
-    quaternion = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
-    return np.asarray(quaternion.inv().as_matrix())
 
 
 def write_bag(

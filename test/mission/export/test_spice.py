@@ -19,7 +19,8 @@ from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.camera.detector_field import cosine_terms, DetectorField
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import OptionError
-from starcal_ros.mission.export.spice import spice_kernels, SpiceNames
+from starcal_ros.mission.export.export_formats import export
+from starcal_ros.mission.export.spice import SpiceNames
 from starcal_ros.records import Calibration
 
 NAMES = SpiceNames(-999, star_tracker_id=-999100)
@@ -33,10 +34,10 @@ def load(tmp_path: Path):
     """Load the kernels of a calibration into a clean kernel pool."""
 
     def loaded(made: Calibration, names: SpiceNames = NAMES) -> tuple[str, str]:
-        fk, ik, _ = spice_kernels(made, names)
-        for name, text in (('camera.tf', fk), ('camera.ti', ik)):
-            (tmp_path / name).write_text(text, 'ascii')
-            spiceypy.furnsh(str(tmp_path / name))
+        done = export(made, 'spice', tmp_path, names)
+        for path in done.files:
+            spiceypy.furnsh(str(path))
+        fk, ik = (path.read_text('ascii') for path in done.files)
         return fk, ik
 
     spiceypy.kclear()
@@ -194,17 +195,20 @@ def test_kernels_are_ascii_with_lines_that_spice_reads(load) -> None:
         (SpiceNames(-99999999), 'shorter NAIF ID'),
     ],
 )
-def test_names_that_spice_does_not_take_are_refused(names: SpiceNames, words: str) -> None:
+def test_names_that_spice_does_not_take_are_refused(
+    names: SpiceNames, words: str, tmp_path: Path
+) -> None:
     with pytest.raises(OptionError, match=words):
-        spice_kernels(calibration(), names)
+        export(calibration(), 'spice', tmp_path, names)
 
 
-def test_a_field_of_view_wider_than_a_half_space_is_left_out(load) -> None:
+def test_a_field_of_view_wider_than_a_half_space_is_left_out(tmp_path: Path) -> None:
     made = calibration('equidistant')
     camera = made.geometry.camera.replace(fx=400.0, fy=400.0)
     wide = dataclasses.replace(made, geometry=dataclasses.replace(made.geometry, camera=camera))
-    _, ik, losses = spice_kernels(wide, NAMES)
-    assert '_FOV_' not in ik.split('begindata')[1] and 'half space' in losses[-1].part
+    done = export(wide, 'spice', tmp_path, NAMES)
+    assert '_FOV_' not in done.files[1].read_text().split('begindata')[1]
+    assert 'half space' in done.losses[-1].part
 
 
 def test_fsolve_agrees_with_the_inverse(load) -> None:

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from sample_sky import CATALOG, QUIET  # type: ignore[import-not-found]
+from sample_sky import QUIET  # type: ignore[import-not-found]
 
 from starcal_ros.camera import project
 from starcal_ros.studies.simulation.rendering import (
@@ -90,9 +90,7 @@ def test_hot_pixels_stay_where_they_are() -> None:
     hot = pattern > tiny.detector.background_electrons
     assert hot.sum() == round(tiny.detector.hot_fraction * pattern.size)
     assert np.array_equal(pattern, fixed_pattern(tiny))
-    first, second = (
-        render(tiny, scene(tiny, index, CATALOG), index, pattern).pixels for index in (0, 1)
-    )
+    first, second = (render(tiny, scene(tiny, index), index, pattern).pixels for index in (0, 1))
     hottest = pattern > 1000
     expected_dn = (
         tiny.detector.offset_dn + pattern[hottest].mean() / tiny.detector.electrons_per_dn
@@ -116,18 +114,18 @@ def test_cosmic_rays_leave_tracks() -> None:
 
 def test_an_image_is_the_same_whatever_was_made_before() -> None:
     tiny = scenario('tiny', 7)
-    alone = render(tiny, scene(tiny, 3, CATALOG), 3)
-    render(tiny, scene(tiny, 2, CATALOG), 2)
-    again = render(scenario('tiny', 7), scene(tiny, 3, CATALOG), 3, fixed_pattern(tiny))
+    alone = render(tiny, scene(tiny, 3), 3)
+    render(tiny, scene(tiny, 2), 2)
+    again = render(scenario('tiny', 7), scene(tiny, 3), 3, fixed_pattern(tiny))
     assert alone.time_ns == again.time_ns
     assert np.array_equal(alone.pixels, again.pixels)
     other = dataclasses.replace(tiny, seed=8)
-    assert not np.array_equal(alone.pixels, render(other, scene(other, 3, CATALOG), 3).pixels)
+    assert not np.array_equal(alone.pixels, render(other, scene(other, 3), 3).pixels)
 
 
 def test_rendered_stars_stand_where_the_camera_puts_them() -> None:
     tiny = scenario('tiny')
-    shown = scene(tiny, 4, CATALOG)
+    shown = scene(tiny, 4)
     pixels = render(tiny, shown, 4).pixels.astype(np.float64)
     directions = shown.direction_icrf @ shown.camera_from_icrf.T
     assert np.allclose(project(tiny.truth.camera, directions), shown.pixel_px, atol=1e-9)
