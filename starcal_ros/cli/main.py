@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING
 
 from starcal_ros.cli import arguments, terminal
 from starcal_ros.cli.commands import mission
-from starcal_ros.cli.folders import make_folder, missing_extra
-from starcal_ros.errors import OptionError, StarcalError
+from starcal_ros.errors import missing_package, OptionError, StarcalError
+from starcal_ros.formats.products.product_files import make_folder
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
 # --help answers at once.
@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         of_command = {'campaign': 'studies', 'trend': 'mission'}.get(command, 'report')
         extra = 'pdf' if error.name == 'weasyprint' else of_command
-        return arguments.complain(missing_extra(error, extra))
+        return arguments.complain(missing_package(error, extra))
 
 
 def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:

@@ -500,7 +500,7 @@ def test_what_needs_ros_names_it(
         ('starcal inspect --ima', ['--image-topic']),
         ('starcal simulate --scenario ', ['paper', 'small', 'tiny']),
         ('starcal campaign te', ['terms']),
-        (f'starcal inspect {TINY}/', [f'{TINY}/tiny_0.mcap']),
+        (f'starcal inspect {TINY}/tiny_0', [f'{TINY}/tiny_0.mcap']),
     ],
 )
 def test_a_shell_completes(line: str, expected: list[str], tmp_path: Path) -> None:

@@ -19,13 +19,18 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.cli import output
 from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_REFUSED, is_interrupt
 from starcal_ros.cli.commands.selection import Selection, selection
-from starcal_ros.cli.folders import make_folder, missing_extra
 from starcal_ros.cli.output_places import check_folder
 from starcal_ros.cli.terminal import print_text, with_progress
-from starcal_ros.errors import NotFromStars, OptionError, StarcalError, TooFewObservations
+from starcal_ros.errors import (
+    missing_package,
+    NotFromStars,
+    OptionError,
+    StarcalError,
+    TooFewObservations,
+)
 from starcal_ros.estimation.calibration_options import tracker_sigma_is_given
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.products.product_files import REPORT_FILE, write_atomically
+from starcal_ros.formats.products.product_files import make_folder, REPORT_FILE, write_atomically
 from starcal_ros.formats.products.product_folder import (
     NotCalibrated,
     write_not_calibrated,
@@ -244,7 +249,7 @@ def _drawn(
     try:
         from starcal_ros.report import page
     except ModuleNotFoundError as error:
-        return '', f'no report: {missing_extra(error, "report")}'
+        return '', f'no report: {missing_package(error, "report")}'
     found = page.Found(calibration, left, tuple(observations), thumbnails.ordered(pictures))
     return page.render(found, folder), f'look at {folder / REPORT_FILE}'
 
@@ -342,7 +347,7 @@ def _write_failure(
         try:
             from starcal_ros.report import page
         except ModuleNotFoundError as error:
-            missing_extra(error, 'report')  # raises where another module is missing
+            missing_package(error, 'report')  # raises where another module is missing
         else:
             page.write_report(folder)
 

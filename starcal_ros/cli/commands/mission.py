@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED
-from starcal_ros.cli.folders import make_folder
 from starcal_ros.cli.terminal import print_text, progress_bar
 from starcal_ros.errors import OptionError
+from starcal_ros.formats.products.product_files import make_folder
 
 if TYPE_CHECKING:
     from starcal_ros.records import StarObservations

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import IngestError
+from starcal_ros.errors import IngestError, needing
 from starcal_ros.formats.images.header_times import Card, middle_of_exposure
 from starcal_ros.formats.images.image_files import (
     content_of,
@@ -140,12 +140,8 @@ _SRGB_TO_LIGHT = _srgb_to_light()
 
 def _of_picture(path: Path) -> tuple[Photograph, float]:
     """Facts of EXIF, and the size of a pixel, micrometres, NaN where it has none."""
-    try:
+    with needing('report', IngestError, path):
         from PIL import Image
-    except ModuleNotFoundError as error:
-        raise IngestError(
-            f"{path}: photographs need Pillow: pip install 'starcal_ros[report]'"
-        ) from error
     try:
         # Opened, not decoded: size and tags only.
         with Image.open(io.BytesIO(content_of(path))) as image:
