@@ -26,6 +26,7 @@ calibration; 2 bad input, named in one line; 130 interrupted."""
 
 _add = argparse.ArgumentParser.add_argument
 
+TOPICS = ('image', 'attitude', 'velocity', 'temperature', 'observations')
 STUDIES = ('table1', 'images', 'terms', 'coverage', 'paper')
 _BAGS = 'an .mcap file or a bag folder'
 _BAGS_OR_IMAGES = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
@@ -183,7 +184,7 @@ def _json(command: argparse.ArgumentParser) -> None:
 
 
 def _topics(command: argparse.ArgumentParser) -> None:
-    for kind in ('image', 'attitude', 'velocity', 'temperature', 'observations'):
+    for kind in TOPICS:
         what = f'{kind} topic (default: the only one of its type in the bag)'
         _add(command, f'--{kind}-topic', default='', metavar='T', help=what)
 

@@ -107,13 +107,7 @@ def _plan(args: argparse.Namespace) -> int:
 def _asked(args: argparse.Namespace) -> Topics:
     from starcal_ros.pipeline.topics import Topics
 
-    return Topics(
-        image=args.image_topic,
-        attitude=args.attitude_topic,
-        velocity=args.velocity_topic,
-        temperature=args.temperature_topic,
-        observations=args.observations_topic,
-    )
+    return Topics(**{kind: vars(args)[f'{kind}_topic'] for kind in arguments.TOPICS})
 
 
 def _report(args: argparse.Namespace) -> int:
@@ -256,7 +250,8 @@ def _play(args: argparse.Namespace) -> int:
     from starcal_ros.formats.bag import reader
 
     reader.mcap_files([args.bag])
-    return demo.become(demo.player_command(args.bag, args.rate, args.remap))
+    parameters = demo.player_arguments(args.bag, args.rate)
+    return demo.become(demo.node_command('bag_player', parameters, args.remap))
 
 
 def _monitor(args: argparse.Namespace) -> int:
@@ -265,7 +260,8 @@ def _monitor(args: argparse.Namespace) -> int:
 
     if args.once is None and not sys.stdout.isatty():
         raise OptionError('--once: needed where the output is not a terminal, e.g. --once 5')
-    return demo.become(demo.monitor_command(args.once, args.remap))
+    once = [] if args.once is None else ['--once', repr(args.once)]
+    return demo.become(demo.node_command('monitor_client', once, args.remap))
 
 
 def _request(args: argparse.Namespace) -> int:
@@ -278,7 +274,8 @@ def _request(args: argparse.Namespace) -> int:
         raise OptionError('-o: the file for the table of lookup (.csv, .npz, .fits), of it alone')
     options = [f'--{name}' for name in ('dry-run', 'force') if vars(args)[name.replace('-', '_')]]
     options += [] if args.output is None else ['--output', str(args.output)]
-    return demo.become(demo.request_command(args.service, options, args.timeout, args.remap))
+    asked = [args.service, *options, '--timeout', repr(args.timeout)]
+    return demo.become(demo.node_command('request_client', asked, args.remap))
 
 
 def _simulate(args: argparse.Namespace) -> int:

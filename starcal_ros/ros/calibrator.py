@@ -72,6 +72,7 @@ class Calibrator(StarcalNode):
     def __init__(self) -> None:
         super().__init__(NAME)
         self._made: list[tuple[Any, Any]] = []
+        self._listeners: list[tuple[Any, Any]] = []
         self._publishing = threading.Lock()
         self._state = CalibratorState(self._now_ns)
         self._reports = CalibratorReports(self.guarded(self._on_report))
@@ -125,7 +126,6 @@ class Calibrator(StarcalNode):
 
     def activate(self) -> None:
         """Start to collect observations and to serve requests."""
-        self._listeners: list[tuple[Any, Any]] = []
         collecting = MutuallyExclusiveCallbackGroup()
         if self._own.set_camera_info_service:
             self._driver = CameraDriver(self, self._own.set_camera_info_service)
@@ -156,9 +156,8 @@ class Calibrator(StarcalNode):
             self._driver.close()
             self._driver = None
         self.inputs.close()
-        listeners = getattr(self, '_listeners', [])
-        while listeners:
-            destroy, entity = listeners.pop()
+        while self._listeners:
+            destroy, entity = self._listeners.pop()
             destroy(entity)
         thread, self._status_thread = self._status_thread, None
         if thread is not None:
@@ -320,10 +319,8 @@ class Calibrator(StarcalNode):
     def _on_send_camera_info(self, _request: Any, response: Any) -> Any:
         driver = self._driver
         if driver is None:
-            response.success, response.message = (
-                False,
-                'parameter set_camera_info_service is empty',
-            )
+            response.success = False
+            response.message = 'parameter set_camera_info_service is empty'
         else:
             response.success, response.message = driver.hand_over_again()
         return response

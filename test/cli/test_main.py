@@ -685,7 +685,7 @@ from starcal_ros.cli.commands import demo
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 become = os.execv
 os.execv = lambda *command: (os.kill(os.getpid(), signal.SIGINT), become(*command))
-demo.become(demo.player_command(Path('none'), 1.0, []))
+demo.become(demo.node_command('bag_player', demo.player_arguments(Path('none'), 1.0)))
 """
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
