@@ -10,7 +10,9 @@ import difflib
 import math
 from pathlib import Path
 import re
+import shutil
 import sys
+import textwrap
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -121,15 +123,6 @@ def _words(parser: argparse.ArgumentParser) -> list[str]:
     return words
 
 
-class _Formatter(argparse.HelpFormatter):
-    """Fills paragraphs, but leaves examples as they are."""
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:
-        if text.startswith('examples:'):
-            return ''.join(indent + line for line in text.splitlines(keepends=True))
-        return super()._fill_text(text, width, indent)
-
-
 class _TopFormatter(argparse.RawDescriptionHelpFormatter):
     """Aligns the summaries of the commands."""
 
@@ -153,13 +146,14 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument('--version', action='store_true', help='show the version and exit')
     commands = top.add_subparsers(metavar='COMMAND', dest='command', title='commands')
-    for name, (summary, description, examples) in HELP.items():
+    for name, text in HELP.items():
+        summary, description, examples = text.split('\n\n', 2)
         command = commands.add_parser(
             name,
             help=summary,
-            description=description,
+            description=textwrap.fill(description, shutil.get_terminal_size().columns - 2),
             epilog=f'examples:\n{examples}',
-            formatter_class=_Formatter,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         _ARGUMENTS[name](command)
     return top
