@@ -253,7 +253,8 @@ def _plan(command: argparse.ArgumentParser) -> None:
     allowed.add_argument('--pointings', type=_path, metavar='FILE', help=what)
     cone = ('RA', 'DEC', 'DEG')
     what = 'allow boresights within DEG degrees of a direction, ICRF (default: the whole sky)'
-    allowed.add_argument('--within', type=float, nargs=3, metavar=cone, help=what)
+    whole = (0.0, 0.0, 180.0)
+    allowed.add_argument('--within', type=float, nargs=3, default=whole, metavar=cone, help=what)
     what = 'no boresight within DEG degrees of a direction: Sun, Moon, Earth; may be repeated'
     _add(command, '--avoid', type=float, nargs=3, action='append', default=[], metavar=cone,
          help=what)  # fmt: skip

@@ -26,7 +26,7 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.assessment.plan import LINE_OF_SIGHT
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import StarcalError
+from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.messages.calibration_messages import (
     alignment_to_message,
     calibration_to_message,
@@ -39,7 +39,8 @@ from starcal_ros.formats.messages.message_fields import make_header
 from starcal_ros.formats.messages.observation_messages import checked_observations
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import CalibratorOptions
-from starcal_ros.pipeline.plan import plan_pointings, request_of
+from starcal_ros.pipeline.plan import Cone, plan_pointings, Pointing
+from starcal_ros.pipeline.plan import Request as PlanRequest
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import IMAGE_REFUSALS
 from starcal_ros.ros.kept.report_queue import ACTIVE, CalibratorReports, CANDIDATE
@@ -311,11 +312,13 @@ class Calibrator(StarcalNode):
     def _on_plan(self, request: Any, response: Any) -> Any:
         response.success = False
         try:
-            wanted = request_of(
+            allowed = _rows('pointings', request.ra_deg, request.dec_deg, request.roll_deg)
+            avoid = (request.avoid_ra_deg, request.avoid_dec_deg, request.avoid_radius_deg)
+            wanted = PlanRequest(
                 images=request.images or 10,
                 minimise=request.minimise or LINE_OF_SIGHT,
-                pointings=(request.ra_deg, request.dec_deg, request.roll_deg),
-                avoid=(request.avoid_ra_deg, request.avoid_dec_deg, request.avoid_radius_deg),
+                pointings=tuple(Pointing(*row) for row in allowed),
+                avoid=tuple(Cone(*row) for row in _rows('avoid', *avoid)),
                 largest_slew_deg=request.largest_slew_deg or 180.0,
             )
             found = plan_pointings(self._state.ensemble, self._setup, wanted)
@@ -414,6 +417,12 @@ class Calibrator(StarcalNode):
             return response
 
         return run_and_tell
+
+
+def _rows(name: str, *columns: Sequence[float]) -> list[tuple[float, ...]]:
+    if len(set(map(len, columns))) > 1:
+        raise OptionError(f'{name}: the columns are not of one length')
+    return list(zip(*columns, strict=True))
 
 
 def main(args: Sequence[str] | None = None) -> int:
