@@ -638,7 +638,7 @@ def test_demo_says_which_node_failed(
     failing = [sys.executable, '-c', 'import sys; print("no such thing"); sys.exit(1)']
     waiting = [sys.executable, '-c', 'import time; time.sleep(60)']
     monkeypatch.setattr(
-        demo, '_module_command', lambda name: failing if name == 'calibrator' else waiting
+        demo, 'node_command', lambda name, *_: failing if name == 'calibrator' else waiting
     )
     assert_refused(run('demo', '-o', tmp_path), 'calibrator', 'no such thing')
 
