@@ -212,19 +212,13 @@ class StarObserver(StarcalNode):
 
     def silent(self) -> list[str]:
         """Return the image and attitude topics that sent nothing yet."""
-        image = self._image_input()[1]
-        inputs = ((image, self._on_image), ('attitude', self._on_attitude))
-        return [
-            self.resolve_topic_name(topic)
-            for topic, callback in inputs
-            if not self.taken(callback)
-        ] + [
-            self.resolve_topic_name(f'{mounting.frame}/attitude')
-            for mounting, history in zip(
-                self._setup.mountings, self._star_trackers.histories[1:], strict=True
-            )
-            if not len(history)
-        ]
+        further = zip(self._setup.mountings, self._star_trackers.histories[1:], strict=True)
+        taken = {
+            self._image_input()[1]: self.taken(self._on_image),
+            'attitude': self.taken(self._on_attitude),
+            **{f'{mounting.frame}/attitude': len(history) for mounting, history in further},
+        }
+        return [self.resolve_topic_name(topic) for topic, count in taken.items() if not count]
 
     def _on_image(self, message: Any) -> None:
         self._image_arrivals.add(0.0)
