@@ -14,8 +14,12 @@ from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.errors import IngestError, OptionError
 from starcal_ros.formats.images.image_files import read_values
 from starcal_ros.records import Image
+from starcal_ros.stars.detection import detect, measure_background
 from starcal_ros.stars.hot_pixels import HotPixels
 
+_UNIT_DN = 30000  # of a response of 1, where it is searched for stars
+_STAR_SIGMA = 8.0  # of a star in a flat field: five megapixels of noise have none
+_MOST_STARS = 5  # of a flat field of the twilight
 _MOST_BAD = 0.5  # part of the pixels from which a map is taken to be inverted
 _LEAST = 0.1  # response over the median below which a pixel is bad: its noise is ten times larger
 
@@ -38,7 +42,7 @@ def read_flat(path: str, width: int, height: int) -> Floats | None:
     Response (height, width) of the pixels, median 1; NaN where it is under a tenth of that.
 
     None without a path. Raises OptionError when the file is missing, damaged or of another size,
-    or holds no positive number.
+    or holds no positive number or stars.
     """
     if not path:
         return None
@@ -48,6 +52,12 @@ def read_flat(path: str, width: int, height: int) -> Floats | None:
         response = values / middle
     if not middle > 0:
         raise OptionError(f'flat_field: {path}: the median is {middle:g}, not positive')
+    stars = _excess_of_stars(response)
+    if stars > _MOST_STARS:
+        raise OptionError(
+            f'flat_field: {path} shows {stars} stars: it is a frame of the sky; give a frame of an'
+            ' evenly lit field, without its bias'
+        )
     response[~(response >= _LEAST)] = np.nan
     return np.asarray(response)
 
@@ -63,6 +73,26 @@ def read_bad_pixels(path: str, width: int, height: int) -> Indices:
             ' write 0 for good pixels, any other value for bad ones'
         )
     return bad
+
+
+def _excess_of_stars(response: Floats) -> int:
+    """
+    Number of star-like bright spots of a response beyond that of dark ones.
+
+    Pixels of a flat field are as often dark as bright, and its dust is dark; stars are bright.
+    """
+    level = np.nan_to_num(response, nan=1.0, posinf=1.0, neginf=1.0)
+    # Columns and rows of another gain have edges, whose maxima are no stars either.
+    level = level / np.maximum(np.median(level, axis=0), _LEAST)
+    level = level / np.maximum(np.median(level, axis=1), _LEAST)[:, None] * _UNIT_DN
+    bright, dark = (
+        detect(pixels, measure_background(pixels), _STAR_SIGMA)
+        for pixels in (
+            np.clip(np.rint(values), 0, 2 * _UNIT_DN).astype(np.uint16)
+            for values in (level, 2 * _UNIT_DN - level)
+        )
+    )
+    return len(bright.snr) - len(dark.snr)
 
 
 def with_bad_pixels(hot: HotPixels, bad: Indices, flat: Floats | None) -> HotPixels:

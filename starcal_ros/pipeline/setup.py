@@ -16,10 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.assessment.gate_options import GateOptions
-from starcal_ros.camera import CameraModel
 from starcal_ros.camera.conversion import convert
 from starcal_ros.camera.lens import COEFFICIENTS
-from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibration_options import CalibrationOptions, check_options
 from starcal_ros.formats.messages.image_messages import CHANNELS
@@ -36,7 +34,7 @@ from starcal_ros.options import (
     read_parameter_file,
     unknown_option,
 )
-from starcal_ros.pipeline import detector_frames
+from starcal_ros.pipeline import detector_frames, set_up_checks
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
 from starcal_ros.records import CameraGeometry
 from starcal_ros.sky.astrometry import SiteOptions
@@ -49,9 +47,6 @@ from starcal_ros.stars.image_model import CentroidOptions
 from starcal_ros.untrusted import shown
 
 NODES = ('star_observer', 'calibrator')
-# No star tracker is as good as 0.01 arcsec: 0.001 rad are 206 arcsec, 0.01 degrees 36 arcsec.
-_RADIANS_BELOW, _DEGREES_BELOW = 1e-3, 1e-2
-_FEWEST_STARS = 2.0  # in a mean field: the densest fields have three times as many
 
 
 @dataclass(frozen=True)
@@ -190,6 +185,16 @@ def files_of(frames: SetupOptions) -> dict[str, Path]:
     return files
 
 
+def _check_relative(files: Mapping[str, Path]) -> None:
+    """Raise OptionError for a relative path that leads to no file from the current folder."""
+    for name, path in files.items():
+        if not path.is_absolute() and not path.exists():
+            raise OptionError(
+                f'{name}: {path}: No such file in {Path.cwd()}, the folder of this process; give'
+                ' its whole path'
+            )
+
+
 def load_setup(
     values: Mapping[str, object], others: Sequence[type] = (), prior: CameraGeometry | None = None
 ) -> Setup:
@@ -207,14 +212,15 @@ def load_setup(
             raise OptionError(unknown_option(name, known))
     groups = {name: from_mapping(kind, values) for name, kind in _OPTION_GROUPS.items()}
     frames: SetupOptions = groups['frames']
+    _check_relative(files_of(frames))
     is_aligned = prior is not None or any(frames.prior_alignment)
     prior = prior or _prior(frames)
-    _check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
-    _check_site(groups['site'])
+    set_up_checks.check_tracker_sigma(groups['calibration'].star_tracker_sigma_arcsec)
+    set_up_checks.check_site(groups['site'])
     check_options(groups['calibration'], prior.camera.model)
     magnitude_limit = groups['identification'].magnitude_limit
     catalog = load_catalog(Path(frames.catalog) if frames.catalog else None, magnitude_limit)
-    _check_field_of_stars(len(catalog), magnitude_limit, prior.camera)
+    set_up_checks.check_field_of_stars(len(catalog), magnitude_limit, prior.camera)
     size = prior.camera.width, prior.camera.height
     dark = detector_frames.read_dark(frames.dark_frame, *size)
     flat = detector_frames.read_flat(frames.flat_field, *size)
@@ -233,42 +239,6 @@ def load_setup(
         flat=flat,
         mountings=_mountings(groups['attitude'], frames, prior, is_aligned),
     )
-
-
-def _check_tracker_sigma(sigma_arcsec: Sequence[float]) -> None:
-    """Raise `OptionError` for a star tracker sigma in radians or degrees."""
-    largest = max(sigma_arcsec)
-    if not 0.0 < largest < _DEGREES_BELOW:
-        return
-    unit, arcsec = ('radians', 1.0 / ARCSECOND_RAD)
-    if largest >= _RADIANS_BELOW:
-        unit, arcsec = ('degrees', 3600.0)
-    converted = ', '.join(f'{sigma * arcsec:.3g}' for sigma in sigma_arcsec)
-    raise OptionError(
-        f'star_tracker_sigma_arcsec: {list(sigma_arcsec)} looks like {unit}: in arcseconds it is'
-        f' [{converted}]'
-    )
-
-
-def _check_site(site: SiteOptions) -> None:
-    """Raise `OptionError` for a camera on the ground without a site."""
-    if site.observer == 'ground' and site.latitude_deg == site.longitude_deg == 0.0:
-        raise OptionError(
-            'observer: ground needs the site: set latitude_deg, longitude_deg (east positive) and'
-            ' height_m'
-        )
-
-
-def _check_field_of_stars(stars: int, magnitude_limit: float, camera: CameraModel) -> None:
-    """Raise `OptionError` for a magnitude limit that leaves a camera without stars."""
-    fx, _, fy = (float(value) for value in camera.intrinsics[:3])
-    field_sr = min(camera.width * camera.height / (fx * fy), 4.0 * math.pi)
-    in_field = stars * field_sr / (4.0 * math.pi)
-    if in_field < _FEWEST_STARS:
-        raise OptionError(
-            f'magnitude_limit: {magnitude_limit:g} leaves {stars} stars in the sky, {in_field:.2g}'
-            ' in a mean field of the camera; raise it'
-        )
 
 
 def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
@@ -334,6 +304,7 @@ def _prior(frames: SetupOptions) -> CameraGeometry:
                 f'lens_model: {frames.lens_model} cannot see all of the field of the prior camera,'
                 f' {frames.camera_info_url}'
             )
+    set_up_checks.check_prior_camera(camera, frames.camera_info_url)
     if not any(frames.prior_alignment):
         return CameraGeometry(camera, np.array([0.0, 0.0, 0.0, 1.0]))
     return CameraGeometry(camera, _unit_quaternion('prior_alignment', frames.prior_alignment))

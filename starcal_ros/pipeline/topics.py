@@ -23,8 +23,8 @@ _IMAGE_TYPES = {_RAW, types.COMPRESSED_TYPE}
 _WITHOUT = {
     'image': 'record the images, or make a bag of image files with starcal import',
     'attitude': (
-        'record the attitudes of the star tracker, give the bag that holds them as well, make a'
-        ' bag of both with starcal import, or set attitude_message to the type of those there are'
+        'record the attitudes of the star tracker, give the bag that holds them as well, or make'
+        ' a bag of both with starcal import'
     ),
 }
 
@@ -89,7 +89,23 @@ def _choose_attitudes(
         )
         return '', more
     only = first[0] if named and len(first) == 1 else ''
-    return _choose(paths, kind, asked or only, 'attitude'), more
+    try:
+        return _choose(paths, kind, asked or only, 'attitude'), more
+    except BagError as error:
+        if first:
+            raise
+        raise BagError(f'{error}{_other_attitudes(there, asked)}') from error
+
+
+def _other_attitudes(there: Sequence[reader.Topic], asked: str) -> str:
+    """Return which topics may hold the attitudes in messages of another type."""
+    names = {kind: name for name, kind in types.ATTITUDE_TYPES.items()}
+    return ''.join(
+        f'; {topic.name} is a {topic.type_name.rpartition("/")[2]}: if it holds the attitudes, set'
+        f' attitude_message: {names[topic.type_name]}'
+        for topic in there
+        if topic.type_name in names and topic.name.lstrip('/') == (asked or topic.name).lstrip('/')
+    )
 
 
 def _choose(paths: Sequence[Path], type_name: str, asked: str, what: str) -> str:

@@ -92,6 +92,21 @@ def test_pixels_without_response_are_bad(camera_yaml: Path, tmp_path: Path) -> N
     assert (same.pixels == image().pixels).all()
 
 
+def test_the_dust_and_noise_of_a_flat_field_are_no_stars(
+    camera_yaml: Path, tmp_path: Path
+) -> None:
+    """Specks of dust, rows of other gain and vignetting, with the noise of the photons."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    flat = response()
+    for place in np.random.default_rng(8).uniform(0, [WIDTH, HEIGHT], (40, 2)):
+        flat *= 1.0 - 0.2 * np.exp(-(np.hypot(u - place[0], v - place[1]) ** 2) / 8.0)
+    flat[:, 100:110] *= 1.3
+    counts = np.random.default_rng(9).poisson(20000.0 * flat).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / 'flat.png'), counts)
+    setup = load_setup(values(camera_yaml, flat_field=str(tmp_path / 'flat.png')))
+    assert setup.flat is not None
+
+
 def test_saturated_pixels_stay_at_the_peak() -> None:
     pixels = np.array([[4095, 2000], [1000, 4095]], np.uint16)
     flat = np.array([[1.5, 0.25], [0.5, 0.5]])
@@ -108,6 +123,7 @@ def test_saturated_pixels_stay_at_the_peak() -> None:
             'one channel of 640 x 512',
         ),
         ('flat_field', np.zeros((HEIGHT, WIDTH), np.uint8), 'median is .*not positive'),
+        ('flat_field', image().pixels, 'shows [0-9]+ stars: it is a frame of the sky'),
         ('bad_pixel_map', np.zeros((3, 4), np.uint8), 'one channel of 640 x 512'),
         ('bad_pixel_map', np.ones((HEIGHT, WIDTH), np.uint8), 'marks 100% .* 0 for good pixels'),
         ('bad_pixel_map', None, 'bad_pixel_map: .*map.png: cannot be read: No such file'),

@@ -208,7 +208,10 @@ def test_a_quaternion_of_another_norm_is_refused_with_it(camera_yaml: Path) -> N
     [
         ({'fx': 35.0, 'fy': 35.0}, 'fx: 35 px is under 96 px.* is it in mm?'),
         ({'fx': 0.035, 'fy': 0.035}, 'fx: 0.035 px is under 96 px'),
+        ({'fx': 35e4, 'fy': 35e4}, 'focal length of 350000 px .* in micrometres'),
+        ({'cx': 1.54, 'cy': 1.23}, r'principal point \(1.54, 1.23\) is in the first corner'),
         ({'cx': 5000.0}, 'cx: 5000 px is far outside of the 640 px'),
+        ({'fx': 4000.0}, 'fx = 4000 and fy = .* differ by a factor of two'),
     ],
 )
 def test_a_camera_that_no_lens_makes(tmp_path: Path, changes: dict[str, float], text: str) -> None:
@@ -217,3 +220,20 @@ def test_a_camera_that_no_lens_makes(tmp_path: Path, changes: dict[str, float], 
     with pytest.raises((OptionError, ProductError), match=text) as refused:
         load_setup(values(path))
     assert str(refused.value).startswith(str(path)) and '\n' not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    'option', ['camera_info_url', 'catalog', 'dark_frame', 'flat_field', 'bad_pixel_map']
+)
+def test_a_relative_path_that_leads_nowhere_names_folder_and_remedy(
+    camera_yaml: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    """The nodes run in a folder that their caller need not have in mind."""
+    monkeypatch.chdir(tmp_path)
+    given = {**values(camera_yaml), option: 'here/file'}
+    expected = f'{option}: here/file: No such file in {tmp_path}, .* give its whole path'
+    with pytest.raises(OptionError, match=expected):
+        load_setup(given)
+    given = {**values(camera_yaml), 'camera_info_url': camera_yaml.name}
+    monkeypatch.chdir(camera_yaml.parent)
+    assert load_setup(given).prior.camera.width > 0

@@ -82,7 +82,8 @@ def test_a_bag_of_transforms_has_no_attitudes_by_default(bag: Path, asked: str) 
     for setup in (setup_with(), None):
         with pytest.raises(BagError, match='no topic.*QuaternionStamped') as caught:
             topics.choose_topics([bag], Topics(attitude=asked), setup)
-        assert 'set attitude_message to the type of those there are' in str(caught.value)
+        remedy = '/attitude is a TransformStamped: if it holds the attitudes, set attitude_message'
+        assert f'{remedy}: transform' in str(caught.value)
 
 
 def test_without_a_channel_the_refusal_names_the_option(bag: Path) -> None:
