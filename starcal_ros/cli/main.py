@@ -306,7 +306,14 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _mistakes(args: argparse.Namespace) -> Mistakes:
     from starcal_ros.studies.simulation.mistakes import Mistakes
+    from starcal_ros.studies.simulation.scenario import ATTITUDE_OFFSETS_S
 
+    still_s = max(ATTITUDE_OFFSETS_S)
+    if 0 < abs(args.clock_error) <= still_s:
+        raise OptionError(
+            f'--clock-error: {args.clock_error:g} s changes no result: in the scenarios the camera'
+            f' is at rest, or turns evenly, within {still_s:g} s of an image; give more'
+        )
     return Mistakes(
         flip=args.flip or '',
         rotate_deg=args.rotate,

@@ -244,3 +244,12 @@ def test_parameters_outside_a_section(
     assert main.main(['inspect', str(TINY), '--params', str(path)]) == 2
     wanted = 'write /**: above' if top else 'write /**: and ros__parameters: above'
     assert wanted in capsys.readouterr().err
+
+
+def test_a_clock_error_that_shows_nothing_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ['simulate', '-o', str(tmp_path / 'bag'), '--scenario', 'tiny']
+    assert main.main([*command, '--clock-error', '-0.5']) == 2
+    assert '--clock-error: -0.5 s changes no result' in capsys.readouterr().err
+    assert not (tmp_path / 'bag').exists()
