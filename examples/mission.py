@@ -3,7 +3,7 @@
 From FITS images and a CCSDS attitude file to SPICE kernels, and a check of these with spiceypy.
 
 Run: python mission.py BAG PARAMS DIR, for example with bags/tiny.  BAG stands for a mission here:
-its images become FITS files and its attitudes an AEM.  Needs pip install 'starcal_ros[mission]'.
+its images become FITS files and its attitudes an AEM.  Needs pip install '.[mission]'.
 """
 
 from __future__ import annotations

@@ -13,6 +13,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 import contextlib
 
+# Modules of the extras in setup.cfg.
+_OF_EXTRAS = (
+    'astropy', 'contourpy', 'dask', 'distributed', 'jinja2', 'markupsafe', 'PIL', 'pyarrow',
+    'rawpy', 'spiceypy', 'weasyprint',
+)  # fmt: skip
+_WITHOUT_KEY = ('mcap', 'rosbags')  # needed, but rosdep has no key for them
+
 
 class StarcalError(Exception):
     """Base class of the exceptions that starcal raises for bad input."""
@@ -62,6 +69,24 @@ class ImageRefused(StarcalError):
 
 class TooFewObservations(StarcalError):
     """The ensemble does not suffice for the requested calibration; the text names the shortage."""
+
+
+def missing_package(error: ModuleNotFoundError, extra: str) -> str:
+    """One line that names the extra to install; raises what is missing for another reason."""
+    if error.name in _WITHOUT_KEY:
+        return f'{error.name} is not installed: pip install {" ".join(_WITHOUT_KEY)}'
+    if error.name not in _OF_EXTRAS:
+        raise error
+    return f"{error.name} is not installed: pip install '.[{extra}]' in the source folder of starcal"
+
+
+@contextlib.contextmanager
+def needing(extra: str, kind: type[StarcalError], place: object) -> Iterator[None]:
+    """Raise an import of the block that fails as a kind that names the extra to install."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise kind(f'{place}: {missing_package(error, extra)}') from error
 
 
 @contextlib.contextmanager

@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 import contextlib
 import difflib
 import math
 from pathlib import Path
 import re
+import shutil
 import sys
+import textwrap
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -24,6 +26,9 @@ _EXIT_STATUS = """\
 exit status: 0 the command succeeded, and a calibration passed the gate; 3 the gate refused the
 calibration; 2 bad input, named in one line; 130 interrupted."""
 
+_add = argparse.ArgumentParser.add_argument
+
+TOPICS = ('image', 'attitude', 'velocity', 'temperature', 'observations')
 STUDIES = ('table1', 'images', 'terms', 'coverage', 'paper')
 _BAGS = 'an .mcap file or a bag folder'
 _BAGS_OR_IMAGES = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
@@ -118,15 +123,6 @@ def _words(parser: argparse.ArgumentParser) -> list[str]:
     return words
 
 
-class _Formatter(argparse.HelpFormatter):
-    """Fills paragraphs, but leaves examples as they are."""
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:
-        if text.startswith('examples:'):
-            return ''.join(indent + line for line in text.splitlines(keepends=True))
-        return super()._fill_text(text, width, indent)
-
-
 class _TopFormatter(argparse.RawDescriptionHelpFormatter):
     """Aligns the summaries of the commands."""
 
@@ -150,36 +146,17 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument('--version', action='store_true', help='show the version and exit')
     commands = top.add_subparsers(metavar='COMMAND', dest='command', title='commands')
-    for name, (summary, description, examples) in HELP.items():
+    for name, text in HELP.items():
+        summary, description, examples = text.split('\n\n', 2)
         command = commands.add_parser(
             name,
             help=summary,
-            description=description,
+            description=textwrap.fill(description, shutil.get_terminal_size().columns - 2),
             epilog=f'examples:\n{examples}',
-            formatter_class=_Formatter,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         _ARGUMENTS[name](command)
     return top
-
-
-def _add(
-    command: argparse.ArgumentParser, *names: str, completer: Any = None, **settings: Any
-) -> None:
-    """Add an argument; argcomplete looks for the completer of its value on the action."""
-    action = command.add_argument(*names, **settings)
-    if completer is not None:
-        action.completer = completer  # type: ignore[attr-defined]
-
-
-def _files_of(*endings: str) -> Any:
-    """Completer of folders and of files with these endings."""
-
-    def complete(prefix: str, **_: object) -> Iterable[str]:
-        from argcomplete.completers import FilesCompleter
-
-        return FilesCompleter(endings)(prefix)
-
-    return complete
 
 
 def _output(command: argparse.ArgumentParser, metavar: str, what: str, **settings: Any) -> None:
@@ -187,16 +164,13 @@ def _output(command: argparse.ArgumentParser, metavar: str, what: str, **setting
 
 
 def _bags(command: argparse.ArgumentParser, what: str) -> None:
-    completer = _files_of('.mcap')
-    _add(command, 'bags', type=_path, metavar='BAG', nargs='+', help=what, completer=completer)
+    _add(command, 'bags', type=_path, metavar='BAG', nargs='+', help=what)
 
 
 def _params(command: argparse.ArgumentParser, what: str = '') -> None:
     """Parameter file, needed where no other meaning is given."""
     text = what or 'ROS parameter file: prior camera, mounting and options'
-    completer = _files_of('.yaml', '.yml')
-    _add(command, '--params', type=_path, metavar='FILE', help=text, required=not what,
-         completer=completer)  # fmt: skip
+    _add(command, '--params', type=_path, metavar='FILE', help=text, required=not what)
 
 
 def _json(command: argparse.ArgumentParser) -> None:
@@ -204,7 +178,7 @@ def _json(command: argparse.ArgumentParser) -> None:
 
 
 def _topics(command: argparse.ArgumentParser) -> None:
-    for kind in ('image', 'attitude', 'velocity', 'temperature', 'observations'):
+    for kind in TOPICS:
         what = f'{kind} topic (default: the only one of its type in the bag)'
         _add(command, f'--{kind}-topic', default='', metavar='T', help=what)
 
@@ -279,7 +253,8 @@ def _plan(command: argparse.ArgumentParser) -> None:
     allowed.add_argument('--pointings', type=_path, metavar='FILE', help=what)
     cone = ('RA', 'DEC', 'DEG')
     what = 'allow boresights within DEG degrees of a direction, ICRF (default: the whole sky)'
-    allowed.add_argument('--within', type=float, nargs=3, metavar=cone, help=what)
+    whole = (0.0, 0.0, 180.0)
+    allowed.add_argument('--within', type=float, nargs=3, default=whole, metavar=cone, help=what)
     what = 'no boresight within DEG degrees of a direction: Sun, Moon, Earth; may be repeated'
     _add(command, '--avoid', type=float, nargs=3, action='append', default=[], metavar=cone,
          help=what)  # fmt: skip
@@ -301,8 +276,7 @@ def _report(command: argparse.ArgumentParser) -> None:
 def _compare(command: argparse.ArgumentParser) -> None:
     for name, which in (('a', 'reference calibration'), ('b', 'calibration to compare')):
         what = f'{which}: calibration.json or its folder'
-        completer = _files_of('.json')
-        _add(command, name, type=_path, metavar=name.upper(), help=what, completer=completer)
+        _add(command, name, type=_path, metavar=name.upper(), help=what)
     _output(command, 'FILE', 'plot of the difference over the detector (.svg)')
     _json(command)
 
@@ -323,7 +297,7 @@ def _remaps(command: argparse.ArgumentParser, what: str) -> None:
 
 
 def _play(command: argparse.ArgumentParser) -> None:
-    _add(command, 'bag', type=_path, metavar='BAG', help=_BAGS, completer=_files_of('.mcap'))
+    _add(command, 'bag', type=_path, metavar='BAG', help=_BAGS)
     what = 'playback speed; 1 is real time, 0 is as fast as stars are observed (default: 1)'
     _add(command, '--rate', type=_number(float, 0, 1e6), default=1.0, metavar='R', help=what)
     _remaps(command, 'publish topic A of the bag as B; may be repeated')
@@ -337,10 +311,10 @@ def _monitor(command: argparse.ArgumentParser) -> None:
 
 def _request(command: argparse.ArgumentParser) -> None:
     services = ('calibrate', 'solve', 'rollback', 'reset', 'lookup')
-    command.add_argument('service', choices=services, help='service of the calibrator')
-    command.add_argument('--dry-run', action='store_true', help='solve: activate nothing')
+    _add(command, 'service', choices=services, help='service of the calibrator')
+    _add(command, '--dry-run', action='store_true', help='solve: activate nothing')
     what = 'solve: activate the result despite the gate'
-    command.add_argument('--force', action='store_true', help=what)
+    _add(command, '--force', action='store_true', help=what)
     what = 'file for the table of lookup (.csv, .npz, .fits)'
     _output(command, 'FILE', what, required=False)
     what = 'longest wait for the answer, s (default: 600)'
@@ -434,11 +408,11 @@ def _workers(command: argparse.ArgumentParser, what: str, default: int | None) -
 
 def _export(command: argparse.ArgumentParser) -> None:
     what = 'calibration.json or its folder'
-    command.add_argument('calibration', type=Path, metavar='DIR', help=what)
+    _add(command, 'calibration', type=Path, metavar='DIR', help=what)
     what = 'format: spice, ck, isd, opencv, kalibr, ros, giant, mrcal, csv or c'
-    command.add_argument('--to', required=True, metavar='FORMAT', help=what)
+    _add(command, '--to', required=True, metavar='FORMAT', help=what)
     what = 'folder for the files, created if absent'
-    command.add_argument('-o', '--output', type=Path, required=True, metavar='OUT', help=what)
+    _add(command, '-o', '--output', type=Path, required=True, metavar='OUT', help=what)
     spice = command.add_argument_group('SPICE')
     what = 'NAIF ID of the spacecraft, negative'
     spice.add_argument('--spacecraft-id', type=int, metavar='ID', help=what)
@@ -456,53 +430,57 @@ def _export(command: argparse.ArgumentParser) -> None:
     spice.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
     what = 'LSK and SCLK of the spacecraft, for ck'
     spice.add_argument('--kernels', nargs='+', type=Path, default=(), metavar='FILE', help=what)
-    command.add_argument('--image-topic', default='', metavar='T', help='image topic, for kalibr')
+    _add(command, '--image-topic', default='', metavar='T', help='image topic, for kalibr')
     what = 'binary table alone, for C code that is compiled already'
-    command.add_argument('--table', action='store_true', help=what)
+    _add(command, '--table', action='store_true', help=what)
 
 
 def _import(command: argparse.ArgumentParser) -> None:
     what = 'image files; a pattern in quotes is expanded here'
-    command.add_argument('--images', nargs='+', required=True, metavar='FILE', help=what)
+    _add(command, '--images', nargs='+', required=True, metavar='FILE', help=what)
     what = (
         'AEM, CSV, SPICE kernels (CK, SCLK, LSK and, for a frame by name, FK), or FITS with the'
         ' WCS of each image: the images themselves, or files of their names'
     )
-    command.add_argument('--attitude', nargs='+', required=True, metavar='FILE', help=what)
+    _add(command, '--attitude', nargs='+', required=True, metavar='FILE', help=what)
     what = 'OEM, CSV, or SPICE kernels (SPK with the Earth or the Sun, LSK); default: the Earth'
-    command.add_argument('--velocity', nargs='+', type=Path, metavar='FILE', help=what)
+    _add(command, '--velocity', nargs='+', type=Path, metavar='FILE', help=what)
     what = 'bag folder or .mcap file to write; replaces an earlier import, no other file'
-    command.add_argument('-o', '--output', type=Path, required=True, metavar='BAG', help=what)
+    _add(command, '-o', '--output', type=Path, required=True, metavar='BAG', help=what)
     what = 'star tracker frame: a body frame of the AEM, or a frame name or number of the CK'
-    command.add_argument('--star-tracker', default='', metavar='FRAME', help=what)
+    _add(command, '--star-tracker', default='', metavar='FRAME', help=what)
     what = 'frames of further star trackers in the same files'
-    command.add_argument('--more-star-trackers', nargs='+', default=(), metavar='FRAME', help=what)
+    _add(command, '--more-star-trackers', nargs='+', default=(), metavar='FRAME', help=what)
     what = 'name or NAIF ID of the spacecraft in the SPK'
-    command.add_argument('--spacecraft', default='', metavar='BODY', help=what)
+    _add(command, '--spacecraft', default='', metavar='BODY', help=what)
     what = 'FITS keyword of the middle of the exposure (default: DATE-AVG, else from DATE-BEG)'
-    command.add_argument('--time-key', default='', metavar='KEY', help=what)
+    _add(command, '--time-key', default='', metavar='KEY', help=what)
     what = 'CSV with columns file and time_utc (or time_tai, time_tdb, time_gps, time_ns)'
-    command.add_argument('--times', type=Path, metavar='FILE', help=what)
+    _add(command, '--times', type=Path, metavar='FILE', help=what)
     what = 'FITS keyword of the camera temperature, degC, e.g. CCD-TEMP'
-    command.add_argument('--temperature-key', default='', metavar='KEY', help=what)
+    _add(command, '--temperature-key', default='', metavar='KEY', help=what)
     what = 'FITS extension by number or name (default: the first image)'
-    command.add_argument('--hdu', default='', metavar='N', help=what)
+    _add(command, '--hdu', default='', metavar='N', help=what)
     what = 'colour to take from an RGB image or a mosaic'
-    command.add_argument('--channel', default='', choices=('red', 'green', 'blue'), help=what)
+    _add(command, '--channel', default='', choices=('red', 'green', 'blue'), help=what)
     what = 'Bayer pattern of a mosaic; the image then has half the width and height'
-    command.add_argument(
-        '--bayer', default='', choices=('rggb', 'bggr', 'gbrg', 'grbg'), help=what
-    )
+    _add(command, '--bayer', default='', choices=('rggb', 'bggr', 'gbrg', 'grbg'), help=what)
     what = 'range of pixel values that is mapped to 16 bit (default: that of all images)'
-    command.add_argument('--value-range', nargs=2, type=float, metavar=('LOW', 'HIGH'), help=what)
+    _add(command, '--value-range', nargs=2, type=float, metavar=('LOW', 'HIGH'), help=what)
     what = 'prior camera, ROS YAML or .cameramodel of mrcal; params.yaml is written then'
-    command.add_argument('--camera', type=Path, metavar='FILE', help=what)
+    _add(command, '--camera', type=Path, metavar='FILE', help=what)
     what = (
         'prior orientation x y z w of the camera in the star tracker frame, then in that of each'
         ' further one (default: found from the first images)'
     )
-    command.add_argument(
-        '--alignment', nargs='+', type=float, default=(0.0, 0.0, 0.0, 0.0), help=what, metavar='Q'
+    _add(
+        command,
+        '--alignment',
+        nargs='+',
+        type=float,
+        default=(0.0, 0.0, 0.0, 0.0),
+        help=what,
+        metavar='Q',
     )
 
 
@@ -515,20 +493,20 @@ def _catalog(command: argparse.ArgumentParser) -> None:
 
 def _trend(command: argparse.ArgumentParser) -> None:
     what = 'folder tree with calibrations and bags, or its URL, e.g. s3://bucket/fleet'
-    command.add_argument('root', metavar='ROOT', help=what)
+    _add(command, 'root', metavar='ROOT', help=what)
     what = 'folder or URL for trend.html and the table trend.parquet, created if absent'
-    command.add_argument('-o', '--output', required=True, metavar='DIR', help=what)
+    _add(command, '-o', '--output', required=True, metavar='DIR', help=what)
     what = (
         'ROS parameter file for bags without a calibration beside them; {spacecraft} and {camera} '
         'in its path are replaced'
     )
-    command.add_argument('--params', default='', metavar='FILE', help=what)
+    _add(command, '--params', default='', metavar='FILE', help=what)
     what = (
         "names of spacecraft and cameras: a pattern, e.g. '{spacecraft}/{camera}/*.mcap', or a "
         'CSV file with columns path, spacecraft, camera, params'
     )
-    command.add_argument('--cameras', default='', metavar='PATTERN', help=what)
-    command.add_argument('--retry', action='store_true', help='try what failed before again')
+    _add(command, '--cameras', default='', metavar='PATTERN', help=what)
+    _add(command, '--retry', action='store_true', help='try what failed before again')
     _workers(command, 'worker processes (default: 0, in-process)', 0)
 
 

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING
 
 from starcal_ros.cli import arguments, terminal
 from starcal_ros.cli.commands import mission
-from starcal_ros.cli.folders import make_folder, missing_extra
-from starcal_ros.errors import OptionError, StarcalError
+from starcal_ros.errors import missing_package, OptionError, StarcalError
+from starcal_ros.formats.products.product_files import make_folder
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
 # --help answers at once.
@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         of_command = {'campaign': 'studies', 'trend': 'mission'}.get(command, 'report')
         extra = 'pdf' if error.name == 'weasyprint' else of_command
-        return arguments.complain(missing_extra(error, extra))
+        return arguments.complain(missing_package(error, extra))
 
 
 def _run(args: argparse.Namespace, tool: argparse.ArgumentParser) -> int:
@@ -107,13 +107,7 @@ def _plan(args: argparse.Namespace) -> int:
 def _asked(args: argparse.Namespace) -> Topics:
     from starcal_ros.pipeline.topics import Topics
 
-    return Topics(
-        image=args.image_topic,
-        attitude=args.attitude_topic,
-        velocity=args.velocity_topic,
-        temperature=args.temperature_topic,
-        observations=args.observations_topic,
-    )
+    return Topics(**{kind: vars(args)[f'{kind}_topic'] for kind in arguments.TOPICS})
 
 
 def _report(args: argparse.Namespace) -> int:
@@ -256,7 +250,8 @@ def _play(args: argparse.Namespace) -> int:
     from starcal_ros.formats.bag import reader
 
     reader.mcap_files([args.bag])
-    return demo.become(demo.player_command(args.bag, args.rate, args.remap))
+    parameters = demo.player_arguments(args.bag, args.rate)
+    return demo.become(demo.node_command('bag_player', parameters, args.remap))
 
 
 def _monitor(args: argparse.Namespace) -> int:
@@ -265,7 +260,8 @@ def _monitor(args: argparse.Namespace) -> int:
 
     if args.once is None and not sys.stdout.isatty():
         raise OptionError('--once: needed where the output is not a terminal, e.g. --once 5')
-    return demo.become(demo.monitor_command(args.once, args.remap))
+    once = [] if args.once is None else ['--once', repr(args.once)]
+    return demo.become(demo.node_command('monitor_client', once, args.remap))
 
 
 def _request(args: argparse.Namespace) -> int:
@@ -278,7 +274,8 @@ def _request(args: argparse.Namespace) -> int:
         raise OptionError('-o: the file for the table of lookup (.csv, .npz, .fits), of it alone')
     options = [f'--{name}' for name in ('dry-run', 'force') if vars(args)[name.replace('-', '_')]]
     options += [] if args.output is None else ['--output', str(args.output)]
-    return demo.become(demo.request_command(args.service, options, args.timeout, args.remap))
+    asked = [args.service, *options, '--timeout', repr(args.timeout)]
+    return demo.become(demo.node_command('request_client', asked, args.remap))
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -334,7 +331,7 @@ def _demo(args: argparse.Namespace) -> int:
     """Calibrate the small bag with the real nodes and compare the result with the truth."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli.commands import demo
-    from starcal_ros.cli.commands.calibrate import calibrate_into, Drawings
+    from starcal_ros.cli.commands.calibrate import calibrate_into, Drawings, Job
     from starcal_ros.cli.output_places import check_folder
     from starcal_ros.formats.products.product_folder import write_products
     from starcal_ros.pipeline.setup import load_setup
@@ -361,7 +358,7 @@ def _demo(args: argparse.Namespace) -> int:
     )
     # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
     setup = load_setup(bag.parameters)
-    again, *_ = calibrate_into(args.output, [bag.bag], Topics(), setup, dict)
+    again, *_ = calibrate_into(Job(args.output, [bag.bag], Topics(), setup, dict))
     write_products(calibration, args.output)
     apart_px = float(comparison.compare(calibration, again).before.length_px.max())
     same = apart_px <= _DEMO_SAME_PX

@@ -82,6 +82,23 @@ class Request:
     avoid: tuple[Cone, ...] = ()
     largest_slew_deg: float = 180.0
 
+    def __post_init__(self) -> None:
+        """Raise OptionError for numbers that have no meaning."""
+        places: tuple[Pointing | Cone, ...] = (*self.pointings, *self.avoid, self.within)
+        for place in places:
+            numbers = dataclasses.astuple(place)
+            if not all(map(math.isfinite, numbers)) or abs(place.dec_deg) > 90.0:
+                raise OptionError(f'{place}: not a direction in degrees')
+        for one in (*self.avoid, self.within):
+            if not 0.0 <= one.radius_deg <= 180.0:
+                raise OptionError(f'{one}: the radius is not within 0 to 180 deg')
+        if not 1 <= self.images <= _MOST_IMAGES:
+            raise OptionError(f'images: {self.images} is not within 1 to {_MOST_IMAGES}')
+        if not 0.0 < self.largest_slew_deg <= 180.0:
+            raise OptionError(
+                f'largest slew: {self.largest_slew_deg:g} deg is not within 0 to 180'
+            )
+
 
 @dataclass(frozen=True)
 class Step:
@@ -111,41 +128,6 @@ class Plan:
         last = self.steps[-1].sigma if self.steps else self.sigma
         count = f'{len(self.steps)} image{"s" * (len(self.steps) != 1)}'
         return f'{self.name} {self.sigma:.4g} now, {last:.4g} expected after {count}'
-
-
-def request_of(
-    images: int,
-    minimise: str,
-    pointings: Sequence[Sequence[float]],
-    avoid: Sequence[Sequence[float]],
-    largest_slew_deg: float,
-    within: Sequence[float] = (0.0, 0.0, 180.0),
-) -> Request:
-    """
-    Return a request from plain numbers, in degrees.
-
-    ``pointings`` are columns of right ascension, declination and roll, ``avoid`` columns and
-    ``within`` numbers of right ascension, declination and radius.  Raises OptionError for numbers
-    that have no meaning.
-    """
-    for name, columns in (('pointings', pointings), ('avoid', avoid)):
-        if len({len(column) for column in columns}) > 1:
-            raise OptionError(f'{name}: the columns are not of one length')
-    allowed = tuple(Pointing(*row) for row in zip(*pointings, strict=True))
-    avoided = tuple(Cone(*row) for row in zip(*avoid, strict=True))
-    cone = Cone(*within)
-    places: tuple[Pointing | Cone, ...] = (*allowed, *avoided, cone)
-    for place in places:
-        if not all(map(math.isfinite, dataclasses.astuple(place))) or abs(place.dec_deg) > 90.0:
-            raise OptionError(f'{place}: not a direction in degrees')
-    for one in (*avoided, cone):
-        if not 0.0 <= one.radius_deg <= 180.0:
-            raise OptionError(f'{one}: the radius is not within 0 to 180 deg')
-    if not 1 <= images <= _MOST_IMAGES:
-        raise OptionError(f'images: {images} is not within 1 to {_MOST_IMAGES}')
-    if not 0.0 < largest_slew_deg <= 180.0:
-        raise OptionError(f'largest slew: {largest_slew_deg:g} deg is not within 0 to 180')
-    return Request(images, minimise, allowed, cone, avoided, largest_slew_deg)
 
 
 @one_blas_thread()

@@ -26,7 +26,7 @@ from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.assessment.plan import LINE_OF_SIGHT
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import StarcalError
+from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.messages.calibration_messages import (
     alignment_to_message,
     calibration_to_message,
@@ -39,17 +39,16 @@ from starcal_ros.formats.messages.message_fields import make_header
 from starcal_ros.formats.messages.observation_messages import checked_observations
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import CalibratorOptions
-from starcal_ros.pipeline.plan import plan_pointings, request_of
+from starcal_ros.pipeline.plan import Cone, plan_pointings, Pointing
+from starcal_ros.pipeline.plan import Request as PlanRequest
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import IMAGE_REFUSALS
-from starcal_ros.ros.kept.report_queue import ACTIVE, CalibratorReports, CANDIDATE, Subject
+from starcal_ros.ros.kept.report_queue import ACTIVE, CalibratorReports, CANDIDATE
 from starcal_ros.ros.kept.state import Answer, CalibratorState
-from starcal_ros.ros.kept.status_thread import StatusThread
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
 from starcal_ros.ros.lifecycle_node.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
 from starcal_ros.ros.lifecycle_node.message_factory import make_message, message_class
 from starcal_ros.ros.set_camera_info_client import CameraDriver
-from starcal_ros.ros.transforms import Transforms
 
 NAME = 'calibrator'
 _NONE_REFUSED = dict.fromkeys(sorted(IMAGE_REFUSALS), 0)
@@ -59,6 +58,7 @@ _TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 # Of every publisher of static transforms the last message.
 _ALL_LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _RETRY_S = 1.0  # after a failed write
+_STATUS_S = 0.25  # a burst of images is one status; idle, it costs 0.3 % of a processor
 _TABLE_POINTS, _MAX_TABLE_POINTS = 25, 200  # pixels a side; 200 take 1 s and 2 MB
 
 
@@ -72,13 +72,14 @@ class Calibrator(StarcalNode):
     def __init__(self) -> None:
         super().__init__(NAME)
         self._made: list[tuple[Any, Any]] = []
+        self._listeners: list[tuple[Any, Any]] = []
         self._publishing = threading.Lock()
         self._state = CalibratorState(self._now_ns)
         self._reports = CalibratorReports(self.guarded(self._on_report))
         self._last_answer = Answer(True, '')
         self._last_gate = 'none'
         self._driver: CameraDriver | None = None
-        self._status_thread: StatusThread | None = None
+        self._status_is_due = threading.Event()
         solving, deciding = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
         sending = MutuallyExclusiveCallbackGroup()
         # There in every state: a caller of a service that is not there waits for ever.
@@ -117,15 +118,14 @@ class Calibrator(StarcalNode):
         self._calibration = latched(CalibrationMessage, 'calibration')
         self._candidate = latched(CalibrationMessage, 'candidate_calibration')
         self._status = latched(StatusMessage, 'ensemble_status')
-        self._transforms = self._tf_static = None
+        self._tf_static = None
+        self._own_transforms: list[Any] = []
+        self._foreign_frames: set[str] = set()
         with contextlib.suppress(ImportError):  # tf2_msgs need not be installed
             self._tf_static = latched(message_class(_TRANSFORMS), '/tf_static')
-            frames = [self._setup.frames.camera_frame]
-            self._transforms = Transforms([*frames, *(one.frame for one in self._setup.mountings)])
 
     def activate(self) -> None:
         """Start to collect observations and to serve requests."""
-        self._listeners: list[tuple[Any, Any]] = []
         collecting = MutuallyExclusiveCallbackGroup()
         if self._own.set_camera_info_service:
             self._driver = CameraDriver(self, self._own.set_camera_info_service)
@@ -136,18 +136,22 @@ class Calibrator(StarcalNode):
             _OBSERVATIONS,
             group=collecting,
         )
-        if self._transforms is not None:
+        if self._tf_static is not None:
             heard = self.create_subscription(
                 message_class(_TRANSFORMS),
                 '/tf_static',
-                self.guarded(self._transforms.hear),
+                self.guarded(self._on_transforms),
                 _ALL_LATCHED,
                 callback_group=collecting,
             )
             self._listeners.append((self.destroy_subscription, heard))
         retry = self.steady_timer(_RETRY_S, self.guarded(self._save_again), collecting)
-        self._listeners.append((self.destroy_timer, retry))
-        self._status_thread = StatusThread(self.guarded(self._publish_status))
+        # Not a guard condition: before ros2/rmw_fastrtps#895 a trigger during the wait of the
+        # executor is lost, and with it the status of the last image.
+        telling = MutuallyExclusiveCallbackGroup()
+        status = self.steady_timer(_STATUS_S, self.guarded(self._publish_status), telling)
+        self._listeners += [(self.destroy_timer, retry), (self.destroy_timer, status)]
+        self._status_is_due.set()
         self._publish_active()
 
     def deactivate(self) -> None:
@@ -156,19 +160,16 @@ class Calibrator(StarcalNode):
             self._driver.close()
             self._driver = None
         self.inputs.close()
-        listeners = getattr(self, '_listeners', [])
-        while listeners:
-            destroy, entity = listeners.pop()
+        while self._listeners:
+            destroy, entity = self._listeners.pop()
             destroy(entity)
-        thread, self._status_thread = self._status_thread, None
-        if thread is not None:
-            thread.close()
 
     def cleanup(self) -> None:
         """Destroy the publishers and close the state folder; the state stays in memory."""
-        while self._made:
-            destroy, entity = self._made.pop()
-            destroy(entity)
+        with self._publishing:
+            while self._made:
+                destroy, entity = self._made.pop()
+                destroy(entity)
         self._reports.close()
         self._state.close()
 
@@ -222,33 +223,48 @@ class Calibrator(StarcalNode):
 
     def _foreign_transforms(self) -> str:
         """Return which transforms another node publishes as well; empty: none."""
-        if self._transforms is None or self.count_publishers('/tf_static') < 2:
+        if not self._own_transforms or self.count_publishers('/tf_static') < 2:
             return ''
-        names = ', '.join(self._transforms.foreign())
+        names = ', '.join(sorted(self._foreign_frames))
         remedy = 'each camera needs frames of its own (camera_frame, more_star_trackers)'
         return names and f'/tf_static: another node publishes {names} too: {remedy}'
+
+    def _on_transforms(self, message: Any) -> None:
+        """Take note of the frames of this node to which another one publishes a transform."""
+        mountings = (one.frame for one in self._setup.mountings)
+        frames = {self._setup.frames.camera_frame, *mountings}
+        with self._publishing:
+            own = self._own_transforms
+            frames |= {transform.child_frame_id for transform in own}
+            names = {frame.lstrip('/') for frame in frames}
+            heard = (one.child_frame_id for one in message.transforms if one not in own)
+            # A frame has one parent: each listener takes the transform that came last.
+            self._foreign_frames = self._foreign_frames | (
+                names & {frame.lstrip('/') for frame in heard}
+            )
 
     def _on_observations(self, message: Any) -> None:
         observations = checked_observations(message)
         if observations.refusal == 'bad_observations':
             self.get_logger().warning(f'observations refused: {observations.detail}')
         self._state.add(observations)
-        self._on_change()
+        self._status_is_due.set()
 
     def _save_again(self) -> None:
         if self._state.trouble:
             self._state.save()
-            self._on_change()
-
-    def _on_change(self) -> None:
-        thread = self._status_thread
-        if thread is not None:
-            thread.changed()
+            self._status_is_due.set()
 
     def _publish_status(self) -> None:
-        frame_id = self._setup.frames.camera_frame
-        status = self._state.status()
-        self._status.publish(status_to_message(status, frame_id, make_message))
+        if not (self.is_active and self._status_is_due.is_set()):
+            return
+        self._status_is_due.clear()  # first: a change during the rest leads to one more status
+        message = status_to_message(
+            self._state.status(), self._setup.frames.camera_frame, make_message
+        )
+        with self._publishing:
+            if self.is_active:
+                self._status.publish(message)
 
     def _on_calibrate(self, _request: Any, response: Any) -> Any:
         return self._told(self._judged(self._state.solve()), response)
@@ -265,7 +281,7 @@ class Calibrator(StarcalNode):
 
     def _on_reset(self, _request: Any, response: Any) -> Any:
         answer = self._state.reset()
-        self._on_change()
+        self._status_is_due.set()
         return self._told(answer, response)
 
     def _on_rollback(self, _request: Any, response: Any) -> Any:
@@ -296,11 +312,13 @@ class Calibrator(StarcalNode):
     def _on_plan(self, request: Any, response: Any) -> Any:
         response.success = False
         try:
-            wanted = request_of(
+            allowed = _rows('pointings', request.ra_deg, request.dec_deg, request.roll_deg)
+            avoid = (request.avoid_ra_deg, request.avoid_dec_deg, request.avoid_radius_deg)
+            wanted = PlanRequest(
                 images=request.images or 10,
                 minimise=request.minimise or LINE_OF_SIGHT,
-                pointings=(request.ra_deg, request.dec_deg, request.roll_deg),
-                avoid=(request.avoid_ra_deg, request.avoid_dec_deg, request.avoid_radius_deg),
+                pointings=tuple(Pointing(*row) for row in allowed),
+                avoid=tuple(Cone(*row) for row in _rows('avoid', *avoid)),
                 largest_slew_deg=request.largest_slew_deg or 180.0,
             )
             found = plan_pointings(self._state.ensemble, self._setup, wanted)
@@ -320,10 +338,8 @@ class Calibrator(StarcalNode):
     def _on_send_camera_info(self, _request: Any, response: Any) -> Any:
         driver = self._driver
         if driver is None:
-            response.success, response.message = (
-                False,
-                'parameter set_camera_info_service is empty',
-            )
+            response.success = False
+            response.message = 'parameter set_camera_info_service is empty'
         else:
             response.success, response.message = driver.hand_over_again()
         return response
@@ -346,15 +362,10 @@ class Calibrator(StarcalNode):
             self._publish_active(answer)
         elif answer.calibration is not None and not answer.success:
             self._candidate.publish(calibration_to_message(answer.calibration, make_message))
-            self._show(CANDIDATE, answer)
+            self._reports.show(CANDIDATE, answer)
         self._last_answer = Answer(answer.success, answer.message)
         response.success, response.message = answer.success, answer.message
         return response
-
-    def _show(self, report: str, answer: Answer) -> None:
-        if answer.calibration is not None:
-            subject = Subject(answer.calibration, answer.residuals, answer.observations)
-            self._reports.show(report, subject)
 
     def _on_report(self, page: Path, trouble: str) -> None:
         if trouble:
@@ -375,14 +386,14 @@ class Calibrator(StarcalNode):
             self._camera_info.publish(camera_info)
             self._alignment.publish(alignment)
             self._calibration.publish(calibration_to_message(calibration, make_message))
-            if self._tf_static is not None and self._transforms is not None:
+            if self._tf_static is not None:
                 transforms = [alignment, *mountings_to_messages(calibration, make_message)]
-                self._transforms.own(transforms)
+                self._own_transforms += transforms
                 self._tf_static.publish(make_message(_TRANSFORMS, transforms=transforms))
             if self._driver is not None:
                 self._driver.hand_over(camera_info)
             if answer is not None and answer.calibration is calibration:
-                self._show(ACTIVE, answer)
+                self._reports.show(ACTIVE, answer)
 
     def _answered(self, answer: Any) -> Any:
         """Return the service callback wrapped so that errors are answered, logged and counted."""
@@ -406,6 +417,12 @@ class Calibrator(StarcalNode):
             return response
 
         return run_and_tell
+
+
+def _rows(name: str, *columns: Sequence[float]) -> list[tuple[float, ...]]:
+    if len(set(map(len, columns))) > 1:
+        raise OptionError(f'{name}: the columns are not of one length')
+    return list(zip(*columns, strict=True))
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -79,15 +79,17 @@ class StarObserver(StarcalNode):
     Callbacks only store their messages; the worker thread alone changes the prediction.
     """
 
+    # By `activate`, before the callbacks that use them.
+    _queue: ImageQueue
+    _unmatched: Unmatched
+
     def __init__(self) -> None:
         super().__init__(NAME)
         self._publishers_made: list[Any] = []
         self._worker: threading.Thread | None = None
-        self._queue: ImageQueue | None = None
         self._counts: Counter[str] = Counter()
         self._last_refusal = ''
         self._retried = self._retried_used = 0
-        self._unmatched: Unmatched | None = None
         self._camera_info: Any = None  # of the active calibration, header of the last image
 
     def configure(self) -> None:
@@ -159,14 +161,14 @@ class StarObserver(StarcalNode):
     def deactivate(self) -> None:
         """Close the inputs and drop the images in the queue."""
         self.inputs.close()
-        if self._queue is not None and self._worker is not None:
-            if len(self._queue):
-                self.get_logger().warning(f'{len(self._queue)} images dropped from the queue')
-            self._queue.close()
-            self._worker.join()
+        if self._worker is None:
+            return
+        if len(self._queue):
+            self.get_logger().warning(f'{len(self._queue)} images dropped from the queue')
+        self._queue.close()
+        self._worker.join()
         self._worker = None
-        if self._unmatched is not None:
-            self._unmatched.close()
+        self._unmatched.close()
 
     def cleanup(self) -> None:
         """Destroy the publishers."""
@@ -175,14 +177,14 @@ class StarObserver(StarcalNode):
 
     def health(self) -> Health:
         """Diagnostics: counts of used and refused images."""
-        why = None if self._unmatched is None else self._unmatched.diagnosis
+        why = self._unmatched.diagnosis
         counts = dict(self._counts)  # the worker thread continues counting
         unfit, first = self._track.unfit, self._setup.frames.star_tracker_frame
         not_used = [f'{name or first}: {one.images}' for name, one in unfit.items()]
         numbers: dict[str, object] = {
             'images': sum(counts.values()),
             'images_used': counts.get('', 0),
-            'images_waiting': len(self._queue or ()),
+            'images_waiting': len(self._queue),
             'image_rate_hz': _short(self._image_arrivals.rate_hz()),
             'latency_median_s': _short(self._latency_s.median()),
             'latency_worst_s': _short(self._latency_s.largest()),
@@ -210,28 +212,21 @@ class StarObserver(StarcalNode):
 
     def silent(self) -> list[str]:
         """Return the image and attitude topics that sent nothing yet."""
-        image = self._image_input()[1]
-        inputs = ((image, self._on_image), ('attitude', self._on_attitude))
-        return [
-            self.resolve_topic_name(topic)
-            for topic, callback in inputs
-            if not self.taken(callback)
-        ] + [
-            self.resolve_topic_name(f'{mounting.frame}/attitude')
-            for mounting, history in zip(
-                self._setup.mountings, self._star_trackers.histories[1:], strict=True
-            )
-            if not len(history)
-        ]
+        further = zip(self._setup.mountings, self._star_trackers.histories[1:], strict=True)
+        taken = {
+            self._image_input()[1]: self.taken(self._on_image),
+            'attitude': self.taken(self._on_attitude),
+            **{f'{mounting.frame}/attitude': len(history) for mounting, history in further},
+        }
+        return [self.resolve_topic_name(topic) for topic, count in taken.items() if not count]
 
     def _on_image(self, message: Any) -> None:
         self._image_arrivals.add(0.0)
         self._publish_camera_info(message)
         time_ns = stamp_ns(message.header.stamp)
         time_ns += offset_ns(self._setup.attitude.stamp_offset_s)
-        if self._queue is not None:
-            width, height = getattr(message, 'width', 0), getattr(message, 'height', 0)
-            self._queue.put(time_ns, width, height, message)
+        width, height = getattr(message, 'width', 0), getattr(message, 'height', 0)
+        self._queue.put(time_ns, width, height, message)
 
     def _publish_camera_info(self, message: Any) -> None:
         """Publish the active calibration with the header of an image message."""
@@ -246,8 +241,7 @@ class StarObserver(StarcalNode):
 
     def _on_attitude(self, message: Any) -> None:
         time_ns, quaternion = telemetry.attitude_from_message(message)
-        if self._unmatched is not None:
-            self._unmatched.add_attitude(time_ns, quaternion)
+        self._unmatched.add_attitude(time_ns, quaternion)
         history = self._star_trackers.histories[0]
         before_ns = history.latest_ns
         self._add_attitude(0, message)
@@ -260,8 +254,7 @@ class StarObserver(StarcalNode):
         time_ns, quaternion = telemetry.attitude_from_message(message)
         direction = self._setup.attitude.attitude_direction
         self._star_trackers.add(which, time_ns, attitude_sample(time_ns, quaternion, direction))
-        if self._queue is not None:
-            self._queue.wake()
+        self._queue.wake()
 
     def _on_velocity(self, message: Any) -> None:
         time_ns, velocity_m_s = telemetry.velocity_from_message(message)
@@ -292,11 +285,9 @@ class StarObserver(StarcalNode):
         self._measure_again()
 
     def _in_worker(self, function: Callable[..., None], *arguments: Any) -> None:
-        if self._queue is not None:
-            self._queue.call(functools.partial(self.guarded(function), *arguments))
+        self._queue.call(functools.partial(self.guarded(function), *arguments))
 
     def _measure_all(self) -> None:
-        assert self._queue is not None  # created before the thread
         heard_by_s = math.inf
         while (waiting := self._queue.take()) is not None:
             # Where all nodes start at once, the first image may be faster than the discovery of
@@ -342,7 +333,7 @@ class StarObserver(StarcalNode):
             self._predicted_from = self._geometry
             self._track = dataclasses.replace(self._track, geometry=self._geometry)
         if not self._setup.is_aligned and self._geometry is self._setup.prior:
-            self._keep(image)
+            self._unmatched.add(image)
             detail = 'prior_alignment is not given: it is being found from the images'
             self._publish(self._refused(waiting, 'no_match', detail))
             return
@@ -353,8 +344,8 @@ class StarObserver(StarcalNode):
             self.get_logger().warning('image stamps went back: restarted the sequence')
         self._publish(observations)
         if observations.refusal == 'no_match':
-            self._keep(image)
-        elif not observations.refusal and self._unmatched is not None:
+            self._unmatched.add(image)
+        elif not observations.refusal:
             self._unmatched.matched()
         if self._annotated.get_subscription_count():
             self._publish_annotated(image, observations, before.geometry)
@@ -373,10 +364,6 @@ class StarObserver(StarcalNode):
             more,
         )
 
-    def _keep(self, image: Image) -> None:
-        if self._unmatched is not None:
-            self._unmatched.add(image)
-
     def _on_diagnosis(self, found: Diagnosis) -> None:
         """Log why images match nothing; without a prior alignment, take the one found."""
         if self._setup.is_aligned:
@@ -384,7 +371,7 @@ class StarObserver(StarcalNode):
             self.publish_health()
             return
         values, sentence = found_alignment(found)
-        if values is None or self._unmatched is None:
+        if values is None:
             self.get_logger().warning(f'prior_alignment is not given, and not found: {sentence}')
             return
         is_prior = self._geometry is self._setup.prior
@@ -397,7 +384,7 @@ class StarObserver(StarcalNode):
 
     def _measure_again(self) -> None:
         """Measure the images that matched nothing, with the calibration or alignment found."""
-        kept = [] if self._unmatched is None else self._unmatched.take()
+        kept = self._unmatched.take()
         for image in kept:
             observations, _ = self._observe_next(image, observe.Track(self._geometry))
             self._retried += 1

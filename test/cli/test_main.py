@@ -500,7 +500,7 @@ def test_what_needs_ros_names_it(
         ('starcal inspect --ima', ['--image-topic']),
         ('starcal simulate --scenario ', ['paper', 'small', 'tiny']),
         ('starcal campaign te', ['terms']),
-        (f'starcal inspect {TINY}/', [f'{TINY}/tiny_0.mcap']),
+        (f'starcal inspect {TINY}/tiny_0', [f'{TINY}/tiny_0.mcap']),
     ],
 )
 def test_a_shell_completes(line: str, expected: list[str], tmp_path: Path) -> None:
@@ -638,7 +638,7 @@ def test_demo_says_which_node_failed(
     failing = [sys.executable, '-c', 'import sys; print("no such thing"); sys.exit(1)']
     waiting = [sys.executable, '-c', 'import time; time.sleep(60)']
     monkeypatch.setattr(
-        demo, '_module_command', lambda name: failing if name == 'calibrator' else waiting
+        demo, 'node_command', lambda name, *_: failing if name == 'calibrator' else waiting
     )
     assert_refused(run('demo', '-o', tmp_path), 'calibrator', 'no such thing')
 
@@ -685,7 +685,7 @@ from starcal_ros.cli.commands import demo
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 become = os.execv
 os.execv = lambda *command: (os.kill(os.getpid(), signal.SIGINT), become(*command))
-demo.become(demo.player_command(Path('none'), 1.0, []))
+demo.become(demo.node_command('bag_player', demo.player_arguments(Path('none'), 1.0)))
 """
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (-signal.SIGINT, '')

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import dataclasses
 import math
 
@@ -14,13 +13,11 @@ from bench.frames import load_set_up
 from starcal_ros.assessment.plan import target
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.pipeline.plan import Plan, plan_pointings, Pointing, request_of
+from starcal_ros.pipeline.plan import Cone, Plan, plan_pointings, Pointing, Request
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Ensemble
 from starcal_ros.studies.simulation.centroids import true_observations
 from starcal_ros.studies.simulation.scenario import camera_from_icrf, Inertial, scenario
-
-_NONE: tuple[Sequence[float], ...] = ()
 
 
 @pytest.fixture(scope='module')
@@ -35,7 +32,7 @@ def ensemble() -> Ensemble:
 
 @pytest.fixture(scope='module')
 def planned(setup: Setup, ensemble: Ensemble) -> Plan:
-    return plan_pointings(ensemble, setup, request_of(4, 'map', _NONE, _NONE, 180.0))
+    return plan_pointings(ensemble, setup, Request(4, 'map'))
 
 
 def _taken(ensemble: Ensemble, planned: Plan) -> Ensemble:
@@ -80,8 +77,9 @@ def test_the_images_then_give_the_sigma_that_was_expected(
 def test_pointings_of_a_list_are_taken_once_and_obey_slew_and_exclusion(
     setup: Setup, ensemble: Ensemble
 ) -> None:
-    rows = np.array([(10.0 * k, 20.0, 5.0) for k in range(12)])
-    request = request_of(12, 'fx', rows.T.tolist(), ((0.0,), (20.0,), (15.0,)), 30.0)
+    allowed = tuple(Pointing(10.0 * k, 20.0, 5.0) for k in range(12))
+    avoid = (Cone(0.0, 20.0, 15.0),)
+    request = Request(12, 'fx', allowed, avoid=avoid, largest_slew_deg=30.0)
     places = [step.pointing for step in plan_pointings(ensemble, setup, request).steps]
     assert len(set(places)) == len(places) > 1
     assert {one.ra_deg for one in places} <= {20.0 + 10.0 * k for k in range(10)}
@@ -92,7 +90,7 @@ def test_pointings_of_a_list_are_taken_once_and_obey_slew_and_exclusion(
 
 @pytest.mark.slow
 def test_pointings_within_a_cone(setup: Setup, ensemble: Ensemble) -> None:
-    request = request_of(2, 'map', _NONE, _NONE, 180.0, (200.0, 50.0, 25.0))
+    request = Request(2, 'map', within=Cone(200.0, 50.0, 25.0))
     axis = Pointing(200.0, 50.0).icrf_from_camera.apply([0.0, 0.0, 1.0])
     for step in plan_pointings(ensemble, setup, request).steps:
         boresight = step.pointing.icrf_from_camera.apply([0.0, 0.0, 1.0])
@@ -102,7 +100,7 @@ def test_pointings_within_a_cone(setup: Setup, ensemble: Ensemble) -> None:
 @pytest.mark.slow
 def test_a_plan_says_when_more_images_stop_helping(setup: Setup, ensemble: Ensemble) -> None:
     """Of one star-poor field only, whose images repeat what is known."""
-    request = request_of(40, 'k1', _NONE, _NONE, 180.0, (200.0, 50.0, 1.0))
+    request = Request(40, 'k1', within=Cone(200.0, 50.0, 1.0))
     found = plan_pointings(ensemble, setup, request)
     assert found.enough is not None and 1 < found.enough < 40
 
@@ -112,22 +110,20 @@ def test_a_plan_says_when_more_images_stop_helping(setup: Setup, ensemble: Ensem
     [
         ({'images': 0}, 'images: 0 is not within 1 to 1000'),
         ({'largest_slew_deg': 0.0}, 'largest slew: 0 deg'),
-        ({'pointings': ((1.0,), (2.0,), ())}, 'pointings: the columns'),
-        ({'pointings': ((1.0,), (91.0,), (0.0,))}, 'not a direction'),
-        ({'avoid': ((math.nan,), (0.0,), (5.0,))}, 'not a direction'),
-        ({'within': (0.0, 0.0, 200.0)}, 'the radius is not within'),
+        ({'pointings': (Pointing(1.0, 91.0),)}, 'not a direction'),
+        ({'avoid': (Cone(math.nan, 0.0, 5.0),)}, 'not a direction'),
+        ({'within': Cone(0.0, 0.0, 200.0)}, 'the radius is not within'),
     ],
 )
 def test_a_request_without_a_meaning(changed: dict[str, object], text: str) -> None:
-    plain = {'images': 1, 'minimise': 'map', 'pointings': (), 'avoid': (), 'largest_slew_deg': 1.0}
     with pytest.raises(OptionError, match=text):
-        request_of(**{**plain, **changed})  # type: ignore[arg-type]
+        Request(**{'images': 1, **changed})  # type: ignore[arg-type]
 
 
 def test_no_pointing_left_and_no_estimate(setup: Setup, ensemble: Ensemble) -> None:
-    nowhere = request_of(1, 'map', _NONE, ((0.0,), (0.0,), (180.0,)), 180.0)
+    nowhere = Request(1, 'map', avoid=(Cone(0.0, 0.0, 180.0),))
     with pytest.raises(OptionError, match='no pointing that is allowed shows a star'):
         plan_pointings(ensemble, setup, nowhere)
     few = dataclasses.replace(ensemble, images=ensemble.images[:1])
     with pytest.raises(TooFewObservations):
-        plan_pointings(few, setup, request_of(1, 'map', _NONE, _NONE, 180.0))
+        plan_pointings(few, setup, Request(1, 'map'))

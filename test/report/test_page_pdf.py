@@ -39,7 +39,7 @@ def test_without_the_library_one_line_names_the_extra(
     monkeypatch.setitem(sys.modules, 'weasyprint', None)
     assert main.main(['report', str(tmp_path / 'out'), '--pdf']) == EXIT_BAD_INPUT
     said = capsys.readouterr().err
-    assert said.count('\n') == 1 and "pip install 'starcal_ros[pdf]'" in said
+    assert said.count('\n') == 1 and "pip install '.[pdf]'" in said
 
 
 def test_without_pango_one_line_names_its_packages(

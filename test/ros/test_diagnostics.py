@@ -209,13 +209,13 @@ def test_a_publisher_that_is_not_received_is_named(
     observer = start_node('star_observer', ros=(*ros, '-p', reliable))
     diagnostics = client.collect(DiagnosticArray, '/diagnostics')
     image = client.node.create_publisher(Image, '/opnav/image_raw', qos_profile_sensor_data)
-    refused = '/opnav/image_raw: a publisher offers best effort, reliable is requested'
+    refused = '/opnav/image_raw: Best effort publisher and reliable subscription'
     client.until(lambda: newest(diagnostics, 'star_observer')[1] == f'not received: {refused}')
     assert newest(diagnostics, 'star_observer')[0] == b'\x01'
     assert refused in observer.said()
     client.node.destroy_publisher(image)
     client.node.create_publisher(Calibration, '/calibration', QoSProfile(depth=1))
-    refused = '/calibration: a publisher offers volatile, transient local is requested'
+    refused = '/calibration: Volatile publisher and transient local subscription'
     client.until(lambda: newest(diagnostics, 'star_observer')[1] == f'not received: {refused}')
 
 

@@ -48,7 +48,6 @@ def test_the_worker_alone_changes_prediction_and_counts(
         busy.set()
         assert go_on.wait(60.0)
 
-    assert observer._queue is not None
     observer._queue.call(hold)
     assert busy.wait(60.0)
     active = read_calibration(tiny_products / CALIBRATION_FILE)

@@ -139,14 +139,14 @@ def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path
     done = run(starcal, 'calibrate', tiny, '--params', params, '-o', 'out', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     assert json.loads((tmp_path / 'out/calibration.json').read_text())['accepted']
-    assert "pip install 'starcal_ros[report]'" in done.stdout.splitlines()[-1]
+    assert "pip install '.[report]'" in done.stdout.splitlines()[-1]
     for line, extra in (
         (('report', 'out'), 'report'),
         (('campaign', 'images', '-o', 'study', '--scheduler', 'tcp://127.0.0.1:1'), 'studies'),
     ):
         refused = run(starcal, *line, cwd=tmp_path)
         assert refused.returncode == 2
-        assert f"is not installed: pip install 'starcal_ros[{extra}]'" in refused.stderr
+        assert f"is not installed: pip install '.[{extra}]'" in refused.stderr
         assert refused.stderr.count('\n') == 1
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import dataclasses
+from dataclasses import dataclass
 import glob
 from pathlib import Path
 import sys
@@ -19,13 +20,18 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.cli import output
 from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_REFUSED, is_interrupt
 from starcal_ros.cli.commands.selection import Selection, selection
-from starcal_ros.cli.folders import make_folder, missing_extra
 from starcal_ros.cli.output_places import check_folder
 from starcal_ros.cli.terminal import print_text, with_progress
-from starcal_ros.errors import NotFromStars, OptionError, StarcalError, TooFewObservations
+from starcal_ros.errors import (
+    missing_package,
+    NotFromStars,
+    OptionError,
+    StarcalError,
+    TooFewObservations,
+)
 from starcal_ros.estimation.calibration_options import tracker_sigma_is_given
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.products.product_files import REPORT_FILE, write_atomically
+from starcal_ros.formats.products.product_files import make_folder, REPORT_FILE, write_atomically
 from starcal_ros.formats.products.product_folder import (
     NotCalibrated,
     write_not_calibrated,
@@ -42,6 +48,23 @@ from starcal_ros.report.pictures import thumbnails
 
 HALVES = ('odd', 'even')
 ThroughAir = Callable[[Sequence[StarObservations]], tuple[list[StarObservations], str]]
+
+
+@dataclass(frozen=True)
+class Job:
+    """
+    Bags to calibrate from, and the folder for the products.
+
+    ``inputs`` gives the digests of the input files; ``through_air`` gives the observations as they
+    are solved, and what was found in words, where the attitudes are those of the stars.
+    """
+
+    folder: Path
+    bags: Sequence[Path]
+    asked: Topics
+    setup: Setup
+    inputs: Callable[[], Mapping[str, str]]
+    through_air: ThroughAir | None = None
 
 
 def calibrate(args: argparse.Namespace, asked: Topics) -> int:
@@ -120,16 +143,8 @@ def _calibrate(
         stopped = threading.Event()
         inputs = thread.submit(inputs_of, files, stopped.is_set)
         try:
-            calibration, observations, report = calibrate_into(
-                args.output,
-                bags,
-                asked,
-                setup,
-                inputs.result,
-                wanted,
-                not args.no_report,
-                through_air,
-            )
+            job = Job(args.output, bags, asked, setup, inputs.result, through_air)
+            calibration, observations, report = calibrate_into(job, wanted, not args.no_report)
         finally:
             stopped.set()
     output.print_calibration(calibration, setup.prior)
@@ -146,22 +161,15 @@ def _calibrate(
 
 
 def calibrate_into(
-    folder: Path,
-    bags: Sequence[Path],
-    asked: Topics,
-    setup: Setup,
-    inputs: Callable[[], Mapping[str, str]],
-    wanted: Wanted | None = None,
-    with_report: bool = False,
-    through_air: ThroughAir | None = None,
+    job: Job, wanted: Wanted | None = None, with_report: bool = False
 ) -> tuple[Calibration, list[StarObservations], str]:
     """
     Calibrate from bags and write the products, with or without a report.
 
-    ``through_air`` gives the observations as they are solved, and what was found in words.  Also
-    returns the observations and where the report is, or why there is none.
+    Also returns the observations and where the report is, or why there is none.
     """
-    topics = bag_topics.choose_topics(bags, asked, setup)
+    folder, bags, setup = job.folder, job.bags, job.setup
+    topics = bag_topics.choose_topics(bags, job.asked, setup)
     count = bag_topics.count(bags, topics)
     album, drawings = thumbnails.Album(count, setup), Drawings()
 
@@ -173,12 +181,12 @@ def calibrate_into(
     observations = list(with_progress(records, count, 'images'))
     if not observations and isinstance(wanted, Selection):
         raise OptionError(wanted.without_images())
-    if through_air is not None:
-        observations, text = through_air(observations)
+    if job.through_air is not None:
+        observations, text = job.through_air(observations)
         if text:
             print_text(text, file=sys.stderr)
     # Each image was identified by itself: what matched nothing does not by the others either.
-    again = topics if through_air is None else Topics()
+    again = topics if job.through_air is None else Topics()
     make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
     write_observations(observations, folder, setup.frames.camera_frame)
@@ -187,11 +195,9 @@ def calibrate_into(
         if with_report:
             thread.submit(_load_report)
         try:
-            calibration, left, observations = _solve_twice(
-                folder, bags, again, setup, inputs(), observations
-            )
+            calibration, left, observations = _solve_twice(job, again, observations)
         except TooFewObservations as error:
-            failure = _failure(str(error), bags, asked, setup, observations, bool(topics.image))
+            failure = _failure(str(error), job, observations, bool(topics.image))
             _write_failure(folder, failure, album.unmatched)
             raise TooFewObservations(failure.reason) from error
         pictures: Sequence[thumbnails.Thumbnail] = ()
@@ -244,24 +250,19 @@ def _drawn(
     try:
         from starcal_ros.report import page
     except ModuleNotFoundError as error:
-        return '', f'no report: {missing_extra(error, "report")}'
+        return '', f'no report: {missing_package(error, "report")}'
     found = page.Found(calibration, left, tuple(observations), thumbnails.ordered(pictures))
     return page.render(found, folder), f'look at {folder / REPORT_FILE}'
 
 
 def _solve_twice(
-    folder: Path,
-    bags: Sequence[Path],
-    topics: Topics,
-    setup: Setup,
-    inputs: Mapping[str, str],
-    observations: list[StarObservations],
+    job: Job, topics: Topics, observations: list[StarObservations]
 ) -> tuple[Calibration, Residuals, list[StarObservations]]:
     """Solve, and once more if that calibration identifies stars in images that matched nothing."""
-    calibration, left = _solve(observations, setup, inputs)
+    calibration, left = _solve(observations, job.setup, job.inputs())
     if not (calibration.accepted and topics.image):
         return calibration, left, observations
-    again = measured_again(bags, topics, setup, calibration.geometry, observations)
+    again = measured_again(job.bags, topics, job.setup, calibration.geometry, observations)
     gained = _used(again) - _used(observations)
     if not gained:
         return calibration, left, observations
@@ -270,8 +271,8 @@ def _solve_twice(
         ' others',
         file=sys.stderr,
     )
-    write_observations(again, folder, setup.frames.camera_frame)
-    return *_solve(again, setup, inputs), again
+    write_observations(again, job.folder, job.setup.frames.camera_frame)
+    return *_solve(again, job.setup, job.inputs()), again
 
 
 def _solve(
@@ -305,12 +306,7 @@ def _split(
 
 
 def _failure(
-    words: str,
-    bags: Sequence[Path],
-    asked: Topics,
-    setup: Setup,
-    observations: Sequence[StarObservations],
-    has_images: bool,
+    words: str, job: Job, observations: Sequence[StarObservations], has_images: bool
 ) -> NotCalibrated:
     """The record of a failure, with the cause for which most images are refused."""
     from starcal_ros.pipeline.diagnosis.bags import of_a_failure, of_refusals
@@ -321,10 +317,10 @@ def _failure(
         words = f'no image of {len(observations)} can be used'
     if refused:
         words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
-    named = tuple(map(str, bags))
+    named = tuple(map(str, job.bags))
     found = of_refusals(groups, len(observations))
     if has_images and not _used(observations):
-        found = of_a_failure(bags, asked, setup, groups)
+        found = of_a_failure(job.bags, job.asked, job.setup, groups)
     if found is None:
         return NotCalibrated(words, named, refused)
     words += f'. {found.in_a_sentence()}'
@@ -342,7 +338,7 @@ def _write_failure(
         try:
             from starcal_ros.report import page
         except ModuleNotFoundError as error:
-            missing_extra(error, 'report')  # raises where another module is missing
+            missing_package(error, 'report')  # raises where another module is missing
         else:
             page.write_report(folder)
 

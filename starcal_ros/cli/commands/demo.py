@@ -125,7 +125,7 @@ def run(
         nodes: dict[str, Process] = {}
         commands = {name: _node_command(name, params, state) for name in _NODES}
         commands['bag_player'] = [
-            *player_command(bag.bag, RATE, []),
+            *node_command('bag_player', player_arguments(bag.bag, RATE)),
             *('-p', 'wait_for_topic:=observations', '-p', f'wait_for_subscribers_s:={_START_S}'),
         ]
         for name, command in commands.items():
@@ -138,7 +138,7 @@ def run(
                 stack.callback(_stop, nodes[name])
         _wait_for_images(bag.image_count, state / 'ensemble', nodes, folder, on_image)
         asked = subprocess.run(
-            request_command('calibrate', [], _ANSWER_S, []),
+            node_command('request_client', ['calibrate', '--timeout', str(_ANSWER_S)]),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             env=environment,
@@ -192,31 +192,6 @@ def become(command: list[str]) -> NoReturn:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
-def player_command(path: Path, rate: float, remaps: Sequence[str]) -> list[str]:
-    """Command line that plays a bag on the graph."""
-    parameters = ['-p', f'bag:={path.resolve()}', '-p', f'rate:={rate!r}']
-    return [*_module_command('bag_player'), '--ros-args', *parameters, *_renamed(remaps)]
-
-
-def monitor_command(once_after_s: float | None, remaps: Sequence[str]) -> list[str]:
-    """Command line that shows running nodes in the terminal."""
-    once = [] if once_after_s is None else ['--once', repr(once_after_s)]
-    return [*_module_command('monitor_client'), *once, *_renamed(remaps)]
-
-
-def request_command(
-    service: str, options: Sequence[str], timeout_s: float, remaps: Sequence[str]
-) -> list[str]:
-    """Command line that calls a service of a running calibrator."""
-    asked = [service, *options, '--timeout', repr(timeout_s)]
-    return [*_module_command('request_client'), *asked, *_renamed(remaps)]
-
-
-def _renamed(remaps: Sequence[str]) -> list[str]:
-    renamed = [part for remap in remaps for part in ('-r', remap)]
-    return ['--ros-args', *renamed] if renamed else []
-
-
 def _node_command(name: str, params: Path, state: Path) -> list[str]:
     topics = {
         'image': simulated_bag.IMAGE_TOPIC,
@@ -225,11 +200,19 @@ def _node_command(name: str, params: Path, state: Path) -> list[str]:
     }
     remaps = [part for name, topic in topics.items() for part in ('-r', f'{name}:={topic}')]
     kept = ['-p', f'state_dir:={state}', '-p', 'state_report:=false']
-    return [*_module_command(name), '--ros-args', '--params-file', str(params), *kept, *remaps]
+    return node_command(name, ['--ros-args', '--params-file', str(params), *kept, *remaps])
 
 
-def _module_command(name: str) -> list[str]:
-    return [*module_command('starcal_ros.entry_points'), name]
+def node_command(name: str, arguments: Sequence[str], remaps: Sequence[str] = ()) -> list[str]:
+    """Command line that runs a module of `ros`, with names replaced by others, ``A:=B``."""
+    renamed = [part for remap in remaps for part in ('-r', remap)]
+    ros_arguments = ['--ros-args', *renamed] if renamed else []
+    return [*module_command('starcal_ros.entry_points'), name, *arguments, *ros_arguments]
+
+
+def player_arguments(path: Path, rate: float) -> list[str]:
+    """Parameters of the bag player."""
+    return ['--ros-args', '-p', f'bag:={path.resolve()}', '-p', f'rate:={rate!r}']
 
 
 @contextlib.contextmanager

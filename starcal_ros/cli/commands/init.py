@@ -8,12 +8,11 @@ import shlex
 import sys
 
 from starcal_ros.cli.arguments import EXIT_ACCEPTED
-from starcal_ros.cli.folders import make_folder
 from starcal_ros.cli.terminal import print_text
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.images.photographs import image_paths
 from starcal_ros.formats.products.camera_yaml import write_camera_info
-from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.formats.products.product_files import make_folder, write_atomically
 from starcal_ros.pipeline import first_setup, night_sky
 from starcal_ros.pipeline.topics import Topics
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED
-from starcal_ros.cli.folders import make_folder
 from starcal_ros.cli.terminal import print_text, progress_bar
 from starcal_ros.errors import OptionError
+from starcal_ros.formats.products.product_files import make_folder
 
 if TYPE_CHECKING:
     from starcal_ros.records import StarObservations
@@ -101,21 +101,19 @@ def _import(args: argparse.Namespace) -> int:
         if problems:
             return EXIT_BAD_INPUT
         stamps = [file.time_ns for file in files]
-        attitudes = guard.call(
-            _names(solved), sources.attitudes, solved, args.star_tracker, stamps, files
+        attitudes, *others = (
+            guard.call(_names(solved), sources.attitudes, solved, frame, stamps, files)
+            for frame in (args.star_tracker, *args.more_star_trackers)
         )
-        others = {
-            recording.frame_name(frame): guard.call(
-                _names(solved), sources.attitudes, solved, frame, stamps, files
-            )
-            for frame in args.more_star_trackers
-        }
+        further = dict(
+            zip(map(recording.frame_name, args.more_star_trackers), others, strict=True)
+        )
         velocities = args.velocity and guard.call(
             _names(args.velocity), sources.velocities, args.velocity, args.spacecraft, stamps
         )
         prior = args.camera and recording.Prior(args.camera, tuple(args.alignment))
         made = recording.write_bag(
-            args.output, files, options, guard, attitudes, velocities, prior, advance, others
+            args.output, files, options, guard, attitudes, velocities, prior, advance, further
         )
     print_text(f'bag {made.bag}: {len(files)} images')
     for note in made.notes:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 import csv
 import io
 import json
@@ -17,7 +16,7 @@ from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline import topics as bag_topics
-from starcal_ros.pipeline.plan import Plan, plan_pointings, request_of
+from starcal_ros.pipeline.plan import Cone, Plan, plan_pointings, Pointing, Request
 from starcal_ros.pipeline.setup import files_of, read_setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.record_codec import json_object
@@ -30,13 +29,13 @@ def plan(args: argparse.Namespace, asked: Topics) -> int:
     setup = read_setup(args.params)
     if args.output:
         check_no_product(args.output, [*args.bags, args.params, *files_of(setup.frames).values()])
-    request = request_of(
+    request = Request(
         args.images,
         args.minimise,
         _pointings(args.pointings) if args.pointings else (),
-        tuple(zip(*args.avoid, strict=True)),
+        Cone(*args.within),
+        tuple(Cone(*one) for one in args.avoid),
         args.slew,
-        args.within or (0.0, 0.0, 180.0),
     )
     images = bag_topics.read(args.bags, bag_topics.choose_topics(args.bags, asked, setup), setup)
     found = plan_pointings(solve.ensemble_of(images, setup), setup, request)
@@ -56,20 +55,20 @@ def plan(args: argparse.Namespace, asked: Topics) -> int:
     return EXIT_ACCEPTED
 
 
-def _pointings(path: Path) -> tuple[Sequence[float], ...]:
-    """Return the columns of a file of pointings."""
+def _pointings(path: Path) -> tuple[Pointing, ...]:
+    """Return the rows of a file of pointings."""
     with path.open(newline='', encoding='utf-8', errors='replace') as file:
         rows = csv.DictReader(file)
         lacking = [name for name in _COLUMNS[:2] if name not in (rows.fieldnames or ())]
         if lacking:
             raise OptionError(f'{path}: no column {" and ".join(lacking)}')
         try:
-            found = [[float(row.get(name) or 0.0) for name in _COLUMNS] for row in rows]
+            found = [Pointing(*(float(row.get(name) or 0.0) for name in _COLUMNS)) for row in rows]
         except (TypeError, ValueError) as error:
             raise OptionError(f'{path}: line {rows.line_num}: {error}') from error
     if not found:
         raise OptionError(f'{path}: no pointings')
-    return tuple(zip(*found, strict=True))
+    return tuple(found)
 
 
 def _csv(found: Plan) -> str:

@@ -35,7 +35,7 @@ from starcal_ros.untrusted import METADATA_BYTES, read_text, yaml_value
 
 _SQLITE, _ROS_1 = b'SQLite format 3', b'#ROSBAG V'  # how bags of other kinds begin
 _MAGIC_BYTES = 16
-_IMAGE_SUFFIXES = frozenset(['.fits', '.fit', '.fts', '.tif', '.tiff', '.png'])
+_HOW_TO_IMPORT = '; starcal import makes a bag of image files'
 _LONGEST_NAME = 4096  # of a path on Linux
 
 
@@ -93,7 +93,7 @@ def mcap_files(paths: Iterable[Path | str]) -> list[Path]:
         with errors_as(BagError, file), file.open('rb') as stream:
             magic = stream.read(_MAGIC_BYTES)
         if not magic.startswith(MAGIC):
-            other = _how_to_convert(file, magic) or _how_to_import(file.parent, file)
+            other = _how_to_convert(file, magic) or _HOW_TO_IMPORT
             raise BagError(f'{file}: not an MCAP bag{other}')
     return files
 
@@ -251,8 +251,7 @@ def _files_of_folder(folder: Path) -> list[Path]:
         other = _how_to_convert(folder, _SQLITE) if any(folder.glob('*.db3')) else ''
         inside = next(folder.glob('*/*.mcap'), None)
         near = f' (did you mean {inside.parent}?)' if inside and not other else ''
-        other = other or near or _how_to_import(folder)
-        raise BagError(f'{folder}: no .mcap files in the folder{other}')
+        raise BagError(f'{folder}: no .mcap files in the folder{other or near or _HOW_TO_IMPORT}')
     missing = [name for name in names if not (folder / name).is_file()]
     if missing and listed:
         raise BagError(f'{folder}: {missing[0]} is listed in metadata.yaml but missing')
@@ -294,18 +293,6 @@ def _how_to_convert(path: Path, magic: bytes) -> str:
     return (
         f' but {kind}: rosbags-convert --src {source} --dst {destination} --dst-storage mcap'
         ' makes one'
-    )
-
-
-def _how_to_import(folder: Path, file: Path | None = None) -> str:
-    """End of an error message: the command that makes a bag of image files, if there are some."""
-    files = sorted(folder.iterdir()) if file is None else [file]
-    found = next((one.suffix for one in files if one.suffix.lower() in _IMAGE_SUFFIXES), '')
-    if not found:
-        return ''
-    return (
-        f' but {found.lstrip(".").upper()} images: starcal import --images'
-        f" '{folder / '*'}{found}' --attitude FILE -o BAG makes one"
     )
 
 

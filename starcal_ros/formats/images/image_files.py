@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
-from starcal_ros.errors import errors_as, IngestError
+from starcal_ros.errors import errors_as, IngestError, needing
 from starcal_ros.formats.images.file_header import has_surplus, png_header, tiff_header
 from starcal_ros.formats.images.header_times import Card, middle_of_exposure
 from starcal_ros.formats.images.time_systems import TimeError
@@ -190,12 +190,8 @@ def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str,
 
 def read_fits(path: Path, hdu: str) -> tuple[NDArray[Any], Mapping[str, Card]]:
     """Values and cards of the image ``hdu``, or the first, of a FITS file; raises IngestError."""
-    try:
+    with needing('mission', IngestError, path):
         from astropy.io import fits
-    except ModuleNotFoundError as error:
-        raise IngestError(
-            f"{path}: FITS files need astropy: pip install 'starcal_ros[mission]'"
-        ) from error
     if path.exists() and not path.is_file():  # opening a pipe would block until it has a writer
         raise IngestError(f'{path}: not a regular file')
     try:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import IngestError
+from starcal_ros.errors import IngestError, needing
 from starcal_ros.formats.images.header_times import Card, middle_of_exposure
 from starcal_ros.formats.images.image_files import (
     content_of,
@@ -153,9 +153,8 @@ _Tags = Mapping[int, Any]
 
 def _facts_of_picture(path: Path) -> tuple[_Tags, _Tags, int, int]:
     """Tags of EXIF and GPS, width and height."""
-    Image = _library(
-        'PIL.Image', path, "photographs need Pillow: pip install 'starcal_ros[report]'"
-    )
+    with needing('report', IngestError, path):
+        from PIL import Image
     try:
         # Opened, not decoded: size and tags only.
         with Image.open(io.BytesIO(content_of(path))) as image:
@@ -219,14 +218,8 @@ def _raw(path: Path) -> Iterator[Any]:
 
 
 def _rawpy(path: Path) -> Any:
-    return _library('rawpy', path, "camera raw needs rawpy: pip install 'starcal_ros[raw]'")
-
-
-def _library(name: str, path: Path, remedy: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise IngestError(f'{path}: {remedy}') from error
+    with needing('raw', IngestError, path):
+        return importlib.import_module('rawpy')
 
 
 def _of_tags(path: Path, tags: _Tags, gps: _Tags, width: int, height: int) -> Photograph:

@@ -40,26 +40,18 @@ BAYER_ENCODINGS = {
 }
 
 
-def decode_image(
-    encoding: str,
-    width: int,
-    height: int,
-    step: int,
-    is_bigendian: bool,
-    data: Any,
-    time_ns: int,
-    channel: str = '',
-) -> Image:
+def decode_image(message: Message, time_ns: int, channel: str = '') -> Image:
     """
-    Pixels of an image message in native byte order, without its row padding.
+    Pixels of a sensor_msgs/Image in native byte order, without its row padding.
 
     No copy where the message holds them so already.  Of a mosaic, the image of a colour has half
     the width and height (`of_mosaic`).
 
-    The first six arguments are those of sensor_msgs/Image, ``data`` anything with a buffer of
-    bytes; ``channel`` is red, green or blue, or empty, which refuses colour images.
-    Raises ImageRefused ``bad_encoding`` or ``bad_layout``.
+    ``data`` is anything with a buffer of bytes; ``channel`` is red, green or blue, or empty, which
+    refuses colour images.  Raises ImageRefused ``bad_encoding`` or ``bad_layout``.
     """
+    encoding, width, height, step = message.encoding, message.width, message.height, message.step
+    data = message.data
     is_colour = encoding in RGB_ENCODINGS or encoding in BAYER_ENCODINGS
     if is_colour and not channel:
         raise ImageRefused(
@@ -84,7 +76,7 @@ def decode_image(
         raise ImageRefused(
             'bad_layout', f'{flat.size} bytes of data, not {step * height} for {height} rows'
         )
-    dtype = np.dtype(np.uint8 if pixel_bytes == 1 else '>u2' if is_bigendian else '<u2')
+    dtype = np.dtype(np.uint8 if pixel_bytes == 1 else '>u2' if message.is_bigendian else '<u2')
     # Strides rather than a slice: a step need not be a whole number of 16-bit pixels.
     rows: NDArray[Any] = np.ndarray(
         (height, width, channels),
@@ -161,16 +153,7 @@ def image_from_message(
         raise ImageRefused('bad_stamp', f'{time_ns} ns is not within the range of ROS stamps')
     if not hasattr(message, 'encoding'):
         return decode_png(message.data, time_ns, size)
-    return decode_image(
-        message.encoding,
-        message.width,
-        message.height,
-        message.step,
-        bool(message.is_bigendian),
-        message.data,
-        time_ns,
-        channel,
-    )
+    return decode_image(message, time_ns, channel)
 
 
 def refused_from_message(

@@ -11,7 +11,7 @@ import numpy as np
 
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import LineOfSightTable
-from starcal_ros.errors import ProductError
+from starcal_ros.errors import needing, ProductError
 from starcal_ros.formats.products.product_files import write_atomically
 
 
@@ -34,16 +34,14 @@ def write_lookup_table(table: LineOfSightTable, path: Path) -> None:
         np.savez_compressed(memory, **columns)
         write_atomically(path, memory.getvalue())
     elif path.suffix == '.fits':
-        write_atomically(path, _fits(columns))
+        write_atomically(path, _fits(columns, path))
     else:
         raise ProductError(f'{path}: ends neither in .csv nor in .npz nor in .fits')
 
 
-def _fits(values: dict[str, Floats]) -> bytes:
-    try:
+def _fits(values: dict[str, Floats], path: Path) -> bytes:
+    with needing('mission', ProductError, path):
         from astropy.io import fits
-    except ImportError as error:
-        raise ProductError('a .fits table needs astropy: pip install astropy') from error
     units = {'px': 'pix', 'arcsec': 'arcsec'}
     columns = [
         fits.Column(name=name, format='D', array=column, unit=units.get(name.rsplit('_', 1)[-1]))

@@ -37,6 +37,12 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         file.write(content.encode() if isinstance(content, str) else content)
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it where they are not there; raises ProductError."""
+    with errors_as(ProductError, path, 'created'):
+        path.mkdir(parents=True, exist_ok=True)
+
+
 def check_not_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
     """Check that no output of a command is one of its inputs; raises ProductError."""
     inputs = tuple(inputs)

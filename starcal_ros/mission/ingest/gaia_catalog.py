@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.errors import CatalogError
+from starcal_ros.errors import CatalogError, needing
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.sky.catalog import (
     ANGLE_UNIT_RAD,
@@ -224,12 +224,8 @@ def _columns(path: Path) -> tuple[Indices, dict[str, Floats]]:
 
 def _table(path: Path) -> Any:
     """A table of astropy."""
-    try:
+    with needing('mission', CatalogError, path):
         from astropy.table import Table
-    except ModuleNotFoundError as error:
-        raise CatalogError(
-            f"{path}: tables need astropy: pip install 'starcal_ros[mission]'"
-        ) from error
     if not path.is_file():
         raise CatalogError(f'{path}: no such file')
     try:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.errors import IngestError
+from starcal_ros.errors import IngestError, needing
 from starcal_ros.mission.ingest import mission_records
 from starcal_ros.mission.ingest.mission_records import Attitudes, naming, Velocities
 
@@ -97,12 +97,8 @@ def _names(paths: Sequence[Path]) -> str:
 @contextlib.contextmanager
 def loaded(paths: Sequence[Path]) -> Iterator[Any]:
     """SPICE with only these kernels loaded; earlier ones are loaded again afterwards."""
-    try:
+    with needing('mission', IngestError, _names(paths)):
         import spiceypy
-    except ModuleNotFoundError as error:
-        raise IngestError(
-            f"{_names(paths)}: SPICE kernels need spiceypy: pip install 'starcal_ros[mission]'"
-        ) from error
     before = [spiceypy.kdata(k, 'ALL')[0] for k in range(spiceypy.ktotal('ALL'))]
     spiceypy.kclear()
     try:

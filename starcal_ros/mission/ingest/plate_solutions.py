@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import line_of_sight, pixel_grid
-from starcal_ros.errors import IngestError
+from starcal_ros.errors import IngestError, needing
 from starcal_ros.formats.images.image_files import FITS_ENDINGS, ImageFile
 from starcal_ros.mission.ingest.mission_records import Attitudes, EME2000_NOTE, start_of
 from starcal_ros.pipeline.from_stars import pinhole
@@ -102,13 +102,9 @@ def _directions(wcs: Any, pixels: Any, path: Path) -> Any:
 
 def _celestial(path: Path) -> Any:
     """The first celestial WCS of a FITS file."""
-    try:
+    with needing('mission', IngestError, path):
         from astropy.io import fits
         from astropy.wcs import WCS
-    except ModuleNotFoundError as error:
-        raise IngestError(
-            f"{path}: FITS files need astropy: pip install 'starcal_ros[mission]'"
-        ) from error
     try:
         with warnings.catch_warnings(), path.open('rb') as file:
             warnings.simplefilter('ignore')  # warnings about keywords that astropy repairs

@@ -12,20 +12,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import contextlib
-from dataclasses import dataclass
 import os
 from pathlib import Path
 import shutil
 import subprocess
 import threading
 
-from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.child_process import module_command
 from starcal_ros.errors import ArchiveError
 from starcal_ros.files import PART, sync_folder
 from starcal_ros.formats.products import product_folder
 from starcal_ros.formats.products.product_files import REPORT_FILE
-from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.ros.kept.state import Answer
 
 ACTIVE, CANDIDATE = 'report', 'candidate_report'
 
@@ -35,21 +33,12 @@ _LONGEST_PAGE_S = 600.0  # a page takes seconds; a slow processor or a hanging d
 _LONGEST_CLOSE_S = 5.0  # a disk that hangs must not hold the node
 
 
-@dataclass(frozen=True)
-class Subject:
-    """Contents of a report; the page states that residuals or observations are missing."""
-
-    calibration: Calibration
-    residuals: Residuals | None = None
-    observations: tuple[StarObservations, ...] = ()
-
-
 class CalibratorReports:
     """
     Maintains the reports of a state folder, safe to use from several threads.
 
-    One page is rendered at a time.  A newer subject for the same folder ends the process that
-    renders the older one.
+    One page is rendered at a time.  A newer calibration for the same folder ends the process that
+    renders the older one; the page states that residuals or observations are missing.
 
     Parameters
     ----------
@@ -70,7 +59,7 @@ class CalibratorReports:
         self._lock = threading.Lock()
         self._state_dir: Path | None = None
         self._frame_id = ''
-        self._waiting: dict[Path, Subject] = {}  # by folder
+        self._waiting: dict[Path, Answer] = {}  # by folder
         self._at: Path | None = None  # the folder that the thread works on
         self._thread: threading.Thread | None = None
         self._process: subprocess.Popen[str] | None = None
@@ -82,13 +71,13 @@ class CalibratorReports:
             self._frame_id = frame_id
             self.trouble = ''
 
-    def show(self, name: str, subject: Subject) -> None:
-        """Update the folder ``name`` to a calibration; returns at once."""
+    def show(self, name: str, answer: Answer) -> None:
+        """Update the folder ``name`` to the calibration of an answer; returns at once."""
         with self._lock:
             if self._state_dir is None:
                 return
             folder = self._state_dir / name
-            self._waiting[folder] = subject
+            self._waiting[folder] = answer
             if self._at == folder:
                 self._kill()
             if self._thread is None:
@@ -122,9 +111,9 @@ class CalibratorReports:
                 if self._at is None:
                     self._thread = None
                     return
-                folder, subject = self._at, self._waiting.pop(self._at)
+                folder, answer = self._at, self._waiting.pop(self._at)
             try:
-                _replace(folder, subject, self._frame_id)
+                _replace(folder, answer, self._frame_id)
                 trouble = self._make_page(folder)
             except Exception as error:  # an error here must not end the node
                 trouble = ' '.join(str(error).split()) or type(error).__name__
@@ -171,7 +160,7 @@ class CalibratorReports:
         return ''
 
 
-def _replace(folder: Path, subject: Subject, frame_id: str) -> None:
+def _replace(folder: Path, answer: Answer, frame_id: str) -> None:
     """
     Replace the folder by one with new products, without a page yet.
 
@@ -184,9 +173,10 @@ def _replace(folder: Path, subject: Subject, frame_id: str) -> None:
     _tidy(folder, new, old)
     try:
         new.mkdir()
-        product_folder.write_products(subject.calibration, new, subject.residuals)
-        if subject.observations:
-            product_folder.write_observations(subject.observations, new, frame_id)
+        assert answer.calibration is not None  # no other answer is shown
+        product_folder.write_products(answer.calibration, new, answer.residuals)
+        if answer.observations:
+            product_folder.write_observations(answer.observations, new, frame_id)
         if folder.exists():
             folder.rename(old)
         new.rename(folder)

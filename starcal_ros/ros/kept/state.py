@@ -14,7 +14,7 @@ import numpy as np
 
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.residuals import Residuals
-from starcal_ros.errors import ArchiveError, OptionError, StarcalError
+from starcal_ros.errors import ArchiveError, missing_package, OptionError, StarcalError
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.node_options import CalibratorOptions
 from starcal_ros.pipeline.setup import Setup
@@ -105,8 +105,8 @@ class CalibratorState:
             from starcal_ros.ros.kept.archive import Archive
         except ModuleNotFoundError as error:  # rosdep has no key for mcap and rosbags
             raise ArchiveError(
-                f'state_dir: {error.name} is not installed: pip install mcap rosbags, or leave'
-                ' state_dir empty: then a restart loses the ensemble'
+                f'state_dir: {missing_package(error, "")}, or leave state_dir empty: then a'
+                ' restart loses the ensemble'
             ) from error
         seal = read_seal(options.state_key_file)
         archive = Archive(Path(options.state_dir), setup.frames.camera_frame, seal)

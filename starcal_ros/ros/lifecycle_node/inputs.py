@@ -98,15 +98,15 @@ class Inputs:
     def _check(self, one: _Input) -> list[str]:
         name = one.subscription.topic_name
         offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(name)]
-        refused = [qos for qos in offers if not _connects(qos, one.qos)]
+        refused = [qos for qos in offers if _mismatch(qos, one.qos)]
         lower = with_reliability(one.qos, ReliabilityPolicy.BEST_EFFORT)
-        if one.adapts and any(_connects(qos, lower) for qos in refused):
+        if one.adapts and not all(_mismatch(qos, lower) for qos in refused):
             one.qos = lower
             self._node.destroy_subscription(one.subscription)
             self._subscribe(one)
             self._node.get_logger().info(f'{name}: received as best effort, as offered')
-            refused = [qos for qos in refused if not _connects(qos, lower)]
-        return [f'{name}: a publisher offers {_lacking(qos, one.qos)}' for qos in refused]
+            refused = [qos for qos in refused if _mismatch(qos, lower)]
+        return [f'{name}: {_mismatch(qos, one.qos)}' for qos in refused]
 
     def _subscribe(self, one: _Input) -> None:
         one.subscription = self._node.create_subscription(
@@ -133,21 +133,8 @@ def _reliability_override(node: Node, topic: str) -> QoSOverridingOptions | None
     return QoSOverridingOptions([QoSPolicyKind.RELIABILITY]) if given else None
 
 
-def _connects(offered: QoSProfile, asked: QoSProfile) -> bool:
-    return bool(qos_check_compatible(offered, asked)[0] != QoSCompatibility.ERROR)
-
-
-def _lacking(offered: QoSProfile, asked: QoSProfile) -> str:
-    """The insufficient policies of a publisher."""
-    lacking = []
-    if (asked.reliability, offered.reliability) == (
-        ReliabilityPolicy.RELIABLE,
-        ReliabilityPolicy.BEST_EFFORT,
-    ):
-        lacking.append('best effort, reliable is requested')
-    if (asked.durability, offered.durability) == (
-        DurabilityPolicy.TRANSIENT_LOCAL,
-        DurabilityPolicy.VOLATILE,
-    ):
-        lacking.append('volatile, transient local is requested')
-    return ' and '.join(lacking) or str(qos_check_compatible(offered, asked)[1])
+def _mismatch(offered: QoSProfile, asked: QoSProfile) -> str:
+    """Why DDS does not connect two profiles, in the words of rclpy; empty: it does."""
+    outcome, why = qos_check_compatible(offered, asked)
+    is_error = outcome == QoSCompatibility.ERROR
+    return why.replace('ERROR: ', '').rstrip(';') if is_error else ''

@@ -12,9 +12,11 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 import rclpy
@@ -69,8 +71,7 @@ class StarcalNode(PrintableLog, LifecycleNode):
         self._diagnostics_timer = self.steady_timer(
             1.0, self.guarded(self._each_second), MutuallyExclusiveCallbackGroup()
         )
-        self._answer_invalid_transitions()
-        self._answer_invalid_parameters()
+        self._answer_where_rclpy_raises()
 
     def configure(self) -> None:
         """Read parameters and files, create the publishers; StarcalError if they are invalid."""
@@ -139,11 +140,8 @@ class StarcalNode(PrintableLog, LifecycleNode):
             return  # at shutdown, handles are destroyed under running callbacks
         with self._counting:
             self._errors += 1
-        where = error.__traceback__
-        while where is not None and where.tb_next is not None:
-            where = where.tb_next
-        code = where.tb_frame.f_code if where is not None else None
-        place = f' in {code.co_name}, line {where.tb_lineno}' if code and where else ''
+        frames = traceback.extract_tb(error.__traceback__)
+        place = f' in {frames[-1].name}, line {frames[-1].lineno}' if frames else ''
         self.get_logger().error(f'{type(error).__name__}: {one_line(error)}{place}')
 
     def _each_second(self) -> None:
@@ -212,17 +210,14 @@ class StarcalNode(PrintableLog, LifecycleNode):
         return outcome
 
     def _prior_in_words(self) -> str:
-        values, setup = self.options.values(), self._setup
-        camera = setup.prior.camera
+        frames, camera = self._setup.frames, self._setup.prior.camera
         width_deg = math.degrees(2 * math.atan(camera.width / 2 / float(camera.parameters[0])))
-        alignment = 'not given: found from the images'
-        if setup.is_aligned:
-            alignment = str(
-                [round(float(q), 6) for q in setup.prior.star_tracker_from_camera_xyzw]
-            )
+        alignment = [round(number, 6) for number in frames.prior_alignment]
+        found = 'not given: found from the images'
         return (
-            f'prior camera {values["camera_info_url"]}: {camera.width} x {camera.height},'
-            f' {width_deg:.1f} degrees wide; prior_alignment {alignment}'
+            f'prior camera {frames.camera_info_url}: {camera.width} x {camera.height},'
+            f' {width_deg:.1f} degrees wide; prior_alignment'
+            f' {alignment if self._setup.is_aligned else found}'
         )
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -275,46 +270,38 @@ class StarcalNode(PrintableLog, LifecycleNode):
         self.failure = ''
         return base(state)
 
-    def _answer_invalid_transitions(self) -> None:
-        """Answer an invalid transition with false; rclpy of Jazzy raises instead."""
-        service = self._service_change_state
-        change_state = service.callback
+    def _answer_where_rclpy_raises(self) -> None:
+        """Refuse an invalid transition (Jazzy) and a parameter of an invalid type by an answer."""
 
-        def answer(request: Any, response: Any) -> Any:
-            try:
-                response = change_state(request, response)
-            except Exception as error:
-                self.get_logger().error(f'transition refused: {one_line(error)}')
-                response.success = False
-            if not response.success and self.failure:
-                self.get_logger().error(self.failure)
-            return response
-
-        service.callback = answer
-
-    def _answer_invalid_parameters(self) -> None:
-        """Reject a parameter of an invalid type; rclpy raises without an answer."""
-
-        def answering(set_parameters: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        def answering(respond: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
             def answer(request: Any, response: Any) -> Any:
                 try:
-                    return set_parameters(request, response)
+                    response = respond(request, response)
                 except Exception as error:
-                    self.get_logger().error(f'parameters refused: {one_line(error)}')
-                    refused = SetParametersResult(successful=False, reason=one_line(error))
-                if isinstance(response, SetParametersAtomically.Response):
-                    response.result = refused
-                else:
-                    # Parameters before the bad one are answered and may be set.
-                    left = len(request.parameters) - len(response.results)
-                    response.results = [*response.results, *[refused] * left]
+                    self.get_logger().error(f'request refused: {one_line(error)}')
+                    _refuse(request, response, one_line(error))
+                is_transition = isinstance(response, ChangeState.Response)
+                if self.failure and is_transition and not response.success:
+                    self.get_logger().error(self.failure)
                 return response
 
             return answer
 
         for service in self.services:
-            if service.srv_type in (SetParameters, SetParametersAtomically):
+            if service.srv_type in (ChangeState, SetParameters, SetParametersAtomically):
                 service.callback = answering(service.callback)
+
+
+def _refuse(request: Any, response: Any, why: str) -> None:
+    refused = SetParametersResult(successful=False, reason=why)
+    if isinstance(response, ChangeState.Response):
+        response.success = False
+    elif isinstance(response, SetParametersAtomically.Response):
+        response.result = refused
+    else:
+        # Parameters before the bad one are answered and may be set.
+        left = len(request.parameters) - len(response.results)
+        response.results = [*response.results, *[refused] * left]
 
 
 def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | None) -> int:

@@ -218,7 +218,7 @@ def test_a_folder_of_image_files_is_imported(
     (tmp_path / '001.fits').write_bytes(b'SIMPLE  =                    T')
     for path in (tmp_path, tmp_path / '001.fits'):
         assert main.main(['inspect', str(path), '--params', str(TINY / 'params.yaml')]) == 2
-        assert f"starcal import --images '{tmp_path}/*.fits'" in capsys.readouterr().err
+        assert 'starcal import makes a bag of image files' in capsys.readouterr().err
     # Calibrated without a bag, by the stars alone: a file that is none is named.
     assert main.main(['calibrate', str(tmp_path), '-o', str(tmp_path / 'out')]) == 2
     assert '001.fits: not readable as FITS' in capsys.readouterr().err

@@ -35,13 +35,19 @@ from starcal_ros.records import Image
 RAMP = np.arange(12, dtype=np.uint16).reshape(3, 4) * 257 + 3
 
 
+def raw(encoding: str, width: int, height: int, step: int, big: bool, data: Any) -> Any:
+    """Return the fields of a sensor_msgs/Image that are read."""
+    sizes = {'width': width, 'height': height, 'step': step}
+    return SimpleNamespace(encoding=encoding, is_bigendian=big, data=data, **sizes)
+
+
 def decode(encoding: str, big: bool, padding: int, container: Any) -> Image:
     """Image of a ramp laid out as asked, with rubbish in the row padding."""
     dtype = 'u1' if encoding in ('mono8', '8UC1') else '>u2' if big else '<u2'
     rows = RAMP.astype(dtype).view(np.uint8).reshape(3, -1)
     padded = np.hstack([rows, np.full((3, padding), 0xAA, np.uint8)])
     data = container(padded.tobytes())
-    return decode_image(encoding, 4, 3, padded.shape[1], big, data, TIME_NS)
+    return decode_image(raw(encoding, 4, 3, padded.shape[1], big, data), TIME_NS)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +69,7 @@ def test_native_images_are_not_copied() -> None:
     """Pixels that are laid out right already are only looked at."""
     data = np.zeros(1024 * 1296 * 2, np.uint8)
     big = sys.byteorder == 'big'
-    image = decode_image('mono16', 1296, 1024, 2592, big, data, 0)
+    image = decode_image(raw('mono16', 1296, 1024, 2592, big, data), 0)
     assert np.shares_memory(image.pixels, data)
     assert not image.pixels.flags.writeable
 
@@ -95,7 +101,7 @@ def test_image_refusals(change: dict[str, Any], reason: str, detail: str) -> Non
         'data': bytes(24),
     }
     with pytest.raises(ImageRefused) as refused:
-        decode_image(**{**fields, **change}, time_ns=TIME_NS)
+        decode_image(SimpleNamespace(**{**fields, **change}), TIME_NS)
     assert refused.value.reason == reason
     assert detail in refused.value.detail
     assert len(refused.value.detail) < 200

@@ -21,8 +21,8 @@ from starcal_ros.formats.products.calibration_json import read_calibration
 from starcal_ros.formats.products.camera_yaml import write_camera_info
 from starcal_ros.pipeline.node_options import CalibratorOptions
 from starcal_ros.pipeline.setup import load_setup
-from starcal_ros.ros.kept.report_queue import ACTIVE, CalibratorReports, CANDIDATE, Subject
-from starcal_ros.ros.kept.state import CalibratorState
+from starcal_ros.ros.kept.report_queue import ACTIVE, CalibratorReports, CANDIDATE
+from starcal_ros.ros.kept.state import Answer, CalibratorState
 from starcal_ros.studies.simulation.centroids import true_observations
 from starcal_ros.studies.simulation.scenario import scenario
 
@@ -34,7 +34,7 @@ StandIn = Callable[[str], None]
 
 
 @pytest.fixture(scope='module')
-def subject(tmp_path_factory: pytest.TempPathFactory) -> Subject:
+def subject(tmp_path_factory: pytest.TempPathFactory) -> Answer:
     """What the state of a calibrator answers to a solve."""
     folder = tmp_path_factory.mktemp('setup')
     write_camera_info(SCENARIO.prior.camera, folder / 'camera.yaml')
@@ -48,7 +48,7 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Subject:
         state.add(image)
     answer = state.solve()
     assert answer.calibration is not None and answer.residuals is not None
-    return Subject(answer.calibration, answer.residuals, answer.observations)
+    return answer
 
 
 @pytest.fixture
@@ -90,14 +90,15 @@ def stand_in(tmp_path_factory: pytest.TempPathFactory, monkeypatch: Any) -> Stan
     return put
 
 
-def numbered(subject: Subject, number: int) -> Subject:
+def numbered(subject: Answer, number: int) -> Answer:
+    assert subject.calibration is not None
     calibration = dataclasses.replace(subject.calibration, number=number)
     return dataclasses.replace(subject, calibration=calibration)
 
 
 @pytest.mark.slow
 def test_the_folder_is_as_the_tool_writes_it(
-    subject: Subject, reports: CalibratorReports, told: Told, tmp_path: Path
+    subject: Answer, reports: CalibratorReports, told: Told, tmp_path: Path
 ) -> None:
     before = children()
     reports.show(ACTIVE, subject)
@@ -113,7 +114,7 @@ def test_the_folder_is_as_the_tool_writes_it(
     page.unlink()
     assert main.main(['report', str(page.parent)]) == 0
     assert page.read_text() == text
-    reports.show(ACTIVE, Subject(subject.calibration))  # it came back by a roll-back
+    reports.show(ACTIVE, Answer(True, '', subject.calibration))  # it came back by a roll-back
     assert told.get(timeout=PAGE_S)[1] == ''
     left = {path.name for path in page.parent.iterdir()}
     assert left == {'calibration.json', 'camera_info.yaml', 'report.html'}
@@ -122,7 +123,7 @@ def test_the_folder_is_as_the_tool_writes_it(
 
 
 def test_the_newest_wins(
-    subject: Subject, reports: CalibratorReports, told: Told, tmp_path: Path, stand_in: StandIn
+    subject: Answer, reports: CalibratorReports, told: Told, tmp_path: Path, stand_in: StandIn
 ) -> None:
     stand_in(
         'test -e "$5/../go" || { touch "$5/../busy"; exec sleep 600; }; touch "$5/report.html"'
@@ -141,7 +142,7 @@ def test_the_newest_wins(
 
 
 def test_closing_ends_the_process_and_keeps_the_products(
-    subject: Subject, reports: CalibratorReports, told: Told, tmp_path: Path, stand_in: StandIn
+    subject: Answer, reports: CalibratorReports, told: Told, tmp_path: Path, stand_in: StandIn
 ) -> None:
     stand_in('touch "$5/../busy"; exec sleep 600')
     before = children()
@@ -163,7 +164,7 @@ def test_closing_ends_the_process_and_keeps_the_products(
 
 
 def test_a_full_disk_leaves_the_report_before(
-    subject: Subject, reports: CalibratorReports, told: Told, tmp_path: Path, stand_in: StandIn
+    subject: Answer, reports: CalibratorReports, told: Told, tmp_path: Path, stand_in: StandIn
 ) -> None:
     stand_in('touch "$5/report.html"')
     reports.show(ACTIVE, subject)
@@ -184,7 +185,7 @@ def test_a_full_disk_leaves_the_report_before(
 
 
 def test_a_folder_that_went_away_is_said(
-    subject: Subject, reports: CalibratorReports, told: Told, tmp_path: Path
+    subject: Answer, reports: CalibratorReports, told: Told, tmp_path: Path
 ) -> None:
     shutil.rmtree(tmp_path)
     reports.show(ACTIVE, subject)
@@ -200,7 +201,7 @@ def test_a_folder_that_went_away_is_said(
     ],
 )
 def test_why_there_is_no_page(
-    subject: Subject,
+    subject: Answer,
     reports: CalibratorReports,
     told: Told,
     tmp_path: Path,
@@ -210,6 +211,6 @@ def test_why_there_is_no_page(
 ) -> None:
     """The products are there all the same."""
     stand_in(script)
-    reports.show(ACTIVE, Subject(subject.calibration))
+    reports.show(ACTIVE, Answer(True, '', subject.calibration))
     assert told.get(timeout=PAGE_S)[1] == said == reports.trouble
     assert (tmp_path / 'report' / 'calibration.json').is_file()
