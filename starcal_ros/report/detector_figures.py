@@ -32,6 +32,7 @@ from starcal_ros.records import (
 )
 from starcal_ros.report import svg
 from starcal_ros.report.svg import Chart, Curve, Drawing, in_digits, Panel, Scale, SERIES, sheet
+from starcal_ros.report.verdict import VISIBLE_PX
 
 FLAT = 0.02  # relative range below which a map is called flat
 _MOST_HEIGHT = 400.0
@@ -154,19 +155,39 @@ def mean_residuals(residuals: Residuals, camera: CameraModel) -> Chart:
 
 def field_vectors(field: DetectorField, camera: CameraModel) -> Chart:
     """The residual field beside the lens model as arrows."""
-    places = pixel_grid(camera, 17, 13)
+    # Middles of cells, and short: arrows at the border would cover the numbers of the axes.
+    middles = (
+        (np.arange(cells) + 0.5) / cells * size - 0.5
+        for cells, size in ((16, camera.width), (12, camera.height))
+    )
+    places = np.stack(np.meshgrid(*middles), axis=-1).reshape(-1, 2)
     return Chart(
         'Residual field beside the lens model',
-        arrows(camera, places, field.displacement_px(places)),
-        'Displacement of a star from its place by the lens model, enlarged to the scale of '
+        arrows(camera, places, field.displacement_px(places), 20, VISIBLE_PX),
+        'Displacement of a star from its position by the lens model, enlarged to the scale of '
         'the arrow above the figure.',
     )
 
 
-def arrows(camera: CameraModel, places: Floats, shift_px: Floats) -> Drawing:
-    """Enlarged displacements (n, 2) at places (n, 2), with an arrow of a round length as scale."""
+def arrows(
+    camera: CameraModel,
+    places: Floats,
+    shift_px: Floats,
+    columns: int = 16,
+    least_px: float = _ROUNDING_PX,
+) -> Drawing:
+    """
+    Enlarged displacements (n, 2) at places (n, 2), with an arrow of a round length as scale.
+
+    The longest is as long as one of the columns; none is drawn if all are below ``least_px``.
+    """
     panel = over_detector(camera)
-    _draw_arrows(panel, places, shift_px, [SERIES[0]] * len(places), 16)
+    if float(np.nanmax(np.hypot(*shift_px.T), initial=0.0)) > least_px:
+        _draw_arrows(panel, places, shift_px, [SERIES[0]] * len(places), columns)
+    elif least_px > _ROUNDING_PX:
+        panel.note(f'less than {least_px:g} px everywhere')
+    else:
+        panel.note('no displacement')
     return _drawn(panel)
 
 

@@ -44,6 +44,11 @@ def test_the_scale_is_that_of_the_arrows() -> None:
     assert lengths[svg.SERIES[0]] == pytest.approx(1.5 * lengths[svg.SERIES[1]], abs=0.2)
 
 
+def test_a_field_that_no_image_shows_is_not_drawn() -> None:
+    drawn = figures.field_vectors(DetectorField(640, 512, 0, np.array([[9e-4], [0.0]])), CAMERA)
+    assert '>less than 0.001 px everywhere<' in drawn.svg.body and 'scale' not in drawn.svg.body
+
+
 def test_no_displacement_is_said() -> None:
     ideal = CAMERA.replace(k1=0.0)
     assert '>no displacement<' in figures.distortion_vectors(ideal).svg.body
