@@ -87,13 +87,13 @@ class StarRefusal(IntEnum):
         return member
 
     NONE = 0, 'the star is used'
-    AMBIGUOUS = 1, 'off the place or the brightness that the other stars give it'
+    AMBIGUOUS = 1, 'position or brightness does not agree with the other stars'
     BLEND = 2, 'another catalog star or source is in the measuring window'
     BORDER = 3, 'the core of the star, or its window by moments, leaves the image'
     ELONGATED = 4, 'not the shape of a star: smear, cosmic ray, hot pixel or galaxy'
     FAINT = 5, 'signal-to-noise below the limit'
     HOT_PIXEL = 6, 'the light of the star falls on a hot pixel'
-    NOT_DETECTED = 7, 'bright enough to be seen, but no source stands there'
+    NOT_DETECTED = 7, 'bright enough to be seen, but no source at its position'
     SATURATED = 8, 'a pixel of the star is saturated'
     TOO_FEW_PIXELS = 9, 'too few pixels stand above the noise'
 
