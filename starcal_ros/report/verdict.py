@@ -48,7 +48,7 @@ def check_rows(gate: Sequence[GateCheck]) -> list[tuple[GateCheck, str, str, str
     for check in sorted(gate, key=lambda check: check.passed is not False):
         found, limit, note = check.found_text, '', check.note
         if check.unit == 'sigma' and found and math.isfinite(check.found):
-            found = f'{check.found:.1f} sigma of the difference'
+            found = f'{check.found:.1f} sigma'
             note = '' if check.passed and check.found < INFORMATIVE_SIGMAS else note
         if note == 'no limit is set':
             limit = 'none'
