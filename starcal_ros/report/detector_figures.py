@@ -44,6 +44,7 @@ _DARK, _BRIGHT, _BAD = '#16202b', '#ffffff', '#a8251c'  # on maps, alike on a da
 _BUDGET_MAPS = 6
 _BUDGET_SHARE = 0.1  # of the sigma: a cause of less is dark everywhere
 _GAP = 10.0
+_SHORT = 20  # columns, of which one is the longest arrow from the middle of a cell
 _FOOTPRINTS = 200  # drawn on the sky
 
 
@@ -101,10 +102,15 @@ def cell_counts(stars: NDArray[np.int64], camera: CameraModel) -> Chart:
 
 def distortion_vectors(camera: CameraModel) -> Chart:
     """Distortion as arrows (paper, Fig. 6 left)."""
-    places = pixel_grid(camera, 17, 13)
+    places, columns = pixel_grid(camera, 17, 13), 16
+    shift_px = distortion_px(camera, places)
+    middle = 0.5 * (np.array([camera.width, camera.height]) - 1)
+    if ((places - middle) * shift_px).sum() > 0.0:  # outwards, over the numbers of the axes
+        places, columns = _middles_of_cells(camera), _SHORT
+        shift_px = distortion_px(camera, places)
     return Chart(
         'Distortion vectors',
-        arrows(camera, places, distortion_px(camera, places)),
+        arrows(camera, places, shift_px, columns),
         'Displacement of a star from its position with an ideal lens (dot). Arrows are '
         'enlarged; the arrow above the figure is their scale.',
     )
@@ -155,18 +161,22 @@ def mean_residuals(residuals: Residuals, camera: CameraModel) -> Chart:
 
 def field_vectors(field: DetectorField, camera: CameraModel) -> Chart:
     """The residual field beside the lens model as arrows."""
-    # Middles of cells, and short: arrows at the border would cover the numbers of the axes.
-    middles = (
-        (np.arange(cells) + 0.5) / cells * size - 0.5
-        for cells, size in ((16, camera.width), (12, camera.height))
-    )
-    places = np.stack(np.meshgrid(*middles), axis=-1).reshape(-1, 2)
+    places = _middles_of_cells(camera)
     return Chart(
         'Residual field beside the lens model',
-        arrows(camera, places, field.displacement_px(places), 20, VISIBLE_PX),
+        arrows(camera, places, field.displacement_px(places), _SHORT, VISIBLE_PX),
         'Displacement of a star from its position by the lens model, enlarged to the scale of '
         'the arrow above the figure.',
     )
+
+
+def _middles_of_cells(camera: CameraModel) -> Floats:
+    """Places (192, 2) from which arrows of the length `_SHORT` cover no number of the axes."""
+    u, v = (
+        (np.arange(cells) + 0.5) / cells * size - 0.5
+        for cells, size in ((16, camera.width), (12, camera.height))
+    )
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
 def arrows(

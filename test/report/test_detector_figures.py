@@ -30,6 +30,16 @@ def test_arrows_have_a_scale_inside_the_canvas(width: int, height: int) -> None:
     assert 0 < float(tips[0][0]) <= wide and 0 < float(tips[0][1]) < high
 
 
+def test_outward_arrows_cover_no_number_of_the_axes() -> None:
+    drawn = figures.distortion_vectors(CAMERA.replace(k1=0.05)).svg
+    tips = re.findall(
+        rf'd="M([\d.]+),([\d.]+)L[^"]*Z" fill="{re.escape(svg.SERIES[0])}"', drawn.body
+    )
+    u, v = np.array(tips, dtype=float).T
+    assert u.min() >= 46 and u.max() <= drawn.width - 2
+    assert v.min() >= 18 and v.max() <= drawn.height - 32
+
+
 def test_the_scale_is_that_of_the_arrows() -> None:
     """Arrows of a field that is 0.3 px along u have 1.5 times the length of 0.2 px."""
     field = DetectorField(640, 512, 0, np.array([[0.3], [0.0]]))
