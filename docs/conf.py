@@ -48,6 +48,9 @@ extensions = [
 exclude_patterns = ['_build']
 html_theme = 'furo'
 html_title = f'starcal {release}'
+html_static_path = ['static']
+html_css_files = ['site.css']
+highlight_language = 'none'  # a fence without a name is output of the tool
 default_role = 'py:obj'
 
 autosummary_generate = True

@@ -47,7 +47,7 @@ from starcal_ros.studies.simulation.scenario import Scenario
 
 FOLDER = Path(__file__).parent / 'images'
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
-REPORT_SIZE = (1400, 880)  # the first screen, px
+REPORT_SIZE = (1400, 960)  # the first screen, px
 SHOWN_IMAGE = 12
 CLOSE_UP_FIRST, CLOSE_UP_SIZE = (931, 541), (94, 74)  # enlarged until an offset of 3 px is seen
 

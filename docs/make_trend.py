@@ -31,7 +31,7 @@ from starcal_ros.studies.simulation.centroids import true_observations
 from starcal_ros.studies.simulation.scenario import Inertial, Scenario, scenario
 
 MONTHS = 60
-SIZE = (1184, 1688)  # of the picture, px
+SIZE = (1184, 1664)  # of the picture, px
 SHOCK, NEW_TRACKER = 20, 41  # the first months after them
 FOCAL_PER_DEGC = 4e-5
 SHOCK_FOCAL_PX, SHOCK_CX_PX = 0.35, -0.6

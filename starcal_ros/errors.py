@@ -77,7 +77,7 @@ def missing_package(error: ModuleNotFoundError, extra: str) -> str:
         return f'{error.name} is not installed: pip install {" ".join(_WITHOUT_KEY)}'
     if error.name not in _OF_EXTRAS:
         raise error
-    return f"{error.name} is not installed: pip install '.[{extra}]' in the source folder of starcal"
+    return f"{error.name} is not installed: pip install '.[{extra}]' in the folder of starcal"
 
 
 @contextlib.contextmanager

@@ -278,6 +278,11 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
     yield from _predicted(found.predictions, options)
 
 
+def _group(part: ResidualBin) -> str:
+    first = 1 if part.by == 'image' else 0  # images are numbered from 1 on the report
+    return f'{part.by} {part.low + first:.4g} to {part.high + first:.4g}'
+
+
 def _predicted(bins: tuple[ResidualBin, ...], options: GateOptions) -> Iterator[GateCheck]:
     """The part of the data with the largest ratio of residuals to their predicted sigma."""
     if not bins:
@@ -289,14 +294,14 @@ def _predicted(bins: tuple[ResidualBin, ...], options: GateOptions) -> Iterator[
 
     worst = max(bins, key=excess)
     doubtful = [
-        f'{part.by} {part.low:.4g} to {part.high:.4g}: {part.normalised:.3f}'
+        f'{_group(part)}: {part.normalised:.3f}'
         for part in bins
         if abs(part.normalised - 1.0) > max(_PART_TOLERANCE, _PART_SIGMAS * part.sigma)
     ]
     check = limit_check(
         options,
         'max_cross_validated_residual',
-        f'residual over predicted sigma at {worst.by} {worst.low:.4g} to {worst.high:.4g}',
+        f'residual over predicted sigma at {_group(worst)}',
         worst.normalised,
     )
     passed = bool(check.passed) or excess(worst) <= options.max_cross_validated_residual

@@ -32,6 +32,7 @@ from starcal_ros.records import (
 )
 from starcal_ros.report import svg
 from starcal_ros.report.svg import Chart, Curve, Drawing, in_digits, Panel, Scale, SERIES, sheet
+from starcal_ros.report.verdict import VISIBLE_PX
 
 FLAT = 0.02  # relative range below which a map counts as flat
 _MOST_HEIGHT = 400.0
@@ -43,6 +44,7 @@ _DARK, _BRIGHT, _BAD = '#16202b', '#ffffff', '#a8251c'  # on maps; the same on a
 _BUDGET_MAPS = 6
 _BUDGET_SHARE = 0.1  # fraction of the sigma; the map of a smaller cause would be dark everywhere
 _GAP = 10.0
+_SHORT = 20  # columns, of which one is the longest arrow from the middle of a cell
 _FOOTPRINTS = 200  # most footprints drawn on the sky
 
 
@@ -100,10 +102,15 @@ def cell_counts(stars: NDArray[np.int64], camera: CameraModel) -> Chart:
 
 def distortion_vectors(camera: CameraModel) -> Chart:
     """Distortion as arrows (paper, Fig. 6 left)."""
-    places = pixel_grid(camera, 17, 13)
+    places, columns = pixel_grid(camera, 17, 13), 16
+    shift_px = distortion_px(camera, places)
+    middle = 0.5 * (np.array([camera.width, camera.height]) - 1)
+    if ((places - middle) * shift_px).sum() > 0.0:  # outwards, over the numbers of the axes
+        places, columns = _middles_of_cells(camera), _SHORT
+        shift_px = distortion_px(camera, places)
     return Chart(
         'Distortion vectors',
-        arrows(camera, places, distortion_px(camera, places)),
+        arrows(camera, places, shift_px, columns),
         'Displacement of a star from its position with an ideal lens (dot). Arrows are '
         'enlarged; the arrow above the figure is their scale.',
     )
@@ -154,19 +161,43 @@ def mean_residuals(residuals: Residuals, camera: CameraModel) -> Chart:
 
 def field_vectors(field: DetectorField, camera: CameraModel) -> Chart:
     """The residual field, which adds to the lens model, as arrows."""
-    places = pixel_grid(camera, 17, 13)
+    places = _middles_of_cells(camera)
     return Chart(
         'Residual field in addition to the lens model',
-        arrows(camera, places, field.displacement_px(places)),
+        arrows(camera, places, field.displacement_px(places), _SHORT, VISIBLE_PX),
         'Displacement of a star from its position by the lens model, enlarged to the scale of '
         'the arrow above the figure.',
     )
 
 
-def arrows(camera: CameraModel, places: Floats, shift_px: Floats) -> Drawing:
-    """Enlarged displacements (n, 2) at places (n, 2), with an arrow of a round length as scale."""
+def _middles_of_cells(camera: CameraModel) -> Floats:
+    """Places (192, 2) from which arrows of the length `_SHORT` cover no number of the axes."""
+    u, v = (
+        (np.arange(cells) + 0.5) / cells * size - 0.5
+        for cells, size in ((16, camera.width), (12, camera.height))
+    )
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+
+def arrows(
+    camera: CameraModel,
+    places: Floats,
+    shift_px: Floats,
+    columns: int = 16,
+    least_px: float = _ROUNDING_PX,
+) -> Drawing:
+    """
+    Enlarged displacements (n, 2) at places (n, 2), with an arrow of a round length as scale.
+
+    The longest is as long as one of the columns; none is drawn if all are below ``least_px``.
+    """
     panel = over_detector(camera)
-    _draw_arrows(panel, places, shift_px, [SERIES[0]] * len(places), 16)
+    if float(np.nanmax(np.hypot(*shift_px.T), initial=0.0)) > least_px:
+        _draw_arrows(panel, places, shift_px, [SERIES[0]] * len(places), columns)
+    elif least_px > _ROUNDING_PX:
+        panel.note(f'less than {least_px:g} px everywhere')
+    else:
+        panel.note('no displacement')
     return _drawn(panel)
 
 

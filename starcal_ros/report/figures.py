@@ -17,7 +17,18 @@ from starcal_ros.estimation.star_equations import whitening
 from starcal_ros.records import CameraGeometry, SigmaPart, StarObservations, TermRemoval
 from starcal_ros.report.pictures.annotation import predicted_px
 from starcal_ros.report.plots import plot
-from starcal_ros.report.svg import Chart, Curve, Drawing, INK, MUTED, Panel, SERIES, sheet
+from starcal_ros.report.svg import (
+    Chart,
+    Curve,
+    Drawing,
+    in_digits,
+    INK,
+    MUTED,
+    Panel,
+    round_step,
+    SERIES,
+    sheet,
+)
 
 _LEAST_IN_BIN = 10
 _WAVES = 16  # highest spatial frequency of the spectrum, waves over the longer side
@@ -232,11 +243,18 @@ def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Ch
         60.0 * NANOSECONDS_PER_SECOND
     )
     misfit = residuals.image_misfit
+    errors = residuals.attitude_error_arcsec.T
+    tops = [
+        1.25 * max(float(np.nanmax(np.abs(error[~misfit]), initial=0.0)), sigma) or 1.0
+        for error, sigma in zip(errors, sigma_arcsec, strict=True)
+    ]
+    ticks = [[(k * step, in_digits(k * step)) for k in (-1, 0, 1)]
+             for step in (round_step(top / 2.5) for top in tops)]  # fmt: skip
+    letters = max(len(name) for of_axis in ticks for _, name in of_axis)
     panels = []
     for k, axis in enumerate('xyz'):
-        error, sigma = residuals.attitude_error_arcsec[:, k], sigma_arcsec[k]
+        error, sigma, top = errors[k], sigma_arcsec[k], tops[k]
         fitting = np.where(misfit, np.nan, error)
-        top = 1.25 * max(float(np.nanmax(np.abs(fitting), initial=0.0)), sigma) or 1.0
         curves = [
             Curve(minutes, fitting, SERIES[0], mark='circle', width=0,
                   sigma=residuals.attitude_sigma_arcsec[:, k]),
@@ -244,7 +262,8 @@ def alignment_in_time(residuals: Residuals, sigma_arcsec: Sequence[float]) -> Ch
         ]  # fmt: skip
         panels.append(
             plot(curves, 'time since the first image (min)' * (axis == 'z'), f'{axis} (arcsec)',
-                 y=(-top, top), height=128.0 + 36.0 * (axis == 'z'),
+                 y=(-top, top), y_ticks=ticks[k], letters=letters,
+                 height=128.0 + 36.0 * (axis == 'z'),
                  under=functools.partial(Panel.band, low=-sigma, high=sigma))
         )  # fmt: skip
     return Chart(

@@ -14,7 +14,7 @@ import numpy as np
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.constants import utc_text
 from starcal_ros.records import Calibration, IMAGE_REFUSALS, STAR_REFUSALS, StarObservations
-from starcal_ros.report.pictures.annotation import STAR_MARKS
+from starcal_ros.report.pictures.annotation import LETTERS, STAR_MARKS
 from starcal_ros.report.pictures.thumbnails import star_of, Thumbnail
 
 _SLIDER_IMAGES, _SLIDER_STARS = 40, 12000  # in the page; a star takes 25 bytes
@@ -99,10 +99,14 @@ def _counts(observations: Sequence[StarObservations]) -> Counter[str]:
     return counts
 
 
-def star_marks(observations: Sequence[StarObservations]) -> list[tuple[str, str]]:
-    """Colour and reason of the marks of refused stars in the pictures."""
+def star_marks(observations: Sequence[StarObservations]) -> list[tuple[str, str, str]]:
+    """Colour, letter and reason of the marks of refused stars in the pictures."""
     return [
-        ('#{:02x}{:02x}{:02x}'.format(*reversed(STAR_MARKS[reason].color)), reason)
+        (
+            '#{:02x}{:02x}{:02x}'.format(*reversed(STAR_MARKS[reason].color)),
+            LETTERS[STAR_MARKS[reason].shape],
+            reason,
+        )
         for reason, count in _counts(observations).items()
         if count and reason in STAR_MARKS
     ]

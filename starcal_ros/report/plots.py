@@ -33,13 +33,15 @@ def plot(
     title: str = '',
     height: float = HEIGHT,
     is_left: bool = False,
+    letters: int = 0,
     under: Callable[[Panel], None] | None = None,
 ) -> Drawing:
     """
     Curves with axes and a legend.  The y axis leaves room for it unless its top is given.
 
     ``log`` holds the letters of the logarithmic axes.  ``x_ticks`` and ``y_ticks`` are values and
-    labels (default: round numbers).  ``is_left`` puts the legend on the left; ``under`` draws
+    labels (default: round numbers).  ``is_left`` puts the legend on the left; ``letters`` is the
+    least room for the labels of ``y_ticks``, so that plots below each other agree; ``under`` draws
     below the curves.
     """
     top = 28.0 if title else 10.0
@@ -54,6 +56,7 @@ def plot(
     x_names = x_ticks if x_ticks is not None else named(scale_x) if x_label else ()
     y_names = y_ticks if y_ticks is not None else named(scale_y, most)
     left = 30.0 + CHARACTER * max((len(name) for _, name in y_names), default=0)
+    left = max(left, 30.0 + CHARACTER * letters)
     widest = CHARACTER * max((len(name) + 1 for _, name in x_names), default=0)
     is_turned = widest * len(x_names) > WIDTH - left
     below = (24.0 if x_names else 6.0) + (18.0 if x_label else 0.0) + (26.0 if is_turned else 0.0)

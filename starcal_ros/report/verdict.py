@@ -15,6 +15,9 @@ from starcal_ros.records import Calibration, GateCheck, HeldTerm, parts_that_mat
 INFORMATIVE_SIGMAS = 2.0
 """Distance from an assumed value below which the value that the stars ask for is noise."""
 
+VISIBLE_PX = 0.001
+"""Length below which a field or a variation is shown as none: no campaign of images shows it."""
+
 _MOST_OF_DETECTOR = 0.98
 _NAMED_CAUSES, _NAMED_SHARE = 3, 0.2  # most causes in a sentence; least part of the sigma
 _REMEDIES = {
@@ -29,8 +32,8 @@ _REMEDIES = {
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
     'temperature': 'images over a wider range of temperatures',
     'star tracker noise': 'more images',
-    'star tracker slow error': 'images in more attitudes of the star tracker, or state its size '
-    '(star_tracker_slow_arcsec)',
+    'star tracker slow error': 'images in more attitudes of the star tracker, or state the size '
+    'of that error (star_tracker_slow_arcsec)',
     'held parameters': 'estimate the held parameters (estimate)',
 }
 """Measures against the causes of a sigma."""
@@ -45,7 +48,7 @@ def check_rows(gate: Sequence[GateCheck]) -> list[tuple[GateCheck, str, str, str
     for check in sorted(gate, key=lambda check: check.passed is not False):
         found, limit, note = check.found_text, '', check.note
         if check.unit == 'sigma' and found and math.isfinite(check.found):
-            found = f'{check.found:.1f} sigma of the difference'
+            found = f'{check.found:.1f} sigma'
             note = '' if check.passed and check.found < INFORMATIVE_SIGMAS else note
         if note == 'no limit is set':
             limit = 'none'
@@ -98,7 +101,10 @@ def _precision(scope: str, sigma: Floats, budget: Sequence[SigmaPart], of: str) 
 def next_step(calibration: Calibration) -> str:
     """The measure against a refusal, or against the largest cause of the sigma."""
     if not calibration.accepted:
-        return 'Do not use it for navigation; mend the failed checks and calibrate again.'
+        return (
+            'Do not use it for navigation. Correct the causes of the failed checks and calibrate '
+            'again.'
+        )
     causes = parts_that_matter(calibration.sigma_budget)[1:]
     if not causes:
         return ''
@@ -108,8 +114,10 @@ def next_step(calibration: Calibration) -> str:
         largest = max(causes, key=lambda part: getattr(part, of))
         remedy = _REMEDIES.get(largest.cause)
         if remedy:
-            steps.append(f'{scope}, limited by {largest.cause}: {remedy}')
-    return f'For a smaller sigma: {"; ".join(steps)}.' if steps else ''
+            steps.append(
+                f'For a smaller sigma of the {scope}, limited by {largest.cause}: {remedy}.'
+            )
+    return ' '.join(steps)
 
 
 @dataclass(frozen=True)
@@ -128,12 +136,13 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
     if found is None:
         return []
     step, cost_px = found.step, calibration.zero_skew_cost_px
-    camera_info = f'camera_info carries neither field nor skew: {_px(cost_px)}'
     field = f'field of {_px(found.field_rms_px)} rms per axis, at most {_px(found.field_worst_px)}'
+    if found.field_worst_px < VISIBLE_PX:
+        field = f'field of {_px(found.field_worst_px)} everywhere'
     return [
         ModelRow(
             'The lens model describes the lens',
-            f'{field}; {camera_info} at most',
+            f'{field}; camera_info, without field and skew, is off by at most {_px(cost_px)}',
             '',
             'choose another lens_model; for lines of sight with the field use starcal lookup',
         ),
@@ -173,7 +182,7 @@ def _held(held: Sequence[HeldTerm]) -> Iterator[ModelRow]:
 
 
 def _px(value: float) -> str:
-    return f'{value:.3g} px'
+    return f'less than {VISIBLE_PX:g} px' if value < VISIBLE_PX else f'{value:.3g} px'
 
 
 def _p(value: float) -> str:

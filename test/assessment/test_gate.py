@@ -248,6 +248,13 @@ def test_each_limit_trips_alone(
     assert reasons(found, GateOptions(**{limit: beyond})) == (reason,)
 
 
+def test_images_are_numbered_from_one_as_on_the_report() -> None:
+    bins = (ResidualBin('image', 7.0, 9.0, 1000, 1.5, 0.01),)
+    found = dataclasses.replace(GOOD, **with_model(predictions=bins))
+    (reason,) = reasons(found, GateOptions())
+    assert reason.startswith('residual over predicted sigma at image 8 to 10 is 1.5')
+
+
 LONGER = turned(0.0, fx=1818.0, fy=1819.01)
 TURNED = turned(0.2)
 CHANGES = [

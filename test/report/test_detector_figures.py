@@ -30,6 +30,16 @@ def test_arrows_have_a_scale_inside_the_canvas(width: int, height: int) -> None:
     assert 0 < float(tips[0][0]) <= wide and 0 < float(tips[0][1]) < high
 
 
+def test_outward_arrows_cover_no_number_of_the_axes() -> None:
+    drawn = figures.distortion_vectors(CAMERA.replace(k1=0.05)).svg
+    tips = re.findall(
+        rf'd="M([\d.]+),([\d.]+)L[^"]*Z" fill="{re.escape(svg.SERIES[0])}"', drawn.body
+    )
+    u, v = np.array(tips, dtype=float).T
+    assert u.min() >= 46 and u.max() <= drawn.width - 2
+    assert v.min() >= 18 and v.max() <= drawn.height - 32
+
+
 def test_the_scale_is_that_of_the_arrows() -> None:
     """Arrows of a field that is 0.3 px along u have 1.5 times the length of 0.2 px."""
     field = DetectorField(640, 512, 0, np.array([[0.3], [0.0]]))
@@ -42,6 +52,11 @@ def test_the_scale_is_that_of_the_arrows() -> None:
         lengths[colour] = float(first[1]) - float(first[0])
     # The view box has one decimal.
     assert lengths[svg.SERIES[0]] == pytest.approx(1.5 * lengths[svg.SERIES[1]], abs=0.2)
+
+
+def test_a_field_that_no_image_shows_is_not_drawn() -> None:
+    drawn = figures.field_vectors(DetectorField(640, 512, 0, np.array([[9e-4], [0.0]])), CAMERA)
+    assert '>less than 0.001 px everywhere<' in drawn.svg.body and 'scale' not in drawn.svg.body
 
 
 def test_no_displacement_is_said() -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -62,3 +63,12 @@ def test_means_in_bins_and_their_errors() -> None:
     assert centre.tolist() == [0.5, 2.5]  # nine values are too few
     assert mean.tolist() == [2.0, -2.0]
     assert error.tolist() == pytest.approx([0.1, 0.0])
+
+
+def test_the_three_axes_of_a_star_tracker_share_the_axis_of_time() -> None:
+    error = np.random.default_rng(1).normal(size=(IMAGES, 3)) * (2.0, 9.0, 90.0)
+    found = dataclasses.replace(noise(0), attitude_error_arcsec=error)
+    chart = figures.alignment_in_time(found, (1.0, 10.0, 100.0))
+    assert chart is not None
+    axes = re.findall(r'<path d="M([\d.]+),[\d.]+V[\d.]+H([\d.]+)"', chart.svg.body)
+    assert len(axes) == 3 and len(set(axes)) == 1

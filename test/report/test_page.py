@@ -147,7 +147,9 @@ def test_the_gate_is_shown_as_the_calibration_holds_it(folder: Path, tmp_path: P
     )[0]
     rows = [re.findall(r'<t[hd][^>]*>(.*?)</t[hd]>', row) for row in table.split('<tr>')[2:]]
     limit = f'at most {not_checked.limit_text}'
-    names = [f'{check.name} <code>{check.option}</code>' for check in shown.gate]
+    names = [
+        f'{check.name} <code>{check.option.replace("_", "_<wbr>")}</code>' for check in shown.gate
+    ]
     assert rows == [
         [names[0], 'failed', '8.125 px', 'at most 1 px', ''],
         [names[1], 'not checked', '', limit, not_checked.note],

@@ -35,7 +35,7 @@ def test_failed_checks_come_first_and_sigmas_have_one_name() -> None:
     names = ['coverage', 'residual', 'step', 'turn', 'distance of cx']
     assert [check.name for check, *_ in rows] == names
     assert rows[0][1:4] == ('failed', '0.1', 'at least 0.3')
-    assert rows[-1][1:] == ('passed', '0.0 sigma of the difference', 'at most 5 sigma', '')
+    assert rows[-1][1:] == ('passed', '0.0 sigma', 'at most 5 sigma', '')
 
 
 def test_the_precision_is_that_of_map_and_budget(tiny_products: Path) -> None:

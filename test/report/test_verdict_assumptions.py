@@ -24,7 +24,7 @@ def test_rows_say_what_was_found_and_what_to_do(tiny_products: Path) -> None:
     )
     assert lens.found == (
         'field of 0.25 px rms per axis, at most 0.86 px; '
-        'camera_info carries neither field nor skew: 0.5 px at most'
+        'camera_info, without field and skew, is off by at most 0.5 px'
     )
     assert lens.p_value == '' and 'starcal lookup' in lens.remedy
     assert term.found == 'the stars put it at 326: 3.0 sigma of the difference'
@@ -35,6 +35,18 @@ def test_rows_say_what_was_found_and_what_to_do(tiny_products: Path) -> None:
         'The camera is the same in all images',
     ]
     assert all(row.remedy for row in others)
+
+
+def test_a_length_that_no_image_shows_has_no_digits(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+    checks = calibration.model_checks
+    assert checks is not None
+    found = dataclasses.replace(
+        checks, field_rms_px=3e-5, field_worst_px=1e-4, image_variation_px=4e-6
+    )
+    lens, *_, camera = model_rows(dataclasses.replace(calibration, model_checks=found))
+    assert lens.found.startswith('field of less than 0.001 px everywhere; ')
+    assert camera.found == 'varies by less than 0.001 px in a corner'
 
 
 def test_values_that_the_stars_do_not_contradict_share_one_row(tiny_products: Path) -> None:

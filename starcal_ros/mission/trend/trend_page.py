@@ -117,7 +117,7 @@ def verdict_of(
     if px <= _RECALIBRATE_PX:
         judged = f'within {_RECALIBRATE_PX:g} px: the active one holds'
     else:
-        judged = f'not within {_RECALIBRATE_PX:g} px: consider to activate it'
+        judged = f'not within {_RECALIBRATE_PX:g} px: consider activating it'
     newest = f'The newest calibration changes lines of sight by up to {px:.2g} px, {judged}.'
     return px <= _RECALIBRATE_PX, (newest, text)
 

@@ -178,7 +178,8 @@ def _held_against(case: Case, tried: int, shift_s: float) -> Diagnosis:
     focal_px = float(np.median([image.sky.camera.parameters[0] for image in solved]))
     prior_px = float(setup.prior.camera.parameters[0])
     identified = f'{len(solved)} of {tried} images identified without attitude'
-    chance = f'expected false matches: under 10^{worst:.0f} each'
+    # A smaller bound is no better evidence.
+    chance = f'expected false matches: under 10^{max(worst, -12.0):.0f} each'
     evidence = [f'{identified}, {min(stars)} to {max(stars)} stars each; {chance}']
     reading = case.best_reading()
     is_mirrored = solved[0].sky.mirrored

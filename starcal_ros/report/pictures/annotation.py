@@ -48,6 +48,17 @@ STAR_MARKS: Mapping[str, Mark] = {
 }
 """Name of `STAR_REFUSALS` -> its mark."""
 
+LETTERS: Mapping[int, str] = {
+    cv2.MARKER_TRIANGLE_DOWN: '\N{WHITE DOWN-POINTING TRIANGLE}',
+    cv2.MARKER_TRIANGLE_UP: '\N{WHITE UP-POINTING TRIANGLE}',
+    cv2.MARKER_SQUARE: '\N{WHITE SQUARE}',
+    cv2.MARKER_DIAMOND: '\N{WHITE DIAMOND}',
+    cv2.MARKER_TILTED_CROSS: '\N{MULTIPLICATION SIGN}',
+    cv2.MARKER_CROSS: '+',
+    cv2.MARKER_STAR: '*',
+}
+"""Shape of a mark -> a letter like it, for the text below a picture."""
+
 _UNKNOWN = Mark(cv2.MARKER_STAR, _TEXT)  # a reason from another version
 
 
