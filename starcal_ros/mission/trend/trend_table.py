@@ -25,17 +25,15 @@ import pyarrow.parquet as pq
 
 from starcal_ros.errors import ProductError
 from starcal_ros.mission.trend import places
-from starcal_ros.mission.trend.answers import Seen, START
-from starcal_ros.mission.trend.rows import Row
+from starcal_ros.mission.trend.answers import Seen
+from starcal_ros.mission.trend.rows import folder_of, NO_NAME, PARTITIONS, Row, START
 from starcal_ros.mission.trend.tasks import Task
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.record_codec import json_object, read_record
 
 TABLE_FOLDER = 'trend.parquet'
 SCHEMA_VERSION = '2'  # in the metadata of each file as `starcal_trend_schema`; 1 has none
-PARTITIONS = ('spacecraft', 'camera')
 _NEW, _SEEN = '_new', '_seen'
-_NONE = '-'  # a value must be there: readers infer the type of a column from it
 _BATCH = 16  # rows in a part: what a crash can lose, a few seconds of work
 _MERGE = 256  # parts from which they are sorted in
 _MOST_KNOWN = 1000  # digests of a size sent with a task: beyond, the content is used again
@@ -232,7 +230,7 @@ class Table:
         parts, seen = self._parts()
         parts = [part for part in parts if part in self._keys]  # others are of another run
         new = {part for part in parts if self._folder(part) in ('', _NEW)}
-        grow = {_folder_of(*row.camera) for row in self._known.values() if row.part in new}
+        grow = {folder_of(*row.camera) for row in self._known.values() if row.part in new}
         old = [
             part
             for part in parts
@@ -243,7 +241,7 @@ class Table:
             cameras = zip(*(rows[name].to_pylist() for name in PARTITIONS), strict=True)
             of_camera: dict[str, list[int]] = {}
             for k, camera in enumerate(cameras):
-                of_camera.setdefault(_folder_of(*camera), []).append(k)
+                of_camera.setdefault(folder_of(*camera), []).append(k)
             for folder, own in of_camera.items():
                 self._write(folder, rows.take(own))
         if len(seen) > 1:
@@ -317,7 +315,7 @@ class Table:
         pairs = [name.partition('=') for name in self._folder(part).split('/')]
         if tuple(name for name, _, _ in pairs) != PARTITIONS:
             return {}
-        return {n: '' if v == _NONE else urllib.parse.unquote(v) for n, _, v in pairs}
+        return {n: '' if v == NO_NAME else urllib.parse.unquote(v) for n, _, v in pairs}
 
 
 @contextlib.contextmanager
@@ -339,9 +337,3 @@ def _opened(part: str) -> pq.ParquetFile:
     if sum(g.column(k).num_values for g in groups for k in range(g.num_columns)) > _MOST_VALUES:
         raise ValueError(f'more than {_MOST_VALUES} values')
     return file
-
-
-def _folder_of(*camera: str) -> str:
-    """Folder of a camera in the form of Hive, which readers of Parquet take columns from."""
-    values = [urllib.parse.quote(value, safe=' ') or _NONE for value in camera]
-    return '/'.join(f'{name}={value}' for name, value in zip(PARTITIONS, values, strict=True))
