@@ -44,6 +44,7 @@ class Proxy:
         self.delay_s = 0.0
         self.requests: list[str] = []
         self.on_request: Callable[[str], None] = lambda line: None
+        self._listener: socket.socket
         self._port, self._open = port, list[socket.socket]()
         self.start(0)
         self._own_port = self._listener.getsockname()[1]
