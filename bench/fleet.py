@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+import hashlib
 import itertools
 import os
 from pathlib import Path
@@ -13,10 +14,17 @@ import statistics
 import tempfile
 import time
 
+import numpy as np
 import psutil  # type: ignore[import-untyped]
+from scipy.spatial.transform import Rotation
 
 from bench.table import Table, verdict
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.mission.trend import fleet, tasks
+from starcal_ros.mission.trend.change_points import SECONDS_PER_YEAR
+from starcal_ros.mission.trend.rows import COMPUTED, Row
 from starcal_ros.mission.trend.tasks import Cameras, Task
 from starcal_ros.mission.trend.trend_table import Table as Rows
 
@@ -24,6 +32,10 @@ LEAST_EFFICIENCY = 0.85
 _WORKERS = 2
 _TINY = Path(__file__).parents[1] / 'bags/tiny'
 _PARAMS = _TINY / 'params.yaml'
+SIGMA_CENTRE_PX, SIGMA_BORESIGHT_ARCSEC = 0.3, 0.2  # of simulated rows
+_SIGMAS = np.array(
+    [0.05, 0.01, 0.05, SIGMA_CENTRE_PX, SIGMA_CENTRE_PX, 1e-4, 1e-3, 3e-3, 1e-5, 1e-5]
+)
 _LIBRARY = b'starcal'  # in the header of the bag, which nothing reads
 
 
@@ -117,3 +129,74 @@ def processor_s() -> float:
     """Processor time of this process and of its children that have ended."""
     used = os.times()
     return used.user + used.system + used.children_user + used.children_system
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A simulated camera: at first, its drift, and its step after a month."""
+
+    parameters: Floats
+    alignment_arcsec: Floats
+    drift_per_year: Floats = field(default_factory=lambda: np.zeros(13))
+    step: Floats = field(default_factory=lambda: np.zeros(13))
+    step_after: int = -1
+
+    def of_month(self, month: int) -> Floats:
+        """Parameters and alignment (arcsec) of a month."""
+        start = np.concatenate([self.parameters, self.alignment_arcsec])
+        is_after = 0 <= self.step_after < month
+        return np.asarray(start + self.drift_per_year * month / 12 + self.step * is_after)
+
+
+def simulated_truth(rng: np.random.Generator) -> Truth:
+    """A camera of a fleet of one design, 20 degrees wide, as it was built."""
+    mean = np.array([3641.5, 0.0, 3642.3, 651.25, 505.75, -0.051, 0.117, 0.01, 5e-4, 3e-4])
+    scatter = np.array([4.0, 0.1, 4.0, 6.0, 6.0, 2e-3, 1e-2, 1e-2, 1e-4, 1e-4])
+    scattered = mean + rng.normal(0, scatter)
+    scattered[2] += scattered[0] - mean[0]
+    return Truth(scattered, rng.normal(0, 300.0, 3))
+
+
+def simulated_rows(name: str, months: list[Floats], rng: np.random.Generator) -> list[Row]:
+    """
+    Rows of the calibrations of a camera whose parameters and alignment each month are given.
+
+    The errors of the principal point and of the alignment trade: together they move the boresight
+    by its much smaller error.
+    """
+    names = CameraModel(1296, 1024, months[0][:10]).parameter_names
+    px_arcsec = 1 / months[0][0] / ARCSECOND_RAD
+    sigma_arcsec = np.hypot(SIGMA_CENTRE_PX * px_arcsec, SIGMA_BORESIGHT_ARCSEC)
+    sigmas = (*_SIGMAS.tolist(), *(np.array([sigma_arcsec, sigma_arcsec, 3.0]) * ARCSECOND_RAD))
+    rows = []
+    for month, truth in enumerate(months):
+        error = rng.normal(0, _SIGMAS)
+        turn = rng.normal(0, (SIGMA_BORESIGHT_ARCSEC, SIGMA_BORESIGHT_ARCSEC, 3.0))
+        turn += np.array([-error[4], error[3], 0.0]) * px_arcsec
+        quaternion = Rotation.from_rotvec((truth[10:] + turn) * ARCSECOND_RAD).as_quat()
+        first_ns = round((50 + month / 12) * SECONDS_PER_YEAR) * NANOSECONDS_PER_SECOND
+        rows.append(
+            Row(
+                key=hashlib.sha256(f'{name} {month}'.encode()).hexdigest(),
+                path=f'/fleet/{name}/{month:03d}',
+                kind=COMPUTED,
+                software='starcal 0',
+                time_ns=first_ns + 50,
+                first_ns=first_ns,
+                last_ns=first_ns + 100,
+                accepted=True,
+                child_frame='camera',
+                lens_model='plumb_bob',
+                width=1296,
+                height=1024,
+                names=names,
+                values=tuple((truth[:10] + error).tolist()),
+                sigmas=tuple(map(float, sigmas)),
+                star_tracker_from_camera_xyzw=tuple(quaternion.tolist()),
+                boresight_sigma_arcsec=(SIGMA_BORESIGHT_ARCSEC,) * 2,
+                spacecraft=name,
+                camera='nav',
+                stamp=f'{name} {month}',
+            )
+        )
+    return rows

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 import contextlib
 import dataclasses
+import itertools
 import posixpath
 import time
 from typing import Any, get_type_hints
@@ -173,15 +174,39 @@ class Table:
 
     def rows(self) -> list[Row]:
         """All rows on disk, in order of time."""
-        found: dict[str, Row] = {}
-        for part in self._parts()[0]:
-            camera = self._camera_of(part)
-            with _naming(part):
-                for batch in _opened(part).iter_batches(_BATCH):
-                    for content in batch.to_pylist():
-                        row = read_record(Row, {**content, **camera})
-                        found[row.key] = row
-        return sorted(found.values(), key=lambda row: (row.time_ns, row.key))
+        return sorted(itertools.chain(*self.cameras()), key=lambda row: (row.time_ns, row.key))
+
+    def cameras(self) -> Iterator[list[Row]]:
+        """Rows on disk of one camera after the other, each in order of time."""
+        parts = self._parts()[0]
+        for part in parts:
+            if part not in self._keys:
+                self._note(part)
+        found: dict[str, list[Row]] = {}
+        of_camera: dict[str, list[str]] = {}
+        for part in parts:
+            if self._camera_of(part):
+                of_camera.setdefault(self._folder(part), []).append(part)
+                continue
+            for row in self._rows_of(part):  # not sorted in: of version 1, or of another run
+                found.setdefault(folder_of(row.spacecraft, row.camera), []).append(row)
+        for folder in sorted({*found, *of_camera}):
+            rows = found.pop(folder, [])
+            for part in of_camera.get(folder, ()):
+                rows += self._rows_of(part)
+            yield sorted(rows, key=lambda row: (row.time_ns, row.key))
+
+    def camera_count(self) -> int:
+        """Number of cameras by their names."""
+        return len({row.camera for row in self._known.values()})
+
+    def _rows_of(self, part: str) -> list[Row]:
+        """Rows of a file that count."""
+        camera, rows = self._camera_of(part), []
+        with _naming(part):
+            for batch in _opened(part).iter_batches(_BATCH):
+                rows += [read_record(Row, {**one, **camera}) for one in batch.to_pylist()]
+        return [row for row in rows if self._known[row.key].part == part]
 
     def _parts(self) -> tuple[list[str], list[str]]:
         """Files with rows: those of version 1, the sorted ones, the new ones; those of stamps."""
