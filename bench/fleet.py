@@ -1,16 +1,27 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""A fleet of small bags by `starcal trend` on two worker processes, one killed in the run."""
+"""
+A fleet of small bags by `starcal trend` on two worker processes, client and a worker killed.
+
+Bags and results are on an S3 server of this machine where moto and s3fs are installed
+(``pip install 'moto[server]' s3fs``), else on its disk.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+import contextlib
+import dataclasses
 from dataclasses import dataclass, field
 import hashlib
+import importlib.util
 import itertools
 import os
 from pathlib import Path
-import shutil
+import socket
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 
@@ -22,13 +33,14 @@ from bench.table import Table, verdict
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.mission.trend import fleet, tasks
+from starcal_ros.mission.trend import fleet, places, tasks
 from starcal_ros.mission.trend.change_points import SECONDS_PER_YEAR
-from starcal_ros.mission.trend.rows import COMPUTED, Row
-from starcal_ros.mission.trend.tasks import Cameras, Task
+from starcal_ros.mission.trend.rows import COMPUTED, kept_name, Row
+from starcal_ros.mission.trend.tasks import Cameras, KEPT_FOLDER, Task
 from starcal_ros.mission.trend.trend_table import Table as Rows
 
 LEAST_EFFICIENCY = 0.85
+MOST_MB, MOST_S = 300.0, 20.0  # of a run with nothing new: at 100,000 rows; over 10,000 keys
 _WORKERS = 2
 _TINY = Path(__file__).parents[1] / 'bags/tiny'
 _PARAMS = _TINY / 'params.yaml'
@@ -36,6 +48,13 @@ SIGMA_CENTRE_PX, SIGMA_BORESIGHT_ARCSEC = 0.3, 0.2  # of simulated rows
 _SIGMAS = np.array(
     [0.05, 0.01, 0.05, SIGMA_CENTRE_PX, SIGMA_CENTRE_PX, 1e-4, 1e-3, 3e-3, 1e-5, 1e-5]
 )
+_CLIENT = """
+import sys
+from starcal_ros.cli.main import main
+main(sys.argv[1:])
+with open('/proc/self/status') as file:
+    print(next(line for line in file if line.startswith('VmHWM:')))
+"""
 _LIBRARY = b'starcal'  # in the header of the bag, which nothing reads
 
 
@@ -59,27 +78,70 @@ class Watch:
             self.killed += 1
 
 
-def run(quick: bool) -> list[Table]:
-    """One bag after another alone, then all on two workers."""
-    count, alone = (8, 2) if quick else (500, 20)
+def run(quick: bool) -> Iterator[Table]:
+    """Bags that are calibrated, then runs over simulated rows with nothing new."""
     with tempfile.TemporaryDirectory(prefix='starcal-fleet-') as name:
         folder = Path(name)
-        copy_bags(folder / 'fleet', count)
-        found = list(tasks.find(str(folder / 'fleet'), Cameras(params=str(_PARAMS))))
-        before = one_bag_s(found[:alone], folder / 'before')
-        watch = Watch(kill_at=count // 2)
-        start_s, start_processor_s = time.perf_counter(), processor_s()
-        with Rows(folder / 'out') as table:
-            fleet.update(table, found, _WORKERS, on_row=watch.on_row)
-        wall_s = time.perf_counter() - start_s
-        used_s = (processor_s() - start_processor_s) / count
-        after = one_bag_s(found[-alone:], folder / 'after')
-        rows = Rows(folder / 'out').rows()
+        with store(folder / 'store') as root:
+            yield of_bags(root, folder, *((8, 2) if quick else (500, 20)))
+            made = Table('starcal trend with nothing new', ('rows', 'place', 's', 'peak MB'))
+            cameras = 4 if quick else 400
+            made.add(25 * cameras, root[:5], *nothing_new(f'{root}/rows', cameras, 25))
+        cameras = 10 if quick else 1000
+        made.add(100 * cameras, 'disk', *nothing_new(str(folder / 'rows'), cameras, 100))
+        made.notes.append(f'limits: {MOST_S:g} s over 10,000 keys, {MOST_MB:g} MB at 100,000 rows')
+        print(made.text())
+        yield made
+
+
+@contextlib.contextmanager
+def store(folder: Path) -> Iterator[str]:
+    """A bucket of an S3 server while the block runs, or a folder."""
+    if not all(map(importlib.util.find_spec, ('moto', 's3fs'))):
+        yield str(folder)
+        return
+    with socket.create_server(('127.0.0.1', 0)) as free:
+        port = free.getsockname()[1]
+    os.environ['AWS_ENDPOINT_URL'] = f'http://127.0.0.1:{port}'
+    os.environ |= dict.fromkeys(('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY'), 'test')
+    line = [sys.executable, '-m', 'moto.server', '-H', '127.0.0.1', '-p', str(port)]
+    server = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        import s3fs  # type: ignore[import-not-found,import-untyped,unused-ignore]
+
+        for _ in range(300):
+            with contextlib.suppress(OSError):
+                socket.create_connection(('127.0.0.1', port), 1).close()
+                break
+            time.sleep(0.1)
+        s3fs.S3FileSystem().mkdir('archive')
+        yield 's3://archive'
+    finally:
+        server.kill()
+        server.wait()
+
+
+def of_bags(root: str, folder: Path, count: int, alone: int) -> Table:
+    """One bag after another alone, then all: a client that is killed, and one that goes on."""
+    copy_bags(f'{root}/fleet', count)
+    found = list(tasks.find(f'{root}/fleet', Cameras(params=str(_PARAMS))))
+    before = one_bag_s(found[:alone], f'{root}/before')
+    watch, output = Watch(kill_at=count // 4), f'{root}/out'
+    start_s, start_processor_s = time.perf_counter(), processor_s()
+    killed_client(f'{root}/fleet', output, folder, count // 4)
+    with Rows(output) as table:
+        fleet.update(table, found, _WORKERS, on_row=watch.on_row)
+    wall_s = time.perf_counter() - start_s
+    used_s = (processor_s() - start_processor_s) / count
+    after = one_bag_s(found[-alone:], f'{root}/after')
+    rows = Rows(output).rows()
     one_s = (before[0] + after[0]) / 2
     one_used_s = (before[1] + after[1]) / 2
     efficiency = count * one_s / (_WORKERS * wall_s)
     stamps = Counter(row.stamp for row in rows)
-    made = Table(f'starcal trend over {count} bags on {_WORKERS} workers', ('quantity', 'value'))
+    kept = {entry.name for entry in places.entries(f'{output}/{KEPT_FOLDER}')}
+    title = f'starcal trend over {count} bags on {root[:5]} with {_WORKERS} workers'
+    made = Table(title, ('quantity', 'value'))
     made.add('one bag alone, before, s', before[0])
     made.add('one bag alone, after, s', after[0])
     made.add(f'{count} bags, s', wall_s)
@@ -87,31 +149,69 @@ def run(quick: bool) -> list[Table]:
     made.add('processor time of a bag alone, s', one_used_s)
     made.add(f'processor time of a bag of {count}, s', used_s)
     made.add('efficiency, processor time', one_used_s / used_s)
+    made.add('clients killed with SIGKILL', 1)
     made.add('workers killed with SIGKILL', watch.killed)
     made.add('bags lost', sum(task.stamp not in stamps for task in found))
     made.add('bags counted twice', sum(n > 1 for n in stamps.values()))
     made.add('bags failed', sum(bool(row.error) for row in rows))
+    made.add('calibrations lost or left over', len(kept ^ {kept_name(row) for row in rows}))
     for who, values in (('this process', watch.parent_mb), ('largest worker', watch.worker_mb)):
         tenth = max(1, len(values) // 10)
         made.add(f'{who}, second tenth, MB', statistics.mean(values[tenth : 2 * tenth]))
         made.add(f'{who}, last tenth, MB', statistics.mean(values[-tenth:]))
     made.notes.append(f'efficiency {verdict(efficiency, LEAST_EFFICIENCY)}')
     print(made.text())
-    return [made]
+    return made
 
 
-def copy_bags(folder: Path, count: int) -> None:
+def killed_client(root: str, output: str, folder: Path, kept: int) -> None:
+    """Run the command in a folder, and kill it once so many calibrations are kept."""
+    line = [sys.executable, '-m', 'starcal_ros.cli.main', 'trend', root, '-o', output]
+    line += ['--params', str(_PARAMS), '--workers', str(_WORKERS)]
+    with subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL) as client:
+        while client.poll() is None and len(places.entries(f'{output}/{KEPT_FOLDER}')) < kept:
+            time.sleep(0.5)
+        client.kill()
+
+
+def nothing_new(root: str, cameras: int, each: int) -> tuple[float, float]:
+    """Wall time and peak memory of a client, all of whose keys are rows of its table."""
+    rng = np.random.default_rng(each)
+    names = [f'sat{k:04d}' for k in range(cameras)]
+    for name, k in itertools.product(names, range(each)):
+        url = f'{root}/fleet/{name}/{k:03d}/calibration.json'
+        if places.is_remote(root):
+            places.write(url, b'')
+        else:  # without waiting for the disk
+            Path(url).parent.mkdir(parents=True)
+            Path(url).touch()
+    found = tasks.find(f'{root}/fleet', Cameras())
+    with Rows(f'{root}/out') as table:
+        for name in names:
+            truth = simulated_truth(rng)
+            months = [truth.of_month(month) for month in range(each)]
+            for row, task in zip(simulated_rows(name, months, rng), found, strict=False):
+                table.add(dataclasses.replace(row, stamp=task.stamp))
+    line = [sys.executable, '-c', _CLIENT, 'trend', f'{root}/fleet', '-o', f'{root}/out']
+    start_s = time.perf_counter()
+    done = subprocess.run(line, check=True, capture_output=True, text=True)
+    wall_s = time.perf_counter() - start_s
+    if f'0 new, {cameras * each} known before, 0 failed' not in done.stdout:
+        raise AssertionError(done.stdout)
+    return wall_s, int(done.stdout.split()[-2]) / 1e3
+
+
+def copy_bags(folder: str, count: int) -> None:
     """Copies of the small bag, each with a digest of its own."""
     content = (_TINY / 'tiny_0.mcap').read_bytes()
     assert content[:64].count(_LIBRARY) == 1
     for k in range(count):
-        bag = folder / f'{k:04d}'
-        bag.mkdir(parents=True)
-        shutil.copyfile(_TINY / 'metadata.yaml', bag / 'metadata.yaml')
-        (bag / 'tiny_0.mcap').write_bytes(content.replace(_LIBRARY, f'{k:07d}'.encode(), 1))
+        bag = places.join(folder, f'{k:04d}')
+        places.write(f'{bag}/metadata.yaml', (_TINY / 'metadata.yaml').read_bytes())
+        places.write(f'{bag}/tiny_0.mcap', content.replace(_LIBRARY, f'{k:07d}'.encode(), 1))
 
 
-def one_bag_s(found: list[Task], folder: Path) -> tuple[float, float]:
+def one_bag_s(found: list[Task], folder: str) -> tuple[float, float]:
     """
     Wall and processor time of a bag on one worker.
 
