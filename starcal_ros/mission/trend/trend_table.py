@@ -36,6 +36,7 @@ TABLE_FOLDER = 'trend.parquet'
 SCHEMA_VERSION = '2'  # in the metadata of each file as `starcal_trend_schema`; 1 has none
 _NEW, _SEEN = '_new', '_seen'
 _BATCH = 16  # rows in a part: what a crash can lose, a few seconds of work
+_READ = 1024  # rows at a time, which take a few MB as Python objects
 _MERGE = 256  # parts from which they are sorted in
 _MOST_KNOWN = 1000  # digests of a size sent with a task: beyond, the content is used again
 _MOST_BYTES = 256 * 2**20  # of a file; a row has 1 kB
@@ -204,7 +205,7 @@ class Table:
         """Rows of a file that count."""
         camera, rows = self._camera_of(part), []
         with _naming(part):
-            for batch in _opened(part).iter_batches(_BATCH):
+            for batch in _opened(part).iter_batches(_READ):
                 rows += [read_record(Row, {**one, **camera}) for one in batch.to_pylist()]
         return [row for row in rows if self._known[row.key].part == part]
 
