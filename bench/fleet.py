@@ -198,7 +198,7 @@ def nothing_new(root: str, cameras: int, each: int) -> tuple[float, float]:
     wall_s = time.perf_counter() - start_s
     if f'0 new, {cameras * each} known before, 0 failed' not in done.stdout:
         raise AssertionError(done.stdout)
-    return wall_s, int(done.stdout.split()[-2]) / 1e3
+    return wall_s, int(done.stdout.split()[-2]) * 1024 / 1e6
 
 
 def copy_bags(folder: str, count: int) -> None:

@@ -32,7 +32,7 @@ _MOST_BYTES = 8 * 2**20
 _TOKEN = re.compile(r'\{(\w+)\}|(\*)|([^{}*]+)|(.)')
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Task:
     """
     A calibration file to read, or a bag to calibrate.

@@ -62,7 +62,7 @@ _SEEN_SCHEMA = pa.schema([('stamp', pa.string()), ('key', pa.string())])
 _STATE = ('key', 'path', 'stamp', 'size_bytes', 'error', 'software', 'is_passing', *PARTITIONS)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class _Known:
     """Part of a row that is kept in memory."""
 
