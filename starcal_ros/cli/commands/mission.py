@@ -183,6 +183,7 @@ def _trend(args: argparse.Namespace) -> int:
         )
     with progress_bar(len(found), 'calibrations') as advance:
         done = fleet.update(table, found, args.workers, args.scheduler, advance)
+    found.clear()  # 50 MB of 100,000 tasks, which the page can use
     page = trend_page.write_page(table.cameras(), table.camera_count(), args.output, args.root)
     copies = f', {done.repeated} the same as another' if done.repeated else ''
     print_text(f'{done.computed} new, {done.known} known before, {done.failed} failed{copies}')

@@ -31,8 +31,10 @@ class Overview:
     after : int
         Index of the calibration before its most significant step; -1 without a step.
     time_ns : int array (n,)
-    values, sigmas : arrays (n, p)
+    values : array (n, p)
         Camera parameters of its n calibrations, those of the alignment left out.
+    sigma : array (p,)
+        Of the calibration after the step.
     model : tuple
         Lens model and image size; only cameras with the same are compared.
     """
@@ -43,7 +45,7 @@ class Overview:
     after: int
     time_ns: Indices
     values: Floats
-    sigmas: Floats
+    sigma: Floats
     model: tuple[str, int, int]
 
     @property
@@ -58,15 +60,15 @@ def overview_of(
     """Overview of the different calibrations of a camera, in order of time."""
     found = findings(shown)
     steps = [(abs(t.size) / t.sigma, one.row[t.after]) for one, t in found if t.kind == 'step']
-    width = len(rows[0].names)
+    after = max(steps)[1] if steps else -1
     return Overview(
         name=name,
         kinds=tuple(sorted({term.kind for _, term in found})),
         is_stable=is_stable,
-        after=max(steps)[1] if steps else -1,
+        after=after,
         time_ns=np.array([row.time_ns for row in rows], np.int64),
         values=np.array([row.values for row in rows], np.float64),
-        sigmas=np.array([row.sigmas[:width] for row in rows], np.float64),
+        sigma=np.array(rows[after + 1].sigmas[: len(rows[0].names)], np.float64),
         model=(rows[0].lens_model, rows[0].width, rows[0].height),
     )
 
@@ -81,7 +83,7 @@ def swapped_with(one: Overview, cameras: Sequence[Overview]) -> str:
     if one.after < 0:
         return ''
     before, after = one.values[one.after], one.values[one.after + 1]
-    sigma = np.where(one.sigmas[one.after + 1] > 0, one.sigmas[one.after + 1], np.inf)
+    sigma = np.where(one.sigma > 0, one.sigma, np.inf)
     found = [(max(_SIGMAS, _ALIKE * float(np.max(np.abs(after - before) / sigma))), '')]
     for other in cameras:
         k = int(np.searchsorted(other.time_ns, one.time_ns[one.after], 'right')) - 1

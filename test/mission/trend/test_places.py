@@ -149,8 +149,8 @@ def test_an_answer_is_one_of_two_kinds(mission: Path) -> None:
     first, *_ = tasks.find(str(mission), Cameras())
     row = answers.compute(first)
     assert isinstance(row, Row) and row.stamp == first.stamp
-    known = dataclasses.replace(first, known=(row.key[: START],))
-    assert answers.compute(known) == Seen(row.key[: START])
+    known = dataclasses.replace(first, known=(row.key[:START],))
+    assert answers.compute(known) == Seen(row.key[:START])
 
 
 def test_a_table_of_version_1_still_counts(mission: Path, capsys) -> None:
