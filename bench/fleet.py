@@ -1,30 +1,60 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""A fleet of small bags by `starcal trend` on two worker processes, one killed in the run."""
+"""
+A fleet of small bags by `starcal trend` on two worker processes, client and a worker killed.
+
+Bags and results are on an S3 server of this machine where moto and s3fs are installed
+(``pip install 'moto[server]' s3fs``), else on its disk.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+import contextlib
+import dataclasses
 from dataclasses import dataclass, field
+import hashlib
+import importlib.util
 import itertools
 import os
 from pathlib import Path
-import shutil
+import socket
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 
+import numpy as np
 import psutil  # type: ignore[import-untyped]
+from scipy.spatial.transform import Rotation
 
 from bench.table import Table, verdict
-from starcal_ros.mission.trend import fleet, tasks
-from starcal_ros.mission.trend.tasks import Cameras, Task
+from starcal_ros.arrays import Floats
+from starcal_ros.camera import CameraModel
+from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.mission.trend import fleet, places, tasks
+from starcal_ros.mission.trend.change_points import SECONDS_PER_YEAR
+from starcal_ros.mission.trend.rows import COMPUTED, kept_name, Row
+from starcal_ros.mission.trend.tasks import Cameras, KEPT_FOLDER, Task
 from starcal_ros.mission.trend.trend_table import Table as Rows
 
 LEAST_EFFICIENCY = 0.85
+MOST_MB, MOST_S = 300.0, 20.0  # of a run with nothing new: at 100,000 rows; over 10,000 keys
 _WORKERS = 2
 _TINY = Path(__file__).parents[1] / 'bags/tiny'
 _PARAMS = _TINY / 'params.yaml'
+SIGMA_CENTRE_PX, SIGMA_BORESIGHT_ARCSEC = 0.3, 0.2  # of simulated rows
+_SIGMAS = np.array(
+    [0.05, 0.01, 0.05, SIGMA_CENTRE_PX, SIGMA_CENTRE_PX, 1e-4, 1e-3, 3e-3, 1e-5, 1e-5]
+)
+_CLIENT = """
+import sys
+from starcal_ros.cli.main import main
+main(sys.argv[1:])
+with open('/proc/self/status') as file:
+    print(next(line for line in file if line.startswith('VmHWM:')))
+"""
 _LIBRARY = b'starcal'  # in the header of the bag, which nothing reads
 
 
@@ -49,25 +79,68 @@ class Watch:
 
 
 def run(quick: bool) -> Iterator[Table]:
-    """One bag after another alone, then all on two workers."""
-    count, alone = (8, 2) if quick else (500, 20)
+    """Bags that are calibrated, then runs over simulated rows with nothing new."""
     with tempfile.TemporaryDirectory(prefix='starcal-fleet-') as name:
         folder = Path(name)
-        copy_bags(folder / 'fleet', count)
-        found = list(tasks.find(str(folder / 'fleet'), Cameras(params=str(_PARAMS))))
-        before = one_bag_s(found[:alone], folder / 'before')
-        watch = Watch(kill_at=count // 2)
-        start_s, start_processor_s = time.perf_counter(), processor_s()
-        with Rows(folder / 'out') as table:
-            fleet.update(table, found, _WORKERS, on_row=watch.on_row)
-        wall_s = time.perf_counter() - start_s
-        used_s = (processor_s() - start_processor_s) / count
-        after = one_bag_s(found[-alone:], folder / 'after')
-        rows = Rows(folder / 'out').rows()
-    one_s, one_used_s = ((a + b) / 2 for a, b in zip(before, after, strict=True))
+        with store(folder / 'store') as root:
+            yield of_bags(root, folder, *((8, 2) if quick else (500, 20)))
+            made = Table('starcal trend with nothing new', ('rows', 'place', 's', 'peak MB'))
+            cameras = 4 if quick else 400
+            made.add(25 * cameras, root[:5], *nothing_new(f'{root}/rows', cameras, 25))
+        cameras = 10 if quick else 1000
+        made.add(100 * cameras, 'disk', *nothing_new(str(folder / 'rows'), cameras, 100))
+        made.notes.append(f'limits: {MOST_S:g} s over 10,000 keys, {MOST_MB:g} MB at 100,000 rows')
+        yield made
+
+
+@contextlib.contextmanager
+def store(folder: Path) -> Iterator[str]:
+    """A bucket of an S3 server while the block runs, or a folder."""
+    if not all(map(importlib.util.find_spec, ('moto', 's3fs'))):
+        yield str(folder)
+        return
+    with socket.create_server(('127.0.0.1', 0)) as free:
+        port = free.getsockname()[1]
+    os.environ['AWS_ENDPOINT_URL'] = f'http://127.0.0.1:{port}'
+    os.environ |= dict.fromkeys(('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY'), 'test')
+    line = [sys.executable, '-m', 'moto.server', '-H', '127.0.0.1', '-p', str(port)]
+    server = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        import s3fs  # type: ignore[import-not-found,import-untyped,unused-ignore]
+
+        for _ in range(300):
+            with contextlib.suppress(OSError):
+                socket.create_connection(('127.0.0.1', port), 1).close()
+                break
+            time.sleep(0.1)
+        s3fs.S3FileSystem().mkdir('archive')
+        yield 's3://archive'
+    finally:
+        server.kill()
+        server.wait()
+
+
+def of_bags(root: str, folder: Path, count: int, alone: int) -> Table:
+    """One bag after another alone, then all: a client that is killed, and one that goes on."""
+    copy_bags(f'{root}/fleet', count)
+    found = list(tasks.find(f'{root}/fleet', Cameras(params=str(_PARAMS))))
+    before = one_bag_s(found[:alone], f'{root}/before')
+    watch, output = Watch(kill_at=count // 4), f'{root}/out'
+    start_s, start_processor_s = time.perf_counter(), processor_s()
+    killed_client(f'{root}/fleet', output, folder, count // 4)
+    with Rows(output) as table:
+        fleet.update(table, found, _WORKERS, on_row=watch.on_row)
+    wall_s = time.perf_counter() - start_s
+    used_s = (processor_s() - start_processor_s) / count
+    after = one_bag_s(found[-alone:], f'{root}/after')
+    rows = Rows(output).rows()
+    one_s = (before[0] + after[0]) / 2
+    one_used_s = (before[1] + after[1]) / 2
     efficiency = count * one_s / (_WORKERS * wall_s)
     stamps = Counter(row.stamp for row in rows)
-    made = Table(f'starcal trend over {count} bags on {_WORKERS} workers', ('quantity', 'value'))
+    kept = {entry.name for entry in places.entries(f'{output}/{KEPT_FOLDER}')}
+    title = f'starcal trend over {count} bags on {root[:5]} with {_WORKERS} workers'
+    made = Table(title, ('quantity', 'value'))
     made.add('one bag alone, before, s', before[0])
     made.add('one bag alone, after, s', after[0])
     made.add(f'{count} bags, s', wall_s)
@@ -75,30 +148,68 @@ def run(quick: bool) -> Iterator[Table]:
     made.add('processor time of a bag alone, s', one_used_s)
     made.add(f'processor time of a bag of {count}, s', used_s)
     made.add('efficiency, processor time', one_used_s / used_s)
+    made.add('clients killed with SIGKILL', 1)
     made.add('workers killed with SIGKILL', watch.killed)
     made.add('bags lost', sum(task.stamp not in stamps for task in found))
     made.add('bags counted twice', sum(n > 1 for n in stamps.values()))
     made.add('bags failed', sum(bool(row.error) for row in rows))
+    made.add('calibrations lost or left over', len(kept ^ {kept_name(row) for row in rows}))
     for who, values in (('this process', watch.parent_mb), ('largest worker', watch.worker_mb)):
         tenth = max(1, len(values) // 10)
         made.add(f'{who}, second tenth, MB', statistics.mean(values[tenth : 2 * tenth]))
         made.add(f'{who}, last tenth, MB', statistics.mean(values[-tenth:]))
     made.notes.append(f'efficiency {verdict(efficiency, LEAST_EFFICIENCY)}')
-    yield made
+    return made
 
 
-def copy_bags(folder: Path, count: int) -> None:
+def killed_client(root: str, output: str, folder: Path, kept: int) -> None:
+    """Run the command in a folder, and kill it once so many calibrations are kept."""
+    line = [sys.executable, '-m', 'starcal_ros.cli.main', 'trend', root, '-o', output]
+    line += ['--params', str(_PARAMS), '--workers', str(_WORKERS)]
+    with subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL) as client:
+        while client.poll() is None and len(places.entries(f'{output}/{KEPT_FOLDER}')) < kept:
+            time.sleep(0.5)
+        client.kill()
+
+
+def nothing_new(root: str, cameras: int, each: int) -> tuple[float, float]:
+    """Wall time and peak memory of a client, all of whose keys are rows of its table."""
+    rng = np.random.default_rng(each)
+    names = [f'sat{k:04d}' for k in range(cameras)]
+    for name, k in itertools.product(names, range(each)):
+        url = f'{root}/fleet/{name}/{k:03d}/calibration.json'
+        if places.is_remote(root):
+            places.write(url, b'')
+        else:  # without waiting for the disk
+            Path(url).parent.mkdir(parents=True)
+            Path(url).touch()
+    found = tasks.find(f'{root}/fleet', Cameras())
+    with Rows(f'{root}/out') as table:
+        for name in names:
+            truth = simulated_truth(rng)
+            months = [truth.of_month(month) for month in range(each)]
+            for row, task in zip(simulated_rows(name, months, rng), found, strict=False):
+                table.add(dataclasses.replace(row, stamp=task.stamp))
+    line = [sys.executable, '-c', _CLIENT, 'trend', f'{root}/fleet', '-o', f'{root}/out']
+    start_s = time.perf_counter()
+    done = subprocess.run(line, check=True, capture_output=True, text=True)
+    wall_s = time.perf_counter() - start_s
+    if f'0 new, {cameras * each} known before, 0 failed' not in done.stdout:
+        raise AssertionError(done.stdout)
+    return wall_s, int(done.stdout.split()[-2]) * 1024 / 1e6
+
+
+def copy_bags(folder: str, count: int) -> None:
     """Copies of the small bag, each with a digest of its own."""
     content = (_TINY / 'tiny_0.mcap').read_bytes()
     assert content[:64].count(_LIBRARY) == 1
     for k in range(count):
-        bag = folder / f'{k:04d}'
-        bag.mkdir(parents=True)
-        shutil.copyfile(_TINY / 'metadata.yaml', bag / 'metadata.yaml')
-        (bag / 'tiny_0.mcap').write_bytes(content.replace(_LIBRARY, f'{k:07d}'.encode(), 1))
+        bag = places.join(folder, f'{k:04d}')
+        places.write(f'{bag}/metadata.yaml', (_TINY / 'metadata.yaml').read_bytes())
+        places.write(f'{bag}/tiny_0.mcap', content.replace(_LIBRARY, f'{k:07d}'.encode(), 1))
 
 
-def one_bag_s(found: list[Task], folder: Path) -> tuple[float, float]:
+def one_bag_s(found: list[Task], folder: str) -> tuple[float, float]:
     """
     Wall and processor time of a bag on one worker.
 
@@ -116,3 +227,74 @@ def processor_s() -> float:
     """Processor time of this process and of its children that have ended."""
     used = os.times()
     return used.user + used.system + used.children_user + used.children_system
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A simulated camera: at first, its drift, and its step after a month."""
+
+    parameters: Floats
+    alignment_arcsec: Floats
+    drift_per_year: Floats = field(default_factory=lambda: np.zeros(13))
+    step: Floats = field(default_factory=lambda: np.zeros(13))
+    step_after: int = -1
+
+    def of_month(self, month: int) -> Floats:
+        """Parameters and alignment (arcsec) of a month."""
+        start = np.concatenate([self.parameters, self.alignment_arcsec])
+        is_after = 0 <= self.step_after < month
+        return np.asarray(start + self.drift_per_year * month / 12 + self.step * is_after)
+
+
+def simulated_truth(rng: np.random.Generator) -> Truth:
+    """A camera of a fleet of one design, 20 degrees wide, as it was built."""
+    mean = np.array([3641.5, 0.0, 3642.3, 651.25, 505.75, -0.051, 0.117, 0.01, 5e-4, 3e-4])
+    scatter = np.array([4.0, 0.1, 4.0, 6.0, 6.0, 2e-3, 1e-2, 1e-2, 1e-4, 1e-4])
+    scattered = mean + rng.normal(0, scatter)
+    scattered[2] += scattered[0] - mean[0]
+    return Truth(scattered, rng.normal(0, 300.0, 3))
+
+
+def simulated_rows(name: str, months: list[Floats], rng: np.random.Generator) -> list[Row]:
+    """
+    Rows of the calibrations of a camera whose parameters and alignment each month are given.
+
+    The errors of the principal point and of the alignment trade: together they move the boresight
+    by its much smaller error.
+    """
+    names = CameraModel(1296, 1024, months[0][:10]).parameter_names
+    px_arcsec = 1 / months[0][0] / ARCSECOND_RAD
+    sigma_arcsec = np.hypot(SIGMA_CENTRE_PX * px_arcsec, SIGMA_BORESIGHT_ARCSEC)
+    sigmas = (*_SIGMAS.tolist(), *(np.array([sigma_arcsec, sigma_arcsec, 3.0]) * ARCSECOND_RAD))
+    rows = []
+    for month, truth in enumerate(months):
+        error = rng.normal(0, _SIGMAS)
+        turn = rng.normal(0, (SIGMA_BORESIGHT_ARCSEC, SIGMA_BORESIGHT_ARCSEC, 3.0))
+        turn += np.array([-error[4], error[3], 0.0]) * px_arcsec
+        quaternion = Rotation.from_rotvec((truth[10:] + turn) * ARCSECOND_RAD).as_quat()
+        first_ns = round((50 + month / 12) * SECONDS_PER_YEAR) * NANOSECONDS_PER_SECOND
+        rows.append(
+            Row(
+                key=hashlib.sha256(f'{name} {month}'.encode()).hexdigest(),
+                path=f'/fleet/{name}/{month:03d}',
+                kind=COMPUTED,
+                software='starcal 0',
+                time_ns=first_ns + 50,
+                first_ns=first_ns,
+                last_ns=first_ns + 100,
+                accepted=True,
+                child_frame='camera',
+                lens_model='plumb_bob',
+                width=1296,
+                height=1024,
+                names=names,
+                values=tuple((truth[:10] + error).tolist()),
+                sigmas=tuple(map(float, sigmas)),
+                star_tracker_from_camera_xyzw=tuple(quaternion.tolist()),
+                boresight_sigma_arcsec=(SIGMA_BORESIGHT_ARCSEC,) * 2,
+                spacecraft=name,
+                camera='nav',
+                stamp=f'{name} {month}',
+            )
+        )
+    return rows

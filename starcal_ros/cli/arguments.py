@@ -494,7 +494,7 @@ def _catalog(command: argparse.ArgumentParser) -> None:
 def _trend(command: argparse.ArgumentParser) -> None:
     what = 'folder tree with calibrations and bags, or its URL, e.g. s3://bucket/fleet'
     _add(command, 'root', metavar='ROOT', help=what)
-    what = 'folder or URL for trend.html and the table trend.parquet, created if absent'
+    what = 'folder or URL for trend.html, the table trend.parquet and the calibrations of bags'
     _add(command, '-o', '--output', required=True, metavar='DIR', help=what)
     what = (
         'ROS parameter file for bags without a calibration beside them; {spacecraft} and {camera} '

@@ -52,11 +52,12 @@ def test_calibrate_bench(tmp_path: Path) -> None:
 
 
 def test_fleet_bench(tmp_path: Path) -> None:
-    """A worker is killed in the run, and each bag is in the table once, without a failure."""
-    (table,), _ = found_by('fleet', tmp_path)
+    """Client and worker are killed, and each bag is in the table once, without a failure."""
+    (table, _), _ = found_by('fleet', tmp_path)
     rows = {row['quantity']: row['value'] for row in table['rows']}
     assert rows['workers killed with SIGKILL'] == 1
     assert [rows[f'bags {what}'] for what in ('lost', 'counted twice', 'failed')] == [0, 0, 0]
+    assert rows['calibrations lost or left over'] == 0
 
 
 def test_ensemble_bench(tmp_path: Path) -> None:

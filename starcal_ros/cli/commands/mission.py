@@ -181,14 +181,14 @@ def _trend(args: argparse.Namespace) -> int:
         )
     with progress_bar(len(found), 'calibrations') as advance:
         done = fleet.update(table, found, args.workers, args.scheduler, advance)
-    rows = table.rows()
-    path = trend_page.write_page(rows, args.output, args.root)
+    found.clear()  # 50 MB of 100,000 tasks, which the page can use
+    page = trend_page.write_page(table.cameras(), table.camera_count(), args.output, args.root)
     copies = f', {done.repeated} the same as another' if done.repeated else ''
     print_text(f'{done.computed} new, {done.known} known before, {done.failed} failed{copies}')
-    for row in [row for row in rows if row.error][:_FAILURES_SHOWN]:
+    for row in page.failures[:_FAILURES_SHOWN]:
         print_text(f'failed: {row.path}: {row.error}')
-    print_text(f'{trend_page.span_years(rows):.2f} years; look at {path}')
-    return EXIT_ACCEPTED if any(not row.error for row in rows) else EXIT_REFUSED
+    print_text(f'{page.years:.2f} years; look at {page.path}')
+    return EXIT_ACCEPTED if page.calibrations else EXIT_REFUSED
 
 
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], int]] = {

@@ -8,7 +8,9 @@ import dataclasses
 from dataclasses import dataclass
 import hashlib
 import math
+import os
 from pathlib import Path
+import posixpath
 import socket
 
 import numpy as np
@@ -19,15 +21,23 @@ from starcal_ros.formats.messages.types import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import calibration_json
 from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE
 from starcal_ros.mission.trend import places
-from starcal_ros.mission.trend.rows import COMPUTED, failure, RECORDED, Row, row_of
-from starcal_ros.mission.trend.tasks import digest, Task
+from starcal_ros.mission.trend.rows import (
+    COMPUTED,
+    failure,
+    kept_name,
+    RECORDED,
+    Row,
+    row_of,
+    START,
+)
+from starcal_ros.mission.trend.tasks import digest, KEPT_FOLDER, Task
 from starcal_ros.pipeline import solve, topics
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
-from starcal_ros.records import StarObservations
+from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.untrusted import json_value, METADATA_BYTES, read_text, yaml_value
 
-START = 16  # characters of a digest that name one of the same size
+_NOT_SEEN = 'not seen by this worker; mount it under the same path as on the client'
 
 
 @dataclass(frozen=True)
@@ -41,8 +51,7 @@ def compute(task: Task) -> Row | Seen:
     """The row of a task, or `Seen`; of one that fails, the row with its error."""
     try:
         if task.size >= 0 and not places.exists(task.url):
-            reason = 'not seen by this worker; mount it under the same path as on the client'
-            raise FileNotFoundError(2, reason, task.url)
+            raise FileNotFoundError(2, _NOT_SEEN, task.url)
         with places.fetched(task.url, task.files) as path:
             return _answer(task, path)
     except OSError as error:
@@ -81,8 +90,10 @@ def _answer(task: Task, path: Path) -> Row | Seen:
         key = digest((*files, *settings), version)
         if key[:START] in task.known:
             return Seen(key[:START])
-        row = _calibrated(task, path, key) if task.is_bag else _recorded(task, path, key)
-        return _of_task(row, task, path)
+        made, temperature = _calibrated(task, path) if task.is_bag else _recorded(path)
+        kind = COMPUTED if task.is_bag else RECORDED
+        row = _of_task(row_of(made, key, task.url, kind, temperature), task, path)
+        return _kept(row, made, task) if task.is_bag and task.table else row
     except (StarcalError, ValueError) as error:
         cause = error.__cause__
         if isinstance(cause, OSError):
@@ -113,17 +124,34 @@ def _custom_data(metadata: Path) -> dict[str, str]:
         return {}  # rosbag2 writes it from version 0.16 on, and only where it was given
 
 
-def _recorded(task: Task, path: Path, key: str) -> Row:
+def _kept(row: Row, calibration: Calibration, task: Task) -> Row:
+    """The row after its calibration is written; a failure that passes if it cannot be."""
+    try:
+        # A worker of a cluster would make a folder of its own, in which nobody looks.
+        if not places.is_remote(task.table) and not os.path.isdir(task.table):
+            raise FileNotFoundError(2, _NOT_SEEN)
+        folder = places.join(posixpath.dirname(task.table), KEPT_FOLDER)
+        text = calibration_json.calibration_text(calibration)
+        places.write(places.join(folder, kept_name(row)), text.encode())
+    except (OSError, ProductError) as error:
+        reason = f'{task.table}: cannot be written: {getattr(error, "strerror", "") or error}'
+        return failed(task, f'{socket.gethostname()}: {reason}', is_passing=True)
+    return row
+
+
+def _recorded(path: Path) -> tuple[Calibration, float]:
+    """A recorded calibration and its mean temperature."""
     temperature = _temperature(path.with_name(OBSERVATIONS_FILE))
-    return row_of(calibration_json.read_calibration(path), key, task.url, RECORDED, temperature)
+    return calibration_json.read_calibration(path), temperature
 
 
-def _calibrated(task: Task, path: Path, key: str) -> Row:
+def _calibrated(task: Task, path: Path) -> tuple[Calibration, float]:
+    """The calibration of a bag and its mean temperature."""
     setup = read_setup(Path(task.params)) if task.params else _setup_beside(path)
     chosen = topics.choose_topics([path], topics.Topics(), setup)
     records = list(topics.read([path], chosen, setup))
     calibration = solve.solve(solve.ensemble_of(records, setup), setup)
-    return row_of(calibration, key, task.url, COMPUTED, _mean_temperature(records))
+    return calibration, _mean_temperature(records)
 
 
 def _setup_beside(bag: Path) -> Setup:

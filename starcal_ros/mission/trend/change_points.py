@@ -57,7 +57,13 @@ class Trend:
     scatter: float
 
 
-def trend_of(time_s: Floats, value: Floats, sigma: Floats, temperature_degc: Floats) -> Trend:
+def trend_of(
+    time_s: Floats,
+    value: Floats,
+    sigma: Floats,
+    temperature_degc: Floats,
+    max_p_value: float = MAX_P_VALUE,
+) -> Trend:
     """
     Trend of a series (n,) in order of time.
 
@@ -70,16 +76,13 @@ def trend_of(time_s: Floats, value: Floats, sigma: Floats, temperature_degc: Flo
     columns = _columns(time_s, temperature_degc)
     chosen: list[str] = []
     while True:
-        best = min(
-            ((_p_value(columns, chosen, name, value, sigma), name) for name in columns
-             if name not in chosen and name != ''),
-            default=(1.0, ''),
-        )  # fmt: skip
-        if best[0] > MAX_P_VALUE or len(chosen) >= n // 3:
+        names = [name for name in columns if name and name not in chosen]
+        p_values = _p_values(columns, chosen, names, value, sigma)
+        p, best = min(zip(p_values, names, strict=True), default=(1.0, ''))
+        if p > max_p_value or len(chosen) >= n // 3:
             break
-        chosen.append(best[1])
-        chosen = _still_needed(columns, chosen, value, sigma)
-        if best[1] not in chosen:
+        chosen = _still_needed(columns, [*chosen, best], value, sigma, max_p_value)
+        if best not in chosen:
             break
     return _fitted(columns, chosen, value, sigma)
 
@@ -107,30 +110,55 @@ def _solve(
     return x, inverse, float(np.sum((b - A @ x) ** 2))
 
 
-def _p_value(
-    columns: dict[str, Floats], chosen: Sequence[str], name: str, value: Floats, sigma: Floats
-) -> float:
-    """p-value of a term beside the chosen ones."""
-    _, _, without = _solve(columns, chosen, value, sigma)
-    _, _, chi2 = _solve(columns, [*chosen, name], value, sigma)
+def _p_values(
+    columns: dict[str, Floats],
+    chosen: Sequence[str],
+    names: Sequence[str],
+    value: Floats,
+    sigma: Floats,
+) -> list[float]:
+    """
+    p-values of terms, each beside the chosen ones.
+
+    A term lowers chi^2 by the square of the residual along the part of its column that is
+    orthogonal to the columns of the chosen ones, so all are judged by one factorisation.
+    """
+    if not names:
+        return []
+    Q, _ = np.linalg.qr(
+        np.stack([columns[name] for name in ('', *chosen)], axis=1) / sigma[:, None]
+    )
+    b = value / sigma
+    b = b - Q @ (Q.T @ b)
+    C = np.stack([columns[name] for name in names], axis=1) / sigma[:, None]
+    squares = np.sum(C**2, axis=0)
+    C -= Q @ (Q.T @ C)
+    left = np.sum(C**2, axis=0)
+    # A column that the chosen ones span lowers nothing.
+    gain = np.where(left > 1e-12 * squares, (C.T @ b) ** 2 / np.maximum(left, 1e-300), 0.0)
     freedom = len(value) - len(chosen) - 2
-    F = (without - chi2) / max(chi2 / freedom, 1.0)
-    p = float(fdtrc(1, freedom, max(F, 0.0)))
+    F = gain / np.maximum((b @ b - gain) / freedom, 1.0)
     places = sum(other.startswith('step') for other in columns)
-    return min(1.0, p * places) if name.startswith('step') else p
+    counts = [places if name.startswith('step') else 1 for name in names]
+    p_values = fdtrc(1, freedom, np.maximum(F, 0.0)) * counts
+    return [min(1.0, float(p)) for p in p_values]
 
 
 def _still_needed(
-    columns: dict[str, Floats], chosen: list[str], value: Floats, sigma: Floats
+    columns: dict[str, Floats],
+    chosen: list[str],
+    value: Floats,
+    sigma: Floats,
+    max_p_value: float,
 ) -> list[str]:
     """The chosen terms without those that the others have made superfluous."""
     while len(chosen) > 1:
         p_values = {
-            name: _p_value(columns, [c for c in chosen if c != name], name, value, sigma)
+            name: _p_values(columns, [c for c in chosen if c != name], [name], value, sigma)[0]
             for name in chosen
         }
         worst = max(p_values, key=lambda name: p_values[name])
-        if p_values[worst] <= MAX_P_VALUE:
+        if p_values[worst] <= max_p_value:
             break
         chosen = [name for name in chosen if name != worst]
     return chosen
@@ -143,7 +171,7 @@ def _fitted(columns: dict[str, Floats], chosen: list[str], value: Floats, sigma:
     terms = []
     for k, name in enumerate(chosen, start=1):
         others = [other for other in chosen if other != name]
-        p = _p_value(columns, others, name, value, sigma)
+        (p,) = _p_values(columns, others, [name], value, sigma)
         kind, _, after = name.partition(' ')
         terms.append(Term(kind, float(x[k]), float(error[k]), p, int(after) if after else -1))
     fit = np.stack([columns[name] for name in ('', *chosen)], axis=1) @ x

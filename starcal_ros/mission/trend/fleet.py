@@ -9,8 +9,8 @@ import dataclasses
 from dataclasses import dataclass, field
 import time
 
-from starcal_ros.mission.trend.answers import compute, failed, Seen, START
-from starcal_ros.mission.trend.rows import Row
+from starcal_ros.mission.trend.answers import compute, failed, Seen
+from starcal_ros.mission.trend.rows import Row, START
 from starcal_ros.mission.trend.tasks import Task
 from starcal_ros.mission.trend.trend_table import Table
 from starcal_ros.studies.workers import stream_each
@@ -61,6 +61,8 @@ def update(
     A task that ends its worker process on every attempt becomes the row of a failure; the others
     go on.  A file that cannot be reached is tried again after the others, with a pause.
     What is computed is on disk within a batch, so a run that was stopped starts where it stopped.
+    A worker writes the calibration of a bag beside the table before its row is sent, so that each
+    row on disk has its calibration.
     ``workers`` and ``scheduler`` as for `run_each`; the workers of a cluster see the same files.
     """
     done = Done()
@@ -70,7 +72,7 @@ def update(
         if start is not None:
             done.count_known(start)
         else:
-            waiting.append(dataclasses.replace(task, known=table.likely(task)))
+            waiting.append(dataclasses.replace(task, known=table.likely(task), table=table.folder))
     with table:
         for pause_s in (*_PAUSES_S, None):
             again = []

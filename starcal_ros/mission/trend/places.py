@@ -30,7 +30,7 @@ _LONGEST_REASON = 200
 _OBJECT_STORES = {'s3', 'gs', 'abfs'}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Entry:
     """
     A file below a root; ``name`` is its path from there.

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+import posixpath
 from typing import Annotated
+import urllib.parse
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import Derivatives
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.record_codec import check_shape
 from starcal_ros.record_fields import Count, Finite, Stamp
@@ -21,8 +24,12 @@ from starcal_ros.text import printable
 from starcal_ros.untrusted import check_text
 
 RECORDED, COMPUTED, FAILED = 'recorded', 'computed', 'failed'
+PARTITIONS = ('spacecraft', 'camera')
+NO_NAME = '-'  # a value must be there: readers infer the type of a column from it
+START = 16  # characters of a digest that name one of the same size
 _LONGEST = 20_000  # characters of a text: a path has 4096, each of up to four after `printable`
 _LONGEST_ERROR = 2000
+_LONGEST_NAME = 100  # of a bag in the name of a folder
 _MOST, _LEAST = 1e15, 1e-30  # of a number whose square and its inverse must stay finite
 
 
@@ -159,6 +166,19 @@ def row_of(
         ),
         boresight_sigma_arcsec=tuple(_boresight_sigma(calibration).tolist()),
     )
+
+
+def folder_of(*camera: str) -> str:
+    """Folder of a camera in the form of Hive, which readers of Parquet take columns from."""
+    values = [urllib.parse.quote(value, safe=' ') or NO_NAME for value in camera]
+    return '/'.join(f'{name}={value}' for name, value in zip(PARTITIONS, values, strict=True))
+
+
+def kept_name(row: Row) -> str:
+    """Path of the calibration of a bag below the folder of kept ones."""
+    bag = urllib.parse.quote(posixpath.basename(row.path).removesuffix('.mcap'))
+    folder = f'{bag[:_LONGEST_NAME]}-{row.key[:START]}'
+    return f'{folder_of(row.spacecraft, row.camera)}/{folder}/{CALIBRATION_FILE}'
 
 
 def failure(key: str, path: str, error: str) -> Row:

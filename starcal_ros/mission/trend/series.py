@@ -15,11 +15,20 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.agreement import alignment_difference_rad, lines_of_sight, movement
 from starcal_ros.camera import INTRINSIC_NAMES, line_of_sight
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.mission.trend.change_points import Trend, trend_of
+from starcal_ros.mission.trend.change_points import MAX_P_VALUE, Term, Trend, trend_of
 from starcal_ros.mission.trend.rows import COMPUTED, Row
 from starcal_ros.records import CameraGeometry
 
 _GRID = (15, 12)  # columns and rows of pixels that changes are taken over
+# Series whose estimates trade with each other: one drift shows in several of them.
+_TRADING = {
+    name: group
+    for group in (
+        ('boresight about x', 'alignment_x', 'cy'),
+        ('boresight about y', 'alignment_y', 'cx'),
+    )
+    for name in group
+}
 
 
 @dataclass(frozen=True)
@@ -68,50 +77,74 @@ class Change:
     shape_px: float
 
 
-def series_of(rows: Sequence[Row]) -> list[Series]:
+def series_of(rows: Sequence[Row], max_p_value: float = MAX_P_VALUE) -> list[Series]:
     """Series of parameters, boresight and alignment of the calibrations of one lens model."""
     first = rows[0].geometry
     found = []
     for k, name in enumerate(rows[0].names):
         values = np.array([row.values[k] for row in rows])
         sigmas = np.array([row.sigmas[k] for row in rows])
-        found += _one(rows, name, 'px' if name in INTRINSIC_NAMES else '', values, sigmas)
-    boresight = np.array([_boresight_arcsec(first, row.geometry) for row in rows])
+        unit = 'px' if name in INTRINSIC_NAMES else ''
+        found += _one(rows, name, unit, values, sigmas, max_p_value)
+    boresight = _boresight_arcsec([row.geometry for row in rows])
     of_boresight = np.array([row.boresight_sigma_arcsec for row in rows])
     for k, axis in enumerate('xy'):
         name = f'boresight about {axis}'
-        found += _one(rows, name, 'arcsec', boresight[:, k], of_boresight[:, k])
+        found += _one(rows, name, 'arcsec', boresight[:, k], of_boresight[:, k], max_p_value)
     alignment = np.array(
         [alignment_difference_rad(row.geometry, first) / ARCSECOND_RAD for row in rows]
     )
     sigmas = np.array([row.sigmas[-3:] for row in rows]) / ARCSECOND_RAD
     for k, axis in enumerate('xyz'):
-        found += _one(rows, f'alignment_{axis}', 'arcsec', alignment[:, k], sigmas[:, k])
+        name = f'alignment_{axis}'
+        found += _one(rows, name, 'arcsec', alignment[:, k], sigmas[:, k], max_p_value)
     return found
 
 
-def _one(rows: Sequence[Row], name: str, unit: str, value: Floats, sigma: Floats) -> list[Series]:
+def findings(shown: Sequence[Series]) -> list[tuple[Series, Term]]:
+    """Terms of series, a drift of several that trade with each other where it is clearest."""
+    found = [(one, term) for one in shown for term in one.trend.terms]
+    clearest: dict[object, tuple[float, str]] = {}
+    for one, term in found:
+        if term.kind == 'drift':
+            group = _TRADING.get(one.name, one.name)
+            best = (abs(term.size) / term.sigma, one.name)
+            clearest[group] = max(best, clearest.get(group, best))
+    names = {name for _, name in clearest.values()}
+    return [(one, term) for one, term in found if term.kind != 'drift' or one.name in names]
+
+
+def _one(
+    rows: Sequence[Row],
+    name: str,
+    unit: str,
+    value: Floats,
+    sigma: Floats,
+    max_p_value: float,
+) -> list[Series]:
     """The series of the calibrations that estimated a number; none where none did."""
     known = np.flatnonzero(np.isfinite(sigma) & (sigma > 0) & np.isfinite(value))
     if not len(known):
         return []
     time_s = np.array([rows[k].time_ns for k in known], np.float64) / NANOSECONDS_PER_SECOND
     temperature = np.array([rows[k].temperature_degc for k in known])
-    trend = trend_of(time_s, value[known], sigma[known], temperature)
+    trend = trend_of(time_s, value[known], sigma[known], temperature, max_p_value)
     return [Series(name, unit, tuple(known.tolist()), value[known], sigma[known], trend)]
 
 
-def _boresight_arcsec(first: CameraGeometry, now: CameraGeometry) -> Floats:
-    """Rotation (2,) of the line of sight of the middle about x and y of the first camera."""
-    camera = first.camera
+def _boresight_arcsec(geometries: Sequence[CameraGeometry]) -> Floats:
+    """Rotations (n, 2) of the line of sight of the middle about x and y of the first camera."""
+    camera = geometries[0].camera
     middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    tracker_from_first, tracker_from_now = (
-        Rotation.from_quat(geometry.star_tracker_from_camera_xyzw) for geometry in (first, now)
-    )
-    before = line_of_sight(camera, middle)
-    in_tracker = tracker_from_now.apply(line_of_sight(now.camera, middle))
-    after = tracker_from_first.inv().apply(in_tracker)
-    return np.asarray(np.cross(before, after)[:2] / ARCSECOND_RAD)
+    in_tracker = [
+        Rotation.from_quat(one.star_tracker_from_camera_xyzw).apply(
+            line_of_sight(one.camera, middle)
+        )
+        for one in geometries
+    ]
+    tracker_from_first = Rotation.from_quat(geometries[0].star_tracker_from_camera_xyzw)
+    of_first = tracker_from_first.inv().apply(in_tracker)
+    return np.asarray(np.cross(of_first[0], of_first)[:, :2] / ARCSECOND_RAD)
 
 
 def activations(rows: Sequence[Row]) -> list[Active]:

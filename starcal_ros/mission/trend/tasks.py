@@ -23,6 +23,7 @@ from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.pipeline.setup import files_of, read_setup
 from starcal_ros.untrusted import regular_file, shown
 
+KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source of rows
 _ARCHIVED = re.compile(r'\d{8,}_calibration_\d{8,}\.json')  # of the state folder of a calibrator
 _METADATA = 'metadata.yaml'
 _KEYS = ('spacecraft', 'camera')
@@ -31,7 +32,7 @@ _MOST_BYTES = 8 * 2**20
 _TOKEN = re.compile(r'\{(\w+)\}|(\*)|([^{}*]+)|(.)')
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Task:
     """
     A calibration file to read, or a bag to calibrate.
@@ -56,6 +57,8 @@ class Task:
         From the table or the pattern of cameras; empty: from the metadata of the bag.
     known : tuple of str
         Starts of digests in the table of which one may be that of this content.
+    table : str
+        Folder or URL of the table that calibrations of bags are kept beside; empty: not kept.
     """
 
     url: str
@@ -68,6 +71,7 @@ class Task:
     spacecraft: str = ''
     camera: str = ''
     known: tuple[str, ...] = ()
+    table: str = ''
 
 
 def find(root: str, cameras: Cameras) -> Iterator[Task]:
@@ -79,7 +83,11 @@ def find(root: str, cameras: Cameras) -> Iterator[Task]:
     the root cannot be listed. Raises StarcalError when a parameter file or a file that it names
     cannot be read.
     """
-    listed = {entry.name: entry for entry in places.entries(root)}
+    listed = {
+        entry.name: entry
+        for entry in places.entries(root)
+        if KEPT_FOLDER not in entry.name.split('/')
+    }
     version, settings_of = software_version(), functools.cache(_settings)
     for name, entry in listed.items():
         if posixpath.basename(name) == CALIBRATION_FILE:

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timezone
 import math
 from pathlib import Path
@@ -14,12 +15,14 @@ from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.mission.trend import places
 from starcal_ros.mission.trend.change_points import MAX_P_VALUE, SECONDS_PER_YEAR, Term
+from starcal_ros.mission.trend.overview import Overview, overview_of, swapped_with
 from starcal_ros.mission.trend.rows import Row
 from starcal_ros.mission.trend.series import (
     activations,
     Active,
     Change,
     changes,
+    findings,
     groups,
     newest_of_each,
     Series,
@@ -42,6 +45,7 @@ from starcal_ros.text import printable
 
 TREND_FILE = 'trend.html'
 _LISTED = 200
+_DRAWN = 10  # cameras with figures, 0.1 MB each, those that need attention first
 _RECALIBRATE_PX = 0.1  # change from which a new calibration is worth its upload, on the figure
 _HEIGHT = 270.0
 _MARGIN_NS = 30 * 86400 * NANOSECONDS_PER_SECOND  # one calibration alone has dates about it
@@ -52,39 +56,106 @@ _PER = {'drift': ' per year', 'temperature': ' per degC', 'step': ''}
 _LEAST_PX = 1e-4  # a smaller change is drawn as this one on the logarithmic axis
 
 
-def write_page(rows: Sequence[Row], folder: str, root: str) -> str:
-    """Write ``trend.html`` and return its path; raises ProductError when it cannot be written."""
-    failures = [row for row in rows if row.error]
-    cameras = [_camera(name, group) for name, group in groups(rows).items()]
+@dataclass(frozen=True)
+class Page:
+    """Path of a page, calibrations on it and their span; failures, and of the first their rows."""
+
+    path: str
+    calibrations: int
+    years: float
+    failed: int
+    failures: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A camera with its overview, and its calibrations and series for the figures."""
+
+    overview: Overview
+    group: Sequence[Row]
+    shown: Sequence[Series]
+    line: tuple[object, ...]
+
+
+def write_page(
+    cameras: Iterable[Sequence[Row]], camera_count: int, folder: str, root: str
+) -> Page:
+    """
+    Write ``trend.html`` from the rows of one camera after the other.
+
+    p-values are corrected for the number of cameras.  Raises ProductError when the page cannot be
+    written.
+    """
+    max_p_value = MAX_P_VALUE / max(camera_count, 1)
+    failures: list[Row] = []
+    drawn: list[_Judged] = []
+    lines: list[tuple[Overview, tuple[object, ...]]] = []
+    failed = count = 0
+    times: list[int] = []
+    for rows in cameras:
+        bad = [row for row in rows if row.error]
+        failures += bad[: _LISTED - len(failures)]
+        failed, count = failed + len(bad), count + len(rows) - len(bad)
+        for name, group in groups(rows).items():
+            one = _judged(name, group, max_p_value)
+            lines.append((one.overview, one.line))
+            times += [group[0].time_ns, group[-1].time_ns]
+            drawn = sorted([*drawn, one], key=_order)[:_DRAWN]
+    overviews = [overview for overview, _ in lines]
+    swaps = {one.name: swapped_with(one, overviews) for one in overviews}
     text = page_template('trend.html').render(
         root=printable(root),
-        cameras=cameras,
-        failures=[(row.path, row.error) for row in failures[:_LISTED]],
-        failure_count=len(failures),
-        count=len(rows) - len(failures),
-        max_p_value=f'{MAX_P_VALUE:g}',
+        lines=[(o, swaps[o.name], *line) for o, line in lines] if len(lines) > 1 else (),
+        attention=sum(one.needs_attention for one in overviews),
+        cameras=[_camera(one, swaps[one.overview.name]) for one in drawn],
+        failures=[(row.path, row.error) for row in failures],
+        failure_count=failed,
+        count=count,
+        max_p_value=f'{max_p_value:.2g}',
     )
     path = places.join(folder, TREND_FILE)
     places.write(path, text.encode())
-    return path
+    span_ns = max(times) - min(times) if times else 0
+    years = span_ns / NANOSECONDS_PER_SECOND / SECONDS_PER_YEAR
+    return Page(path, count, years, failed, tuple(failures))
+
+
+def _order(one: _Judged) -> tuple[bool, int, str]:
+    """Sort key of the cameras with figures."""
+    return not one.overview.needs_attention, -len(one.group), one.overview.name
 
 
 @np.errstate(all='ignore')  # a refused camera may be wild: no line of sight is not drawn
-def _camera(name: str, group: Sequence[Row]) -> dict[str, object]:
-    """The part of the page on one camera."""
+def _judged(name: str, group: Sequence[Row], max_p_value: float) -> _Judged:
     rows = newest_of_each(group)
     active = activations(group)
-    shown = series_of(rows)
+    shown = series_of(rows, max_p_value)
+    new = changes(group, active[-1:])
+    is_stable, verdict = verdict_of(group, active, new, shown)
+    px = new[-1].line_of_sight_px if new else math.nan
+    line = (len(rows), utc_text(rows[-1].time_ns)[:10], px, verdict[1])
+    return _Judged(overview_of(name, rows, shown, is_stable), group, shown, line)
+
+
+@np.errstate(all='ignore')
+def _camera(judged: _Judged, swapped: str) -> dict[str, object]:
+    """The part of the page on one camera."""
+    group, shown = judged.group, judged.shown
+    rows = newest_of_each(group)
+    active = activations(group)
     new = changes(group, active)
     charts = [_change_chart(group, new)] if new else []
     charts += [_chart(one, rows) for one in shown]
     is_stable, verdict = verdict_of(group, active, new, shown)
     return {
-        'name': name,
+        'name': judged.overview.name,
         'is_stable': is_stable,
-        'verdict': verdict,
+        'verdict': (
+            *verdict,
+            f'Since its step it has the parameters of {swapped}.' * bool(swapped),
+        ),
         'rows': rows,
-        'findings': [_finding(one, term, rows) for one in shown for term in one.trend.terms],
+        'findings': [_finding(one, term, rows) for one, term in findings(shown)],
         'charts': charts,
         'active': [_active(one, group, new) for one in active],
         'versions': [
@@ -107,7 +178,7 @@ def verdict_of(
     words = {'step': 'steps of', 'drift': 'drifts of', 'temperature': 'effects of temperature on'}
     found = []
     for kind, word in words.items():
-        names = [one.name for one in shown if any(term.kind == kind for term in one.trend.terms)]
+        names = list(dict.fromkeys(one.name for one, t in findings(shown) if t.kind == kind))
         found += [f'{word} {", ".join(names)}'] if names else []
     text = f'Found: {"; ".join(found)}.' if found else 'No step or drift was found.'
     later = [change for change in new if active and change.against == active[-1].row]
@@ -173,14 +244,6 @@ def _change_chart(rows: Sequence[Row], new: Sequence[Change]) -> Chart:
         f'{worst:.3g} px, {over} of {len(new)} over {_RECALIBRATE_PX:g} px (dashed).'
     )
     return Chart('Change by a recalibration', change_figure(new, rows), text)
-
-
-def span_years(rows: Sequence[Row]) -> float:
-    """Time from the first to the last calibration, years."""
-    times = [row.time_ns for row in rows if not row.error]
-    if not times:
-        return 0.0
-    return (max(times) - min(times)) / NANOSECONDS_PER_SECOND / SECONDS_PER_YEAR
 
 
 def series_figure(series: Series, rows: Sequence[Row]) -> Drawing:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 import contextlib
 import dataclasses
+import itertools
 import posixpath
 import time
 from typing import Any, get_type_hints
@@ -25,18 +26,17 @@ import pyarrow.parquet as pq
 
 from starcal_ros.errors import ProductError
 from starcal_ros.mission.trend import places
-from starcal_ros.mission.trend.answers import Seen, START
-from starcal_ros.mission.trend.rows import Row
+from starcal_ros.mission.trend.answers import Seen
+from starcal_ros.mission.trend.rows import folder_of, NO_NAME, PARTITIONS, Row, START
 from starcal_ros.mission.trend.tasks import Task
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.record_codec import json_object, read_record
 
 TABLE_FOLDER = 'trend.parquet'
 SCHEMA_VERSION = '2'  # in the metadata of each file as `starcal_trend_schema`; 1 has none
-PARTITIONS = ('spacecraft', 'camera')
 _NEW, _SEEN = '_new', '_seen'
-_NONE = '-'  # a value must be there: readers infer the type of a column from it
 _BATCH = 16  # rows in a part: what a crash can lose, a few seconds of work
+_READ = 1024  # rows at a time, which take a few MB as Python objects
 _MERGE = 256  # parts from which they are sorted in
 _MOST_KNOWN = 1000  # digests of a size sent with a task: beyond, the content is used again
 _MOST_BYTES = 256 * 2**20  # of a file; a row has 1 kB
@@ -62,7 +62,7 @@ _SEEN_SCHEMA = pa.schema([('stamp', pa.string()), ('key', pa.string())])
 _STATE = ('key', 'path', 'stamp', 'size_bytes', 'error', 'software', 'is_passing', *PARTITIONS)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class _Known:
     """Part of a row that is kept in memory."""
 
@@ -175,15 +175,39 @@ class Table:
 
     def rows(self) -> list[Row]:
         """All rows on disk, in order of time."""
-        found: dict[str, Row] = {}
-        for part in self._parts()[0]:
-            camera = self._camera_of(part)
-            with _naming(part):
-                for batch in _opened(part).iter_batches(_BATCH):
-                    for content in batch.to_pylist():
-                        row = read_record(Row, {**content, **camera})
-                        found[row.key] = row
-        return sorted(found.values(), key=lambda row: (row.time_ns, row.key))
+        return sorted(itertools.chain(*self.cameras()), key=lambda row: (row.time_ns, row.key))
+
+    def cameras(self) -> Iterator[list[Row]]:
+        """Rows on disk of one camera after the other, each in order of time."""
+        parts = self._parts()[0]
+        for part in parts:
+            if part not in self._keys:
+                self._note(part)
+        found: dict[str, list[Row]] = {}
+        of_camera: dict[str, list[str]] = {}
+        for part in parts:
+            if self._camera_of(part):
+                of_camera.setdefault(self._folder(part), []).append(part)
+                continue
+            for row in self._rows_of(part):  # not sorted in: of version 1, or of another run
+                found.setdefault(folder_of(row.spacecraft, row.camera), []).append(row)
+        for folder in sorted({*found, *of_camera}):
+            rows = found.pop(folder, [])
+            for part in of_camera.get(folder, ()):
+                rows += self._rows_of(part)
+            yield sorted(rows, key=lambda row: (row.time_ns, row.key))
+
+    def camera_count(self) -> int:
+        """Number of cameras by their names."""
+        return len({row.camera for row in self._known.values()})
+
+    def _rows_of(self, part: str) -> list[Row]:
+        """Rows of a file that count."""
+        camera, rows = self._camera_of(part), []
+        with _naming(part):
+            for batch in _opened(part).iter_batches(_READ):
+                rows += [read_record(Row, {**one, **camera}) for one in batch.to_pylist()]
+        return [row for row in rows if self._known[row.key].part == part]
 
     def _parts(self) -> tuple[list[str], list[str]]:
         """Files with rows: those of version 1, the sorted ones, the new ones; those of stamps."""
@@ -232,7 +256,7 @@ class Table:
         parts, seen = self._parts()
         parts = [part for part in parts if part in self._keys]  # others are of another run
         new = {part for part in parts if self._folder(part) in ('', _NEW)}
-        grow = {_folder_of(*row.camera) for row in self._known.values() if row.part in new}
+        grow = {folder_of(*row.camera) for row in self._known.values() if row.part in new}
         old = [
             part
             for part in parts
@@ -243,7 +267,7 @@ class Table:
             cameras = zip(*(rows[name].to_pylist() for name in PARTITIONS), strict=True)
             of_camera: dict[str, list[int]] = {}
             for k, camera in enumerate(cameras):
-                of_camera.setdefault(_folder_of(*camera), []).append(k)
+                of_camera.setdefault(folder_of(*camera), []).append(k)
             for folder, own in of_camera.items():
                 self._write(folder, rows.take(own))
         if len(seen) > 1:
@@ -317,7 +341,7 @@ class Table:
         pairs = [name.partition('=') for name in self._folder(part).split('/')]
         if tuple(name for name, _, _ in pairs) != PARTITIONS:
             return {}
-        return {n: '' if v == _NONE else urllib.parse.unquote(v) for n, _, v in pairs}
+        return {n: '' if v == NO_NAME else urllib.parse.unquote(v) for n, _, v in pairs}
 
 
 @contextlib.contextmanager
@@ -339,9 +363,3 @@ def _opened(part: str) -> pq.ParquetFile:
     if sum(g.column(k).num_values for g in groups for k in range(g.num_columns)) > _MOST_VALUES:
         raise ValueError(f'more than {_MOST_VALUES} values')
     return file
-
-
-def _folder_of(*camera: str) -> str:
-    """Folder of a camera in the form of Hive, which readers of Parquet take columns from."""
-    values = [urllib.parse.quote(value, safe=' ') or _NONE for value in camera]
-    return '/'.join(f'{name}={value}' for name, value in zip(PARTITIONS, values, strict=True))

@@ -1,9 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The command against an S3 server: bags, table and page by URL, and a store that fails."""
+"""The command against an S3 server: bags, results and page by URL, and a store that fails."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import contextlib
 import importlib.util
 import io
@@ -43,20 +43,33 @@ class Proxy:
         self.drop = ''  # pattern of the first line of requests whose connection is closed
         self.delay_s = 0.0
         self.requests: list[str] = []
-        self._port = port
-        self._listener = socket.create_server(('127.0.0.1', 0))
-        self.url = f'http://127.0.0.1:{self._listener.getsockname()[1]}'
+        self.on_request: Callable[[str], None] = lambda line: None
+        self._listener: socket.socket
+        self._port, self._open = port, list[socket.socket]()
+        self.start(0)
+        self._own_port = self._listener.getsockname()[1]
+        self.url = f'http://127.0.0.1:{self._own_port}'
+
+    def start(self, port: int | None = None) -> None:
+        self._listener = socket.create_server(
+            ('127.0.0.1', self._own_port if port is None else port)
+        )
         threading.Thread(target=self._accept, daemon=True).start()
 
     def close(self) -> None:
+        """End as a server that is killed: connections are cut, and none is accepted."""
         # close() alone does not wake the thread in accept().
-        self._listener.shutdown(socket.SHUT_RDWR)
+        for connection in (self._listener, *self._open):
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
         self._listener.close()
+        self._open.clear()
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):
             while True:
                 client, _ = self._listener.accept()
+                self._open.append(client)
                 threading.Thread(target=self._serve, args=(client,), daemon=True).start()
 
     def _serve(self, client: socket.socket) -> None:
@@ -68,6 +81,7 @@ class Proxy:
                     line = data.partition(b'\r\n')[0].decode(errors='replace')
                     if line.endswith('HTTP/1.1'):
                         self.requests.append(line)
+                        self.on_request(line)
                         if self.drop and re.search(self.drop, line):
                             break
                     time.sleep(self.delay_s)
@@ -99,6 +113,19 @@ class Store:
     def names(self, bucket: str = 'archive') -> list[str]:
         listing = self.request('GET', f'{bucket}?list-type=2').decode()
         return re.findall('<Key>(.*?)</Key>', listing)
+
+    def put_bag(self, k: int) -> None:
+        content = (TINY / 'tiny_0.mcap').read_bytes()
+        changed = content.replace(b'starcal', b'%07d' % k, 1)  # in the header, which nothing reads
+        self.request('PUT', f'archive/fleet/{k}/tiny_0.mcap', changed)
+        metadata = (TINY / 'metadata.yaml').read_bytes()
+        self.request('PUT', f'archive/fleet/{k}/metadata.yaml', metadata)
+
+    def kept(self) -> list[str]:
+        """Bags whose calibrations are kept."""
+        names = [name for name in self.names() if name.endswith('/calibration.json')]
+        assert all(name.startswith('trend/trend.calibrations/spacecraft=-/') for name in names)
+        return sorted(f's3://archive/fleet/{name.split("/")[-2][:-17]}' for name in names)
 
     def bags_in_table(self) -> list[str]:
         found = []
@@ -158,12 +185,8 @@ def store(server: tuple[str, int], tmp_path: Path) -> Iterator[Store]:
     made = Store(url, proxy, tmp_path)
     made.request('POST', 'moto-api/reset')
     made.request('PUT', 'archive')
-    content = (TINY / 'tiny_0.mcap').read_bytes()
     for k in range(2):
-        changed = content.replace(b'starcal', b'%07d' % k, 1)  # in the header, which nothing reads
-        made.request('PUT', f'archive/fleet/{k}/tiny_0.mcap', changed)
-        metadata = (TINY / 'metadata.yaml').read_bytes()
-        made.request('PUT', f'archive/fleet/{k}/metadata.yaml', metadata)
+        made.put_bag(k)
     yield made
     proxy.close()
 
@@ -171,13 +194,14 @@ def store(server: tuple[str, int], tmp_path: Path) -> Iterator[Store]:
 def test_a_second_run_from_another_folder_reads_no_bag(store: Store) -> None:
     store.proxy.delay_s = 0.05
     assert '2 new, 0 known before, 0 failed' in store.trend().stdout
-    assert store.bags_in_table() == _BAGS and 'trend/trend.html' in store.names()
+    assert store.bags_in_table() == store.kept() == _BAGS
+    assert 'trend/trend.html' in store.names()
     assert not any('_probe' in name or '_new' in name for name in store.names())
     store.proxy.requests.clear()
     store.folder = store.folder / 'elsewhere'
     store.folder.mkdir()
     assert '0 new, 2 known before, 0 failed' in store.trend().stdout
-    assert not any('.mcap' in line for line in store.proxy.requests)
+    assert not any('.mcap' in line or 'calibrations' in line for line in store.proxy.requests)
     assert list(store.folder.iterdir()) == []
 
 
@@ -209,19 +233,34 @@ def test_wrong_credentials_are_one_line(store: Store) -> None:
     assert 's3://archive/fleet: cannot be read: PermissionError: Forbidden' in done.stderr
 
 
-def test_a_bag_that_cannot_be_reached_is_done_by_the_next_run(store: Store) -> None:
-    store.proxy.drop = 'GET /archive/fleet/1/.*mcap'
+@pytest.mark.parametrize(
+    ('drop', 'words'),
+    [
+        ('GET /archive/fleet/1/.*mcap', 'cannot be read: '),
+        ('PUT .*calibrations/.*/1-', 's3://archive/trend/trend.parquet: cannot be written: '),
+    ],
+)
+def test_a_bag_that_cannot_be_reached_or_kept_is_done_by_the_next_run(
+    store: Store, drop: str, words: str
+) -> None:
+    store.proxy.drop = drop
     done = store.trend()
     assert '1 new, 0 known before, 1 failed' in done.stdout and done.stderr == ''
     (line,) = [line for line in done.stdout.splitlines() if line.startswith('failed: ')]
-    assert 's3://archive/fleet/1: ' in line and 'cannot be read: ' in line
+    assert 's3://archive/fleet/1: ' in line and words in line
     store.proxy.drop = ''
     assert '1 new, 1 known before, 0 failed' in store.trend().stdout
-    assert store.bags_in_table() == _BAGS
+    assert store.bags_in_table() == store.kept() == _BAGS
 
 
 @pytest.mark.parametrize(
-    'drop', ['PUT .*/_new/', 'PUT .*/camera(=|%3D)', 'DELETE .*/_new/', 'PUT .*html']
+    'drop',
+    [
+        'PUT .*/_new/',
+        'PUT .*/camera(=|%3D)',
+        'DELETE .*/_new/',
+        'PUT .*html',
+    ],
 )
 def test_a_write_that_fails_is_made_good_by_the_next_run(store: Store, drop: str) -> None:
     store.proxy.drop = drop
@@ -231,3 +270,23 @@ def test_a_write_that_fails_is_made_good_by_the_next_run(store: Store, drop: str
     store.proxy.drop = ''
     assert ' 0 failed' in store.trend().stdout
     assert store.bags_in_table() == _BAGS
+
+
+def test_a_server_that_is_killed_in_the_run_costs_a_pause(store: Store) -> None:
+    for k in range(2, 6):
+        store.put_bag(k)
+    fetched: list[str] = []
+
+    def kill_and_restart(line: str) -> None:
+        if re.match('GET .*mcap', line):
+            fetched.append(line)
+            if len(fetched) == 3:
+                store.proxy.close()
+                time.sleep(3.0)  # longer than the first pause, shorter than the second
+                store.proxy.start()
+
+    store.proxy.on_request = kill_and_restart
+    done = store.trend()
+    assert '6 new, 0 known before, 0 failed' in done.stdout and done.stderr == ''
+    assert len(fetched) > 6
+    assert store.bags_in_table() == store.kept() == [f's3://archive/fleet/{k}' for k in range(6)]

@@ -18,7 +18,7 @@ from trend_missions import make_mission, trend, write  # type: ignore[import-not
 from starcal_ros.cli.main import main
 from starcal_ros.mission.trend import answers, fleet, places, tasks
 from starcal_ros.mission.trend.answers import Seen
-from starcal_ros.mission.trend.rows import Row
+from starcal_ros.mission.trend.rows import Row, START
 from starcal_ros.mission.trend.tasks import Cameras
 from starcal_ros.mission.trend.trend_table import Table
 
@@ -149,8 +149,8 @@ def test_an_answer_is_one_of_two_kinds(mission: Path) -> None:
     first, *_ = tasks.find(str(mission), Cameras())
     row = answers.compute(first)
     assert isinstance(row, Row) and row.stamp == first.stamp
-    known = dataclasses.replace(first, known=(row.key[: answers.START],))
-    assert answers.compute(known) == Seen(row.key[: answers.START])
+    known = dataclasses.replace(first, known=(row.key[:START],))
+    assert answers.compute(known) == Seen(row.key[:START])
 
 
 def test_a_table_of_version_1_still_counts(mission: Path, capsys) -> None:

@@ -73,6 +73,28 @@ def test_rows_of_another_run_stay(tmp_path: Path) -> None:
     assert [one.key for one in Table(tmp_path).rows()] == ['a', 'b']
 
 
+def test_rows_come_one_camera_after_the_other_and_once(tmp_path: Path) -> None:
+    with Table(tmp_path) as table:
+        table.add(of_camera('a', 'x'))
+        table.add(of_camera('b', 'y'))
+    (part,) = tmp_path.rglob('camera=x/*.parquet')
+    before = part.read_bytes()
+    with Table(tmp_path) as table:
+        table.add(of_camera('a', 'z'))  # its camera has another name now
+    part.parent.mkdir(exist_ok=True)
+    part.write_bytes(before)  # as after a crash before its removal
+    running = Table(tmp_path)
+    running.add(of_camera('c', 'y'))
+    running.flush()
+    again = Table(tmp_path)
+    found = [[(one.key, one.camera) for one in rows] for rows in again.cameras() if rows]
+    assert found == [[('b', 'y'), ('c', 'y')], [('a', 'z')]] and again.camera_count() == 2
+
+
+def of_camera(key: str, camera: str) -> Row:
+    return dataclasses.replace(row(key), camera=camera)
+
+
 def test_failures_are_forgotten_on_request(tmp_path: Path) -> None:
     with Table(tmp_path) as table:
         table.add(row('a'))
