@@ -51,7 +51,15 @@ class Overview:
     @property
     def needs_attention(self) -> bool:
         """True for a step, a drift or a newest calibration that differs."""
-        return not self.is_stable or bool({'step', 'drift'} & {*self.kinds})
+        return self.verdict != 'sound'
+
+    @property
+    def verdict(self) -> str:
+        """Stepped, drifting, changed since the active calibration; or sound."""
+        words = {'step': 'stepped', 'drift': 'drifting'}
+        found = [words[kind] for kind in self.kinds if kind in words]
+        found += [] if self.is_stable else ['changed']
+        return ', '.join(found) or 'sound'
 
 
 def overview_of(

@@ -101,6 +101,7 @@ def write_page(
             lines.append((one.overview, one.line))
             times += [group[0].time_ns, group[-1].time_ns]
             drawn = sorted([*drawn, one], key=_order)[:_DRAWN]
+    lines.sort(key=lambda line: not line[0].needs_attention)
     overviews = [overview for overview, _ in lines]
     swaps = {one.name: swapped_with(one, overviews) for one in overviews}
     text = page_template('trend.html').render(

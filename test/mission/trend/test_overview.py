@@ -79,7 +79,7 @@ _USE = """<script>
 const name = (row) => row.cells[0].textContent.split(',')[0];
 const shown = () => [...body.rows].filter((row) => !row.hidden).map(name).join();
 const search = document.getElementById('search');
-const [camera, calibrations] = table.tHead.rows[0].cells;
+const [camera, , calibrations] = table.tHead.rows[0].cells;
 const views = [];
 calibrations.click(); views.push(shown());
 calibrations.click(); views.push(shown());
