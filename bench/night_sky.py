@@ -20,6 +20,7 @@ import numpy as np
 
 from bench.table import Table
 from bench.trials import rms, shape_error_arcsec
+from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import StarcalError
@@ -128,6 +129,6 @@ def calibrated(given: Scenario) -> Calibration:
 def off_arcsec(found: Calibration, truth: CameraModel) -> tuple[float, float]:
     """RMS error of the lines of sight, common rotation removed, and their 1-sigma, arcsec."""
     pixels = pixel_grid(truth, 15, 15)
-    mine, true = (line_of_sight(one, pixels) for one in (found.geometry.camera, truth))
-    assert found.maps is not None
-    return shape_error_arcsec(true, mine), rms(found.maps.shape_sigma_arcsec)
+    mine = line_of_sight_table(found.geometry.camera, found.map_covariance, pixels)
+    error_arcsec = shape_error_arcsec(line_of_sight(truth, pixels), mine.direction_camera)
+    return error_arcsec, rms(mine.shape_sigma_arcsec)

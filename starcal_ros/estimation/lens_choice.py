@@ -6,6 +6,9 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
+
+from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.camera.conversion import convert
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import TooFewObservations
@@ -23,8 +26,8 @@ def estimate_with_smallest_lens(
     """
     Return the estimate with the smallest lens model that needs no field, and the prior with it.
 
-    The model of the prior camera comes first, then those with more coefficients, ascending, then
-    those with fewer.  A model is accepted where the likelihood of a field beside it is not larger
+    The model of the prior camera comes first, then the others by the number of their coefficients.
+    A model is accepted where the likelihood of a field beside it is not larger
     than chance makes it: structure over the detector, which a model does not lose by having more
     coefficients alone.  Where none is accepted, the model with the least evidence for a field is.
 
@@ -37,15 +40,8 @@ def estimate_with_smallest_lens(
     """
     least = math.inf
     best: tuple[Estimate, CameraGeometry] | None = None
-    own = len(COEFFICIENTS[prior.camera.model])
-    for model in sorted(
-        COEFFICIENTS,
-        key=lambda name: (
-            name != prior.camera.model,
-            len(COEFFICIENTS[name]) < own,
-            len(COEFFICIENTS[name]),
-        ),
-    ):
+    others = sorted(COEFFICIENTS.keys() - {prior.camera.model}, key=lambda m: len(COEFFICIENTS[m]))
+    for model in (prior.camera.model, *others):
         camera, worst_px = convert(prior.camera, model)
         if not math.isfinite(worst_px):
             continue
@@ -58,6 +54,9 @@ def estimate_with_smallest_lens(
             continue  # the stars do not determine a model that large
         if estimate.termination != 'converged' and best is not None:
             continue  # lost on the way: its lack of a field means nothing
+        found = estimate.geometry.camera
+        if not np.isfinite(line_of_sight(found, pixel_grid(found, 15, 15))).all():
+            continue  # beyond the stars it folds
         ratio = estimate.posterior.field.likelihood_ratio
         if ratio < _CHANCE:
             return estimate, started

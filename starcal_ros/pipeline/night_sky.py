@@ -183,7 +183,9 @@ def _set_up(
             xyzw = found.icrf_from_camera[time_ns].as_quat()
             writer.write_attitude('/stars/attitude', time_ns, xyzw, 'icrf')
     prior = CameraGeometry(found.camera, np.array([0.0, 0.0, 0.0, 1.0]))
-    setup = load_setup(options_of(values), others=NODE_OPTION_CLASSES, prior=prior)
+    # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
+    stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
+    setup = load_setup({**stated, **options_of(values)}, others=NODE_OPTION_CLASSES, prior=prior)
     return NightSky((*bags, attitudes), setup, (found.in_a_sentence(),), is_located)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.night_sky import camera_of
+from bench.night_sky import calibrated, camera_of, off_arcsec
 import starcal_ros
 from starcal_ros.arrays import Pixels
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
@@ -108,6 +108,16 @@ def test_an_equidistant_lens_of_103_degrees_is_found() -> None:
     assert half_deg > 50 and found.camera.model == true.model == 'equidistant'
     assert len(found.icrf_from_camera) == 4
     assert found.camera.parameters[0] == pytest.approx(true.parameters[0], rel=2e-3)
+
+
+@pytest.mark.slow
+def test_a_fisheye_found_as_a_pinhole_gets_the_lens_that_its_stars_need() -> None:
+    """As a pinhole, its corners without stars were off by 22 of their sigmas, and accepted."""
+    given, _ = camera_of(44)
+    found = calibrated(given)
+    error_arcsec, sigma_arcsec = off_arcsec(found, given.truth.camera)
+    assert found.accepted and found.geometry.camera.model == given.truth.camera.model
+    assert error_arcsec < 5.0 * sigma_arcsec
 
 
 def zoomed(pixels: Pixels, factor: float) -> Pixels:
