@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.cli.terminal import print_table, print_text, print_verdict
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
@@ -25,9 +26,12 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
     from starcal_ros.estimation import mountings, temperature
 
     camera, sigma = calibration.geometry.camera, calibration.sigma
+    changes: Floats = np.full(len(camera.parameters), np.nan)
+    if prior.camera.model == camera.model:  # those of another lens model are no start of these
+        changes = camera.parameters - prior.camera.parameters
     rows = []
     for k, name in enumerate(camera.parameter_names):
-        value, change = camera.parameters[k], camera.parameters[k] - prior.camera.parameters[k]
+        value, change = camera.parameters[k], changes[k]
         free = name in calibration.estimated
         rows.append(
             (
@@ -35,8 +39,8 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
                 f'{value:.8g}',
                 'px' if name in INTRINSIC_NAMES else '',
                 f'{sigma[k]:.2g}' if free else 'held',
-                f'{change:+.4g}',
-                _sigmas(change, sigma[k]) if free else '',
+                f'{change:+.4g}' if np.isfinite(change) else '',
+                _sigmas(change, sigma[k]) if free and np.isfinite(change) else '',
             )
         )
     angles = alignment_difference_rad(calibration.geometry, prior) / ARCSECOND_RAD

@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
+import numpy as np
 import pytest
-from sample_records import calibration  # type: ignore[import-not-found]
+from sample_records import calibration, without_field  # type: ignore[import-not-found]
 
+from starcal_ros.camera.conversion import convert
 from starcal_ros.cli.output import print_calibration
 from starcal_ros.records import SigmaPart
 
@@ -36,3 +39,19 @@ def test_a_calibration_without_a_budget_has_no_table_of_it(
     record = dataclasses.replace(calibration(), sigma_budget=())
     print_calibration(record, record.geometry)
     assert '1-sigma of lines' not in capsys.readouterr().out
+
+
+def test_a_lens_that_the_prior_did_not_have_has_no_changes(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """With ``lens_model: auto``."""
+    prior = calibration().geometry
+    camera, _ = convert(prior.camera, 'rational_polynomial')
+    record = dataclasses.replace(
+        without_field(),
+        geometry=dataclasses.replace(prior, camera=camera),
+        covariance=np.eye(len(camera.parameters) + 3),
+    )
+    print_calibration(record, prior)
+    said = capsys.readouterr().out
+    assert re.search(r'^k6 +\S+ +\S+ *$', said, re.MULTILINE)
