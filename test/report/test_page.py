@@ -11,6 +11,7 @@ import shutil
 import subprocess
 from typing import Any
 
+from browser import BROWSER  # type: ignore[import-not-found]
 from markupsafe import Markup
 import numpy as np
 import pytest
@@ -27,9 +28,6 @@ from starcal_ros.formats.products.calibration_json import (
 from starcal_ros.formats.products.product_files import REPORT_FILE
 from starcal_ros.report import page as report
 
-BROWSER = next(
-    filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), ''
-)
 FIGURES = (
     'coverage',
     'cells',

@@ -8,6 +8,7 @@ from pathlib import Path
 import re
 import subprocess
 
+from browser import BROWSER  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 
@@ -17,7 +18,6 @@ from starcal_ros.mission.trend.overview import Overview, overview_of, swapped_wi
 from starcal_ros.mission.trend.rows import Row
 from starcal_ros.mission.trend.series import findings, series_of
 from starcal_ros.mission.trend.trend_page import write_page
-from test.report.test_page import BROWSER
 
 MONTHS = 24
 UNIT = np.eye(13)
