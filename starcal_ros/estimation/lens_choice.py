@@ -18,6 +18,7 @@ from starcal_ros.records import CameraGeometry, Ensemble
 
 # Twice the log likelihood of a field that is not there: the 1 % level of three amplitudes.
 _CHANCE = 9.0
+_PER_COEFFICIENT = 2.0  # Akaike 1974: less of a likelihood ratio is what any coefficient takes
 
 
 def estimate_with_smallest_lens(
@@ -27,9 +28,10 @@ def estimate_with_smallest_lens(
     Return the estimate with the smallest lens model that needs no field, and the prior with it.
 
     The model of the prior camera comes first, then the others by the number of their coefficients.
-    A model is accepted where the likelihood of a field beside it is not larger
-    than chance makes it: structure over the detector, which a model does not lose by having more
-    coefficients alone.  Where none is accepted, the model with the least evidence for a field is.
+    A model is accepted where the likelihood of a field beside it is not larger than chance makes
+    it: structure over the detector, which a model does not lose by having more coefficients alone.
+    Where none is accepted, the model with the least evidence for a field is, each coefficient
+    counted as 2.
 
     Raises
     ------
@@ -60,8 +62,9 @@ def estimate_with_smallest_lens(
         ratio = estimate.posterior.field.likelihood_ratio
         if ratio < _CHANCE:
             return estimate, started
-        if ratio < least:
-            least, best = ratio, (estimate, started)
+        if ratio + _PER_COEFFICIENT * len(COEFFICIENTS[model]) < least:
+            least = ratio + _PER_COEFFICIENT * len(COEFFICIENTS[model])
+            best = estimate, started
     if best is None:
         raise TooFewObservations('no lens model describes the prior camera')
     return best
