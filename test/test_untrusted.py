@@ -58,7 +58,8 @@ def test_values_of_yaml(text: str, value: object) -> None:
         ('a: !!bool 5', 'not YAML'),
         ('%TAG ! x\n---\na: 1', 'tag directives'),
         (40 * '[' + 40 * ']', 'line 1: nested deeper than 32'),
-        (100_000 * '[', 'nested deeper'),
+        # PyYAML 6.1 has a limit of its own.
+        (100_000 * '[', 'nested deeper|maximum nesting depth'),
         ('a: &a [*a]', 'line 1: YAML aliases are not read'),
         ('[' + 100_000 * '1,' + '1]', 'more than 100000 values'),
         ('--- 1\n--- 2', 'not YAML: expected a single document'),
