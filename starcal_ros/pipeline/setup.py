@@ -62,8 +62,8 @@ class SetupOptions:
     lens_model: str = option(
         'prior',
         'lens model to estimate; prior: the model of the prior camera; auto: the smallest model'
-        ' that leaves no significant residual field; other models start from a fit to the prior'
-        ' camera',
+        ' that leaves no significant residual field, as for images without attitudes and camera'
+        ' file; other models start from a fit to the prior camera',
         choices=('prior', 'auto', *COEFFICIENTS),
     )
     prior_alignment: tuple[float, ...] = option(
