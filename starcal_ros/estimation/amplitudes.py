@@ -27,6 +27,7 @@ from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.special import erf
 
 from starcal_ros.arrays import Floats, Indices
+from starcal_ros.estimation.levenberg_marquardt import NotObservable
 
 # Prior of the logarithm of an amplitude: a lens or a detector departs from its model by a
 # micropixel as likely as by a tenth of a pixel.  A narrower prior, or one that is centred where
@@ -252,7 +253,10 @@ def shapes(sums: ShapeSums, near: Amplitudes | None = None) -> Shapes:
     prior = ((best - LOG_CENTRE) ** 2 - (none - LOG_CENTRE) ** 2).sum() / LOG_SIGMA**2
     ratio = 2.0 * (value - likelihood(none)) + float(prior)
     shift = _SHAPE_SHIFTS[math.log(LARGEST_SHAPE_PX) - best.max() >= _SHAPE_SHIFTS]
-    weight = np.exp(np.array([likelihood(best + one) for one in shift]) - value)
+    log_weight = np.array([likelihood(best + one) for one in shift])
+    if not np.isfinite(log_weight.max()):
+        raise NotObservable('the unknowns cannot be separated from the shapes of the images')
+    weight = np.exp(log_weight - log_weight.max())
     sigma_px = np.exp(best) * interval_factor(np.exp(shift), weight)
     return Shapes(sigma_px, Amplitudes(best, ratio), _common_part(sums, sigma_px))
 
