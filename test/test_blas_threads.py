@@ -67,6 +67,30 @@ def test_a_trial_runs_on_one_thread() -> None:
     assert blas_threads() == 2
 
 
+LOADED_LATER = """
+from starcal_ros.blas_threads import one_blas_thread
+import numpy
+with one_blas_thread():
+    pass
+import scipy.linalg
+from threadpoolctl import threadpool_info
+with one_blas_thread():
+    found = [one['num_threads'] for one in threadpool_info() if one['user_api'] == 'blas']
+print(len(found), max(found))
+"""
+
+
+def test_a_library_that_is_loaded_later_has_one_thread_too() -> None:
+    """NumPy and SciPy bring one each."""
+    done = subprocess.run(
+        [sys.executable, '-c', LOADED_LATER],
+        env={**os.environ, 'OPENBLAS_NUM_THREADS': '2'},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.split()[1:] == ['1'], done.stdout + done.stderr
+
+
 # Other threads than the one that calls spend processor time only where BLAS has given them work.
 ON_ITS_THREAD = """
 import sys, time

@@ -19,7 +19,6 @@ from starcal_ros.assessment.lookup import GRID
 from starcal_ros.assessment.predictions import predictions
 from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.posterior import without_prior
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks
 
@@ -110,10 +109,7 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
         tested = np.isin(at, found.estimated) & (layout.prior_precision[at] > 0)
         if entry.name not in _STATED or not tested.any():
             continue
-        try:
-            means, variances = without_prior(estimate.sums, estimate.linear, entry.name)
-        except (NotObservable, np.linalg.LinAlgError):
-            continue  # without its prior nothing determines it
+        means, variances = without_prior(estimate.sums, estimate.linear, entry.name)
         for k, mean, variance in zip(at[tested], means[tested], variances[tested], strict=True):
             if not np.isfinite(variance):
                 continue

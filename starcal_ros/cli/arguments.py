@@ -26,8 +26,6 @@ _EXIT_STATUS = """\
 exit status: 0 the command succeeded, and a calibration passed the gate; 3 the gate refused the
 calibration; 2 bad input, named in one line; 130 interrupted."""
 
-_add = argparse.ArgumentParser.add_argument
-
 TOPICS = ('image', 'attitude', 'velocity', 'temperature', 'observations')
 STUDIES = ('table1', 'images', 'terms', 'coverage', 'paper')
 _BAGS = 'an .mcap file or a bag folder'
@@ -160,27 +158,29 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _output(command: argparse.ArgumentParser, metavar: str, what: str, **settings: Any) -> None:
-    _add(command, '-o', '--output', type=_path, metavar=metavar, help=what, **settings)
+    command.add_argument('-o', '--output', type=_path, metavar=metavar, help=what, **settings)
 
 
 def _bags(command: argparse.ArgumentParser, what: str) -> None:
-    _add(command, 'bags', type=_path, metavar='BAG', nargs='+', help=what)
+    command.add_argument('bags', type=_path, metavar='BAG', nargs='+', help=what)
 
 
 def _params(command: argparse.ArgumentParser, what: str = '') -> None:
     """Parameter file, needed where no other meaning is given."""
     text = what or 'ROS parameter file: prior camera, mounting and options'
-    _add(command, '--params', type=_path, metavar='FILE', help=text, required=not what)
+    command.add_argument('--params', type=_path, metavar='FILE', help=text, required=not what)
 
 
 def _json(command: argparse.ArgumentParser) -> None:
-    _add(command, '--json', action='store_true', help='print one JSON object instead of tables')
+    command.add_argument(
+        '--json', action='store_true', help='print one JSON object instead of tables'
+    )
 
 
 def _topics(command: argparse.ArgumentParser) -> None:
     for kind in TOPICS:
         what = f'{kind} topic (default: the only one of its type in the bag)'
-        _add(command, f'--{kind}-topic', default='', metavar='T', help=what)
+        command.add_argument(f'--{kind}-topic', default='', metavar='T', help=what)
 
 
 def _demo(command: argparse.ArgumentParser) -> None:
@@ -198,9 +198,9 @@ def _init(command: argparse.ArgumentParser) -> None:
 
 def _lens(command: argparse.ArgumentParser) -> None:
     what = 'focal length of the lens, mm, with --pixel-size-um (default: EXIF, FITS, else found)'
-    _add(command, '--focal-length-mm', type=float, default=0.0, metavar='MM', help=what)
+    command.add_argument('--focal-length-mm', type=float, default=0.0, metavar='MM', help=what)
     what = 'size of a pixel of the images, micrometres'
-    _add(command, '--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
+    command.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
 
 
 def _inspect(command: argparse.ArgumentParser) -> None:
@@ -223,21 +223,27 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
     _params(command, what)
     what = 'folder for the products, created if absent; existing products are replaced'
     _output(command, 'DIR', what, required=True)
-    _add(
-        command, '--no-report', action='store_true',
+    command.add_argument(
+        '--no-report', action='store_true',
         help='write no report; starcal report DIR writes it later',
     )  # fmt: skip
     _lens(command)
     _topics(command)
     when = 'UTC in ISO 8601, seconds since 1970, or +seconds after the first image'
     what = f'use images from T on: {when}'
-    _add(command, '--from', dest='from_time', type=parse_time, metavar='T', help=what)
-    _add(command, '--to', dest='to_time', type=parse_time, metavar='T', help='use images up to T')
+    command.add_argument('--from', dest='from_time', type=parse_time, metavar='T', help=what)
+    command.add_argument(
+        '--to', dest='to_time', type=parse_time, metavar='T', help='use images up to T'
+    )
     count = _number(int, 1)
-    _add(command, '--first', type=count, metavar='N', help='use only the first N of these images')
-    _add(command, '--every', type=count, metavar='K', help='use only every K-th of these images')
+    command.add_argument(
+        '--first', type=count, metavar='N', help='use only the first N of these images'
+    )
+    command.add_argument(
+        '--every', type=count, metavar='K', help='use only every K-th of these images'
+    )
     what = 'compare calibrations of the images of odd and of even number, DIR/odd and DIR/even'
-    _add(command, '--split-half', action='store_true', help=what)
+    command.add_argument('--split-half', action='store_true', help=what)
 
 
 def _plan(command: argparse.ArgumentParser) -> None:
@@ -245,9 +251,11 @@ def _plan(command: argparse.ArgumentParser) -> None:
     _bags(command, what)
     _params(command)
     what = 'images that may be taken (default: 10)'
-    _add(command, '--images', type=_number(int, 1, 1000), default=10, metavar='N', help=what)
+    command.add_argument(
+        '--images', type=_number(int, 1, 1000), default=10, metavar='N', help=what
+    )
     what = 'sigma to lower: line_of_sight (default), map, or a parameter such as fx or k1'
-    _add(command, '--minimise', default='line_of_sight', metavar='NAME', help=what)
+    command.add_argument('--minimise', default='line_of_sight', metavar='NAME', help=what)
     allowed = command.add_mutually_exclusive_group()
     what = 'CSV of the allowed pointings, with the columns ra_deg, dec_deg and, if fixed, roll_deg'
     allowed.add_argument('--pointings', type=_path, metavar='FILE', help=what)
@@ -256,11 +264,11 @@ def _plan(command: argparse.ArgumentParser) -> None:
     whole = (0.0, 0.0, 180.0)
     allowed.add_argument('--within', type=float, nargs=3, default=whole, metavar=cone, help=what)
     what = 'no boresight within DEG degrees of a direction: Sun, Moon, Earth; may be repeated'
-    _add(command, '--avoid', type=float, nargs=3, action='append', default=[], metavar=cone,
+    command.add_argument('--avoid', type=float, nargs=3, action='append', default=[], metavar=cone,
          help=what)  # fmt: skip
     what = 'largest angle between the boresights of an image and the next (default: 180)'
-    _add(
-        command, '--slew', type=_number(float, 0.001, 180), default=180.0, metavar='DEG', help=what
+    command.add_argument(
+        '--slew', type=_number(float, 0.001, 180), default=180.0, metavar='DEG', help=what
     )
     _output(command, 'FILE', 'write the pointings as CSV too')
     _topics(command)
@@ -269,20 +277,24 @@ def _plan(command: argparse.ArgumentParser) -> None:
 
 def _report(command: argparse.ArgumentParser) -> None:
     what = 'folder with the products of starcal calibrate'
-    _add(command, 'folder', type=_path, metavar='DIR', help=what)
-    _add(command, '--pdf', action='store_true', help='write report.pdf too, to print and sign')
+    command.add_argument('folder', type=_path, metavar='DIR', help=what)
+    command.add_argument(
+        '--pdf', action='store_true', help='write report.pdf too, to print and sign'
+    )
 
 
 def _compare(command: argparse.ArgumentParser) -> None:
     for name, which in (('a', 'reference calibration'), ('b', 'calibration to compare')):
         what = f'{which}: calibration.json or its folder'
-        _add(command, name, type=_path, metavar=name.upper(), help=what)
+        command.add_argument(name, type=_path, metavar=name.upper(), help=what)
     _output(command, 'FILE', 'plot of the difference over the detector (.svg)')
     _json(command)
 
 
 def _lookup(command: argparse.ArgumentParser) -> None:
-    _add(command, 'calibration', type=_path, metavar='DIR', help='calibration.json or its folder')
+    command.add_argument(
+        'calibration', type=_path, metavar='DIR', help='calibration.json or its folder'
+    )
     what = 'table to write: .csv, .npz or .fits'
     _output(command, 'FILE', what, required=True)
     grid = command.add_mutually_exclusive_group()
@@ -293,55 +305,59 @@ def _lookup(command: argparse.ArgumentParser) -> None:
 
 
 def _remaps(command: argparse.ArgumentParser, what: str) -> None:
-    _add(command, '--remap', type=_remap, action='append', default=[], metavar='A:=B', help=what)
+    command.add_argument(
+        '--remap', type=_remap, action='append', default=[], metavar='A:=B', help=what
+    )
 
 
 def _play(command: argparse.ArgumentParser) -> None:
-    _add(command, 'bag', type=_path, metavar='BAG', help=_BAGS)
+    command.add_argument('bag', type=_path, metavar='BAG', help=_BAGS)
     what = 'playback speed; 1 is real time, 0 is as fast as stars are observed (default: 1)'
-    _add(command, '--rate', type=_number(float, 0, 1e6), default=1.0, metavar='R', help=what)
+    command.add_argument(
+        '--rate', type=_number(float, 0, 1e6), default=1.0, metavar='R', help=what
+    )
     _remaps(command, 'publish topic A of the bag as B; may be repeated')
 
 
 def _monitor(command: argparse.ArgumentParser) -> None:
     what = 'print one view after S seconds and end; needed where the output is not a terminal'
-    _add(command, '--once', type=_number(float, 0, 3600), metavar='S', help=what)
+    command.add_argument('--once', type=_number(float, 0, 3600), metavar='S', help=what)
     _remaps(command, 'read topic A of the nodes from B; may be repeated')
 
 
 def _request(command: argparse.ArgumentParser) -> None:
     services = ('calibrate', 'solve', 'rollback', 'reset', 'lookup')
-    _add(command, 'service', choices=services, help='service of the calibrator')
-    _add(command, '--dry-run', action='store_true', help='solve: activate nothing')
+    command.add_argument('service', choices=services, help='service of the calibrator')
+    command.add_argument('--dry-run', action='store_true', help='solve: activate nothing')
     what = 'solve: activate the result despite the gate'
-    _add(command, '--force', action='store_true', help=what)
+    command.add_argument('--force', action='store_true', help=what)
     what = 'file for the table of lookup (.csv, .npz, .fits)'
     _output(command, 'FILE', what, required=False)
     what = 'longest wait for the answer, s (default: 600)'
     seconds = _number(float, 0.1, 86400)
-    _add(command, '--timeout', type=seconds, default=600.0, metavar='S', help=what)
+    command.add_argument('--timeout', type=seconds, default=600.0, metavar='S', help=what)
     _remaps(command, 'rename A of the calibrator to B, e.g. __ns:=/cam1; may be repeated')
 
 
 def _seed(command: argparse.ArgumentParser, what: str) -> None:
     seed = _number(int, 0, 2**63 - 1)
-    _add(command, '--seed', type=seed, default=1, metavar='N', help=f'{what} (default: 1)')
+    command.add_argument('--seed', type=seed, default=1, metavar='N', help=f'{what} (default: 1)')
 
 
 def _simulate(command: argparse.ArgumentParser) -> None:
     what = 'bag folder or .mcap file to write; an existing one is replaced'
     _output(command, 'BAG', what, required=True)
     what, names = 'scenario: tiny, small or paper', ('tiny', 'small', 'paper')
-    _add(command, '--scenario', required=True, choices=names, metavar='NAME', help=what)
+    command.add_argument('--scenario', required=True, choices=names, metavar='NAME', help=what)
     _seed(command, 'seed of the truth and the noise')
     what = (
         'seed of the camera and its mounting: the same camera with other noise (default: --seed)'
     )
-    _add(command, '--camera-seed', type=_number(int, 0), metavar='N', help=what)
+    command.add_argument('--camera-seed', type=_number(int, 0), metavar='N', help=what)
     what = 'number of images (default: that of the scenario)'
-    _add(command, '--images', type=_number(int, 1), metavar='N', help=what)
+    command.add_argument('--images', type=_number(int, 1), metavar='N', help=what)
     what = 'draw only the N brightest stars of each image'
-    _add(command, '--stars-per-image', type=_number(int, 1), metavar='N', help=what)
+    command.add_argument('--stars-per-image', type=_number(int, 1), metavar='N', help=what)
     _mistakes(command)
 
 
@@ -378,10 +394,10 @@ def _mistakes(command: argparse.ArgumentParser) -> None:
 
 def _campaign(command: argparse.ArgumentParser) -> None:
     what = f'study: {", ".join(STUDIES[:-1])} or {STUDIES[-1]}'
-    _add(command, 'study', metavar='STUDY', choices=STUDIES, help=what)
+    command.add_argument('study', metavar='STUDY', choices=STUDIES, help=what)
     _output(command, 'DIR', 'folder for STUDY.json and STUDY.svg', required=True)
     what = 'number of trials (default: depends on the study)'
-    _add(command, '--trials', type=_number(int, 1, 1e6), metavar='N', help=what)
+    command.add_argument('--trials', type=_number(int, 1, 1e6), metavar='N', help=what)
     _seed(command, 'seed of all trials')
     arcsec = _number(float, 0, 3600)
     for name, kind, metavar, what in (
@@ -389,12 +405,12 @@ def _campaign(command: argparse.ArgumentParser) -> None:
         ('stars', _number(int, 3, 1000), 'N', 'numbers of stars in an image'),
         ('tracker', arcsec, 'ARCSEC', 'true star tracker 1-sigma values about each axis, arcsec'),
     ):
-        _add(command, f'--{name}', type=kind, nargs='+', metavar=metavar, help=what)
+        command.add_argument(f'--{name}', type=kind, nargs='+', metavar=metavar, help=what)
     methods = ('per_image', 'single', 'hierarchical')
     what = f'methods to compare: {", ".join(methods)}'
-    _add(command, '--methods', nargs='+', choices=methods, metavar='METHOD', help=what)
+    command.add_argument('--methods', nargs='+', choices=methods, metavar='METHOD', help=what)
     what = 'star tracker 1-sigma assumed by the calibration, arcsec (default: the true one)'
-    _add(command, '--tracker-assumed', type=arcsec, metavar='ARCSEC', help=what)
+    command.add_argument('--tracker-assumed', type=arcsec, metavar='ARCSEC', help=what)
     _workers(command, 'worker processes; 0 runs in-process (default: one per CPU)', None)
 
 
@@ -408,11 +424,11 @@ def _workers(command: argparse.ArgumentParser, what: str, default: int | None) -
 
 def _export(command: argparse.ArgumentParser) -> None:
     what = 'calibration.json or its folder'
-    _add(command, 'calibration', type=Path, metavar='DIR', help=what)
+    command.add_argument('calibration', type=Path, metavar='DIR', help=what)
     what = 'format: spice, ck, isd, opencv, kalibr, ros, giant, mrcal, csv or c'
-    _add(command, '--to', required=True, metavar='FORMAT', help=what)
+    command.add_argument('--to', required=True, metavar='FORMAT', help=what)
     what = 'folder for the files, created if absent'
-    _add(command, '-o', '--output', type=Path, required=True, metavar='OUT', help=what)
+    command.add_argument('-o', '--output', type=Path, required=True, metavar='OUT', help=what)
     spice = command.add_argument_group('SPICE')
     what = 'NAIF ID of the spacecraft, negative'
     spice.add_argument('--spacecraft-id', type=int, metavar='ID', help=what)
@@ -430,51 +446,52 @@ def _export(command: argparse.ArgumentParser) -> None:
     spice.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
     what = 'LSK and SCLK of the spacecraft, for ck'
     spice.add_argument('--kernels', nargs='+', type=Path, default=(), metavar='FILE', help=what)
-    _add(command, '--image-topic', default='', metavar='T', help='image topic, for kalibr')
+    command.add_argument('--image-topic', default='', metavar='T', help='image topic, for kalibr')
     what = 'binary table alone, for C code that is compiled already'
-    _add(command, '--table', action='store_true', help=what)
+    command.add_argument('--table', action='store_true', help=what)
 
 
 def _import(command: argparse.ArgumentParser) -> None:
     what = 'image files; a pattern in quotes is expanded here'
-    _add(command, '--images', nargs='+', required=True, metavar='FILE', help=what)
+    command.add_argument('--images', nargs='+', required=True, metavar='FILE', help=what)
     what = (
         'AEM, CSV, SPICE kernels (CK, SCLK, LSK and, for a frame by name, FK), or FITS with the'
         ' WCS of each image: the images themselves, or files of their names'
     )
-    _add(command, '--attitude', nargs='+', required=True, metavar='FILE', help=what)
+    command.add_argument('--attitude', nargs='+', required=True, metavar='FILE', help=what)
     what = 'OEM, CSV, or SPICE kernels (SPK with the Earth or the Sun, LSK); default: the Earth'
-    _add(command, '--velocity', nargs='+', type=Path, metavar='FILE', help=what)
+    command.add_argument('--velocity', nargs='+', type=Path, metavar='FILE', help=what)
     what = 'bag folder or .mcap file to write; replaces an earlier import, no other file'
-    _add(command, '-o', '--output', type=Path, required=True, metavar='BAG', help=what)
+    command.add_argument('-o', '--output', type=Path, required=True, metavar='BAG', help=what)
     what = 'star tracker frame: a body frame of the AEM, or a frame name or number of the CK'
-    _add(command, '--star-tracker', default='', metavar='FRAME', help=what)
+    command.add_argument('--star-tracker', default='', metavar='FRAME', help=what)
     what = 'frames of further star trackers in the same files'
-    _add(command, '--more-star-trackers', nargs='+', default=(), metavar='FRAME', help=what)
+    command.add_argument('--more-star-trackers', nargs='+', default=(), metavar='FRAME', help=what)
     what = 'name or NAIF ID of the spacecraft in the SPK'
-    _add(command, '--spacecraft', default='', metavar='BODY', help=what)
+    command.add_argument('--spacecraft', default='', metavar='BODY', help=what)
     what = 'FITS keyword of the middle of the exposure (default: DATE-AVG, else from DATE-BEG)'
-    _add(command, '--time-key', default='', metavar='KEY', help=what)
+    command.add_argument('--time-key', default='', metavar='KEY', help=what)
     what = 'CSV with columns file and time_utc (or time_tai, time_tdb, time_gps, time_ns)'
-    _add(command, '--times', type=Path, metavar='FILE', help=what)
+    command.add_argument('--times', type=Path, metavar='FILE', help=what)
     what = 'FITS keyword of the camera temperature, degC, e.g. CCD-TEMP'
-    _add(command, '--temperature-key', default='', metavar='KEY', help=what)
+    command.add_argument('--temperature-key', default='', metavar='KEY', help=what)
     what = 'FITS extension by number or name (default: the first image)'
-    _add(command, '--hdu', default='', metavar='N', help=what)
+    command.add_argument('--hdu', default='', metavar='N', help=what)
     what = 'colour to take from an RGB image or a mosaic'
-    _add(command, '--channel', default='', choices=('red', 'green', 'blue'), help=what)
+    command.add_argument('--channel', default='', choices=('red', 'green', 'blue'), help=what)
     what = 'Bayer pattern of a mosaic; the image then has half the width and height'
-    _add(command, '--bayer', default='', choices=('rggb', 'bggr', 'gbrg', 'grbg'), help=what)
+    command.add_argument(
+        '--bayer', default='', choices=('rggb', 'bggr', 'gbrg', 'grbg'), help=what
+    )
     what = 'range of pixel values that is mapped to 16 bit (default: that of all images)'
-    _add(command, '--value-range', nargs=2, type=float, metavar=('LOW', 'HIGH'), help=what)
+    command.add_argument('--value-range', nargs=2, type=float, metavar=('LOW', 'HIGH'), help=what)
     what = 'prior camera, ROS YAML or .cameramodel of mrcal; params.yaml is written then'
-    _add(command, '--camera', type=Path, metavar='FILE', help=what)
+    command.add_argument('--camera', type=Path, metavar='FILE', help=what)
     what = (
         'prior orientation x y z w of the camera in the star tracker frame, then in that of each'
         ' further one (default: found from the first images)'
     )
-    _add(
-        command,
+    command.add_argument(
         '--alignment',
         nargs='+',
         type=float,
@@ -486,27 +503,27 @@ def _import(command: argparse.ArgumentParser) -> None:
 
 def _catalog(command: argparse.ArgumentParser) -> None:
     what = 'table of Gaia DR3 by the Gaia archive or VizieR: VOTable, FITS, CSV or Parquet'
-    _add(command, 'table', type=_path, metavar='GAIA_FILE', help=what)
+    command.add_argument('table', type=_path, metavar='GAIA_FILE', help=what)
     what = 'catalog file to write (.npz), for the option catalog; no file is replaced'
     _output(command, 'FILE', what, required=True)
 
 
 def _trend(command: argparse.ArgumentParser) -> None:
     what = 'folder tree with calibrations and bags, or its URL, e.g. s3://bucket/fleet'
-    _add(command, 'root', metavar='ROOT', help=what)
+    command.add_argument('root', metavar='ROOT', help=what)
     what = 'folder or URL for trend.html, the table trend.parquet and the calibrations of bags'
-    _add(command, '-o', '--output', required=True, metavar='DIR', help=what)
+    command.add_argument('-o', '--output', required=True, metavar='DIR', help=what)
     what = (
         'ROS parameter file for bags without a calibration beside them; {spacecraft} and {camera} '
         'in its path are replaced'
     )
-    _add(command, '--params', default='', metavar='FILE', help=what)
+    command.add_argument('--params', default='', metavar='FILE', help=what)
     what = (
         "names of spacecraft and cameras: a pattern, e.g. '{spacecraft}/{camera}/*.mcap', or a "
         'CSV file with columns path, spacecraft, camera, params'
     )
-    _add(command, '--cameras', default='', metavar='PATTERN', help=what)
-    _add(command, '--retry', action='store_true', help='try what failed before again')
+    command.add_argument('--cameras', default='', metavar='PATTERN', help=what)
+    command.add_argument('--retry', action='store_true', help='try what failed before again')
     _workers(command, 'worker processes (default: 0, in-process)', 0)
 
 

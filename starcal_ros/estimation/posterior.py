@@ -38,7 +38,7 @@ from starcal_ros.estimation.equations import (
     StarSums,
     tracker_turns,
 )
-from starcal_ros.estimation.levenberg_marquardt import inverse
+from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
 from starcal_ros.estimation.shared_errors import GroupSums, SharedError
 from starcal_ros.estimation.unknowns import (
     FIELD_OCTAVES,
@@ -202,8 +202,11 @@ def without_prior(sums: StarSums, linear: Linearisation, name: str) -> tuple[Flo
         )
     )
     linear = dataclasses.replace(linear, layout=wide)
-    found = posterior(sums, linear, np.full(3, _SMALL_SHAPE_PX), True)
     at = wide.of([name])
+    try:
+        found = posterior(sums, linear, np.full(3, _SMALL_SHAPE_PX), True)
+    except (NotObservable, np.linalg.LinAlgError):  # its prior alone determines it
+        return np.zeros(len(at)), np.full(len(at), np.inf)
     precision, off = wide.prior_precision[at], wide.prior_offset[at]
     with np.errstate(divide='ignore', invalid='ignore'):
         shown = 1.0 / found.working_variance[at] - precision

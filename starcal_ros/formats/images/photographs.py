@@ -11,6 +11,7 @@ import glob
 import importlib
 import io
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,8 @@ def look_at(path: Path, focal_length_mm: float = 0.0, pixel_um: float = 0.0) -> 
     else:
         is_raw = path.name.lower().endswith(_RAW)
         tags, gps, width, height = (_facts_of_raw if is_raw else _facts_of_picture)(path)
+        if width * height > MOST_VALUES:
+            raise IngestError(f'{path}: claims {width} x {height} pixels')
         stated = _of_tags(path, tags, gps, width, height)
         stated_mm, stated_um = _real(tags.get(_FOCAL_LENGTH)), _pixel_um(tags, width)
     given_px = _focal_px(focal_length_mm or stated_mm, pixel_um or stated_um)
@@ -166,8 +169,6 @@ def _facts_of_picture(path: Path) -> tuple[_Tags, _Tags, int, int]:
         raise
     except Exception as error:  # a damaged file makes Pillow raise anything
         raise IngestError(f'{path}: not readable: {" ".join(str(error).split())[:160]}') from error
-    if width * height > MOST_VALUES:
-        raise IngestError(f'{path}: claims {width} x {height} pixels')
     return tags, gps, width, height
 
 
@@ -175,8 +176,7 @@ def _facts_of_raw(path: Path) -> tuple[_Tags, _Tags, int, int]:
     """Return the same of camera raw, as far as LibRaw reads them."""
     with _raw(path) as raw:
         sizes, stated, lens = raw.sizes, raw.other, raw.lens
-    # LibRaw takes the digits of the camera's clock as local time of this machine.
-    taken = stated.timestamp
+    taken = stated.timestamp  # the digits of the camera's clock, whatever its time zone
     tags = {
         0x829A: stated.shutter_speed,
         _FOCAL_LENGTH: stated.focal_length,
@@ -213,8 +213,8 @@ def _raw(path: Path) -> Iterator[Any]:
         with rawpy.imread(io.BytesIO(content_of(path))) as raw:
             yield raw
     except rawpy.LibRawError as error:
-        why = error.args[0] if error.args else b''
-        raise IngestError(f'{path}: not readable: {why.decode(errors="replace")}') from error
+        why = os.fsdecode(*error.args[:1] or [''])
+        raise IngestError(f'{path}: not readable: {why}') from error
 
 
 def _rawpy(path: Path) -> Any:

@@ -25,9 +25,8 @@ from starcal_ros.sky.catalog import StarCatalog
 _SMALLEST_DEG = 1.6
 _STEP = math.sqrt(2.0)
 _SCALES = 10  # discs of 1.6 to 36 degrees of radius
-_SPACING = (
-    0.7  # distance of disc centres in disc radii: adjacent discs share two thirds of their area
-)
+# Distance of disc centres in disc radii: adjacent discs share two thirds of their area.
+_SPACING = 0.7
 _STARS = (7, 8, 9, 10, 11, 12, 13, 14, 14, 14)  # stars per disc: at most about a million patterns
 _DEPTH = 3.0  # stars indexed over the number needed for a sky of even density
 # Orders of A, B, C, D in which noise may show a canonical pattern.

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import dataclasses
 
-from export_calibrations import calibration  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from trend_rows import DAY_NS, made  # type: ignore[import-not-found]
 
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.mission.trend.rows import COMPUTED, FAILED, RECORDED, Row, row_of
+from starcal_ros.mission.trend.rows import COMPUTED, FAILED, Row
 from starcal_ros.mission.trend.series import (
     activations,
     changes,
@@ -20,20 +19,6 @@ from starcal_ros.mission.trend.series import (
     series_of,
     versions,
 )
-from starcal_ros.records import Calibration, CameraGeometry
-
-DAY_NS = 86400 * 10**9
-
-
-def made(day: int, rotation_arcsec: tuple[float, ...] = (0, 0, 0), **changed: object) -> Row:
-    """Row of a day, its camera turned by a rotation about its axes."""
-    one: Calibration = calibration()
-    before = Rotation.from_quat(one.geometry.star_tracker_from_camera_xyzw)
-    after = before * Rotation.from_rotvec(np.array(rotation_arcsec) * ARCSECOND_RAD)
-    geometry = CameraGeometry(one.geometry.camera, after.as_quat())
-    stamps = {'first_image_ns': day * DAY_NS, 'time_ns': day * DAY_NS + 100}
-    one = dataclasses.replace(one, geometry=geometry, **stamps, **changed)  # type: ignore[arg-type]
-    return row_of(one, str(day), f'/{day}', RECORDED, 20.0)
 
 
 def test_boresight_and_alignment_turn_as_the_camera_does() -> None:

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import pytest
+from trend_rows import made  # type: ignore[import-not-found]
 
 from starcal_ros.mission.trend.series import Active, Change
 from starcal_ros.mission.trend.trend_page import verdict_of
-from test.mission.trend.test_series import made
 
 
 @pytest.mark.parametrize(('size_px', 'holds'), [(0.04, True), (0.4, False)])

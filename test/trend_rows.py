@@ -1,0 +1,27 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""Rows of a trend whose differences are known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from export_calibrations import calibration  # type: ignore[import-not-found]
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.mission.trend.rows import RECORDED, Row, row_of
+from starcal_ros.records import Calibration, CameraGeometry
+
+DAY_NS = 86400 * 10**9
+
+
+def made(day: int, rotation_arcsec: tuple[float, ...] = (0, 0, 0), **changed: object) -> Row:
+    """Row of a day, its camera turned by a rotation about its axes."""
+    one: Calibration = calibration()
+    before = Rotation.from_quat(one.geometry.star_tracker_from_camera_xyzw)
+    after = before * Rotation.from_rotvec(np.array(rotation_arcsec) * ARCSECOND_RAD)
+    geometry = CameraGeometry(one.geometry.camera, after.as_quat())
+    stamps = {'first_image_ns': day * DAY_NS, 'time_ns': day * DAY_NS + 100}
+    one = dataclasses.replace(one, geometry=geometry, **stamps, **changed)  # type: ignore[arg-type]
+    return row_of(one, str(day), f'/{day}', RECORDED, 20.0)
