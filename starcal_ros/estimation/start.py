@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Start of the search where the stars of each image put it.
+Start of the search: the problem of an ensemble at its prior, moved to where its stars put it.
 
 An attitude, an alignment or a mounting may be wrong by more than a search can cross: a robust loss
 has no slope far from the stars, and none behind the camera.  Each image has its rotation from its
@@ -16,9 +16,74 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Mask
 from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError
+from starcal_ros.estimation.calibration_options import (
+    assumed_tracker_sigma_rad,
+    CalibrationOptions,
+    estimated_parameters,
+)
+from starcal_ros.estimation.mountings import star_tracker_names
 from starcal_ros.estimation.problem import Problem, State
 from starcal_ros.estimation.reweighting import FEWEST_STARS
 from starcal_ros.estimation.star_equations import StarTable
+from starcal_ros.records import CameraGeometry, Ensemble
+
+
+def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Problem:
+    """Problem of a search over an ensemble."""
+    model, names = prior.camera.model, prior.camera.parameter_names
+    prior_sigma = np.array(np.broadcast_to(options.prior_sigma, len(names)))
+    weak_px = options.principal_point_prior * max(prior.camera.width, prior.camera.height)
+    free = {names.index(name) for name in estimated_parameters(options, model)}
+    for k in free & {names.index('cx'), names.index('cy')}:
+        if prior_sigma[k] == 0:
+            prior_sigma[k] = weak_px
+    attitudes = Rotation.from_quat(
+        np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
+    )
+    names = star_tracker_names(ensemble)
+    mountings = None
+    if len(names) > 1:
+        if options.method == 'per_image':
+            raise OptionError(
+                'method: per_image has no common alignment, which several star trackers need'
+            )
+        mountings = Rotation.from_quat(
+            np.array([image.first_from_star_tracker_xyzw for image in ensemble.images])
+        )
+        attitudes = attitudes * mountings
+    return Problem(
+        method=options.method,
+        model=model,
+        free=np.array(sorted(free), np.int64),
+        prior_parameters=prior.camera.parameters,
+        prior_sigma=np.where(prior_sigma > 0, prior_sigma, np.inf),
+        star_tracker_from_icrf=attitudes.inv(),
+        star_tracker_sigma_rad=np.tile(
+            assumed_tracker_sigma_rad(options), (len(ensemble.images), 1)
+        ),
+        above_reference_k=np.array([image.temperature_degc for image in ensemble.images])
+        - options.reference_temperature_degc,
+        star_tracker=np.array([names.index(image.star_tracker) for image in ensemble.images]),
+        first_from_star_tracker=mountings,
+        mounting_sigma_rad=options.star_tracker_mounting_sigma_arcsec * ARCSECOND_RAD,
+    )
+
+
+def start_of(problem: Problem, prior: CameraGeometry, order: int, with_rate: bool) -> State:
+    """The prior as a state, with so many focal terms of zero and a rate of zero, or none."""
+    alignment = Rotation.from_quat(prior.star_tracker_from_camera_xyzw).inv()
+    return State(
+        prior.camera.parameters.copy(),
+        alignment,
+        alignment * problem.star_tracker_from_icrf
+        if problem.first_from_star_tracker is None
+        else alignment * problem.first_from_star_tracker * problem.star_tracker_from_icrf,
+        np.zeros(order),
+        np.zeros(3 if with_rate else 0),
+        mountings=np.zeros(3 * int(problem.star_tracker.max(initial=0))),
+    )
 
 
 def moved_to_stars(problem: Problem, start: State, table: StarTable, camera: CameraModel) -> State:

@@ -18,7 +18,7 @@ from starcal_ros.camera import pixel_grid
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.equations import equations
-from starcal_ros.estimation.posterior import with_shared_errors
+from starcal_ros.estimation.shared_covariance import with_shared_errors
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, parts_that_matter, SigmaPart
 
 RAM = World(pointing='ram', velocity_m_s=1.0)  # pointings on one side of the sky
