@@ -19,7 +19,7 @@ from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS
 
 KEPT = 5  # images; of 5 megapixels and 16 bit they are 50 MB
 DIAGNOSED = 5  # images in a row without a match
-_LOWEST_PRIORITY = 19  # of a diagnosis: no image waits for it
+_LOWEST_PRIORITY = 19  # of a diagnosis that no image waits for
 _ATTITUDES = 20_000  # of the last minutes, for the search of a shift of clocks
 
 
@@ -125,5 +125,6 @@ class Unmatched:
 
 def _answer(images: tuple[Image, ...], attitudes: WireAttitudes, setup: Setup) -> Diagnosis:
     """Diagnose in a process of its own."""
-    os.nice(_LOWEST_PRIORITY)
+    if setup.is_aligned:  # else all images wait for the answer
+        os.nice(_LOWEST_PRIORITY)
     return diagnose(images, attitudes, setup)
