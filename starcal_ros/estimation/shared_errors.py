@@ -41,6 +41,7 @@ _NO_EFFECT = 0.01  # of the variance of the mean of a group
 _LOG_GRID: Floats = np.asarray(
     np.linspace(math.log(1e-9), math.log(LARGEST_FIELD_PX), 240), np.float64
 )
+_PRIOR: Floats = np.exp(-0.5 * ((_LOG_GRID - LOG_CENTRE) / LOG_SIGMA) ** 2)
 
 
 @dataclass(frozen=True)
@@ -147,9 +148,14 @@ def shared_errors(
     for one in groups:
         residual = on_sky if one.of_one_star is None else residual_px
         moments.append(pair_moment(residual, weight, one.group, one.of_one_star))
-    variances = [posterior_mean(*moment) for moment in moments]
-    octaves = slice(1, 1 + len(_FINE_OCTAVES))
-    variances[octaves] = _chain_means(last_octave, moments[octaves])
+    octaves = 1 + len(_FINE_OCTAVES)
+    variances = [
+        *chain_means(_PRIOR, moments[:1]),
+        *chain_means(last_octave[1] @ _next_octave(last_octave[0]), moments[1:octaves]),
+    ]
+    # Strips of rows and of columns are chains of their own, from the coarser to the finer.
+    for first in range(octaves, len(moments), len(_STRIPS)):
+        variances += chain_means(_PRIOR, moments[first : first + len(_STRIPS)])
     used = weight > 0
     return tuple(
         SharedError(
@@ -194,14 +200,6 @@ def pair_moment(
     return products / (2.0 * pairs), 1.0 / math.sqrt(pairs)
 
 
-def posterior_mean(estimate_px2: float, sigma_px2: float) -> float:
-    """Posterior mean of a variance from an unbiased estimate, under the prior of amplitudes."""
-    log_weight = _log_likelihood(estimate_px2, sigma_px2)
-    log_weight = log_weight - 0.5 * ((_LOG_GRID - LOG_CENTRE) / LOG_SIGMA) ** 2
-    weight = np.exp(log_weight - log_weight.max())
-    return float(weight @ np.exp(2.0 * _LOG_GRID) / weight.sum())
-
-
 def _log_likelihood(estimate_px2: float, sigma_px2: float) -> Floats:
     """Log likelihood of amplitudes on the grid."""
     return np.asarray(-0.5 * ((estimate_px2 - np.exp(2.0 * _LOG_GRID)) / sigma_px2) ** 2)
@@ -212,23 +210,29 @@ def _ratio(estimate_px2: float, sigma_px2: float) -> float:
     return max(estimate_px2 / sigma_px2, 0.0) ** 2
 
 
-def _chain_means(
-    last_octave: tuple[Floats, Floats], moments: Sequence[tuple[float, float]]
-) -> list[float]:
-    """
-    Return the posterior mean variance of octaves in a chain that begins at the field's last one.
+def _next_octave(log_px: Floats) -> Floats:
+    """Weights (s, 240) on the grid of an octave that follows one of logarithms (s,)."""
+    off = _LOG_GRID[None, :] - log_px[:, None] - OCTAVE_STEP
+    kernel = np.exp(-0.5 * (off / OCTAVE_SIGMA) ** 2)
+    return np.asarray(kernel / kernel.sum(axis=1, keepdims=True).clip(1e-300))
 
-    Each octave is tied to the one before as those of the field are; sums over a grid of the
+
+def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[float]:
+    """
+    Return the posterior mean variance, px^2, of errors in a chain, the first with its prior.
+
+    Each is tied to the one before as the octaves of the field are; sums over a grid of the
     logarithms, forward and backward.
+
+    Parameters
+    ----------
+    first : (240,)
+        Prior weights of the first on the grid.
+    moments : sequence of (estimate, 1-sigma), px^2
+        From `pair_moment`.
     """
-
-    def step(log_px: Floats) -> Floats:
-        off = _LOG_GRID[None, :] - log_px[:, None] - OCTAVE_STEP
-        kernel = np.exp(-0.5 * (off / OCTAVE_SIGMA) ** 2)
-        return np.asarray(kernel / kernel.sum(axis=1, keepdims=True).clip(1e-300))
-
-    transition = step(_LOG_GRID)
-    forward = last_octave[1] @ step(last_octave[0])
+    transition = _next_octave(_LOG_GRID)
+    forward = first
     likelihoods, before = [], []
     for estimate, sigma in moments:
         log_likelihood = _log_likelihood(estimate, sigma)

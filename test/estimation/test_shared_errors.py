@@ -13,13 +13,13 @@ from scipy.integrate import quad
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.estimation import shared_errors as module
 from starcal_ros.estimation.shared_errors import (
+    chain_means,
     GroupSums,
     observation_groups,
     pair_moment,
     pairs_of,
     pixel_variance_px2,
     place_variance_px2,
-    posterior_mean,
     shared_errors,
     SharedError,
 )
@@ -86,6 +86,12 @@ def test_observations_without_a_partner_show_nothing() -> None:
     assert pair_moment(residual, weight, group, group) == (0.0, math.inf)
 
 
+def posterior_mean(estimate: float, sigma: float) -> float:
+    """Return the mean variance of one error alone."""
+    (mean,) = chain_means(module._PRIOR, [(estimate, sigma)])
+    return mean
+
+
 @pytest.mark.parametrize(
     ('estimate', 'sigma'),
     [(0.0, 1e-4), (-1e-4, 1e-4), (4e-4, 1e-4), (0.01, 1e-4), (0.0, math.inf)],
@@ -118,7 +124,7 @@ def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes(
     monkeypatch.setattr(module, '_LOG_GRID', grid)
     last = np.log([1e-3, 1e-2]), np.array([0.3, 0.7])
     moments = [(4e-4, 1e-4), (0.0, 1e-4), (3e-5, 4e-5)]
-    found = module._chain_means(last, moments)
+    found = chain_means(last[1] @ module._next_octave(last[0]), moments)
     # Each octave is e^-0.7 of the one before, within e; the kernel is normalised on the grid.
     steps = np.exp(-0.5 * (grid[None, :] - grid[:, None] + 0.7) ** 2)
     steps /= steps.sum(axis=1, keepdims=True)
