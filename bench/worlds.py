@@ -75,6 +75,7 @@ WORLDS = {
     'tilt': World(lens=partial(tilt, 0.7)),
     'radial8_03': World(lens=partial(radial8, 0.3)),
     'radial8_10': World(lens=partial(radial8, 1.0)),
+    'radial8_30': World(lens=partial(radial8, 3.0)),
     'pp': World(principal_point_px=(17.0, -22.0)),
     'out5': World(outlier_fraction=0.05),
     'badstars': World(24, 'fields4', bad_stars=10),

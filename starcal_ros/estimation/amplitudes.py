@@ -35,6 +35,9 @@ from starcal_ros.estimation.levenberg_marquardt import NotObservable
 LOG_CENTRE, LOG_SIGMA = math.log(1e-5), 4.0
 # An octave of the field is smaller than the one before, within a factor of e.
 OCTAVE_STEP, OCTAVE_SIGMA = -0.7, 1.0
+# The next term of the lens is one of many departures: the first octave is e^2 times as large,
+# within a factor of e^0.3.  Untied, the term takes what is not its own (`docs/design.md`).
+LENS_STEP, LENS_SIGMA = -2.0, 0.3
 # Beyond it field and camera are collinear, and the likelihood is rounding.
 LARGEST_FIELD_PX = 0.5
 LARGEST_SHAPE_PX = 30.0
@@ -76,41 +79,48 @@ class Averaged:
 
 
 def octave_prior(count: int) -> tuple[Floats, Floats]:
-    """Mean (count,) and precision (count, count) of the logarithms of octaves in a chain."""
-    mean: Floats = LOG_CENTRE + OCTAVE_STEP * np.arange(count, dtype=np.float64)
+    """
+    Mean (count,) and precision (count, count) of the logarithms of the amplitudes of a field.
+
+    The first is that of the next term of the lens; then the octaves, in a chain.
+    """
+    mean: Floats = LOG_CENTRE + OCTAVE_STEP * (np.arange(count, dtype=np.float64) - 1.0)
+    mean[0] = LOG_CENTRE + LENS_STEP
     precision = np.zeros((count, count))
-    precision[0, 0] = LOG_SIGMA**-2
-    for k in range(1, count):
-        precision[k - 1 : k + 1, k - 1 : k + 1] += np.array([[1, -1], [-1, 1]]) / OCTAVE_SIGMA**2
+    precision[1, 1] = LOG_SIGMA**-2
+    for k, sigma in enumerate([LENS_SIGMA] + [OCTAVE_SIGMA] * (count - 2)):
+        precision[k : k + 2, k : k + 2] += np.array([[1, -1], [-1, 1]]) / sigma**2
     return mean, precision
 
 
 def prior_of_last_octave(count: int) -> tuple[Floats, Floats]:
-    """Logarithms (s,) of the amplitude of the last of some octaves with their prior weights."""
-    sigma = math.hypot(LOG_SIGMA, OCTAVE_SIGMA * math.sqrt(count - 1))
+    """Logarithms (s,) of the last amplitude of some with their prior weights."""
+    mean, precision = octave_prior(count)
+    sigma = math.sqrt(np.linalg.inv(precision)[-1, -1])
     off: Floats = np.asarray(np.linspace(-3.0, 3.0, 61), np.float64)
     weight = np.exp(-0.5 * off**2)
-    mean = LOG_CENTRE + OCTAVE_STEP * (count - 1)
-    return mean + sigma * off, weight / weight.sum()
+    return mean[-1] + sigma * off, weight / weight.sum()
 
 
 def field_amplitudes(
     information: Floats, gradient: Floats, octave: Indices, near: Amplitudes | None = None
 ) -> Amplitudes:
     """
-    Amplitudes of the octaves of a field by Fisher scoring.
+    Amplitudes of the next term of the lens and of the octaves of a field, by Fisher scoring.
 
     Parameters
     ----------
     information, gradient : (q, q), (q,)
         On the coefficients, scaled to a prior of 1 px for each octave, all else eliminated.
     octave : (q,)
+        0: the next term of the lens; from 1: the octaves.
     near : Amplitudes, optional
         Amplitudes of the round before: the search starts there and from one other place.
     """
     count = int(octave.max()) + 1
     mean, precision = octave_prior(count)
-    starts = [math.log(one) - 0.3 * np.arange(count, dtype=np.float64) for one in _STARTS_PX]
+    below = np.array([LENS_STEP, *(-0.3 * k for k in range(count - 1))], np.float64)
+    starts = [math.log(one) + below for one in _STARTS_PX]
     if near is not None:
         starts = [near.log_px, starts[1]]
     member = np.equal.outer(np.arange(count), octave).astype(float)
@@ -137,7 +147,9 @@ def field_amplitudes(
     for log_px in starts:
         value, slope, fisher = evaluate(log_px)
         for _ in range(_MOST_STEPS):
-            step = np.linalg.solve(fisher, slope)
+            inside = np.flatnonzero((log_px < cap) | (slope < 0.0))  # the others stay at the cap
+            step = np.zeros(count)
+            step[inside] = np.linalg.solve(fisher[np.ix_(inside, inside)], slope[inside])
             step *= 2.0 / max(2.0, float(np.abs(step).max()))
             before = value
             for share in (1.0, 0.4, 0.16, 0.06):

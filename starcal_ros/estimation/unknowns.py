@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 import dataclasses
 from dataclasses import dataclass
 import functools
+import math
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -56,6 +57,7 @@ SHAPE_MODES = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, -1.0], [0.0, 1.0, 0.0]]).T
 _UNKNOWN_RATE_RAD_S = 1e-3  # of a camera that looks at the Earth from a low orbit
 _FASTEST_M_S = 300e3  # no spacecraft has reached 200 km/s
 FIELD_OCTAVES = 3  # of the field: wavelengths down to a quarter of the width
+_SHOWN = 1e-2  # least singular value over the largest: none that only a border shows
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,8 @@ class Unknown:
         q is twice their number: those of u, then those of v.
     octave : (q,) or None
         Octave of each coefficient of those functions.
+    combined : (q, k) or None
+        Combinations of the functions with an amplitude of their own besides, 1 px each.
     tracker : (m, 3, q) or None
         Rotation of the camera, as the star tracker of each image predicts it.
     widest : float
@@ -98,6 +102,7 @@ class Unknown:
     turn: Turn | None = None
     functions: Scalars | None = None
     octave: Indices | None = None
+    combined: Floats | None = None
     tracker: Floats | None = None
     widest: float = np.inf
 
@@ -430,4 +435,31 @@ def _field(width: int, height: int) -> Unknown:
     sigma = np.concatenate([sigma, sigma])
     octave = np.concatenate([octave, octave])
     value = np.zeros(len(labels))
-    return Unknown('field', labels, sigma, value, functions=functions, octave=octave)
+    term = _next_lens_term(width, height)[:, None]
+    return Unknown(
+        'field', labels, sigma, value, functions=functions, octave=octave, combined=term
+    )
+
+
+@functools.lru_cache(maxsize=16)
+def _next_lens_term(width: int, height: int) -> Floats:
+    """
+    Return the coefficients (q,) of the next radial term of a lens, 1 px RMS along each axis.
+
+    The term is ``r^9`` less what lower ones, which a lens model has, can take of it: the radial
+    polynomial of Zernike ``R_9^1``, which is orthogonal to r, r^3, r^5 and r^7 over the circle
+    through the corners (Born & Wolf, 9.2.1).  In the outermost corners it is steeper than the
+    field.
+    """
+    at = np.stack(np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in (41, 41)), indexing='ij'))
+    from_centre = at.reshape(2, -1).T * np.array([width, height]) / math.hypot(width, height)
+    r2 = (from_centre**2).sum(axis=1, keepdims=True)
+    radial = (((126.0 * r2 - 280.0) * r2 + 210.0) * r2 - 60.0) * r2 + 5.0
+    term = from_centre * radial
+    term /= np.sqrt((term**2).mean())
+    pixels = (at.reshape(2, -1).T + 1.0) / 2.0 * np.array([width, height]) - 0.5
+    phi = basis(pixels, width, height, FIELD_OCTAVES, 'cosine')
+    found, *_ = np.linalg.lstsq(phi, term, rcond=_SHOWN)
+    coefficients: Floats = np.asarray(found.T.ravel(), np.float64)
+    coefficients.setflags(write=False)
+    return coefficients

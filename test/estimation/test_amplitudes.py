@@ -29,7 +29,10 @@ from starcal_ros.estimation.amplitudes import (
 )
 
 DRAWS = 200
-CENTRE, SIGMA, STEP = math.log(1e-5), 4.0, -0.7
+CENTRE, SIGMA = math.log(1e-5), 4.0
+# Prior of the next term of the lens and of two octaves.
+MEAN = CENTRE + np.array([-2.0, 0.0, -0.7])
+PLANTED = np.array([0.05, 0.37, 0.18])  # near a chain of the prior
 
 
 @dataclass(frozen=True)
@@ -54,9 +57,9 @@ class Field:
         return float(multivariate_normal.logpdf(self.contrasts.T @ self.y, cov=V))
 
     def log_posterior(self, log_px: Floats) -> float:
-        """Log likelihood with the prior: N(ln 1e-5, 4), each octave e^-0.7 within e."""
-        steps = np.diff(log_px) - STEP
-        off = (log_px[0] - CENTRE) / SIGMA
+        """Log likelihood with the prior: N(ln 1e-5, 4) of the first octave, e^-0.7 within e."""
+        steps = np.diff(log_px - MEAN) / [0.3, 1.0]
+        off = (log_px[1] - CENTRE) / SIGMA
         return self.log_likelihood(np.exp(log_px)) - 0.5 * float(off**2 + steps @ steps)
 
 
@@ -71,12 +74,13 @@ def field(rng: Generator, sigma_px: Floats, each: int = 4, n: int = 60) -> Field
 
 def test_the_prior_of_octaves_is_a_chain() -> None:
     mean, precision = octave_prior(4)
-    assert mean == pytest.approx(CENTRE + STEP * np.arange(4))
-    later = np.minimum.outer(np.arange(4), np.arange(4))
+    assert mean == pytest.approx(CENTRE + np.array([-2.0, 0.0, -0.7, -1.4]))
+    later = np.minimum.outer(np.arange(-1, 3), np.arange(-1, 3)).clip(0)
+    later = later + np.diag([0.09, 0.0, 0.0, 0.0])
     assert np.linalg.inv(precision) == pytest.approx(16.0 + later)
 
 
-@pytest.mark.parametrize('count', [1, 3])
+@pytest.mark.parametrize('count', [2, 4])
 def test_before_the_data_the_last_octave_has_its_prior(count: int) -> None:
     log_px, weight = prior_of_last_octave(count)
     mean, precision = octave_prior(count)
@@ -114,7 +118,7 @@ def test_the_mode_is_that_of_the_dense_posterior(sigma_px: tuple[float, ...], se
 def test_the_mode_is_found_from_each_start(
     start_px: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = field(np.random.default_rng(5), np.array([0.2, 0.1, 0.05]), each=10, n=80)
+    made = field(np.random.default_rng(5), PLANTED, each=10, n=80)
     whole = field_amplitudes(*made.sums)
     monkeypatch.setattr(module, '_STARTS_PX', (start_px,))
     alone = field_amplitudes(*made.sums)
@@ -124,11 +128,10 @@ def test_the_mode_is_found_from_each_start(
 
 
 def test_planted_amplitudes_are_recovered_within_their_uncertainty() -> None:
-    planted = np.array([0.2, 0.1, 0.05])  # a chain of its own prior
     off = []
     for seed in range(30):
-        made = field(np.random.default_rng(seed), planted, each=20, n=120)
-        off.append(field_amplitudes(*made.sums).log_px - np.log(planted))
+        made = field(np.random.default_rng(seed), PLANTED, each=20, n=120)
+        off.append(field_amplitudes(*made.sums).log_px - np.log(PLANTED))
     # Twenty coefficients leave 1 / sqrt(40) of a logarithm, and the noise somewhat more.
     sigma = 1.0 / math.sqrt(40.0)
     assert np.abs(np.mean(off, axis=0)).max() < 4.0 * sigma / math.sqrt(30.0)
@@ -159,7 +162,7 @@ def test_a_field_larger_than_the_limit_stops_there() -> None:
 def test_a_field_without_any_effect_has_the_prior_mode() -> None:
     octave = np.repeat(np.arange(3), 4)
     found = field_amplitudes(1e-6 * np.eye(12), np.zeros(12), octave)
-    assert found.log_px == pytest.approx(CENTRE + STEP * np.arange(3), abs=1e-6)
+    assert found.log_px == pytest.approx(MEAN, abs=1e-6)
     assert found.likelihood_ratio == pytest.approx(0.0, abs=1e-9)
 
 

@@ -10,6 +10,7 @@ from four_images import (  # type: ignore[import-not-found]
     Dense,
     dense,
     IMAGES,
+    lens_term,
     prior_offset,
     prior_precision,
     SHAPE,
@@ -146,11 +147,15 @@ def mixture(
     parts = []
     for shift in shifts:
         log_px = mode_px + shift
-        precision = prior_precision(made, shape_px, np.exp(log_px))
-        mean, covariance, evidence = solution(truth, precision, prior_offset(made))
-        # The prior of the logarithms: N(ln 1e-5, 4), and each octave e^-0.7 of the one before.
-        steps = np.diff(log_px) + 0.7
-        evidence -= 0.5 * (((log_px[0] - np.log(1e-5)) / 4.0) ** 2 + steps @ steps)
+        lens_px, field_px = np.exp(log_px[0]), np.exp(log_px[1:])
+        precision = prior_precision(made, shape_px, field_px)
+        term = lens_term(made, lens_px)
+        mean, covariance, evidence = solution(truth, precision, prior_offset(made), term)
+        # The prior of the logarithms: N(ln 1e-5, 4), each octave e^-0.7 of the one before, and
+        # the lens term e^-2 of the first.
+        steps = np.diff(log_px) - [2.0, -0.7, -0.7]
+        steps[0] /= 0.3
+        evidence -= 0.5 * (((log_px[1] - np.log(1e-5)) / 4.0) ** 2 + steps @ steps)
         parts.append((evidence, mean, covariance))
     weight = np.exp(np.array([e for e, _, _ in parts]) - max(e for e, _, _ in parts))
     weight /= weight.sum()
@@ -165,7 +170,7 @@ def test_the_whole_is_the_mixture_over_the_amplitude_of_the_field(varied: Varied
     made, truth, found, result = varied.made, varied.truth, varied.found, varied.result
     assert np.array_equal(found.shape_sigma_px, result.sigma_px)
     mode_px = found.field.log_px
-    shifts = found.last_octave[0] - mode_px[2]
+    shifts = found.last_octave[0] - mode_px[-1]
     assert shifts.min() == pytest.approx(-8.0)
     assert shifts.max() <= np.log(0.5) - mode_px.max() + 1e-9
     mean, covariance, weight = mixture(made, truth, mode_px, shifts, result.sigma_px)
@@ -195,7 +200,7 @@ def test_the_whole_is_the_mixture_over_the_amplitude_of_the_field(varied: Varied
 
 def test_shapes_are_sought_beside_the_field_of_the_amplitudes_before(varied: Varied) -> None:
     made, mode_px = varied.made, varied.found.field.log_px
-    shifts = varied.found.last_octave[0] - mode_px[2]
+    shifts = varied.found.last_octave[0] - mode_px[-1]
     mean, covariance, _ = mixture(made, varied.truth, mode_px, shifts, SHAPE)
     field = made.layout.of(['field'])
     sigma = np.sqrt(np.diag(covariance)[field])

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 from four_images import (  # type: ignore[import-not-found]
     ASSUMED,
@@ -23,6 +24,7 @@ from four_images import (  # type: ignore[import-not-found]
 )
 import numpy as np
 import pytest
+from scipy.special import eval_jacobi
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import rotation_jacobian
@@ -220,6 +222,23 @@ def test_an_amplitude_of_one_is_about_the_rms_of_its_octave_along_each_axis(
             assert np.sqrt(variance.mean()) == pytest.approx(1.0, abs=0.15)
     k = entry.labels.index('field_3_1_u_px')
     assert phi[k] == pytest.approx(cosine(grid[0], 3, WIDTH) * cosine(grid[1], 1, HEIGHT))
+
+
+def test_the_field_has_the_next_radial_term_of_a_lens_free_of_lower_ones(given: Small) -> None:
+    entry = given.layout['field']
+    assert entry.functions is not None and entry.combined is not None
+    u, v = (size * (np.arange(60) + 0.5) / 60 - 0.5 for size in (WIDTH, HEIGHT))
+    grid = np.stack([np.repeat(u, 60), np.tile(v, 60)])
+    found = entry.combined.reshape(2, -1) @ entry.functions(grid)
+    x = 2.0 * (grid + 0.5) - np.array([[WIDTH], [HEIGHT]])
+    x /= math.hypot(WIDTH, HEIGHT)
+    r = np.linalg.norm(x, axis=0)
+    jacobi = eval_jacobi(4, 0.0, 1.0, 2.0 * r**2 - 1.0)  # R_9^1(r) / r, as Zernike's are defined
+    term = x * jacobi / np.sqrt(((x * jacobi) ** 2).mean())
+    # Of the steep rise in the corners three octaves hold little: a fifth of the term.
+    off = np.sqrt(((found - term) ** 2).mean())
+    assert off < 0.25 and np.sqrt(((found - term)[:, r < 0.9] ** 2).mean()) < off
+    assert np.sqrt((found**2).mean()) == pytest.approx(1.0, abs=0.1)
 
 
 def test_what_is_not_assumed_or_not_known_is_no_unknown() -> None:
