@@ -23,16 +23,15 @@ from scipy.spatial.transform import Rotation
 from bench import trials
 from bench.frames import load_set_up
 from bench.lens_departures import corner_bump, kink, radial8, rings, ripple, rows, stitch, tilt
-from bench.observed_campaign import Campaign, MEMORY, simulate, World
 from bench.table import Table
-from bench.trials import GRID, rms, Score
-from starcal_ros.assessment.lookup import line_of_sight_table
+from bench.trials import rms, Score
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import pixel_grid, project_jacobians
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import MapCovariance
-from starcal_ros.studies.simulation import scenario as synthetic
 from starcal_ros.studies.simulation.centroids import scaled_inverse
+from starcal_ros.studies.simulation.departures import Campaign, MEMORY, simulate, World
 
 _BRIGHT = World(magnitude_limit=6.0, zero_point_dn=1.2e7)  # sigma 0.001 to 0.02 px
 _BRIGHT60 = dataclasses.replace(_BRIGHT, images=60)
@@ -99,18 +98,16 @@ def score(name: str, seed: int) -> tuple[Score, float]:
     determine the camera.
     """
     made = campaign(name, seed)
-    base = synthetic.scenario('paper' if WORLDS[name].pointing == 'paper' else 'small', seed)
     # The simulated camera's own file states its shutter: the default is to state none.
-    assumed_arcsec = [made.star_tracker_sigma_arcsec] * 3
-    setup = load_set_up(base, star_tracker_sigma_arcsec=assumed_arcsec, shutter='unknown')
-    found = trials.score(made.ensemble, setup, made.truth, [made.true_directions])
+    setup = load_set_up(made.scenario, shutter='unknown')
+    found = trials.score(made.ensemble, setup, made.scenario.truth, [made.true_directions])
     return found, found.sigma_arcsec / bound_arcsec(made, setup.calibration)
 
 
 def bound_arcsec(made: Campaign, options: CalibrationOptions) -> float:
     """Cramer-Rao bound of the rms 1-sigma of the shape: the lens model, free image rotations."""
-    camera = made.truth.camera
-    to_camera = Rotation.from_quat(made.truth.star_tracker_from_camera_xyzw).inv()
+    camera = made.scenario.truth.camera
+    to_camera = Rotation.from_quat(made.scenario.truth.star_tracker_from_camera_xyzw).inv()
     p = len(camera.parameters)
     information = np.zeros((p, p))
     prior_px = options.principal_point_prior * max(camera.width, camera.height)

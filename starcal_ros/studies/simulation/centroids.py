@@ -65,7 +65,7 @@ def true_observations(
         measured = shown.pixel_px + np.einsum('nij,nj->ni', root, error)
         # All samples about an image have one error.
         _, before, after, _ = attitude_samples(scenario, index)
-        observed = _observations(scenario, shown, measured, covariance, snr)
+        observed = observations(scenario, shown, measured, covariance, snr)
         rate_rad_s = rate_between(before, after)
         images.append(
             dataclasses.replace(observed.select(keep), star_tracker_rate_rad_s=rate_rad_s)
@@ -83,9 +83,10 @@ def scene_bound(scenario: Scenario, shown: Scene) -> tuple[Floats, Floats, NDArr
     return covariance, snr, inside.all(axis=1) & (snr > BOUND_SNR)
 
 
-def _observations(
+def observations(
     scenario: Scenario, shown: Scene, measured_px: Floats, covariance: Floats, snr: Floats
 ) -> StarObservations:
+    """Observations of all stars of a scene by their centroids (n, 2) and covariances (n, 2, 2)."""
     camera, detector = scenario.truth.camera, scenario.detector
     signal_dn = detector.background_electrons / detector.electrons_per_dn
     return refused_image(
