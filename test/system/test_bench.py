@@ -86,9 +86,9 @@ def test_peers_bench(tmp_path: Path) -> None:
         # A lens that its model does not describe is not in the sigma of a solver.
         assert (scipy['error/sigma'] > 4.0) == ('ripple' in kind)
         assert rows[kind, 'OpenCV']['sigma "'] is None
-        for name in ('tetra3rs', 'mrcal', 'Ceres'):
+        for name in ('tetra3rs', 'GIANT', 'GIANT, estimator', 'mrcal', 'Ceres'):
             skipped = f'{name} is not installed: skipped' in said
-            images_only = name == 'tetra3rs' and kind.startswith('stars')
+            images_only = name in ('tetra3rs', 'GIANT') and kind.startswith('stars')
             assert ((kind, name) in rows) == (not skipped and not images_only)
     whole = rows['images, sound', 'starcal, bag to camera']
     assert whole['frames'] == 5 and whole['by ours'] == pytest.approx(1.0, abs=1e-3)
