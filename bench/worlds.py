@@ -26,11 +26,11 @@ from bench.lens_departures import corner_bump, kink, radial8, rings, ripple, row
 from bench.table import Table
 from bench.trials import rms, Score
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
-from starcal_ros.camera import pixel_grid, project_jacobians
+from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import MapCovariance
-from starcal_ros.studies.simulation.centroids import scaled_inverse
+from starcal_ros.studies.simulation.centroids import camera_information, scaled_inverse
 from starcal_ros.studies.simulation.departures import Campaign, MEMORY, simulate, World
 
 _BRIGHT = World(magnitude_limit=6.0, zero_point_dn=1.2e7)  # sigma 0.001 to 0.02 px
@@ -115,11 +115,8 @@ def bound_arcsec(made: Campaign, options: CalibrationOptions) -> float:
     for image in made.ensemble.images:
         to_icrf = Rotation.from_quat(image.icrf_from_star_tracker_xyzw)
         in_camera = (to_camera * to_icrf.inv()).apply(image.direction_icrf)
-        _, J_camera, J_rotation = project_jacobians(camera, in_camera)
-        J = np.concatenate([J_camera, J_rotation], axis=-1)
-        J /= np.sqrt(image.covariance_px2[:, [0, 2], None])
-        N = np.tensordot(J, J, axes=((0, 1), (0, 1)))
-        information += N[:p, :p] - N[:p, p:] @ np.linalg.solve(N[p:, p:], N[p:, :p])
+        covariance_px2 = image.covariance_px2[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        information += camera_information(camera, in_camera, covariance_px2, range(p))
     covariance = np.zeros((p + 3, p + 3))
     covariance[:p, :p] = scaled_inverse(information)
     pixels = pixel_grid(camera, GRID, GRID)
