@@ -29,7 +29,7 @@ from starcal_ros.sky.astrometry import tt_julian_date
 from starcal_ros.sky.catalog import cone
 
 INSTALLED = importlib.util.find_spec('giant') is not None
-# Its names of the parameters of starcal, in the order of both.
+# Its names of the camera parameters, in the order of starcal.
 _GIANT = ('fx', 'alpha', 'fy', 'px', 'py', 'k1', 'k2', 'k3', 'p1', 'p2')
 _HELD: dict[str, tuple[str, ...]] = {'cx, cy free': (), 'cx, cy held': ('px', 'py')}
 _LEAST_PARALLAX_RAD = 1e-12  # of stars without one: GIANT needs a distance
@@ -43,7 +43,7 @@ _PASSES: tuple[dict[str, Any], ...] = (
 
 
 def _giant() -> Any:
-    """The package, which imports a matcher of images that is on no registry: replaced here."""
+    """The package, with an empty module for a matcher of images that is on no registry."""
     name = 'giant.image_processing.feature_matchers.roma_matcher'
     matcher = types.ModuleType(name)
     matcher.RoMaFeatureMatcher = matcher.RoMaFeatureMatcherOptions = None  # type: ignore[attr-defined]
@@ -54,7 +54,7 @@ def _giant() -> Any:
 
 
 def _model(campaign: Campaign, held: tuple[str, ...]) -> Any:
-    """Its Brown model, which is that of starcal, at the prior; each image has a rotation."""
+    """GIANT's Brown model, equal to starcal's, at the prior; each image has a rotation."""
     camera, images = campaign.scenario.prior.camera, len(campaign.ensemble.images)
     free = [name for name in _GIANT if name not in held]
     return _giant().camera_models.BrownModel(
@@ -68,7 +68,7 @@ def _model(campaign: Campaign, held: tuple[str, ...]) -> Any:
 
 
 def _catalog(campaign: Campaign) -> Any:
-    """Starcal's catalog at the date of a campaign; GIANT applies parallax and aberration."""
+    """The bundled catalog at the date of a campaign; GIANT applies parallax and aberration."""
     import pandas
 
     giant, stars = _giant(), campaign.setup.catalog
@@ -95,7 +95,7 @@ def _catalog(campaign: Campaign) -> Any:
 
 
 def _image(campaign: Campaign, frame: Frame) -> Any:
-    """One of its images, with the attitude of the star tracker and the prior alignment."""
+    """GIANT's image of a frame: attitude of the star tracker, prior alignment, velocity."""
     image, samples = frame
     xyzw, _ = history(samples).at(image.time_ns, 1.0)
     tracker_from_camera = campaign.scenario.prior.star_tracker_from_camera
@@ -114,7 +114,7 @@ def _image(campaign: Campaign, frame: Frame) -> Any:
 
 
 def _options() -> Any:
-    """Options of its least squares, which by default take rounding at a minimum for divergence."""
+    """Options of the least squares; the defaults take rounding at a minimum for divergence."""
     geometric = _giant().calibration.estimators.geometric
     return geometric.IterativeNonlinearLstSqOptions(residual_rtol=1e-8)
 
@@ -150,7 +150,7 @@ def whole(campaign: Campaign) -> list[Result]:
 
 
 def _calibrated(campaign: Campaign, images: list[Any], catalog: Any, held: tuple[str, ...]) -> Any:
-    """Its estimator after several passes of identification and calibration."""
+    """GIANT's estimator after several passes of identification and calibration."""
     giant = _giant()
     camera = giant.camera.Camera(deepcopy(images), _model(campaign, held), parse_data=False)
     options = giant.calibration.CalibrationOptions()
@@ -172,7 +172,7 @@ def _calibrated(campaign: Campaign, images: list[Any], catalog: Any, held: tuple
 
 
 def _result(campaign: Campaign, variant: str, found: Any, took_s: float) -> Result:
-    """Camera of its estimator, whose covariance for errors of 1 px is scaled by the residuals."""
+    """Camera of an estimator; its covariance, for errors of 1 px, is scaled by the residuals."""
     frames = sum(np.size(seen) > 0 for seen in found.camera_frame_directions)
     used = (frames, found.measurements.shape[1], took_s)
     if not found.successful:
