@@ -43,7 +43,7 @@ _PASSES: tuple[dict[str, Any], ...] = (
 
 
 def _giant() -> Any:
-    """The package, with an empty module for a matcher of images that is on no registry."""
+    """The package, with an empty module for a matcher of images that nothing here uses."""
     name = 'giant.image_processing.feature_matchers.roma_matcher'
     matcher = types.ModuleType(name)
     matcher.RoMaFeatureMatcher = matcher.RoMaFeatureMatcherOptions = None  # type: ignore[attr-defined]
