@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 import dataclasses
 import os
 from pathlib import Path
-import pstats
 import statistics
 import subprocess
 import sys
@@ -36,21 +35,6 @@ with open(sys.argv[1], 'rb') as stream:
 # As the console script does.
 TOOL = 'import sys; from starcal_ros.cli.entry_point import main; sys.exit(main())'
 
-# Cumulative times in the main thread; indented stages are parts of the one above.
-_STAGES = (
-    ('import of Python modules', 'importlib._bootstrap', '_find_and_load'),
-    ('load options, camera, catalog', 'pipeline/setup', 'read_setup'),
-    ('images and stars', 'pipeline/topics', 'read'),
-    ('  wait for the reading thread', 'formats/bag/frames', 'read_ahead'),
-    ('  measure and identify stars', 'pipeline/observe', 'observe_next'),
-    ('  select pictures', 'report/pictures/thumbnails', 'show'),
-    ('write the observations', 'formats/products/product_folder', 'write_observations'),
-    ('solve and judge', 'pipeline/solve', 'solve_with_residuals'),
-    ('  estimates', 'estimation/calibrate', 'estimate_calibration'),
-    ('report', 'report/page', 'render'),
-    ('  figures', 'report/page', 'charts_of'),
-)
-
 
 class Cost(NamedTuple):
     """Wall time, processor time (user and system, of the process and its children), memory."""
@@ -61,16 +45,16 @@ class Cost(NamedTuple):
 
 
 def run(quick: bool) -> Iterator[Table]:
-    """Compare with a bare read, then profile."""
+    """Compare bags of several sizes with a bare read."""
     rounds = 1 if quick else _ROUNDS
     for name, images, most_s, most_ratio in (('tiny', 10, None, None),) if quick else SIZES:
-        yield from compare(name, images, most_s, most_ratio, rounds)
+        yield compare(name, images, most_s, most_ratio, rounds)
 
 
 def compare(
     name: str, images: int, most_s: float | None, most_ratio: float | None, rounds: int
-) -> Iterator[Table]:
-    """Alternate a bare read and a calibration of a rendered bag; shares of a profiled run."""
+) -> Table:
+    """Alternate a bare read and a calibration of a rendered bag."""
     print(f'calibrate: rendering {images} images of scenario {name}', flush=True)
     with tempfile.TemporaryDirectory() as folder:
         scenario = dataclasses.replace(synthetic.scenario(name), image_count=images)
@@ -83,13 +67,8 @@ def compare(
         for _ in range(rounds):
             for runs, arguments in zip(costs.values(), calls, strict=True):
                 runs.append(cost(arguments))
-        profile = Path(folder, 'profile')
-        profiled = ['-m', 'cProfile', '-o', str(profile), '-m', 'starcal_ros.cli.main']
-        cost([*profiled, *calibrate])
-        stages = _stages(profile)
     size = f'{scenario.truth.camera.width} x {scenario.truth.camera.height}'
-    yield _compared(f'{images} images of {size}', costs, most_s, most_ratio)
-    yield stages
+    return _compared(f'{images} images of {size}', costs, most_s, most_ratio)
 
 
 def _compared(
@@ -143,26 +122,3 @@ def cost(arguments: Sequence[str]) -> Cost:
     if process.returncode not in (0, 3):
         raise RuntimeError(f'{" ".join(arguments[:3])} ended with {process.returncode}')
     return Cost(wall_s, usage.ru_utime + usage.ru_stime, peak_mb)
-
-
-def _stages(profile: Path) -> Table:
-    """Share of each stage in a profiled run."""
-    stats = pstats.Stats(str(profile))
-    found = stats.stats  # type: ignore[attr-defined]
-    total_s = stats.total_tt  # type: ignore[attr-defined]
-    table = Table('Share of the time by stage, from cProfile', ('stage', 'calls', 's', 'share %'))
-    for stage, module, function in _STAGES:
-        count = len(table.rows)
-        for (file, _, name), (_, calls, _, cumulative_s, _) in found.items():
-            if name == function and _module(file) == module:
-                table.add(stage, calls, cumulative_s, 100 * cumulative_s / total_s)
-        if len(table.rows) == count:
-            raise LookupError(f'{module}.{function} was not called: is the stage still there?')
-    table.add('all', None, total_s, 100.0)
-    return table
-
-
-def _module(file: str) -> str:
-    """Path of a profiled file in the package, without its suffix; or name of a frozen module."""
-    stem = file.removeprefix('<frozen ').removesuffix('>').removesuffix('.py')
-    return stem.rpartition('starcal_ros/')[2]

@@ -124,30 +124,24 @@ def of_bags(root: str, folder: Path, count: int, alone: int) -> Table:
     """One bag after another alone, then all: a client that is killed, and one that goes on."""
     copy_bags(f'{root}/fleet', count)
     found = list(tasks.find(f'{root}/fleet', Cameras(params=str(_PARAMS))))
-    before = one_bag_s(found[:alone], f'{root}/before')
+    before_s = one_bag_s(found[:alone], f'{root}/before')
     watch, output = Watch(kill_at=count // 4), f'{root}/out'
-    start_s, start_processor_s = time.perf_counter(), processor_s()
+    start_s = time.perf_counter()
     killed_client(f'{root}/fleet', output, folder, count // 4)
     with Rows(output) as table:
         fleet.update(table, found, _WORKERS, on_row=watch.on_row)
     wall_s = time.perf_counter() - start_s
-    used_s = (processor_s() - start_processor_s) / count
-    after = one_bag_s(found[-alone:], f'{root}/after')
+    after_s = one_bag_s(found[-alone:], f'{root}/after')
     rows = Rows(output).rows()
-    one_s = (before[0] + after[0]) / 2
-    one_used_s = (before[1] + after[1]) / 2
-    efficiency = count * one_s / (_WORKERS * wall_s)
+    efficiency = count * (before_s + after_s) / 2 / (_WORKERS * wall_s)
     stamps = Counter(row.stamp for row in rows)
     kept = {entry.name for entry in places.entries(f'{output}/{KEPT_FOLDER}')}
     title = f'starcal trend over {count} bags on {root[:5]} with {_WORKERS} workers'
     made = Table(title, ('quantity', 'value'))
-    made.add('one bag alone, before, s', before[0])
-    made.add('one bag alone, after, s', after[0])
+    made.add('one bag alone, before, s', before_s)
+    made.add('one bag alone, after, s', after_s)
     made.add(f'{count} bags, s', wall_s)
-    made.add('efficiency, wall time', efficiency)
-    made.add('processor time of a bag alone, s', one_used_s)
-    made.add(f'processor time of a bag of {count}, s', used_s)
-    made.add('efficiency, processor time', one_used_s / used_s)
+    made.add('efficiency', efficiency)
     made.add('clients killed with SIGKILL', 1)
     made.add('workers killed with SIGKILL', watch.killed)
     made.add('bags lost', sum(task.stamp not in stamps for task in found))
@@ -209,24 +203,12 @@ def copy_bags(folder: str, count: int) -> None:
         places.write(f'{bag}/tiny_0.mcap', content.replace(_LIBRARY, f'{k:07d}'.encode(), 1))
 
 
-def one_bag_s(found: list[Task], folder: str) -> tuple[float, float]:
-    """
-    Wall and processor time of a bag on one worker.
-
-    The wall time is the median without the first bag, before which the worker starts.
-    """
+def one_bag_s(found: list[Task], folder: str) -> float:
+    """Median wall time of a bag on one worker, without the first, before which it starts."""
     ends_s: list[float] = []
-    start_s = processor_s()
     with Rows(folder) as table:
         fleet.update(table, found, 1, on_row=lambda: ends_s.append(time.perf_counter()))
-    wall_s = statistics.median(b - a for a, b in itertools.pairwise(ends_s))
-    return wall_s, (processor_s() - start_s) / len(found)
-
-
-def processor_s() -> float:
-    """Processor time of this process and of its children that have ended."""
-    used = os.times()
-    return used.user + used.system + used.children_user + used.children_system
+    return statistics.median(b - a for a, b in itertools.pairwise(ends_s))
 
 
 @dataclass(frozen=True)

@@ -9,29 +9,17 @@ gives the same lens.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import math
 
 import numpy as np
 from numpy.random import Generator
 
 from starcal_ros.arrays import Floats
-
-Lens = Callable[[Generator, Floats], Floats]
+from starcal_ros.studies.simulation.departures import unit
 
 _HALF_WIDTH_PX = 648.0
 _HALF_HEIGHT = 1024 / 1296  # half widths
 _CORNER = math.hypot(1.0, _HALF_HEIGHT)
-
-
-def unit(vector: Floats) -> Floats:
-    """Return vectors (..., d) scaled to unit length."""
-    return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
-
-
-def no_departure(rng: Generator, x: Floats) -> Floats:
-    """Lens that the model describes."""
-    return np.zeros_like(x)
 
 
 def ripple(size_px: float, rad_per_half_width: float, rng: Generator, x: Floats) -> Floats:

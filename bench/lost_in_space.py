@@ -26,13 +26,13 @@ import tempfile
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import binomtest, gamma
+from scipy.stats import binomtest
 
 from bench.table import Table, timed
 from bench.trials import in_processes
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, field_radius_rad, project
-from starcal_ros.identification.blind.search import find_sky, MAX_LOG10_P_VALUE, SkyMatch
+from starcal_ros.identification.blind.search import find_sky, SkyMatch
 from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
 
 SEED = 416
@@ -132,18 +132,10 @@ def beside_tetra3(catalog: StarCatalog, count: int) -> Table:
 
 
 def random_points(count: int) -> Table:
-    """
-    Number of frames of random points that are accepted, and how far the others are from it.
-
-    The best fit of each frame has an expected number E of false matches as good.  Of the lowest
-    tenth of log10 E, the distances below their limit have an exponential distribution if E is what
-    it says, or one that falls faster; its upper 95 % limit gives the rate at which frames would
-    reach the limit of acceptance.
-    """
-    columns = 'points, widths deg, tried, identified, 95 % limit, lowest log10 E, rate by the tail'
+    """Number of frames of random points that are accepted, and the rate that this allows."""
     table = Table(
         'Random points that must not be identified',
-        (*columns.split(', '), 's each'),
+        ('points', 'widths deg', 'tried', 'identified', '95 % limit', 's each'),
         notes=[
             '95 % limit: Clopper and Pearson, one-sided; with none it is 3 in those tried.',
             'One process for each processor; s each: processor time.',
@@ -152,42 +144,23 @@ def random_points(count: int) -> Table:
     rng = np.random.default_rng([SEED, 99])
     points = [rng.uniform([0, 0], SIZE, ((18, 30, 60)[k % 3], 2)) for k in range(count)]
     widths_deg = [WIDTHS_DEG[k % len(WIDTHS_DEG)] for k in range(count)]
-    best, identified, took_s = np.array(in_processes(_searched, points, widths_deg)).T
+    identified, took_s = np.array(in_processes(_searched, points, widths_deg)).T
     wrong = int(identified.sum())
     limit = float(binomtest(wrong, count, alternative='less').proportion_ci().high)
-    lowest, rate = float(best.min()), tail_rate(best, MAX_LOG10_P_VALUE)
-    each_s = float(took_s.mean())
-    table.add('18, 30 and 60', '4 to 70', count, wrong, limit, lowest, rate, each_s)
+    table.add('18, 30 and 60', '4 to 70', count, wrong, limit, float(took_s.mean()))
     return table
 
 
-def _searched(points: Floats, width_deg: float) -> tuple[float, bool, float]:
-    """Best log10 E of points (n, 2), whether they are taken for stars, and processor time, s."""
+def _searched(points: Floats, width_deg: float) -> tuple[bool, float]:
+    """True if points (n, 2) are taken for stars, and processor time, s."""
     catalog = _catalog()
     sky, took_s = timed(lambda: find_sky(points, camera(width_deg), catalog))
-    return sky.log10_p_value, isinstance(sky, SkyMatch), took_s
+    return isinstance(sky, SkyMatch), took_s
 
 
 @functools.lru_cache(maxsize=1)
 def _catalog() -> StarCatalog:
     return load_catalog()
-
-
-def tail_rate(best: Floats, limit: float) -> float:
-    """
-    Upper 95 % limit of the share of values (n,) below a limit, by their lowest tenth.
-
-    Frames of which no fit was carried to its end are infinite: fewer than a tenth may remain.
-    NaN with fewer than six values.
-    """
-    lowest = np.sort(best[np.isfinite(best)])[: max(5, len(best) // 10) + 1]
-    few = len(lowest) - 1
-    if few < 5:
-        return math.nan
-    below = lowest[-1] - lowest[:-1]
-    # The sum of exponential distances has a gamma distribution: the largest mean that 95 % allow.
-    mean = float(below.sum() / gamma.ppf(0.05, few))
-    return few / len(best) * math.exp(-max(lowest[-1] - limit, 0.0) / mean)
 
 
 def camera(width_deg: float) -> CameraModel:

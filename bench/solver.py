@@ -36,12 +36,11 @@ from bench.competitors import (
 from bench.table import Table, verdict
 from bench.trials import in_processes, memory_mb
 from starcal_ros.estimation.star_equations import normal_blocks, RESIDUAL, ROTATION
-from starcal_ros.records import CameraGeometry, Ensemble
+from starcal_ros.records import Ensemble
 
 LIMIT_S = 60.0  # longest wait for a competitor
 TARGETS_FROM = 100  # images; below, Python overhead dominates
 TARGETS = {'pyceres': 20.0, 'scipy': 10.0, 'opencv': 12.0}
-TARGET_PASS_NS = 100.0
 TARGET_MEMORY_MB = 40.0
 
 SOLVERS: dict[str, tuple[str, Callable[[Case], Answer]]] = {
@@ -147,46 +146,20 @@ def add_rows(table: Table, case: Case, names: list[str], results: dict[str, Resu
         )
 
 
-def measure_growth(
-    ensembles: dict[int, tuple[Ensemble, CameraGeometry]], sizes: tuple[int, ...], repeats: int
-) -> Table:
-    """Times of search, estimate and one pass over the normal equations by number of images."""
-    columns = ('m', 'stars', 'search ms', 'estimate ms', 'us/image', 'ns/star by iteration')
-    title = 'How starcal grows with the number of images (us/image, ns/star: of the search)'
-    table = Table(title, (*columns, 'by pass', 'target'))
-    for m in sizes:
-        ensemble, prior = ensembles.get(m) or ensembles[max(ensembles)]
-        # The largest case repeats the previous one five times: only its time matters.
-        case = make_case(Ensemble(ensemble.images * (m // len(ensemble.images))), prior)
-        n, rotations = len(case.table), case.start.camera_from_icrf.as_matrix()
-        held = (case.measurements, 'plumb_bob', case.start.parameters, rotations)
-        pass_ns = 1e9 * least_s(3 * repeats, normal_blocks, *held) / n
-        search_s = least_s(repeats, solve_starcal, case)
-        iteration_ns = 1e9 * search_s / n / solve_starcal(case).iterations
-        estimate_ms = 1e3 * least_s(max(1, repeats // 3), estimate_starcal, case)
-        met = f'<= {TARGET_PASS_NS:g}: ' + ('met' if pass_ns <= TARGET_PASS_NS else 'MISSED')
-        times = (1e3 * search_s, estimate_ms, 1e6 * search_s / m, iteration_ns, pass_ns)
-        table.add(m, n, *times, met if m >= TARGETS_FROM else '')
-    return table
-
-
 def run(quick: bool) -> Iterator[Table]:
     """
-    Compare the solvers at several numbers of images, then the growth of starcal with them.
+    Compare the solvers at several numbers of images.
 
     All use one thread of linear algebra: on two shared cores more threads wait for each other,
     which makes SciPy up to five times slower and no solver faster.
     """
-    yield from in_processes(measure, [quick])[0]
+    yield from in_processes(measure, [quick])
 
 
-def measure(quick: bool) -> list[Table]:
-    """Tables of `run`."""
+def measure(quick: bool) -> Table:
+    """Table of `run`."""
     sizes = (6,) if quick else (15, 359, 2000)
-    growth = (6, 30) if quick else (15, 359, 2000, 10000)
     repeats = 1 if quick else 3
-    print('solver: making observations', flush=True)
-    ensembles = {m: make_ensemble(m) for m in {*sizes, *growth} if m <= 2000}
     table = Table(
         f'Solvers, {SIGMA_PX} px noise, 8 camera parameters and m rotations free',
         ('m', 'solver', 'iterations', 'ms', 'by ours', 'target', 'cost off', 'sigma off', 'MB'),
@@ -200,7 +173,7 @@ def measure(quick: bool) -> list[Table]:
     names = [name for name in SOLVERS if name != 'pyceres' or importlib.util.find_spec(name)]
     for m in sizes:
         print(f'solver: m = {m}', flush=True)
-        case = make_case(*ensembles[m])
+        case = make_case(*make_ensemble(m))
         results = solve_all(case, names, repeats)
         add_rows(table, case, names, results)
         for name in [name for name in names if name not in results]:
@@ -208,5 +181,4 @@ def measure(quick: bool) -> list[Table]:
             names.remove(name)  # more images would take longer yet
     if results['starcal'].peak_mb > TARGET_MEMORY_MB:
         table.notes.append(f'Memory of our search MISSED {TARGET_MEMORY_MB:.0f} MB at m = {m}.')
-    grown = measure_growth(ensembles, growth, 2 * repeats)
-    return [table, grown]
+    return table

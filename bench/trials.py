@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import line_of_sight_table
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.pipeline.setup import Setup
@@ -27,7 +27,6 @@ from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.studies.workers import processors
 
 ResultT = TypeVar('ResultT')
-GRID = 25  # columns and rows of the pixels at which lines of sight are compared
 
 
 @dataclass(frozen=True)

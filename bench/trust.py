@@ -19,24 +19,24 @@ from dataclasses import dataclass
 import functools
 import math
 
-import erfa
 import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from bench import worlds
-from bench.frames import Frame, load_set_up, observed
+from bench.frames import earth_velocity_m_s, Frame, load_set_up, observed
 from bench.lens_departures import eighth_order, keystone
 from bench.table import Table
-from bench.trials import GRID, in_processes, rms, Score, score
+from bench.trials import in_processes, rms, Score, score
 from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
-from starcal_ros.constants import ARCSECOND_RAD, AU_M, SPEED_OF_LIGHT_M_S
+from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.records import AttitudeSample, CameraGeometry, Image
-from starcal_ros.sky.astrometry import tt_julian_date
 from starcal_ros.studies.simulation import rendering
 from starcal_ros.studies.simulation import scenario as synthetic
+from starcal_ros.studies.simulation.departures import aberrated
 from starcal_ros.studies.simulation.scenario import Inertial, Scenario, Scene
 
 # Displacement (n, 2) px of pixels (n, 2), of a size, and drawn from a generator.
@@ -190,9 +190,7 @@ def _seen_at(world: World, scenario: Scenario, shown: Scene, index: int) -> Floa
     """Pixels (n, 2) of the stars of a scene on the detector of a world."""
     camera, seen = _camera_at(world, scenario, index), shown.direction_icrf
     if world.has_aberration_reversed:
-        _, barycentric = erfa.epv00(*tt_julian_date(shown.time_ns))
-        beta = barycentric['v'] * (AU_M / 86400.0) / SPEED_OF_LIGHT_M_S
-        seen = seen - 2.0 * (beta - seen * (seen @ beta)[:, None])
+        seen = aberrated(seen, -2.0 * earth_velocity_m_s(shown.time_ns))
     if world.has_aberration_reversed or world.focal_change:
         return np.asarray(project(camera, seen @ shown.camera_from_icrf.T))
     return np.asarray(shown.pixel_px + _displacement(world, scenario, shown.pixel_px))

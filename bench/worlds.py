@@ -23,16 +23,15 @@ from scipy.spatial.transform import Rotation
 from bench import trials
 from bench.frames import load_set_up
 from bench.lens_departures import corner_bump, kink, radial8, rings, ripple, rows, stitch, tilt
-from bench.observed_campaign import Campaign, MEMORY, simulate, World
 from bench.table import Table
-from bench.trials import GRID, rms, Score
-from starcal_ros.assessment.lookup import line_of_sight_table
-from starcal_ros.camera import pixel_grid, project_jacobians
+from bench.trials import rms, Score
+from starcal_ros.assessment.lookup import GRID, line_of_sight_table
+from starcal_ros.camera import pixel_grid
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import MapCovariance
-from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.centroids import scaled_inverse
+from starcal_ros.studies.simulation.centroids import camera_information, scaled_inverse
+from starcal_ros.studies.simulation.departures import Campaign, MEMORY, simulate, World
 
 _BRIGHT = World(magnitude_limit=6.0, zero_point_dn=1.2e7)  # sigma 0.001 to 0.02 px
 _BRIGHT60 = dataclasses.replace(_BRIGHT, images=60)
@@ -100,18 +99,16 @@ def score(name: str, seed: int) -> tuple[Score, float]:
     determine the camera.
     """
     made = campaign(name, seed)
-    base = synthetic.scenario('paper' if WORLDS[name].pointing == 'paper' else 'small', seed)
     # The simulated camera's own file states its shutter: the default is to state none.
-    assumed_arcsec = [made.star_tracker_sigma_arcsec] * 3
-    setup = load_set_up(base, star_tracker_sigma_arcsec=assumed_arcsec, shutter='unknown')
-    found = trials.score(made.ensemble, setup, made.truth, [made.true_directions])
+    setup = load_set_up(made.scenario, shutter='unknown')
+    found = trials.score(made.ensemble, setup, made.scenario.truth, [made.true_directions])
     return found, found.sigma_arcsec / bound_arcsec(made, setup.calibration)
 
 
 def bound_arcsec(made: Campaign, options: CalibrationOptions) -> float:
     """Cramer-Rao bound of the rms 1-sigma of the shape: the lens model, free image rotations."""
-    camera = made.truth.camera
-    to_camera = Rotation.from_quat(made.truth.star_tracker_from_camera_xyzw).inv()
+    camera = made.scenario.truth.camera
+    to_camera = Rotation.from_quat(made.scenario.truth.star_tracker_from_camera_xyzw).inv()
     p = len(camera.parameters)
     information = np.zeros((p, p))
     prior_px = options.principal_point_prior * max(camera.width, camera.height)
@@ -119,11 +116,8 @@ def bound_arcsec(made: Campaign, options: CalibrationOptions) -> float:
     for image in made.ensemble.images:
         to_icrf = Rotation.from_quat(image.icrf_from_star_tracker_xyzw)
         in_camera = (to_camera * to_icrf.inv()).apply(image.direction_icrf)
-        _, J_camera, J_rotation = project_jacobians(camera, in_camera)
-        J = np.concatenate([J_camera, J_rotation], axis=-1)
-        J /= np.sqrt(image.covariance_px2[:, [0, 2], None])
-        N = np.tensordot(J, J, axes=((0, 1), (0, 1)))
-        information += N[:p, :p] - N[:p, p:] @ np.linalg.solve(N[p:, p:], N[p:, :p])
+        covariance_px2 = image.covariance_px2[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        information += camera_information(camera, in_camera, covariance_px2, range(p))
     covariance = np.zeros((p + 3, p + 3))
     covariance[:p, :p] = scaled_inverse(information)
     pixels = pixel_grid(camera, GRID, GRID)

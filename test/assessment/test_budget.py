@@ -10,7 +10,6 @@ import math
 import numpy as np
 import pytest
 
-from bench.observed_campaign import Campaign, simulate, World
 from starcal_ros.assessment import budget
 from starcal_ros.assessment.budget import sigma_budget
 from starcal_ros.assessment.lookup import line_of_sight_table
@@ -20,6 +19,7 @@ from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.shared_covariance import with_shared_errors
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, parts_that_matter, SigmaPart
+from starcal_ros.studies.simulation.departures import Campaign, simulate, World
 
 RAM = World(pointing='ram', velocity_m_s=1.0)  # pointings on one side of the sky
 FIELDS = World(24, 'fields4', star_arcsec=3.0)
@@ -34,10 +34,10 @@ def campaign(world: World) -> Campaign:
 def estimate(world: World, **options: object) -> tuple[Estimate, CalibrationOptions]:
     made = campaign(world)
     chosen = CalibrationOptions(
-        star_tracker_sigma_arcsec=(made.star_tracker_sigma_arcsec,) * 3,
+        star_tracker_sigma_arcsec=made.scenario.star_tracker_sigma_arcsec,
         **options,  # type: ignore[arg-type]
     )
-    return estimate_calibration(made.ensemble, made.prior, chosen), chosen
+    return estimate_calibration(made.ensemble, made.scenario.prior, chosen), chosen
 
 
 @functools.cache

@@ -10,25 +10,25 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.observed_campaign import Campaign, simulate, World
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.records import Ensemble
+from starcal_ros.studies.simulation.departures import Campaign, simulate, World
 
 ROLLING = World(rate_deg_s=0.42, row_s=20e-6, tracker_arcsec=5.0)
 READOUT_S = 20e-6 * 1024
 
 
 def estimated(made: Campaign, **options: object) -> Estimate:
-    sigma = (made.star_tracker_sigma_arcsec,) * 3
+    sigma = made.scenario.star_tracker_sigma_arcsec
     chosen = CalibrationOptions(star_tracker_sigma_arcsec=sigma, **options)  # type: ignore[arg-type]
-    return estimate_calibration(made.ensemble, made.prior, chosen)
+    return estimate_calibration(made.ensemble, made.scenario.prior, chosen)
 
 
 def of_focal(found: Estimate, made: Campaign) -> tuple[np.ndarray, np.ndarray]:
     """Errors of fx, skew and fy and their sigmas, px."""
-    error_px = found.geometry.camera.parameters[:3] - made.truth.camera.parameters[:3]
+    error_px = found.geometry.camera.parameters[:3] - made.scenario.truth.camera.parameters[:3]
     return error_px, np.sqrt(np.diag(found.covariance)[:3])
 
 
@@ -63,7 +63,7 @@ def test_the_noise_of_the_centroids_is_no_time_of_readout() -> None:
 def test_an_offset_of_the_stamps_is_in_the_sigma_of_the_pointing() -> None:
     """18 arcsec at 0.1 degrees/s, of which the stars show nothing."""
     made = simulate(World(rate_deg_s=0.1, stamp_s=0.05, tracker_arcsec=5.0), 1)
-    true = Rotation.from_quat(made.truth.star_tracker_from_camera_xyzw)
+    true = Rotation.from_quat(made.scenario.truth.star_tracker_from_camera_xyzw)
     held = {'estimate': ('fx', 'skew', 'fy', 'distortion'), 'shutter': 'global'}
     for stamp_sigma_s, is_covered in ((0.0, False), (0.05, True)):
         found = estimated(made, stamp_sigma_s=stamp_sigma_s, **held)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from bench import worlds
-from bench.observed_campaign import Campaign, simulate, World
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
@@ -21,6 +20,7 @@ from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry, Ensemble
 from starcal_ros.studies.simulation.centroids import true_observations
+from starcal_ros.studies.simulation.departures import Campaign, simulate, World
 from starcal_ros.studies.simulation.scenario import scenario
 
 SEEDS = range(1, 21)
@@ -28,12 +28,12 @@ SEEDS = range(1, 21)
 
 def estimated(made: Campaign, **changed: object) -> Estimate:
     values: dict[str, object] = {
-        'star_tracker_sigma_arcsec': (made.star_tracker_sigma_arcsec,) * 3,
+        'star_tracker_sigma_arcsec': made.scenario.star_tracker_sigma_arcsec,
         'velocity_sigma_m_s': 0.0,
         **changed,
     }
     options = CalibrationOptions(**values)  # type: ignore[arg-type]
-    return estimate_calibration(made.ensemble, made.prior, options)
+    return estimate_calibration(made.ensemble, made.scenario.prior, options)
 
 
 def errors(found: Estimate, truth: CameraGeometry) -> Floats:
@@ -63,7 +63,7 @@ def sound(seed: int, tracker_arcsec: float = 20.0) -> Campaign:
 def test_normalised_errors_are_chi_squared() -> None:
     found = [estimated(sound(seed)) for seed in SEEDS]
     camera = [
-        normalised(one, sound(seed).truth, slice(0, 10))
+        normalised(one, sound(seed).scenario.truth, slice(0, 10))
         for seed, one in zip(SEEDS, found, strict=True)
     ]
     low, high = chi2.ppf([0.0005, 0.9995], 10 * len(SEEDS)) / (10 * len(SEEDS))
@@ -71,7 +71,7 @@ def test_normalised_errors_are_chi_squared() -> None:
     assert 0.85 * low < np.mean(camera) < high
     assert max(camera) < chi2.isf(1e-5, 10) / 10
     pointing = [
-        normalised(one, sound(seed).truth, slice(10, 13))
+        normalised(one, sound(seed).scenario.truth, slice(10, 13))
         for seed, one in zip(SEEDS, found, strict=True)
     ]
     # Slow errors as large as the noise are part of it until the images show otherwise.
@@ -95,8 +95,8 @@ def test_each_method_is_true_to_its_sigma(method: str) -> None:
     for seed in range(1, 7):
         made = sound(seed, tracker_arcsec)
         found = estimated(made, method=method)
-        camera.append(normalised(found, made.truth, slice(0, 10)))
-        pointing.append(normalised(found, made.truth, slice(10, 13)))
+        camera.append(normalised(found, made.scenario.truth, slice(0, 10)))
+        pointing.append(normalised(found, made.scenario.truth, slice(10, 13)))
     low, high = chi2.ppf([0.0005, 0.9995], 60) / 60
     assert 0.85 * low < np.mean(camera) < high
     assert 0.1 < np.mean(pointing) < chi2.isf(0.001, 18) / 18
@@ -132,12 +132,12 @@ def test_observations_without_noise_give_the_truth(method: str) -> None:
 )
 def test_held_parameters_keep_their_prior_to_the_last_bit(estimate: tuple[str, ...]) -> None:
     made = sound(2)
-    names = made.prior.camera.parameter_names
+    names = made.scenario.prior.camera.parameter_names
     asked = {*estimate, *(names[5:] if 'distortion' in estimate else ())}
     found = estimated(made, estimate=estimate)
     held = [k for k, name in enumerate(names) if name not in asked]
     free = [k for k, name in enumerate(names) if name in asked]
-    before, after = made.prior.camera.parameters, found.geometry.camera.parameters
+    before, after = made.scenario.prior.camera.parameters, found.geometry.camera.parameters
     assert before[held].tobytes() == after[held].tobytes()
     assert (before[free] != after[free]).all()
     assert not found.covariance[held].any() and not found.covariance[:, held].any()
@@ -146,19 +146,21 @@ def test_held_parameters_keep_their_prior_to_the_last_bit(estimate: tuple[str, .
 
 def test_a_held_parameter_with_a_sigma_is_a_consider_parameter() -> None:
     made = sound(2)
-    names = made.prior.camera.parameter_names
+    names = made.scenario.prior.camera.parameter_names
     k = names.index('k1')
     sigma = np.zeros(len(names))
     asked = tuple(name for name in names if name != 'k1')
     exactly = estimated(made, estimate=asked)
     sigma[k] = 1e-2
     considered = estimated(made, estimate=asked, prior_sigma=tuple(sigma.tolist()))
-    assert considered.geometry.camera.parameters[k] == made.prior.camera.parameters[k]
+    assert considered.geometry.camera.parameters[k] == made.scenario.prior.camera.parameters[k]
     assert considered.covariance[k, k] == pytest.approx(1e-4)
     # Its effect on the others is that of a change of it by its sigma.
-    k1 = float(made.prior.camera.parameters[k] + 1e-2)
-    moved = dataclasses.replace(made.prior, camera=made.prior.camera.replace(k1=k1))
-    other = estimated(dataclasses.replace(made, prior=moved), estimate=asked)
+    prior = made.scenario.prior
+    k1 = float(prior.camera.parameters[k] + 1e-2)
+    moved = dataclasses.replace(prior, camera=prior.camera.replace(k1=k1))
+    scenario = dataclasses.replace(made.scenario, prior=moved)
+    other = estimated(dataclasses.replace(made, scenario=scenario), estimate=asked)
     change = other.geometry.camera.parameters - exactly.geometry.camera.parameters
     added = np.diag(considered.covariance - exactly.covariance)[:10]
     # The field of the other one is larger, and takes a part of the change.
@@ -193,7 +195,7 @@ def test_outliers_and_bad_stars_are_left_out() -> None:
     found = estimated(made)
     # Displacements of 1 to 20 px of one star in twenty; those of under 4.5 sigma stay.
     assert 0.03 < (~found.kept).mean() < 0.06
-    assert normalised(found, made.truth, slice(0, 10)) < chi2.isf(1e-4, 10) / 10
+    assert normalised(found, made.scenario.truth, slice(0, 10)) < chi2.isf(1e-4, 10) / 10
     bad = worlds.campaign('badstars', 1)
     dropped = estimated(bad).dropped_catalog_id
     assert 5 <= len(dropped) <= 10
@@ -231,7 +233,7 @@ def test_a_star_tracker_that_drifts_among_several_loses_no_images() -> None:
     # Its errors are slow, those of the others are noise.
     slow = sorted(one.slow for one in found.tracker_errors)
     assert slow[2] > 5.0 > 2.0 * slow[1]
-    turn = errors(found, made.truth)[10:]
+    turn = errors(found, made.scenario.truth)[10:]
     sigma = np.sqrt(np.diag(found.covariance)[10:])
     assert (np.abs(turn) < 4.0 * sigma).all()
 
@@ -242,8 +244,8 @@ def test_an_image_with_a_wrong_attitude_is_a_misfit_and_moves_nothing() -> None:
     rad[2, 1] = 600.0 * ARCSECOND_RAD
     found = estimated(with_attitude_errors(made, rad, [''] * 6))
     assert np.flatnonzero(found.misfit_image).tolist() == [2]
-    assert normalised(found, made.truth, slice(10, 13)) < chi2.isf(0.001, 3) / 3
-    assert normalised(found, made.truth, slice(0, 10)) < chi2.isf(0.001, 10) / 10
+    assert normalised(found, made.scenario.truth, slice(10, 13)) < chi2.isf(0.001, 3) / 3
+    assert normalised(found, made.scenario.truth, slice(0, 10)) < chi2.isf(0.001, 10) / 10
     # Its stars still count.
     assert found.kept[found.table.image == 2].all()
 

@@ -34,21 +34,21 @@ def found_by(name: str, tmp_path: Path) -> tuple[Any, str]:
 
 def test_solver_bench(tmp_path: Path) -> None:
     """A row for each solver; SciPy and starcal agree to a hundredth of a sigma."""
-    (compared, grown), said = found_by('solver', tmp_path)
+    (compared,), said = found_by('solver', tmp_path)
     rows = {row['solver']: row for row in compared['rows']}
     for name in ('starcal, search alone', 'starcal, whole estimate', 'OpenCV calibrateCamera'):
         assert rows[name]['ms'] > 0 and name in said
     scipy = rows['SciPy trf, sparse Jacobian']
     # Costs of one minimum differ by their rounding and by the inner tolerance of SciPy, 1e-9.
     assert scipy['sigma off'] < 0.01 and abs(scipy['cost off']) < 1e-8
-    assert [row['m'] for row in grown['rows']] == [6, 30]
 
 
 def test_calibrate_bench(tmp_path: Path) -> None:
-    """Every stage of the profile is still called where the bench looks for it."""
-    (_, stages), _ = found_by('calibrate', tmp_path)
-    calls = {row['stage'].strip(): row['calls'] for row in stages['rows']}
-    assert calls['measure and identify stars'] == calls['select pictures'] == 10
+    """A bare read takes less processor time and memory than a calibration, which ends well."""
+    (table,), _ = found_by('calibrate', tmp_path)
+    bare, whole, ratio = table['rows']
+    assert 0 < bare['processor s'] < whole['processor s'] and bare['peak MB'] < whole['peak MB']
+    assert ratio['processor s'] == pytest.approx(whole['processor s'] / bare['processor s'])
 
 
 def test_fleet_bench(tmp_path: Path) -> None:
@@ -86,9 +86,9 @@ def test_peers_bench(tmp_path: Path) -> None:
         # A lens that its model does not describe is not in the sigma of a solver.
         assert (scipy['error/sigma'] > 4.0) == ('ripple' in kind)
         assert rows[kind, 'OpenCV']['sigma "'] is None
-        for name in ('tetra3rs', 'mrcal', 'Ceres'):
+        for name in ('tetra3rs', 'GIANT', 'GIANT, estimator', 'mrcal', 'Ceres'):
             skipped = f'{name} is not installed: skipped' in said
-            images_only = name == 'tetra3rs' and kind.startswith('stars')
+            images_only = name in ('tetra3rs', 'GIANT') and kind.startswith('stars')
             assert ((kind, name) in rows) == (not skipped and not images_only)
     whole = rows['images, sound', 'starcal, bag to camera']
     assert whole['frames'] == 5 and whole['by ours'] == pytest.approx(1.0, abs=1e-3)

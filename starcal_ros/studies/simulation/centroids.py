@@ -8,6 +8,7 @@ Simulated centroids without pixels, and Cramer-Rao bounds.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import dataclasses
 
 import numpy as np
@@ -65,7 +66,7 @@ def true_observations(
         measured = shown.pixel_px + np.einsum('nij,nj->ni', root, error)
         # All samples about an image have one error.
         _, before, after, _ = attitude_samples(scenario, index)
-        observed = _observations(scenario, shown, measured, covariance, snr)
+        observed = observations(scenario, shown, measured, covariance, snr)
         rate_rad_s = rate_between(before, after)
         images.append(
             dataclasses.replace(observed.select(keep), star_tracker_rate_rad_s=rate_rad_s)
@@ -83,9 +84,10 @@ def scene_bound(scenario: Scenario, shown: Scene) -> tuple[Floats, Floats, NDArr
     return covariance, snr, inside.all(axis=1) & (snr > BOUND_SNR)
 
 
-def _observations(
+def observations(
     scenario: Scenario, shown: Scene, measured_px: Floats, covariance: Floats, snr: Floats
 ) -> StarObservations:
+    """Observations of all stars of a scene by their centroids (n, 2) and covariances (n, 2, 2)."""
     camera, detector = scenario.truth.camera, scenario.detector
     signal_dn = detector.background_electrons / detector.electrons_per_dn
     return refused_image(
@@ -165,14 +167,24 @@ def cramer_rao_covariance(scenario: Scenario) -> Floats:
     for shown in scenes(scenario):
         covariance, _, keep = scene_bound(scenario, shown)
         in_camera = shown.direction_icrf[keep] @ shown.camera_from_icrf.T
-        _, J_parameters, J_rotation = project_jacobians(camera, in_camera)
-        W = np.linalg.inv(covariance[keep])
-        J, G = J_parameters[..., columns], J_rotation
-        N_cc = np.einsum('nia,nij,njb->ab', J, W, J, optimize=True)
-        N_ca = np.einsum('nia,nij,njb->ab', J, W, G, optimize=True)
-        N_aa = np.einsum('nia,nij,njb->ab', G, W, G, optimize=True)
-        information += N_cc - N_ca @ np.linalg.solve(N_aa, N_ca.T)
+        information += camera_information(camera, in_camera, covariance[keep], columns)
     return scaled_inverse(information)
+
+
+def camera_information(
+    camera: CameraModel, in_camera: Floats, covariance_px2: Floats, columns: Sequence[int]
+) -> Floats:
+    """
+    Information (k, k) of an image on the camera parameters of some columns, its rotation free.
+
+    ``in_camera`` (n, 3) and ``covariance_px2`` (n, 2, 2) are those of its stars.
+    """
+    _, J_parameters, G = project_jacobians(camera, in_camera)
+    W, J = np.linalg.inv(covariance_px2), J_parameters[..., columns]
+    N_cc = np.einsum('nia,nij,njb->ab', J, W, J, optimize=True)
+    N_ca = np.einsum('nia,nij,njb->ab', J, W, G, optimize=True)
+    N_aa = np.einsum('nia,nij,njb->ab', G, W, G, optimize=True)
+    return np.asarray(N_cc - N_ca @ np.linalg.solve(N_aa, N_ca.T))
 
 
 def scaled_inverse(information: Floats) -> Floats:

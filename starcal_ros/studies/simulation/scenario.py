@@ -275,7 +275,8 @@ def attitude_samples(scenario: Scenario, index: int) -> tuple[AttitudeSample, ..
 
 
 @functools.lru_cache(maxsize=4)
-def _bundled_catalog(magnitude_limit: float) -> StarCatalog:
+def bundled_catalog(magnitude_limit: float) -> StarCatalog:
+    """The bundled catalog down to a magnitude."""
     return load_catalog(None, magnitude_limit)
 
 
@@ -286,7 +287,7 @@ def stamp_half_px(psf_sigma_px: float) -> int:
 
 def scene(scenario: Scenario, index: int, attitude_noise: bool = True) -> Scene:
     """Stars of an image, of the bundled catalog down to the magnitude limit."""
-    catalog = _bundled_catalog(scenario.magnitude_limit)
+    catalog = bundled_catalog(scenario.magnitude_limit)
     camera, time_ns = scenario.truth.camera, scenario.time_ns(index)
     R = camera_from_icrf(scenario, index)
     margin_px = stamp_half_px(scenario.detector.psf_sigma_px * (1 + scenario.detector.psf_growth))

@@ -8,17 +8,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench import worlds
-from bench.observed_campaign import Campaign
-from bench.trials import GRID
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import line_of_sight, pixel_grid, project, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.studies.simulation import scenario as synthetic
+from starcal_ros.studies.simulation.departures import Campaign
 
 
 def residuals(made: Campaign, index: int) -> tuple[Floats, Floats]:
     """Residuals (n, 2) of an image by the true camera and its best rotation; sigma (n,), px."""
-    image, camera = made.ensemble.images[index], made.truth.camera
+    image, camera = made.ensemble.images[index], made.scenario.truth.camera
     seen = line_of_sight(camera, image.measured_px)
     sigma_px = np.sqrt(image.covariance_px2[:, 0])
     rotation, _ = Rotation.align_vectors(seen, image.direction_icrf, weights=sigma_px**-2)
@@ -62,7 +62,7 @@ def test_a_campaign_is_determined_by_its_seed() -> None:
 @pytest.mark.parametrize('name', ['rip7_050', 'wave11_050', 'radial8_10'])
 def test_true_directions_have_the_displacement_of_the_stars(name: str) -> None:
     made = worlds.campaign(name, 1)
-    camera = made.truth.camera
+    camera = made.scenario.truth.camera
     grid = pixel_grid(camera, GRID, GRID)
     moved_px = grid - project(camera, made.true_directions)
     shown, left = [], []
@@ -89,7 +89,7 @@ def test_the_rate_is_that_of_the_attitudes() -> None:
 
 def test_a_late_stamp_turns_the_reported_attitude_by_the_rate() -> None:
     early, late = (worlds.campaign(name, 1) for name in ('plain', 'stamp_50ms'))
-    to_camera = Rotation.from_quat(late.truth.star_tracker_from_camera_xyzw).inv()
+    to_camera = Rotation.from_quat(late.scenario.truth.star_tracker_from_camera_xyzw).inv()
     reported = [
         to_camera * Rotation.from_quat(m.ensemble.images[3].icrf_from_star_tracker_xyzw).inv()
         for m in (early, late)

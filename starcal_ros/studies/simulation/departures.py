@@ -9,29 +9,33 @@ the stated covariance.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
-from dataclasses import dataclass
-import functools
+from dataclasses import dataclass, field
 import math
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
-from bench.lens_departures import Lens, no_departure, unit
-from bench.trials import GRID
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.lookup import GRID
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
-from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
+from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.sky.astrometry import apparent_directions, GIVEN_SIGMA_M_S
-from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
+from starcal_ros.sky.catalog import cone
 from starcal_ros.studies.simulation import scenario as synthetic
-from starcal_ros.studies.simulation.scenario import Scenario
+from starcal_ros.studies.simulation.centroids import observations
+from starcal_ros.studies.simulation.scenario import bundled_catalog, Detector, Scenario, Scene
+
+Lens = Callable[[Generator, Floats], Floats]
+"""Displacement (n, 2) px of stars at points (n, 2) in half widths of the detector."""
 
 MEMORY = math.exp(-0.1)  # correlation of neighbouring images: ten images
 _START_NS = 1786160160 * 10**9
-_CADENCE_NS = 60 * 10**9
+_CADENCE_S = 60.0
 _SATURATED_MAGNITUDE = 2.0
 _PSF_SIGMA_PX = 0.95
 _ELECTRONS_PER_DN = 0.0668
@@ -44,6 +48,16 @@ _PIXEL_STEPS = 4  # displacements change by 0.01 px per px at most
 _SMOOTH_RAD = math.radians(60.0)  # correlation length of errors that depend on the attitude
 # Random streams (seed, purpose)
 _POINTING, _NOISE, _TRACKER, _CHANGE, _STARS, _LENS, _VELOCITY, _RATE, _OUTLIERS = range(80, 89)
+
+
+def no_departure(rng: Generator, x: Floats) -> Floats:
+    """Lens that the model describes."""
+    return np.zeros_like(x)
+
+
+def unit(vector: Floats) -> Floats:
+    """Return vectors (..., d) scaled to unit length."""
+    return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
 
 
 @dataclass(frozen=True)
@@ -84,74 +98,81 @@ class Campaign:
 
     Attributes
     ----------
-    true_directions : (GRID * GRID, 3)
-        Lines of sight of the pixels of a grid in the camera frame.
+    scenario : Scenario
+        Prior, and truth without the departure of the lens.
+    camera_from_icrf : (m,)
+        True attitudes at the exposures.
     rate_rad_s : (m, 3)
         Angular rate of the camera at each image, camera frame.
     velocity_m_s : (3,)
         Velocity that the directions of the observations lack, ICRF axes.
     """
 
-    ensemble: Ensemble
-    prior: CameraGeometry
-    truth: CameraGeometry
-    star_tracker_sigma_arcsec: float
-    true_directions: Floats
+    world: World
+    scenario: Scenario
+    camera_from_icrf: Rotation
     rate_rad_s: Floats
     velocity_m_s: Floats
+    ensemble: Ensemble = field(default_factory=Ensemble)
+
+    @property
+    def true_directions(self) -> Floats:
+        """Lines of sight (GRID * GRID, 3) of the pixels of a grid in the camera frame."""
+        camera = self.scenario.truth.camera
+        grid = pixel_grid(camera, GRID, GRID)
+        return line_of_sight(camera, grid - self.displacement_px(grid))
+
+    def displacement_px(self, pixels: Floats) -> Floats:
+        """Displacement of stars at pixels (n, 2) by the departure of the lens."""
+        camera = self.scenario.truth.camera
+        middle = np.array([camera.width - 1, camera.height - 1]) / 2.0
+        half_widths = np.asarray((pixels - middle) / (camera.width / 2.0))
+        return self.world.lens(_stream(self.scenario.seed, _LENS), half_widths)
 
 
 def simulate(world: World, seed: int, images: int | None = None) -> Campaign:
     """Campaign of a world; the seed determines camera, pointings, departures and noise."""
-    drawn = _draw(dataclasses.replace(world, images=images or world.images), seed)
-    camera = drawn.truth.camera
-    grid = pixel_grid(camera, GRID, GRID)
-    directions = line_of_sight(camera, grid - drawn.displacement_px(grid))
-    ensemble = Ensemble(tuple(_image(drawn, k) for k in range(drawn.world.images)))
-    motion = (drawn.rate_rad_s, drawn.velocity_m_s)
-    geometries = (drawn.base.prior, drawn.truth)
-    return Campaign(ensemble, *geometries, world.tracker_arcsec, directions, *motion)
-
-
-@dataclass(frozen=True)
-class _Drawn:
-    """Unknowns of a campaign of m images, as its seed determines them."""
-
-    world: World
-    base: Scenario
-    truth: CameraGeometry
-    velocity_m_s: Floats
-    camera_from_icrf: Rotation  # (m,) at the exposures
-    rate_rad_s: Floats  # (m, 3)
-    reported_xyzw: Floats  # (m, 4) icrf_from_star_tracker at the stamps
-    focal_scale: Floats  # (m,)
-    star_offset_rad: Floats  # (n, 3) of the stars of the catalog
-
-    def displacement_px(self, pixels: Floats) -> Floats:
-        """Displacement of stars at pixels (n, 2) by the departure of the lens."""
-        camera = self.truth.camera
-        middle = np.array([camera.width - 1, camera.height - 1]) / 2.0
-        half_widths = np.asarray((pixels - middle) / (camera.width / 2.0))
-        return self.world.lens(_stream(self.base.seed, _LENS), half_widths)
-
-
-def _draw(world: World, seed: int) -> _Drawn:
-    base = synthetic.scenario('paper' if world.pointing == 'paper' else 'small', seed)
-    camera = base.truth.camera
-    cx, cy = camera.intrinsics[3:] + world.principal_point_px
-    truth = dataclasses.replace(base.truth, camera=camera.replace(cx=float(cx), cy=float(cy)))
+    world = dataclasses.replace(world, images=images or world.images)
+    scenario = _scenario(world, seed)
     velocity_m_s = world.velocity_m_s * unit(_stream(seed, _VELOCITY).normal(size=3))
-    camera_from_icrf = _attitudes(world, base, velocity_m_s)
+    camera_from_icrf = _attitudes(world, scenario, velocity_m_s)
     rate_rad_s = _rates(world, seed, camera_from_icrf)
     at_stamp = Rotation.from_rotvec(-world.stamp_s * rate_rad_s) * camera_from_icrf
     errors = Rotation.from_rotvec(_tracker_errors_rad(world, seed, camera_from_icrf))
-    camera_from_tracker = Rotation.from_quat(truth.star_tracker_from_camera_xyzw).inv()
-    change = _walk(_stream(seed, _CHANGE), world.images, 1, world.memory)[:, 0]
+    camera_from_tracker = scenario.truth.star_tracker_from_camera.inv()
     reported_xyzw = (at_stamp.inv() * camera_from_tracker * errors).as_quat()
-    offset_rad = _star_offsets_rad(world, base, camera_from_icrf)
-    motion = (velocity_m_s, camera_from_icrf, rate_rad_s)
-    focal_scale = 1.0 + world.breathing * change
-    return _Drawn(world, base, truth, *motion, reported_xyzw, focal_scale, offset_rad)
+    change = _walk(_stream(seed, _CHANGE), world.images, 1, world.memory)[:, 0]
+    offset_rad = _star_offsets_rad(world, scenario, camera_from_icrf)
+    made = Campaign(world, scenario, camera_from_icrf, rate_rad_s, velocity_m_s)
+    ensemble = Ensemble(
+        tuple(
+            _image(made, k, reported_xyzw[k], 1.0 + world.breathing * change[k], offset_rad)
+            for k in range(world.images)
+        )
+    )
+    return dataclasses.replace(made, ensemble=ensemble)
+
+
+def _scenario(world: World, seed: int) -> Scenario:
+    base = synthetic.scenario('paper' if world.pointing == 'paper' else 'small', seed)
+    camera = base.truth.camera
+    cx, cy = camera.intrinsics[3:] + world.principal_point_px
+    own: dict[str, Any] = {}
+    if world.pointing not in _FIXED_TO_EARTH:
+        own = {'start_ns': _START_NS, 'cadence_s': _CADENCE_S}
+    return dataclasses.replace(
+        base,
+        truth=dataclasses.replace(base.truth, camera=camera.replace(cx=float(cx), cy=float(cy))),
+        detector=Detector(
+            psf_sigma_px=_PSF_SIGMA_PX,
+            electrons_per_dn=_ELECTRONS_PER_DN,
+            zero_point_electrons=_ELECTRONS_PER_DN * world.zero_point_dn,
+        ),
+        star_tracker_sigma_arcsec=(world.tracker_arcsec,) * 3,
+        image_count=world.images,
+        magnitude_limit=world.magnitude_limit,
+        **own,
+    )
 
 
 def _stream(seed: int, *purpose: int) -> Generator:
@@ -230,92 +251,69 @@ def _tracker_errors_rad(world: World, seed: int, camera_from_icrf: Rotation) -> 
     return np.asarray((noise + wander + smooth) * ARCSECOND_RAD)
 
 
-@functools.lru_cache(maxsize=4)
-def _catalog(magnitude_limit: float) -> StarCatalog:
-    return load_catalog(None, magnitude_limit)
-
-
-def _star_offsets_rad(world: World, base: Scenario, camera_from_icrf: Rotation) -> Floats:
+def _star_offsets_rad(world: World, scenario: Scenario, camera_from_icrf: Rotation) -> Floats:
     """Errors (n, 3) of the places of all catalog stars; the part along the direction is moot."""
-    catalog, rng = _catalog(world.magnitude_limit), _stream(base.seed, _STARS)
+    catalog, rng = bundled_catalog(world.magnitude_limit), _stream(scenario.seed, _STARS)
     offsets = world.star_arcsec * ARCSECOND_RAD * rng.normal(size=(len(catalog), 3))
     if world.bad_stars:
         near = [cone(catalog, axis, 0.1) for axis in camera_from_icrf.as_matrix()[:, 2]]
         bad = rng.choice(np.unique(np.concatenate(near)), world.bad_stars, replace=False)
-        ten_px_rad = 10.0 / base.truth.camera.parameters[0]
+        ten_px_rad = 10.0 / scenario.truth.camera.parameters[0]
         way = np.cross(catalog.direction_icrs[bad], rng.normal(size=(len(bad), 3)))
         offsets[bad] += ten_px_rad * unit(way)
     return np.asarray(offsets)
 
 
-def _image(drawn: _Drawn, k: int) -> StarObservations:
-    """Observations of one image."""
-    world, base, camera = drawn.world, drawn.base, drawn.truth.camera
-    fixed_to_earth = world.pointing in _FIXED_TO_EARTH
-    time_ns = base.time_ns(k) if fixed_to_earth else _START_NS + k * _CADENCE_NS
-    catalog, R = _catalog(world.magnitude_limit), drawn.camera_from_icrf[k].as_matrix()
+def _image(
+    made: Campaign, k: int, reported_xyzw: Floats, focal_scale: float, offset_rad: Floats
+) -> StarObservations:
+    """Observations of an image; the catalog stars are off by ``offset_rad`` (n, 3)."""
+    world, scenario, seed = made.world, made.scenario, made.scenario.seed
+    camera, time_ns = scenario.truth.camera, scenario.time_ns(k)
+    catalog, R = bundled_catalog(world.magnitude_limit), made.camera_from_icrf[k].as_matrix()
     near = cone(catalog, R[2], field_radius_rad(camera, _MARGIN_PX))
     near = near[catalog.magnitude[near] > _SATURATED_MAGNITUDE]
     stars = catalog.select(near)
     directions = apparent_directions(stars, time_ns)
-    seen = _aberrated(directions, drawn.velocity_m_s) + drawn.star_offset_rad[near]
-    pixels = _pixels(drawn, k, seen @ R.T)
-    pixels += _outliers_px(world, len(pixels), _stream(base.seed, _OUTLIERS, k))
-    sigma_px, flux_dn = _brightness(world, stars.magnitude)
-    noise = _stream(base.seed, _NOISE, k).normal(size=pixels.shape)
-    variance = sigma_px**2
-    to_tracker = Rotation.from_quat(drawn.truth.star_tracker_from_camera_xyzw)
+    seen = aberrated(directions, made.velocity_m_s) + offset_rad[near]
+    pixels = _pixels(made, made.rate_rad_s[k], focal_scale, seen @ R.T)
+    pixels += _outliers_px(world, len(pixels), _stream(seed, _OUTLIERS, k))
+    electrons = scenario.detector.zero_point_electrons * 10 ** (-0.4 * stars.magnitude)
+    sigma_px = _PSF_SIGMA_PX * np.sqrt(electrons + _NOISE_ELECTRONS**2) / electrons
+    noise_px = sigma_px[:, None] * _stream(seed, _NOISE, k).normal(size=pixels.shape)
     inside = np.all((pixels > 0) & (pixels < [camera.width - 1, camera.height - 1]), axis=1)
-    return StarObservations(
-        time_ns=time_ns,
-        width=camera.width,
-        height=camera.height,
-        refusal='',
-        detail='',
-        icrf_from_star_tracker_xyzw=drawn.reported_xyzw[k],
-        attitude_gap_s=0.1,
-        catalog_id=stars.id,
-        direction_icrf=directions,
-        magnitude=stars.magnitude.astype(np.float32),
-        measured_px=pixels + sigma_px[:, None] * noise,
-        covariance_px2=np.stack([variance, 0.0 * variance, variance], axis=-1),
-        flux_dn=flux_dn.astype(np.float32),
-        snr=(_PSF_SIGMA_PX / sigma_px).astype(np.float32),
-        refused_stars={},
-        background_dn=0.0,
-        noise_dn=5.0,
-        psf_sigma_px=0.0,
-        catalog_digest=stars.digest,
-        star_tracker_rate_rad_s=to_tracker.apply(drawn.rate_rad_s[k]),
+    scene = Scene(
+        *(time_ns, R, reported_xyzw, stars.id, stars.magnitude, directions, pixels),
+        *(electrons, stars.digest),
+    )
+    covariance_px2 = sigma_px[:, None, None] ** 2 * np.eye(2)
+    snr = _PSF_SIGMA_PX / sigma_px
+    found = observations(scenario, scene, pixels + noise_px, covariance_px2, snr)
+    return dataclasses.replace(
+        found.select(np.asarray(inside)),
+        star_tracker_rate_rad_s=scenario.truth.star_tracker_from_camera.apply(made.rate_rad_s[k]),
         velocity_sigma_m_s=math.nan if world.velocity_m_s else GIVEN_SIGMA_M_S,
-    ).select(np.asarray(inside))
+    )
 
 
-def _aberrated(directions: Floats, velocity_m_s: Floats) -> Floats:
+def aberrated(directions: Floats, velocity_m_s: Floats) -> Floats:
     """Directions (n, 3) for an observer who moves as well; first order in v/c."""
     beta = velocity_m_s / SPEED_OF_LIGHT_M_S
     return np.asarray(directions + beta - directions * (directions @ beta)[:, None])
 
 
-def _pixels(drawn: _Drawn, k: int, in_camera: Floats) -> Floats:
+def _pixels(made: Campaign, rate_rad_s: Floats, focal_scale: float, in_camera: Floats) -> Floats:
     """True pixels (n, 2): a row that is read later sees the camera turned; lens displacements."""
-    camera, scale = drawn.truth.camera, drawn.focal_scale[k]
-    camera = camera.replace(fx=camera.intrinsics[0] * scale, fy=camera.intrinsics[2] * scale)
+    camera = made.scenario.truth.camera
+    fx, _, fy = focal_scale * camera.intrinsics[:3]
+    camera = camera.replace(fx=float(fx), fy=float(fy))
     pixels = project(camera, in_camera)
-    moved_per_s = np.cross(in_camera, drawn.rate_rad_s[k])
+    moved_per_s = np.cross(in_camera, rate_rad_s)
     for _ in range(_PIXEL_STEPS):
-        after_s = drawn.world.row_s * (pixels[:, 1] - (camera.height - 1) / 2.0)
+        after_s = made.world.row_s * (pixels[:, 1] - (camera.height - 1) / 2.0)
         turned = project(camera, in_camera + moved_per_s * after_s[:, None])
-        pixels = turned + drawn.displacement_px(pixels)
+        pixels = turned + made.displacement_px(pixels)
     return pixels
-
-
-def _brightness(world: World, magnitude: Floats) -> tuple[Floats, Floats]:
-    """Sigma of the centroids (n,), px, and flux (n,), DN."""
-    flux_dn = world.zero_point_dn * 10 ** (-0.4 * magnitude)
-    electrons = _ELECTRONS_PER_DN * flux_dn
-    sigma_px = _PSF_SIGMA_PX * np.sqrt(electrons + _NOISE_ELECTRONS**2) / electrons
-    return sigma_px, flux_dn
 
 
 def _outliers_px(world: World, count: int, rng: Generator) -> Floats:
