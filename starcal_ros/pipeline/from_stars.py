@@ -30,6 +30,7 @@ from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.identification.blind.bright_sources import bright_sources
 from starcal_ros.identification.blind.search import (
     confirm_sky,
+    find_in_any,
     find_sky,
     mirror,
     NotFound,
@@ -197,14 +198,12 @@ def _first_match(
     half = ordered[: max(1, (len(ordered) + 1) // 2)]
     for one in half[:: max(1, len(half) // _SEARCHED)][:_SEARCHED]:
         for camera in cameras:
-            for compact, xy_px in ((True, one.compact), (False, one.all)):
-                sky = find_sky(
-                    xy_px, camera, catalog, True, rounds=ROUNDS[:1], deadline_s=deadline_s
-                )
-                if isinstance(sky, SkyMatch):
-                    return _of_better_lens(sky, xy_px, catalog), compact
-                if time.thread_time() > deadline_s:
-                    return None
+            rankings = (one.compact, one.all)
+            sky, matched = find_in_any(rankings, camera, catalog, True, ROUNDS[:1], deadline_s)
+            if isinstance(sky, SkyMatch):
+                return _of_better_lens(sky, rankings[matched], catalog), matched == 0
+            if time.thread_time() > deadline_s:
+                return None
     return None
 
 
