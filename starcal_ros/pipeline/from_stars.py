@@ -10,10 +10,9 @@ from the rotations (method ``per_image``).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
-import itertools
 import math
 import time
 
@@ -31,7 +30,6 @@ from starcal_ros.identification.blind.bright_sources import bright_sources
 from starcal_ros.identification.blind.search import (
     confirm_sky,
     find_in_any,
-    find_sky,
     mirror,
     NotFound,
     ROUNDS,
@@ -229,19 +227,28 @@ def _all_matches(
     camera = first.camera
     before: SkyMatch | NotFound = NotFound('')
     for one in seen:
-        rankings = (one.compact, one.all) if compact_first else (one.all, one.compact)
-        # Both rankings before either is searched further.
-        for rounds, xy_px in itertools.product((ROUNDS[:1], ROUNDS[1:]), rankings):
-            turned_px = mirror(xy_px, camera.width) if first.mirrored else xy_px
-            sky = before
-            if isinstance(before, SkyMatch):
-                sky = confirm_sky(turned_px, camera, catalog, before.camera_from_icrf)
-            if isinstance(sky, NotFound):
-                sky = find_sky(turned_px, camera, catalog, rounds=rounds)
+        rankings = [one.compact, one.all] if compact_first else [one.all, one.compact]
+        if first.mirrored:
+            rankings = [mirror(xy_px, camera.width) for xy_px in rankings]
+        for sky in _attempts(rankings, camera, catalog, before):
             if isinstance(sky, SkyMatch):
                 found[one.time_ns] = before = sky
                 break
     return found
+
+
+def _attempts(
+    rankings: Sequence[Floats],
+    camera: CameraModel,
+    catalog: StarCatalog,
+    before: SkyMatch | NotFound,
+) -> Iterator[SkyMatch | NotFound]:
+    """Matches of an image, the cheapest first: at the rotation before, then of few patterns."""
+    if isinstance(before, SkyMatch):
+        for xy_px in rankings:
+            yield confirm_sky(xy_px, camera, catalog, before.camera_from_icrf)
+    for rounds in (ROUNDS[:1], ROUNDS[1:]):
+        yield find_in_any(rankings, camera, catalog, rounds=rounds)[0]
 
 
 def _of_one_lens(found: Mapping[int, SkyMatch]) -> dict[int, SkyMatch]:
