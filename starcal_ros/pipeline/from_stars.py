@@ -65,13 +65,15 @@ class FromStars:
     Camera and rotations of images that were identified by their stars.
 
     ``camera`` is of the images mirrored left to right where they are ``mirrored``;
-    ``icrf_from_camera`` by stamp; ``images`` is the number of all images.
+    ``icrf_from_camera`` by stamp; ``images`` is the number of all images; ``other_focal_px`` has
+    the focal lengths of images that match the sky with another camera and are left out.
     """
 
     camera: CameraModel
     mirrored: bool
     icrf_from_camera: Mapping[int, Rotation]
     images: int
+    other_focal_px: tuple[float, ...] = ()
 
     def in_a_sentence(self) -> str:
         """Findings as a sentence for a person."""
@@ -83,9 +85,11 @@ class FromStars:
         across_deg = np.degrees(np.arccos((a * b).sum(axis=1)))
         field = ' x '.join(f'{deg:.1f}' for deg in across_deg)
         flipped = '; the images are mirrored, and were mirrored back' if self.mirrored else ''
+        others = ', '.join(f'{focal_px:.0f}' for focal_px in self.other_focal_px)
+        left_out = f'; left out, with another focal length: {others} px' if others else ''
         return (
             f'{len(self.icrf_from_camera)} of {self.images} images identified by their stars:'
-            f' focal length {fx:.1f} px, field {field} degrees{flipped}'
+            f' focal length {fx:.1f} px, field {field} degrees{left_out}{flipped}'
         )
 
 
@@ -133,14 +137,14 @@ def from_stars(
             f' degrees: {ADVICE}; a tripod or a still spacecraft, no clouds, no lights'
         )
     first, compact_first = matched
-    found = _of_one_lens(_all_matches(rich, first, compact_first, catalog))
+    found, other_focal_px = _of_one_lens(_all_matches(rich, first, compact_first, catalog))
     if len(found) < min_images:
         raise NotFromStars(
             f'{len(found)} of {len(seen)} images match the sky, {min_images} are needed: {ADVICE};'
             ' no clouds, no lights, no frames of anything else'
         )
     camera, rotations = _common_camera(found, catalog, first.camera)
-    return FromStars(camera, first.mirrored, rotations, len(seen))
+    return FromStars(camera, first.mirrored, rotations, len(seen), other_focal_px)
 
 
 def _sources(images: Iterable[Image]) -> tuple[list[_Seen], tuple[int, int], int]:
@@ -251,8 +255,14 @@ def _attempts(
         yield find_in_any(rankings, camera, catalog, rounds=rounds)[0]
 
 
-def _of_one_lens(found: Mapping[int, SkyMatch]) -> dict[int, SkyMatch]:
-    """The matches with the focal length of most; a few others are false, or of another lens."""
+def _of_one_lens(
+    found: Mapping[int, SkyMatch],
+) -> tuple[dict[int, SkyMatch], tuple[float, ...]]:
+    """
+    The matches with the focal length of most, and the focal lengths of the others.
+
+    A few others are false, of another lens, or pictures of a screen that shows the sky.
+    """
     focal_px = np.array([float(sky.camera.parameters[0]) for sky in found.values()])
     low, high = np.percentile(focal_px, [10, 90])
     if high > (1 + _SAME_CAMERA) * low:
@@ -261,7 +271,8 @@ def _of_one_lens(found: Mapping[int, SkyMatch]) -> dict[int, SkyMatch]:
             f' focus; with one lens, its zoom and focus fixed, {ADVICE}'
         )
     alike = np.abs(focal_px / np.median(focal_px) - 1) < _SAME_CAMERA
-    return {t: sky for (t, sky), same in zip(found.items(), alike, strict=True) if same}
+    kept = {t: sky for (t, sky), same in zip(found.items(), alike, strict=True) if same}
+    return kept, tuple(focal_px[~alike].tolist())
 
 
 def _common_camera(
