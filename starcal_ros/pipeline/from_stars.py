@@ -10,10 +10,9 @@ from the rotations (method ``per_image``).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
-import itertools
 import math
 import time
 
@@ -30,7 +29,7 @@ from starcal_ros.estimation.calibration_options import CalibrationOptions
 from starcal_ros.identification.blind.bright_sources import bright_sources
 from starcal_ros.identification.blind.search import (
     confirm_sky,
-    find_sky,
+    find_in_any,
     mirror,
     NotFound,
     ROUNDS,
@@ -66,13 +65,15 @@ class FromStars:
     Camera and rotations of images that were identified by their stars.
 
     ``camera`` is of the images mirrored left to right where they are ``mirrored``;
-    ``icrf_from_camera`` by stamp; ``images`` is the number of all images.
+    ``icrf_from_camera`` by stamp; ``images`` is the number of all images; ``other_focal_px`` has
+    the focal lengths of images that match the sky with another camera and are left out.
     """
 
     camera: CameraModel
     mirrored: bool
     icrf_from_camera: Mapping[int, Rotation]
     images: int
+    other_focal_px: tuple[float, ...] = ()
 
     def in_a_sentence(self) -> str:
         """Findings as a sentence for a person."""
@@ -84,9 +85,11 @@ class FromStars:
         across_deg = np.degrees(np.arccos((a * b).sum(axis=1)))
         field = ' x '.join(f'{deg:.1f}' for deg in across_deg)
         flipped = '; the images are mirrored, and were mirrored back' if self.mirrored else ''
+        others = ', '.join(f'{focal_px:.0f}' for focal_px in self.other_focal_px)
+        left_out = f'; left out, with another focal length: {others} px' if others else ''
         return (
             f'{len(self.icrf_from_camera)} of {self.images} images identified by their stars:'
-            f' focal length {fx:.1f} px, field {field} degrees{flipped}'
+            f' focal length {fx:.1f} px, field {field} degrees{left_out}{flipped}'
         )
 
 
@@ -134,14 +137,14 @@ def from_stars(
             f' degrees: {ADVICE}; a tripod or a still spacecraft, no clouds, no lights'
         )
     first, compact_first = matched
-    found = _of_one_lens(_all_matches(rich, first, compact_first, catalog))
+    found, other_focal_px = _of_one_lens(_all_matches(rich, first, compact_first, catalog))
     if len(found) < min_images:
         raise NotFromStars(
             f'{len(found)} of {len(seen)} images match the sky, {min_images} are needed: {ADVICE};'
             ' no clouds, no lights, no frames of anything else'
         )
     camera, rotations = _common_camera(found, catalog, first.camera)
-    return FromStars(camera, first.mirrored, rotations, len(seen))
+    return FromStars(camera, first.mirrored, rotations, len(seen), other_focal_px)
 
 
 def _sources(images: Iterable[Image]) -> tuple[list[_Seen], tuple[int, int], int]:
@@ -197,14 +200,12 @@ def _first_match(
     half = ordered[: max(1, (len(ordered) + 1) // 2)]
     for one in half[:: max(1, len(half) // _SEARCHED)][:_SEARCHED]:
         for camera in cameras:
-            for compact, xy_px in ((True, one.compact), (False, one.all)):
-                sky = find_sky(
-                    xy_px, camera, catalog, True, rounds=ROUNDS[:1], deadline_s=deadline_s
-                )
-                if isinstance(sky, SkyMatch):
-                    return _of_better_lens(sky, xy_px, catalog), compact
-                if time.thread_time() > deadline_s:
-                    return None
+            rankings = (one.compact, one.all)
+            sky, matched = find_in_any(rankings, camera, catalog, True, ROUNDS[:1], deadline_s)
+            if isinstance(sky, SkyMatch):
+                return _of_better_lens(sky, rankings[matched], catalog), matched == 0
+            if time.thread_time() > deadline_s:
+                return None
     return None
 
 
@@ -230,23 +231,38 @@ def _all_matches(
     camera = first.camera
     before: SkyMatch | NotFound = NotFound('')
     for one in seen:
-        rankings = (one.compact, one.all) if compact_first else (one.all, one.compact)
-        # Both rankings before either is searched further.
-        for rounds, xy_px in itertools.product((ROUNDS[:1], ROUNDS[1:]), rankings):
-            turned_px = mirror(xy_px, camera.width) if first.mirrored else xy_px
-            sky = before
-            if isinstance(before, SkyMatch):
-                sky = confirm_sky(turned_px, camera, catalog, before.camera_from_icrf)
-            if isinstance(sky, NotFound):
-                sky = find_sky(turned_px, camera, catalog, rounds=rounds)
+        rankings = [one.compact, one.all] if compact_first else [one.all, one.compact]
+        if first.mirrored:
+            rankings = [mirror(xy_px, camera.width) for xy_px in rankings]
+        for sky in _attempts(rankings, camera, catalog, before):
             if isinstance(sky, SkyMatch):
                 found[one.time_ns] = before = sky
                 break
     return found
 
 
-def _of_one_lens(found: Mapping[int, SkyMatch]) -> dict[int, SkyMatch]:
-    """The matches with the focal length of most; a few others are false, or of another lens."""
+def _attempts(
+    rankings: Sequence[Floats],
+    camera: CameraModel,
+    catalog: StarCatalog,
+    before: SkyMatch | NotFound,
+) -> Iterator[SkyMatch | NotFound]:
+    """Matches of an image, the cheapest first: at the rotation before, then of few patterns."""
+    if isinstance(before, SkyMatch):
+        for xy_px in rankings:
+            yield confirm_sky(xy_px, camera, catalog, before.camera_from_icrf)
+    for rounds in (ROUNDS[:1], ROUNDS[1:]):
+        yield find_in_any(rankings, camera, catalog, rounds=rounds)[0]
+
+
+def _of_one_lens(
+    found: Mapping[int, SkyMatch],
+) -> tuple[dict[int, SkyMatch], tuple[float, ...]]:
+    """
+    The matches with the focal length of most, and the focal lengths of the others.
+
+    A few others are false, of another lens, or pictures of a screen that shows the sky.
+    """
     focal_px = np.array([float(sky.camera.parameters[0]) for sky in found.values()])
     low, high = np.percentile(focal_px, [10, 90])
     if high > (1 + _SAME_CAMERA) * low:
@@ -255,7 +271,8 @@ def _of_one_lens(found: Mapping[int, SkyMatch]) -> dict[int, SkyMatch]:
             f' focus; with one lens, its zoom and focus fixed, {ADVICE}'
         )
     alike = np.abs(focal_px / np.median(focal_px) - 1) < _SAME_CAMERA
-    return {t: sky for (t, sky), same in zip(found.items(), alike, strict=True) if same}
+    kept = {t: sky for (t, sky), same in zip(found.items(), alike, strict=True) if same}
+    return kept, tuple(focal_px[~alike].tolist())
 
 
 def _common_camera(

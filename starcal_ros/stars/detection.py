@@ -35,6 +35,7 @@ _DETECTION_SIGMA_PX = 1.0
 # A Gaussian filter of sigma s leaves white noise at 1 / (2 s sqrt(pi)) of its strength.
 _NOISE_LEFT = 1.0 / (2.0 * _DETECTION_SIGMA_PX * math.sqrt(math.pi))
 _ALONG_U, _ALONG_V = np.array([[[1], [0]], [[0], [1]]])  # a step along either axis, (2, 1)
+_AROUND = [(dv, du) for dv in (-1, 0, 1) for du in (-1, 0, 1) if (dv, du) != (0, 0)]
 _RIM_PX = 4  # reach of the filter, plus one pixel to interpolate the maximum
 # Peak over filtered peak: 6.3 for a single lit pixel without noise; for a star centred on a pixel
 # 4.2 with a PSF of 0.45 px (half of the light in that pixel) and 4.65 with one of 0.4 px.
@@ -272,26 +273,27 @@ def detect(
         np.float32,
     )
     lowest = detection_sigma * _NOISE_LEFT * float(background.noise_mesh.min())
-    # Few pixels pass the lowest threshold; all later steps use only those.
-    v, u = np.nonzero(filtered > lowest)
-    inner = (u >= 2) & (u < width - 2) & (v >= 2) & (v < height - 2)
-    v, u = v[inner], u[inner]
-    centre = filtered[v, u]
+    # Few pixels pass the lowest threshold; all later steps use only those.  The search of the flat
+    # image takes a tenth of the time of that by rows and columns.
+    place = np.flatnonzero(filtered > lowest)
+    v, u = np.divmod(place, width)
+    place = place[(u >= 2) & (u < width - 2) & (v >= 2) & (v < height - 2)]
+    flat = filtered.ravel()
+    for dv, du in _AROUND:
+        beside, centre = flat[place + (dv * width + du)], flat[place]
+        place = place[centre >= beside if (dv, du) > (0, 0) else centre > beside]
+    v, u = np.divmod(place, width)
+    centre = flat[place]
     noise = background.noise_at(np.stack([u, v], axis=-1))
-    keep = centre > detection_sigma * _NOISE_LEFT * noise
-    for dv in (-1, 0, 1):
-        for du in (-1, 0, 1):
-            if (dv, du) != (0, 0):
-                other = filtered[v + dv, u + du]
-                keep &= centre >= other if (dv, du) > (0, 0) else centre > other
-    v, u, centre, noise = v[keep], u[keep], centre[keep], noise[keep]
+    bright = centre > detection_sigma * _NOISE_LEFT * noise
+    v, u, centre, noise = v[bright], u[bright], centre[bright], noise[bright]
     sharp = image[v, u] > _HOT_PEAK_RATIO * centre
     v, u, centre, noise = v[~sharp], u[~sharp], centre[~sharp], noise[~sharp]
-    place = _parabola_vertex(
+    vertex = _parabola_vertex(
         filtered[v - _ALONG_V, u - _ALONG_U], centre, filtered[v + _ALONG_V, u + _ALONG_U]
     )
     order = np.argsort(-centre, kind='stable')
-    xy = place.T + np.stack([u, v], axis=-1)
+    xy = vertex.T + np.stack([u, v], axis=-1)
     snr = (centre / (_NOISE_LEFT * noise)).astype(np.float64)
     return Sources(xy[order], snr[order], float(width * height))
 

@@ -176,6 +176,18 @@ def test_a_zoom_between_the_frames_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_an_image_with_another_focal_length_is_left_out_and_named() -> None:
+    """As a picture of a planetarium on a screen among images of the sky."""
+    frames = tiny_images()
+    frames[4] = Image(frames[4].time_ns, zoomed(frames[4].pixels, 1.1))
+    found = from_stars(frames, load_catalog())
+    assert found.icrf_from_camera.keys() == {one.time_ns for one in frames} - {frames[4].time_ns}
+    (focal_px,) = found.other_focal_px
+    assert focal_px == pytest.approx(1.1 * found.camera.parameters[0], rel=5e-3)
+    assert f'left out, with another focal length: {focal_px:.0f} px' in found.in_a_sentence()
+
+
+@pytest.mark.slow
 def test_a_change_of_focus_is_refused_by_the_gate(tmp_path: Path) -> None:
     frames = [one.pixels for one in tiny_images()[:6]]
     frames[3:] = [zoomed(pixels, 1.005) for pixels in frames[3:]]

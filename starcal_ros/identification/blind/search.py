@@ -2,17 +2,15 @@
 """
 Identification of the stars of one image without attitude or alignment.
 
-Patterns of four of the brightest sources are looked up among those of the catalog
-(`pattern_index`).  Each match gives a rotation and a focal length, and the bright stars predicted
-with them are compared with the sources.  The best candidates are refined; the first one with a
-significant p-value is accepted (`sky_fit`).
+Patterns of the brightest sources give candidates (`candidates`).  The best ones are refined, those
+that are almost certain before all others; the first one with a significant p-value is accepted
+(`sky_fit`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-import functools
 import itertools
 import math
 import time
@@ -22,16 +20,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.identification.blind.pattern_index import (
-    brightest_within,
-    equal_shapes,
-    equivalent,
-    pattern_index,
-    scales_for,
-    shapes,
-    sphere_points,
-)
+from starcal_ros.camera import CameraModel
+from starcal_ros.identification.blind.candidates import Candidates, focal_scales, look_up, View
+from starcal_ros.identification.blind.pattern_index import scales_for
 from starcal_ros.identification.blind.sky_fit import (
     FOCAL_RANGE,
     log10_p_value,
@@ -49,18 +40,10 @@ ROUNDS = ((0, 12), (12, 18), (18, 24))
 (first, last) of each round: patterns of the ``last`` brightest sources, with at least one source
 after the ``first`` brightest.
 """
-_REFINED = 32  # number of best candidates of a lookup that are refined
 _GUESSED = 0.2  # largest shift of a guess, half diagonals
 _ALIKE = 0.03  # largest shift of one star to the next, half diagonals
 _OF_A_GUESS = 40  # brightest stars and sources compared with a guess
-_CANDIDATES = 20_000  # tested candidates of a lookup, drawn at random from more
-_TESTED = 16  # brightest predictions used to test a candidate
-_TABLED = 5000  # most points whose stars are kept in memory: for discs of 9 degrees and more
-_CHUNK = 5000  # candidates tested at once: 30 MB
-_MAP_SIDE = 128  # cells of the map of the sources along each side
-_NEAR, _FAR = 0.006, 0.02  # 1-sigma of the predictions of a candidate, in half diagonals
-_SHOWN = 0.6  # expected share of the bright stars that a true candidate shows
-_LEAST_GAIN = 0.8  # smallest gain, over that of the four stars of a pattern alone
+_FEWEST_SOURCES = 5
 
 
 @dataclass(frozen=True)
@@ -103,19 +86,6 @@ class NotFound:
     log10_p_value: float = math.inf
 
 
-@dataclass(frozen=True)
-class _Candidates:
-    """
-    Patterns of the image that match patterns of the catalog.
-
-    ``stars`` and ``sources`` (n, 4); ``growth`` (n,): focal length over that of the search.
-    """
-
-    stars: Indices
-    sources: Indices
-    growth: Floats
-
-
 def find_sky(
     xy_px: Floats,
     camera: CameraModel,
@@ -132,27 +102,79 @@ def find_sky(
     ``try_mirrored`` the mirror image is searched too.  ``rounds`` is a part of `ROUNDS`; the
     search ends when the processor time of the thread reaches ``deadline_s``.
     """
-    if len(xy_px) < 5:
-        return NotFound(f'{len(xy_px)} star-like sources, at least 5 are needed')
-    images = [SourceImage(xy_px, camera)]
+    found, _ = find_in_any([xy_px], camera, catalog, try_mirrored, rounds, deadline_s)
+    return found
+
+
+def find_in_any(
+    rankings: Sequence[Floats],
+    camera: CameraModel,
+    catalog: StarCatalog,
+    try_mirrored: bool = False,
+    rounds: Sequence[tuple[int, int]] = ROUNDS,
+    deadline_s: float = math.inf,
+) -> tuple[SkyMatch | NotFound, int]:
+    """As `find_sky` for several selections of the sources of an image; the row of the matched."""
+    seen = [
+        _Seen(SourceImage(xy_px, camera), False, k)
+        for k, xy_px in enumerate(rankings)
+        if len(xy_px) >= _FEWEST_SOURCES
+    ]
+    if not seen:
+        count = max(len(xy_px) for xy_px in rankings)
+        return NotFound(f'{count} star-like sources, at least {_FEWEST_SOURCES} are needed'), 0
     if try_mirrored:
-        images.append(SourceImage(mirror(xy_px, camera.width), mirrored_camera(camera)))
+        seen = [one for k in seen for one in (k, k.turned())]
+    tried = math.log10(1 + try_mirrored)
     least = math.inf
     for before, sources in rounds:
-        if len(xy_px) <= before:
-            break
-        ways = itertools.product(_focal_scales(images[0].half_diagonal_rad), enumerate(images))
-        for focal_scale, (mirrored, image) in ways:
-            for scale in scales_for(image.half_diagonal_rad / focal_scale):
-                for fit in _fits(image, catalog, scale, focal_scale, before, sources):
-                    log10_p, radius_px = log10_p_value(image, catalog, fit)
-                    log10_p += math.log10(len(images))
-                    least = min(least, log10_p)
-                    if log10_p < MAX_LOG10_P_VALUE:
-                        return _result(image, catalog, fit, radius_px, log10_p, bool(mirrored))
-                if time.thread_time() > deadline_s:
-                    return NotFound('the search has reached its time limit', least)
-    return NotFound('no pattern of the sources matches the catalog beyond chance', least)
+        chosen = [one for one in seen if len(one.image.xy_px) > before]
+        for one, candidates in _candidates(chosen, catalog, before, sources):
+            for fit in _fits(one.image, catalog, candidates):
+                log10_p, radius_px = log10_p_value(one.image, catalog, fit)
+                log10_p += tried
+                least = min(least, log10_p)
+                if log10_p < MAX_LOG10_P_VALUE:
+                    result = _result(one.image, catalog, fit, radius_px, log10_p, one.mirrored)
+                    return result, one.ranking
+            if time.thread_time() > deadline_s:
+                return NotFound('the search has reached its time limit', least), 0
+    return NotFound('no pattern of the sources matches the catalog beyond chance', least), 0
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A selection of the sources of an image, as given or mirrored left to right."""
+
+    image: SourceImage
+    mirrored: bool
+    ranking: int
+
+    def turned(self) -> _Seen:
+        """The mirror image."""
+        camera = self.image.camera
+        xy_px = mirror(self.image.xy_px, camera.width)
+        return _Seen(SourceImage(xy_px, mirrored_camera(camera)), True, self.ranking)
+
+
+def _candidates(
+    seen: Sequence[_Seen], catalog: StarCatalog, before: int, sources: int
+) -> Iterator[tuple[_Seen, Candidates]]:
+    """
+    Candidates of all look-ups: first the almost certain ones of each, then the others.
+
+    To refine a false candidate costs half as much as a look-up, and there may be 32 of them.
+    """
+    others = []
+    scales = focal_scales(seen[0].image.half_diagonal_rad) if seen else ()
+    for focal_scale, one in itertools.product(scales, seen):
+        view = View(one.image, focal_scale)
+        patterns = view.patterns(before, sources)
+        for scale in scales_for(one.image.half_diagonal_rad / focal_scale):
+            certain, other = look_up(view, catalog, scale, patterns).in_two()
+            yield one, certain
+            others.append((one, other))
+    yield from others
 
 
 def confirm_sky(
@@ -186,8 +208,8 @@ def _shifted_alike(image: SourceImage, catalog: StarCatalog, start: SkyFit) -> I
     if len(rank) == 0:
         return np.empty((0, 2), np.int64)
     tree = cKDTree(shift[rank, source])
-    alike = tree.query_ball_point(tree.data, _ALIKE)
-    chosen = np.array(max(alike, key=len))
+    fullest = tree.query_ball_point(tree.data, _ALIKE, return_length=True).argmax()
+    chosen = np.array(tree.query_ball_point(tree.data[fullest], _ALIKE))
     return np.stack([stars[rank[chosen]], source[chosen]], axis=-1)
 
 
@@ -205,176 +227,20 @@ def mirrored_camera(camera: CameraModel) -> CameraModel:
     return turned.replace(p2=-float(camera.parameters[9]))
 
 
-def _focal_scales(half_diagonal_rad: float) -> tuple[float, ...]:
-    """Focal lengths to try, over the prior; in a narrow field shapes do not depend on it."""
-    if half_diagonal_rad < math.radians(12.0):
-        return (1.0,)
-    if half_diagonal_rad < math.radians(24.0):
-        return (1.0, 0.86, 1.16)
-    return (1.0, 0.91, 1.1, 0.83, 1.2)
-
-
-def _tolerances(half_diagonal_rad: float) -> tuple[float, float]:
-    """Largest error of the shape of a pattern, and of the logarithm of its size."""
-    size = {1: FOCAL_RANGE + 0.05, 3: 0.16, 5: 0.13}[len(_focal_scales(half_diagonal_rad))]
-    return 0.012 + 0.04 * half_diagonal_rad, size
-
-
-def _fits(
-    image: SourceImage,
-    catalog: StarCatalog,
-    scale: int,
-    focal_scale: float,
-    before: int,
-    sources: int,
-) -> Iterator[SkyFit]:
-    """Refined fits from patterns of the brightest sources, most likely first."""
-    fx, fy = focal_scale * image.camera.parameters[[0, 2]]
-    camera = image.camera.replace(fx=float(fx), fy=float(fy))
-    directions = line_of_sight(camera, image.xy_px)
-    candidates = _look_up(image, catalog, scale, directions[:sources], before)
-    if len(candidates.growth) == 0:
-        return
-    plane = directions[:, :2] / directions[:, 2:]
-    rotation = _rotations(catalog, candidates, plane)
-    gain, own = _gains(image, catalog, candidates, plane, rotation)
-    best = np.argsort(-gain, kind='stable')[:_REFINED]
-    for k in best[gain[best] > _LEAST_GAIN * own]:
-        growth = float(candidates.growth[k])
+def _fits(image: SourceImage, catalog: StarCatalog, candidates: Candidates) -> Iterator[SkyFit]:
+    """Refined fits of candidates in their order."""
+    fx, fy = image.camera.parameters[[0, 2]]
+    for k, scale in enumerate(candidates.focal_scale.tolist()):
+        rotation = candidates.rotation[k]
         start = SkyFit(
-            Rotation.from_matrix(rotation[k]),
-            camera.replace(fx=growth * float(fx), fy=growth * float(fy)),
-            _stars_about(image, catalog, rotation[k, 2]),
+            Rotation.from_matrix(rotation),
+            image.camera.replace(fx=scale * float(fx), fy=scale * float(fy)),
+            _stars_about(image, catalog, rotation[2]),
         )
         pairs = np.stack([candidates.stars[k], candidates.sources[k]], axis=-1)
         fit = refined(image, catalog, start, pairs)
         if fit is not None:
             yield fit
-
-
-def _look_up(
-    image: SourceImage, catalog: StarCatalog, scale: int, directions: Floats, before: int
-) -> _Candidates:
-    """Matches of patterns of directions (n, 3) with at least one from row ``before`` on."""
-    index = pattern_index(catalog, scale)
-    usable = np.flatnonzero(np.isfinite(directions[:, 0]))
-    every = list(itertools.combinations(usable.tolist(), 4))
-    chosen: Indices = np.array(every, np.int64).reshape(-1, 4)
-    chosen = chosen[chosen[:, 3] >= before]
-    place_tolerance, size_tolerance = _tolerances(image.half_diagonal_rad)
-    order, shape = shapes(directions[chosen])
-    sources = np.take_along_axis(chosen, order, axis=1)
-    fits = shape[:, 4] < math.log(2 * index.radius_rad) + size_tolerance
-    sources, shape = equivalent(sources[fits], shape[fits], place_tolerance)
-    query, quad = equal_shapes(index.grid, shape, place_tolerance, size_tolerance)
-    if len(quad) > _CANDIDATES:
-        few = np.random.default_rng(0).choice(len(quad), _CANDIDATES, replace=False)
-        quad, query = quad[few], query[few]
-    growth = np.exp(shape[query, 4] - index.grid.shape[quad, 4])
-    return _Candidates(index.quads[quad], sources[query], growth)
-
-
-def _rotations(catalog: StarCatalog, candidates: _Candidates, plane: Floats) -> Floats:
-    """Rotations (n, 3, 3) of candidates from the catalog to the camera."""
-    seen = np.empty((len(candidates.growth), 4, 3))
-    seen[..., :2] = plane[candidates.sources] / candidates.growth[:, None, None]
-    seen[..., 2] = 1.0
-    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
-    stars = catalog.direction_icrs[candidates.stars]
-    return np.asarray(np.matmul(_triads(seen).transpose(0, 2, 1), _triads(stars)))
-
-
-def _triads(directions: Floats) -> Floats:
-    """Axes (n, 3, 3), in rows, of four directions (n, 4, 3): their middle, and A towards B."""
-    middle = directions.sum(axis=1)
-    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    # C and D enter through the middle.
-    towards = directions[:, 1] - directions[:, 0]
-    side = np.cross(middle, towards)
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    return np.stack([middle, np.cross(side, middle), side], axis=1)
-
-
-def _gains(
-    image: SourceImage,
-    catalog: StarCatalog,
-    candidates: _Candidates,
-    plane: Floats,
-    rotation: Floats,
-) -> tuple[Floats, float]:
-    """
-    Log-likelihood ratio (n,) of the sources with a candidate to that by chance.
-
-    Also the ratio that the four stars of a pattern give alone.
-    """
-    half = math.tan(image.half_diagonal_rad)
-    finite = plane[np.isfinite(plane[:, 0])]
-    gain_map, low, cell = _gain_map(finite, half)
-    (rows, columns), flat = gain_map.shape, gain_map.ravel()
-    gains = np.empty(len(rotation))
-    for first in range(0, len(rotation), _CHUNK):
-        part = slice(first, first + _CHUNK)
-        stars = _bright_about(catalog, rotation[part, 2], 1.1 * math.atan(half), 3 * _TESTED)
-        place = np.matmul(catalog.direction_icrs[stars], rotation[part].transpose(0, 2, 1))
-        ahead = (stars >= 0) & (place[..., 2] > 0.1)
-        scale = candidates.growth[part, None] / np.where(ahead, place[..., 2], 1.0) / cell
-        column, row = (np.floor(place[..., k] * scale - low[k] / cell) for k in (0, 1))
-        inside = ahead & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        at = np.where(inside, row * columns + column, 0.0).astype(np.int64)
-        inside &= np.cumsum(inside, axis=1, dtype=np.int32) <= _TESTED
-        value = flat[at]
-        # An image of few stars shows only the brightest: take the best depth.
-        gains[part] = np.cumsum(value * inside, axis=1).max(axis=1)
-    return gains, 4.0 * float(gain_map.max())
-
-
-def _gain_map(plane: Floats, half: float) -> tuple[Floats, Floats, float]:
-    """Log-likelihood ratio of a star predicted in each cell of the image plane."""
-    low, high = plane.min(axis=0), plane.max(axis=0)
-    cell = float((high - low).max()) / _MAP_SIDE
-    shape = np.ceil((high - low) / cell).astype(np.int64) + 1
-    u, v = np.meshgrid(*(low[k] + cell * (np.arange(shape[k]) + 0.5) for k in (0, 1)))
-    apart, _ = cKDTree(plane).query(np.stack([u.ravel(), v.ravel()], axis=-1))
-    area = float(np.prod(high - low)) / len(plane)
-    density = sum(
-        0.5 * np.exp(-0.5 * (apart / (s * half)) ** 2) / (2 * math.pi * (s * half) ** 2)
-        for s in (_NEAR, _FAR)
-    )
-    gain = np.log((1.0 - _SHOWN) + _SHOWN * area * density)
-    return gain.reshape(u.shape), low, cell
-
-
-@functools.lru_cache(maxsize=8)
-def _bright_stars(catalog: StarCatalog, radius_deg: int) -> tuple[cKDTree, cKDTree]:
-    """Search trees of points all over the sky and of the stars that discs of a radius need."""
-    radius_rad = math.radians(radius_deg)
-    points = sphere_points(int(4 * math.pi / (0.3 * radius_rad) ** 2))
-    # The emptiest discs hold half of the mean number, which is still most of the stars tested.
-    enough = int(5 * _TESTED * 2.0 / (1.0 - math.cos(radius_rad)))
-    return cKDTree(points), cKDTree(catalog.direction_icrs[:enough])
-
-
-def _bright_about(catalog: StarCatalog, axes: Floats, radius_rad: float, count: int) -> Indices:
-    """Rows (n, count) of the brightest stars within about a radius of axes (n, 3); -1 if fewer."""
-    points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
-    point = points.query(axes)[1]
-    if points.n <= _TABLED:
-        return np.asarray(_bright_everywhere(catalog, radius_rad, count)[point])
-    point, place = np.unique(point, return_inverse=True)
-    found = brightest_within(stars, points.data[point], _widened(radius_rad), count)
-    return np.asarray(found[place.ravel()])
-
-
-@functools.lru_cache(maxsize=8)
-def _bright_everywhere(catalog: StarCatalog, radius_rad: float, count: int) -> Indices:
-    """Rows (p, count) of `_bright_about` for all points of `_bright_stars`."""
-    points, stars = _bright_stars(catalog, max(1, math.ceil(math.degrees(radius_rad))))
-    return brightest_within(stars, points.data, _widened(radius_rad), count)
-
-
-def _widened(radius_rad: float) -> float:
-    """Radius about the nearest point that holds the disc about an axis."""
-    return min(1.25 * radius_rad, math.pi)
 
 
 def _stars_about(image: SourceImage, catalog: StarCatalog, axis: Floats) -> Indices:

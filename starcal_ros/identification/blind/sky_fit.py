@@ -11,6 +11,7 @@ of the brightest predictions fall near a source by chance.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 import functools
 import math
@@ -21,7 +22,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import betainc
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.camera import CameraModel, line_of_sight, project, project_jacobians
+from starcal_ros.camera import CameraModel, line_of_sight, project, rotation_jacobian
+from starcal_ros.camera.lens import coefficient_jacobian, distort, ideal_points
 from starcal_ros.sky.catalog import StarCatalog
 
 FOCAL_RANGE = 0.25  # half range of the logarithm of the focal length
@@ -153,15 +155,20 @@ def match(
 
 def predicted(catalog: StarCatalog, fit: SkyFit, most: int) -> tuple[Indices, Floats]:
     """Catalog rows (n,) of the brightest stars in the image, and their pixels (n, 2)."""
-    camera = fit.camera
-    directions = fit.camera_from_icrf.apply(catalog.direction_icrs[fit.stars])
-    xy = project(camera, directions)
-    with np.errstate(invalid='ignore'):
-        inside = (xy > -0.5).all(axis=1) & (xy < [camera.width - 0.5, camera.height - 0.5]).all(
-            axis=1
-        )
-    rank = np.flatnonzero(inside)[:most]
-    return fit.stars[rank], xy[rank]
+    # Most often the brightest stars suffice: a third of a disc is in the image.
+    for stars in (fit.stars[: 4 * most], fit.stars):
+        u, v = _pixels(fit, catalog.direction_icrs[stars]).T
+        inside = (u > -0.5) & (u < fit.camera.width - 0.5)
+        inside &= (v > -0.5) & (v < fit.camera.height - 0.5)
+        rank = np.flatnonzero(inside)[:most]
+        if len(rank) == most or len(stars) == len(fit.stars):
+            break
+    return stars[rank], np.stack([u[rank], v[rank]], axis=-1)
+
+
+def _pixels(fit: SkyFit, directions_icrs: Floats) -> Floats:
+    """Pixels (n, 2) of directions (n, 3); NaN behind a perspective lens."""
+    return project(fit.camera, directions_icrs @ fit.camera_from_icrf.as_matrix().T)
 
 
 def _mutual(
@@ -187,49 +194,46 @@ def _step(
 ) -> SkyFit:
     """One robust Gauss-Newton step; ``scale_px`` is the expected residual of a pair."""
     camera, prior, half_px = fit.camera, image.camera, image.half_diagonal_px
-    directions = fit.camera_from_icrf.apply(catalog.direction_icrs[pairs[:, 0]])
-    xy, J_camera, J_rotation = project_jacobians(camera, directions)
-    residual = image.xy_px[pairs[:, 1]] - xy
-    fx, fy, cx, cy = camera.parameters[[0, 2, 3, 4]]
+    before, (fx, skew, fy, cx, cy) = prior.parameters, camera.intrinsics.tolist()
     # k1 as displacement in the corner over the radius there.
     k1_per_part = (fx / half_px) ** 2
-    J = np.concatenate(
-        [
-            J_rotation,
-            (fx * J_camera[..., 0] + fy * J_camera[..., 2])[..., None],
-            J_camera[..., 3:5],
-            (k1_per_part * J_camera[..., 5])[..., None],
-        ],
-        axis=-1,
+    directions = catalog.direction_icrs[pairs[:, 0]] @ fit.camera_from_icrf.as_matrix().T
+    ideal = ideal_points(camera.model, directions)
+    xd, yd = distort(camera.model, ideal, camera.distortion).T
+    x_by_k1, y_by_k1 = (
+        k1_per_part * coefficient_jacobian(camera.model, ideal, camera.distortion)[:, 0]
     )
-    size2 = (residual**2).sum(axis=1)
-    root = 1.0 / np.sqrt(scale_px**2 + size2 / 4)
-    part = (camera.parameters[5] - prior.parameters[5]) / k1_per_part
-    off = np.array(
-        [
-            math.log(prior.parameters[0] / fx),
-            prior.parameters[3] - cx,
-            prior.parameters[4] - cy,
-            -part,
-        ]
-    )
+    J = np.zeros((2, len(pairs), 7))  # by rotation, logarithm of the focal length, cx, cy, k1
+    J[:, :, :3] = rotation_jacobian(camera, directions).transpose(1, 0, 2)
+    J[0, :, 3], J[1, :, 3] = fx * xd, fy * yd
+    J[0, :, 4] = J[1, :, 5] = 1.0
+    J[0, :, 6], J[1, :, 6] = fx * x_by_k1 + skew * y_by_k1, fy * y_by_k1
+    residual = image.xy_px[pairs[:, 1]].T - [fx * xd + skew * yd + cx, fy * yd + cy]
+    weight = 1.0 / (scale_px**2 + (residual**2).sum(axis=0) / 4)
+    part = (float(camera.parameters[5]) - float(before[5])) / k1_per_part
+    off = [math.log(before[0] / fx), float(before[3]) - cx, float(before[4]) - cy, -part]
     centre_px = CENTRE_RANGE * camera.width
-    sigma = np.array([FOCAL_RANGE, centre_px, centre_px, DISTORTION_RANGE]) / 1.7
-    A = np.concatenate([(J * root[:, None, None]).reshape(-1, 7), np.zeros((4, 7))])
-    A[-4:, 3:] = np.diag(1.0 / sigma)
-    b = np.concatenate([(residual * root[:, None]).ravel(), off / sigma])
-    N = A.T @ A
-    step = np.linalg.solve(N + 1e-12 * np.diag(np.diag(N)), A.T @ b)
-    growth = math.exp(float(np.clip(step[3], -0.2, 0.2)))
-    k1 = (part + float(np.clip(step[6], -0.05, 0.05))) * (growth * fx / half_px) ** 2
-    changed = camera.replace(
-        fx=growth * fx,
-        fy=growth * fy,
-        cx=cx + float(np.clip(step[4], -centre_px, centre_px)),
-        cy=cy + float(np.clip(step[5], -centre_px, centre_px)),
-        k1=float(prior.parameters[5]) + k1,
-    )
-    return SkyFit(Rotation.from_rotvec(-step[:3]) * fit.camera_from_icrf, changed, fit.stars)
+    held = (1.7 / np.array([FOCAL_RANGE, centre_px, centre_px, DISTORTION_RANGE])) ** 2
+    weighted = J * weight[:, None]
+    N = np.tensordot(weighted, J, ((0, 1), (0, 1)))
+    b = np.tensordot(weighted, residual, ((0, 1), (0, 1)))
+    N[[3, 4, 5, 6], [3, 4, 5, 6]] += held
+    b[3:] += held * off
+    N[range(7), range(7)] *= 1.0 + 1e-12
+    step = np.linalg.solve(N, b).tolist()
+    growth = math.exp(_within(step[3], 0.2))
+    changed = camera.parameters.copy()
+    changed[[0, 2]] *= growth
+    changed[3] += _within(step[4], centre_px)
+    changed[4] += _within(step[5], centre_px)
+    changed[5] = before[5] + (part + _within(step[6], 0.05)) * (growth * fx / half_px) ** 2
+    rotation = Rotation.from_rotvec([-step[0], -step[1], -step[2]]) * fit.camera_from_icrf
+    return SkyFit(rotation, dataclasses.replace(camera, parameters=changed), fit.stars)
+
+
+def _within(value: float, limit: float) -> float:
+    """Value clipped to a limit on both sides."""
+    return min(max(value, -limit), limit)
 
 
 def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tuple[float, float]:
@@ -239,6 +243,7 @@ def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tupl
     Infinite with fewer than five stars near their predictions.
     """
     _, xy_px = predicted(catalog, fit, _MOST_STARS)
+    crowding = [_crowded(image, xy_px, radius_px) for radius_px in _JUDGED_PX]
     best, best_radius_px = math.inf, _JUDGED_PX[-1]
     depths = [n for n in _DEPTHS if n < len(xy_px)] + [len(xy_px)]
     for n in depths:
@@ -246,30 +251,28 @@ def log10_p_value(image: SourceImage, catalog: StarCatalog, fit: SkyFit) -> tupl
             continue
         sources = min(len(image.xy_px), 4 * n)
         _, source, apart_px = _mutual(image, xy_px[:n], _JUDGED_PX[-1], sources)
-        for radius_px in _JUDGED_PX:
+        order, ordered = 1.0, 0
+        for radius_px, crowded in zip(_JUDGED_PX, crowding, strict=True):
             near = apart_px < radius_px
             hits = int(np.count_nonzero(near))
             if hits < 5:
                 continue
-            q = _chance_of_one(image, xy_px[:n], radius_px, sources)
+            if hits > ordered:
+                order, ordered = _chance_of_order(source[near]), hits
+            # The mean over the stars; those among many sources have their local density.
+            q = float(np.maximum(crowded[:n], _evenly(image, radius_px, sources)).mean())
             tail = float(betainc(hits, n - hits + 1, q))  # P(Binomial(n, q) >= hits)
-            chance = max(_LOOKS * tail * _chance_of_order(source[near]), 1e-300)
+            chance = max(_LOOKS * tail * order, 1e-300)
             log10_p = math.log10(chance) + _log10_positions(image, radius_px)
             if log10_p < best:
                 best, best_radius_px = log10_p, radius_px
     return best, best_radius_px
 
 
-def _chance_of_one(image: SourceImage, xy_px: Floats, radius_px: float, sources: int) -> float:
-    """
-    Probability that a source lies within a radius of a star by chance.
-
-    Mean over the stars; a star among many sources, as in glare, has their local density.
-    """
-    everywhere = _evenly(image, radius_px, sources)
+def _crowded(image: SourceImage, xy_px: Floats, radius_px: float) -> Floats:
+    """Probability (n,) that another source lies within a radius, from the density about it."""
     near = image.tree.query_ball_point(xy_px, _ALONE * radius_px, return_length=True)
-    crowded = np.minimum((np.maximum(near, 1) - 1) / _ALONE**2, 1.0)
-    return float(np.maximum(crowded, everywhere).mean())
+    return np.asarray(np.minimum((np.maximum(near, 1) - 1) / _ALONE**2, 1.0))
 
 
 def _chance_of_order(source: Indices) -> float:

@@ -22,6 +22,7 @@ from starcal_ros.identification.blind.pattern_index import (
 )
 from starcal_ros.identification.blind.search import (
     confirm_sky,
+    find_in_any,
     find_sky,
     mirror,
     mirrored_camera,
@@ -71,6 +72,17 @@ def test_a_mirror_image_is_found_as_such(frame: Frame, catalog: StarCatalog) -> 
     found = find_sky(flipped, frame.prior, catalog, try_mirrored=True)
     assert isinstance(found, SkyMatch) and found.mirrored
     assert {tuple(xy) for xy in found.xy_px.tolist()} <= {tuple(xy) for xy in flipped.tolist()}
+
+
+def test_the_selection_of_sources_that_shows_stars_is_found(
+    frame: Frame, catalog: StarCatalog
+) -> None:
+    points = np.random.default_rng(1).uniform([0, 0], [1024, 820], (18, 2))
+    found, row = find_in_any([points[:4], points, frame.xy_px], frame.prior, catalog)
+    assert isinstance(found, SkyMatch) and row == 2
+    alone = find_sky(frame.xy_px, frame.prior, catalog)
+    assert isinstance(alone, SkyMatch)
+    np.testing.assert_array_equal(found.catalog_index, alone.catalog_index)
 
 
 @pytest.mark.slow
