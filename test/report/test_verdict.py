@@ -56,10 +56,9 @@ def test_the_precision_is_that_of_map_and_budget(tiny_products: Path) -> None:
         maps=dataclasses.replace(calibration.maps, shape_sigma_arcsec=sigma),
     )
     assert verdict.precision_sentences(shown)[0] == (
-        'Camera alone: lines of sight are known to 0.2″ (1-sigma) or better over '
-        '98 % of the detector, to 9″ at worst; 0.25″ rms: 0.2″ from stars, '
-        '0.15″ from fine structure.'
+        'Camera alone: the 1-sigma of a line of sight is 0.25″ rms over the detector, at most '
+        '0.2″ over 98 % of it, 9″ at worst. Largest causes: stars (0.2″), fine structure (0.15″).'
     )
-    assert 'camera, limited by stars: more images' in verdict.next_step(shown)
+    assert 'camera (largest cause: stars), take more images' in verdict.next_step(shown)
     refused = dataclasses.replace(shown, accepted=False)
     assert verdict.next_step(refused).startswith('Do not use it for navigation')
