@@ -64,7 +64,7 @@ def checks_sentence(gate: Sequence[GateCheck]) -> str:
     if not gate:
         return ''
     counts = [(name, sum(check.passed is key for check in gate)) for key, name in _RESULTS.items()]
-    text = ', '.join(f'{name} {count}' for name, count in counts if count or name == 'passed')
+    text = ', '.join(f'{count} {name}' for name, count in counts if count or name == 'passed')
     reasons = dict.fromkeys(check.note for check in gate if check.passed is None and check.note)
     why = f' ({"; ".join(reasons)})' if reasons else ''
     return f'Checks: {text}{why}.'

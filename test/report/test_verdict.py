@@ -24,9 +24,9 @@ GATE = (
 
 
 def test_checks_that_were_not_made_did_not_pass() -> None:
-    sentence = 'Checks: failed 1, passed 2, not checked 2 (no calibration was active).'
+    sentence = 'Checks: 1 failed, 2 passed, 2 not checked (no calibration was active).'
     assert verdict.checks_sentence(GATE) == sentence
-    assert verdict.checks_sentence(GATE[:1]) == 'Checks: passed 1.'
+    assert verdict.checks_sentence(GATE[:1]) == 'Checks: 1 passed.'
     assert verdict.checks_sentence(()) == ''
 
 
