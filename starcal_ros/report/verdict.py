@@ -39,6 +39,21 @@ _REMEDIES = {
 }
 """Measures against the causes of a sigma."""
 
+_MEASURES = {
+    'max_residual_rms_px': 'look for smeared images and a wrong lens model (Residuals)',
+    'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals)',
+    'max_misfit_fraction': 'check the attitudes and stamps of the misfit images (Alignment)',
+    'min_images': 'take more images',
+    'min_stars': 'take more images',
+    'min_coverage': 'take images with stars in the empty cells (Coverage)',
+    'max_rotation_deg': 'check the prior alignment (prior_alignment)',
+    'max_step_px': 'find out if the camera has changed',
+    'max_step_rotation_deg': 'find out if the mounting has changed',
+}
+"""Measures for failed checks, with the section of the report; other checks state theirs."""
+
+_SIGMA_LIMITS = {'max_map_sigma_px', 'max_line_of_sight_sigma_arcsec'}
+
 
 _RESULTS = {False: 'failed', True: 'passed', None: 'not checked'}
 
@@ -104,15 +119,24 @@ def _precision(scope: str, sigma: Floats, budget: Sequence[SigmaPart], of: str) 
 
 
 def next_step(calibration: Calibration) -> str:
-    """The measure against a refusal, or against the largest cause of the sigma."""
-    if not calibration.accepted:
-        return (
-            'Do not use it for navigation. Correct the causes of the failed checks and calibrate '
-            'again.'
-        )
+    """The measures against a refusal, or against the largest causes of the sigma."""
+    if calibration.accepted:
+        return ' '.join(_against_sigma(calibration))
+    failed = [check.option for check in calibration.gate if check.passed is False]
+    measures = dict.fromkeys(_MEASURES[option] for option in failed if option in _MEASURES)
+    causes = (
+        f': {"; ".join(measures)}. Then calibrate again.' if measures else ' and calibrate again.'
+    )
+    text = f'Do not use it for navigation. Correct the causes of the failed checks{causes}'
+    steps = _against_sigma(calibration) if _SIGMA_LIMITS & set(failed) else []
+    return ' '.join([text, *steps])
+
+
+def _against_sigma(calibration: Calibration) -> list[str]:
+    """A sentence with the measure against the largest cause of each sigma."""
     causes = parts_that_matter(calibration.sigma_budget)[1:]
     if not causes:
-        return ''
+        return []
     steps = []
     scopes = (('camera', 'map_arcsec'), ('alignment', 'pointing_arcsec'))
     for scope, of in scopes if calibration.has_alignment else scopes[:1]:
@@ -122,7 +146,7 @@ def next_step(calibration: Calibration) -> str:
             steps.append(
                 f'To reduce the sigma of the {scope} (largest cause: {largest.cause}), {remedy}.'
             )
-    return ' '.join(steps)
+    return steps
 
 
 @dataclass(frozen=True)

@@ -62,3 +62,20 @@ def test_the_precision_is_that_of_map_and_budget(tiny_products: Path) -> None:
     assert 'camera (largest cause: stars), take more images' in verdict.next_step(shown)
     refused = dataclasses.replace(shown, accepted=False)
     assert verdict.next_step(refused).startswith('Do not use it for navigation')
+
+
+def test_a_refusal_states_the_measures_against_its_failed_checks(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+
+    def step(*failed: str) -> str:
+        gate = tuple(
+            dataclasses.replace(check, passed=check.passed and check.option not in failed)
+            for check in calibration.gate
+        )
+        return verdict.next_step(dataclasses.replace(calibration, accepted=False, gate=gate))
+
+    options = {check.option for check in calibration.gate}
+    assert options >= {*verdict._MEASURES, *verdict._SIGMA_LIMITS}
+    assert 'failed checks: take more images. Then' in step('min_images', 'min_stars')
+    assert 'To reduce the sigma' in step('max_map_sigma_px')
+    assert step('max_change_px').endswith('failed checks and calibrate again.')
