@@ -275,7 +275,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         found.image_variation_px,
         'px',
         'focal length or lens changes between images: estimate with temperature, or calibrate'
-        ' each state by itself',
+        ' each state separately',
     )
     yield from _predicted(found.predictions, options)
 

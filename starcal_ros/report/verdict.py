@@ -28,7 +28,7 @@ _REMEDIES = {
     'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
     'field': 'take more images with stars at other places on the detector',
     'fine structure': 'take more images with stars at other places on the detector',
-    'change from image to image': 'estimate with temperature, or calibrate each state by itself',
+    'change from image to image': 'estimate with temperature, or calibrate each state separately',
     'star places': 'take more images of other star fields',
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
     'temperature': 'take images over a wider range of temperatures',
@@ -171,7 +171,8 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
     return [
         ModelRow(
             'The lens model describes the lens',
-            f'{field}; camera_info, without field and skew, is off by at most {_px(cost_px)}',
+            f'{field}; camera_info, without field and skew, differs from the calibration by at '
+            f'most {_px(cost_px)}',
             '',
             'choose another lens_model; for lines of sight with the field use starcal lookup',
         ),
@@ -186,7 +187,7 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
             'The camera is the same in all images',
             f'varies by {_px(found.image_variation_px)} in a corner',
             '',
-            'estimate with temperature, or calibrate each state by itself',
+            'estimate with temperature, or calibrate each state separately',
         ),
     ]
 

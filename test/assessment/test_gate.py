@@ -223,7 +223,7 @@ def test_a_good_calibration_passes() -> None:
             (
                 'change of the camera from image to image in a corner is 0.25 px, over the limit '
                 'of 0.2 px (max_image_variation_px); focal length or lens changes between images: '
-                'estimate with temperature, or calibrate each state by itself'
+                'estimate with temperature, or calibrate each state separately'
             ),
         ),
         (

@@ -347,7 +347,7 @@ def _no_reading(case: Case) -> Diagnosis:
         None,
         'The stars of the images are identified, but the attitudes do not go with them.',
         (tried,),
-        ('# check that the attitudes are those of this spacecraft, star tracker and time',),
+        ('# check that the attitudes belong to this spacecraft, star tracker and time',),
     )
 
 
