@@ -16,8 +16,6 @@ import shutil
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
-from pygments.lexers.special import TextLexer
-
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
@@ -115,4 +113,3 @@ def setup(app: Sphinx) -> None:
     """Sphinx calls this."""
     app.connect('builder-inited', write_copies, priority=100)  # before autosummary looks for files
     app.connect('source-read', lead_links)
-    app.add_lexer('mermaid', TextLexer)  # a diagram is shown as its text, which is to be read

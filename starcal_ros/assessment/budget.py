@@ -32,6 +32,7 @@ from starcal_ros.estimation.calibration_options import CalibrationOptions, track
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.posterior import common_shape, ErrorParts
 from starcal_ros.estimation.shared_covariance import TRACKER_NOISE, TRACKER_SLOW
+from starcal_ros.number_text import significant
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart, TOTAL
 
 _KNOWN_SHAPE_PX = 1e-7  # moves no pixel by a measurable amount
@@ -204,11 +205,11 @@ def _unknowns(
         sigma = float(layout[name].sigma[0])
         return {
             'velocity': _of_velocity(sigma, options),
-            'refraction': f'site not given: {sigma:.3g} arcsec at 45 degrees assumed',
+            'refraction': f'site not given: {significant(sigma, 3)} arcsec at 45 degrees assumed',
             'readout': _of_readout(layout[name].labels[0], sigma, options),
-            'stamps': f'{1e3 * sigma:.3g} ms assumed',
+            'stamps': f'{significant(1e3 * sigma, 3)} ms assumed',
             'field': _estimated(_field_px(estimate), field.likelihood_ratio),
-            'mountings': f'{sigma / ARCSECOND_RAD:.3g}″ per angle assumed',
+            'mountings': f'{significant(sigma / ARCSECOND_RAD, 3)}″ per angle assumed',
         }.get(name, 'estimated, no prior')
 
     causes = []
@@ -252,7 +253,7 @@ def _shared(
 
 def _estimated(rms_px: float, likelihood_ratio: float) -> str:
     ratio = max(likelihood_ratio, 0.0)
-    return f'estimated: {rms_px:.2g} px rms per axis, 2 log L {ratio:.1f}'
+    return f'estimated: {significant(rms_px, 2)} px rms per axis, 2 log L {ratio:.1f}'
 
 
 def _field_px(estimate: Estimate) -> float:
@@ -264,11 +265,16 @@ def _field_px(estimate: Estimate) -> float:
 
 def _of_stars(estimate: Estimate) -> str:
     variance = estimate.covariance_px2[estimate.kept][:, [0, 2]].mean()
-    return f'estimated: {math.sqrt(variance):.2g} px rms of {int(estimate.kept.sum())} centroids'
+    rms_px = significant(math.sqrt(variance), 2)
+    return f'estimated: {rms_px} px rms of {int(estimate.kept.sum())} centroids'
 
 
 def _of_velocity(sigma_m_s: float, options: CalibrationOptions) -> str:
-    size = f'{sigma_m_s / 1e3:.3g} km/s' if sigma_m_s >= 1e3 else f'{sigma_m_s:.3g} m/s'
+    size = (
+        f'{significant(sigma_m_s / 1e3, 3)} km/s'
+        if sigma_m_s >= 1e3
+        else f'{significant(sigma_m_s, 3)} m/s'
+    )
     if options.velocity_sigma_m_s >= 0:
         return f'{size} per axis stated'
     return f'not given: {size} per axis assumed'
@@ -276,13 +282,16 @@ def _of_velocity(sigma_m_s: float, options: CalibrationOptions) -> str:
 
 def _of_readout(label: str, sigma: float, options: CalibrationOptions) -> str:
     if label.endswith('_rad'):  # of a rate that is not known
-        return f'rate not known: {sigma / ARCSECOND_RAD:.3g}″ per axis within an image assumed'
-    size = f'{1e3 * sigma:.3g} ms'
+        angle_arcsec = significant(sigma / ARCSECOND_RAD, 3)
+        return f'rate not known: {angle_arcsec}″ per axis within an image assumed'
+    size = f'{significant(1e3 * sigma, 3)} ms'
     return f'shutter unknown: {size} assumed' if options.shutter == 'unknown' else f'{size} stated'
 
 
 def _of_noise(estimate: Estimate, options: CalibrationOptions) -> str:
-    noise = ', '.join(f'{s / ARCSECOND_RAD:.3g}' for s in estimate.star_tracker_sigma_rad)
+    noise = ', '.join(
+        f'{significant(s / ARCSECOND_RAD, 3)}' for s in estimate.star_tracker_sigma_rad
+    )
     given = 'stated sigmas, ' if tracker_sigma_is_given(options) else ''
     return f'{given}estimated: {noise}″ about x, y, z'
 
@@ -291,17 +300,19 @@ def _of_slow(estimate: Estimate, options: CalibrationOptions) -> str:
     if not estimate.tracker_errors:
         return ''
     stated = options.star_tracker_slow_arcsec
-    assumed = f'{stated:.3g}″ stated' if stated else 'not given: as the noise assumed'
+    assumed = f'{significant(stated, 3)}″ stated' if stated else 'not given: as the noise assumed'
     noise = float(np.mean([one.noise for one in estimate.tracker_errors]))
     slow = float(np.mean([one.slow for one in estimate.tracker_errors]))
     unit = float(estimate.star_tracker_sigma_rad.mean()) / max(noise, 1e-12) / ARCSECOND_RAD
     ratio = max(one.likelihood_ratio for one in estimate.tracker_errors)
-    return f'{assumed}; estimated: {slow * unit:.3g}″, 2 log L {max(ratio, 0.0):.1f}'
+    return f'{assumed}; estimated: {significant(slow * unit, 3)}″, 2 log L {max(ratio, 0.0):.1f}'
 
 
 def _of_held(estimate: Estimate) -> str:
     """Return the parameters that are held and have a sigma; empty if there are none."""
     problem = estimate.linear.problem
     held = np.setdiff1d(np.flatnonzero(np.isfinite(problem.prior_sigma)), problem.free)
-    names = [f'{problem.parameter_names[k]} {problem.prior_sigma[k]:.3g}' for k in held]
+    names = [
+        f'{problem.parameter_names[k]} {significant(problem.prior_sigma[k], 3)}' for k in held
+    ]
     return f'1-sigma of the prior: {", ".join(names)}' if names else ''

@@ -13,6 +13,7 @@ from starcal_ros.assessment.agreement import movement
 from starcal_ros.assessment.gate_options import GateOptions, limit_check
 from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.estimation.calibration_options import CalibrationOptions
+from starcal_ros.number_text import p_value_text, significant
 from starcal_ros.records import (
     Calibration,
     CameraGeometry,
@@ -248,7 +249,8 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
             term.significance,
             'sigma',
         )
-        note = f'the stars put {term.name} at {term.asked:.6g}, assumed is {term.assumed:.6g}'
+        asked, assumed = significant(term.asked, 6), significant(term.assumed, 6)
+        note = f'the stars put {term.name} at {asked}, assumed is {assumed}'
         if not check.passed:
             note += '; ' + _REMEDIES.get(
                 term.name.replace(' ', '_').partition('_')[0],
@@ -273,7 +275,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
         found.image_variation_px,
         'px',
         'focal length or lens changes between images: estimate with temperature, or calibrate'
-        ' each state by itself',
+        ' each state separately',
     )
     yield from _predicted(found.predictions, options)
 
@@ -324,7 +326,7 @@ def _significant(
     """A check that fails if the value exceeds its limit and is significant."""
     check = limit_check(options, option, name, found, unit)
     likely = not p_value < least_p_value
-    note = f'the p-value is {p_value:.1g}'
+    note = f'p-value {p_value_text(p_value)}'
     if not check.passed and not likely:
         note += f'; {remedy}'
     return dataclasses.replace(check, passed=bool(check.passed) or likely, note=note)

@@ -197,7 +197,10 @@ def _init(command: argparse.ArgumentParser) -> None:
 
 
 def _lens(command: argparse.ArgumentParser) -> None:
-    what = 'focal length of the lens, mm, with --pixel-size-um (default: EXIF, FITS, else found)'
+    what = (
+        'focal length of the lens, mm, with --pixel-size-um (default: from EXIF or FITS, else '
+        'estimated)'
+    )
     command.add_argument('--focal-length-mm', type=float, default=0.0, metavar='MM', help=what)
     what = 'size of a pixel of the images, micrometres'
     command.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
@@ -354,7 +357,7 @@ def _simulate(command: argparse.ArgumentParser) -> None:
         'seed of the camera and its mounting: the same camera with other noise (default: --seed)'
     )
     command.add_argument('--camera-seed', type=_number(int, 0), metavar='N', help=what)
-    what = 'number of images (default: that of the scenario)'
+    what = 'number of images (default: from the scenario)'
     command.add_argument('--images', type=_number(int, 1), metavar='N', help=what)
     what = 'draw only the N brightest stars of each image'
     command.add_argument('--stars-per-image', type=_number(int, 1), metavar='N', help=what)
@@ -367,7 +370,7 @@ def _mistakes(command: argparse.ArgumentParser) -> None:
     mistakes.add_argument(
         '--flip', nargs='?', const='left-right', choices=('left-right', 'top-bottom'), help=what
     )
-    what = 'turn the images counterclockwise by so many degrees'
+    what = 'angle of a counterclockwise rotation of the images, degrees'
     mistakes.add_argument('--rotate', type=int, choices=(0, 90, 180, 270), default=0, help=what)
     what = 'direction of the attitudes in the bag; the parameter file has st_to_inertial'
     directions = ('st_to_inertial', 'inertial_to_st')
@@ -381,11 +384,11 @@ def _mistakes(command: argparse.ArgumentParser) -> None:
     for name, low, high, metavar, what in (
         ('alignment-error', -180, 180, 'DEG', 'error of the prior alignment, degrees'),
         ('focal-error', -90, 400, 'PERCENT', 'error of the prior focal length, percent'),
-        ('clock-error', -1e9, 1e9, 'S', 'stamps of the images late by so many seconds, over 0.75'),
+        ('clock-error', -1e9, 1e9, 'S', 'delay of the image stamps, s, over 0.75'),
     ):
         kind = _number(float, low, high)
         mistakes.add_argument(f'--{name}', type=kind, default=0.0, metavar=metavar, help=what)
-    what = 'length of the streak that a star becomes, px'
+    what = 'length of the streak of a star, px'
     mistakes.add_argument('--smear', type=_number(int, 1, 200), default=1, metavar='PX', help=what)
     what = 'tone curve: pixel values grow with light to the power 1/G'
     gamma = _number(float, 0.2, 5)
@@ -432,7 +435,7 @@ def _export(command: argparse.ArgumentParser) -> None:
     spice = command.add_argument_group('SPICE')
     what = 'NAIF ID of the spacecraft, negative'
     spice.add_argument('--spacecraft-id', type=int, metavar='ID', help=what)
-    what = 'NAIF ID of the camera (default: 1000 times that of the spacecraft, minus 1)'
+    what = 'NAIF ID of the camera (default: 1000 times the spacecraft ID, minus 1)'
     spice.add_argument('--instrument-id', type=int, default=0, metavar='ID', help=what)
     what = (
         'frame ID of the star tracker; the kernel then defines its frame as a CK frame (default: '
@@ -440,14 +443,14 @@ def _export(command: argparse.ArgumentParser) -> None:
     )
     spice.add_argument('--star-tracker-id', type=int, default=0, metavar='ID', help=what)
     for name in ('camera', 'star-tracker'):
-        what = f'name of the {name.replace("-", " ")} frame (default: that of the calibration)'
+        what = f'name of the {name.replace("-", " ")} frame (default: from the calibration)'
         spice.add_argument(f'--{name}-frame', default='', metavar='NAME', help=what)
     what = 'pixel size, micrometres, for a focal length in mm (default: pixels only)'
     spice.add_argument('--pixel-size-um', type=float, default=0.0, metavar='UM', help=what)
     what = 'LSK and SCLK of the spacecraft, for ck'
     spice.add_argument('--kernels', nargs='+', type=Path, default=(), metavar='FILE', help=what)
     command.add_argument('--image-topic', default='', metavar='T', help='image topic, for kalibr')
-    what = 'binary table alone, for C code that is compiled already'
+    what = 'only the binary table, for compiled C code'
     command.add_argument('--table', action='store_true', help=what)
 
 
@@ -456,7 +459,7 @@ def _import(command: argparse.ArgumentParser) -> None:
     command.add_argument('--images', nargs='+', required=True, metavar='FILE', help=what)
     what = (
         'AEM, CSV, SPICE kernels (CK, SCLK, LSK and, for a frame by name, FK), or FITS with the'
-        ' WCS of each image: the images themselves, or files of their names'
+        ' WCS of each image: the images, or files with the same names'
     )
     command.add_argument('--attitude', nargs='+', required=True, metavar='FILE', help=what)
     what = 'OEM, CSV, or SPICE kernels (SPK with the Earth or the Sun, LSK); default: the Earth'
@@ -483,13 +486,13 @@ def _import(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         '--bayer', default='', choices=('rggb', 'bggr', 'gbrg', 'grbg'), help=what
     )
-    what = 'range of pixel values that is mapped to 16 bit (default: that of all images)'
+    what = 'range of pixel values that is mapped to 16 bit (default: the range of all images)'
     command.add_argument('--value-range', nargs=2, type=float, metavar=('LOW', 'HIGH'), help=what)
     what = 'prior camera, ROS YAML or .cameramodel of mrcal; params.yaml is written then'
     command.add_argument('--camera', type=Path, metavar='FILE', help=what)
     what = (
-        'prior orientation x y z w of the camera in the star tracker frame, then in that of each'
-        ' further one (default: found from the first images)'
+        'prior orientation x y z w of the camera in the star tracker frame, then in the frame of'
+        ' each further star tracker (default: found from the first images)'
     )
     command.add_argument(
         '--alignment',

@@ -23,6 +23,7 @@ from starcal_ros.cli import arguments, terminal
 from starcal_ros.cli.commands import mission
 from starcal_ros.errors import missing_package, OptionError, StarcalError
 from starcal_ros.formats.products.product_files import make_folder
+from starcal_ros.number_text import significant
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
 # --help answers at once.
@@ -366,7 +367,8 @@ def _demo(args: argparse.Namespace) -> int:
         same,
         'starcal calibrate gives the same calibration from the bag'
         if same
-        else f'starcal calibrate gives another calibration from the bag: {apart_px:.2g} px apart',
+        else 'starcal calibrate gives another calibration from the bag: they differ by '
+        f'{significant(apart_px, 2)} px',
     )
     with Drawings().kind('report'):
         terminal.print_text(f'open {page.write_report(args.output)}')

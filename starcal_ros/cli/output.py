@@ -13,6 +13,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.cli.terminal import print_table, print_text, print_verdict
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
+from starcal_ros.number_text import p_value_text, significant, to_sigma
 
 if TYPE_CHECKING:
     from starcal_ros.assessment.comparison import Comparison, DifferenceMap
@@ -36,10 +37,10 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry) -> None:
         rows.append(
             (
                 name,
-                f'{value:.8g}',
+                to_sigma(value, sigma[k]),
                 'px' if name in INTRINSIC_NAMES else '',
-                f'{sigma[k]:.2g}' if free else 'held',
-                f'{change:+.4g}' if np.isfinite(change) else '',
+                significant(sigma[k], 2) if free else 'held',
+                to_sigma(change, sigma[k], '+') if np.isfinite(change) else '',
                 _sigmas(change, sigma[k]) if free and np.isfinite(change) else '',
             )
         )
@@ -84,7 +85,14 @@ def _print_budget(calibration: Calibration) -> None:
     parts = parts_that_matter(calibration.sigma_budget)
     columns = 4 if calibration.has_alignment else 3
     rows = [
-        (part.cause, part.assumption, f'{part.map_arcsec:.3g}"', f'{part.pointing_arcsec:.3g}"')
+        (
+            part.cause,
+            part.assumption,
+            *(
+                f'{significant(one, 3, least=0.001)}"'
+                for one in (part.map_arcsec, part.pointing_arcsec)
+            ),
+        )
         for part in parts
     ]
     if rows:
@@ -101,8 +109,8 @@ def print_inspection(inspection: Inspection) -> None:
                 topic.name,
                 topic.type_name.replace('/msg/', '/'),
                 str(topic.count),
-                f'{topic.rate_hz:.3g} Hz' if topic.rate_hz else '',
-                f'{topic.longest_gap_s:.3g} s' if topic.count > 1 else '',
+                f'{significant(topic.rate_hz, 3)} Hz' if topic.rate_hz else '',
+                f'{significant(topic.longest_gap_s, 3)} s' if topic.count > 1 else '',
             )
             for topic in inspection.topics
         ],
@@ -145,9 +153,8 @@ def _print_images(inspection: Inspection) -> None:
         + (f', with the attitudes of {attitudes}' if attitudes else '')
     )
     if math.isfinite(inspection.longest_attitude_gap_s):
-        print_text(
-            f'longest attitude gap around an image: {inspection.longest_attitude_gap_s:.3g} s'
-        )
+        gap_s = significant(inspection.longest_attitude_gap_s, 3)
+        print_text(f'longest attitude gap around an image: {gap_s} s')
     if inspection.refused:
         print_table(
             ('refused', 'images', 'meaning', 'first'),
@@ -173,10 +180,10 @@ def print_comparison(comparison: Comparison) -> None:
     rows = [
         (
             name,
-            f'{of_a[name]:.8g}' if name in of_a else '',
-            f'{b.parameters[k]:.8g}',
-            f'{difference[k]:+.4g}',
-            f'{sigma[k]:.2g}' if sigma[k] else 'held',
+            to_sigma(of_a[name], sigma[k]) if name in of_a else '',
+            to_sigma(b.parameters[k], sigma[k]),
+            to_sigma(difference[k], sigma[k], '+'),
+            significant(sigma[k], 2) if sigma[k] else 'held',
             _sigmas(difference[k], sigma[k]),
         )
         for k, name in enumerate(b.parameter_names)
@@ -199,7 +206,7 @@ def print_comparison(comparison: Comparison) -> None:
     if total.degrees_of_freedom:
         print_text(
             f'all parameters  chi2 {total.value:.1f}, {total.degrees_of_freedom} degrees of '
-            f'freedom, p-value {total.p_value:.3g}'
+            f'freedom, p-value {p_value_text(total.p_value)}'
         )
     for note in comparison.notes:
         print_text(f'note: {note}')
@@ -226,7 +233,9 @@ def _counted(counts: Mapping[str, int]) -> str:
 def _predicted(name: str, sigma: float) -> str:
     if not np.isfinite(sigma):
         return 'not observable yet'
-    return f'{sigma / ARCSECOND_RAD:.2f}"' if name.startswith('alignment') else f'{sigma:.2g}'
+    return (
+        f'{sigma / ARCSECOND_RAD:.2f}"' if name.startswith('alignment') else significant(sigma, 2)
+    )
 
 
 def _topic_notes(topic: TopicContent) -> list[str]:

@@ -20,6 +20,7 @@ from scipy.special import stdtr
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.problem import Problem, State
+from starcal_ros.number_text import p_value_text
 from starcal_ros.records import Ensemble, StarTrackerAlignment
 
 _FEWEST_IMAGES = 4  # for a mean, a slope and a scatter about them
@@ -153,7 +154,9 @@ def summary(one: StarTrackerAlignment) -> str:
     if mounted.any():
         text += f', mounting within {_three(mounted)}'
     if np.isfinite(one.drift_p_value):
-        text += f'; drift {one.drift_arcsec:.1f} arcsec (p-value {one.drift_p_value:.1g})'
+        text += (
+            f'; drift {one.drift_arcsec:.1f} arcsec (p-value {p_value_text(one.drift_p_value)})'
+        )
     return text
 
 

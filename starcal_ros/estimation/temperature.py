@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
+from starcal_ros.number_text import significant, to_sigma
 from starcal_ros.records import Calibration, CameraGeometry, TemperatureTerms
 
 FEWEST_SPREAD_K = 1.0  # of the temperatures; sensor errors and lag hide a smaller one
@@ -103,7 +104,8 @@ def why_unsupported(temperatures_degc: Floats, order: int) -> str:
 def summary(thermal: TemperatureTerms) -> str:
     """One line of text with the terms, their sigmas and the reference."""
     parts = [
-        f'a{k} {value:+.4g} ({sigma:.2g}) /degC' + (f'^{k}' if k > 1 else '')
+        f'a{k} {to_sigma(value, sigma, "+")} ({significant(sigma, 2)}) /degC'
+        + (f'^{k}' if k > 1 else '')
         for k, (value, sigma) in enumerate(
             zip(thermal.focal_per_degc, thermal.focal_per_degc_sigma, strict=True), start=1
         )
@@ -111,7 +113,10 @@ def summary(thermal: TemperatureTerms) -> str:
     if thermal.alignment_rate_rad_per_degc:
         rates = np.degrees(thermal.alignment_rate_rad_per_degc) * 3600.0
         sigmas = np.degrees(thermal.alignment_rate_rad_per_degc_sigma) * 3600.0
-        axes = (f'{rate:+.3f} ({sigma:.2g})' for rate, sigma in zip(rates, sigmas, strict=True))
+        axes = (
+            f'{rate:+.3f} ({significant(sigma, 2)})'
+            for rate, sigma in zip(rates, sigmas, strict=True)
+        )
         parts.append('alignment ' + ', '.join(axes) + ' arcsec/degC')
     text = f'{"; ".join(parts) or "no terms"}; reference {thermal.reference_degc:g} degC'
     return text + (f'; {thermal.note}' if thermal.note else '')

@@ -22,6 +22,7 @@ from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.identification.prediction import predict, within_image
+from starcal_ros.number_text import significant
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
 from starcal_ros.records import Ensemble, refused_image, StarObservations
@@ -127,7 +128,8 @@ class Plan:
         """Return the sigma now and at the end."""
         last = self.steps[-1].sigma if self.steps else self.sigma
         count = f'{len(self.steps)} image{"s" * (len(self.steps) != 1)}'
-        return f'{self.name} {self.sigma:.4g} now, {last:.4g} expected after {count}'
+        now, then = significant(self.sigma, 4), significant(last, 4)
+        return f'{self.name} {now} now, {then} expected after {count}'
 
 
 @one_blas_thread()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, check_plausible
+from starcal_ros.number_text import significant
 from starcal_ros.record_fields import Count, Finite, Named, Quaternion, Shape, Stamp
 from starcal_ros.records.calibration_parts import ModelChecks, SigmaPart, StarTrackerAlignment
 from starcal_ros.records.residual_field import MapCovariance, ResidualField
@@ -182,17 +183,23 @@ class GateCheck:
     @property
     def found_text(self) -> str:
         """The value found with its unit; empty where there is none."""
-        return self._text(self.found) if self.option and self.passed is not None else ''
+        if not self.option or self.passed is None:
+            return ''
+        # Thousandths of a small limit; digits behind them decide nothing.
+        decimals = 4 if not 0 < self.limit < 0.1 else 3 - math.floor(math.log10(self.limit))
+        return self._text(self.found, decimals)
 
     @property
     def limit_text(self) -> str:
         """The limit with its unit; empty where there is none."""
         return self._text(self.limit) if self.option else ''
 
-    def _text(self, value: float) -> str:
+    def _text(self, value: float, decimals: int = 15) -> str:
         if not math.isfinite(value):
             return 'not a finite number'
-        number = f'{value:.0f}' if 1e4 <= abs(value) < 1e15 else f'{value:.4g}'
+        least = 10.0**-decimals
+        rounded = round(value, decimals) if abs(value) >= least else value
+        number = significant(rounded, 4, least=least)
         return f'{number} {self.unit}' if self.unit else number
 
 

@@ -36,7 +36,7 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'frozen_attitude': 'the star tracker repeats an earlier attitude, but the stars have moved',
     'no_attitude': 'no attitude sample on both sides of the image',
     'attitude_gap': 'the attitude samples before and after the image are too far apart',
-    'out_of_order': 'the stamp of the image is not later than that of the last image',
+    'out_of_order': 'the stamp is not later than the stamp of the last image',
     'duplicate': 'the ensemble has an image with the same stamp (reported by the calibrator)',
     'overexposed': 'too large a fraction of the image is saturated',
     'blank': 'every pixel has the same value',

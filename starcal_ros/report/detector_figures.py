@@ -22,6 +22,7 @@ from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.number_text import significant
 from starcal_ros.records import (
     BUDGET_COLUMNS,
     BUDGET_ROWS,
@@ -231,8 +232,8 @@ def line_of_sight_sigma(maps: DetectorMaps, camera: CameraModel, is_alone: bool)
     return Chart(
         f'Line of sight, {title}',
         detector_map(sigma, camera, '″'),
-        f'1-sigma of the line of sight of each pixel, {text}: {sigma.min():.4g}″ to '
-        f'{sigma.max():.4g}″. The colours start at zero.',
+        f'1-sigma of the line of sight of each pixel, {text}: {significant(sigma.min(), 4)}″ to '
+        f'{significant(sigma.max(), 4)}″. The colours start at zero.',
     )
 
 
@@ -258,7 +259,9 @@ def budget_over_detector(parts: Sequence[SigmaPart], camera: CameraModel) -> Cha
         panels.append(panel)
     last = panels[min(len(panels), across) - 1]
     height = panels[-1].y.end + 8.0
-    sizes = ', '.join(f'{max(part.map_over_detector_arcsec):.2g}″ {part.cause}' for part in shown)
+    sizes = ', '.join(
+        f'{significant(max(part.map_over_detector_arcsec), 2)}″ {part.cause}' for part in shown
+    )
     return Chart(
         'Causes over the detector',
         panels[0].drawing(height, *panels[1:], _bar(last, top, '″')),
@@ -448,8 +451,10 @@ def write_comparison(found: Comparison, path: Path) -> None:
 def _difference(camera: CameraModel, found: DifferenceMap, title: str) -> Drawing:
     """Length in pixels as colours from zero, direction as arrows with a scale."""
     known = found.sigmas[np.isfinite(found.sigmas)]
-    in_sigmas = f', {known.max():.2g} sigma' if known.size else ''
+    in_sigmas = f', {significant(known.max(), 2)} sigma' if known.size else ''
     drawn = detector_map(
         found.length_px[::2, ::2], camera, ' px', shift_px=found.difference_px[::2, ::2]
     )
-    return sheet([[drawn]], f'{title}: at most {found.length_px.max():.3g} px{in_sigmas}')
+    return sheet(
+        [[drawn]], f'{title}: at most {significant(found.length_px.max(), 3)} px{in_sigmas}'
+    )

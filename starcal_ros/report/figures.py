@@ -14,6 +14,7 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.star_equations import whitening
+from starcal_ros.number_text import significant
 from starcal_ros.records import CameraGeometry, SigmaPart, StarObservations, TermRemoval
 from starcal_ros.report.pictures.annotation import predicted_px
 from starcal_ros.report.plots import plot
@@ -98,7 +99,7 @@ def before_and_after(
                                  ('calibrated', after_px, SERIES[0])):  # fmt: skip
         at = np.linspace(0, len(values) - 1, min(len(values), 200)).astype(int)
         share = 100.0 * (at + 1) / len(values)
-        name = f'{name}: median {np.median(values):.3g} px'
+        name = f'{name}: median {significant(float(np.median(values)), 3)} px'
         curves.append(Curve(np.maximum(values[at], low), share, colour, name, width=1.8))
     return Chart(
         'Residuals before and after',

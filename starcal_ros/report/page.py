@@ -31,6 +31,7 @@ from starcal_ros.formats.products.product_files import (
     REPORT_FILE,
     write_atomically,
 )
+from starcal_ros.number_text import significant
 from starcal_ros.pipeline.provenance import inputs_of
 from starcal_ros.records import Calibration, IMAGE_REFUSALS, parts_that_matter, StarObservations
 from starcal_ros.report import detector_figures, figures, image_sections, result_rows, verdict
@@ -251,6 +252,7 @@ def page_template(name: str) -> jinja2.Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters['significant'] = significant
     return environment.get_template(name)
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-import math
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from starcal_ros.assessment.agreement import alignment_difference_rad
 from starcal_ros.assessment.observability import movement_px
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.number_text import significant, to_sigma
 from starcal_ros.records import Calibration, CameraGeometry, TOTAL
 
 
@@ -55,31 +55,23 @@ def tiles(calibration: Calibration) -> list[tuple[str, str, str]]:
     if maps is not None:
         total = next((part for part in calibration.sigma_budget if part.cause == TOTAL), None)
         scopes = (
-            ('Line of sight', maps.line_of_sight_sigma_arcsec, total and total.pointing_arcsec,
-             'in the star tracker frame'),
-            ('Camera alone', maps.shape_sigma_arcsec, total and total.map_arcsec,
+            ('Line of sight', maps.line_of_sight_sigma_arcsec,
+             total.pointing_arcsec if total else None, 'in the star tracker frame'),
+            ('Camera alone', maps.shape_sigma_arcsec, total.map_arcsec if total else None,
              'common rotation removed'),
         )  # fmt: skip
         for name, sigma, rms, text in scopes if calibration.has_alignment else scopes[1:]:
-            worst = f'at most {sigma.max():.3g}″'
+            worst = f'at most {significant(sigma.max(), 3)}″'
             if rms is None:
                 results.append((name, worst, f'1-sigma, {text}'))
             else:
                 note = f'1-sigma, rms over the detector, {text}; {worst}'
-                results.append((name, f'{rms:.2g}″', note))
+                results.append((name, f'{significant(rms, 2)}″', note))
     return results
 
 
-def _number(value: float, form: str) -> str:
-    return format(value, form).replace('-', '\N{MINUS SIGN}')
-
-
-def _significant(value: float, sigma: float) -> str:
-    """Format a value with two significant digits of its sigma."""
-    if not (math.isfinite(sigma) and sigma > 0 and math.isfinite(value)):
-        return f'{value:.8g}'
-    decimals = max(0, 1 - math.floor(math.log10(sigma)))
-    return _number(value, f'.{min(decimals, 12)}f')
+def _minus(number: str) -> str:
+    return number.replace('-', '\N{MINUS SIGN}')
 
 
 def parameter_rows(calibration: Calibration, prior: CameraGeometry | None) -> list[Row]:
@@ -97,11 +89,11 @@ def parameter_rows(calibration: Calibration, prior: CameraGeometry | None) -> li
             Row(
                 name=name,
                 unit='px' if name in INTRINSIC_NAMES else '',
-                value=_significant(camera.parameters[k], sigma[k]),
-                sigma=held + (f'{sigma[k]:.2g}' if known else ''),
-                prior=_number(prior.camera.parameters[k], '.8g') if prior else '',
-                change=_number(changes[k], '+.3g') if changed else '',
-                change_sigmas=_number(changes[k] / sigma[k], '+.1f') if changed and known else '',
+                value=_minus(to_sigma(camera.parameters[k], sigma[k])),
+                sigma=held + (significant(sigma[k], 2) if known else ''),
+                prior=_minus(significant(prior.camera.parameters[k], 8)) if prior else '',
+                change=_minus(to_sigma(changes[k], sigma[k], '+')) if changed else '',
+                change_sigmas=_minus(f'{changes[k] / sigma[k]:+.1f}') if changed and known else '',
                 moves_px=f'{moves[k]:.3f}' if changed else '',
                 sigma_px=f'{sigma_moves[k]:.3f}' if known else '',
             )
@@ -122,8 +114,10 @@ def alignment_rows(calibration: Calibration, prior: CameraGeometry | None) -> li
             name=axis,
             unit='arcsec',
             sigma=f'{sigma[k]:.2f}',
-            change=_number(changes[k], '+.2f') if prior else '',
-            change_sigmas=_number(changes[k] / sigma[k], '+.1f') if prior and sigma[k] > 0 else '',
+            change=_minus(f'{changes[k]:+.2f}') if prior else '',
+            change_sigmas=_minus(f'{changes[k] / sigma[k]:+.1f}')
+            if prior and sigma[k] > 0
+            else '',
         )
         for k, axis in enumerate('xyz')
     ]

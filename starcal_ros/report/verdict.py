@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from starcal_ros.arrays import Floats
+from starcal_ros.number_text import p_value_text, significant
 from starcal_ros.records import Calibration, GateCheck, HeldTerm, parts_that_matter, SigmaPart
 
 INFORMATIVE_SIGMAS = 2.0
@@ -21,22 +22,37 @@ VISIBLE_PX = 0.001
 _MOST_OF_DETECTOR = 0.98
 _NAMED_CAUSES, _NAMED_SHARE = 3, 0.2  # most causes in a sentence; least part of the sigma
 _REMEDIES = {
-    'stars': 'more images',
+    'stars': 'take more images',
     'velocity': 'record the velocity of the spacecraft (velocity_topic, velocity_sigma_m_s)',
     'read-out': 'state the shutter and its read-out time (shutter, readout_s)',
     'stamps': 'state the uncertainty of the time stamps (stamp_sigma_s)',
-    'field': 'more images with the stars at other places of the detector',
-    'fine structure': 'more images with the stars at other places of the detector',
-    'change from image to image': 'estimate with temperature, or calibrate each state by itself',
-    'star places': 'more images of other star fields',
+    'field': 'take more images with stars at other places on the detector',
+    'fine structure': 'take more images with stars at other places on the detector',
+    'change from image to image': 'estimate with temperature, or calibrate each state separately',
+    'star places': 'take more images of other star fields',
     'mountings': 'state the 1-sigma of the mountings (star_tracker_mounting_sigma_arcsec)',
-    'temperature': 'images over a wider range of temperatures',
-    'star tracker noise': 'more images',
-    'star tracker slow error': 'images in more attitudes of the star tracker, or state the size '
-    'of that error (star_tracker_slow_arcsec)',
+    'temperature': 'take images over a wider range of temperatures',
+    'star tracker noise': 'take more images',
+    'star tracker slow error': 'take images in more attitudes of the star tracker, or state the '
+    'size of this error (star_tracker_slow_arcsec)',
     'held parameters': 'estimate the held parameters (estimate)',
 }
 """Measures against the causes of a sigma."""
+
+_MEASURES = {
+    'max_residual_rms_px': 'look for smeared images and a wrong lens model (Residuals)',
+    'max_rejected_fraction': 'look for smeared or misidentified stars (Residuals)',
+    'max_misfit_fraction': 'check the attitudes and stamps of the misfit images (Alignment)',
+    'min_images': 'take more images',
+    'min_stars': 'take more images',
+    'min_coverage': 'take images with stars in the empty cells (Coverage)',
+    'max_rotation_deg': 'check the prior alignment (prior_alignment)',
+    'max_step_px': 'find out if the camera has changed',
+    'max_step_rotation_deg': 'find out if the mounting has changed',
+}
+"""Measures for failed checks, with the section of the report; other checks state theirs."""
+
+_SIGMA_LIMITS = {'max_map_sigma_px', 'max_line_of_sight_sigma_arcsec'}
 
 
 _RESULTS = {False: 'failed', True: 'passed', None: 'not checked'}
@@ -63,7 +79,7 @@ def checks_sentence(gate: Sequence[GateCheck]) -> str:
     if not gate:
         return ''
     counts = [(name, sum(check.passed is key for check in gate)) for key, name in _RESULTS.items()]
-    text = ', '.join(f'{name} {count}' for name, count in counts if count or name == 'passed')
+    text = ', '.join(f'{count} {name}' for name, count in counts if count or name == 'passed')
     reasons = dict.fromkeys(check.note for check in gate if check.passed is None and check.note)
     why = f' ({"; ".join(reasons)})' if reasons else ''
     return f'Checks: {text}{why}.'
@@ -76,7 +92,7 @@ def precision_sentences(calibration: Calibration) -> list[str]:
         return []
     sentences = [_precision('Camera alone', maps.shape_sigma_arcsec, budget, 'map_arcsec')]
     if calibration.has_alignment:
-        frame, sigma = f'In {calibration.parent_frame}', maps.line_of_sight_sigma_arcsec
+        frame, sigma = f'In the frame {calibration.parent_frame}', maps.line_of_sight_sigma_arcsec
         sentences.append(_precision(frame, sigma, budget, 'pointing_arcsec'))
     return sentences
 
@@ -86,28 +102,41 @@ def _precision(scope: str, sigma: Floats, budget: Sequence[SigmaPart], of: str) 
     if not len(finite):
         return f'{scope}: the lines of sight have no sigma.'
     most = float(np.quantile(finite, _MOST_OF_DETECTOR, method='inverted_cdf'))
-    text = (
-        f'{scope}: lines of sight are known to {most:.2g}″ (1-sigma) or better over '
-        f'{100 * _MOST_OF_DETECTOR:.0f} % of the detector, to {finite.max():.2g}″ at worst'
-    )
+    share, worst = f'{100 * _MOST_OF_DETECTOR:.0f} %', significant(float(finite.max()), 2)
+    bound = f'at most {significant(most, 2)}″ over {share}'
+    text = f'{scope}: the 1-sigma of a line of sight is'
     if not budget:
-        return f'{text}.'
+        return f'{text} {bound} of the detector, {worst}″ at worst.'
     total, *causes = [(getattr(part, of), part.cause) for part in budget]
     named = sorted((one for one in causes if one[0] > _NAMED_SHARE * total[0]), reverse=True)
-    parts = ', '.join(f'{size:.2g}″ from {cause}' for size, cause in named[:_NAMED_CAUSES])
-    return f'{text}; {total[0]:.2g}″ rms{f": {parts}" if parts else ""}.'
+    parts = ', '.join(
+        f'{cause} ({significant(size, 2)}″)' for size, cause in named[:_NAMED_CAUSES]
+    )
+    return (
+        f'{text} {significant(total[0], 2)}″ rms over the detector, {bound} '
+        f'of it, {worst}″ at worst.{f" Largest causes: {parts}." if parts else ""}'
+    )
 
 
 def next_step(calibration: Calibration) -> str:
-    """The measure against a refusal, or against the largest cause of the sigma."""
-    if not calibration.accepted:
-        return (
-            'Do not use it for navigation. Correct the causes of the failed checks and calibrate '
-            'again.'
-        )
+    """The measures against a refusal, or against the largest causes of the sigma."""
+    if calibration.accepted:
+        return ' '.join(_against_sigma(calibration))
+    failed = [check.option for check in calibration.gate if check.passed is False]
+    measures = dict.fromkeys(_MEASURES[option] for option in failed if option in _MEASURES)
+    causes = (
+        f': {"; ".join(measures)}. Then calibrate again.' if measures else ' and calibrate again.'
+    )
+    text = f'Do not use it for navigation. Correct the causes of the failed checks{causes}'
+    steps = _against_sigma(calibration) if _SIGMA_LIMITS & set(failed) else []
+    return ' '.join([text, *steps])
+
+
+def _against_sigma(calibration: Calibration) -> list[str]:
+    """A sentence with the measure against the largest cause of each sigma."""
     causes = parts_that_matter(calibration.sigma_budget)[1:]
     if not causes:
-        return ''
+        return []
     steps = []
     scopes = (('camera', 'map_arcsec'), ('alignment', 'pointing_arcsec'))
     for scope, of in scopes if calibration.has_alignment else scopes[:1]:
@@ -115,9 +144,9 @@ def next_step(calibration: Calibration) -> str:
         remedy = _REMEDIES.get(largest.cause)
         if remedy:
             steps.append(
-                f'For a smaller sigma of the {scope}, limited by {largest.cause}: {remedy}.'
+                f'To reduce the sigma of the {scope} (largest cause: {largest.cause}), {remedy}.'
             )
-    return ' '.join(steps)
+    return steps
 
 
 @dataclass(frozen=True)
@@ -142,7 +171,8 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
     return [
         ModelRow(
             'The lens model describes the lens',
-            f'{field}; camera_info, without field and skew, is off by at most {_px(cost_px)}',
+            f'{field}; camera_info, without field and skew, differs from the calibration by at '
+            f'most {_px(cost_px)}',
             '',
             'choose another lens_model; for lines of sight with the field use starcal lookup',
         ),
@@ -157,7 +187,7 @@ def model_rows(calibration: Calibration) -> list[ModelRow]:
             'The camera is the same in all images',
             f'varies by {_px(found.image_variation_px)} in a corner',
             '',
-            'estimate with temperature, or calibrate each state by itself',
+            'estimate with temperature, or calibrate each state separately',
         ),
     ]
 
@@ -168,25 +198,23 @@ def _held(held: Sequence[HeldTerm]) -> Iterator[ModelRow]:
     for term in held:
         if term.significance >= INFORMATIVE_SIGMAS:
             yield ModelRow(
-                f'{term.name} is {term.assumed:.6g}',
-                f'the stars put it at {term.asked:.6g}: {term.significance:.1f} sigma of the '
-                'difference',
+                f'{term.name} is {significant(term.assumed, 6)}',
+                f'the stars put it at {significant(term.asked, 6)}: '
+                f'{term.significance:.1f} sigma of the difference',
                 _p(math.erfc(term.significance / math.sqrt(2))),
                 f'estimate {term.name} (estimate) or widen its prior (prior_sigma)',
             )
     if agreeing:
-        names = ', '.join(f'{term.name} is {term.assumed:.6g}' for term in agreeing)
+        names = ', '.join(f'{term.name} is {significant(term.assumed, 6)}' for term in agreeing)
         worst = max(term.significance for term in agreeing)
         found = f'the stars agree, within {worst:.1f} sigma of the difference'
         yield ModelRow(names, found, _p(math.erfc(worst / math.sqrt(2))), '')
 
 
 def _px(value: float) -> str:
-    return f'less than {VISIBLE_PX:g} px' if value < VISIBLE_PX else f'{value:.3g} px'
+    return f'less than {VISIBLE_PX:g} px' if value < VISIBLE_PX else f'{significant(value, 3)} px'
 
 
 def _p(value: float) -> str:
     """A p-value as text; empty where nothing was tested."""
-    if math.isnan(value):
-        return ''
-    return '< 1e\N{MINUS SIGN}6' if value < 1e-6 else f'{value:.2g}'
+    return '' if math.isnan(value) else p_value_text(value)

@@ -226,7 +226,7 @@ class Calibrator(StarcalNode):
         if not self._own_transforms or self.count_publishers('/tf_static') < 2:
             return ''
         names = ', '.join(sorted(self._foreign_frames))
-        remedy = 'each camera needs frames of its own (camera_frame, more_star_trackers)'
+        remedy = 'give each camera its own frames (camera_frame, more_star_trackers)'
         return names and f'/tf_static: another node publishes {names} too: {remedy}'
 
     def _on_transforms(self, message: Any) -> None:

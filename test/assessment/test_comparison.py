@@ -219,7 +219,7 @@ def test_the_tool_compares(
     out = capsys.readouterr().out
     (row,) = (line.split() for line in out.splitlines() if line.startswith('fx '))
     sigma = np.sqrt(2) * tiny.sigma[0]
-    assert row[3:] == ['+0.5', f'{sigma:.2g}', f'{0.5 / sigma:+.1f}']
+    assert row[3:] == ['+0.500', f'{sigma:.2g}', f'{0.5 / sigma:+.1f}']
     assert (tmp_path / 'c.svg').is_file() and str(tmp_path / 'c.svg') in out
     assert main.main(['compare', *folders, '--json']) == 0
     made = json.loads(capsys.readouterr().out)

@@ -360,7 +360,7 @@ def test_the_summary_is_a_line() -> None:
         20.0, (4e-5,), (1e-6,), (1e-5, 0.0, 0.0), (1e-6,) * 3, 'left out: this'
     )
     assert temperature.summary(terms) == (
-        'a1 +4e-05 (1e-06) /degC; alignment +2.063 (0.21), +0.000 (0.21), +0.000 (0.21) '
+        'a1 +0.0000400 (0.000001) /degC; alignment +2.063 (0.21), +0.000 (0.21), +0.000 (0.21) '
         'arcsec/degC; reference 20 degC; left out: this'
     )
     assert temperature.summary(TemperatureTerms(20.0)) == 'no terms; reference 20 degC'

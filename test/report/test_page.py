@@ -26,6 +26,7 @@ from starcal_ros.formats.products.calibration_json import (
     write_calibration,
 )
 from starcal_ros.formats.products.product_files import REPORT_FILE
+from starcal_ros.number_text import significant
 from starcal_ros.report import page as report
 
 FIGURES = (
@@ -93,7 +94,7 @@ def test_the_page_shows_what_the_calibration_holds(folder: Path, page: str) -> N
     checks = calibration.model_checks
     assert checks is not None and len(checks.amplitudes) >= 3
     for one in checks.amplitudes:
-        assert f'<th scope="row">{one.name}</th><td>{one.value:.2g}</td>' in page
+        assert f'<th scope="row">{one.name}</th><td>{significant(one.value, 2)}</td>' in page
 
 
 def test_the_page_needs_nothing_else(page: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from ctypes.util import find_library
 from pathlib import Path
+import re
 import shutil
 import sys
 
@@ -12,6 +13,7 @@ import pytest
 
 from starcal_ros.cli import main
 from starcal_ros.cli.arguments import EXIT_BAD_INPUT
+from starcal_ros.report import svg
 from starcal_ros.report.page import PDF_FILE, write_report
 from starcal_ros.report.svg import light
 
@@ -20,6 +22,15 @@ def test_colours_are_those_of_the_light_palette(tiny_products: Path, tmp_path: P
     shutil.copytree(tiny_products, tmp_path / 'out')
     text = light(write_report(tmp_path / 'out').read_text())
     assert 'stroke="#0b62a8"' in text and '"var(--' not in text
+
+
+def test_letters_of_printed_figures_have_six_points() -> None:
+    css = (Path(svg.__file__).parent / 'templates' / 'report.css').read_text()
+    rule = re.search(r'\.charts > figure \{ display: inline-block;[^}]*width: (\d+)%', css)
+    margins = re.search(r'size: A4; margin: \S+ (\d+)mm', css)
+    assert rule is not None and margins is not None
+    line_pt = (210 - 2 * int(margins[1])) / 25.4 * 72
+    assert line_pt * int(rule[1]) / 100 * svg.LETTER / svg.WIDTH >= 6
 
 
 @pytest.mark.slow

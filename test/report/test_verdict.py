@@ -24,9 +24,9 @@ GATE = (
 
 
 def test_checks_that_were_not_made_did_not_pass() -> None:
-    sentence = 'Checks: failed 1, passed 2, not checked 2 (no calibration was active).'
+    sentence = 'Checks: 1 failed, 2 passed, 2 not checked (no calibration was active).'
     assert verdict.checks_sentence(GATE) == sentence
-    assert verdict.checks_sentence(GATE[:1]) == 'Checks: passed 1.'
+    assert verdict.checks_sentence(GATE[:1]) == 'Checks: 1 passed.'
     assert verdict.checks_sentence(()) == ''
 
 
@@ -56,10 +56,26 @@ def test_the_precision_is_that_of_map_and_budget(tiny_products: Path) -> None:
         maps=dataclasses.replace(calibration.maps, shape_sigma_arcsec=sigma),
     )
     assert verdict.precision_sentences(shown)[0] == (
-        'Camera alone: lines of sight are known to 0.2″ (1-sigma) or better over '
-        '98 % of the detector, to 9″ at worst; 0.25″ rms: 0.2″ from stars, '
-        '0.15″ from fine structure.'
+        'Camera alone: the 1-sigma of a line of sight is 0.25″ rms over the detector, at most '
+        '0.2″ over 98 % of it, 9″ at worst. Largest causes: stars (0.2″), fine structure (0.15″).'
     )
-    assert 'camera, limited by stars: more images' in verdict.next_step(shown)
+    assert 'camera (largest cause: stars), take more images' in verdict.next_step(shown)
     refused = dataclasses.replace(shown, accepted=False)
     assert verdict.next_step(refused).startswith('Do not use it for navigation')
+
+
+def test_a_refusal_states_the_measures_against_its_failed_checks(tiny_products: Path) -> None:
+    calibration = read_calibration(tiny_products / 'calibration.json')
+
+    def step(*failed: str) -> str:
+        gate = tuple(
+            dataclasses.replace(check, passed=check.passed and check.option not in failed)
+            for check in calibration.gate
+        )
+        return verdict.next_step(dataclasses.replace(calibration, accepted=False, gate=gate))
+
+    options = {check.option for check in calibration.gate}
+    assert options >= {*verdict._MEASURES, *verdict._SIGMA_LIMITS}
+    assert 'failed checks: take more images. Then' in step('min_images', 'min_stars')
+    assert 'To reduce the sigma' in step('max_map_sigma_px')
+    assert step('max_change_px').endswith('failed checks and calibrate again.')

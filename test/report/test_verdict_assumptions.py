@@ -24,7 +24,7 @@ def test_rows_say_what_was_found_and_what_to_do(tiny_products: Path) -> None:
     )
     assert lens.found == (
         'field of 0.25 px rms per axis, at most 0.86 px; '
-        'camera_info, without field and skew, is off by at most 0.5 px'
+        'camera_info, without field and skew, differs from the calibration by at most 0.5 px'
     )
     assert lens.p_value == '' and 'starcal lookup' in lens.remedy
     assert term.found == 'the stars put it at 326: 3.0 sigma of the difference'

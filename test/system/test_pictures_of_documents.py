@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import functools
 from pathlib import Path
+import re
 import shutil
 import sys
 
@@ -13,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from docs import make_gallery, make_images, make_phase, make_trend
+from docs import make_gallery, make_images, make_nodes, make_phase, make_trend
 from starcal_ros.studies.simulation import scenario
 
 pytestmark = pytest.mark.slow
@@ -25,6 +26,7 @@ SHOWN = {path.stem for path in IMAGES.iterdir()}
 BY_COMMAND = {
     'make_images': {'star_field', 'focal_plane', 'report'},
     'make_gallery': {name for name in SHOWN if name.startswith('gallery_')},
+    'make_nodes': {'nodes'},
     'make_phase': {'pixel_phase'},
     'make_trend': {'trend'},
     # `starcal campaign paper`: test/studies/test_paper.py draws them from a few images.
@@ -34,6 +36,15 @@ BY_COMMAND = {
 
 def test_every_picture_has_its_command() -> None:
     assert set().union(*BY_COMMAND.values()) == SHOWN
+
+
+def test_the_graph_of_the_nodes_is_the_drawn_one_and_names_their_topics() -> None:
+    assert (IMAGES / 'nodes.svg').read_text() == make_nodes.nodes().document()
+    interface = (ROOT / 'docs' / 'icd.md').read_text()
+    labels = [*(label for *_, labels in make_nodes.TOPICS for label in labels),
+              *make_nodes.SERVICES]  # fmt: skip
+    for name in ' '.join(labels).replace(',', '').split():
+        assert re.search(rf'^\| (pub|sub|srv) \| `{name}` \|', interface, re.MULTILINE), name
 
 
 def small_images(patch: pytest.MonkeyPatch, folder: Path) -> None:

@@ -30,6 +30,7 @@ from starcal_ros.errors import ProductError, StarcalError
 from starcal_ros.formats.products.calibration_json import prior_of, read_calibration
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import read_text, write_atomically
+from starcal_ros.number_text import significant, to_sigma
 from starcal_ros.records import Calibration, CameraGeometry
 from starcal_ros.studies.simulation import scenario, simulated_bag
 from starcal_ros.studies.simulation.simulated_bag import true_geometry
@@ -281,7 +282,14 @@ def compare(calibration: Calibration, truth: CameraGeometry, prior: CameraGeomet
     off = (estimate - true) / sigma[columns]
     rows = zip(names, before, estimate, sigma[columns], true, off, strict=True)
     table = [
-        (name, f'{b:.6g}', f'{e:.6g}', f'{s:.2g}', f'{t:.6g}', f'{o:+.1f} sigma')
+        (
+            name,
+            significant(b, 6),
+            to_sigma(e, s),
+            significant(s, 2),
+            significant(t, 6),
+            f'{o:+.1f} sigma',
+        )
         for name, b, e, s, t, o in rows
     ]
     # Alignment angles are relative to the truth.

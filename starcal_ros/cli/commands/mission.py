@@ -15,6 +15,7 @@ from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT, E
 from starcal_ros.cli.terminal import print_text, progress_bar
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import make_folder
+from starcal_ros.number_text import significant
 
 if TYPE_CHECKING:
     from starcal_ros.records import StarObservations
@@ -55,9 +56,11 @@ def _export(args: argparse.Namespace) -> int:
     if not math.isfinite(done.worst_px):
         print_text('the format cannot see the whole detector: use spice, opencv or csv')
     else:
-        print_text(f'largest error of a pixel against the calibration: {done.worst_px:.3g} px')
+        print_text(
+            f'largest error of a pixel against the calibration: {significant(done.worst_px, 3)} px'
+        )
     for loss in done.losses:
-        print_text(f'left out: {loss.part}, {loss.cost_px:.3g} px alone')
+        print_text(f'left out: {loss.part}, {significant(loss.cost_px, 3)} px alone')
     return EXIT_ACCEPTED
 
 

@@ -19,6 +19,7 @@ from rich.text import Text
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
+from starcal_ros.number_text import significant
 from starcal_ros.records import Calibration, EnsembleStatus, GateCheck, StarObservations
 from starcal_ros.text import printable
 
@@ -158,7 +159,7 @@ def _sigma_text(name: str, sigma: float) -> str:
     if name.startswith('alignment'):
         per = '/degC' if name.endswith('_temperature') else ''
         return f'{sigma / ARCSECOND_RAD:.2f} arcsec{per}'
-    return f'{sigma:.2g}{_UNITS.get(name, "")}'
+    return f'{significant(sigma, 2)}{_UNITS.get(name, "")}'
 
 
 def _calibration(seen: Seen) -> Group | Text:

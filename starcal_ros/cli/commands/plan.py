@@ -14,6 +14,7 @@ from starcal_ros.cli.output_places import check_no_product
 from starcal_ros.cli.terminal import print_table, print_text
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.number_text import significant
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.plan import Cone, Plan, plan_pointings, Pointing, Request
@@ -84,9 +85,9 @@ def _csv(found: Plan) -> str:
 
 def _table(found: Plan) -> tuple[list[str], list[list[str]]]:
     header = ['image', 'ra', 'dec', 'roll', 'stars', found.name]
-    rows = [['now', '', '', '', '', f'{found.sigma:.4g}']]
+    rows = [['now', '', '', '', '', significant(found.sigma, 4)]]
     for k, step in enumerate(found.steps, 1):
         place = step.pointing
         angles = [f'{deg:.3f}' for deg in (place.ra_deg, place.dec_deg, place.roll_deg)]
-        rows.append([str(k), *angles, str(step.stars), f'{step.sigma:.4g}'])
+        rows.append([str(k), *angles, str(step.stars), significant(step.sigma, 4)])
     return header, rows

@@ -183,7 +183,7 @@ def _read(path: Path, options: ImageOptions) -> tuple[NDArray[Any], Mapping[str,
     if values.ndim != _GREY or min(values.shape) < 2:
         raise IngestError(
             f'{path}: array of shape {values.shape}, neither an image nor three colour planes: '
-            'write each image to a file of its own'
+            'write each image to its own file'
         )
     return values, header
 

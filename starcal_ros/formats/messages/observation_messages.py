@@ -75,7 +75,8 @@ def _check_stars(record: StarObservations) -> None:
     reasons = len(record.refused_stars)
     if (record.refused_reason >= reasons).any():
         raise ValueError(
-            f'refused_star_reason: {int(record.refused_reason.max())} is none of {reasons} reasons'
+            f'refused_star_reason: {int(record.refused_reason.max())} is not one of {reasons}'
+            ' reasons'
         )
     # The first pixel reaches from -0.5 to 0.5.
     inside = (record.measured_px >= -1.0) & (record.measured_px <= (record.width, record.height))

@@ -134,7 +134,7 @@ def check_names(names: SpiceNames) -> None:
     if names.instrument_id > 0:
         raise OptionError(f'--instrument-id: {names.instrument_id} is not a negative NAIF ID')
     if names.camera_id == names.star_tracker_id:
-        raise OptionError(f'--star-tracker-id: {names.star_tracker_id} is that of the camera')
+        raise OptionError(f'--star-tracker-id: {names.star_tracker_id} is the ID of the camera')
     if not 0 <= names.pixel_size_um < 1e4:
         raise OptionError(f'--pixel-size-um: {names.pixel_size_um:g} is not within 0 to 10000')
 

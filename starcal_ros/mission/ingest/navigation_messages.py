@@ -194,7 +194,7 @@ def _xml_segments(text: str, kind: str) -> Iterator[Segment]:
             yield segment
             element.clear()
     if kind not in messages:
-        raise ValueError(f'the message is {" and ".join(messages) or "none of CCSDS"}')
+        raise ValueError(f'the message is {" and ".join(messages) or "not a CCSDS message"}')
 
 
 def _add_state(segment: Segment, state: ElementTree.Element, units: Mapping[str, str]) -> None:

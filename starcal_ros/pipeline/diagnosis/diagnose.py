@@ -347,7 +347,7 @@ def _no_reading(case: Case) -> Diagnosis:
         None,
         'The stars of the images are identified, but the attitudes do not go with them.',
         (tried,),
-        ('# check that the attitudes are those of this spacecraft, star tracker and time',),
+        ('# check that the attitudes belong to this spacecraft, star tracker and time',),
     )
 
 
@@ -368,7 +368,7 @@ def _tone_curve(solved: Sequence[Solved], catalog: StarCatalog) -> list[Diagnosi
     if slope is None or slope >= _LINEAR_SLOPE:
         return []
     sentence = 'The images are not linear in the light: they have been through a tone curve.'
-    evidence = f'brightness grows with that of the catalog to the power {slope:.2f}'
+    evidence = f'measured brightness grows with catalog brightness to the power {slope:.2f}'
     mend = '# no parameter mends this: record raw images'
     return [Diagnosis('not_linear', round(slope, 2), sentence, (evidence,), (mend,))]
 

@@ -37,7 +37,7 @@ def test_observations_round_trip(make: Any) -> None:
         ('refused_star_counts', np.zeros(1, np.uint32), '2 reasons but 1 counts'),
         ('refused_star_px', np.zeros(7), 'refused_star_px: 7 numbers, not 4 x 2'),
         ('refused_star_px', np.full(8, np.inf), r'refused_star_px\[0\]\[0\]: inf is not a finite'),
-        ('refused_star_reason', np.full(4, 2), 'refused_star_reason: 2 is none of 2 reasons'),
+        ('refused_star_reason', np.full(4, 2), 'refused_star_reason: 2 is not one of 2 reasons'),
     ],
 )
 def test_bad_observations_are_refused(field: str, value: Any, text: str) -> None:
