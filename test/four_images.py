@@ -386,10 +386,10 @@ def prior_offset(given: Small) -> Floats:
 
 def lens_term(given: Small, amplitude_px: float) -> Floats:
     """Return the next term of the lens as values (P + 6 m,) of the unknowns."""
-    term = given.layout['field'].combined
+    term = given.layout['field'].term
     assert term is not None
     values = np.zeros(given.layout.count + 6 * IMAGES)
-    values[given.layout.of(['field'])] = amplitude_px * term[:, 0]
+    values[given.layout.of(['field'])] = amplitude_px * term
     return values
 
 

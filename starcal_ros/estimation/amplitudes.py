@@ -35,9 +35,6 @@ from starcal_ros.estimation.levenberg_marquardt import NotObservable
 LOG_CENTRE, LOG_SIGMA = math.log(1e-5), 4.0
 # An octave of the field is smaller than the one before, within a factor of e.
 OCTAVE_STEP, OCTAVE_SIGMA = -0.7, 1.0
-# The next term of the lens is one of many departures: the first octave is e^2 times as large,
-# within a factor of e^0.3.  Untied, the term takes what is not its own (`docs/design.md`).
-LENS_STEP, LENS_SIGMA = -2.0, 0.3
 # Beyond it field and camera are collinear, and the likelihood is rounding.
 LARGEST_FIELD_PX = 0.5
 LARGEST_SHAPE_PX = 30.0
@@ -49,6 +46,8 @@ _NO_EFFECT = 1e-6  # information on an unknown times its prior variance
 _NONE = -25.0  # log amplitude without any effect
 # Common factors of the amplitudes over which results are averaged, in logarithms.
 _SHIFTS = np.linspace(-8.0, 6.0, 57)
+# Amplitudes of the likely term, in sigmas of the prior of the logarithm.
+_OF_TERM = np.linspace(-3.0, 3.0, 49)
 
 
 @dataclass(frozen=True)
@@ -79,48 +78,41 @@ class Averaged:
 
 
 def octave_prior(count: int) -> tuple[Floats, Floats]:
-    """
-    Mean (count,) and precision (count, count) of the logarithms of the amplitudes of a field.
-
-    The first is that of the next term of the lens; then the octaves, in a chain.
-    """
-    mean: Floats = LOG_CENTRE + OCTAVE_STEP * (np.arange(count, dtype=np.float64) - 1.0)
-    mean[0] = LOG_CENTRE + LENS_STEP
+    """Mean (count,) and precision (count, count) of the logarithms of octaves in a chain."""
+    mean: Floats = LOG_CENTRE + OCTAVE_STEP * np.arange(count, dtype=np.float64)
     precision = np.zeros((count, count))
-    precision[1, 1] = LOG_SIGMA**-2
-    for k, sigma in enumerate([LENS_SIGMA] + [OCTAVE_SIGMA] * (count - 2)):
-        precision[k : k + 2, k : k + 2] += np.array([[1, -1], [-1, 1]]) / sigma**2
+    precision[0, 0] = LOG_SIGMA**-2
+    for k in range(1, count):
+        precision[k - 1 : k + 1, k - 1 : k + 1] += np.array([[1, -1], [-1, 1]]) / OCTAVE_SIGMA**2
     return mean, precision
 
 
 def prior_of_last_octave(count: int) -> tuple[Floats, Floats]:
-    """Logarithms (s,) of the last amplitude of some with their prior weights."""
-    mean, precision = octave_prior(count)
-    sigma = math.sqrt(np.linalg.inv(precision)[-1, -1])
+    """Logarithms (s,) of the amplitude of the last of some octaves with their prior weights."""
+    sigma = math.hypot(LOG_SIGMA, OCTAVE_SIGMA * math.sqrt(count - 1))
     off: Floats = np.asarray(np.linspace(-3.0, 3.0, 61), np.float64)
     weight = np.exp(-0.5 * off**2)
-    return mean[-1] + sigma * off, weight / weight.sum()
+    mean = LOG_CENTRE + OCTAVE_STEP * (count - 1)
+    return mean + sigma * off, weight / weight.sum()
 
 
 def field_amplitudes(
     information: Floats, gradient: Floats, octave: Indices, near: Amplitudes | None = None
 ) -> Amplitudes:
     """
-    Amplitudes of the next term of the lens and of the octaves of a field, by Fisher scoring.
+    Amplitudes of the octaves of a field by Fisher scoring.
 
     Parameters
     ----------
     information, gradient : (q, q), (q,)
         On the coefficients, scaled to a prior of 1 px for each octave, all else eliminated.
     octave : (q,)
-        0: the next term of the lens; from 1: the octaves.
     near : Amplitudes, optional
         Amplitudes of the round before: the search starts there and from one other place.
     """
     count = int(octave.max()) + 1
     mean, precision = octave_prior(count)
-    below = np.array([LENS_STEP, *(-0.3 * k for k in range(count - 1))], np.float64)
-    starts = [math.log(one) + below for one in _STARTS_PX]
+    starts = [math.log(one) - 0.3 * np.arange(count, dtype=np.float64) for one in _STARTS_PX]
     if near is not None:
         starts = [near.log_px, starts[1]]
     member = np.equal.outer(np.arange(count), octave).astype(float)
@@ -147,9 +139,7 @@ def field_amplitudes(
     for log_px in starts:
         value, slope, fisher = evaluate(log_px)
         for _ in range(_MOST_STEPS):
-            inside = np.flatnonzero((log_px < cap) | (slope < 0.0))  # the others stay at the cap
-            step = np.zeros(count)
-            step[inside] = np.linalg.solve(fisher[np.ix_(inside, inside)], slope[inside])
+            step = np.linalg.solve(fisher, slope)
             step *= 2.0 / max(2.0, float(np.abs(step).max()))
             before = value
             for share in (1.0, 0.4, 0.16, 0.06):
@@ -178,9 +168,15 @@ def _cholesky_and_inverse(matrix: Floats) -> tuple[Floats, Floats]:
 
 
 def averaged_field(
-    information: Floats, gradient: Floats, octave: Indices, amplitudes: Amplitudes
+    information: Floats, gradient: Floats, octave: Indices, amplitudes: Amplitudes, term: Floats
 ) -> Averaged:
-    """Return the coefficients averaged over a common factor of the amplitudes of the octaves."""
+    """
+    Return the coefficients averaged over a common factor of the amplitudes of the octaves.
+
+    ``term`` (q,) are the coefficients of a departure that is likely, at 1 px.  It is averaged over
+    an amplitude of its own; those of the octaves are found without it, since what looks like it
+    may be another one.
+    """
     mean, precision = octave_prior(len(amplitudes.log_px))
     s = np.exp(amplitudes.log_px)[octave]
     values, vectors = eigh(information * np.outer(s, s), check_finite=False)
@@ -190,20 +186,34 @@ def averaged_field(
     shift = _SHIFTS[room + 1e-9 >= _SHIFTS]
     factor = np.exp(2.0 * shift)[:, None]
     held = 1.0 + values * factor
+    variance = factor / held
     off = (amplitudes.log_px - mean)[None] + shift[:, None]
-    log_weight = -0.5 * np.log(held).sum(axis=1) + 0.5 * (factor * along**2 / held).sum(axis=1)
+    log_weight = -0.5 * np.log(held).sum(axis=1) + 0.5 * (variance * along**2).sum(axis=1)
     log_weight -= 0.5 * np.einsum('sa,ab,sb->s', off, precision, off)
+    # The term, with the coefficients eliminated at each factor, and its amplitudes.
+    shown = information @ term
+    with_term = vectors.T @ (s * shown)
+    own = np.maximum(term @ shown - variance @ with_term**2, 0.0)[:, None]
+    pull = (term @ gradient - variance @ (with_term * along))[:, None]
+    log_term = np.minimum(LOG_CENTRE + LOG_SIGMA * _OF_TERM, math.log(LARGEST_FIELD_PX))
+    prior = np.exp(2.0 * log_term)
+    of_term = prior / (1.0 + prior * own)
+    log_share = 0.5 * (of_term * pull**2 - np.log1p(prior * own)) - 0.5 * _OF_TERM**2
+    share = np.exp(log_share - log_share.max(axis=1, keepdims=True))
+    share /= share.sum(axis=1, keepdims=True)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    means = factor * along / held
-    centre = weight @ means
-    spread = weight @ (factor / held)
-    apart = (means - centre) * np.sqrt(weight)[:, None]
+    value = (share * of_term * pull).sum(axis=1)
+    spread = (share * (of_term + (of_term * pull) ** 2)).sum(axis=1) - value**2
     back = s[:, None] * vectors
-    scatter = back @ apart.T
+    means = back @ (variance * (along - value[:, None] * with_term)).T + np.outer(term, value)
+    centre = means @ weight
+    apart = (means - centre[:, None]) * np.sqrt(weight)
+    by_term = term[:, None] - back @ (variance * with_term).T
+    by_term *= np.sqrt(weight * np.maximum(spread, 0.0))
     return Averaged(
-        back @ centre,
-        (back * spread) @ back.T + scatter @ scatter.T,
+        centre,
+        (back * (weight @ variance)) @ back.T + apart @ apart.T + by_term @ by_term.T,
         amplitudes.log_px[-1] + shift,
         weight,
     )

@@ -16,7 +16,6 @@ import numpy as np
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.estimation.amplitudes import (
     Amplitudes,
-    Averaged,
     averaged_field,
     field_amplitudes,
     prior_of_last_octave,
@@ -225,16 +224,13 @@ class _Solver:
         self.free = np.setdiff1d(np.flatnonzero(np.isfinite(self.precision)), self.field)
         self.estimated = np.concatenate([self.free, self.field]) if with_field else self.free
         self.unit: Floats = np.empty(0)
-        self.octave: Indices = np.arange(1 + FIELD_OCTAVES)
-        self.combined: Floats = np.empty((0, 0))
+        self.octave: Indices = np.arange(FIELD_OCTAVES)
+        self.term: Floats = np.empty(0)
         if with_field:
             field = layout['field']
-            assert field.octave is not None and field.combined is not None
-            self.unit = field.sigma
-            self.octave = np.concatenate(
-                [np.zeros(field.combined.shape[1], int), field.octave + 1]
-            )
-            self.combined = field.combined / self.unit[:, None]
+            assert field.octave is not None and field.term is not None
+            self.unit, self.octave = field.sigma, field.octave
+            self.term = field.term / field.sigma
 
     def _of_free(self, arrow: Equations) -> tuple[Floats, Floats]:
         """Return the covariance of all but the field, the field known, and their gradient."""
@@ -244,20 +240,14 @@ class _Solver:
         return inverse(information), arrow.gradient[self.free] - offset
 
     def _of_field(self, arrow: Equations) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Return information and gradient of the terms of the field, and what eliminated it."""
+        """Return information and gradient of the field in its unit, and what eliminated it."""
         free, gradient = self._of_free(arrow)
         cross = arrow.information[np.ix_(self.free, self.field)] * self.unit
         back = free @ cross
         own = arrow.information[np.ix_(self.field, self.field)] * np.outer(self.unit, self.unit)
         information = own - cross.T @ back
         left = arrow.gradient[self.field] * self.unit - back.T @ gradient
-        information = 0.5 * (information + information.T)
-        terms, k = self.combined, self.combined.shape[1]
-        with_terms = np.empty((len(left) + k, len(left) + k))
-        with_terms[k:, k:], with_terms[k:, :k] = information, information @ terms
-        with_terms[:k, k:] = with_terms[k:, :k].T
-        with_terms[:k, :k] = terms.T @ with_terms[k:, :k]
-        return with_terms, np.concatenate([terms.T @ left, left]), free, gradient, back
+        return 0.5 * (information + information.T), left, free, gradient, back
 
     def amplitudes(self, arrow: Equations, near: Amplitudes | None) -> Amplitudes:
         """Return the amplitudes of the octaves of the field."""
@@ -278,26 +268,17 @@ class _Solver:
             covariance[np.ix_(self.free, self.free)] = free
             return mean, covariance, prior_of_last_octave(len(amplitudes.log_px))
         information, left, free, gradient, back = self._of_field(arrow)
-        field = averaged_field(information, left, self.octave, amplitudes)
-        own, own_covariance = self._of_functions(field)
-        mean[self.field] = self.unit * own
-        mean[self.free] = free @ gradient - back @ own
-        to_free = -back @ own_covariance
-        covariance[np.ix_(self.field, self.field)] = own_covariance * np.outer(
+        field = averaged_field(information, left, self.octave, amplitudes, self.term)
+        mean[self.field] = self.unit * field.mean
+        mean[self.free] = free @ gradient - back @ field.mean
+        to_free = -back @ field.covariance
+        covariance[np.ix_(self.field, self.field)] = field.covariance * np.outer(
             self.unit, self.unit
         )
         covariance[np.ix_(self.free, self.field)] = to_free * self.unit
         covariance[np.ix_(self.field, self.free)] = (to_free * self.unit).T
         covariance[np.ix_(self.free, self.free)] = free - to_free @ back.T
         return mean, covariance, (field.log_px, field.weight)
-
-    def _of_functions(self, field: Averaged) -> tuple[Floats, Floats]:
-        """Return mean and covariance of the functions, in their unit: combinations are sums."""
-        terms, k = self.combined, self.combined.shape[1]
-        across = terms @ field.covariance[:k, k:]
-        covariance = field.covariance[k:, k:] + across + across.T
-        covariance += terms @ field.covariance[:k, :k] @ terms.T
-        return field.mean[k:] + terms @ field.mean[:k], covariance
 
     def resolved(self, arrow: Equations, covariance: Floats) -> float:
         """Return the number of shared unknowns that the data determine."""

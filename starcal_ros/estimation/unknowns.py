@@ -85,8 +85,8 @@ class Unknown:
         q is twice their number: those of u, then those of v.
     octave : (q,) or None
         Octave of each coefficient of those functions.
-    combined : (q, k) or None
-        Combinations of the functions with an amplitude of their own besides, 1 px each.
+    term : (q,) or None
+        A likely combination of the functions, 1 px, with an amplitude of its own besides.
     tracker : (m, 3, q) or None
         Rotation of the camera, as the star tracker of each image predicts it.
     widest : float
@@ -102,7 +102,7 @@ class Unknown:
     turn: Turn | None = None
     functions: Scalars | None = None
     octave: Indices | None = None
-    combined: Floats | None = None
+    term: Floats | None = None
     tracker: Floats | None = None
     widest: float = np.inf
 
@@ -435,10 +435,8 @@ def _field(width: int, height: int) -> Unknown:
     sigma = np.concatenate([sigma, sigma])
     octave = np.concatenate([octave, octave])
     value = np.zeros(len(labels))
-    term = _next_lens_term(width, height)[:, None]
-    return Unknown(
-        'field', labels, sigma, value, functions=functions, octave=octave, combined=term
-    )
+    term = _next_lens_term(width, height)
+    return Unknown('field', labels, sigma, value, functions=functions, octave=octave, term=term)
 
 
 @functools.lru_cache(maxsize=16)

@@ -39,6 +39,8 @@ from starcal_ros.estimation.shared_errors import SharedError
 
 # In sigma: finite differences leave 1e-10 of a derivative, first-order attitude errors 1e-8.
 EXACT = 2e-7
+# Amplitudes of the next term of the lens: none, and two that the stars may show.
+OF_TERM = np.array([-2.0, 1.5, 2.2])
 
 
 @pytest.fixture(scope='module')
@@ -134,6 +136,7 @@ def varied() -> Varied:
         return to_sums(*args)
 
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(amplitudes, '_OF_TERM', OF_TERM)
         patch.setattr(module, 'shapes', recorded)
         patch.setattr(module, '_shape_sums', of_field)
         found = solved(made, whole=True)
@@ -144,25 +147,32 @@ def mixture(
     made: Small, truth: Dense, mode_px: Floats, shifts: Floats, shape_px: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Mean, covariance and weights of dense posteriors over a factor of the field's amplitudes."""
-    parts = []
+    offset, parts = prior_offset(made), []
     for shift in shifts:
         log_px = mode_px + shift
-        lens_px, field_px = np.exp(log_px[0]), np.exp(log_px[1:])
-        precision = prior_precision(made, shape_px, field_px)
-        term = lens_term(made, lens_px)
-        mean, covariance, evidence = solution(truth, precision, prior_offset(made), term)
-        # The prior of the logarithms: N(ln 1e-5, 4), each octave e^-0.7 of the one before, and
-        # the lens term e^-2 of the first.
-        steps = np.diff(log_px) - [2.0, -0.7, -0.7]
-        steps[0] /= 0.3
-        evidence -= 0.5 * (((log_px[1] - np.log(1e-5)) / 4.0) ** 2 + steps @ steps)
-        parts.append((evidence, mean, covariance))
-    weight = np.exp(np.array([e for e, _, _ in parts]) - max(e for e, _, _ in parts))
+        precision = prior_precision(made, shape_px, np.exp(log_px))
+        *_, evidence = solution(truth, precision, offset)
+        # The prior of the logarithms: N(ln 1e-5, 4), and each octave e^-0.7 of the one before.
+        steps = np.diff(log_px) + 0.7
+        evidence -= 0.5 * (((log_px[0] - np.log(1e-5)) / 4.0) ** 2 + steps @ steps)
+        with_term = []
+        for off in OF_TERM:
+            term = lens_term(made, np.exp(np.log(1e-5) + 4.0 * off))
+            mean, covariance, own = solution(truth, precision, offset, term)
+            with_term.append((own - 0.5 * off**2, mean, covariance))
+        parts.append((evidence, *mixed(with_term)[:2]))
+    return mixed(parts)
+
+
+def mixed(parts: list[tuple[float, Floats, Floats]]) -> tuple[Floats, Floats, Floats]:
+    """Mean, covariance and weights of a mixture of some log evidences, means and covariances."""
+    logs = np.array([log for log, _, _ in parts])
+    weight = np.exp(logs - logs.max())
     weight /= weight.sum()
     means = np.array([mean for _, mean, _ in parts])
     mean = weight @ means
     apart = means - mean
-    covariance = np.einsum('s,sij->ij', weight, [c for _, _, c in parts])
+    covariance = np.einsum('s,sij->ij', weight, np.array([c for _, _, c in parts]))
     return mean, covariance + (apart.T * weight) @ apart, weight
 
 

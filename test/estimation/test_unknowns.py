@@ -226,10 +226,10 @@ def test_an_amplitude_of_one_is_about_the_rms_of_its_octave_along_each_axis(
 
 def test_the_field_has_the_next_radial_term_of_a_lens_free_of_lower_ones(given: Small) -> None:
     entry = given.layout['field']
-    assert entry.functions is not None and entry.combined is not None
+    assert entry.functions is not None and entry.term is not None
     u, v = (size * (np.arange(60) + 0.5) / 60 - 0.5 for size in (WIDTH, HEIGHT))
     grid = np.stack([np.repeat(u, 60), np.tile(v, 60)])
-    found = entry.combined.reshape(2, -1) @ entry.functions(grid)
+    found = entry.term.reshape(2, -1) @ entry.functions(grid)
     x = 2.0 * (grid + 0.5) - np.array([[WIDTH], [HEIGHT]])
     x /= math.hypot(WIDTH, HEIGHT)
     r = np.linalg.norm(x, axis=0)
