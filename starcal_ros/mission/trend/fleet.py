@@ -77,8 +77,7 @@ def update(
         for pause_s in (*_PAUSES_S, None):
             again = []
             with contextlib.closing(stream_each(compute, waiting, workers, scheduler)) as found:
-                for number, answer in found:
-                    task = waiting[number]
+                for task, answer in found:
                     if isinstance(answer, Exception):
                         answer = failed(task, str(answer))
                     if isinstance(answer, Row) and answer.is_passing and pause_s is not None:
