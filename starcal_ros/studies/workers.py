@@ -89,9 +89,10 @@ def stream_each(
     """
     Pairs (item, result) of a function called with each item, in any order, as they come.
 
-    An item is taken when it is submitted, and let go with its result.  The result of an item whose function raises, or whose process ends early each time that it is
-    tried, is the exception.  ``workers`` and ``scheduler`` as for `run_each`.  Raises OptionError
-    when no scheduler answers at the address.
+    An item is taken when it is submitted, and let go with its result.  The result of an item whose
+    function raises, or whose process ends early each time that it is tried, is the exception.
+    ``workers`` and ``scheduler`` as for `run_each`.  Raises OptionError when no scheduler answers
+    at the address.
     """
     items = iter(items)
     first = list(itertools.islice(items, 1))

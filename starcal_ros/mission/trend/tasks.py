@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import csv
 from dataclasses import dataclass, field
 import fnmatch
@@ -76,19 +76,27 @@ class Task:
 
 def find(root: str, cameras: Cameras) -> Iterator[Task]:
     """
-    Tasks below a root: calibrations in order of their paths, then bags; no file is read.
+    Tasks below a root, as it is listed; no file is read.
 
     A bag is a task where it has parameters and no calibration beside it.  Observations beside a
     calibration are one too: it is done only if that is of another version.  Raises OSError when
-    the root cannot be listed. Raises StarcalError when a parameter file or a file that it names
+    a folder cannot be listed. Raises StarcalError when a parameter file or a file that it names
     cannot be read.
     """
-    listed = {
-        entry.name: entry
-        for entry in places.entries(root)
-        if KEPT_FOLDER not in entry.name.split('/')
-    }
     version, settings_of = software_version(), functools.cache(_settings)
+    for entries in places.listings(root):
+        listed = {e.name: e for e in entries if KEPT_FOLDER not in e.name.split('/')}
+        yield from _tasks(root, listed, cameras, version, settings_of)
+
+
+def _tasks(
+    root: str,
+    listed: dict[str, Entry],
+    cameras: Cameras,
+    version: str,
+    settings_of: Callable[[str], tuple[tuple[str, ...], str]],
+) -> Iterator[Task]:
+    """Tasks of files by name: calibrations in order of their paths, then bags."""
     for name, entry in listed.items():
         if posixpath.basename(name) == CALIBRATION_FILE:
             observations = listed.get(posixpath.join(posixpath.dirname(name), OBSERVATIONS_FILE))
