@@ -179,7 +179,7 @@ def _trend(args: argparse.Namespace) -> int:
     # A file that was repaired or removed is no longer among the tasks.
     table.forget_failed(() if args.retry else (task.stamp for task in tasks()))
     with progress_bar(None, 'calibrations') as advance:
-        done = fleet.update(table, tasks(), args.workers, args.scheduler, advance)
+        done = fleet.update(table, tasks(), args.workers, args.scheduler, advance, args.reports)
     if done == fleet.Done():
         raise OptionError(
             f'{args.root}: no calibration.json below it, and no bag to calibrate with --params'

@@ -53,6 +53,7 @@ def update(
     workers: int = 0,
     scheduler: str = '',
     on_row: Callable[[], None] = lambda: None,
+    with_reports: bool = False,
 ) -> Done:
     """
     Add the rows of the tasks that the table does not have; a task is taken when it is submitted.
@@ -61,12 +62,12 @@ def update(
     go on.  A file that cannot be reached, one of the first 10,000, is tried again after the
     others, with a pause.
     What is computed is on disk within a batch, so a run that was stopped starts where it stopped.
-    A worker writes the calibration of a bag beside the table before its row is sent, so that each
-    row on disk has its calibration.
+    A worker writes the calibration of a bag (and its report) beside the table before its row is
+    sent, so that each row on disk has its calibration.
     ``workers`` and ``scheduler`` as for `run_each`; the workers of a cluster see the same files.
     """
     done = Done()
-    waiting = _not_known(table, tasks, done)
+    waiting = _not_known(table, tasks, done, with_reports)
     with table:
         for pause_s in (*_PAUSES_S, None):
             again: list[Task] = []
@@ -87,11 +88,15 @@ def update(
     return done
 
 
-def _not_known(table: Table, tasks: Iterable[Task], done: Done) -> Iterator[Task]:
+def _not_known(
+    table: Table, tasks: Iterable[Task], done: Done, with_report: bool
+) -> Iterator[Task]:
     """Tasks that the table has no row of, with what a worker asks of the table; others count."""
     for task in tasks:
         start = table.start_of(task)
         if start is None:
-            yield dataclasses.replace(task, known=table.likely(task), table=table.folder)
+            yield dataclasses.replace(
+                task, known=table.likely(task), table=table.folder, with_report=with_report
+            )
         else:
             done.count_known(table, start)

@@ -59,6 +59,8 @@ class Task:
         Starts of digests in the table of which one may be that of this content.
     table : str
         Folder or URL of the table that calibrations of bags are kept beside; empty: not kept.
+    with_report : bool
+        True if the report of a bag is kept as well.
     """
 
     url: str
@@ -72,6 +74,7 @@ class Task:
     camera: str = ''
     known: tuple[str, ...] = ()
     table: str = ''
+    with_report: bool = False
 
 
 def find(root: str, cameras: Cameras) -> Iterator[Task]:
