@@ -1,13 +1,15 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-A simulated fleet with a bag a day of each camera, ``python -m bench.fleet_years CAMERAS DAYS``.
+A simulated fleet with a bag a day of each camera.
 
+``python -m bench.fleet_years CAMERAS DAYS [--without-page]``
 A run with nothing new, and one with a new day.  The listing of the store and the calibrations are
 simulated; the table on disk, its index and the page are those of `starcal trend`.
 """
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import dataclasses
@@ -16,7 +18,6 @@ import hashlib
 from pathlib import Path
 import posixpath
 import re
-import sys
 import tempfile
 import time
 from unittest import mock
@@ -40,10 +41,11 @@ _PARAMS = Path(__file__).parents[1] / 'bags/tiny/params.yaml'
 _ROOT = 's3://archive/fleet'
 _NAMES = Cameras(re.compile('(?P<spacecraft>[^/]+)/'), params=str(_PARAMS))
 _DAY_NS = 86400 * NANOSECONDS_PER_SECOND
+_listings = places.listings
 _FILE_ROWS = 1000
 
 
-def main(cameras: int, days: int) -> Table:
+def run(cameras: int, days: int, with_page: bool) -> Table:
     """Processor time and peak memory of the steps of two runs over the rows of years."""
     title = f'starcal trend, {cameras} cameras, {days} days'
     made = Table(title, ('run', 'step', 'processor s', 'peak MB'))
@@ -61,16 +63,17 @@ def main(cameras: int, days: int) -> Table:
                 mock.patch.object(fleet, 'compute', functools.partial(answer, rows)),
             ):
                 done = fleet.update(table, tasks.find(_ROOT, _NAMES))
-            with step(add, 'page'):
-                trend_page.write_page(table.cameras(), table.camera_count(), folder, _ROOT)
+            if with_page:
+                with step(add, 'page'):
+                    trend_page.write_page(table.cameras(), table.camera_count(), folder, _ROOT)
             expected = fleet.Done(computed=cameras * (last - days), known=cameras * days)
             if done != expected:
                 raise AssertionError(done)
         sizes = [entry.size for entry in places.entries(table.folder)]
-        page_mb = Path(folder, trend_page.TREND_FILE).stat().st_size / 1e6
-    made.notes.append(
-        f'table {sum(sizes) / 1e6:.0f} MB in {len(sizes)} files, page {page_mb:.1f} MB'
-    )
+        made.notes.append(f'table {sum(sizes) / 1e6:.0f} MB in {len(sizes)} files')
+        if with_page:
+            page_mb = Path(folder, trend_page.TREND_FILE).stat().st_size / 1e6
+            made.notes.append(f'page {page_mb:.1f} MB')
     return made
 
 
@@ -106,7 +109,10 @@ def days_of_a_camera(count: int) -> list[Row]:
 
 
 def listings_of(names: Sequence[str], days: int, root: str) -> Iterator[list[Entry]]:
-    """Lists of the files of each camera after so many days."""
+    """Lists of the files of each camera after so many days; the table is listed as it is."""
+    if root != _ROOT:
+        yield from _listings(root)
+        return
     for camera in names:
         found = []
         for day in range(days):
@@ -155,4 +161,9 @@ def write_table(folder: Path, names: Sequence[str], rows: Sequence[Row]) -> None
 
 
 if __name__ == '__main__':
-    print(main(*map(int, sys.argv[1:])).text())
+    parser = argparse.ArgumentParser(prog='python -m bench.fleet_years')
+    parser.add_argument('cameras', type=int)
+    parser.add_argument('days', type=int)
+    parser.add_argument('--without-page', action='store_true')
+    asked = parser.parse_args()
+    print(run(asked.cameras, asked.days, not asked.without_page).text())
