@@ -12,7 +12,6 @@ import os
 from pathlib import Path
 import posixpath
 import socket
-import tempfile
 
 import numpy as np
 
@@ -100,7 +99,11 @@ def _answer(task: Task, path: Path) -> Row | Seen:
         row = _of_task(row, task, path)
         products = {calibration_json.CALIBRATION_FILE: calibration_json.calibration_text(made)}
         if task.with_report:
-            products[REPORT_FILE] = _report(task.url, products, made, left, records)
+            from starcal_ros.report import page  # seldom needed, slow to load
+
+            # Pictures of images would be most of its bytes.
+            contents = page.Found(made, left, tuple(records), (), ())
+            products[REPORT_FILE] = page.render(contents, Path(task.url))
         return _kept(row, products, task) if task.table else row
     except (StarcalError, ValueError) as error:
         cause = error.__cause__
@@ -130,24 +133,6 @@ def _custom_data(metadata: Path) -> dict[str, str]:
         return {name: value for name, value in found.items() if isinstance(value, str)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}  # rosbag2 writes it from version 0.16 on, and only where it was given
-
-
-def _report(
-    url: str,
-    products: Mapping[str, str],
-    calibration: Calibration,
-    left: Residuals,
-    records: Sequence[StarObservations],
-) -> str:
-    """The page of a calibration, without pictures of images; raises ProductError."""
-    from starcal_ros.report import page  # seldom needed, slow to load
-
-    found = page.Found(calibration, left, tuple(records), (), tuple(products))
-    with tempfile.TemporaryDirectory(prefix='starcal-') as name:
-        folder = Path(name)
-        for file, text in products.items():
-            (folder / file).write_text(text)
-        return page.with_digests(page.render(found, Path(url)), folder)
 
 
 def _kept(row: Row, products: Mapping[str, str], task: Task) -> Row:
