@@ -21,6 +21,7 @@ from starcal_ros.mission.trend import places
 from starcal_ros.mission.trend.places import Entry
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.pipeline.setup import files_of, read_setup
+from starcal_ros.text import printable
 from starcal_ros.untrusted import regular_file, shown
 
 KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source of rows
@@ -150,7 +151,7 @@ def _task(
     # A calibration is the same whatever is beside it, a bag is not.
     decide = [*files, *(others if version else ())]
     identities = [(entry.name, entry.identity) for entry in decide]
-    spacecraft, camera = cameras.of(name)
+    spacecraft, camera = map(printable, cameras.of(name))
     text = f'{identities!r} {version} {settings[1]} {spacecraft!r} {camera!r}'
     return Task(
         url=places.join(root, name),
