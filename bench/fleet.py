@@ -147,7 +147,10 @@ def of_bags(root: str, folder: Path, count: int, alone: int) -> Table:
     made.add('bags lost', sum(task.stamp not in stamps for task in found))
     made.add('bags counted twice', sum(n > 1 for n in stamps.values()))
     made.add('bags failed', sum(bool(row.error) for row in rows))
-    made.add('calibrations lost or left over', len(kept ^ {kept_name(row) for row in rows}))
+    made.add(
+        'calibrations lost or left over',
+        len(kept ^ {f'{kept_name(row)}/calibration.json' for row in rows}),
+    )
     for who, values in (('this process', watch.parent_mb), ('largest worker', watch.worker_mb)):
         tenth = max(1, len(values) // 10)
         made.add(f'{who}, second tenth, MB', statistics.mean(values[tenth : 2 * tenth]))

@@ -527,6 +527,8 @@ def _trend(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument('--cameras', default='', metavar='PATTERN', help=what)
     command.add_argument('--retry', action='store_true', help='try what failed before again')
+    what = 'write report.html beside the calibration of each bag that is calibrated in this run'
+    command.add_argument('--reports', action='store_true', help=what)
     _workers(command, 'worker processes (default: 0, in-process)', 0)
 
 

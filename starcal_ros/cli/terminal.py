@@ -41,8 +41,12 @@ def print_text(text: str = '', end: str = '\n', file: TextIO | None = None) -> N
 
 
 @contextlib.contextmanager
-def progress_bar(total: int, label: str) -> Iterator[Callable[[], None]]:
-    """Progress bar on a terminal, nothing elsewhere; yields a function that advances it by one."""
+def progress_bar(total: int | None, label: str) -> Iterator[Callable[[], None]]:
+    """
+    Progress bar on a terminal, nothing elsewhere; yields a function that advances it by one.
+
+    ``total`` is None where it is not known.
+    """
     if not sys.stderr.isatty():
         yield lambda: None
         return

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import CancelledError, FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 import contextlib
 import functools
+import itertools
 import logging
 import os
 import re
@@ -81,32 +82,36 @@ def run_each(
 
 def stream_each(
     function: Callable[[Item], Result],
-    items: Sequence[Item],
+    items: Iterable[Item],
     workers: int = 0,
     scheduler: str = '',
-) -> Generator[tuple[int, Result | Exception], None, None]:
+) -> Generator[tuple[Item, Result | Exception], None, None]:
     """
-    Pairs (index, result) of a function called with each item, in any order, as they come.
+    Pairs (item, result) of a function called with each item, in any order, as they come.
 
-    The result of an item whose function raises, or whose process ends early each time that it is
-    tried, is the exception.  ``workers`` and ``scheduler`` as for `run_each`.  Raises OptionError
-    when no scheduler answers at the address.
+    An item is taken when it is submitted, and let go with its result.  The result of an item whose
+    function raises, or whose process ends early each time that it is tried, is the exception.
+    ``workers`` and ``scheduler`` as for `run_each`.  Raises OptionError when no scheduler answers
+    at the address.
     """
-    if not items:
-        return
+    items = iter(items)
+    first = list(itertools.islice(items, 1))
+    if not first:
+        return  # without a look for the scheduler
+    items = itertools.chain(first, items)
     # Here and not in the worker processes: those of a cluster are not ours.
     function = functools.partial(_on_one_thread, function)
     if not scheduler and not workers:
-        for number, item in enumerate(items):
+        for item in items:
             try:
-                yield number, function(item)
+                yield item, function(item)
             except Exception as error:
-                yield number, error
+                yield item, error
         return
     if scheduler:
         tasks = _cluster(scheduler, function)
     else:
-        tasks = _processes(function, min(workers, len(items)))
+        tasks = _processes(function, workers)
     with tasks as (submit, ahead, ended):
         yield from _as_completed(submit, ahead, ended, items)
 
@@ -115,28 +120,28 @@ def _as_completed(
     submit: Callable[[Item], Future[Result]],
     ahead: int,
     ended: type[Exception],
-    items: Sequence[Item],
-) -> Iterator[tuple[int, Result | Exception]]:
+    items: Iterator[Item],
+) -> Iterator[tuple[Item, Result | Exception]]:
     """Results as they come, with ``ahead`` items submitted at a time."""
-    waiting, again, deaths = deque(range(len(items))), deque[int](), Counter[int]()
-    running: dict[Future[Result], int] = {}
-    while waiting or again or running:
-        if not waiting and not running:
+    again = deque[tuple[Item, int]]()  # items whose process ended, and how often
+    running: dict[Future[Result], tuple[Item, int]] = {}
+    while True:
+        for item in itertools.islice(items, ahead - len(running)):
+            running[submit(item)] = item, 0
+        if not running:
+            if not again:
+                return
             # Alone: where memory is short, the system may have ended the wrong process.
-            waiting.append(again.popleft())
-        while waiting and len(running) < ahead:
-            number = waiting.popleft()
-            running[submit(items[number])] = number
+            item, deaths = again.popleft()
+            running[submit(item)] = item, deaths
         for future in wait(running, return_when=FIRST_COMPLETED).done:
-            number, error = running.pop(future), future.exception()
+            (item, deaths), error = running.pop(future), future.exception()
             if not isinstance(error, ended):
-                yield number, error if isinstance(error, Exception) else future.result()
-                continue
-            deaths[number] += 1
-            if deaths[number] == _TRIES:
-                yield number, StarcalError(f'{error}, the last of {_TRIES} times: out of memory?')
+                yield item, error if isinstance(error, Exception) else future.result()
+            elif deaths + 1 == _TRIES:
+                yield item, StarcalError(f'{error}, the last of {_TRIES} times: out of memory?')
             else:
-                again.append(number)
+                again.append((item, deaths + 1))
 
 
 def _on_one_thread(function: Callable[[Item], Result], item: Item) -> Result:

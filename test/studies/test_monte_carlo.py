@@ -150,17 +150,31 @@ def test_each_result_comes_once_whatever_workers_are_killed(count: int) -> None:
     us = psutil.Process()
     earlier = {child.pid for child in us.children()}  # of other tests
     items, found = [*'1234', 'x', *'5678'], {}
-    for number, result in workers.stream_each(int, items, workers=count):
-        assert number not in found
-        found[number] = result
+    for item, result in workers.stream_each(int, items, workers=count):
+        assert item not in found
+        found[item] = result
         if len(found) < 6:
             for child in us.children():
                 if child.pid not in earlier:
                     child.kill()
-    assert isinstance(found.pop(4), ValueError)
-    assert found == {k: int(item) for k, item in enumerate(items) if item != 'x'}
+    assert isinstance(found.pop('x'), ValueError)
+    assert found == {item: int(item) for item in items if item != 'x'}
     ended = dict(workers.stream_each(os._exit, [3, 4, 5], workers=count))
     assert all('ended with status' in str(error) for error in ended.values()) and len(ended) == 3
+
+
+@pytest.mark.parametrize('count', [0, 2])
+def test_items_are_taken_when_they_are_submitted(count: int) -> None:
+    taken: list[int] = []
+
+    def items() -> Iterator[int]:
+        for k in range(100):
+            taken.append(k)
+            yield k
+
+    for done, _ in enumerate(workers.stream_each(abs, items(), workers=count)):
+        assert len(taken) <= done + 2 * count + 1
+    assert len(taken) == 100
 
 
 def test_interrupted_leaves_in_one_line(tmp_path: Path) -> None:

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import contextlib
 import dataclasses
 import glob
 import math
@@ -163,28 +164,29 @@ def _catalog(args: argparse.Namespace) -> int:
 def _trend(args: argparse.Namespace) -> int:
     """Follow calibrations over years."""
     from starcal_ros.mission.trend import fleet, places, trend_page
-    from starcal_ros.mission.trend.tasks import find, read_cameras
+    from starcal_ros.mission.trend.tasks import find, read_cameras, Task
     from starcal_ros.mission.trend.trend_table import Table
 
-    root = places.absolute(args.root)
-    try:
+    root, cameras = places.absolute(args.root), read_cameras(args.cameras, args.params)
+    with _reading(args.root):
         if not places.exists(root):
             raise OptionError(f'{args.root}: no such folder')
-        found = list(find(root, read_cameras(args.cameras, args.params)))
-    except OSError as error:
-        raise OptionError(f'{args.root}: cannot be read: {error.strerror or error}') from error
+
+    def tasks() -> Iterator[Task]:
+        with _reading(args.root):
+            yield from find(root, cameras)
+
     if not places.is_remote(args.output):
         make_folder(Path(args.output))
     table = Table(args.output)
     # A file that was repaired or removed is no longer among the tasks.
-    table.forget_failed(() if args.retry else {task.stamp for task in found})
-    if not found:
+    table.forget_failed(() if args.retry else (task.stamp for task in tasks()))
+    with progress_bar(None, 'calibrations') as advance:
+        done = fleet.update(table, tasks(), args.workers, args.scheduler, advance, args.reports)
+    if done == fleet.Done():
         raise OptionError(
             f'{args.root}: no calibration.json below it, and no bag to calibrate with --params'
         )
-    with progress_bar(len(found), 'calibrations') as advance:
-        done = fleet.update(table, found, args.workers, args.scheduler, advance)
-    found.clear()  # 50 MB of 100,000 tasks, which the page can use
     page = trend_page.write_page(table.cameras(), table.camera_count(), args.output, args.root)
     copies = f', {done.repeated} the same as another' if done.repeated else ''
     print_text(f'{done.computed} new, {done.known} known before, {done.failed} failed{copies}')
@@ -192,6 +194,14 @@ def _trend(args: argparse.Namespace) -> int:
         print_text(f'failed: {row.path}: {row.error}')
     print_text(f'{page.years:.2f} years; look at {page.path}')
     return EXIT_ACCEPTED if page.calibrations else EXIT_REFUSED
+
+
+@contextlib.contextmanager
+def _reading(root: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OptionError(f'{root}: cannot be read: {error.strerror or error}') from error
 
 
 COMMANDS: Mapping[str, Callable[[argparse.Namespace], int]] = {

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import hashlib
@@ -15,11 +15,12 @@ import socket
 
 import numpy as np
 
+from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.errors import ProductError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.types import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import calibration_json
-from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE
+from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE, REPORT_FILE
 from starcal_ros.mission.trend import places
 from starcal_ros.mission.trend.rows import (
     COMPUTED,
@@ -90,10 +91,20 @@ def _answer(task: Task, path: Path) -> Row | Seen:
         key = digest((*files, *settings), version)
         if key[:START] in task.known:
             return Seen(key[:START])
-        made, temperature = _calibrated(task, path) if task.is_bag else _recorded(path)
-        kind = COMPUTED if task.is_bag else RECORDED
-        row = _of_task(row_of(made, key, task.url, kind, temperature), task, path)
-        return _kept(row, made, task) if task.is_bag and task.table else row
+        if not task.is_bag:
+            made, temperature = _recorded(path)
+            return _of_task(row_of(made, key, task.url, RECORDED, temperature), task)
+        made, left, records = _calibrated(task, path)
+        row = row_of(made, key, task.url, COMPUTED, _mean_temperature(records))
+        row = _of_task(row, task, path)
+        products = {calibration_json.CALIBRATION_FILE: calibration_json.calibration_text(made)}
+        if task.with_report:
+            from starcal_ros.report import page  # seldom needed, slow to load
+
+            # Pictures of images would be most of its bytes.
+            contents = page.Found(made, left, tuple(records), (), ())
+            products[REPORT_FILE] = page.render(contents, Path(task.url))
+        return _kept(row, products, task) if task.table else row
     except (StarcalError, ValueError) as error:
         cause = error.__cause__
         if isinstance(cause, OSError):
@@ -124,15 +135,15 @@ def _custom_data(metadata: Path) -> dict[str, str]:
         return {}  # rosbag2 writes it from version 0.16 on, and only where it was given
 
 
-def _kept(row: Row, calibration: Calibration, task: Task) -> Row:
-    """The row after its calibration is written; a failure that passes if it cannot be."""
+def _kept(row: Row, products: Mapping[str, str], task: Task) -> Row:
+    """The row after the products are written; a failure that passes if they cannot be."""
     try:
         # A worker of a cluster would make a folder of its own, in which nobody looks.
         if not places.is_remote(task.table) and not os.path.isdir(task.table):
             raise FileNotFoundError(2, _NOT_SEEN)
         folder = places.join(posixpath.dirname(task.table), KEPT_FOLDER)
-        text = calibration_json.calibration_text(calibration)
-        places.write(places.join(folder, kept_name(row)), text.encode())
+        for name, text in products.items():
+            places.write(places.join(folder, f'{kept_name(row)}/{name}'), text.encode())
     except (OSError, ProductError) as error:
         reason = f'{task.table}: cannot be written: {getattr(error, "strerror", "") or error}'
         return failed(task, f'{socket.gethostname()}: {reason}', is_passing=True)
@@ -145,13 +156,13 @@ def _recorded(path: Path) -> tuple[Calibration, float]:
     return calibration_json.read_calibration(path), temperature
 
 
-def _calibrated(task: Task, path: Path) -> tuple[Calibration, float]:
-    """The calibration of a bag and its mean temperature."""
+def _calibrated(task: Task, path: Path) -> tuple[Calibration, Residuals, list[StarObservations]]:
+    """The calibration of a bag, its residuals and its observations."""
     setup = read_setup(Path(task.params)) if task.params else _setup_beside(path)
     chosen = topics.choose_topics([path], topics.Topics(), setup)
     records = list(topics.read([path], chosen, setup))
-    calibration = solve.solve(solve.ensemble_of(records, setup), setup)
-    return calibration, _mean_temperature(records)
+    ensemble = solve.ensemble_of(records, setup)
+    return *solve.solve_with_residuals(ensemble, setup), records
 
 
 def _setup_beside(bag: Path) -> Setup:

@@ -76,9 +76,8 @@ def trend_of(
     columns = _columns(time_s, temperature_degc)
     chosen: list[str] = []
     while True:
-        names = [name for name in columns if name and name not in chosen]
-        p_values = _p_values(columns, chosen, names, value, sigma)
-        p, best = min(zip(p_values, names, strict=True), default=(1.0, ''))
+        p_values = _p_values(columns, chosen, value, sigma)
+        p, best = min((p, name) for name, p in p_values.items() if name not in chosen)
         if p > max_p_value or len(chosen) >= n // 3:
             break
         chosen = _still_needed(columns, [*chosen, best], value, sigma, max_p_value)
@@ -88,22 +87,28 @@ def trend_of(
 
 
 def _columns(time_s: Floats, temperature_degc: Floats) -> dict[str, Floats]:
-    """Regressors (n,) by name: '' the constant, steps as ``step 7``."""
-    n = len(time_s)
+    """Regressors (n,) by name, '' the constant; those of steps are made when they are needed."""
     years = (time_s - time_s.mean()) / SECONDS_PER_YEAR
-    columns = {'': np.ones(n), _DRIFT: years}
+    columns = {'': np.ones(len(time_s)), _DRIFT: years}
     if np.isfinite(temperature_degc).all() and np.ptp(temperature_degc) > 0:
         columns[_TEMPERATURE] = temperature_degc - temperature_degc.mean()
-    for k in range(_STEP_SIDE - 1, n - _STEP_SIDE):
-        columns[f'step {k}'] = (np.arange(n) > k).astype(np.float64)
     return columns
+
+
+def _matrix(columns: dict[str, Floats], chosen: Sequence[str]) -> Floats:
+    """Regressors (n, 1 + c) of the constant and the chosen terms; a step is named ``step 7``."""
+    measurement, found = np.arange(len(columns[''])), [columns['']]
+    for name in chosen:
+        kind, _, after = name.partition(' ')
+        found.append(np.asarray(measurement > int(after), np.float64) if after else columns[kind])
+    return np.stack(found, axis=1)
 
 
 def _solve(
     columns: dict[str, Floats], chosen: Sequence[str], value: Floats, sigma: Floats
 ) -> tuple[Floats, Floats, float]:
     """Coefficients of the constant and the chosen terms, their covariance, and chi^2."""
-    A = np.stack([columns[name] for name in ('', *chosen)], axis=1) / sigma[:, None]
+    A = _matrix(columns, chosen) / sigma[:, None]
     b = value / sigma
     inverse = np.asarray(np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True), np.float64)
     x = inverse @ (A.T @ b)
@@ -111,37 +116,36 @@ def _solve(
 
 
 def _p_values(
-    columns: dict[str, Floats],
-    chosen: Sequence[str],
-    names: Sequence[str],
-    value: Floats,
-    sigma: Floats,
-) -> list[float]:
+    columns: dict[str, Floats], chosen: Sequence[str], value: Floats, sigma: Floats
+) -> dict[str, float]:
     """
-    p-values of terms, each beside the chosen ones.
+    p-values of all terms, each beside the chosen ones; 1 for those.
 
     A term lowers chi^2 by the square of the residual along the part of its column that is
-    orthogonal to the columns of the chosen ones, so all are judged by one factorisation.
+    orthogonal to the columns of the chosen ones, so all are judged by one factorisation.  The
+    sums of a step are those over the measurements after it: time and memory grow with n.
     """
-    if not names:
-        return []
-    Q, _ = np.linalg.qr(
-        np.stack([columns[name] for name in ('', *chosen)], axis=1) / sigma[:, None]
-    )
+    n, w = len(value), 1.0 / sigma[:, None]
+    Q, _ = np.linalg.qr(_matrix(columns, chosen) * w)
     b = value / sigma
     b = b - Q @ (Q.T @ b)
-    C = np.stack([columns[name] for name in names], axis=1) / sigma[:, None]
-    squares = np.sum(C**2, axis=0)
-    C -= Q @ (Q.T @ C)
-    left = np.sum(C**2, axis=0)
+    names = [name for name in columns if name]
+    places = range(_STEP_SIDE - 1, n - _STEP_SIDE)
+    terms = np.hstack([w, b[:, None], Q]) * w  # times a column, for the sums below
+    C = np.stack([columns[name] for name in names], axis=1)
+    sums = np.vstack([C.T @ terms, np.cumsum(terms[::-1], axis=0)[::-1][places.start + 1 :]])
+    sums = sums[: len(names) + len(places)]
+    sums[: len(names), 0] = np.sum((C * w) ** 2, axis=0)
+    squares, along_b, along_Q = sums[:, 0], sums[:, 1], sums[:, 2:]
+    left = squares - np.sum(along_Q**2, axis=1)
     # A column that the chosen ones span lowers nothing.
-    gain = np.where(left > 1e-12 * squares, (C.T @ b) ** 2 / np.maximum(left, 1e-300), 0.0)
-    freedom = len(value) - len(chosen) - 2
+    gain = np.where(left > 1e-12 * squares, along_b**2 / np.maximum(left, 1e-300), 0.0)
+    freedom = n - len(chosen) - 2
     F = gain / np.maximum((b @ b - gain) / freedom, 1.0)
-    places = sum(other.startswith('step') for other in columns)
-    counts = [places if name.startswith('step') else 1 for name in names]
-    p_values = fdtrc(1, freedom, np.maximum(F, 0.0)) * counts
-    return [min(1.0, float(p)) for p in p_values]
+    p_values = fdtrc(1, freedom, np.maximum(F, 0.0))
+    p_values[len(names) :] *= len(places)
+    names += [f'step {k}' for k in places]
+    return dict(zip(names, np.minimum(p_values, 1.0).tolist(), strict=True))
 
 
 def _still_needed(
@@ -154,7 +158,7 @@ def _still_needed(
     """The chosen terms without those that the others have made superfluous."""
     while len(chosen) > 1:
         p_values = {
-            name: _p_values(columns, [c for c in chosen if c != name], [name], value, sigma)[0]
+            name: _p_values(columns, [c for c in chosen if c != name], value, sigma)[name]
             for name in chosen
         }
         worst = max(p_values, key=lambda name: p_values[name])
@@ -171,9 +175,9 @@ def _fitted(columns: dict[str, Floats], chosen: list[str], value: Floats, sigma:
     terms = []
     for k, name in enumerate(chosen, start=1):
         others = [other for other in chosen if other != name]
-        (p,) = _p_values(columns, others, [name], value, sigma)
+        p = _p_values(columns, others, value, sigma)[name]
         kind, _, after = name.partition(' ')
         terms.append(Term(kind, float(x[k]), float(error[k]), p, int(after) if after else -1))
-    fit = np.stack([columns[name] for name in ('', *chosen)], axis=1) @ x
+    fit = _matrix(columns, chosen) @ x
     terms.sort(key=lambda term: (term.after, term.kind))
     return Trend(tuple(terms), np.asarray(fit), float(np.sqrt(scale)))

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 import contextlib
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import time
 
 from starcal_ros.mission.trend.answers import compute, failed, Seen
@@ -16,6 +16,7 @@ from starcal_ros.mission.trend.trend_table import Table
 from starcal_ros.studies.workers import stream_each
 
 _PAUSES_S = (1.0, 10.0)  # before a file that could not be reached is tried again
+_MOST_AGAIN = 10_000  # such files; where a whole store is gone, others are tried by the next run
 
 
 @dataclass
@@ -26,62 +27,56 @@ class Done:
     failed: int = 0
     known: int = 0
     repeated: int = 0
-    _starts: set[str] = field(default_factory=set, compare=False, repr=False)
 
-    def count_known(self, start: str) -> None:
+    def count_known(self, table: Table, start: str) -> None:
         """Count a file whose row, named by the start of its key, is in the table."""
         if start:
-            self.known += start not in self._starts
-            self.repeated += start in self._starts
-            self._starts.add(start)
+            is_first = table.count(start)
+            self.known += is_first
+            self.repeated += not is_first
 
     def count(self, table: Table, task: Task, answer: Row | Seen) -> None:
         """Put an answer into the table, and count it."""
         if isinstance(answer, Seen):
             table.add_seen(task.stamp, answer)
-            self.count_known(answer.key)
+            self.count_known(table, answer.key)
         elif table.add(answer):
             self.computed += not answer.error
             self.failed += bool(answer.error)
-            self._starts.add(answer.key[:START])
         else:
-            self.count_known(answer.key[:START])
+            self.count_known(table, answer.key[:START])
 
 
 def update(
     table: Table,
-    tasks: Sequence[Task],
+    tasks: Iterable[Task],
     workers: int = 0,
     scheduler: str = '',
     on_row: Callable[[], None] = lambda: None,
+    with_reports: bool = False,
 ) -> Done:
     """
-    Add the rows of the tasks that the table does not have.
+    Add the rows of the tasks that the table does not have; a task is taken when it is submitted.
 
     A task that ends its worker process on every attempt becomes the row of a failure; the others
-    go on.  A file that cannot be reached is tried again after the others, with a pause.
+    go on.  A file that cannot be reached, one of the first 10,000, is tried again after the
+    others, with a pause.
     What is computed is on disk within a batch, so a run that was stopped starts where it stopped.
-    A worker writes the calibration of a bag beside the table before its row is sent, so that each
-    row on disk has its calibration.
+    A worker writes the calibration of a bag (and its report) beside the table before its row is
+    sent, so that each row on disk has its calibration.
     ``workers`` and ``scheduler`` as for `run_each`; the workers of a cluster see the same files.
     """
     done = Done()
-    waiting = []
-    for task in tasks:
-        start = table.start_of(task)
-        if start is not None:
-            done.count_known(start)
-        else:
-            waiting.append(dataclasses.replace(task, known=table.likely(task), table=table.folder))
+    waiting = _not_known(table, tasks, done, with_reports)
     with table:
         for pause_s in (*_PAUSES_S, None):
-            again = []
+            again: list[Task] = []
             with contextlib.closing(stream_each(compute, waiting, workers, scheduler)) as found:
-                for number, answer in found:
-                    task = waiting[number]
+                for task, answer in found:
                     if isinstance(answer, Exception):
                         answer = failed(task, str(answer))
-                    if isinstance(answer, Row) and answer.is_passing and pause_s is not None:
+                    may_pass = isinstance(answer, Row) and answer.is_passing
+                    if may_pass and pause_s is not None and len(again) < _MOST_AGAIN:
                         again.append(task)
                         continue
                     done.count(table, task, answer)
@@ -89,5 +84,19 @@ def update(
             if not again or pause_s is None:
                 break
             time.sleep(pause_s)
-            waiting = again
+            waiting = iter(again)
     return done
+
+
+def _not_known(
+    table: Table, tasks: Iterable[Task], done: Done, with_report: bool
+) -> Iterator[Task]:
+    """Tasks that the table has no row of, with what a worker asks of the table; others count."""
+    for task in tasks:
+        start = table.start_of(task)
+        if start is None:
+            yield dataclasses.replace(
+                task, known=table.likely(task), table=table.folder, with_report=with_report
+            )
+        else:
+            done.count_known(table, start)

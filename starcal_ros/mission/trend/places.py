@@ -8,10 +8,11 @@ too, so callers tell a place that cannot be reached from a file that is bad.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass
 import errno
+import itertools
 import os
 from pathlib import Path
 import posixpath
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _ETAGS = ('ETag', 'etag', 'md5Hash')  # of S3, Google and Azure
 _TIMES = ('LastModified', 'last_modified', 'updated', 'mtime', 'created')
 _LONGEST_REASON = 200
+_TOGETHER = 100_000  # files that are listed at once: 0.2 GB in the clients of stores
 _OBJECT_STORES = {'s3', 'gs', 'abfs'}
 
 
@@ -65,19 +67,43 @@ def join(folder: str, name: str) -> str:
 def entries(root: str) -> list[Entry]:
     """Files below a root, in order of their names; raises OSError."""
     if not is_remote(root):
-        return sorted(_local_entries(root), key=lambda entry: entry.name)
+        return sorted(itertools.chain(*listings(root)), key=lambda entry: entry.name)
     with _remote(root) as (fs, base):
         fs.invalidate_cache()
-        found = fs.find(base, detail=True)
-        return [
-            Entry(
-                fs.unstrip_protocol(path),
-                posixpath.relpath(path, base),
-                int(info['size']),
-                _identity(info),
-            )
-            for path, info in sorted(found.items())
-        ]
+        return _remote_entries(fs, base, fs.find(base, detail=True))
+
+
+def listings(root: str) -> Iterator[list[Entry]]:
+    """
+    Files below a root in lists, each with all files of a folder or none; raises OSError.
+
+    A local list is that of one folder.  A request to a store lists 1000 files below one folder, so
+    a list is that of all files below a subfolder of the root (of the first folder with several),
+    or of all files below the root where they are fewer than about 100,000.
+    """
+    if not is_remote(root):
+        for folder, folders, files in os.walk(root):
+            folders.sort()
+            # A folder in place of a calibration or a table is a file that cannot be read.
+            files += (name for name in folders if name.endswith(('.json', '.parquet')))
+            yield _local_entries(root, folder, sorted(files))
+        return
+    with _remote(root) as (fs, base):
+        fs.invalidate_cache()
+        top, found = base, fs.ls(base, detail=True)
+        # The marker of an empty folder has the name of the folder.
+        while [i['type'] for i in found] == ['directory'] and len(found[0]['name']) > len(top):
+            top = found[0]['name']
+            found = fs.ls(top, detail=True)
+        below = [info['name'] for info in found if info['type'] == 'directory']
+        if not below or len(below) * len(fs.find(below[0])) < _TOGETHER:
+            yield _remote_entries(fs, base, fs.find(top, detail=True))
+            return
+        files_here = {info['name']: info for info in found if info['type'] != 'directory'}
+        yield _remote_entries(fs, base, files_here)
+        for below_one in below:
+            fs.invalidate_cache()  # it keeps each listing
+            yield _remote_entries(fs, base, fs.find(below_one, detail=True))
 
 
 def make_folder(folder: str) -> None:
@@ -162,17 +188,30 @@ def fetched(url: str, files: Sequence[str]) -> Iterator[Path]:
         yield Path(folder, posixpath.basename(url))
 
 
-def _local_entries(root: str) -> Iterator[Entry]:
-    for folder, folders, files in os.walk(root):
-        # A folder in place of a calibration or a table is a file that cannot be read.
-        for name in (*files, *(n for n in folders if n.endswith(('.json', '.parquet')))):
-            path = os.path.join(folder, name)
-            try:
-                status = os.stat(path)
-                size, identity = status.st_size, f'{status.st_size} {status.st_mtime_ns}'
-            except OSError as error:
-                size, identity = -1, f'error {error.errno}'
-            yield Entry(path, os.path.relpath(path, root), size, identity)
+def _local_entries(root: str, folder: str, names: Sequence[str]) -> list[Entry]:
+    found = []
+    for path in (os.path.join(folder, name) for name in names):
+        try:
+            status = os.stat(path)
+            size, identity = status.st_size, f'{status.st_size} {status.st_mtime_ns}'
+        except OSError as error:
+            size, identity = -1, f'error {error.errno}'
+        found.append(Entry(path, os.path.relpath(path, root), size, identity))
+    return found
+
+
+def _remote_entries(
+    fs: AbstractFileSystem, base: str, found: Mapping[str, dict[str, Any]]
+) -> list[Entry]:
+    return [
+        Entry(
+            fs.unstrip_protocol(path),
+            posixpath.relpath(path, base),
+            int(info['size']),
+            _identity(info),
+        )
+        for path, info in sorted(found.items())
+    ]
 
 
 def _identity(info: dict[str, Any]) -> str:

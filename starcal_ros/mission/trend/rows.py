@@ -15,7 +15,6 @@ from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import Derivatives
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.formats.products.calibration_json import CALIBRATION_FILE
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.record_codec import check_shape
 from starcal_ros.record_fields import Count, Finite, Stamp
@@ -175,10 +174,9 @@ def folder_of(*camera: str) -> str:
 
 
 def kept_name(row: Row) -> str:
-    """Path of the calibration of a bag below the folder of kept ones."""
+    """Path of the folder of a bag below the folder of kept calibrations."""
     bag = urllib.parse.quote(posixpath.basename(row.path).removesuffix('.mcap'))
-    folder = f'{bag[:_LONGEST_NAME]}-{row.key[:START]}'
-    return f'{folder_of(row.spacecraft, row.camera)}/{folder}/{CALIBRATION_FILE}'
+    return f'{folder_of(row.spacecraft, row.camera)}/{bag[:_LONGEST_NAME]}-{row.key[:START]}'
 
 
 def failure(key: str, path: str, error: str) -> Row:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import csv
 from dataclasses import dataclass, field
 import fnmatch
@@ -21,6 +21,7 @@ from starcal_ros.mission.trend import places
 from starcal_ros.mission.trend.places import Entry
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.pipeline.setup import files_of, read_setup
+from starcal_ros.text import printable
 from starcal_ros.untrusted import regular_file, shown
 
 KEPT_FOLDER = 'trend.calibrations'  # beside the table; those of bags, no source of rows
@@ -59,6 +60,8 @@ class Task:
         Starts of digests in the table of which one may be that of this content.
     table : str
         Folder or URL of the table that calibrations of bags are kept beside; empty: not kept.
+    with_report : bool
+        True if the report of a bag is kept as well.
     """
 
     url: str
@@ -72,23 +75,32 @@ class Task:
     camera: str = ''
     known: tuple[str, ...] = ()
     table: str = ''
+    with_report: bool = False
 
 
 def find(root: str, cameras: Cameras) -> Iterator[Task]:
     """
-    Tasks below a root: calibrations in order of their paths, then bags; no file is read.
+    Tasks below a root, as it is listed; no file is read.
 
     A bag is a task where it has parameters and no calibration beside it.  Observations beside a
     calibration are one too: it is done only if that is of another version.  Raises OSError when
-    the root cannot be listed. Raises StarcalError when a parameter file or a file that it names
+    a folder cannot be listed. Raises StarcalError when a parameter file or a file that it names
     cannot be read.
     """
-    listed = {
-        entry.name: entry
-        for entry in places.entries(root)
-        if KEPT_FOLDER not in entry.name.split('/')
-    }
     version, settings_of = software_version(), functools.cache(_settings)
+    for entries in places.listings(root):
+        listed = {e.name: e for e in entries if KEPT_FOLDER not in e.name.split('/')}
+        yield from _tasks(root, listed, cameras, version, settings_of)
+
+
+def _tasks(
+    root: str,
+    listed: dict[str, Entry],
+    cameras: Cameras,
+    version: str,
+    settings_of: Callable[[str], tuple[tuple[str, ...], str]],
+) -> Iterator[Task]:
+    """Tasks of files by name: calibrations in order of their paths, then bags."""
     for name, entry in listed.items():
         if posixpath.basename(name) == CALIBRATION_FILE:
             observations = listed.get(posixpath.join(posixpath.dirname(name), OBSERVATIONS_FILE))
@@ -139,7 +151,7 @@ def _task(
     # A calibration is the same whatever is beside it, a bag is not.
     decide = [*files, *(others if version else ())]
     identities = [(entry.name, entry.identity) for entry in decide]
-    spacecraft, camera = cameras.of(name)
+    spacecraft, camera = map(printable, cameras.of(name))
     text = f'{identities!r} {version} {settings[1]} {spacecraft!r} {camera!r}'
     return Task(
         url=places.join(root, name),

@@ -46,6 +46,7 @@ from starcal_ros.text import printable
 TREND_FILE = 'trend.html'
 _LISTED = 200
 _DRAWN = 10  # cameras with figures, 0.1 MB each, those that need attention first
+_POINTS = 400  # calibrations in a figure; of more, each second one and so on: 200 bytes a point
 _RECALIBRATE_PX = 0.1  # change from which a new calibration is worth its upload, on the figure
 _HEIGHT = 270.0
 _MARGIN_NS = 30 * 86400 * NANOSECONDS_PER_SECOND  # one calibration alone has dates about it
@@ -227,8 +228,15 @@ def _chart(series: Series, rows: Sequence[Row]) -> Chart:
     words = ', '.join(_words(term, series) for term in series.trend.terms) or 'no change found'
     scatter = series.trend.scatter
     about = '' if math.isnan(scatter) else f' Scatter about the fit: {scatter:.2f} of the sigmas.'
+    every = _every(series.row)
+    about += f' One in {every} calibrations is drawn.' if every > 1 else ''
     text = f'{words[0].upper()}{words[1:]}.{about}'
     return Chart(series.name, series_figure(series, rows), text)
+
+
+def _every(numbers: Sequence[object]) -> int:
+    """Distance of those that are drawn; 1 for up to 400."""
+    return -(-len(numbers) // _POINTS)
 
 
 def _words(term: Term, series: Series) -> str:
@@ -256,13 +264,15 @@ def series_figure(series: Series, rows: Sequence[Row]) -> Drawing:
     offset = _offset(float(low - room), float(high + room))
     sign = '\N{MINUS SIGN}' if offset > 0 else '+'
     name = f'{series.name} {sign} {in_digits(abs(offset))}' if offset else series.name
+    drawn = slice(None, None, _every(series.row))
+    value, sigma = series.value[drawn], series.sigma[drawn]
     titles = [
         f'{utc_text(rows[index].time_ns)[:10]}: {v:.9g} ± {s:.2g} {series.unit}'
-        for index, v, s in zip(series.row, series.value, series.sigma, strict=True)
+        for index, v, s in zip(series.row[drawn], value, sigma, strict=True)
     ]
     curves = [
-        Curve(at, series.value - offset, SERIES[0], 'calibration, 1-sigma', 'circle', width=0,
-              sigma=series.sigma, titles=titles)
+        Curve(at[drawn], value - offset, SERIES[0], 'calibration, 1-sigma', 'circle', width=0,
+              sigma=sigma, titles=titles)
     ]  # fmt: skip
     steps = sorted(term.after for term in series.trend.terms if term.kind == 'step')
     if series.trend.terms:

@@ -6,16 +6,20 @@ The Parquet table of a trend: a folder of files, each written whole, that grows 
 ended, which are sorted in at its end or after 256 files; ``_seen`` the stamps of files whose row
 is that of another file.  Readers of Parquet skip folders whose names start with an underscore.
 
-A crash leaves complete files only.  Rows are unique by their key; of several the newest counts.
+A crash leaves complete files only.  Rows are unique by the start of their key; of several the
+newest counts.  A file of a camera with 1000 rows is never rewritten for new ones.
+
+The index of all rows is a temporary SQLite database, which goes to disk beyond its cache.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 import itertools
 import posixpath
+import sqlite3
 import time
 from typing import Any, get_type_hints
 import urllib.parse
@@ -38,6 +42,7 @@ _NEW, _SEEN = '_new', '_seen'
 _BATCH = 16  # rows in a part: what a crash can lose, a few seconds of work
 _READ = 1024  # rows at a time, which take a few MB as Python objects
 _MERGE = 256  # parts from which they are sorted in
+_FULL = 1000  # rows of a file of a camera that new ones are not merged with
 _MOST_KNOWN = 1000  # digests of a size sent with a task: beyond, the content is used again
 _MOST_BYTES = 256 * 2**20  # of a file; a row has 1 kB
 _MOST_VALUES = 2**25  # of a file, repeated ones counted, which compress to nothing
@@ -59,18 +64,16 @@ SCHEMA = pa.schema(
     metadata={'starcal_trend_schema': SCHEMA_VERSION},
 )
 _SEEN_SCHEMA = pa.schema([('stamp', pa.string()), ('key', pa.string())])
-_STATE = ('key', 'path', 'stamp', 'size_bytes', 'error', 'software', 'is_passing', *PARTITIONS)
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Known:
-    """Part of a row that is kept in memory."""
-
-    part: str
-    stamp: str
-    camera: tuple[str, str]
-    failed_with: str  # the software; empty: it has not failed
-    is_passing: bool
+# Their order is that of the columns of `row` below.
+_STATE = ('key', *PARTITIONS, 'stamp', 'size_bytes', 'error', 'software', 'is_passing')
+_INDEX = """
+create table row (start primary key, spacecraft, camera, stamp, size, failed_with, is_passing,
+                  part, is_counted);
+create table stamp (stamp primary key, start);
+create index of_size on row (size);
+create index of_part on row (part);
+pragma cache_size = -65536;
+"""
 
 
 class Table:
@@ -85,10 +88,9 @@ class Table:
         self.folder = places.join(places.absolute(str(folder)), TABLE_FOLDER)
         self._pending: list[Row] = []
         self._pending_seen: dict[str, str] = {}
-        self._known: dict[str, _Known] = {}
-        self._keys: dict[str, list[str]] = {}  # by part
-        self._stamps: dict[str, str] = {}
-        self._by_size: dict[int, list[str]] = {}
+        self._rows_in: dict[str, int] = {}  # by part
+        self._index = sqlite3.connect('')  # a file without a name
+        self._index.executescript(_INDEX)
         self._new_parts = 0
         try:
             places.make_folder(self.folder)
@@ -96,7 +98,7 @@ class Table:
             raise ProductError(f'{self.folder}: cannot be created: {error.strerror}') from error
         parts, seen = self._parts()
         for part in parts:
-            self._note(part)
+            self._note_part(part)
         self._note_seen(seen)
 
     def __enter__(self) -> Table:
@@ -110,28 +112,38 @@ class Table:
 
     def start_of(self, task: Task) -> str | None:
         """Start of the key of the row of a task; empty where none is due, None if not known."""
-        return self._stamps.get(task.stamp)
+        start: str | None = self._one('select start from stamp where stamp = ?', task.stamp)
+        return start
 
     def likely(self, task: Task) -> tuple[str, ...]:
         """Starts of the digests of rows whose content may be that of a task."""
-        same = self._by_size.get(task.size, ())
-        found = [key[:START] for key in same if key in self._known and self._is_of(task, key)]
-        return tuple(found) if len(found) <= _MOST_KNOWN else ()
+        # The metadata of a bag may add a name that the task has not.
+        found = self._index.execute(
+            "select start from row where size = ? and ? in ('', spacecraft) and ? in ('', camera)"
+            ' limit ?',
+            (task.size, task.spacecraft, task.camera, _MOST_KNOWN + 1),
+        ).fetchall()
+        return tuple(start for (start,) in found) if len(found) <= _MOST_KNOWN else ()
 
-    def _is_of(self, task: Task, key: str) -> bool:
-        """True if a row has the names of its task; the metadata of a bag may add some."""
-        names = zip((task.spacecraft, task.camera), self._known[key].camera, strict=True)
-        return all(given in ('', name) for given, name in names)
+    def count(self, start: str) -> bool:
+        """True at the first call for a row."""
+        return bool(
+            self._index.execute(
+                'update row set is_counted = 1 where start = ? and not is_counted', (start,)
+            ).rowcount
+        )
 
     def add(self, row: Row) -> bool:
         """Add a row, and return whether it is new: none with its key is of the same camera."""
-        before, camera = self._known.get(row.key), (row.spacecraft, row.camera)
-        if before and before.camera == camera:
+        start = row.key[:START]
+        if self._one(
+            'select 1 from row where start = ? and spacecraft = ? and camera = ?',
+            *(start, row.spacecraft, row.camera),
+        ):
             self.add_seen(row.stamp, Seen(row.key))
             return False
-        failed_with = row.software if row.error else ''
-        self._known[row.key] = _Known('', row.stamp, camera, failed_with, row.is_passing)
-        self._index(row.key, row.stamp, row.size_bytes)
+        self._note([[getattr(row, name)] for name in _STATE], '')
+        self.count(start)
         self._pending.append(row)
         if len(self._pending) >= _BATCH:
             self.flush()
@@ -140,7 +152,8 @@ class Table:
     def add_seen(self, stamp: str, seen: Seen) -> None:
         """Note that a stamp is that of another row, or needs none."""
         if stamp:
-            self._stamps[stamp] = self._pending_seen[stamp] = seen.key[:START]
+            start = self._pending_seen[stamp] = seen.key[:START]
+            self._index.execute('replace into stamp values (?, ?)', (stamp, start))
 
     def flush(self) -> None:
         """Write what is held in memory, and sort the parts in if there are many."""
@@ -156,21 +169,20 @@ class Table:
         if self._new_parts >= _MERGE:
             self._sort_in()
 
-    def forget_failed(self, but: Collection[str] = ()) -> None:
+    def forget_failed(self, but: Iterable[str] = ()) -> None:
         """Remove failures, but lasting ones of some stamps that this version has tried."""
+        failed = self._index.execute(
+            "select start, stamp, failed_with, is_passing from row where failed_with != ''"
+        ).fetchall()
         software = f'starcal {software_version()}'
-        gone = {
-            key: row
-            for key, row in self._known.items()
-            if row.failed_with
-            and (row.is_passing or row.stamp not in but or row.failed_with != software)
-        }
-        for key, row in gone.items():
-            del self._known[key]
-            self._stamps.pop(row.stamp, None)
-        starts = {key[:START] for key in gone}
-        self._stamps = {s: key for s, key in self._stamps.items() if key not in starts}
+        lasting = {stamp for _, stamp, by, passing in failed if by == software and not passing}
+        kept = lasting.intersection(but) if lasting else lasting
+        gone = [(start,) for start, stamp, *_ in failed if stamp not in kept]
+        self._index.executemany('delete from row where start = ?', gone)
         if gone:
+            self._index.execute(
+                "delete from stamp where start != '' and start not in (select start from row)"
+            )
             self._sort_in()
 
     def rows(self) -> list[Row]:
@@ -181,8 +193,8 @@ class Table:
         """Rows on disk of one camera after the other, each in order of time."""
         parts = self._parts()[0]
         for part in parts:
-            if part not in self._keys:
-                self._note(part)
+            if part not in self._rows_in:
+                self._note_part(part)
         found: dict[str, list[Row]] = {}
         of_camera: dict[str, list[str]] = {}
         for part in parts:
@@ -199,7 +211,7 @@ class Table:
 
     def camera_count(self) -> int:
         """Number of cameras by their names."""
-        return len({row.camera for row in self._known.values()})
+        return int(self._one('select count(*) from (select distinct spacecraft, camera from row)'))
 
     def _rows_of(self, part: str) -> list[Row]:
         """Rows of a file that count."""
@@ -207,7 +219,8 @@ class Table:
         with _naming(part):
             for batch in _opened(part).iter_batches(_READ):
                 rows += [read_record(Row, {**one, **camera}) for one in batch.to_pylist()]
-        return [row for row in rows if self._known[row.key].part == part]
+        current = self._starts_in(part)
+        return [row for row in rows if row.key[:START] in current]
 
     def _parts(self) -> tuple[list[str], list[str]]:
         """Files with rows: those of version 1, the sorted ones, the new ones; those of stamps."""
@@ -222,80 +235,78 @@ class Table:
         parts.sort(key=lambda url: (rank.get(self._folder(url), 1), url))
         return parts, [url for url in found if self._folder(url) == _SEEN]
 
-    def _note(self, part: str) -> None:
-        """Note the keys of a file in memory."""
+    def _one(self, query: str, *values: object) -> Any:
+        """The one value of a query; None without."""
+        return (self._index.execute(query, values).fetchone() or (None,))[0]
+
+    def _starts_in(self, part: str) -> set[str]:
+        """Starts of the keys of the rows of a file that count."""
+        found = self._index.execute('select start from row where part = ?', (part,))
+        return {start for (start,) in found}
+
+    def _note_part(self, part: str) -> None:
+        """Note the rows of a file in the index."""
         camera = self._camera_of(part)
         with _naming(part):
             file = _opened(part)
-            there = [name for name in _STATE if name in file.schema_arrow.names]
-            for row in file.read(there).to_pylist():
-                row = {**_DEFAULTS, **row, **camera}
-                who = (str(row['spacecraft']), str(row['camera']))
-                failed_with = str(row['software'] or '-') if row['error'] else ''
-                key, stamp = str(row['key']), str(row['stamp'])
-                self._known[key] = _Known(part, stamp, who, failed_with, bool(row['is_passing']))
-                self._keys.setdefault(part, []).append(key)
-                self._index(key, stamp, int(row['size_bytes']))
+            table = file.read([name for name in _STATE if name in file.schema_arrow.names])
+            self._note([_column(table, name, camera).to_pylist() for name in _STATE], part)
+            self._rows_in[part] = len(table)
         self._new_parts += self._folder(part) == _NEW
 
-    def _index(self, key: str, stamp: str, size: int) -> None:
-        if stamp:
-            self._stamps[stamp] = key[:START]
-        self._by_size.setdefault(size, []).append(key)
+    def _note(self, columns: Sequence[Sequence[Any]], part: str) -> None:
+        rows = [
+            (key[:START], *names, stamp, size, (by or '-') if error else '', passing, part, False)
+            for key, *names, stamp, size, error, by, passing in zip(*columns, strict=True)
+        ]
+        self._index.executemany('replace into row values (?, ?, ?, ?, ?, ?, ?, ?, ?)', rows)
+        stamps = [(stamp, start) for start, _, _, stamp, *_ in rows if stamp]
+        self._index.executemany('replace into stamp values (?, ?)', stamps)
 
     def _note_seen(self, parts: list[str]) -> None:
-        starts = {key[:START] for key in self._known}
         for part in parts:
             with _naming(part):
-                for line in _opened(part).read().to_pylist():
-                    if not line['key'] or line['key'] in starts:
-                        self._stamps.setdefault(line['stamp'], line['key'])
+                lines = _opened(part).read().select(['stamp', 'key']).to_pylist()
+                self._index.executemany(
+                    'insert or ignore into stamp select :stamp, :key'
+                    " where :key = '' or exists (select 1 from row where start = :key)",
+                    lines,
+                )
 
     def _sort_in(self) -> None:
         """Write new rows into the files of their cameras; rows that are gone are left out."""
         parts, seen = self._parts()
-        parts = [part for part in parts if part in self._keys]  # others are of another run
-        new = {part for part in parts if self._folder(part) in ('', _NEW)}
-        grow = {folder_of(*row.camera) for row in self._known.values() if row.part in new}
-        old = [
-            part
-            for part in parts
-            if part in new or self._folder(part) in grow or not self._is_current(part)
-        ]
-        if old:
-            rows = pa.concat_tables([self._current_rows(part) for part in old])
-            cameras = zip(*(rows[name].to_pylist() for name in PARTITIONS), strict=True)
-            of_camera: dict[str, list[int]] = {}
-            for k, camera in enumerate(cameras):
-                of_camera.setdefault(folder_of(*camera), []).append(k)
-            for folder, own in of_camera.items():
-                self._write(folder, rows.take(own))
+        parts = [part for part in parts if part in self._rows_in]  # others are of another run
+        new = [part for part in parts if self._folder(part) in ('', _NEW)]
+        tables = [self._current_rows(part) for part in new]
+        fresh = pa.concat_tables(tables) if tables else SCHEMA.empty_table()
+        names = zip(*(fresh[name].to_pylist() for name in PARTITIONS), strict=True)
+        of_camera: dict[str, list[int]] = {}
+        for k, camera in enumerate(names):
+            of_camera.setdefault(folder_of(*camera), []).append(k)
+        counts = dict(self._index.execute('select part, count(*) from row group by part'))
+        old: dict[str, list[str]] = {folder: [] for folder in of_camera}
+        for part in (part for part in parts if part not in new):
+            folder, count = self._folder(part), self._rows_in[part]
+            if counts.get(part, 0) < count or (folder in of_camera and count < _FULL):
+                old.setdefault(folder, []).append(part)
+        for folder, own in old.items():  # one camera in memory at a time
+            rows = [self._current_rows(part) for part in own]
+            rows.append(fresh.take(pa.array(of_camera.get(folder, []), pa.int64())))
+            self._write(folder, pa.concat_tables(rows))
+            _remove(own)
+        _remove(new)
         if len(seen) > 1:
             with _naming(seen[0]):
                 merged = pa.concat_tables([_opened(part).read() for part in seen])
             self._write(_SEEN, merged)
-            old += seen
-        for part in old:
-            try:
-                places.remove(part)
-            except OSError as error:
-                raise ProductError(f'{part}: cannot be removed: {error.strerror}') from error
+            _remove(seen)
         self._new_parts = 0
-
-    def _is_current(self, part: str) -> bool:
-        """True if each row of a file counts."""
-        rows = [self._known.get(key) for key in self._keys[part]]
-        return all(row is not None and row.part == part for row in rows)
 
     def _current_rows(self, part: str) -> pa.Table:
         """Rows of a file that count, with all columns."""
-        table = self._arrow(part)
-        names = (table[name].to_pylist() for name in ('key', *PARTITIONS))
-        kept = []
-        for k, (key, *camera) in enumerate(zip(*names, strict=True)):
-            row = self._known.get(key)
-            if row is not None and (row.part, row.camera) == (part, tuple(camera)):
-                kept.append(k)
+        table, current = self._arrow(part), self._starts_in(part)
+        kept = [k for k, key in enumerate(table['key'].to_pylist()) if key[:START] in current]
         return table.take(pa.array(kept, pa.int64()))
 
     def _arrow(self, part: str) -> pa.Table:
@@ -303,15 +314,7 @@ class Table:
         camera = self._camera_of(part)
         with _naming(part):
             table = _opened(part).read()
-            columns = []
-            for field in SCHEMA:
-                if field.name in camera:
-                    column = pa.array([camera[field.name]] * len(table), field.type)
-                elif field.name in table.column_names:
-                    column = table[field.name].cast(field.type)
-                else:
-                    column = pa.array([_DEFAULTS[field.name]] * len(table), field.type)
-                columns.append(column)
+            columns = [_column(table, name, camera) for name in SCHEMA.names]
             return pa.table(columns, schema=SCHEMA)
 
     def _write(self, folder: str, table: pa.Table) -> None:
@@ -328,9 +331,9 @@ class Table:
         except OSError as error:
             raise ProductError(f'{url}: cannot be written: {error.strerror}') from error
         if folder != _SEEN:
-            self._keys[url] = table['key'].to_pylist()
-            for key in self._keys[url]:
-                self._known[key] = dataclasses.replace(self._known[key], part=url)
+            starts = [(url, key[:START]) for key in table['key'].to_pylist()]
+            self._index.executemany('update row set part = ? where start = ?', starts)
+            self._rows_in[url] = len(table)
 
     def _folder(self, part: str) -> str:
         """Folder of a file below the table."""
@@ -342,6 +345,22 @@ class Table:
         if tuple(name for name, _, _ in pairs) != PARTITIONS:
             return {}
         return {n: '' if v == NO_NAME else urllib.parse.unquote(v) for n, _, v in pairs}
+
+
+def _column(table: pa.Table, name: str, camera: Mapping[str, str]) -> pa.ChunkedArray:
+    """A column of a file, from its folder or with its default where the file has none."""
+    kind = SCHEMA.field(name).type
+    if name in table.column_names and name not in camera:
+        return table[name].cast(kind)
+    return pa.chunked_array([pa.array([{**_DEFAULTS, **camera}[name]] * len(table), kind)])
+
+
+def _remove(parts: Iterable[str]) -> None:
+    for part in parts:
+        try:
+            places.remove(part)
+        except OSError as error:
+            raise ProductError(f'{part}: cannot be removed: {error.strerror}') from error
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 import shutil
+from unittest import mock
 
 from mission_files import TINY  # type: ignore[import-not-found]
 import pytest
@@ -16,6 +17,7 @@ from starcal_ros.mission.trend.answers import compute
 from starcal_ros.mission.trend.rows import COMPUTED, FAILED, kept_name, Row, row_of
 from starcal_ros.mission.trend.tasks import Cameras, KEPT_FOLDER, Task
 from starcal_ros.mission.trend.trend_table import Table
+from starcal_ros.report import page
 
 CAMERAS = Cameras(params=str(TINY / 'params.yaml'))
 
@@ -36,14 +38,28 @@ def test_each_computed_row_has_its_calibration_after_any_kill(tmp_path: Path, ta
     found = list(tasks.find(str(tmp_path), CAMERAS))  # that calibration is no task
     assert [one.url for one in found] == [task.url]
     with Table(tmp_path) as table:
-        assert fleet.update(table, [task]).computed == 1
+        assert fleet.update(table, [task], with_reports=True).computed == 1
     (row,) = Table(tmp_path).rows()
-    assert kept(tmp_path) == [kept_name(row)]
+    names = [f'{kept_name(row)}/{name}' for name in ('calibration.json', 'report.html')]
+    assert kept(tmp_path) == names
+    text = (tmp_path / KEPT_FOLDER / names[1]).read_text()
+    assert 'Residual' in text and '@sha256' not in text
     assert kept_name(row).startswith('spacecraft=sat 1/camera=nav/2026-01-')
-    calibration = read_calibration(tmp_path / KEPT_FOLDER / kept_name(row))
+    calibration = read_calibration(tmp_path / KEPT_FOLDER / names[0])
     again = row_of(calibration, row.key, row.path, COMPUTED, row.temperature_degc)
     assert (again.values, again.sigmas) == (row.values, row.sigmas)
     assert calibration.covariance.shape == (len(row.sigmas),) * 2
+
+
+@pytest.mark.slow
+def test_a_page_that_cannot_be_drawn_fails_its_bag_alone(tmp_path: Path, task: Task) -> None:
+    table = Table(tmp_path)
+    task = dataclasses.replace(task, table=table.folder, with_report=True)
+    with mock.patch.object(page, '_context', side_effect=RuntimeError('no figure')):
+        row = compute(task)
+    assert isinstance(row, Row)
+    assert row.error == f'{task.url}: the products cannot be drawn: RuntimeError: no figure'
+    assert not row.is_passing and row.stamp == task.stamp
 
 
 @pytest.mark.slow
@@ -56,7 +72,7 @@ def test_a_worker_that_does_not_see_the_table_keeps_nothing(tmp_path: Path, task
 
 def test_a_name_of_a_bag_is_one_folder() -> None:
     row = Row('0' * 64, 's3://b/fleet/..', FAILED, 'bad', spacecraft='../x', camera='')
-    assert kept_name(row) == f'spacecraft=..%2Fx/camera=-/..-{"0" * 16}/calibration.json'
+    assert kept_name(row) == f'spacecraft=..%2Fx/camera=-/..-{"0" * 16}'
     long = dataclasses.replace(row, path=f'/{"é" * 200}.mcap')
     assert max(map(len, kept_name(long).split('/'))) < 255
 

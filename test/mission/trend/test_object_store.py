@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import contextlib
 import importlib.util
 import io
@@ -15,11 +15,14 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.parse
 import urllib.request
 
 from mission_files import TINY  # type: ignore[import-not-found]
 import pyarrow.parquet as pq
 import pytest
+
+from starcal_ros.mission.trend import places
 
 _MISSING = [name for name in ('moto', 'flask', 's3fs') if importlib.util.find_spec(name) is None]
 pytestmark = [
@@ -30,6 +33,8 @@ pytestmark = [
 ]
 
 _RUN = 'import sys; from starcal_ros.cli.main import main; sys.exit(main())'
+# Loaded before it is needed, so that a restart takes less than the pauses of a run.
+_SERVER = 'import sys; from moto.server import main; sys.stdin.read(); main(sys.argv[1:])'
 _BAGS = ['s3://archive/fleet/0', 's3://archive/fleet/1']
 _START_S = 60.0
 # With the content type of a form the server loses the content; without a key it gives none.
@@ -43,33 +48,21 @@ class Proxy:
         self.drop = ''  # pattern of the first line of requests whose connection is closed
         self.delay_s = 0.0
         self.requests: list[str] = []
-        self.on_request: Callable[[str], None] = lambda line: None
-        self._listener: socket.socket
-        self._port, self._open = port, list[socket.socket]()
-        self.start(0)
-        self._own_port = self._listener.getsockname()[1]
-        self.url = f'http://127.0.0.1:{self._own_port}'
-
-    def start(self, port: int | None = None) -> None:
-        self._listener = socket.create_server(
-            ('127.0.0.1', self._own_port if port is None else port)
-        )
+        self._port = port
+        self._listener = socket.create_server(('127.0.0.1', 0))
+        self.url = f'http://127.0.0.1:{self._listener.getsockname()[1]}'
         threading.Thread(target=self._accept, daemon=True).start()
 
     def close(self) -> None:
-        """End as a server that is killed: connections are cut, and none is accepted."""
         # close() alone does not wake the thread in accept().
-        for connection in (self._listener, *self._open):
-            with contextlib.suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
-        self._open.clear()
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):
             while True:
                 client, _ = self._listener.accept()
-                self._open.append(client)
                 threading.Thread(target=self._serve, args=(client,), daemon=True).start()
 
     def _serve(self, client: socket.socket) -> None:
@@ -81,7 +74,6 @@ class Proxy:
                     line = data.partition(b'\r\n')[0].decode(errors='replace')
                     if line.endswith('HTTP/1.1'):
                         self.requests.append(line)
-                        self.on_request(line)
                         if self.drop and re.search(self.drop, line):
                             break
                     time.sleep(self.delay_s)
@@ -139,6 +131,7 @@ class Store:
         self,
         root: str = 's3://archive/fleet',
         output: str = 's3://archive/trend',
+        workers: int = 2,
         **environment: str,
     ) -> subprocess.CompletedProcess[str]:
         settings = {
@@ -151,7 +144,7 @@ class Store:
         }
         line = ['trend', root, '-o', output, '--params', str(TINY / 'params.yaml')]
         done = subprocess.run(
-            [sys.executable, '-c', _RUN, *line, '--workers', '2'],
+            [sys.executable, '-c', _RUN, *line, '--workers', str(workers)],
             cwd=self.folder,
             env={**os.environ, **settings},
             capture_output=True,
@@ -162,27 +155,52 @@ class Store:
         return done
 
 
+class Server:
+    """A server process, with another one loaded that takes its port when it is killed."""
+
+    def __init__(self) -> None:
+        with socket.create_server(('127.0.0.1', 0)) as free:
+            self.port = free.getsockname()[1]
+        self.url = f'http://127.0.0.1:{self.port}'
+        self._processes = [self._loaded()]
+
+    def _loaded(self) -> subprocess.Popen[bytes]:
+        command = [sys.executable, '-c', _SERVER, '-H', '127.0.0.1', '-p', str(self.port)]
+        none = subprocess.DEVNULL
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=none, stderr=none)
+
+    def start(self) -> None:
+        pipe = self._processes[-1].stdin
+        assert pipe is not None
+        pipe.close()
+        end_s = time.monotonic() + _START_S
+        while time.monotonic() < end_s:
+            with contextlib.suppress(OSError), socket.create_connection(('127.0.0.1', self.port)):
+                break
+            time.sleep(0.1)
+
+    def load_another(self) -> None:
+        self._processes.append(self._loaded())
+
+    def kill(self) -> None:
+        """Kill the oldest process with SIGKILL."""
+        process = self._processes.pop(0)
+        process.kill()
+        process.wait()
+
+
 @pytest.fixture(scope='module')
-def server() -> Iterator[tuple[str, int]]:
-    with socket.create_server(('127.0.0.1', 0)) as free:
-        port = free.getsockname()[1]
-    command = [sys.executable, '-m', 'moto.server', '-H', '127.0.0.1', '-p', str(port)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    end_s = time.monotonic() + _START_S
-    while time.monotonic() < end_s:
-        with contextlib.suppress(OSError), socket.create_connection(('127.0.0.1', port), 1):
-            break
-        time.sleep(0.1)
-    yield f'http://127.0.0.1:{port}', port
-    process.kill()
-    process.wait()
+def server() -> Iterator[Server]:
+    made = Server()
+    made.start()
+    yield made
+    made.kill()
 
 
 @pytest.fixture
-def store(server: tuple[str, int], tmp_path: Path) -> Iterator[Store]:
-    url, port = server
-    proxy = Proxy(port)
-    made = Store(url, proxy, tmp_path)
+def store(server: Server, tmp_path: Path) -> Iterator[Store]:
+    proxy = Proxy(server.port)
+    made = Store(server.url, proxy, tmp_path)
     made.request('POST', 'moto-api/reset')
     made.request('PUT', 'archive')
     for k in range(2):
@@ -272,21 +290,43 @@ def test_a_write_that_fails_is_made_good_by_the_next_run(store: Store, drop: str
     assert store.bags_in_table() == _BAGS
 
 
-def test_a_server_that_is_killed_in_the_run_costs_a_pause(store: Store) -> None:
+def test_a_bucket_is_listed_by_folders_with_a_request_each(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(places, '_TOGETHER', 1)
+    settings = {'ACCESS_KEY_ID': 'a', 'SECRET_ACCESS_KEY': 'b', 'ENDPOINT_URL': store.proxy.url}
+    for name, value in settings.items():
+        monkeypatch.setenv(f'AWS_{name}', value)
+    assert [len(found) for found in places.listings('s3://archive')] == [0, 2, 2]
+    # The bucket, its one folder, a probe of the first folder below it; then each of these.
+    assert len(store.proxy.requests) == 5
+    assert all('list-type=2' in line for line in store.proxy.requests)
+
+
+def test_a_server_that_is_killed_in_the_run_costs_a_pause(store: Store, server: Server) -> None:
     for k in range(2, 6):
         store.put_bag(k)
-    fetched: list[str] = []
+    server.load_another()
+    killed: list[int] = []
 
-    def kill_and_restart(line: str) -> None:
-        if re.match('GET .*mcap', line):
-            fetched.append(line)
-            if len(fetched) == 3:
-                store.proxy.close()
-                time.sleep(3.0)  # longer than the first pause, shorter than the second
-                store.proxy.start()
+    def kill_and_restart() -> None:
+        while len(store.kept()) < 2:
+            time.sleep(0.05)
+        # One worker: it writes nothing until it has calibrated the next bag.
+        content = {name: store.request('GET', f'archive/{name}') for name in store.names()}
+        server.kill()
+        killed.append(sum('calibrations' in name for name in content))
+        time.sleep(3.0)  # longer than the first pause, shorter than the second
+        server.start()
+        store.request('PUT', 'archive')
+        for name, data in content.items():
+            store.request('PUT', f'archive/{urllib.parse.quote(name)}', data)
 
-    store.proxy.on_request = kill_and_restart
-    done = store.trend()
+    thread = threading.Thread(target=kill_and_restart)
+    thread.start()
+    done = store.trend(workers=1, AWS_ENDPOINT_URL=server.url)
+    thread.join()
     assert '6 new, 0 known before, 0 failed' in done.stdout and done.stderr == ''
-    assert len(fetched) > 6
+    assert killed and 2 <= killed[0] < 6
     assert store.bags_in_table() == store.kept() == [f's3://archive/fleet/{k}' for k in range(6)]
+    assert '0 new, 6 known before, 0 failed' in store.trend().stdout

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 from pathlib import Path
 import shutil
@@ -137,6 +138,22 @@ def test_bags_products_and_table_by_url(tmp_path: Path, capsys) -> None:
     assert '0 new, 2 known before, 0 failed' in capsys.readouterr().out
     paths = sorted(row.path for row in Table('memory://fleet/out').rows())
     assert paths == ['memory://fleet/bag', 'memory://fleet/one/calibration.json']
+
+
+@pytest.mark.parametrize(('together', 'lists'), [(100, [13]), (5, [1, 4, 4, 4])])
+def test_a_store_is_listed_by_folders_where_it_has_many_files(
+    monkeypatch: pytest.MonkeyPatch, together: int, lists: list[int]
+) -> None:
+    memory = fsspec.filesystem('memory')
+    for camera, day in itertools.product(range(3), range(4)):
+        memory.pipe(f'/years/fleet/{camera}/{day}/calibration.json', b'1')
+    memory.pipe('/years/fleet/readme', b'1')
+    monkeypatch.setattr(places, '_TOGETHER', together)
+    found = list(places.listings('memory://years'))
+    assert [len(one) for one in found] == lists
+    assert sorted(e.name for e in itertools.chain(*found)) == [
+        e.name for e in places.entries('memory://years')
+    ]
 
 
 def test_an_unknown_protocol_is_one_line(tmp_path: Path, capsys) -> None:

@@ -134,6 +134,8 @@ def test_a_path_that_is_not_utf_8_costs_nothing(mission: Path, capsys) -> None:
     out = capsys.readouterr().out
     assert '8 new, 0 known before, 1 failed' in out and '\\udcff/calibration.json' in out
     assert trend(moved) == 0 and '0 new, 9 known before, 0 failed' in capsys.readouterr().out
+    assert trend(moved, '--cameras', '{spacecraft}/*') == 0  # which names a camera
+    assert '8 new, 0 known before, 1 failed' in capsys.readouterr().out
 
 
 def test_what_is_no_file_costs_itself(mission: Path, capsys) -> None:

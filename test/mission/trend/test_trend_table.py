@@ -56,6 +56,38 @@ def test_parts_are_merged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert [one.key for one in Table(tmp_path).rows()] == list('0123456')
 
 
+def test_a_full_file_of_a_camera_is_left_and_each_camera_is_read_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trend_table, '_FULL', 3)
+    with Table(tmp_path) as table:
+        for k in range(3):
+            table.add(of_camera(f'x{k}', 'x'))
+        table.add(of_camera('y0', 'y'))
+    (full,) = tmp_path.rglob('camera=x/*.parquet')
+    read: list[str] = []
+    arrow = Table._arrow
+
+    def noted(self: Table, part: str) -> pa.Table:
+        read.append(part)
+        return arrow(self, part)
+
+    monkeypatch.setattr(Table, '_arrow', noted)
+    with Table(tmp_path) as table:
+        for name in ('x3', 'y1'):
+            table.add(of_camera(name, name[0]))
+    assert full.exists() and str(full) not in read
+    parts = [len(list(tmp_path.rglob(f'camera={name}/*.parquet'))) for name in 'xy']
+    assert parts == [2, 1]
+    assert [len(rows) for rows in Table(tmp_path).cameras()] == [4, 2]
+    monkeypatch.setattr(Table, '_arrow', arrow)
+    table = Table(tmp_path)
+    with table:
+        table.add(of_camera('x0', 'z'))  # has another name now
+    assert not full.exists()
+    assert [len(rows) for rows in Table(tmp_path).cameras()] == [3, 2, 1]
+
+
 def test_what_was_not_flushed_is_made_again(tmp_path: Path) -> None:
     table = Table(tmp_path)
     for k in range(20):
