@@ -150,6 +150,29 @@ def start_node(forks: Forks, tmp_path: Path) -> Iterator[StartNode]:
 
 
 @pytest.fixture(scope='session')
+def kept_indices() -> Iterator[None]:
+    """
+    Indices of patterns are built once for equal catalogs, not once for each catalog read.
+
+    The search for a sky takes 2 s for each scale otherwise, in each test.
+    """
+    from starcal_ros.identification.blind import search
+
+    build: Any = search.pattern_index
+    indices: dict[tuple[bytes, int], Any] = {}
+
+    def kept(catalog: Any, scale: int) -> Any:
+        key = (catalog.id.tobytes(), scale)
+        if key not in indices:
+            indices[key] = build(catalog, scale)
+        return indices[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search, 'pattern_index', kept)
+        yield
+
+
+@pytest.fixture(scope='session')
 def tiny_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Copy of the bag in the repository, with an absolute URL of its camera file."""
     folder = tmp_path_factory.mktemp('bags') / 'tiny'
