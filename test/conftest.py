@@ -24,6 +24,22 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
+# Files of half a minute and more: last, one of them would keep one worker while the others wait.
+LONGEST = (
+    *('test_colcon', 'test_night_sky', 'test_monte_carlo', 'test_bench', 'test_kills'),
+    *('test_calibrate', 'test_diagnose', 'test_docs', 'test_set_up_mistakes'),
+    *('test_hostile_messages', 'test_set_camera_info_client', 'test_ros_tools'),
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Have pytest-xdist keep the order below; it would begin with the files of most tests."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest."""
+    items.sort(key=lambda item: item.path.stem not in LONGEST)
 
 
 def free_domain() -> int:
