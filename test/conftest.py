@@ -71,10 +71,10 @@ def ros_domain() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def domain_of_node_tests(request: pytest.FixtureRequest) -> None:
+def surroundings(request: pytest.FixtureRequest) -> None:
     """Tests marked ``nodes`` run in `ros_domain`; other tests open no socket."""
-    if request.node.get_closest_marker('nodes'):
-        request.getfixturevalue('ros_domain')
+    is_of_nodes = request.node.get_closest_marker('nodes')
+    request.getfixturevalue('ros_domain' if is_of_nodes else 'kept_indices')
 
 
 class NodeProcess:
@@ -172,19 +172,18 @@ def kept_indices() -> Iterator[None]:
 
     The search for a sky takes 2 s for each scale otherwise, in each test.
     """
-    from starcal_ros.identification.blind import search
+    from starcal_ros.identification.blind.pattern_index import pattern_index
 
-    build: Any = search.pattern_index
     indices: dict[tuple[bytes, int], Any] = {}
 
     def kept(catalog: Any, scale: int) -> Any:
         key = (catalog.id.tobytes(), scale)
         if key not in indices:
-            indices[key] = build(catalog, scale)
+            indices[key] = pattern_index(catalog, scale)
         return indices[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search, 'pattern_index', kept)
+        patch.setattr('starcal_ros.identification.blind.search.pattern_index', kept)
         yield
 
 

@@ -28,8 +28,6 @@ from starcal_ros.records import Image
 from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.studies.simulation.rendering import images
 
-pytestmark = pytest.mark.usefixtures('kept_indices')
-
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 TOPIC = '/camera/image_raw'
 

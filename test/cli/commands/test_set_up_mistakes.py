@@ -23,7 +23,7 @@ from starcal_ros.formats.messages.types import COMPRESSED_TYPE, IMAGE_TYPE
 from starcal_ros.records import Image
 from starcal_ros.studies.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('kept_indices')]
+pytestmark = pytest.mark.slow
 
 TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 IMAGES = 4

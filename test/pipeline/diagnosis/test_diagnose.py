@@ -27,7 +27,7 @@ from starcal_ros.sky.catalog import load_catalog, StarCatalog
 from starcal_ros.studies.simulation import rendering
 from starcal_ros.studies.simulation import scenario as synthetic
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('kept_indices')]
+pytestmark = pytest.mark.slow
 
 GRANASAT = Path('/work/shared/realsky/granasat')
 START_NS = 1778829600_000000000
