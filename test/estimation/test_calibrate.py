@@ -46,7 +46,7 @@ EIGHT = CalibrationOptions(
 )
 NAMES = estimated_parameters(EIGHT, 'plumb_bob')
 FREE = [PARAMETER_NAMES.index(name) for name in NAMES]
-TRIALS = 30
+TRIALS = 60
 each_method = pytest.mark.parametrize('method', METHODS)
 
 

@@ -45,7 +45,7 @@ TEMPERATURES_DEGC = np.array([-20.0, 12.0, -5.0, 31.0, 3.0, 40.0, -14.0, 22.0, 9
 # arcseconds per degree.
 FOCAL = (4e-5, 6e-7)
 RATE_RAD = np.array([4.0, -6.0, 20.0]) * ARCSECOND_RAD
-TRIALS = 20
+TRIALS = 40
 
 
 def camera_of(temperature_degc: float, focal: tuple[float, ...]) -> CameraModel:
