@@ -1,6 +1,6 @@
 # make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, check, test, bench, lint, docs.
 # make test TESTS='-m nodes' runs a part: what follows is handed to pytest. The whole is two runs:
-# tests that start nodes wait most of the time, so three run at once. VERSIONS=oldest: with the
+# tests that start nodes wait most of the time, so four run at once. VERSIONS=oldest: with the
 # oldest versions of the Python packages that starcal is tested on; VERSIONS=newest: with the newest
 # ones that PyPI has today. Each in an environment of its own, without linters.
 ROS_DISTRO ?= jazzy
@@ -9,6 +9,8 @@ VENV := .venv$(filter-out -jazzy,-$(ROS_DISTRO))$(filter-out -pinned,-$(VERSIONS
 # An environment keeps the interpreter it was made with unless another is asked for.
 PYTHON ?= $(or $(wildcard $(VENV)/bin/python),python3)
 RUN := $(VENV)/bin
+# A file to one worker: its fixtures and campaigns are made once.
+BY_FILE := --numprocesses 2 --dist loadfile
 MAKE_VENV = $(PYTHON) tools/make_venv.py $(VENV) --ros $(ROS_DISTRO) --versions $(VERSIONS)
 
 .PHONY: setup demo check test bench lint docs help
@@ -24,7 +26,7 @@ ifdef TESTS
 	$(RUN)/python -m pytest $(TESTS)
 else
 	@failed=0; \
-	for part in "-m 'not nodes' --numprocesses 2 --dist loadgroup" "-m nodes --numprocesses 3"; do \
+	for part in "-m 'not nodes' $(BY_FILE)" "-m nodes test/ros test/system --numprocesses 4 --dist worksteal"; do \
 		echo "$(RUN)/python -m pytest $$part"; \
 		eval $(RUN)/python -m pytest $$part || failed=1; \
 	done; \
@@ -32,7 +34,7 @@ else
 endif
 
 check: lint
-	$(RUN)/python -m pytest -m 'not nodes and not slow' --numprocesses 2 --quiet
+	$(RUN)/python -m pytest -m 'not nodes and not slow' $(BY_FILE) --quiet
 
 bench:
 	@$(MAKE_VENV) --also bench

@@ -16,6 +16,7 @@ import sys
 import time
 from typing import Any
 
+from node_forks import Fork, Forks  # type: ignore[import-not-found]
 import pytest
 
 # Read when NumPy is loaded: two tests at once on two cores leave no core for more threads.
@@ -23,6 +24,22 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
+# Files of half a minute and more: last, one of them would keep one worker while the others wait.
+LONGEST = (
+    *('test_colcon', 'test_night_sky', 'test_monte_carlo', 'test_bench', 'test_kills'),
+    *('test_calibrate', 'test_diagnose', 'test_docs', 'test_set_up_mistakes'),
+    *('test_hostile_messages', 'test_set_camera_info_client', 'test_ros_tools'),
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Have pytest-xdist keep the order below; it would begin with the files of most tests."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest."""
+    items.sort(key=lambda item: item.path.stem not in LONGEST)
 
 
 def free_domain() -> int:
@@ -54,26 +71,19 @@ def ros_domain() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def domain_of_node_tests(request: pytest.FixtureRequest) -> None:
+def surroundings(request: pytest.FixtureRequest) -> None:
     """Tests marked ``nodes`` run in `ros_domain`; other tests open no socket."""
-    if request.node.get_closest_marker('nodes'):
-        request.getfixturevalue('ros_domain')
+    is_of_nodes = request.node.get_closest_marker('nodes')
+    request.getfixturevalue('ros_domain' if is_of_nodes else 'kept_indices')
 
 
 class NodeProcess:
     """A node as a separate process with its output in a file."""
 
-    def __init__(self, name: str, log: Path, arguments: list[str]) -> None:
+    def __init__(self, name: str, process: subprocess.Popen[bytes] | Fork, log: Path) -> None:
         self.name = name
+        self.process = process
         self._log = log
-        with log.open('wb') as output:
-            self.process = subprocess.Popen(
-                [sys.executable, '-m', 'starcal_ros.entry_points', name, *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, 'PYTHONFAULTHANDLER': '1'},
-            )
 
     def said(self) -> str:
         """Return the output so far."""
@@ -111,15 +121,40 @@ class NodeProcess:
 StartNode = Callable[..., NodeProcess]
 
 
+@pytest.fixture(scope='session')
+def forks(ros_domain: None) -> Iterator[Forks]:
+    """The process of which nodes are forks."""
+    started = Forks()
+    yield started
+    started.close()
+
+
+def execute(arguments: list[str], log: Path) -> subprocess.Popen[bytes]:
+    """Start an interpreter that imports and runs a node, as an operator does."""
+    with log.open('wb') as output:
+        return subprocess.Popen(
+            [sys.executable, '-m', 'starcal_ros.entry_points', *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, 'PYTHONFAULTHANDLER': '1'},
+        )
+
+
 @pytest.fixture
-def start_node(ros_domain: None, tmp_path: Path) -> Iterator[StartNode]:
-    """Start node processes by module name; they are stopped at the end of the test."""
+def start_node(forks: Forks, tmp_path: Path) -> Iterator[StartNode]:
+    """
+    Start node processes by module name; they are stopped at the end of the test.
+
+    They are forks, which saves the imports, but for those that shall be ``executed``.
+    """
     started: list[NodeProcess] = []
 
-    def start(name: str, *arguments: str, ros: tuple[str, ...] = ()) -> NodeProcess:
-        ros_arguments = ['--ros-args', *ros] if ros else []
+    def start(name: str, ros: tuple[str, ...] = (), executed: bool = False) -> NodeProcess:
         log = tmp_path / f'{name}{len(started)}.log'
-        started.append(NodeProcess(name, log, [*arguments, *ros_arguments]))
+        arguments = [name, *(['--ros-args', *ros] if ros else [])]
+        process = execute(arguments, log) if executed else forks.start(arguments, log)
+        started.append(NodeProcess(name, process, log))
         return started[-1]
 
     yield start
@@ -128,6 +163,28 @@ def start_node(ros_domain: None, tmp_path: Path) -> Iterator[StartNode]:
         process.send()
     for process in started:
         process.end()
+
+
+@pytest.fixture(scope='session')
+def kept_indices() -> Iterator[None]:
+    """
+    Indices of patterns are built once for equal catalogs, not once for each catalog read.
+
+    The search for a sky takes 2 s for each scale otherwise, in each test.
+    """
+    from starcal_ros.identification.blind.pattern_index import pattern_index
+
+    indices: dict[tuple[bytes, int], Any] = {}
+
+    def kept(catalog: Any, scale: int) -> Any:
+        key = (catalog.id.tobytes(), scale)
+        if key not in indices:
+            indices[key] = pattern_index(catalog, scale)
+        return indices[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('starcal_ros.identification.blind.search.pattern_index', kept)
+        yield
 
 
 @pytest.fixture(scope='session')

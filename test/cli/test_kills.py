@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import contextlib
 from dataclasses import dataclass
+import functools
 import io
 import itertools
 import json
@@ -116,8 +117,8 @@ def _arguments(command: Command, folder: Path) -> list[str]:
 @pytest.mark.parametrize('command', WRITING, ids=lambda command: command.name)
 def test_outputs_are_old_or_whole_before_each_operation(command: Command, folder: Path) -> None:
     """Look at the output folder before each operation on a file in it, in two whole runs."""
-    old, arguments = _old_outputs(command, folder), _arguments(command, folder)
-    expected, _ = _whole_run(command, folder, old)
+    arguments = _arguments(command, folder)
+    old, expected, _ = _whole_run(command, folder)
     looked = 0
     for earlier in (old,) if command.name == 'report' else (old, None):
         _restore(folder, earlier)
@@ -137,8 +138,8 @@ def test_kills_at_random(command: Command, folder: Path) -> None:
 
     Every second pair of runs replaces the products of an earlier one.
     """
-    old, arguments = _old_outputs(command, folder), _arguments(command, folder)
-    expected, longest_s = _whole_run(command, folder, old)
+    arguments = _arguments(command, folder)
+    old, expected, longest_s = _whole_run(command, folder)
     inputs = _inputs(folder)
     draw = random.Random(14)
     for k in range(many(4)):
@@ -156,7 +157,6 @@ def test_kills_at_random(command: Command, folder: Path) -> None:
 def _old_outputs(command: Command, folder: Path) -> Path:
     """Folder with products of an earlier run, other ones than those of the next."""
     old = folder / f'old_{command.name}'
-    shutil.rmtree(old, ignore_errors=True)
     old.mkdir()
     if command.name == 'report':
         shutil.copytree(folder / 'in/a', old, dirs_exist_ok=True)
@@ -172,8 +172,10 @@ def _old_outputs(command: Command, folder: Path) -> Path:
     return old
 
 
-def _whole_run(command: Command, folder: Path, old: Path) -> tuple[Mapping[str, str], float]:
-    """Digests of the outputs of a run that is not killed, and its processor time, s."""
+@functools.cache
+def _whole_run(command: Command, folder: Path) -> tuple[Path, Mapping[str, str], float]:
+    """Older products, digests of those of a run that is not killed, and its processor time, s."""
+    old = _old_outputs(command, folder)
     _restore(folder, old)
     before = os.times()
     child = Child(folder, _arguments(command, folder))
@@ -182,7 +184,7 @@ def _whole_run(command: Command, folder: Path, old: Path) -> tuple[Mapping[str, 
     after = os.times()
     processor_s = after.children_user + after.children_system
     processor_s -= before.children_user + before.children_system
-    return digests(folder / 'out'), processor_s
+    return old, digests(folder / 'out'), processor_s
 
 
 def _restore(folder: Path, old: Path | None) -> None:

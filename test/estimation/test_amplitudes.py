@@ -168,7 +168,7 @@ def test_coefficients_are_the_mixture_of_dense_posteriors(sigma_px: tuple[float,
     made = field(np.random.default_rng(8), np.array(sigma_px))
     information, gradient, octave = made.sums
     mode = field_amplitudes(information, gradient, octave)
-    term = np.linspace(0.5, -1.0, len(octave))
+    term: Floats = np.asarray(np.linspace(0.5, -1.0, len(octave)), np.float64)
     averaged = averaged_field(information, gradient, octave, mode, term)
     room = math.log(LARGEST_FIELD_PX) - mode.log_px.max()
     shifts = averaged.log_px - mode.log_px[2]
@@ -184,14 +184,14 @@ def test_coefficients_are_the_mixture_of_dense_posteriors(sigma_px: tuple[float,
     means, seconds = [], []
     for shift in shifts:
         own = np.diag(np.exp(2 * (mode.log_px + shift)[octave]))
-        logs, parts = [], []
+        own_logs, parts = [], []
         for offset, term_px in zip(off, of_term_px, strict=True):
             prior = own + term_px**2 * np.outer(term, term)
             inverse = np.linalg.inv(np.eye(len(own)) + prior @ information) @ prior
             log_det = np.linalg.slogdet(np.eye(len(own)) + prior @ information)[1]
-            logs.append(0.5 * (gradient @ inverse @ gradient - log_det - offset**2))
+            own_logs.append(0.5 * (gradient @ inverse @ gradient - log_det - offset**2))
             parts.append((inverse @ gradient, inverse))
-        share = np.exp(np.array(logs) - max(logs))
+        share = np.exp(np.array(own_logs) - max(own_logs))
         share /= share.sum()
         means.append(share @ np.array([m for m, _ in parts]))
         seconds.append(

@@ -129,11 +129,6 @@ def trials(method: str) -> tuple[Estimate, ...]:
     )
 
 
-def with_trials(test):
-    """A test of the trials: all in one process of pytest-xdist, which estimates them once."""
-    return pytest.mark.slow(pytest.mark.xdist_group('trials')(test))
-
-
 def assert_true_to_its_covariance(errors: list[float], parameters: int) -> None:
     """The sum of normalised squared errors lies within the 99 % interval of chi squared."""
     low, high = chi2.ppf([0.005, 0.995], parameters * len(errors)) / len(errors)
@@ -193,7 +188,7 @@ def test_the_order_of_the_names_does_not_matter(method: str) -> None:
     np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
-@with_trials
+@pytest.mark.slow
 @each_method
 def test_the_reported_covariance_is_true(method: str) -> None:
     estimates = trials(method)
@@ -204,7 +199,7 @@ def test_the_reported_covariance_is_true(method: str) -> None:
     assert rejected < 3.0
 
 
-@with_trials
+@pytest.mark.slow
 def test_the_covariance_holds_for_each_group_alone() -> None:
     for method in ('per_image', 'hierarchical'):
         for rows in (FREE, [10, 11, 12]):
@@ -215,7 +210,7 @@ def test_the_covariance_holds_for_each_group_alone() -> None:
             assert_true_to_its_covariance(errors, len(rows))
 
 
-@with_trials
+@pytest.mark.slow
 def test_the_variance_of_the_centroids_is_found_again() -> None:
     for method in METHODS:
         ratio = [
@@ -233,7 +228,7 @@ def test_the_variance_of_the_centroids_is_found_again() -> None:
         assert factor == pytest.approx(1.0, abs=0.008)
 
 
-@with_trials
+@pytest.mark.slow
 def test_the_line_of_sight_reaches_the_cramer_rao_bound() -> None:
     assert tuple(PARAMETER_NAMES[k] for k in FREE) == bound_names(TRUTH.camera)
     bound = cramer_rao_covariance(SCENARIO)
@@ -279,7 +274,7 @@ def test_hierarchical_is_no_worse_than_the_better_of_the_others() -> None:
     assert (np.sqrt(np.diag(one.covariance))[FREE] < 2.0 * sigma[: len(FREE)]).all()
 
 
-@with_trials
+@pytest.mark.slow
 @each_method
 def test_the_errors_of_single_and_hierarchical_in_order(method: str) -> None:
     # Predicted from the same noise: knowing more of the attitudes never makes sigma larger.

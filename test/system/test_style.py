@@ -41,6 +41,13 @@ def test_tests_have_the_names_of_their_modules() -> None:
     assert strange == set()
 
 
+def test_tests_with_nodes_are_where_make_looks_for_them() -> None:
+    """``make test`` collects the tests marked ``nodes`` in two folders only."""
+    marked = [path for path in (ROOT / 'test').rglob('test_*.py')
+              if 'pytest.mark.nodes' in path.read_text()]  # fmt: skip
+    assert {path.relative_to(ROOT / 'test').parts[0] for path in marked} == {'ros', 'system'}
+
+
 def test_docstrings_state_a_result_and_functions_are_short() -> None:
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
     texts, long = [], []

@@ -59,10 +59,11 @@ def test_content_that_is_known_is_not_calibrated_again(tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
-def test_ten_thousand_known_files_are_passed_over_in_20_s(tmp_path: Path) -> None:
+def test_three_thousand_known_files_are_passed_over_in_6_s(tmp_path: Path) -> None:
+    """The limit of the bench of fleets is 20 s for ten thousand; this one takes a second."""
     write(tmp_path / 'one', 1)
     content = (tmp_path / 'one/calibration.json').read_bytes()
-    for k in range(10_000):
+    for k in range(3_000):
         (tmp_path / f'fleet/{k:05d}').mkdir(parents=True)
         (tmp_path / f'fleet/{k:05d}/calibration.json').write_bytes(content)
     found = list(tasks.find(str(tmp_path / 'fleet'), Cameras()))
@@ -76,8 +77,8 @@ def test_ten_thousand_known_files_are_passed_over_in_20_s(tmp_path: Path) -> Non
     with Table(tmp_path / 'out') as table:
         again = list(tasks.find(str(tmp_path / 'fleet'), Cameras()))
         done = fleet.update(table, again)
-    assert done == fleet.Done(known=10_000)
-    assert time.process_time() - start_s < 20.0
+    assert done == fleet.Done(known=3_000)
+    assert time.process_time() - start_s < 6.0
 
 
 def test_a_file_that_a_worker_cannot_see_is_tried_again(
