@@ -71,10 +71,10 @@ def ros_domain() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def surroundings(request: pytest.FixtureRequest) -> None:
+def domain_of_node_tests(request: pytest.FixtureRequest) -> None:
     """Tests marked ``nodes`` run in `ros_domain`; other tests open no socket."""
-    is_of_nodes = request.node.get_closest_marker('nodes')
-    request.getfixturevalue('ros_domain' if is_of_nodes else 'kept_indices')
+    if request.node.get_closest_marker('nodes'):
+        request.getfixturevalue('ros_domain')
 
 
 class NodeProcess:
@@ -163,28 +163,6 @@ def start_node(forks: Forks, tmp_path: Path) -> Iterator[StartNode]:
         process.send()
     for process in started:
         process.end()
-
-
-@pytest.fixture(scope='session')
-def kept_indices() -> Iterator[None]:
-    """
-    Indices of patterns are built once for equal catalogs, not once for each catalog read.
-
-    The search for a sky takes 2 s for each scale otherwise, in each test.
-    """
-    from starcal_ros.identification.blind.pattern_index import pattern_index
-
-    indices: dict[tuple[bytes, int], Any] = {}
-
-    def kept(catalog: Any, scale: int) -> Any:
-        key = (catalog.id.tobytes(), scale)
-        if key not in indices:
-            indices[key] = pattern_index(catalog, scale)
-        return indices[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr('starcal_ros.identification.blind.search.pattern_index', kept)
-        yield
 
 
 @pytest.fixture(scope='session')

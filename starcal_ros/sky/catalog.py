@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from functools import cached_property
+from functools import cached_property, lru_cache
 import hashlib
 import io
 import math
@@ -193,7 +193,17 @@ def load_catalog(path: Path | None = None, magnitude_limit: float | None = None)
     magnitude_limit : float, optional
         Omit stars fainter than this V.
     """
-    columns, digest = _read_columns(CATALOG_PATH if path is None else Path(path))
+    return _bundled(magnitude_limit) if path is None else _read(Path(path), magnitude_limit)
+
+
+@lru_cache(maxsize=4)
+def _bundled(magnitude_limit: float | None) -> StarCatalog:
+    """Return one object for each limit: indices of patterns are kept by catalog."""
+    return _read(CATALOG_PATH, magnitude_limit)
+
+
+def _read(path: Path, magnitude_limit: float | None) -> StarCatalog:
+    columns, digest = _read_columns(path)
     rows = slice(None)
     if magnitude_limit is not None:
         limit = math.floor(magnitude_limit / MAGNITUDE_UNIT + 1e-6)

@@ -25,10 +25,10 @@ from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, proj
 from starcal_ros.constants import ARCSECOND_RAD, SPEED_OF_LIGHT_M_S
 from starcal_ros.records import Ensemble, StarObservations
 from starcal_ros.sky.astrometry import apparent_directions, GIVEN_SIGMA_M_S
-from starcal_ros.sky.catalog import cone
+from starcal_ros.sky.catalog import cone, load_catalog
 from starcal_ros.studies.simulation import scenario as synthetic
 from starcal_ros.studies.simulation.centroids import observations
-from starcal_ros.studies.simulation.scenario import bundled_catalog, Detector, Scenario, Scene
+from starcal_ros.studies.simulation.scenario import Detector, Scenario, Scene
 
 Lens = Callable[[Generator, Floats], Floats]
 """Displacement (n, 2) px of stars at points (n, 2) in half widths of the detector."""
@@ -253,7 +253,7 @@ def _tracker_errors_rad(world: World, seed: int, camera_from_icrf: Rotation) -> 
 
 def _star_offsets_rad(world: World, scenario: Scenario, camera_from_icrf: Rotation) -> Floats:
     """Errors (n, 3) of the places of all catalog stars; the part along the direction is moot."""
-    catalog, rng = bundled_catalog(world.magnitude_limit), _stream(scenario.seed, _STARS)
+    catalog, rng = load_catalog(None, world.magnitude_limit), _stream(scenario.seed, _STARS)
     offsets = world.star_arcsec * ARCSECOND_RAD * rng.normal(size=(len(catalog), 3))
     if world.bad_stars:
         near = [cone(catalog, axis, 0.1) for axis in camera_from_icrf.as_matrix()[:, 2]]
@@ -270,7 +270,7 @@ def _image(
     """Observations of an image; the catalog stars are off by ``offset_rad`` (n, 3)."""
     world, scenario, seed = made.world, made.scenario, made.scenario.seed
     camera, time_ns = scenario.truth.camera, scenario.time_ns(k)
-    catalog, R = bundled_catalog(world.magnitude_limit), made.camera_from_icrf[k].as_matrix()
+    catalog, R = load_catalog(None, world.magnitude_limit), made.camera_from_icrf[k].as_matrix()
     near = cone(catalog, R[2], field_radius_rad(camera, _MARGIN_PX))
     near = near[catalog.magnitude[near] > _SATURATED_MAGNITUDE]
     stars = catalog.select(near)

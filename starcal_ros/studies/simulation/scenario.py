@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-import functools
 import math
 from typing import Any
 
@@ -28,7 +27,7 @@ from starcal_ros.camera.lens import fold_radius2, ideal_points
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.records import AttitudeSample, CameraGeometry
 from starcal_ros.sky.astrometry import apparent_directions, tt_julian_date
-from starcal_ros.sky.catalog import cone, load_catalog, StarCatalog
+from starcal_ros.sky.catalog import cone, load_catalog
 
 # Random streams (seed, purpose, image): an image does not depend on the previous ones.
 TRUTH_STREAM, ATTITUDE_STREAM, CENTROID_STREAM, PATTERN_STREAM, PIXEL_STREAM = range(5)
@@ -274,12 +273,6 @@ def attitude_samples(scenario: Scenario, index: int) -> tuple[AttitudeSample, ..
     )
 
 
-@functools.lru_cache(maxsize=4)
-def bundled_catalog(magnitude_limit: float) -> StarCatalog:
-    """The bundled catalog down to a magnitude."""
-    return load_catalog(None, magnitude_limit)
-
-
 def stamp_half_px(psf_sigma_px: float) -> int:
     """Half width of the stamp in which the light of a star is drawn, px."""
     return math.ceil(_STAMP_SIGMAS * psf_sigma_px)
@@ -287,7 +280,7 @@ def stamp_half_px(psf_sigma_px: float) -> int:
 
 def scene(scenario: Scenario, index: int, attitude_noise: bool = True) -> Scene:
     """Stars of an image, of the bundled catalog down to the magnitude limit."""
-    catalog = bundled_catalog(scenario.magnitude_limit)
+    catalog = load_catalog(None, scenario.magnitude_limit)
     camera, time_ns = scenario.truth.camera, scenario.time_ns(index)
     R = camera_from_icrf(scenario, index)
     margin_px = stamp_half_px(scenario.detector.psf_sigma_px * (1 + scenario.detector.psf_growth))
