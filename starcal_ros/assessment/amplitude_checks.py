@@ -50,6 +50,12 @@ def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
     shape = float(np.sqrt((np.exp(found.shape.log_px) ** 2).sum()))
     return (
         Amplitude('field', octaves, 'px', found.field.likelihood_ratio),
+        Amplitude(
+            'next term of the lens',
+            float(np.exp(found.term.log_px[0])),
+            'px',
+            found.term.likelihood_ratio,
+        ),
         Amplitude('change from image to image', shape, 'px', found.shape.likelihood_ratio),
         *(
             Amplitude(error.name, math.sqrt(error.variance_px2), 'px', error.likelihood_ratio)

@@ -68,13 +68,14 @@ class Averaged:
     Unknowns averaged over a common factor of their amplitudes.
 
     ``mean`` (q,), ``covariance`` (q, q); ``log_px`` (s,) of the last group with ``weight`` (s,):
-    the posterior of its amplitude.
+    the posterior of its amplitude; ``term``: the amplitude of the likely term at the best factor.
     """
 
     mean: Floats
     covariance: Floats
     log_px: Floats
     weight: Floats
+    term: Amplitudes
 
 
 def octave_prior(count: int) -> tuple[Floats, Floats]:
@@ -211,12 +212,23 @@ def averaged_field(
     apart = (means - centre[:, None]) * np.sqrt(weight)
     by_term = term[:, None] - back @ (variance * with_term).T
     by_term *= np.sqrt(weight * np.maximum(spread, 0.0))
+    best = int(np.argmax(weight))
     return Averaged(
         centre,
         (back * (weight @ variance)) @ back.T + apart @ apart.T + by_term @ by_term.T,
         amplitudes.log_px[-1] + shift,
         weight,
+        _of_one(float(own[best, 0]), float(pull[best, 0])),
     )
+
+
+def _of_one(information: float, gradient: float) -> Amplitudes:
+    """Return the amplitude at the maximum of the likelihood of one coefficient."""
+    excess = gradient**2 / information - 1.0 if information > 0 else 0.0
+    if excess <= 0:
+        return Amplitudes(np.array([_NONE]), 0.0)
+    log_px = 0.5 * math.log(excess / information)
+    return Amplitudes(np.array([log_px]), excess - math.log1p(excess))
 
 
 @dataclass(frozen=True)

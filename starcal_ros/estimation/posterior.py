@@ -83,7 +83,8 @@ class Posterior:
         Covariance of the unknowns of an image, the shared ones known.
     estimated : (e,) int
         Shared unknowns that are estimated; the others are held.
-    field, shape : Amplitudes
+    field, term, shape : Amplitudes
+        Of the octaves of the field, of the next term of the lens, of the shapes of the images.
     last_octave : (s,), (s,)
         Posterior of the logarithm of the finest amplitude of the field, with weights.
     shape_sigma_px : (3,)
@@ -106,6 +107,7 @@ class Posterior:
     image_covariance: Floats
     estimated: Indices
     field: Amplitudes
+    term: Amplitudes
     shape: Amplitudes
     last_octave: tuple[Floats, Floats]
     shape_sigma_px: Floats
@@ -157,7 +159,7 @@ def posterior(
         by_image = _shape_sums(sums, layout, solver, field_px)
         found = shapes(by_image, near.shape if near else None)
         last = eliminated(normal, layout, found.sigma_px)
-    mean, covariance, last_octave = solver.solve(last, base)
+    mean, covariance, last_octave, term = solver.solve(last, base)
     resolved = solver.resolved(last, covariance)
     return Posterior(
         mean=mean,
@@ -168,6 +170,7 @@ def posterior(
         image_covariance=last.covariance,
         estimated=solver.estimated,
         field=base,
+        term=term,
         shape=found.amplitudes,
         last_octave=last_octave,
         shape_sigma_px=found.sigma_px,
@@ -258,15 +261,16 @@ class _Solver:
 
     def solve(
         self, arrow: Equations, amplitudes: Amplitudes
-    ) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
-        """Return mean (P,), covariance (P, P) and the posterior of the last amplitude."""
+    ) -> tuple[Floats, Floats, tuple[Floats, Floats], Amplitudes]:
+        """Return mean (P,), covariance (P, P), the last octave's posterior, and the lens term."""
         count = self.layout.count
         mean, covariance = np.zeros(count), np.zeros((count, count))
         if not self.with_field:
             free, gradient = self._of_free(arrow)
             mean[self.free] = free @ gradient
             covariance[np.ix_(self.free, self.free)] = free
-            return mean, covariance, prior_of_last_octave(len(amplitudes.log_px))
+            last = prior_of_last_octave(len(amplitudes.log_px))
+            return mean, covariance, last, Amplitudes(np.array([-25.0]), 0.0)
         information, left, free, gradient, back = self._of_field(arrow)
         field = averaged_field(information, left, self.octave, amplitudes, self.term)
         mean[self.field] = self.unit * field.mean
@@ -278,7 +282,7 @@ class _Solver:
         covariance[np.ix_(self.free, self.field)] = to_free * self.unit
         covariance[np.ix_(self.field, self.free)] = (to_free * self.unit).T
         covariance[np.ix_(self.free, self.free)] = free - to_free @ back.T
-        return mean, covariance, (field.log_px, field.weight)
+        return mean, covariance, (field.log_px, field.weight), field.term
 
     def resolved(self, arrow: Equations, covariance: Floats) -> float:
         """Return the number of shared unknowns that the data determine."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 import pytest
 from scipy.linalg import null_space
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2, multivariate_normal, norm
 from scipy.stats import t as student_t
 
@@ -207,6 +207,19 @@ def test_coefficients_are_the_mixture_of_dense_posteriors(sigma_px: tuple[float,
     assert averaged.covariance / np.outer(size, size) == pytest.approx(
         covariance / np.outer(size, size), abs=1e-6
     )
+    # The amplitude of the term alone, at the best factor of the octaves.
+    own = np.diag(np.exp(2 * (mode.log_px + shifts[np.argmax(weight)])[octave]))
+
+    def log_likelihood(term_px: float) -> float:
+        grown = np.eye(len(own)) + (own + term_px**2 * np.outer(term, term)) @ information
+        inverse = np.linalg.solve(grown, own + term_px**2 * np.outer(term, term))
+        return float(0.5 * (gradient @ inverse @ gradient - np.linalg.slogdet(grown)[1]))
+
+    found = minimize_scalar(lambda log: -log_likelihood(math.exp(log)), bounds=(-12.0, 1.0))
+    ratio = 2.0 * (-found.fun - log_likelihood(0.0))
+    assert averaged.term.likelihood_ratio == pytest.approx(max(ratio, 0.0), abs=1e-4)
+    if ratio > 0.1:
+        assert averaged.term.log_px[0] == pytest.approx(found.x, abs=1e-2)
 
 
 @dataclass(frozen=True)
