@@ -16,7 +16,6 @@ import sys
 import time
 from typing import Any
 
-from node_forks import Fork, Forks  # type: ignore[import-not-found]
 import pytest
 
 # Read when NumPy is loaded: two tests at once on two cores leave no core for more threads.
@@ -80,10 +79,17 @@ def domain_of_node_tests(request: pytest.FixtureRequest) -> None:
 class NodeProcess:
     """A node as a separate process with its output in a file."""
 
-    def __init__(self, name: str, process: subprocess.Popen[bytes] | Fork, log: Path) -> None:
+    def __init__(self, name: str, log: Path, arguments: list[str]) -> None:
         self.name = name
-        self.process = process
         self._log = log
+        with log.open('wb') as output:
+            self.process = subprocess.Popen(
+                [sys.executable, '-m', 'starcal_ros.entry_points', name, *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, 'PYTHONFAULTHANDLER': '1'},
+            )
 
     def said(self) -> str:
         """Return the output so far."""
@@ -121,40 +127,15 @@ class NodeProcess:
 StartNode = Callable[..., NodeProcess]
 
 
-@pytest.fixture(scope='session')
-def forks(ros_domain: None) -> Iterator[Forks]:
-    """The process of which nodes are forks."""
-    started = Forks()
-    yield started
-    started.close()
-
-
-def execute(arguments: list[str], log: Path) -> subprocess.Popen[bytes]:
-    """Start an interpreter that imports and runs a node, as an operator does."""
-    with log.open('wb') as output:
-        return subprocess.Popen(
-            [sys.executable, '-m', 'starcal_ros.entry_points', *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, 'PYTHONFAULTHANDLER': '1'},
-        )
-
-
 @pytest.fixture
-def start_node(forks: Forks, tmp_path: Path) -> Iterator[StartNode]:
-    """
-    Start node processes by module name; they are stopped at the end of the test.
-
-    They are forks, which saves the imports, but for those that shall be ``executed``.
-    """
+def start_node(ros_domain: None, tmp_path: Path) -> Iterator[StartNode]:
+    """Start node processes by module name; they are stopped at the end of the test."""
     started: list[NodeProcess] = []
 
-    def start(name: str, ros: tuple[str, ...] = (), executed: bool = False) -> NodeProcess:
+    def start(name: str, *arguments: str, ros: tuple[str, ...] = ()) -> NodeProcess:
+        ros_arguments = ['--ros-args', *ros] if ros else []
         log = tmp_path / f'{name}{len(started)}.log'
-        arguments = [name, *(['--ros-args', *ros] if ros else [])]
-        process = execute(arguments, log) if executed else forks.start(arguments, log)
-        started.append(NodeProcess(name, process, log))
+        started.append(NodeProcess(name, log, [*arguments, *ros_arguments]))
         return started[-1]
 
     yield start

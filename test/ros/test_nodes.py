@@ -114,7 +114,7 @@ def test_nodes_and_tool_give_the_same_calibration(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
 ) -> None:
     for name in BOTH:
-        start_node(name, (*parameters(tiny_bag), *REMAPS), executed=True)
+        start_node(name, ros=(*parameters(tiny_bag), *REMAPS))
     # The player waits for the observer, but the calibrator must not miss the first image.
     client.until_listened()
     play(start_node, tiny_bag)
@@ -646,7 +646,7 @@ def test_a_signal_while_python_imports(name: str) -> None:
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_signals(client: Client, start_node: StartNode, tiny_bag: Path, number: int) -> None:
-    nodes = [start_node(name, parameters(tiny_bag), executed=True) for name in BOTH]
+    nodes = [start_node(name, ros=parameters(tiny_bag)) for name in BOTH]
     client.until(lambda: set(BOTH) <= set(client.node.get_node_names()))
     for node in nodes:
         assert node.stop(number) == 0
