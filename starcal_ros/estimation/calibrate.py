@@ -94,6 +94,9 @@ _ROBUST_SCALE = 3.0  # of the Cauchy loss, in sigma: of normal noise 5 % of the 
 _ROBUST_GAIN = 1e-3  # a step of 0.04 sigma: the posterior goes on from there
 _ROUNDS = 16  # three or four are usual; principal points that stars hardly show take ten
 _STEP_SIGMA = 0.05  # of any unknown, below which the state is at the minimum
+_USUAL = 3  # rounds after which steps shrink
+_SHRUNK = 0.8  # of the step before: a step that is longer is halved
+_LEAST_SHARE = 0.25  # of a step, so that it still arrives
 _FIRST_SHAPE_PX = 1e-4
 _SPACE_VELOCITY_M_S = 8000.0  # an orbit about the Earth
 _UNKNOWN_READOUT_S = 0.02  # of a rolling shutter: 5 to 50 ms a frame are usual
@@ -259,11 +262,12 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     shape_px: Floats = np.full(3, _FIRST_SHAPE_PX)
     near: Posterior | None = None
     termination = 'iteration_limit'
+    share, before_sigma = 1.0, math.inf
     for k in range(_ROUNDS):
         whole = k > 0
         if not judged.kept.any():
             raise NotObservable('no image has three stars that fit')
-        last = _round(data, problem, state, judged, residual_px, shape_px, whole, near)
+        last = _round(data, problem, state, judged, residual_px, shape_px, whole, near, share)
         after = judge(
             data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes
         )
@@ -277,6 +281,10 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
             break
         if k < _ROUNDS - 1:
             state, judged = last.after, after
+        # Where stars hardly show an unknown, whole steps overshoot to and fro.
+        if k > _USUAL and step_sigma > _SHRUNK * before_sigma:
+            share = max(0.5 * share, _LEAST_SHARE)
+        before_sigma = step_sigma
     weights = Weights(
         judged.covariance_px2(table)[:, [0, 2]].mean(axis=1),
         judged.inflation_px2(table),
@@ -309,8 +317,9 @@ def _round(
     shape_px: Floats,
     whole: bool,
     near: Posterior | None,
+    share: float,
 ) -> _Round:
-    """Return a step from a state, where the residuals are (n, 2), with the weights judged."""
+    """Return a share of a step from a state of residuals (n, 2), with the weights judged."""
     table, camera = data.table, data.prior.camera
     problem = weighted_attitudes(problem, data, judged.attitudes)
     rates_rad_s = state.camera_from_star_tracker.apply(data.rates_rad_s)
@@ -320,7 +329,8 @@ def _round(
     linear = Linearisation(problem, state, layout, measurements, table.measured_px - residual_px)
     sums = star_sums(linear)
     found = posterior(sums, linear, shape_px, whole, near)
-    after = moved(problem, state, layout, found.mean, found.of_images[:, IMAGE_ROTATION])
+    own = share * found.of_images[:, IMAGE_ROTATION]
+    after = moved(problem, state, layout, share * found.mean, own)
     left_px = _residuals_px(problem, after, table, layout, found, camera)
     freedom = degrees_of_freedom(found, linear, table, judged.kept)
     attitudes = tracker_attitudes(data, linear, sums, found, after, judged.attitudes)
