@@ -26,7 +26,7 @@ ifdef TESTS
 	$(RUN)/python -m pytest $(TESTS)
 else
 	@failed=0; \
-	for part in "-m 'not nodes' $(BY_FILE)" "-m nodes test/ros test/system --numprocesses 4 --dist worksteal"; do \
+	for part in "-m 'not nodes' $(BY_FILE)" "-m nodes test/ros test/system --numprocesses 3 --dist worksteal"; do \
 		echo "$(RUN)/python -m pytest $$part"; \
 		eval $(RUN)/python -m pytest $$part || failed=1; \
 	done; \
