@@ -43,7 +43,7 @@ _STARTS_PX = (1e-4, 1e-2, 1e-1)
 _MOST_STEPS = 12
 _SETTLED = 1e-3  # change of the log likelihood that moves no sigma by a thousandth
 _NO_EFFECT = 1e-6  # information on an unknown times its prior variance
-_NONE = -25.0  # log amplitude without any effect
+NO_AMPLITUDE = -25.0  # log amplitude without any effect
 # Common factors of the amplitudes over which results are averaged, in logarithms.
 _SHIFTS = np.linspace(-8.0, 6.0, 57)
 # Amplitudes of the likely term, in sigmas of the prior of the logarithm.
@@ -226,7 +226,7 @@ def _of_one(information: float, gradient: float) -> Amplitudes:
     """Return the amplitude at the maximum of the likelihood of one coefficient."""
     excess = gradient**2 / information - 1.0 if information > 0 else 0.0
     if excess <= 0:
-        return Amplitudes(np.array([_NONE]), 0.0)
+        return Amplitudes(np.array([NO_AMPLITUDE]), 0.0)
     log_px = 0.5 * math.log(excess / information)
     return Amplitudes(np.array([log_px]), excess - math.log1p(excess))
 
@@ -283,7 +283,7 @@ def shapes(sums: ShapeSums, near: Amplitudes | None = None) -> Shapes:
     """Return the amplitudes of scale, stretch and shear; ``near``: those of the round before."""
     likelihood = _shape_likelihood(sums)
     best, value = _climb(likelihood, near)
-    none = np.full(3, _NONE)
+    none = np.full(3, NO_AMPLITUDE)
     prior = ((best - LOG_CENTRE) ** 2 - (none - LOG_CENTRE) ** 2).sum() / LOG_SIGMA**2
     ratio = 2.0 * (value - likelihood(none)) + float(prior)
     shift = _SHAPE_SHIFTS[math.log(LARGEST_SHAPE_PX) - best.max() >= _SHAPE_SHIFTS]
@@ -374,7 +374,7 @@ def _climb(likelihood: Callable[[Floats], float], near: Amplitudes | None) -> tu
                 for there in (best[k] - step, best[k] + step) if step else coarse:
                     trial = best.copy()
                     trial[k] = there
-                    if _NONE < there < math.log(LARGEST_SHAPE_PX) and there != best[k]:
+                    if NO_AMPLITUDE < there < math.log(LARGEST_SHAPE_PX) and there != best[k]:
                         found = likelihood(trial)
                         if found > value + _SETTLED:
                             best, value, improved = trial, found, True

@@ -18,6 +18,7 @@ from starcal_ros.estimation.amplitudes import (
     Amplitudes,
     averaged_field,
     field_amplitudes,
+    NO_AMPLITUDE,
     prior_of_last_octave,
     Shapes,
     shapes,
@@ -152,7 +153,7 @@ def posterior(
     start = eliminated(normal, layout, before)
     solver = _Solver(layout, whole)
     base = solver.amplitudes(start, near.field if near else None)
-    none = Amplitudes(np.full(3, -25.0), 0.0)
+    none = Amplitudes(np.full(3, NO_AMPLITUDE), 0.0)
     found, last = Shapes(before, none, np.zeros(3)), start
     if whole and len(sums.blocks) > 1:
         field_px = solver.solve(start, base)[0][layout.places['field']]
@@ -255,7 +256,7 @@ class _Solver:
     def amplitudes(self, arrow: Equations, near: Amplitudes | None) -> Amplitudes:
         """Return the amplitudes of the octaves of the field."""
         if not self.with_field:
-            return Amplitudes(np.full(int(self.octave.max()) + 1, -25.0), 0.0)
+            return Amplitudes(np.full(int(self.octave.max()) + 1, NO_AMPLITUDE), 0.0)
         information, gradient, *_ = self._of_field(arrow)
         return field_amplitudes(information, gradient, self.octave, near)
 
@@ -270,7 +271,7 @@ class _Solver:
             mean[self.free] = free @ gradient
             covariance[np.ix_(self.free, self.free)] = free
             last = prior_of_last_octave(len(amplitudes.log_px))
-            return mean, covariance, last, Amplitudes(np.array([-25.0]), 0.0)
+            return mean, covariance, last, Amplitudes(np.array([NO_AMPLITUDE]), 0.0)
         information, left, free, gradient, back = self._of_field(arrow)
         field = averaged_field(information, left, self.octave, amplitudes, self.term)
         mean[self.field] = self.unit * field.mean
