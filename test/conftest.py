@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 import functools
 import inspect
 import os
@@ -22,6 +22,7 @@ import pytest
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 START_S = 60.0  # a node starts in 2 s; much slower on two busy cores
+FAILED = pytest.StashKey[bool]()  # in the stash of a test
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
 # Files of half a minute and more: last, one of them would keep one worker while the others wait.
 LONGEST = (
@@ -39,6 +40,16 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the files that take longest."""
     items.sort(key=lambda item: item.path.stem not in LONGEST)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Store for `has_failed` that a test has failed."""
+    report = yield
+    item.stash[FAILED] = item.stash.get(FAILED, False) or report.failed
+    return report
 
 
 def free_domain() -> int:
@@ -124,11 +135,19 @@ class NodeProcess:
             self.process.wait()
 
 
+@pytest.fixture
+def has_failed(request: pytest.FixtureRequest) -> Callable[[], bool]:
+    """Whether the test has failed, for the teardown of fixtures."""
+    return lambda: request.node.stash.get(FAILED, False)
+
+
 StartNode = Callable[..., NodeProcess]
 
 
 @pytest.fixture
-def start_node(ros_domain: None, tmp_path: Path) -> Iterator[StartNode]:
+def start_node(
+    ros_domain: None, tmp_path: Path, has_failed: Callable[[], bool]
+) -> Iterator[StartNode]:
     """Start node processes by module name; they are stopped at the end of the test."""
     started: list[NodeProcess] = []
 
@@ -139,11 +158,15 @@ def start_node(ros_domain: None, tmp_path: Path) -> Iterator[StartNode]:
         return started[-1]
 
     yield start
+    failed = has_failed()
     # A node that does not end must not disturb later tests; test_lifecycle tests that nodes end.
     for process in started:
-        process.send()
+        # Of a failed test the stacks too: Python's fault handler answers SIGABRT with them.
+        process.send(signal.SIGABRT if failed else signal.SIGINT)
     for process in started:
         process.end()
+        if failed:
+            print(f'{process.name}, exit status {process.process.returncode}:\n{process.said()}')
 
 
 @pytest.fixture(scope='session')

@@ -49,7 +49,8 @@ class RosTools:
         )
         lines = shown.stdout.decode().split('\0')
         self.environment = dict(line.split('=', 1) for line in lines if '=' in line)
-        self.environment |= {'RMW_IMPLEMENTATION': rmw, 'PYTHONUNBUFFERED': '1', **more}
+        self.environment |= {'RMW_IMPLEMENTATION': rmw, 'PYTHONUNBUFFERED': '1'}
+        self.environment |= {'PYTHONFAULTHANDLER': '1', **more}
         if rmw == 'rmw_cyclonedds_cpp':
             # The wheels' rmw_implementation looks for libraries beside itself alone.
             self.environment['LD_PRELOAD'] = f'{tools}/native/lib/lib{rmw}.so'
@@ -101,12 +102,16 @@ class RosTools:
         self._started.append(process)
         return Started(process, log)
 
-    def close(self) -> None:
-        """Kill what has not ended by itself."""
-        for process in self._started:
+    def close(self, failed: bool) -> None:
+        """Kill what has not ended by itself; after a failed test, print what all wrote."""
+        for k, process in enumerate(self._started):
             if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
+                # Python's fault handler answers SIGABRT with the stacks of all threads.
+                os.killpg(process.pid, signal.SIGABRT if failed else signal.SIGKILL)
             process.wait()
+            if failed:
+                said = (self._logs / f'{k}.log').read_text(errors='replace')
+                print(f'{process.args!s}, exit status {process.returncode}:\n{said}')
 
 
 class Started:

@@ -53,7 +53,7 @@ def tools(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def make(tools: Path, tmp_path: Path) -> Iterator[Make]:
+def make(tools: Path, tmp_path: Path, has_failed: Callable[[], bool]) -> Iterator[Make]:
     """Make the tools for a middleware, with more variables of the environment."""
     made: list[RosTools] = []
 
@@ -65,7 +65,7 @@ def make(tools: Path, tmp_path: Path) -> Iterator[Make]:
 
     yield make
     for one in made:
-        one.close()
+        one.close(has_failed())
 
 
 @pytest.fixture(params=[FAST, CYCLONE])
