@@ -12,7 +12,7 @@ from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
@@ -24,7 +24,7 @@ from starcal_ros.formats.messages import types
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import PlayerOptions
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
-from starcal_ros.ros.lifecycle_node.lifecycle import end_quietly, until_told_to_end
+from starcal_ros.ros.lifecycle_node.lifecycle import end_quietly, Executor, until_told_to_end
 from starcal_ros.ros.lifecycle_node.message_factory import message_class
 from starcal_ros.ros.lifecycle_node.parameters import OptionParameters
 from starcal_ros.ros.lifecycle_node.printable_log import PrintableLog
@@ -219,7 +219,7 @@ def _offer(topic: reader.Topic, is_image: bool) -> QoSProfile:
     return QoSProfile(depth=_IMAGE_DEPTH if is_image else _OTHER_DEPTH)
 
 
-def _listen(executor: SingleThreadedExecutor) -> None:
+def _listen(executor: Executor) -> None:
     """
     Answer messages until ROS is shut down.
 
@@ -243,12 +243,12 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     player: BagPlayer | None = None
     listener: threading.Thread | None = None
-    executor: SingleThreadedExecutor | None = None  # destroyed after the end, as in `run`
+    executor: Executor | None = None  # destroyed after the end, as in `run`
 
     def work() -> int:
         nonlocal player, listener, executor
         player = BagPlayer()
-        executor = SingleThreadedExecutor()
+        executor = Executor(2)  # parameters, observations
         executor.add_node(player)
         listener = threading.Thread(target=_listen, args=[executor])
         listener.start()

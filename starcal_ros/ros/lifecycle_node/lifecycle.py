@@ -44,6 +44,17 @@ _SILENT_S = 5.0
 _THREADS = 8
 
 
+class Executor(MultiThreadedExecutor):
+    """
+    Calls the callbacks of a node in threads of its own.
+
+    ROS may be shut down while it is constructed; `__del__` of rclpy then looks for an attribute
+    that is not there yet, and Python prints a traceback.
+    """
+
+    _sigint_gc: Any = None
+
+
 class StarcalNode(PrintableLog, LifecycleNode):
     """
     Base class of the lifecycle nodes.
@@ -313,7 +324,7 @@ def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | N
     node: StarcalNode | None = None
     # Destroyed after the end, with the thread in which rclpy answers signals: the thread triggers
     # a guard condition of each executor, and another signal may come while one is destroyed.
-    executor: MultiThreadedExecutor | None = None
+    executor: Executor | None = None
 
     def work() -> int:
         nonlocal node, executor
@@ -321,7 +332,7 @@ def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | N
         given = sys.argv if args is None else args
         for text in unread_sections(given, node.get_fully_qualified_name(), name):
             node.get_logger().warning(text)
-        executor = MultiThreadedExecutor(_THREADS)
+        executor = Executor(_THREADS)
         executor.add_node(node)
         if node.options.values()['autostart'] and not _start(node):
             raise StarcalError(node.failure)
@@ -396,7 +407,7 @@ def _start(node: StarcalNode) -> bool:
     return bool(node.trigger_configure() == success and node.trigger_activate() == success)
 
 
-def _spin(node: StarcalNode, executor: MultiThreadedExecutor) -> None:
+def _spin(node: StarcalNode, executor: Executor) -> None:
     while node.context.ok():
         try:
             executor.spin_once(timeout_sec=1.0)

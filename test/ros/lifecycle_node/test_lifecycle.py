@@ -225,8 +225,8 @@ def end():
     shut_down()
     print('signals answered no more')
 rclpy.try_shutdown = end
-told_of(lifecycle, 'MultiThreadedExecutor')
-told_of(bag_player, 'SingleThreadedExecutor')
+told_of(lifecycle, 'Executor')
+told_of(bag_player, 'Executor')
 lifecycle._spin = lambda node, executor: os.kill(os.getpid(), signal.SIGTERM)
 bag_player.BagPlayer.play = lambda player: os.kill(os.getpid(), signal.SIGTERM) or 0
 node = {'calibrator': calibrator, 'bag_player': bag_player}[sys.argv.pop(1)]
@@ -243,6 +243,25 @@ def test_an_executor_outlives_the_thread_that_answers_signals(name: str, tiny_ba
     lines = [line for line in done.stdout.splitlines() if line]
     assert (done.returncode, done.stderr) == (0, '')
     assert lines.index('executor destroyed') > lines.index('signals answered no more')
+
+
+EXECUTOR_AFTER_THE_SHUTDOWN = """
+import rclpy
+from starcal_ros.ros.lifecycle_node.lifecycle import Executor
+
+rclpy.init()
+rclpy.shutdown()
+try:
+    Executor(2)
+except Exception:
+    print('refused')
+"""
+
+
+def test_a_signal_while_the_executor_is_constructed_prints_no_traceback() -> None:
+    command = [sys.executable, '-c', EXECUTOR_AFTER_THE_SHUTDOWN]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, 'refused\n', '')
 
 
 ARENAS_OF_A_NODE = """
