@@ -84,6 +84,11 @@ class StarcalNode(PrintableLog, LifecycleNode):
         )
         self._answer_where_rclpy_raises()
 
+    def destroy_node(self) -> None:
+        """Leave the graph too: rclpy keeps the node in it as long as the state machine exists."""
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     def configure(self) -> None:
         """Read parameters and files, create the publishers; StarcalError if they are invalid."""
         raise NotImplementedError

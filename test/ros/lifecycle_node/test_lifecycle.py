@@ -22,6 +22,9 @@ pytest.importorskip('starcal.msg')
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+import rclpy
+
+from starcal_ros.ros.calibrator import Calibrator
 
 pytestmark = pytest.mark.nodes
 
@@ -315,3 +318,15 @@ def test_nodes_end_after_several_signals(
     for node in nodes:
         assert node.wait() == 0, node.said()
         assert 'Traceback' not in node.said()
+
+
+def test_a_destroyed_node_is_no_longer_in_the_graph(client: Client, tiny_bag: Path) -> None:
+    """A process may hold several nodes, one after the other, with the same name."""
+    rclpy.init(args=['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')])
+    try:
+        node = Calibrator()
+        client.until(lambda: 'calibrator' in client.node.get_node_names())
+        node.destroy_node()
+        client.until(lambda: 'calibrator' not in client.node.get_node_names())
+    finally:
+        rclpy.try_shutdown()
