@@ -178,6 +178,7 @@ class StarObserver(StarcalNode):
     def health(self) -> Health:
         """Diagnostics: counts of used and refused images."""
         why = self._unmatched.diagnosis
+        image_topic = self.resolve_topic_name(self._image_input()[1])
         counts = dict(self._counts)  # the worker thread continues counting
         unfit, first = self._track.unfit, self._setup.frames.star_tracker_frame
         not_used = [f'{name or first}: {one.images}' for name, one in unfit.items()]
@@ -185,6 +186,7 @@ class StarObserver(StarcalNode):
             'images': sum(counts.values()),
             'images_used': counts.get('', 0),
             'images_waiting': len(self._queue),
+            'images_lost': self.inputs.lost().get(image_topic, 0),
             'image_rate_hz': _short(self._image_arrivals.rate_hz()),
             'latency_median_s': _short(self._latency_s.median()),
             'latency_worst_s': _short(self._latency_s.largest()),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import array
 import contextlib
 import dataclasses
 import itertools
@@ -99,6 +100,24 @@ def test_observer_says_what_the_document_says(
     assert 0 < float(values['latency_median_s']) == float(values['latency_worst_s'])
     assert int(values['memory_peak_mb']) > 10
     assert values['callback_errors'] == '0'
+
+
+def test_images_that_the_middleware_loses_are_counted(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    """A publisher with a short history sends large images faster than they can be received."""
+    ros = ('--params-file', str(tiny_bag / 'params.yaml'), *REMAPS)
+    start_node('star_observer', ros=ros)
+    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    images = client.publisher(Image, '/opnav/image_raw', 1)
+    large = make_message('sensor_msgs/msg/Image', width=2592, height=2048, encoding='mono8')
+    large.data = array.array('B', bytes(2592 * 2048))
+
+    def is_counted() -> bool:
+        images.publish(large)
+        return int(newest(diagnostics, 'star_observer')[2].get('images_lost', 0)) > 0
+
+    client.until(is_counted)
 
 
 def test_calibrator_diagnostics_match_the_document(

@@ -39,6 +39,7 @@ class _Input:
     group: CallbackGroup
     override: QoSOverridingOptions | None
     subscription: Any = None
+    lost: int = 0
 
 
 class Inputs:
@@ -86,6 +87,16 @@ class Inputs:
         with self._lock:
             return sorted(one.subscription.topic_name for one in self._inputs)
 
+    def lost(self) -> dict[str, int]:
+        """
+        Messages of each topic that the middleware reports as lost, by the name on the graph.
+
+        A publisher that is faster than the network or this node discards messages that were not
+        repeated yet.
+        """
+        with self._lock:
+            return {one.subscription.topic_name: one.lost for one in self._inputs}
+
     def incompatible(self) -> list[str]:
         """
         Adapt to the current publishers; return each topic with lost messages, and the reason.
@@ -109,6 +120,9 @@ class Inputs:
         return [f'{name}: {_mismatch(qos, one.qos)}' for qos in refused]
 
     def _subscribe(self, one: _Input) -> None:
+        def count(event: Any) -> None:
+            one.lost += event.total_count_change
+
         one.subscription = self._node.create_subscription(
             one.kind,
             one.topic,
@@ -117,7 +131,9 @@ class Inputs:
             callback_group=one.group,
             qos_overriding_options=one.override,
             # rclpy's own event callback warns of the name before remapping.
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=lambda _event: None),
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=lambda _event: None, message_lost=count
+            ),
         )
 
 
