@@ -9,14 +9,14 @@ runs a node in the same way.
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import importlib
 import os
 import signal
 import sys
 
-_M_ARENA_MAX = -8  # of malloc.h
+from starcal_ros.allocator import use_one_arena
+
 _REMEDY = (
     'Source the setup files of ROS 2 and of the workspace with starcal, or run it from the'
     ' environment that make setup makes'
@@ -25,7 +25,7 @@ _REMEDY = (
 
 def _run(name: str) -> int:
     """Run the function ``main`` of a module of `starcal_ros.ros`."""
-    _keep_memory_in_one_place()
+    use_one_arena()
     # Read when NumPy is imported: see `starcal_ros.blas_threads`, which a vehicle may not have.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     # Unless nohup or a shell ignores it; `main` sets the handler of the node.
@@ -46,18 +46,6 @@ def _run(name: str) -> int:
         print(f'{name}: {why}', file=sys.stderr)
         return 2
     return int(module.main())
-
-
-def _keep_memory_in_one_place() -> None:
-    """
-    Have the allocator of glibc serve all threads from one arena; before the first thread.
-
-    By default each thread of an executor keeps the memory that it has freed: a calibrator that
-    solved in turn on eight threads grew to twice its size.
-    """
-    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
-    if mallopt is not None:  # musl has one arena and no such function
-        mallopt(_M_ARENA_MAX, 1)
 
 
 star_observer = functools.partial(_run, 'star_observer')

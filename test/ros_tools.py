@@ -49,8 +49,8 @@ class RosTools:
         )
         lines = shown.stdout.decode().split('\0')
         self.environment = dict(line.split('=', 1) for line in lines if '=' in line)
-        self.environment |= {'RMW_IMPLEMENTATION': rmw, 'PYTHONUNBUFFERED': '1'}
-        self.environment |= {'PYTHONFAULTHANDLER': '1', **more}
+        self.environment |= {'PYTHONUNBUFFERED': '1', 'PYTHONFAULTHANDLER': '1'}
+        self.environment |= {'RMW_IMPLEMENTATION': rmw, **more}
         if rmw == 'rmw_cyclonedds_cpp':
             # The wheels' rmw_implementation looks for libraries beside itself alone.
             self.environment['LD_PRELOAD'] = f'{tools}/native/lib/lib{rmw}.so'

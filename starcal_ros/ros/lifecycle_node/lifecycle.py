@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-import ctypes
 import functools
 import math
 import resource
@@ -28,6 +27,7 @@ from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 
+from starcal_ros.allocator import return_freed_memory
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.options import unknown_option
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES
@@ -170,7 +170,7 @@ class StarcalNode(PrintableLog, LifecycleNode):
         self._incompatible = incompatible
         if time.monotonic() > self._trim_due_s:
             self._trim_due_s = time.monotonic() + _TRIM_S
-            _return_freed_memory()
+            return_freed_memory()
         if time.monotonic() > self._listening_since_s + _SILENT_S:
             self._listening_since_s = math.inf
             for topic in self.silent():
@@ -426,18 +426,6 @@ def _spin(node: StarcalNode, executor: Executor) -> None:
             return
         except Exception as error:
             node.count_error(error)
-
-
-def _return_freed_memory() -> None:
-    """
-    Have the allocator of glibc return free pages to the system, which it keeps between others.
-
-    Large images of several threads leave gaps: in ten minutes a star observer grew by a quarter.
-    A fixed threshold for memory maps prevents them too, for half as much processor time again.
-    """
-    trim = getattr(ctypes.CDLL(None), 'malloc_trim', None)
-    if trim is not None:  # musl has no such function
-        trim(0)
 
 
 def one_line(error: Exception) -> str:
