@@ -200,6 +200,8 @@ def _seen(condition: Callable[..., object]) -> str:
     looked_at = inspect.signature(function).bind(*arguments).arguments
     if inspect.isfunction(function):
         looked_at |= inspect.getclosurevars(function).nonlocals
+    for asked in [value for value in looked_at.values() if inspect.isfunction(value)]:
+        looked_at |= inspect.getclosurevars(asked).nonlocals
     newest = {
         name: (len(value), value[-1:]) if isinstance(value, list) else value
         for name, value in looked_at.items()

@@ -203,7 +203,7 @@ def test_two_cameras_with_one_frame_are_named(
         heard = [one.status[0] for one in told if f'{name}/calibrator' in one.status[0].name]
         return str(heard[-1].message) if heard else ''
 
-    says = f'/tf_static: another node publishes {stored.child_frame} too: each camera needs frames'
+    says = f'/tf_static: another node publishes {stored.child_frame} too: give each camera its own'
     for name in ('left', 'right'):
         client.until(lambda name=name: message(name).startswith(says))
     client.until(lambda: message('third') == 'calibration active')
