@@ -61,16 +61,25 @@ class RosTools:
     def run(
         self, *arguments: str | Path, timeout_s: float = RUN_S
     ) -> subprocess.CompletedProcess[str]:
-        """Run `ros2` with these arguments to its end."""
-        return subprocess.run(
-            [self._ros2, *map(str, arguments)],
-            env=self.environment,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=timeout_s,
-            check=False,
-        )
+        """
+        Run `ros2` with these arguments to its end.
+
+        The tool looks for a node once, half a second after its start: on busy cores discovery
+        takes longer.  It runs again where it did not find the node, and so did nothing.
+        """
+        deadline_s = time.monotonic() + RUN_S
+        while True:
+            done = subprocess.run(
+                [self._ros2, *map(str, arguments)],
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                timeout=timeout_s,
+                check=False,
+            )
+            if 'Node not found' not in done.stderr or time.monotonic() > deadline_s:
+                return done
 
     def until(self, expected: str, *arguments: str | Path) -> str:
         """Output of `ros2`, run again until it holds what is expected."""
