@@ -20,6 +20,7 @@ import time
 import pytest
 
 BESIDE = Path(__file__).parents[2] / 'shared' / 'ros2tools' / 'install.sh'
+PROFILE = Path(__file__).parents[1] / 'config' / 'cyclonedds.xml'
 JAZZY_RCLPY = '7.'  # compiled tools serve the ROS they were built against alone
 RUN_S = 100.0  # a command of ros2 takes 2 s; busy cores make that much of it
 
@@ -54,6 +55,8 @@ class RosTools:
         if rmw == 'rmw_cyclonedds_cpp':
             # The wheels' rmw_implementation looks for libraries beside itself alone.
             self.environment['LD_PRELOAD'] = f'{tools}/native/lib/lib{rmw}.so'
+            # Cyclone DDS starts no node with an element that it does not know.
+            self.environment['CYCLONEDDS_URI'] = PROFILE.as_uri()
         self._ros2 = str(tools / 'bin' / 'ros2')
         self._logs = logs
         self._started: list[subprocess.Popen[bytes]] = []
