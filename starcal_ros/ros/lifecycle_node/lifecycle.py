@@ -56,6 +56,10 @@ class Executor(MultiThreadedExecutor):
 
     _sigint_gc: Any = None
 
+    def join(self) -> None:
+        """Wait for the callbacks that run, and drop those that wait for a thread."""
+        self._executor.shutdown(wait=True, cancel_futures=True)
+
 
 class StarcalNode(PrintableLog, LifecycleNode):
     """
@@ -350,7 +354,7 @@ def run(make_node: Callable[[], StarcalNode], name: str, args: Sequence[str] | N
         _spin(node, executor)
         return 0
 
-    return until_told_to_end(name, args, work, lambda: _end(node))
+    return until_told_to_end(name, args, work, lambda: _end(node, executor))
 
 
 def until_told_to_end(
@@ -406,10 +410,12 @@ def end_quietly(node: Node | None) -> None:
     rclpy.try_shutdown()
 
 
-def _end(node: StarcalNode | None) -> None:
+def _end(node: StarcalNode | None, executor: Executor | None) -> None:
     if node is not None:
         node.deactivate()
         node.cleanup()
+    if executor is not None:
+        executor.join()  # a callback that asks a destroyed node for its state crashes in rclpy
     end_quietly(node)
 
 

@@ -320,6 +320,44 @@ def test_nodes_end_after_several_signals(
         assert 'Traceback' not in node.said()
 
 
+CALLBACK_AT_THE_END = """
+import os
+import signal
+import sys
+import threading
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from starcal_ros.ros.calibrator import Calibrator
+from starcal_ros.ros.lifecycle_node.lifecycle import run
+
+class Slow(Calibrator):
+    destroyed = threading.Event()
+
+    def activate(self):
+        super().activate()
+        self.steady_timer(0.01, self.slow, MutuallyExclusiveCallbackGroup())
+
+    def slow(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        print('destroyed' if self.destroyed.wait(2.0) else 'a node', self.is_active)
+
+    def destroy_node(self):
+        super().destroy_node()
+        self.destroyed.set()
+
+sys.exit(run(Slow, 'calibrator', sys.argv[1:]))
+"""
+
+
+def test_a_callback_that_runs_at_the_end_has_a_node(tiny_bag: Path) -> None:
+    """In a destroyed one, rclpy crashes where the state is asked for."""
+    ros = ['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')]
+    command = [sys.executable, '-c', CALLBACK_AT_THE_END, *ros]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith('a node ')
+
+
 def test_a_destroyed_node_is_no_longer_in_the_graph(client: Client, tiny_bag: Path) -> None:
     """A process may hold several nodes, one after the other, with the same name."""
     rclpy.init(args=['--ros-args', '--params-file', str(tiny_bag / 'params.yaml')])
