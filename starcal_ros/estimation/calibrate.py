@@ -265,8 +265,6 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     share, before_sigma = 1.0, math.inf
     for k in range(_ROUNDS):
         whole = k > 0
-        if not judged.kept.any():
-            raise NotObservable('no image has three stars that fit')
         last = _round(data, problem, state, judged, residual_px, shape_px, whole, near, share)
         after = judge(
             data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes

@@ -300,7 +300,11 @@ def judge(
     found: Posterior | None,
     attitudes: Attitudes | None = None,
 ) -> Judged:
-    """Return the weights that the residuals of a state ask for."""
+    """
+    Return the weights that the residuals of a state ask for.
+
+    Raises NotObservable where no star fits.
+    """
     table, options = data.table, data.options
     finite = np.asarray(np.isfinite(residual_px).all(axis=1))
     residual_px = np.where(finite[:, None], residual_px, 1e6)
@@ -319,6 +323,8 @@ def judge(
         coarsest_cells(data.groups),
         options.outlier_sigma,
     )
+    if not kept.any():
+        raise NotObservable('no image has three stars that fit')
     if found is not None:
         own_px2 = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
         weight = np.where(kept, 1.0 / own_px2, 0.0)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats
 from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.camera import CameraModel, line_of_sight
-from starcal_ros.camera.conversion import convert
+from starcal_ros.camera.lens import ideal_points
 from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.calibration_options import CalibrationOptions
@@ -214,7 +214,10 @@ def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMa
     if sky.camera.model == _EQUIDISTANT:
         return sky
     turned_px = mirror(xy_px, sky.camera.width) if sky.mirrored else xy_px
-    camera, _ = convert(sky.camera, _EQUIDISTANT)
+    # Without coefficients: those of a perspective lens would be overdone beyond the stars.
+    focal_px = _mean_focal_px(sky.camera, _EQUIDISTANT)
+    intrinsics = [focal_px, 0.0, focal_px, *sky.camera.parameters[3:5], 0.0, 0.0, 0.0, 0.0]
+    camera = CameraModel(sky.camera.width, sky.camera.height, np.array(intrinsics), _EQUIDISTANT)
     other = confirm_sky(turned_px, camera, catalog, sky.camera_from_icrf)
     if isinstance(other, SkyMatch) and (
         len(other.xy_px) > _MORE * len(sky.xy_px) or other.residual_px < _CLOSER * sky.residual_px
@@ -263,7 +266,7 @@ def _of_one_lens(
 
     A few others are false, of another lens, or pictures of a screen that shows the sky.
     """
-    focal_px = np.array([float(sky.camera.parameters[0]) for sky in found.values()])
+    focal_px = np.array([_mean_focal_px(sky.camera, sky.camera.model) for sky in found.values()])
     low, high = np.percentile(focal_px, [10, 90])
     if high > (1 + _SAME_CAMERA) * low:
         raise NotFromStars(
@@ -273,6 +276,20 @@ def _of_one_lens(
     alike = np.abs(focal_px / np.median(focal_px) - 1) < _SAME_CAMERA
     kept = {t: sky for (t, sky), same in zip(found.items(), alike, strict=True) if same}
     return kept, tuple(focal_px[~alike].tolist())
+
+
+def _mean_focal_px(camera: CameraModel, model: str) -> float:
+    """
+    Focal length of a lens model at the RMS radius of the detector.
+
+    There it hardly trades with the distortion, which in the middle it does from image to image.
+    """
+    size = np.array([camera.width, camera.height])
+    from_middle_px = math.sqrt((size @ size) / 12) * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    middle_px = camera.parameters[3:5]
+    directions = line_of_sight(camera, middle_px + from_middle_px)
+    radius = np.linalg.norm(ideal_points(model, directions), axis=1)
+    return float((np.linalg.norm(from_middle_px, axis=1) / radius).mean())
 
 
 def _common_camera(
