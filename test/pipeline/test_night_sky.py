@@ -107,8 +107,8 @@ def test_an_equidistant_lens_of_103_degrees_is_found() -> None:
 def test_a_camera_found_as_a_pinhole_gets_the_lens_that_its_stars_need(camera: int) -> None:
     """
     As a pinhole, the corners of 44 without stars were off by 22 of their sigmas, and accepted.
-    The images of 109 looked like several lenses: their focal length traded with their distortion.
 
+    The images of 109 looked like several lenses: their focal length traded with their distortion.
     The stars of 137 hardly separate the coefficients of its lens, nor without a prior anything.
     """
     given, _ = camera_of(camera)
