@@ -364,3 +364,5 @@ def test_the_summary_is_a_line() -> None:
         'arcsec/degC; reference 20 degC; left out: this'
     )
     assert temperature.summary(TemperatureTerms(20.0)) == 'no terms; reference 20 degC'
+    both = TemperatureTerms(20.0, (4e-5, 2e-6), (1e-6, 1e-7))
+    assert '; a2 +0.00000200 (0.0000001) /degC^2;' in temperature.summary(both)
