@@ -10,7 +10,6 @@ import threading
 import time
 from typing import Any
 
-import rclpy
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import QoSProfile
@@ -24,7 +23,12 @@ from starcal_ros.formats.messages import types
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import PlayerOptions
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
-from starcal_ros.ros.lifecycle_node.lifecycle import end_quietly, Executor, until_told_to_end
+from starcal_ros.ros.lifecycle_node.lifecycle import (
+    end_quietly,
+    Executor,
+    shut_down,
+    until_told_to_end,
+)
 from starcal_ros.ros.lifecycle_node.message_factory import message_class
 from starcal_ros.ros.lifecycle_node.parameters import OptionParameters
 from starcal_ros.ros.lifecycle_node.printable_log import PrintableLog
@@ -255,7 +259,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return player.play()
 
     def end() -> None:
-        rclpy.try_shutdown()
+        shut_down()
         if listener is not None:
             listener.join()
         end_quietly(player)

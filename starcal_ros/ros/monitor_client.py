@@ -36,6 +36,7 @@ from starcal_ros.formats.messages.calibration_messages import (
 )
 from starcal_ros.formats.messages.observation_messages import observations_from_message
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
+from starcal_ros.ros.lifecycle_node.lifecycle import shut_down
 
 _PREFIX = 'starcal: '  # of the diagnostics of our nodes
 _PERIOD_S = 0.25
@@ -212,7 +213,7 @@ def main() -> int:
         return 130
     finally:
         monitor.destroy_node()
-        rclpy.try_shutdown()
+        shut_down()
 
 
 if __name__ == '__main__':

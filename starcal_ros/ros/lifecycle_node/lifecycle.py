@@ -401,13 +401,26 @@ def _record_signals() -> list[int]:
     return told
 
 
+def shut_down() -> None:
+    """
+    Leave ROS, though the thread in which rclpy answers signals may do so at the same time.
+
+    `rclpy.try_shutdown` asks whether ROS is up and then shuts it down; where the thread comes in
+    between, rcl has an error.
+    """
+    try:
+        rclpy.try_shutdown()
+    except RuntimeError:
+        rclpy.try_shutdown()
+
+
 def end_quietly(node: Node | None) -> None:
     """Destroy a node and leave ROS; a second signal does not interrupt it."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     if node is not None:
         node.destroy_node()
-    rclpy.try_shutdown()
+    shut_down()
 
 
 def _end(node: StarcalNode | None, executor: Executor | None) -> None:

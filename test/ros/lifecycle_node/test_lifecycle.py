@@ -320,6 +320,28 @@ def test_nodes_end_after_several_signals(
         assert 'Traceback' not in node.said()
 
 
+SHUT_DOWN_TWICE = """
+import os
+import signal
+
+import rclpy
+from starcal_ros.ros.lifecycle_node.lifecycle import shut_down
+
+signal.signal(signal.SIGTERM, lambda *_: None)
+for _ in range(10_000):
+    rclpy.init()
+    os.kill(os.getpid(), signal.SIGTERM)
+    shut_down()
+"""
+
+
+def test_ros_may_be_shut_down_by_a_signal_at_the_same_time() -> None:
+    """One in some hundred times, `rclpy.try_shutdown` alone finds it shut down under its hands."""
+    command = [sys.executable, '-c', SHUT_DOWN_TWICE]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, '')
+
+
 CALLBACK_AT_THE_END = """
 import os
 import signal
