@@ -186,9 +186,16 @@ def pinhole(size: tuple[int, int], focal_px: float) -> CameraModel:
 
 def _usual(size: tuple[int, int], half_px: float, model: str, half_rad: float) -> CameraModel:
     """A camera of a model without distortion, of this half diagonal."""
+    half_ideal = math.tan(half_rad) if model == _PINHOLE else half_rad
+    return _without_distortion(size, half_px / half_ideal, model)
+
+
+def _without_distortion(size: tuple[int, int], focal_px: float, model: str) -> CameraModel:
+    """A camera of a model and size, its axis in the middle."""
+    camera = pinhole(size, focal_px)
     if model == _PINHOLE:
-        return pinhole(size, half_px / math.tan(half_rad))
-    return CameraModel(*size, pinhole(size, half_px / half_rad).parameters[:9], model)
+        return camera
+    return CameraModel(*size, camera.parameters[:9], model)
 
 
 def _first_match(
@@ -214,11 +221,11 @@ def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMa
     if sky.camera.model == _EQUIDISTANT:
         return sky
     turned_px = mirror(xy_px, sky.camera.width) if sky.mirrored else xy_px
-    # Without coefficients: those of a perspective lens would be overdone beyond the stars.
-    focal_px = _mean_focal_px(sky.camera, _EQUIDISTANT)
-    intrinsics = [focal_px, 0.0, focal_px, *sky.camera.parameters[3:5], 0.0, 0.0, 0.0, 0.0]
-    camera = CameraModel(sky.camera.width, sky.camera.height, np.array(intrinsics), _EQUIDISTANT)
-    other = confirm_sky(turned_px, camera, catalog, sky.camera_from_icrf)
+    # Without distortion: coefficients fitted to a perspective lens bend corners without stars.
+    size, focal_px = (sky.camera.width, sky.camera.height), _focal_px(sky.camera, _EQUIDISTANT)
+    camera = _without_distortion(size, focal_px, _EQUIDISTANT)
+    cx, cy = sky.camera.parameters[3:5].tolist()
+    other = confirm_sky(turned_px, camera.replace(cx=cx, cy=cy), catalog, sky.camera_from_icrf)
     if isinstance(other, SkyMatch) and (
         len(other.xy_px) > _MORE * len(sky.xy_px) or other.residual_px < _CLOSER * sky.residual_px
     ):
@@ -266,7 +273,7 @@ def _of_one_lens(
 
     A few others are false, of another lens, or pictures of a screen that shows the sky.
     """
-    focal_px = np.array([_mean_focal_px(sky.camera, sky.camera.model) for sky in found.values()])
+    focal_px = np.array([_focal_px(sky.camera, sky.camera.model) for sky in found.values()])
     low, high = np.percentile(focal_px, [10, 90])
     if high > (1 + _SAME_CAMERA) * low:
         raise NotFromStars(
@@ -278,18 +285,17 @@ def _of_one_lens(
     return kept, tuple(focal_px[~alike].tolist())
 
 
-def _mean_focal_px(camera: CameraModel, model: str) -> float:
+def _focal_px(camera: CameraModel, model: str) -> float:
     """
     Focal length of a lens model at the RMS radius of the detector.
 
     There it hardly trades with the distortion, which in the middle it does from image to image.
     """
-    size = np.array([camera.width, camera.height])
-    from_middle_px = math.sqrt((size @ size) / 12) * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
-    middle_px = camera.parameters[3:5]
-    directions = line_of_sight(camera, middle_px + from_middle_px)
-    radius = np.linalg.norm(ideal_points(model, directions), axis=1)
-    return float((np.linalg.norm(from_middle_px, axis=1) / radius).mean())
+    radius_px = math.hypot(camera.width, camera.height) / math.sqrt(12.0)
+    from_middle_px = radius_px * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    directions = line_of_sight(camera, camera.parameters[3:5] + from_middle_px)
+    ideal = ideal_points(model, directions)
+    return float(np.mean(radius_px / np.linalg.norm(ideal, axis=1)))
 
 
 def _common_camera(

@@ -23,13 +23,13 @@ from starcal_ros.formats.messages import types
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import PlayerOptions
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
-from starcal_ros.ros.lifecycle_node.lifecycle import (
+from starcal_ros.ros.lifecycle_node.message_factory import message_class
+from starcal_ros.ros.lifecycle_node.node_process import (
     end_quietly,
     Executor,
     shut_down,
     until_told_to_end,
 )
-from starcal_ros.ros.lifecycle_node.message_factory import message_class
 from starcal_ros.ros.lifecycle_node.parameters import OptionParameters
 from starcal_ros.ros.lifecycle_node.printable_log import PrintableLog
 

@@ -46,8 +46,9 @@ from starcal_ros.records import IMAGE_REFUSALS
 from starcal_ros.ros.kept.report_queue import ACTIVE, CalibratorReports, CANDIDATE
 from starcal_ros.ros.kept.state import Answer, CalibratorState
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
-from starcal_ros.ros.lifecycle_node.lifecycle import ERROR, Health, OK, run, StarcalNode, WARN
+from starcal_ros.ros.lifecycle_node.lifecycle import ERROR, Health, OK, StarcalNode, WARN
 from starcal_ros.ros.lifecycle_node.message_factory import make_message, message_class
+from starcal_ros.ros.lifecycle_node.node_process import run
 from starcal_ros.ros.set_camera_info_client import CameraDriver
 
 NAME = 'calibrator'

@@ -36,7 +36,7 @@ from starcal_ros.formats.messages.calibration_messages import (
 )
 from starcal_ros.formats.messages.observation_messages import observations_from_message
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
-from starcal_ros.ros.lifecycle_node.lifecycle import shut_down
+from starcal_ros.ros.lifecycle_node.node_process import shut_down
 
 _PREFIX = 'starcal: '  # of the diagnostics of our nodes
 _PERIOD_S = 0.25

@@ -22,7 +22,7 @@ from starcal.srv import Calibrate, LineOfSightTable
 from starcal_ros.assessment import lookup
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.lookup_table import write_lookup_table
-from starcal_ros.ros.lifecycle_node.lifecycle import shut_down
+from starcal_ros.ros.lifecycle_node.node_process import shut_down
 from starcal_ros.text import printable
 
 _TYPES = {'solve': Calibrate, 'lookup': LineOfSightTable}  # the others are Trigger

@@ -48,8 +48,9 @@ from starcal_ros.records import (
 )
 from starcal_ros.report.pictures.annotation import annotate
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
-from starcal_ros.ros.lifecycle_node.lifecycle import Health, OK, run, StarcalNode, WARN
+from starcal_ros.ros.lifecycle_node.lifecycle import Health, OK, StarcalNode, WARN
 from starcal_ros.ros.lifecycle_node.message_factory import make_message
+from starcal_ros.ros.lifecycle_node.node_process import run
 from starcal_ros.ros.queue.image_queue import ImageQueue, Recent, Waiting
 from starcal_ros.ros.queue.tracker_inputs import StarTrackers
 from starcal_ros.ros.unmatched import Unmatched

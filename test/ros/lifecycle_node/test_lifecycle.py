@@ -121,7 +121,7 @@ def test_every_transition_in_every_state(
 SIGNALLED = """
 import os, signal, sys, time
 import rclpy
-from starcal_ros.ros.lifecycle_node.lifecycle import end_quietly, until_told_to_end
+from starcal_ros.ros.lifecycle_node.node_process import end_quietly, until_told_to_end
 
 def work():
     if 'told' in sys.argv:
@@ -148,7 +148,7 @@ def test_what_fails_after_a_signal_is_no_error(argument: str, status: int, said:
 SIGNALLED_AGAIN = """
 import os, signal, sys, time
 import rclpy
-from starcal_ros.ros.lifecycle_node.lifecycle import end_quietly, until_told_to_end
+from starcal_ros.ros.lifecycle_node.node_process import end_quietly, until_told_to_end
 
 def tell():
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):
@@ -179,7 +179,7 @@ def test_signals_do_not_cut_the_end_short() -> None:
 SIGNALLED_AT_AN_ENTRY = """
 import os, signal, sys, time
 import rclpy
-from starcal_ros.ros.lifecycle_node.lifecycle import end_quietly, until_told_to_end
+from starcal_ros.ros.lifecycle_node.node_process import end_quietly, until_told_to_end
 
 class Lock:
     def __enter__(self):
@@ -214,7 +214,7 @@ EXECUTOR_OF_A_NODE = """
 import os, signal, sys
 import rclpy
 from starcal_ros.ros import bag_player, calibrator
-from starcal_ros.ros.lifecycle_node import lifecycle
+from starcal_ros.ros.lifecycle_node import node_process
 
 def told_of(module, name):
     kind = getattr(module, name)
@@ -228,9 +228,9 @@ def end():
     shut_down()
     print('signals answered no more')
 rclpy.try_shutdown = end
-told_of(lifecycle, 'Executor')
+told_of(node_process, 'Executor')
 told_of(bag_player, 'Executor')
-lifecycle._spin = lambda node, executor: os.kill(os.getpid(), signal.SIGTERM)
+node_process._spin = lambda node, executor: os.kill(os.getpid(), signal.SIGTERM)
 bag_player.BagPlayer.play = lambda player: os.kill(os.getpid(), signal.SIGTERM) or 0
 node = {'calibrator': calibrator, 'bag_player': bag_player}[sys.argv.pop(1)]
 node.main(sys.argv[1:])
@@ -250,7 +250,7 @@ def test_an_executor_outlives_the_thread_that_answers_signals(name: str, tiny_ba
 
 EXECUTOR_AFTER_THE_SHUTDOWN = """
 import rclpy
-from starcal_ros.ros.lifecycle_node.lifecycle import Executor
+from starcal_ros.ros.lifecycle_node.node_process import Executor
 
 rclpy.init()
 rclpy.shutdown()
@@ -325,7 +325,7 @@ import os
 import signal
 
 import rclpy
-from starcal_ros.ros.lifecycle_node.lifecycle import shut_down
+from starcal_ros.ros.lifecycle_node.node_process import shut_down
 
 signal.signal(signal.SIGTERM, lambda *_: None)
 for _ in range(10_000):
@@ -336,7 +336,7 @@ for _ in range(10_000):
 
 
 def test_ros_may_be_shut_down_by_a_signal_at_the_same_time() -> None:
-    """One in some hundred times, `rclpy.try_shutdown` alone finds it shut down under its hands."""
+    """`rclpy.try_shutdown` alone fails once in some hundred times: the signal was faster."""
     command = [sys.executable, '-c', SHUT_DOWN_TWICE]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr) == (0, '')
@@ -350,7 +350,7 @@ import threading
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from starcal_ros.ros.calibrator import Calibrator
-from starcal_ros.ros.lifecycle_node.lifecycle import run
+from starcal_ros.ros.lifecycle_node.node_process import run
 
 class Slow(Calibrator):
     destroyed = threading.Event()
@@ -361,6 +361,7 @@ class Slow(Calibrator):
 
     def slow(self):
         os.kill(os.getpid(), signal.SIGTERM)
+        # The node was destroyed 0.1 s after the signal, before its end waited for callbacks.
         print('destroyed' if self.destroyed.wait(2.0) else 'a node', self.is_active)
 
     def destroy_node(self):
