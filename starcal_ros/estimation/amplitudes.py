@@ -88,15 +88,6 @@ def octave_prior(count: int) -> tuple[Floats, Floats]:
     return mean, precision
 
 
-def prior_of_last_octave(count: int) -> tuple[Floats, Floats]:
-    """Logarithms (s,) of the amplitude of the last of some octaves with their prior weights."""
-    sigma = math.hypot(LOG_SIGMA, OCTAVE_SIGMA * math.sqrt(count - 1))
-    off: Floats = np.asarray(np.linspace(-3.0, 3.0, 61), np.float64)
-    weight = np.exp(-0.5 * off**2)
-    mean = LOG_CENTRE + OCTAVE_STEP * (count - 1)
-    return mean + sigma * off, weight / weight.sum()
-
-
 def field_amplitudes(
     information: Floats, gradient: Floats, octave: Indices, near: Amplitudes | None = None
 ) -> Amplitudes:

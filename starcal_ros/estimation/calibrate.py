@@ -264,17 +264,16 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     termination = 'iteration_limit'
     share, before_sigma = 1.0, math.inf
     for k in range(_ROUNDS):
-        whole = k > 0
-        last = _round(data, problem, state, judged, residual_px, shape_px, whole, near, share)
+        last = _round(data, problem, state, judged, residual_px, shape_px, near, share)
         after = judge(
             data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes
         )
-        near = last.posterior if whole else None
+        near = last.posterior
         residual_px = last.residual_px
         shape_px = np.maximum(last.posterior.shape_sigma_px, _FIRST_SHAPE_PX)
         iterations += 1
         step_sigma = _step_sigma(last.linear.layout, last.posterior)
-        if whole and step_sigma < _STEP_SIGMA and agree(judged, after, table):
+        if step_sigma < _STEP_SIGMA and agree(judged, after, table):
             termination = 'converged'
             break
         if k < _ROUNDS - 1:
@@ -313,7 +312,6 @@ def _round(
     judged: Judged,
     residual_px: Floats,
     shape_px: Floats,
-    whole: bool,
     near: Posterior | None,
     share: float,
 ) -> _Round:
@@ -322,11 +320,11 @@ def _round(
     problem = weighted_attitudes(problem, data, judged.attitudes)
     rates_rad_s = state.camera_from_star_tracker.apply(data.rates_rad_s)
     size = camera.width, camera.height
-    layout = unknowns_of(problem, state, rates_rad_s, size, _assumed(data), whole)
+    layout = unknowns_of(problem, state, rates_rad_s, size, _assumed(data))
     measurements = arrange(table, judged.kept, judged.working_px2(table))
     linear = Linearisation(problem, state, layout, measurements, table.measured_px - residual_px)
     sums = star_sums(linear)
-    found = posterior(sums, linear, shape_px, whole, near)
+    found = posterior(sums, linear, shape_px, near)
     own = share * found.of_images[:, IMAGE_ROTATION]
     after = moved(problem, state, layout, share * found.mean, own)
     left_px = _residuals_px(problem, after, table, layout, found, camera)
@@ -403,8 +401,7 @@ def _residuals_px(
         shapes_px = found.of_images[:, layout.places['shape']]
         own[:, FOCAL_PARAMETERS] += shapes_px @ SHAPE_MODES.T
         size = camera.width, camera.height
-        if 'field' in layout:
-            measured = measured - field_of(layout, found, size).displacement_px(measured)
+        measured = measured - field_of(layout, found, size).displacement_px(measured)
         turned = np.zeros((3, len(table)))
         for entry in layout.shared:
             if entry.turn is not None:

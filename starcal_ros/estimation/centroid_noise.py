@@ -19,6 +19,7 @@ from starcal_ros.arrays import Floats, Mask
 
 _CLIP_SIGMA = 4.5  # length of a normal residual: one in 25,000 is longer
 _SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
+_ALIKE = 1e-9  # relative determinant below which all variances are equal but for rounding
 _ROUNDS = 12
 _SETTLED = 1e-3
 _NODES = 5  # of the function of brightness, at quantiles
@@ -97,21 +98,21 @@ def estimate_variance(
 
 def _line(own: Floats, squared: Floats, expected: Floats) -> tuple[float, float]:
     """Return scale and floor of ``squared = scale own + floor``, neither negative."""
-    weight = expected**-2.0
-    columns = np.stack([own, np.ones(len(own))])
-    normal = (columns * weight) @ columns.T
-    right = (columns * weight) @ squared
-    size = np.sqrt(np.diag(normal))
-    try:
-        scale, floor_px2 = np.linalg.solve(normal / np.outer(size, size), right / size) / size
-    except np.linalg.LinAlgError:  # all variances are equal
-        scale, floor_px2 = right[0] / normal[0, 0], 0.0
+    weight = 1.0 / (expected * expected)
+    weighted = weight * own
+    by_own, both, by_one = float(weighted @ own), float(weighted.sum()), float(weight.sum())
+    right_own, right_one = float(weighted @ squared), float(weight @ squared)
+    determinant = by_own * by_one - both**2
+    scale, floor_px2 = right_own / by_own, 0.0
+    if determinant > _ALIKE * by_own * by_one:
+        scale = (by_one * right_own - both * right_one) / determinant
+        floor_px2 = (by_own * right_one - both * right_own) / determinant
     if floor_px2 < 0:
-        scale, floor_px2 = right[0] / normal[0, 0], 0.0
+        scale, floor_px2 = right_own / by_own, 0.0
     if not _SCALE_LIMITS[0] <= scale <= _SCALE_LIMITS[1]:
         scale = float(np.clip(scale, *_SCALE_LIMITS))
-        floor_px2 = max(float(weight @ (squared - scale * own) / weight.sum()), 0.0)
-    return float(scale), float(floor_px2)
+        floor_px2 = max((right_one - scale * both) / by_one, 0.0)
+    return scale, floor_px2
 
 
 def _brightness(ratio: Floats, magnitude: Floats) -> tuple[tuple[float, ...], tuple[float, ...]]:

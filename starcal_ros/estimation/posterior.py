@@ -19,7 +19,6 @@ from starcal_ros.estimation.amplitudes import (
     averaged_field,
     field_amplitudes,
     NO_AMPLITUDE,
-    prior_of_last_octave,
     Shapes,
     shapes,
     ShapeSums,
@@ -34,13 +33,7 @@ from starcal_ros.estimation.equations import (
     StarSums,
 )
 from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
-from starcal_ros.estimation.unknowns import (
-    FIELD_OCTAVES,
-    FOCAL_PARAMETERS,
-    Layout,
-    SHAPE_MODES,
-    Unknown,
-)
+from starcal_ros.estimation.unknowns import FOCAL_PARAMETERS, Layout, SHAPE_MODES, Unknown
 
 _WITHOUT = 1e3  # times the sigma of a prior: far more than a wrong data sheet is off
 _SMALL_SHAPE_PX = 1e-4  # to begin with
@@ -133,7 +126,6 @@ def posterior(
     sums: StarSums,
     linear: Linearisation,
     before: Floats,
-    whole: bool,
     near: Posterior | None = None,
 ) -> Posterior:
     """
@@ -143,19 +135,17 @@ def posterior(
     ----------
     before : (3,)
         Amplitudes px of the shapes of the images to begin with.
-    whole : bool
-        False: the field and the shapes are zero; the list need not have a field.
     near : Posterior, optional
-        A whole one at a state near this one: the search of amplitudes begins with its own.
+        At a state near this one: the search of amplitudes begins with its own.
     """
     layout = linear.layout
     normal = arrow(sums, linear.problem, linear.state, layout)
     start = eliminated(normal, layout, before)
-    solver = _Solver(layout, whole)
+    solver = _Solver(layout)
     base = solver.amplitudes(start, near.field if near else None)
     none = Amplitudes(np.full(3, NO_AMPLITUDE), 0.0)
     found, last = Shapes(before, none, np.zeros(3)), start
-    if whole and len(sums.blocks) > 1:
+    if len(sums.blocks) > 1:
         field_px = solver.solve(start, base)[0][layout.places['field']]
         by_image = _shape_sums(sums, layout, solver, field_px)
         found = shapes(by_image, near.shape if near else None)
@@ -198,7 +188,7 @@ def without_prior(sums: StarSums, linear: Linearisation, name: str) -> tuple[Flo
     linear = dataclasses.replace(linear, layout=wide)
     at = wide.of([name])
     try:
-        found = posterior(sums, linear, np.full(3, _SMALL_SHAPE_PX), True)
+        found = posterior(sums, linear, np.full(3, _SMALL_SHAPE_PX))
     except (NotObservable, np.linalg.LinAlgError):  # its prior alone determines it
         return np.zeros(len(at)), np.full(len(at), np.inf)
     precision, off = wide.prior_precision[at], wide.prior_offset[at]
@@ -220,21 +210,15 @@ def _without_prior(entry: Unknown) -> Floats:
 class _Solver:
     """Solution of the shared unknowns: the field by its amplitudes, the others by their priors."""
 
-    def __init__(self, layout: Layout, with_field: bool) -> None:
+    def __init__(self, layout: Layout) -> None:
         self.layout = layout
-        self.with_field = with_field
         self.precision = layout.prior_precision
         self.field = layout.of(['field'])
         self.free = np.setdiff1d(np.flatnonzero(np.isfinite(self.precision)), self.field)
-        self.estimated = np.concatenate([self.free, self.field]) if with_field else self.free
-        self.unit: Floats = np.empty(0)
-        self.octave: Indices = np.arange(FIELD_OCTAVES)
-        self.term: Floats = np.empty(0)
-        if with_field:
-            field = layout['field']
-            assert field.octave is not None and field.term is not None
-            self.unit, self.octave = field.sigma, field.octave
-            self.term = field.term / field.sigma
+        self.estimated = np.concatenate([self.free, self.field])
+        field = layout['field']
+        assert field.octave is not None and field.term is not None
+        self.unit, self.octave, self.term = field.sigma, field.octave, field.term / field.sigma
 
     def _of_free(self, arrow: Equations) -> tuple[Floats, Floats]:
         """Return the covariance of all but the field, the field known, and their gradient."""
@@ -255,8 +239,6 @@ class _Solver:
 
     def amplitudes(self, arrow: Equations, near: Amplitudes | None) -> Amplitudes:
         """Return the amplitudes of the octaves of the field."""
-        if not self.with_field:
-            return Amplitudes(np.full(int(self.octave.max()) + 1, NO_AMPLITUDE), 0.0)
         information, gradient, *_ = self._of_field(arrow)
         return field_amplitudes(information, gradient, self.octave, near)
 
@@ -266,12 +248,6 @@ class _Solver:
         """Return mean (P,), covariance (P, P), the last octave's posterior, and the lens term."""
         count = self.layout.count
         mean, covariance = np.zeros(count), np.zeros((count, count))
-        if not self.with_field:
-            free, gradient = self._of_free(arrow)
-            mean[self.free] = free @ gradient
-            covariance[np.ix_(self.free, self.free)] = free
-            last = prior_of_last_octave(len(amplitudes.log_px))
-            return mean, covariance, last, Amplitudes(np.array([NO_AMPLITUDE]), 0.0)
         information, left, free, gradient, back = self._of_field(arrow)
         field = averaged_field(information, left, self.octave, amplitudes, self.term)
         mean[self.field] = self.unit * field.mean

@@ -116,9 +116,8 @@ def _rotations(
     real = np.isfinite(seen).all(axis=1)
     seen, e, image = seen[real], table.direction_icrf[real], table.image[real]
     m = table.image_count
-    products = np.zeros((m, 3, 3))
-    np.add.at(products, image, seen[:, :, None] * e[:, None, :])
-    u, _, vt = np.linalg.svd(products)
+    products = [np.bincount(image, a * b, minlength=m) for a in seen.T for b in e.T]
+    u, _, vt = np.linalg.svd(np.stack(products, axis=1).reshape(m, 3, 3))
     fitted, before = u @ vt, predicted.as_matrix()
     # A mirrored image has an improper one: the search finds its negative focal length.
     good = (np.linalg.det(fitted) > 0) & (np.bincount(image, minlength=m) >= FEWEST_STARS)

@@ -30,9 +30,9 @@ _NOISE_SIGMA = 0.5  # of ln n: data sheets are right to a factor of 1.6
 _UNSTATED_SIGMA = 3.0  # of ln n where no sigma is stated
 _SLOW_SIGMA = 1.25  # of ln s about the stated noise
 _STATED_SLOW_SIGMA = 0.3  # of ln s about star_tracker_slow_arcsec
-# Groups of a correlation: neighbours in time are joined to at most so many, 1/200 of a campaign
+# Groups of a correlation: neighbours in time are joined to at most so many, 1/100 of a campaign
 # against correlation times of a third of it and more.  The time of an estimate stays linear.
-_MOST_GROUPS = 200
+_MOST_GROUPS = 100
 _MOST_MEMBERS = 4  # of a group, of which the mean correlation is taken
 
 

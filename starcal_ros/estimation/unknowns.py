@@ -307,7 +307,6 @@ def unknowns_of(
     rates_rad_s: Floats,
     size: tuple[int, int],
     assumed: Assumptions,
-    with_field: bool = True,
 ) -> Layout:
     """
     Return the list of unknowns of a calibration at a state.
@@ -318,8 +317,6 @@ def unknowns_of(
         Angular rate of the camera in its frame; NaN where it is not known.
     size : (width, height)
         Of the detector, px.
-    with_field : bool
-        False for a first estimate, of what does not depend on the field.
     """
     m = len(state.camera_from_icrf)
     width, height = size
@@ -339,8 +336,7 @@ def unknowns_of(
     if assumed.refraction is not None:
         entries += _refraction(assumed.refraction, state.camera_from_icrf.as_matrix())
     entries += _of_timing(rates_rad_s, height, assumed)
-    if with_field:
-        entries.append(_field(width, height))
+    entries.append(_field(width, height))
     modes = np.zeros((p, 3))
     modes[FOCAL_PARAMETERS] = SHAPE_MODES
     shape = ('scale_px', 'stretch_px', 'shear_px')

@@ -23,7 +23,6 @@ from starcal_ros.estimation.amplitudes import (
     LARGEST_FIELD_PX,
     LARGEST_SHAPE_PX,
     octave_prior,
-    prior_of_last_octave,
     shapes,
     ShapeSums,
 )
@@ -74,17 +73,6 @@ def test_the_prior_of_octaves_is_a_chain() -> None:
     assert mean == pytest.approx(CENTRE + STEP * np.arange(4))
     later = np.minimum.outer(np.arange(4), np.arange(4))
     assert np.linalg.inv(precision) == pytest.approx(16.0 + later)
-
-
-@pytest.mark.parametrize('count', [1, 3])
-def test_before_the_data_the_last_octave_has_its_prior(count: int) -> None:
-    log_px, weight = prior_of_last_octave(count)
-    mean, precision = octave_prior(count)
-    assert weight.sum() == pytest.approx(1.0)
-    assert weight @ log_px == pytest.approx(mean[-1])
-    variance = np.linalg.inv(precision)[-1, -1]
-    # Beyond three sigma nothing is left: 3 % of the variance.
-    assert weight @ (log_px - mean[-1]) ** 2 == pytest.approx(variance, rel=0.04)
 
 
 @pytest.mark.parametrize('sigma_px', [(0.3, 0.1, 0.05), (0.05, 0.05, 0.0), (0.0, 0.2, 0.2)])

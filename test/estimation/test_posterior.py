@@ -41,6 +41,7 @@ from starcal_ros.estimation.shared_errors import SharedError
 EXACT = 2e-7
 # Amplitudes of the next term of the lens: none, and two that the stars may show.
 OF_TERM = np.array([-2.0, 1.5, 2.2])
+OCTAVES_PX = np.array([0.03, 0.02, 0.01])
 
 
 @pytest.fixture(scope='module')
@@ -53,8 +54,19 @@ def truth() -> Dense:
     return usual()[1]
 
 
-def solved(given: Small, whole: bool) -> Posterior:
-    return posterior(given.sums(), given.linear(), SHAPE, whole)
+def solved(given: Small) -> Posterior:
+    return posterior(given.sums(), given.linear(), SHAPE)
+
+
+@pytest.fixture
+def known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let all amplitudes be known: those of octaves and shapes; the term of the lens is absent."""
+    field, shape = (Amplitudes(np.log(one), 0.0) for one in (OCTAVES_PX, SHAPE))
+    monkeypatch.setattr(module, 'field_amplitudes', lambda *_: field)
+    monkeypatch.setattr(module, 'shapes', lambda *_: Shapes(SHAPE, shape, np.zeros(3)))
+    monkeypatch.setattr(amplitudes, '_SHIFTS', np.zeros(1))
+    monkeypatch.setattr(amplitudes, '_OF_TERM', np.array([-300.0]))
+    monkeypatch.setattr(shared_covariance, '_HELD', 1e-13)
 
 
 def assert_same(found: Posterior, mean: Floats, covariance: Floats) -> None:
@@ -80,14 +92,13 @@ def assert_same(found: Posterior, mean: Floats, covariance: Floats) -> None:
         assert np.abs((whole[k] - covariance[own, own]) / size).max() < EXACT
 
 
-def test_without_a_field_it_is_the_dense_solution(given: Small, truth: Dense) -> None:
-    found = solved(given, whole=False)
-    precision, offset = prior_precision(given, SHAPE, None), prior_offset(given)
+@pytest.mark.usefixtures('known')
+def test_at_known_amplitudes_it_is_the_dense_solution(given: Small, truth: Dense) -> None:
+    found = solved(given)
+    precision, offset = prior_precision(given, SHAPE, OCTAVES_PX), prior_offset(given)
     mean, covariance, _ = solution(truth, precision, offset)
     assert_same(found, mean, covariance)
     assert np.array_equal(found.shape_sigma_px, SHAPE)
-    assert found.field.likelihood_ratio == 0.0 == found.shape.likelihood_ratio
-    assert np.exp(found.field.log_px).max() < 1e-9 > np.exp(found.shape.log_px).max()
     # The number of unknowns that the data determine: trace of data over all information.
     free = np.flatnonzero(np.isfinite(precision[: given.layout.count]))
     prior = np.trace(covariance[np.ix_(free, free)] * precision[free])
@@ -95,12 +106,13 @@ def test_without_a_field_it_is_the_dense_solution(given: Small, truth: Dense) ->
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('known')
 def test_one_star_tracker_without_terms_is_the_dense_solution() -> None:
     plain = small(5, terms=False, two_trackers=False)
     mean, covariance, _ = solution(
-        dense(plain), prior_precision(plain, SHAPE, None), prior_offset(plain)
+        dense(plain), prior_precision(plain, SHAPE, OCTAVES_PX), prior_offset(plain)
     )
-    assert_same(solved(plain, whole=False), mean, covariance)
+    assert_same(solved(plain), mean, covariance)
 
 
 @dataclass(frozen=True)
@@ -139,7 +151,7 @@ def varied() -> Varied:
         patch.setattr(amplitudes, '_OF_TERM', OF_TERM)
         patch.setattr(module, 'shapes', recorded)
         patch.setattr(module, '_shape_sums', of_field)
-        found = solved(made, whole=True)
+        found = solved(made)
     return Varied(made, dense(made), found, fields[0], *calls[0])
 
 
@@ -330,13 +342,16 @@ def propagated(
     return parts
 
 
-def test_shared_errors_without_a_field_propagate_as_the_dense_covariance(
+@pytest.mark.usefixtures('known')
+def test_shared_errors_at_known_amplitudes_propagate_as_the_dense_covariance(
     given: Small, truth: Dense
 ) -> None:
     weights, V = shared(given, 0.11, 0.07)
-    found = solved(given, whole=False)
+    found = solved(given)
     after = widened(given, found, weights)
-    _, covariance, _ = solution(truth, prior_precision(given, SHAPE, None), prior_offset(given))
+    _, covariance, _ = solution(
+        truth, prior_precision(given, SHAPE, OCTAVES_PX), prior_offset(given)
+    )
     X = np.concatenate([truth.stars, truth.trackers])
     P = given.layout.count
     gain = (covariance @ X.T)[:P]
@@ -375,7 +390,7 @@ def test_shared_errors_with_a_field_widen_lines_of_sight_as_the_dense_covariance
     truth = dense(given)
     # Far larger than centroid errors, which are mostly hidden by the field of 150 coefficients.
     weights, V = shared(given, 2.0, 1.5)
-    found = solved(given, whole=True)
+    found = solved(given)
     after = widened(given, found, weights)
     P = given.layout.count
     # The gain of the averaged estimator: its covariance times what the images leave of X.
@@ -401,6 +416,7 @@ def test_shared_errors_with_a_field_widen_lines_of_sight_as_the_dense_covariance
     assert (of_field[seen] > 0.1 * other[seen]).any()
 
 
+@pytest.mark.usefixtures('known')
 def test_independent_errors_of_the_working_weights_change_nothing(given: Small) -> None:
     n = len(given.table)
     weights = Weights(
@@ -410,7 +426,7 @@ def test_independent_errors_of_the_working_weights_change_nothing(given: Small) 
         (SharedError('alone', np.arange(n), 1.0, 0.0, False, 1.0),),
         ((np.arange(IMAGES), np.arange(IMAGES), np.eye(IMAGES), 1.0),),
     )
-    found = solved(given, whole=False)
+    found = solved(given)
     after = widened(given, found, weights)
     sigma = np.sqrt(np.diag(found.covariance).clip(1e-300))
     free = found.estimated
@@ -418,6 +434,7 @@ def test_independent_errors_of_the_working_weights_change_nothing(given: Small) 
     assert np.abs(off[np.ix_(free, free)]).max() < 1e-9
 
 
+@pytest.mark.usefixtures('known')
 def test_star_trackers_beyond_the_stars_only_enter_the_alignment(given: Small) -> None:
     # Attitude errors that all images of a star tracker share are an error of the alignment.
     plain = small(6, terms=False, two_trackers=False)
@@ -430,7 +447,7 @@ def test_star_trackers_beyond_the_stars_only_enter_the_alignment(given: Small) -
         (),
         ((np.arange(IMAGES), np.arange(IMAGES), shared_all, 1.0),),
     )
-    found = solved(plain, whole=False)
+    found = solved(plain)
     after = widened(plain, found, weights)
     added = after.covariance - found.covariance
     at = plain.layout.of(['alignment'])
