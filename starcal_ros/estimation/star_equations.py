@@ -221,7 +221,6 @@ def whitened_chunks(
     They are (2, p + 5, m n): the u and the v rows of the columns of `normal_blocks`, and a column
     of zeros; None where the camera model has no image of a star.  The next chunk overwrites them.
     """
-    whitened_columns = _plumb_bob_columns if model == 'plumb_bob' else _lens_columns
     columns = parameters.shape[-1] + 5
     for chunk in measurements.chunks:
         m, _, n = chunk.direction_icrf.shape
@@ -233,11 +232,11 @@ def whitened_chunks(
         if field is not None:
             off_px = field.displacement_px(chunk.measured_px.T).T
             ideal = dataclasses.replace(chunk, measured_px=chunk.measured_px - off_px)
-        seen = whitened_columns(ideal, model, own, camera_from_icrf[chunk.image], J)
+        seen = _whitened_columns(ideal, model, own, camera_from_icrf[chunk.image], J)
         yield chunk, (J if seen else None)
 
 
-def _lens_columns(
+def _whitened_columns(
     chunk: Chunk, model: str, parameters: Floats, camera_from_icrf: Floats, J: Floats
 ) -> bool:
     """
@@ -247,8 +246,9 @@ def _lens_columns(
     model has no image of a star.  ``parameters`` is (p,) or (p, m n).
     """
     m, _, n = chunk.direction_icrf.shape
-    e = (camera_from_icrf @ chunk.direction_icrf).transpose(0, 2, 1).reshape(m * n, 3)
-    ideal = ideal_points(model, e)
+    e = np.empty((3, m, n))
+    np.matmul(camera_from_icrf, chunk.direction_icrf, out=e.transpose(1, 0, 2))
+    ideal = ideal_points(model, e.reshape(3, m * n).T)
     fx, skew, fy, cx, cy = parameters[:5]
     coefficients = parameters[5:]
     xd, yd = distort(model, ideal, coefficients).T
@@ -258,99 +258,25 @@ def _lens_columns(
     wuu, wuv, wvv = chunk.whitener
     # Whitened rows by the distorted image plane: u = uu x' + uv y', v = vv y'.
     uu, uv, vv = wuu * fx, wuu * skew + wuv * fy, wvv * fy
-    J[...] = 0.0
-    J[0, 0], J[0, 1], J[0, 2], J[0, 3], J[0, 4] = wuu * xd, wuu * yd, wuv * yd, wuu, wuv
-    J[1, 2], J[1, 4] = wvv * yd, wvv
-    by_x, by_y = coefficient_jacobian(model, ideal, coefficients)
-    J[0, 5:p] = uu * by_x + uv * by_y
-    J[1, 5:p] = vv * by_y
-    J_ideal = distort_jacobian(model, ideal, coefficients)
-    x_theta, y_theta = ideal_by_rotation(model, ideal)
-    by_x, by_y = ((J_ideal[:, k, :1] * x_theta + J_ideal[:, k, 1:] * y_theta).T for k in (0, 1))
-    J[0, p : p + 3] = uu * by_x + uv * by_y
-    J[1, p : p + 3] = vv * by_y
-    u, v = chunk.measured_px
-    residual_u = u - cx - fx * xd - skew * yd
-    residual_v = v - cy - fy * yd
-    J[0, p + 3] = wuu * residual_u + wuv * residual_v
-    J[1, p + 3] = wvv * residual_v
-    return True
-
-
-def _plumb_bob_columns(
-    chunk: Chunk, model: str, parameters: Floats, camera_from_icrf: Floats, J: Floats
-) -> bool:
-    """
-    Write the same as `_lens_columns` for ``plumb_bob``, in half the time.
-
-    The columns are those of `camera.project_jacobians`, whitened in place: most of the
-    time of a calibration is spent here, in memory traffic.
-    """
-    del model
-    m, _, n = chunk.direction_icrf.shape
-    e = np.empty((3, m, n))
-    np.matmul(camera_from_icrf, chunk.direction_icrf, out=e.transpose(1, 0, 2))
-    e_x, e_y, e_z = e.reshape(3, m * n)
-    if e_z.min() <= 0:
-        return False
-    fx, skew, fy, cx, cy, k1, k2, k3, p1, p2 = parameters
     U, V = J
-    scratch = np.empty_like(e_z)
-    multiply = np.multiply
-    wuu, wuv, wvv = chunk.whitener
-    # Whitened rows by the distorted image plane: u = uu x' + uv y', v = vv y'.
-    uu, uv, vv = wuu * fx, wuu * skew + wuv * fy, wvv * fy
-
-    def put(column: int, dx: Floats, dy: Floats) -> None:
-        multiply(uu, dx, out=U[column])
-        U[column] += multiply(uv, dy, out=scratch)
-        multiply(vv, dy, out=V[column])
-
-    x, y = e_x / e_z, e_y / e_z
-    xx, yy, xy = x * x, y * y, x * y
-    r2 = xx + yy
-    xy_2, r2_2xx, r2_2yy = 2.0 * xy, r2 + 2.0 * xx, r2 + 2.0 * yy
-    put(8, xy_2, r2_2yy)
-    put(9, r2_2xx, xy_2)
-    put(5, x, y)
-    for W in (U, V):
-        W[5] *= r2
-        multiply(W[5], r2, out=W[6])
-        multiply(W[6], r2, out=W[7])
-
-    g = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    g_r2 = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)))
-    xd = g * x + p1 * xy_2 + p2 * r2_2xx
-    yd = g * y + p1 * r2_2yy + p2 * xy_2
-    cross = xy * g_r2 + (2.0 * p1) * x + (2.0 * p2) * y
-    x_x = xx * g_r2 + g + (2.0 * p1) * y + (6.0 * p2) * x
-    y_y = yy * g_r2 + g + (6.0 * p1) * y + (2.0 * p2) * x
-    one_xx, one_yy = 1.0 + xx, 1.0 + yy
-    for W, by_x, by_y in (
-        (U, uu * x_x + uv * cross, uu * cross + uv * y_y),
-        (V, vv * cross, vv * y_y),
-    ):
-        multiply(by_x, xy, out=W[10])
-        W[10] += multiply(by_y, one_yy, out=scratch)
-        multiply(by_x, one_xx, out=W[11])
-        W[11] += multiply(by_y, xy, out=scratch)
-        np.negative(W[11], out=W[11])
-        multiply(by_x, y, out=W[12])
-        W[12] -= multiply(by_y, x, out=scratch)
-
-    multiply(wuu, xd, out=U[0])
-    multiply(wuu, yd, out=U[1])
-    multiply(wuv, yd, out=U[2])
-    U[3], U[4] = wuu, wuv
-    V[:2], V[3] = 0.0, 0.0
-    multiply(wvv, yd, out=V[2])
-    V[4] = wvv
+    U[0], U[1], U[2], U[3], U[4] = wuu * xd, wuu * yd, wuv * yd, wuu, wuv
+    V[:2], V[2], V[3], V[4] = 0.0, wvv * yd, 0.0, wvv
+    by_x, by_y = coefficient_jacobian(model, ideal, coefficients)
+    np.multiply(uu, by_x, out=U[5:p])
+    U[5:p] += uv * by_y
+    np.multiply(vv, by_y, out=V[5:p])
+    (x_x, x_y), (y_x, y_y) = distort_jacobian(model, ideal, coefficients).transpose(1, 2, 0)
+    x_theta, y_theta = ideal_by_rotation(model, ideal).transpose(0, 2, 1)
+    rotation = slice(p, p + 3)
+    for W, of_x, of_y in ((U, uu * x_x + uv * y_x, uu * x_y + uv * y_y), (V, vv * y_x, vv * y_y)):
+        np.multiply(of_x, x_theta, out=W[rotation])
+        W[rotation] += of_y * y_theta
     u, v = chunk.measured_px
     residual_u = u - cx - fx * xd - skew * yd
     residual_v = v - cy - fy * yd
-    U[13] = wuu * residual_u + wuv * residual_v
-    multiply(wvv, residual_v, out=V[13])
-    J[:, 14] = 0.0
+    U[p + 3] = wuu * residual_u + wuv * residual_v
+    np.multiply(wvv, residual_v, out=V[p + 3])
+    J[:, p + 4] = 0.0
     return True
 
 
