@@ -34,8 +34,8 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.mission.trend import fleet, places, tasks
-from starcal_ros.mission.trend.change_points import SECONDS_PER_YEAR
 from starcal_ros.mission.trend.rows import COMPUTED, kept_name, Row
+from starcal_ros.mission.trend.series import SECONDS_PER_YEAR
 from starcal_ros.mission.trend.tasks import Cameras, KEPT_FOLDER, Task
 from starcal_ros.mission.trend.trend_table import Table as Rows
 

@@ -1,8 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Text of unknown origin, made safe to print."""
+"""Text for a reader: of unknown origin made safe to print; numbers with the digits they mean."""
 
 from __future__ import annotations
 
+import math
 import re
 
 # Controls, marks that reverse the direction of writing, line separators, lone surrogates.
@@ -19,3 +20,38 @@ def printable(text: str) -> str:
     change the lines above, or set the title of the window.
     """
     return _UNSAFE.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+_SMALLEST, _LARGEST = 1e-9, 1e15
+"""Beyond these, zeros are harder to count than an exponent is to read."""
+
+_LEAST_P_VALUE = 1e-6
+
+
+def significant(value: float, digits: int, sign: str = '', least: float = 0.0) -> str:
+    """
+    A number with significant digits and no trailing zeros.
+
+    A size below ``least``, except zero, is shown as less than that; ``sign`` is '+' or empty.
+    """
+    if 0.0 < abs(value) < least:
+        return f'< {significant(least, 1)}'
+    rounded = float(f'{value:.{digits - 1}e}')
+    if not _SMALLEST <= abs(rounded) < _LARGEST:  # also zero and NaN
+        return f'{value:{sign}.{digits}g}'
+    decimals = max(0, digits - 1 - math.floor(math.log10(abs(rounded))))
+    text = f'{value:{sign}.{decimals}f}'
+    return text.rstrip('0').rstrip('.') if decimals else text
+
+
+def to_sigma(value: float, sigma: float, sign: str = '') -> str:
+    """A number with two significant digits of its sigma; eight of its own without a sigma."""
+    if not (math.isfinite(sigma) and sigma > 0 and math.isfinite(value)):
+        return significant(value, 8, sign)
+    decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    return f'{value:{sign}.{min(decimals, 12)}f}'
+
+
+def p_value_text(p_value: float) -> str:
+    """A p-value with two digits; the chance of less than one in a million is not told apart."""
+    return significant(p_value, 2, least=_LEAST_P_VALUE)

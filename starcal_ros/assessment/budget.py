@@ -32,8 +32,8 @@ from starcal_ros.estimation.calibration_options import CalibrationOptions, track
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.posterior import common_shape, ErrorParts
 from starcal_ros.estimation.shared_covariance import TRACKER_NOISE, TRACKER_SLOW
-from starcal_ros.number_text import significant
 from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart, TOTAL
+from starcal_ros.text import significant
 
 _KNOWN_SHAPE_PX = 1e-7  # moves no pixel by a measurable amount
 _UNKNOWNS = {

@@ -13,7 +13,6 @@ from starcal_ros.assessment.agreement import movement
 from starcal_ros.assessment.gate_options import GateOptions, limit_check
 from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.estimation.calibration_options import CalibrationOptions
-from starcal_ros.number_text import p_value_text, significant
 from starcal_ros.records import (
     Calibration,
     CameraGeometry,
@@ -22,6 +21,7 @@ from starcal_ros.records import (
     ResidualBin,
     StarTrackerAlignment,
 )
+from starcal_ros.text import p_value_text, significant
 
 _DRIFT_P_VALUE = 1e-4  # of a star tracker; a few images determine a slope to no more
 _STEP_P_VALUE = 1e-6  # of a step of the detector among all places

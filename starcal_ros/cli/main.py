@@ -23,13 +23,13 @@ from starcal_ros.cli import arguments, terminal
 from starcal_ros.cli.commands import mission
 from starcal_ros.errors import missing_package, OptionError, StarcalError
 from starcal_ros.formats.products.product_files import make_folder
-from starcal_ros.number_text import significant
+from starcal_ros.text import significant
 
 # NumPy, SciPy and OpenCV take a second to import: each command imports what it needs, so that
 # --help answers at once.
 if TYPE_CHECKING:
     from starcal_ros.pipeline.topics import Topics
-    from starcal_ros.studies.simulation.mistakes import Mistakes
+    from starcal_ros.studies.simulation.simulated_bag import Mistakes
 
 _DEMO_SAME_PX = 1e-6  # rounding that depends on the threads of BLAS
 _DEMO_SIGMAS = 5.0  # exceeded by one random demo in 10^5; with the fixed seed by none
@@ -126,7 +126,11 @@ def _inspect(args: argparse.Namespace) -> int:
     """List the contents of a bag and the images that a calibration would refuse."""
     from starcal_ros.cli import output
     from starcal_ros.formats.bag import reader
-    from starcal_ros.formats.messages.types import COMPRESSED_TYPE, IMAGE_TYPE, OBSERVATIONS_TYPE
+    from starcal_ros.formats.messages.message_fields import (
+        COMPRESSED_TYPE,
+        IMAGE_TYPE,
+        OBSERVATIONS_TYPE,
+    )
     from starcal_ros.pipeline import inspect
 
     setup = None
@@ -191,7 +195,7 @@ def _compare(args: argparse.Namespace) -> int:
         return _compare_with_truth(args)
     found = comparison.compare(*map(read_calibration, files))
     if args.output:
-        from starcal_ros.cli.output_places import check_no_product
+        from starcal_ros.cli.output import check_no_product
         from starcal_ros.report.detector_figures import write_comparison
 
         check_no_product(args.output, files)
@@ -225,7 +229,7 @@ def _lookup(args: argparse.Namespace) -> int:
     """Write a table of lines of sight by pixel."""
     from starcal_ros.assessment.lookup import line_of_sight_table, pixels_every
     from starcal_ros.camera import pixel_grid
-    from starcal_ros.cli.output_places import check_no_product
+    from starcal_ros.cli.output import check_no_product
     from starcal_ros.formats.products.calibration_json import read_calibration
     from starcal_ros.formats.products.lookup_table import write_lookup_table
     from starcal_ros.formats.products.product_folder import calibration_file
@@ -306,8 +310,8 @@ def _simulate(args: argparse.Namespace) -> int:
 
 
 def _mistakes(args: argparse.Namespace) -> Mistakes:
-    from starcal_ros.studies.simulation.mistakes import Mistakes
     from starcal_ros.studies.simulation.scenario import ATTITUDE_OFFSETS_S
+    from starcal_ros.studies.simulation.simulated_bag import Mistakes
 
     still_s = max(ATTITUDE_OFFSETS_S)
     if 0 < abs(args.clock_error) <= still_s:
@@ -333,7 +337,7 @@ def _demo(args: argparse.Namespace) -> int:
     from starcal_ros.assessment import comparison
     from starcal_ros.cli.commands import demo
     from starcal_ros.cli.commands.calibrate import calibrate_into, Drawings, Job
-    from starcal_ros.cli.output_places import check_folder
+    from starcal_ros.cli.output import check_folder
     from starcal_ros.formats.products.product_folder import write_products
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics

@@ -28,10 +28,9 @@ from starcal_ros.estimation.calibration_options import (
     check_options,
     estimated_parameters,
 )
-from starcal_ros.estimation.centroid_noise import CentroidVariance
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.minimise import minimise, Minimum
+from starcal_ros.estimation.minimise import minimise, Minimum, moved_to_stars, problem_of, start_of
 from starcal_ros.estimation.mountings import (
     AttitudeErrors,
     canonical_xyzw,
@@ -41,7 +40,7 @@ from starcal_ros.estimation.mountings import (
 from starcal_ros.estimation.posterior import Posterior, posterior
 from starcal_ros.estimation.problem import image_parameters, Problem, State
 from starcal_ros.estimation.refraction import Refraction
-from starcal_ros.estimation.reweighting import dropped_stars
+from starcal_ros.estimation.reweighting import CentroidVariance, dropped_stars
 from starcal_ros.estimation.shared_covariance import Weights, with_shared_errors
 from starcal_ros.estimation.shared_errors import (
     observation_groups,
@@ -55,7 +54,6 @@ from starcal_ros.estimation.star_equations import (
     star_table,
     StarTable,
 )
-from starcal_ros.estimation.start import moved_to_stars, problem_of, start_of
 from starcal_ros.estimation.temperature import why_unsupported
 from starcal_ros.estimation.tracker_errors import TrackerErrors
 from starcal_ros.estimation.unknowns import (

@@ -20,9 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.estimation.attitude_errors import whitened_attitude_errors
 from starcal_ros.estimation.levenberg_marquardt import inverse, NormalEquations, NotObservable
-from starcal_ros.estimation.problem import image_parameters, Problem, State
+from starcal_ros.estimation.problem import (
+    image_parameters,
+    Problem,
+    State,
+    whitened_attitude_errors,
+)
 from starcal_ros.estimation.star_equations import Chunk, Measurements, whitened_chunks
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout, Unknown
 

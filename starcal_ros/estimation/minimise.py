@@ -1,14 +1,29 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The state of least cost: camera, alignment and the rotations of the images."""
+"""
+The search: its start, and the state of least cost of camera, alignment and images.
+
+An attitude, an alignment or a mounting may be wrong by more than a search can cross: a robust loss
+has no slope far from the stars, and none behind the camera.  Each image therefore begins with the
+rotation from its own stars (Wahba's problem by singular values, Markley 1988); these give
+alignment and mountings.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Indices
-from starcal_ros.estimation.attitude_errors import whitened_attitude_errors
+from starcal_ros.arrays import Floats, Indices, Mask
+from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import OptionError
+from starcal_ros.estimation.calibration_options import (
+    assumed_tracker_sigma_rad,
+    CalibrationOptions,
+    estimated_parameters,
+)
 from starcal_ros.estimation.equations import arrow, stars_alone
 from starcal_ros.estimation.levenberg_marquardt import (
     levenberg_marquardt,
@@ -16,9 +31,12 @@ from starcal_ros.estimation.levenberg_marquardt import (
     Solution,
     solve_arrow,
 )
-from starcal_ros.estimation.problem import image_blocks, Problem, State
-from starcal_ros.estimation.star_equations import Measurements
+from starcal_ros.estimation.mountings import star_tracker_names
+from starcal_ros.estimation.problem import image_blocks, Problem, State, whitened_attitude_errors
+from starcal_ros.estimation.reweighting import FEWEST_STARS
+from starcal_ros.estimation.star_equations import Measurements, StarTable
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state
+from starcal_ros.records import CameraGeometry, Ensemble
 
 Minimum = Solution[State, NormalEquations]
 
@@ -122,3 +140,107 @@ def equations_in_state(
         normal.C,
         normal.c,
     )
+
+
+def problem_of(ensemble: Ensemble, prior: CameraGeometry, options: CalibrationOptions) -> Problem:
+    """Problem of a search over an ensemble."""
+    model, names = prior.camera.model, prior.camera.parameter_names
+    prior_sigma = np.array(np.broadcast_to(options.prior_sigma, len(names)))
+    weak_px = options.principal_point_prior * max(prior.camera.width, prior.camera.height)
+    free = {names.index(name) for name in estimated_parameters(options, model)}
+    for k in free & {names.index('cx'), names.index('cy')}:
+        if prior_sigma[k] == 0:
+            prior_sigma[k] = weak_px
+    attitudes = Rotation.from_quat(
+        np.array([image.icrf_from_star_tracker_xyzw for image in ensemble.images])
+    )
+    names = star_tracker_names(ensemble)
+    mountings = None
+    if len(names) > 1:
+        if options.method == 'per_image':
+            raise OptionError(
+                'method: per_image has no common alignment, which several star trackers need'
+            )
+        mountings = Rotation.from_quat(
+            np.array([image.first_from_star_tracker_xyzw for image in ensemble.images])
+        )
+        attitudes = attitudes * mountings
+    return Problem(
+        method=options.method,
+        model=model,
+        free=np.array(sorted(free), np.int64),
+        prior_parameters=prior.camera.parameters,
+        prior_sigma=np.where(prior_sigma > 0, prior_sigma, np.inf),
+        star_tracker_from_icrf=attitudes.inv(),
+        star_tracker_sigma_rad=np.tile(
+            assumed_tracker_sigma_rad(options), (len(ensemble.images), 1)
+        ),
+        above_reference_k=np.array([image.temperature_degc for image in ensemble.images])
+        - options.reference_temperature_degc,
+        star_tracker=np.array([names.index(image.star_tracker) for image in ensemble.images]),
+        first_from_star_tracker=mountings,
+        mounting_sigma_rad=options.star_tracker_mounting_sigma_arcsec * ARCSECOND_RAD,
+    )
+
+
+def start_of(problem: Problem, prior: CameraGeometry, order: int, with_rate: bool) -> State:
+    """The prior as a state, with so many focal terms of zero and a rate of zero, or none."""
+    alignment = Rotation.from_quat(prior.star_tracker_from_camera_xyzw).inv()
+    return State(
+        prior.camera.parameters.copy(),
+        alignment,
+        alignment * problem.star_tracker_from_icrf
+        if problem.first_from_star_tracker is None
+        else alignment * problem.first_from_star_tracker * problem.star_tracker_from_icrf,
+        np.zeros(order),
+        np.zeros(3 if with_rate else 0),
+        mountings=np.zeros(3 * int(problem.star_tracker.max(initial=0))),
+    )
+
+
+def moved_to_stars(problem: Problem, start: State, table: StarTable, camera: CameraModel) -> State:
+    """Return a start with alignment, mountings and rotations by the stars, the camera as given."""
+    rotations, by_stars = _rotations(start.camera_from_icrf, table, camera)
+    # The alignment to the first star tracker that each image shows, the mountings as assumed.
+    shown = rotations * problem.star_tracker_from_icrf.inv()
+    if problem.first_from_star_tracker is not None:
+        shown = shown * problem.first_from_star_tracker.inv()
+    alignment, mountings = None, start.mountings.copy()
+    for k in np.unique(problem.star_tracker[by_stars]):
+        own = shown[by_stars & (problem.star_tracker == k)].mean()
+        if alignment is None:
+            alignment = own
+        elif k:
+            mountings[3 * k - 3 : 3 * k] = -(own * alignment.inv()).as_rotvec()
+    return dataclasses.replace(
+        start,
+        camera_from_star_tracker=alignment or start.camera_from_star_tracker,
+        camera_from_icrf=rotations,
+        mountings=mountings,
+    )
+
+
+def _rotations(
+    predicted: Rotation, table: StarTable, camera: CameraModel
+) -> tuple[Rotation, Mask]:
+    """Return the rotations (m,) that fit the stars better, and which are those of the stars."""
+    seen = line_of_sight(camera, table.measured_px)
+    real = np.isfinite(seen).all(axis=1)
+    seen, e, image = seen[real], table.direction_icrf[real], table.image[real]
+    m = table.image_count
+    products = [np.bincount(image, a * b, minlength=m) for a in seen.T for b in e.T]
+    u, _, vt = np.linalg.svd(np.stack(products, axis=1).reshape(m, 3, 3))
+    fitted, before = u @ vt, predicted.as_matrix()
+    # A mirrored image has an improper one: the search finds its negative focal length.
+    good = (np.linalg.det(fitted) > 0) & (np.bincount(image, minlength=m) >= FEWEST_STARS)
+    count = np.bincount(image, minlength=m)
+    middle = np.cumsum(count) - count + count // 2
+    off, off_before = (
+        np.append(length[np.lexsort((length, image))], np.inf)[middle]
+        for length in (
+            np.linalg.norm(seen - np.einsum('nij,nj->ni', one[image], e), axis=1)
+            for one in (fitted, before)
+        )
+    )
+    good &= off < off_before
+    return Rotation.from_matrix(np.where(good[:, None, None], fitted, before)), good

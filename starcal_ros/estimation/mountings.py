@@ -20,8 +20,8 @@ from scipy.special import stdtr
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.problem import Problem, State
-from starcal_ros.number_text import p_value_text
 from starcal_ros.records import Ensemble, StarTrackerAlignment
+from starcal_ros.text import p_value_text
 
 _FEWEST_IMAGES = 4  # for a mean, a slope and a scatter about them
 _HOUR_S = 3600.0

@@ -3,7 +3,7 @@
 Refraction as unknowns: its size, the latitude of the site and the sidereal time of each image.
 
 They are there where the observations state a zenith, which is then not known exactly
-(`sky.refraction`).  All images are of one site: their zeniths have one declination.  Where they
+(`sky.astrometry`).  All images are of one site: their zeniths have one declination.  Where they
 run as the stamps do, the sidereal times have one error.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.sky.refraction import LEAST_COSINE, SIDEREAL_RAD_S
+from starcal_ros.sky.astrometry import LEAST_COSINE, SIDEREAL_RAD_S
 
 ZENITH_SIGMA_RAD = 1.0  # of latitude and sidereal time: anywhere above the horizon
 _ONE_CLOCK_RAD = 1e-6
@@ -86,5 +86,5 @@ class Refraction:
 
 
 def _cosine(zenith: Floats, directions: Floats) -> Floats:
-    """Cosines (n,) of zenith distances, as `sky.refraction.refracted` takes them."""
+    """Cosines (n,) of zenith distances, as `sky.astrometry.refracted` takes them."""
     return np.asarray(np.maximum(np.sum(zenith * directions, axis=0), LEAST_COSINE))

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.estimation.attitude_errors import whitened_attitude_errors
 from starcal_ros.estimation.equations import Linearisation, star_rows, StarSums, tracker_turns
 from starcal_ros.estimation.posterior import common_shape, ErrorParts, Posterior
+from starcal_ros.estimation.problem import whitened_attitude_errors
 from starcal_ros.estimation.shared_errors import GroupSums, SharedError
 from starcal_ros.estimation.unknowns import IMAGE_ROTATION, Layout
 

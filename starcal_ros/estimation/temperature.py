@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.number_text import significant, to_sigma
 from starcal_ros.records import Calibration, CameraGeometry, TemperatureTerms
+from starcal_ros.text import significant, to_sigma
 
 FEWEST_SPREAD_K = 1.0  # of the temperatures; sensor errors and lag hide a smaller one
 _SCALED = slice(0, 3)  # fx, skew, fy

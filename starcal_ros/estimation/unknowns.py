@@ -30,13 +30,13 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera.detector_field import basis, cosine_terms
 from starcal_ros.constants import SPEED_OF_LIGHT_M_S
-from starcal_ros.estimation.attitude_errors import turn_derivatives
 from starcal_ros.estimation.problem import (
     image_alignment,
     mounting_errors_rad,
     mounting_turns,
     Problem,
     State,
+    turn_derivatives,
 )
 from starcal_ros.estimation.refraction import Refraction, ZENITH_SIGMA_RAD
 from starcal_ros.estimation.temperature import parameters_chain, turns_chain

@@ -19,9 +19,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import CameraModel, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.estimation.attitude_errors import attitude_errors
 from starcal_ros.estimation.calibration_options import CalibrationOptions, tracker_sigma_is_given
-from starcal_ros.estimation.centroid_noise import CentroidVariance, estimate_variance
 from starcal_ros.estimation.equations import (
     chain,
     chain_columns,
@@ -31,9 +29,20 @@ from starcal_ros.estimation.equations import (
 )
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.posterior import Posterior
-from starcal_ros.estimation.problem import image_alignment, image_parameters, Problem, State
+from starcal_ros.estimation.problem import (
+    attitude_errors,
+    image_alignment,
+    image_parameters,
+    Problem,
+    State,
+)
 from starcal_ros.estimation.refraction import Refraction
-from starcal_ros.estimation.reweighting import fitting_stars, misfit_images
+from starcal_ros.estimation.reweighting import (
+    CentroidVariance,
+    estimate_variance,
+    fitting_stars,
+    misfit_images,
+)
 from starcal_ros.estimation.shared_errors import (
     coarsest_cells,
     Groups,

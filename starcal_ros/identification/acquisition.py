@@ -17,8 +17,7 @@ from scipy.special import bdtr, pdtrc
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.camera import line_of_sight, project, rotation_jacobian
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.polynomial_warp import fit_warp, warp_powers
-from starcal_ros.identification.prediction import in_image, Prediction
+from starcal_ros.identification.prediction import fit_warp, in_image, Prediction, warp_powers
 from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import median, medians
 from starcal_ros.stars.detection import Sources

@@ -22,10 +22,9 @@ from starcal_ros.camera import line_of_sight
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import acquire
 from starcal_ros.identification.blending import separate
-from starcal_ros.identification.line_loss import find_line_loss
-from starcal_ros.identification.photometric_check import refuse_by_brightness
-from starcal_ros.identification.polynomial_warp import fit_warp
+from starcal_ros.identification.match_checks import find_line_loss, refuse_by_brightness
 from starcal_ros.identification.prediction import (
+    fit_warp,
     in_image,
     predict,
     Prediction,
@@ -41,10 +40,10 @@ from starcal_ros.stars.detection import (
     Background,
     detect,
     detect_near,
+    detectable_count,
     measure_background,
     Sources,
 )
-from starcal_ros.stars.faint_end import detectable_count
 from starcal_ros.stars.hot_pixels import NO_HOT_PIXELS, refuse_on_hot_pixels
 from starcal_ros.stars.image_model import CentroidOptions, ImageModel, model_image
 from starcal_ros.stars.psf_field import Instrument, learn, MeasuredStars

@@ -16,8 +16,17 @@ from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import read_ahead, read_frames
 from starcal_ros.formats.bag.mcap_reader import Damage
-from starcal_ros.formats.messages import message_fields, types
+from starcal_ros.formats.messages import message_fields
 from starcal_ros.formats.messages.image_messages import decode_png
+from starcal_ros.formats.messages.message_fields import (
+    ATTITUDE_TYPE,
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    Message,
+    OBSERVATIONS_TYPE,
+    TEMPERATURE_TYPE,
+    VELOCITY_TYPE,
+)
 from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.observe import check_order
@@ -26,13 +35,13 @@ from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import EnsembleStatus, IMAGE_REFUSALS, refused_image, StarObservations
 from starcal_ros.sky.attitude import attitude_sample, AttitudeOptions
 
-_IMAGES = (types.IMAGE_TYPE, types.COMPRESSED_TYPE)
+_IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
 _STAMPED = (
     *_IMAGES,
-    types.ATTITUDE_TYPE,
-    types.VELOCITY_TYPE,
-    types.TEMPERATURE_TYPE,
-    types.OBSERVATIONS_TYPE,
+    ATTITUDE_TYPE,
+    VELOCITY_TYPE,
+    TEMPERATURE_TYPE,
+    OBSERVATIONS_TYPE,
 )
 
 
@@ -173,7 +182,7 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
                 stamp_ns = message_fields.stamp_ns(message.header.stamp)
                 if raw.type_name in _IMAGES:
                     kinds[raw.topic][_kind(message)] += 1
-                elif raw.type_name == types.ATTITUDE_TYPE:
+                elif raw.type_name == ATTITUDE_TYPE:
                     sample = attitude_sample(*attitude_from_message(message), '')
                     bad[raw.topic] += sample is None
         stamps[raw.topic].append(stamp_ns)
@@ -198,7 +207,7 @@ def _contents(paths: Sequence[Path], on_damage: Damage) -> tuple[TopicContent, .
     return tuple(found)
 
 
-def _kind(message: types.Message) -> str:
+def _kind(message: Message) -> str:
     """Encoding and size of an image message as text."""
     if hasattr(message, 'encoding'):
         return f'{message.encoding} {message.width} x {message.height}'

@@ -29,7 +29,7 @@ from starcal_ros.formats.images.photographs import (
     Photograph,
     pixels_of_photograph,
 )
-from starcal_ros.formats.messages.types import VELOCITY_TYPE
+from starcal_ros.formats.messages.message_fields import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.pipeline.from_stars import from_stars, FromStars, options_of, pinhole
 from starcal_ros.pipeline.node_options import NODE_OPTION_CLASSES

@@ -26,8 +26,7 @@ from starcal_ros.pipeline.detector_frames import flattened
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.sky.astrometry import velocity_of
-from starcal_ros.sky.attitude import AttitudeHistory
-from starcal_ros.sky.tracker_alignments import Attitude, attitudes_at
+from starcal_ros.sky.attitude import Attitude, AttitudeHistory, attitudes_at
 from starcal_ros.stars.frame_checks import Fingerprint, fingerprint, sample_rows, screen
 from starcal_ros.stars.hot_pixels import HotPixels, learn_hot_pixels
 from starcal_ros.stars.image_model import saturation_level

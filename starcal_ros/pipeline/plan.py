@@ -22,10 +22,10 @@ from starcal_ros.blas_threads import one_blas_thread
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.identification.prediction import predict, within_image
-from starcal_ros.number_text import significant
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
 from starcal_ros.records import Ensemble, refused_image, StarObservations
+from starcal_ros.text import significant
 
 _CANDIDATES = 150  # in a cone: on the whole sky 16 degrees apart
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)

@@ -10,7 +10,15 @@ from starcal_ros.errors import BagError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import Frame, read_frames
 from starcal_ros.formats.bag.reader import Topics as Topics
-from starcal_ros.formats.messages import types
+from starcal_ros.formats.messages.message_fields import (
+    ATTITUDE_TYPE,
+    ATTITUDE_TYPES,
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    OBSERVATIONS_TYPE,
+    TEMPERATURE_TYPE,
+    VELOCITY_TYPE,
+)
 from starcal_ros.pipeline.observe import observe_next, Track
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
@@ -18,8 +26,8 @@ from starcal_ros.records import CameraGeometry, Image, StarObservations
 Wanted = Callable[[int], bool]
 OnImage = Callable[[Image, StarObservations, CameraGeometry], None]
 
-_RAW = types.IMAGE_TYPE
-_IMAGE_TYPES = {_RAW, types.COMPRESSED_TYPE}
+_RAW = IMAGE_TYPE
+_IMAGE_TYPES = {_RAW, COMPRESSED_TYPE}
 _WITHOUT = {
     'image': 'record the images, or make a bag of image files with starcal import',
     'attitude': (
@@ -39,21 +47,21 @@ def choose_topics(paths: Sequence[Path], asked: Topics, setup: Setup | None = No
     """
     there = reader.topics(paths)
     kinds = {topic.type_name for topic in there}
-    only_recorded = not kinds & _IMAGE_TYPES and types.OBSERVATIONS_TYPE in kinds
+    only_recorded = not kinds & _IMAGE_TYPES and OBSERVATIONS_TYPE in kinds
     if asked.observations or (only_recorded and not asked.image):
-        kind = types.OBSERVATIONS_TYPE
+        kind = OBSERVATIONS_TYPE
         return Topics(observations=_choose(paths, kind, asked.observations, 'observations'))
     image = choose_image_topic(paths, asked)
     attitude, more = _choose_attitudes(paths, there, asked.attitude, setup)
     velocity, temperature = asked.velocity, asked.temperature
-    if velocity or types.VELOCITY_TYPE in kinds:
-        velocity = _choose(paths, types.VELOCITY_TYPE, velocity, 'velocity')
+    if velocity or VELOCITY_TYPE in kinds:
+        velocity = _choose(paths, VELOCITY_TYPE, velocity, 'velocity')
     options = setup.calibration if setup else None
     used = options and (options.focal_temperature_order or options.alignment_temperature)
-    thermometers = sum(topic.type_name == types.TEMPERATURE_TYPE for topic in there)
+    thermometers = sum(topic.type_name == TEMPERATURE_TYPE for topic in there)
     # A spacecraft has many: the topic must be unique only if the calibration uses it.
     if temperature or thermometers == 1 or (thermometers and used):
-        temperature = _choose(paths, types.TEMPERATURE_TYPE, temperature, 'temperature')
+        temperature = _choose(paths, TEMPERATURE_TYPE, temperature, 'temperature')
     return Topics(image, attitude, velocity, temperature, more_attitudes=more)
 
 
@@ -72,7 +80,7 @@ def _choose_attitudes(
 
     A star tracker may drop out, but not all of them.
     """
-    kind = types.ATTITUDE_TYPES[setup.attitude.attitude_message] if setup else types.ATTITUDE_TYPE
+    kind = ATTITUDE_TYPES[setup.attitude.attitude_message] if setup else ATTITUDE_TYPE
     fitting = [topic.name for topic in there if topic.type_name == kind]
     named = [f'/{one.frame.lstrip("/")}/attitude' for one in setup.mountings] if setup else []
     more = tuple(name if name in fitting else '' for name in named)
@@ -99,7 +107,7 @@ def _choose_attitudes(
 
 def _other_attitudes(there: Sequence[reader.Topic], asked: str) -> str:
     """Return which topics may hold the attitudes in messages of another type."""
-    names = {kind: name for name, kind in types.ATTITUDE_TYPES.items()}
+    names = {kind: name for name, kind in ATTITUDE_TYPES.items()}
     return ''.join(
         f'; {topic.name} is a {topic.type_name.rpartition("/")[2]}: if it holds the attitudes, set'
         f' attitude_message: {names[topic.type_name]}'
@@ -197,7 +205,7 @@ def _of_frame(frame: Frame, setup: Setup, track: Track) -> tuple[StarObservation
 def without_attitudes(bags: Sequence[Path], asked: Topics) -> bool:
     """Return True if bags hold images, but neither attitudes nor observations."""
     kinds = {topic.type_name for topic in reader.topics(bags)}
-    others = {*types.ATTITUDE_TYPES.values(), types.OBSERVATIONS_TYPE}
+    others = {*ATTITUDE_TYPES.values(), OBSERVATIONS_TYPE}
     return bool(kinds & _IMAGE_TYPES) and not kinds & others and not asked.attitude
 
 

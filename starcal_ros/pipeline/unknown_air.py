@@ -25,7 +25,7 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.identification.star_finder import realigned
 from starcal_ros.records import CameraGeometry, refused_image, StarObservations
 from starcal_ros.robust_statistics import median
-from starcal_ros.sky.refraction import (
+from starcal_ros.sky.astrometry import (
     LEAST_COSINE,
     refracted,
     SIDEREAL_RAD_S,

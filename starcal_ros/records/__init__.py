@@ -24,10 +24,13 @@ from starcal_ros.records.calibration_parts import (
     BUDGET_COLUMNS,
     BUDGET_ROWS,
     DetectorStep,
+    factored_field,
     HeldTerm,
+    MapCovariance,
     ModelChecks,
     parts_that_matter,
     ResidualBin,
+    ResidualField,
     SigmaPart,
     StarTrackerAlignment,
     TOTAL,
@@ -45,4 +48,3 @@ from starcal_ros.records.observations import (
     StarObservations,
     StarRefusal,
 )
-from starcal_ros.records.residual_field import factored_field, MapCovariance, ResidualField

@@ -14,10 +14,15 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, check_plausible
-from starcal_ros.number_text import significant
 from starcal_ros.record_fields import Count, Finite, Named, Quaternion, Shape, Stamp
-from starcal_ros.records.calibration_parts import ModelChecks, SigmaPart, StarTrackerAlignment
-from starcal_ros.records.residual_field import MapCovariance, ResidualField
+from starcal_ros.records.calibration_parts import (
+    MapCovariance,
+    ModelChecks,
+    ResidualField,
+    SigmaPart,
+    StarTrackerAlignment,
+)
+from starcal_ros.text import significant
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

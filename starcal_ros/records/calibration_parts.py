@@ -1,14 +1,24 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Parts of a calibration: model checks, star trackers, and the budget of the sigma."""
+"""
+Parts of a calibration: model checks, star trackers, the budget of the sigma, the field.
+
+The field over the detector stands in addition to the lens model, with the covariance of lines of
+sight.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+import functools
 from typing import Annotated
 
+import numpy as np
+from numpy.typing import NDArray
+
 from starcal_ros.arrays import Floats
-from starcal_ros.record_fields import Count, Finite, Quaternion, Shape
+from starcal_ros.camera.detector_field import DetectorField, FAMILIES, term_count
+from starcal_ros.record_fields import Count, Finite, OneOf, Quaternion, Shape
 
 TOTAL = 'total'
 BUDGET_COLUMNS, BUDGET_ROWS = 9, 7
@@ -187,3 +197,153 @@ def parts_that_matter(budget: Sequence[SigmaPart]) -> list[SigmaPart]:
 
     causes = [part for part in budget if part.cause != TOTAL and share(part) > _MATTERS]
     return [total, *sorted(causes, key=share, reverse=True)]
+
+
+_DIGITS = 9  # of the factor: parameters and field cancel to a thousandth and less
+# Steps of a coefficient's own 1-sigma: the sigma of any line of sight holds to 3e-4.
+_STEPS = 1000
+_NO_VARIANCE = 1e-12  # of the largest, scaled: rounding
+
+
+@dataclass(frozen=True)
+class MapCovariance:
+    """
+    Covariance of all that moves a line of sight.
+
+    ``matrix`` is (k, k), of the numbers of `lookup.line_of_sight_jacobian`; ``unresolved_px`` the
+    1-sigma per axis of an independent displacement of each pixel, by structure of the detector
+    finer than the field.
+    """
+
+    matrix: Floats
+    unresolved_px: float = 0.0
+
+
+@dataclass(frozen=True)
+class ResidualField:
+    """
+    Field over the detector in addition to the lens model.
+
+    With coefficients of zero none was found; its covariance is that of the fields that the stars
+    do not rule out.  ``covariance`` is ``F F'``, plus ``R R'`` in the rows of the coefficients,
+    where F is the factor and R the lower triangle with the rows ``remainder_unit_px * remainder``.
+    Every sigma of a line of sight holds to 1e-3.
+
+    Raises ValueError when remainder and units do not fit.
+
+    Attributes
+    ----------
+    degree : int
+        Total degree of its polynomials, or number of octaves of its cosines.
+    coefficients : (2, t)
+        px, for u and for v; a star that the lens model places at u is measured at u + f(u).
+    joint_covariance : (p + 2 t, p + 2 t)
+        As earlier versions wrote it; empty where there is a factor.
+    family : str
+        One of `detector_field.FAMILIES`, the kind of its functions.
+    unresolved_px : float
+        1-sigma per axis of structure finer than the field.
+    covariance_factor : (p + 2 t, r)
+        F, of the parameters of the calibration and the coefficients of u, then of v.
+    remainder_unit_px : (2 t,)
+    remainder : (t (2 t + 1),) int16
+        Rows of the triangle, one after the other: the coefficients, the parameters known.
+    """
+
+    degree: Count
+    coefficients: Annotated[Floats, Finite(), Shape((2, 'terms'))]
+    joint_covariance: Annotated[Floats, Finite(), Shape(('joint', 'joint'))] = field(
+        default_factory=lambda: np.empty((0, 0))
+    )
+    family: Annotated[str, OneOf(FAMILIES)] = 'legendre'
+    unresolved_px: Annotated[float, Finite()] = 0.0
+    covariance_factor: Annotated[Floats, Finite(), Shape(('factor_rows', 'factor_cols'))] = field(
+        default_factory=lambda: np.empty((0, 0))
+    )
+    remainder_unit_px: Annotated[Floats, Finite(), Shape(('c',))] = field(
+        default_factory=lambda: np.empty(0)
+    )
+    remainder: Annotated[NDArray[np.int16], Shape(('n',))] = field(
+        default_factory=lambda: np.empty(0, np.int16)
+    )
+
+    def __post_init__(self) -> None:
+        """Check the size of the remainder."""
+        count, all_of_them = len(self.remainder_unit_px), self.coefficients.size
+        in_triangle = count * (count + 1) // 2
+        if len(self.remainder) != in_triangle:
+            raise ValueError(f'remainder: {len(self.remainder)} numbers, not {in_triangle}')
+        if count not in (0, all_of_them) or count > len(self.covariance_factor):
+            raise ValueError(f'remainder_unit_px: {count} numbers, not {all_of_them}')
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of the covariance."""
+        return len(self.joint_covariance) or len(self.covariance_factor)
+
+    @functools.cached_property
+    def covariance(self) -> Floats:
+        """(p + 2 t, p + 2 t): of the parameters of the calibration and the coefficients."""
+        if len(self.joint_covariance):
+            return self.joint_covariance
+        F = self.covariance_factor
+        covariance: Floats = F @ F.T
+        count = len(self.remainder_unit_px)
+        triangle = np.zeros((count, count))
+        triangle[np.tril_indices(count)] = self.remainder
+        triangle *= self.remainder_unit_px[:, None]
+        first = len(F) - count
+        covariance[first:, first:] += triangle @ triangle.T
+        return covariance
+
+    def on(self, width: int, height: int) -> DetectorField:
+        """Return the field on a detector; raises ValueError for a wrong number of terms."""
+        if self.family not in FAMILIES:
+            raise ValueError(f'field.family: {self.family!r} is not one of {", ".join(FAMILIES)}')
+        found = self.coefficients.shape[1]
+        expected = term_count(width, height, self.degree, self.family)
+        if found != expected:
+            raise ValueError(f'field.coefficients: {found} for an axis, not {expected}')
+        return DetectorField(width, height, self.degree, self.coefficients, self.family)
+
+
+def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualField:
+    """
+    Return the record of a field with the covariance of lines of sight as factor and remainder.
+
+    The factor has the parameters exactly, and the field as it follows them.  The remainder, that
+    of the field with the parameters known, displaces pixels without cancellation: a thousandth of
+    the sigma of each coefficient is enough.
+    """
+    count, matrix = of.coefficients.size, covariance.matrix
+    p = len(matrix) - count
+    known = np.sqrt(np.diag(matrix)[:p])
+    scale = np.where(known > 0, known, 1.0)
+    values, vectors = np.linalg.eigh(matrix[:p, :p] / np.outer(scale, scale))
+    used = values > _NO_VARIANCE * values.max()
+    vectors, root = vectors[:, used], np.sqrt(values[used])
+    factor = np.concatenate(
+        [known[:, None] * vectors * root, matrix[p:, :p] / scale @ vectors / root]
+    )
+    factor = _to_digits(factor, _DIGITS)
+    left = matrix[p:, p:] - factor[p:] @ factor[p:].T
+    unit_px = _to_digits(np.sqrt(np.diag(left).clip(0.0)) / _STEPS, 4)
+    steps = np.where(unit_px > 0, unit_px, np.inf)
+    values, vectors = np.linalg.eigh(left / np.outer(steps, steps))
+    # The triangle of the QR decomposition of a root exists for deficient rank too.
+    _, upper = np.linalg.qr((vectors * np.sqrt(values.clip(0.0))).T)
+    return ResidualField(
+        degree=of.degree,
+        coefficients=of.coefficients,
+        family=of.family,
+        unresolved_px=covariance.unresolved_px,
+        covariance_factor=factor,
+        remainder_unit_px=unit_px,
+        remainder=np.rint(upper.T[np.tril_indices(count)]).astype(np.int16),
+    )
+
+
+def _to_digits(values: Floats, digits: int) -> Floats:
+    """Return numbers rounded to so many significant digits: texts of them are as short."""
+    rounded = [float(f'{value:.{digits - 1}e}') for value in values.ravel().tolist()]
+    return np.array(rounded, np.float64).reshape(values.shape)

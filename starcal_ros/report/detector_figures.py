@@ -22,7 +22,6 @@ from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.number_text import significant
 from starcal_ros.records import (
     BUDGET_COLUMNS,
     BUDGET_ROWS,
@@ -34,6 +33,7 @@ from starcal_ros.records import (
 from starcal_ros.report import svg
 from starcal_ros.report.svg import Chart, Curve, Drawing, in_digits, Panel, Scale, SERIES, sheet
 from starcal_ros.report.verdict import VISIBLE_PX
+from starcal_ros.text import significant
 
 FLAT = 0.02  # relative range below which a map counts as flat
 _MOST_HEIGHT = 400.0

@@ -14,7 +14,6 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.star_equations import whitening
-from starcal_ros.number_text import significant
 from starcal_ros.records import CameraGeometry, SigmaPart, StarObservations, TermRemoval
 from starcal_ros.report.pictures.annotation import predicted_px
 from starcal_ros.report.plots import plot
@@ -30,6 +29,7 @@ from starcal_ros.report.svg import (
     SERIES,
     sheet,
 )
+from starcal_ros.text import significant
 
 _LEAST_IN_BIN = 10
 _WAVES = 16  # highest spatial frequency of the spectrum, waves over the longer side

@@ -23,7 +23,7 @@ from starcal_ros.errors import ProductError
 from starcal_ros.estimation.mountings import summary as tracker_summary
 from starcal_ros.estimation.temperature import summary as thermal_summary
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages.types import OBSERVATIONS_TYPE
+from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import calibration_json, product_folder
 from starcal_ros.formats.products.camera_yaml import CAMERA_INFO_FILE
 from starcal_ros.formats.products.product_files import (
@@ -31,12 +31,12 @@ from starcal_ros.formats.products.product_files import (
     REPORT_FILE,
     write_atomically,
 )
-from starcal_ros.number_text import significant
 from starcal_ros.pipeline.provenance import inputs_of
 from starcal_ros.records import Calibration, IMAGE_REFUSALS, parts_that_matter, StarObservations
-from starcal_ros.report import detector_figures, figures, image_sections, result_rows, verdict
+from starcal_ros.report import detector_figures, figures, page_sections, verdict
 from starcal_ros.report.pictures import thumbnails
 from starcal_ros.report.svg import Chart, light
+from starcal_ros.text import significant
 from starcal_ros.untrusted import json_value
 
 _DIGEST = '@sha256 of {}@'  # in a page that is drawn while its products are written
@@ -128,11 +128,11 @@ def _context(found: Found) -> Mapping[str, object]:
         'calibration': calibration,
         'time': utc_text(calibration.time_ns),
         'active_since': utc_text(calibration.active_since_ns),
-        'parameters': result_rows.parameter_rows(calibration, prior),
-        'alignment': result_rows.alignment_rows(calibration, prior)
+        'parameters': page_sections.parameter_rows(calibration, prior),
+        'alignment': page_sections.alignment_rows(calibration, prior)
         if calibration.has_alignment
         else [],
-        'tiles': result_rows.tiles(calibration),
+        'tiles': page_sections.tiles(calibration),
         'checks': verdict.check_rows(calibration.gate),
         'checks_sentence': verdict.checks_sentence(calibration.gate),
         'precision': verdict.precision_sentences(calibration),
@@ -142,14 +142,14 @@ def _context(found: Found) -> Mapping[str, object]:
         'thermal': thermal_summary(calibration.temperature) if calibration.temperature else '',
         'charts': charts_of(calibration, residuals, observations),
         'correlation': calibration.correlation,
-        'slider': image_sections.slider(calibration, residuals),
-        'refused_images': image_sections.refused_images(refused, observations, pictures),
-        'refused_stars': image_sections.refused_stars(observations, pictures),
+        'slider': page_sections.slider(calibration, residuals),
+        'refused_images': page_sections.refused_images(refused, observations, pictures),
+        'refused_stars': page_sections.refused_stars(observations, pictures),
         'model_rows': verdict.model_rows(calibration),
-        'star_marks': image_sections.star_marks(observations),
+        'star_marks': page_sections.star_marks(observations),
         'files': [(name, _DIGEST.format(name)) for name in found.files],
         'has_images': any(not one.reason for one in pictures),
-        'used_images': image_sections.used_images(observations, pictures),
+        'used_images': page_sections.used_images(observations, pictures),
         'options': _options(calibration),
     }
 
@@ -180,7 +180,7 @@ def write_failure_page(record: product_folder.NotCalibrated, folder: Path) -> Pa
     Raises ProductError when the page cannot be written.
     """
     pictures = [
-        (image_sections.picture(one), utc_text(one.time_ns))
+        (page_sections.picture(one), utc_text(one.time_ns))
         for one in thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER)
         if one.reason == thumbnails.EXPECTED
     ]

@@ -10,8 +10,8 @@ import math
 import numpy as np
 
 from starcal_ros.arrays import Floats
-from starcal_ros.number_text import p_value_text, significant
 from starcal_ros.records import Calibration, GateCheck, HeldTerm, parts_that_matter, SigmaPart
+from starcal_ros.text import p_value_text, significant
 
 INFORMATIVE_SIGMAS = 2.0
 """Distance from an assumed value below which the value that the stars ask for is noise."""

@@ -47,12 +47,11 @@ from starcal_ros.records import (
     StarObservations,
 )
 from starcal_ros.report.pictures.annotation import annotate
+from starcal_ros.ros.image_queue import ImageQueue, Recent, StarTrackers, Waiting
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
 from starcal_ros.ros.lifecycle_node.lifecycle import Health, OK, StarcalNode, WARN
 from starcal_ros.ros.lifecycle_node.message_factory import make_message
 from starcal_ros.ros.lifecycle_node.node_process import run
-from starcal_ros.ros.queue.image_queue import ImageQueue, Recent, Waiting
-from starcal_ros.ros.queue.tracker_inputs import StarTrackers
 from starcal_ros.ros.unmatched import Unmatched
 from starcal_ros.sky.attitude import attitude_sample
 

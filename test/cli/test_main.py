@@ -362,7 +362,7 @@ def test_images_of_a_wrong_encoding(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from starcal_ros.formats.messages.image_messages import image_to_message
-    from starcal_ros.formats.messages.types import Make, Message
+    from starcal_ros.formats.messages.message_fields import Make, Message
 
     def colour(image: Image, frame_id: str, make: Make) -> Message:
         message = image_to_message(image, frame_id, make)

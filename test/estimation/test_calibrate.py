@@ -22,8 +22,8 @@ from starcal_ros.estimation.calibration_options import (
     check_enough,
     estimated_parameters,
 )
-from starcal_ros.estimation.centroid_noise import CentroidVariance
 from starcal_ros.estimation.problem import METHODS
+from starcal_ros.estimation.reweighting import CentroidVariance
 from starcal_ros.estimation.shared_errors import SharedError
 from starcal_ros.estimation.star_equations import star_table
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations

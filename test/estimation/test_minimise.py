@@ -22,10 +22,15 @@ from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.levenberg_marquardt import covariance
-from starcal_ros.estimation.minimise import minimise, Minimum, without_parameter
+from starcal_ros.estimation.minimise import (
+    minimise,
+    Minimum,
+    problem_of,
+    start_of,
+    without_parameter,
+)
 from starcal_ros.estimation.problem import Problem
 from starcal_ros.estimation.star_equations import arrange, star_table
-from starcal_ros.estimation.start import problem_of, start_of
 from starcal_ros.records import Ensemble
 from starcal_ros.studies.simulation.centroids import true_observations
 from starcal_ros.studies.simulation.scenario import scenario

@@ -28,8 +28,8 @@ from scipy.special import eval_jacobi
 
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import rotation_jacobian
-from starcal_ros.estimation.attitude_errors import attitude_errors
 from starcal_ros.estimation.equations import star_columns, tracker_turns
+from starcal_ros.estimation.problem import attitude_errors
 from starcal_ros.estimation.unknowns import Assumptions, moved, unknowns_in_state, unknowns_of
 
 # Finite differences are exact to 1e-10 of a column; attitude errors of 20 arcsec enter the

@@ -17,9 +17,8 @@ from starcal_ros.cli.arguments import EXIT_REFUSED
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.message_fields import make_header
+from starcal_ros.formats.messages.message_fields import COMPRESSED_TYPE, make_header
 from starcal_ros.formats.messages.telemetry import attitude_from_message
-from starcal_ros.formats.messages.types import COMPRESSED_TYPE
 from starcal_ros.pipeline import inspect, topics
 from starcal_ros.pipeline.setup import read_setup, Setup
 from starcal_ros.pipeline.topics import Topics

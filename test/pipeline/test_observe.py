@@ -28,8 +28,7 @@ from starcal_ros.records import (
     StarObservations,
 )
 from starcal_ros.sky.astrometry import apparent_directions, through_the_air
-from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
-from starcal_ros.sky.tracker_alignments import attitudes_at, Mounting
+from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, attitudes_at, Mounting
 from starcal_ros.studies.simulation.rendering import render, star_electrons
 from starcal_ros.studies.simulation.scenario import attitude_samples, Inertial, scene
 from starcal_ros.studies.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC

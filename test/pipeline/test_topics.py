@@ -14,11 +14,12 @@ from starcal_ros.errors import BagError
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.message_fields import (
+    ATTITUDE_TYPES,
+    IMAGE_TYPE,
     make_header,
     quaternion_to_message,
     vector_to_message,
 )
-from starcal_ros.formats.messages.types import ATTITUDE_TYPES, IMAGE_TYPE
 from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import topics
 from starcal_ros.pipeline.setup import load_setup, NODES, Setup

@@ -22,12 +22,13 @@ from starcal_ros.pipeline.unknown_air import with_air
 from starcal_ros.records import CameraGeometry, Ensemble, refused_image, StarObservations
 from starcal_ros.sky.astrometry import (
     apparent_directions,
+    refracted,
     SiteOptions,
     standard_pressure_hpa,
     through_the_air,
+    zenith_of,
 )
 from starcal_ros.sky.catalog import load_catalog
-from starcal_ros.sky.refraction import refracted, zenith_of
 from starcal_ros.studies.simulation.scenario import scenario
 
 SITE = SiteOptions(observer='ground', latitude_deg=47.0, longitude_deg=11.0, height_m=500.0)

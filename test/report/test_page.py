@@ -26,8 +26,8 @@ from starcal_ros.formats.products.calibration_json import (
     write_calibration,
 )
 from starcal_ros.formats.products.product_files import REPORT_FILE
-from starcal_ros.number_text import significant
 from starcal_ros.report import page as report
+from starcal_ros.text import significant
 
 FIGURES = (
     'coverage',

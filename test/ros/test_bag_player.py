@@ -23,8 +23,12 @@ from rclpy.executors import SingleThreadedExecutor
 from starcal.msg import StarObservations
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.message_fields import make_header, quaternion_to_message
-from starcal_ros.formats.messages.types import COMPRESSED_TYPE, POSE_TYPE
+from starcal_ros.formats.messages.message_fields import (
+    COMPRESSED_TYPE,
+    make_header,
+    POSE_TYPE,
+    quaternion_to_message,
+)
 from starcal_ros.ros import bag_player
 
 pytestmark = pytest.mark.nodes

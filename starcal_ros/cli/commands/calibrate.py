@@ -20,7 +20,7 @@ from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.cli import output
 from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_REFUSED, is_interrupt
 from starcal_ros.cli.commands.selection import Selection, selection
-from starcal_ros.cli.output_places import check_folder
+from starcal_ros.cli.output import check_folder
 from starcal_ros.cli.terminal import print_text, with_progress
 from starcal_ros.errors import (
     missing_package,

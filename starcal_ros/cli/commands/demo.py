@@ -30,10 +30,10 @@ from starcal_ros.errors import ProductError, StarcalError
 from starcal_ros.formats.products.calibration_json import prior_of, read_calibration
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import read_text, write_atomically
-from starcal_ros.number_text import significant, to_sigma
 from starcal_ros.records import Calibration, CameraGeometry
 from starcal_ros.studies.simulation import scenario, simulated_bag
 from starcal_ros.studies.simulation.simulated_bag import true_geometry
+from starcal_ros.text import significant, to_sigma
 from starcal_ros.untrusted import json_value, PRODUCT_BYTES
 
 Process = subprocess.Popen[bytes]

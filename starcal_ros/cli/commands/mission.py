@@ -16,7 +16,7 @@ from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_BAD_INPUT, E
 from starcal_ros.cli.terminal import print_text, progress_bar
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import make_folder
-from starcal_ros.number_text import significant
+from starcal_ros.text import significant
 
 if TYPE_CHECKING:
     from starcal_ros.records import StarObservations

@@ -19,9 +19,8 @@ from rich.text import Text
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import INTRINSIC_NAMES
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
-from starcal_ros.number_text import significant
 from starcal_ros.records import Calibration, EnsembleStatus, GateCheck, StarObservations
-from starcal_ros.text import printable
+from starcal_ros.text import printable, significant
 
 _HEALTH = {0: ('ok', 'green'), 1: ('warning', 'yellow'), 2: ('error', 'bold red')}
 _STALE = ('stale', 'yellow')

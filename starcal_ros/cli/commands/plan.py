@@ -10,17 +10,17 @@ import json
 from pathlib import Path
 
 from starcal_ros.cli.arguments import EXIT_ACCEPTED
-from starcal_ros.cli.output_places import check_no_product
+from starcal_ros.cli.output import check_no_product
 from starcal_ros.cli.terminal import print_table, print_text
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.number_text import significant
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline import topics as bag_topics
 from starcal_ros.pipeline.plan import Cone, Plan, plan_pointings, Pointing, Request
 from starcal_ros.pipeline.setup import files_of, read_setup
 from starcal_ros.pipeline.topics import Topics
 from starcal_ros.record_codec import json_object
+from starcal_ros.text import significant
 
 _COLUMNS = ('ra_deg', 'dec_deg', 'roll_deg')
 

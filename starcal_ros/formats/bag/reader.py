@@ -26,9 +26,8 @@ from starcal_ros.formats.bag.mcap_reader import (
 )
 from starcal_ros.formats.bag.typestore import typestore_of
 from starcal_ros.formats.messages.image_messages import image_from_message, refused_from_message
-from starcal_ros.formats.messages.message_fields import nearest_stamp_ns
+from starcal_ros.formats.messages.message_fields import Message, nearest_stamp_ns
 from starcal_ros.formats.messages.observation_messages import checked_observations
-from starcal_ros.formats.messages.types import Message
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.text import printable
 from starcal_ros.untrusted import METADATA_BYTES, read_text, yaml_value

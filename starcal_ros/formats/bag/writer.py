@@ -21,8 +21,15 @@ from starcal_ros.arrays import Floats
 from starcal_ros.errors import BagError, errors_as
 from starcal_ros.files import replacing
 from starcal_ros.formats.bag.typestore import described, make_message, typestore
-from starcal_ros.formats.messages import telemetry, types
+from starcal_ros.formats.messages import telemetry
 from starcal_ros.formats.messages.image_messages import image_to_message
+from starcal_ros.formats.messages.message_fields import (
+    ATTITUDE_TYPE,
+    IMAGE_TYPE,
+    OBSERVATIONS_TYPE,
+    TEMPERATURE_TYPE,
+    VELOCITY_TYPE,
+)
 from starcal_ros.formats.messages.observation_messages import observations_to_message
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.untrusted import PRODUCT_BYTES, read_text
@@ -101,19 +108,19 @@ class BagWriter:
     def write_image(self, topic: str, image: Image, frame_id: str) -> None:
         """Write a sensor_msgs/Image."""
         message = image_to_message(image, frame_id, make_message)
-        self._write(topic, types.IMAGE_TYPE, image.time_ns, message)
+        self._write(topic, IMAGE_TYPE, image.time_ns, message)
 
     def write_attitude(self, topic: str, time_ns: int, xyzw: Floats, frame_id: str) -> None:
         """Write a geometry_msgs/QuaternionStamped in the inertial frame ``frame_id``."""
         message = telemetry.attitude_to_message(time_ns, xyzw, frame_id, make_message)
-        self._write(topic, types.ATTITUDE_TYPE, time_ns, message)
+        self._write(topic, ATTITUDE_TYPE, time_ns, message)
 
     def write_velocity(
         self, topic: str, time_ns: int, velocity_m_s: Floats, frame_id: str
     ) -> None:
         """Write a geometry_msgs/TwistStamped."""
         message = telemetry.velocity_to_message(time_ns, velocity_m_s, frame_id, make_message)
-        self._write(topic, types.VELOCITY_TYPE, time_ns, message)
+        self._write(topic, VELOCITY_TYPE, time_ns, message)
 
     def write_temperature(
         self, topic: str, time_ns: int, temperature_degc: float, frame_id: str
@@ -122,12 +129,12 @@ class BagWriter:
         message = telemetry.temperature_to_message(
             time_ns, temperature_degc, frame_id, make_message
         )
-        self._write(topic, types.TEMPERATURE_TYPE, time_ns, message)
+        self._write(topic, TEMPERATURE_TYPE, time_ns, message)
 
     def write_observations(self, topic: str, record: StarObservations, frame_id: str) -> None:
         """Write a starcal/StarObservations."""
         message = observations_to_message(record, frame_id, make_message)
-        self._write(topic, types.OBSERVATIONS_TYPE, record.time_ns, message)
+        self._write(topic, OBSERVATIONS_TYPE, record.time_ns, message)
 
     def _write(self, topic: str, type_name: str, time_ns: int, message: object) -> None:
         number, of_topic = self._channels.get(topic) or self._open(topic, type_name)

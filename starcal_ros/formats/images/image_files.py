@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import errors_as, IngestError, needing
 from starcal_ros.formats.images.file_header import has_surplus, png_header, tiff_header
-from starcal_ros.formats.images.header_times import Card, middle_of_exposure
-from starcal_ros.formats.images.time_systems import TimeError
+from starcal_ros.formats.images.time_systems import Card, middle_of_exposure, TimeError
 from starcal_ros.formats.messages.image_messages import CHANNELS, of_mosaic, plane
 from starcal_ros.untrusted import read_bytes
 

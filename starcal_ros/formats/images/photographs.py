@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import IngestError, needing
-from starcal_ros.formats.images.header_times import Card, middle_of_exposure
 from starcal_ros.formats.images.image_files import (
     content_of,
     decoded,
@@ -30,7 +29,7 @@ from starcal_ros.formats.images.image_files import (
     number,
     read_fits,
 )
-from starcal_ros.formats.images.time_systems import TimeError
+from starcal_ros.formats.images.time_systems import Card, middle_of_exposure, TimeError
 
 _RAW = ('.dng', '.cr2', '.cr3', '.nef', '.arw', '.orf', '.rw2', '.raf', '.pef')
 ENDINGS = ('.jpg', '.jpeg', '.png', '.tif', '.tiff', '.bmp', *_RAW, *FITS_ENDINGS)

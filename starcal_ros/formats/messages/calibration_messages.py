@@ -19,17 +19,15 @@ from starcal_ros.formats.messages.message_codec import (
     record_to_message,
 )
 from starcal_ros.formats.messages.message_fields import (
-    make_header,
-    quaternion_to_message,
-    vector_to_message,
-)
-from starcal_ros.formats.messages.types import (
     ALIGNMENT_TYPE,
     CALIBRATION_TYPE,
     CAMERA_INFO_TYPE,
     Make,
+    make_header,
     Message,
+    quaternion_to_message,
     STATUS_TYPE,
+    vector_to_message,
 )
 from starcal_ros.record_codec import plain_record, read_record
 from starcal_ros.record_fields import Named, Quaternion

@@ -14,12 +14,14 @@ from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.images.file_header import has_surplus, png_header, PNG_HEADER_BYTES
 from starcal_ros.formats.messages.message_fields import (
+    IMAGE_TYPE,
+    Make,
     make_header,
+    Message,
     nearest_stamp_ns,
     offset_ns,
     stamp_ns,
 )
-from starcal_ros.formats.messages.types import IMAGE_TYPE, Make, Message
 from starcal_ros.records import Image, refused_image, StarObservations
 
 _MOST_PIXELS = 2**27  # of a camera that is not known: 256 MB of 16 bit

@@ -34,13 +34,14 @@ from numpy.typing import NDArray
 
 from starcal_ros.formats.messages.message_fields import (
     flat_array,
+    Make,
     make_header,
     make_time,
+    Message,
     quaternion_from_message,
     quaternion_to_message,
     stamp_ns,
 )
-from starcal_ros.formats.messages.types import Make, Message
 from starcal_ros.record_codec import plain_record, read_record
 from starcal_ros.record_fields import fields_of, FieldType
 

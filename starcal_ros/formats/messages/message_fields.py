@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Parts that messages of several types share: stamps, headers, quaternions and arrays.
+Names of the message types, and the parts that messages of several types share.
 
 Readers accept any object with the fields of the message, from rclpy or from rosbags.  Writers take
 ``make``, which builds a message from its type and its fields; sequences of numbers are passed as
@@ -9,14 +9,43 @@ flat numpy arrays of the field's type.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import MAX_STAMP_NS, NANOSECONDS_PER_SECOND
-from starcal_ros.formats.messages.types import Make, Message
+
+IMAGE_TYPE = 'sensor_msgs/msg/Image'
+COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
+ATTITUDE_TYPE = 'geometry_msgs/msg/QuaternionStamped'
+VELOCITY_TYPE = 'geometry_msgs/msg/TwistStamped'
+TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
+CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
+ALIGNMENT_TYPE = 'geometry_msgs/msg/TransformStamped'
+POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
+IMU_TYPE = 'sensor_msgs/msg/Imu'
+OBSERVATIONS_TYPE = 'starcal/msg/StarObservations'
+CALIBRATION_TYPE = 'starcal/msg/Calibration'
+STATUS_TYPE = 'starcal/msg/EnsembleStatus'
+
+ATTITUDE_TYPES = {
+    'quaternion': ATTITUDE_TYPE,
+    'pose': POSE_TYPE,
+    'transform': ALIGNMENT_TYPE,
+    'imu': IMU_TYPE,
+}
+"""Values of the option `attitude_message`, and the type of message of each."""
+
+Message = Any  # a message class of rclpy or of rosbags: they share field names and nothing else
+
+
+class Make(Protocol):
+    """Builds a message of a type, ``'pkg/msg/Name'``, from its fields."""
+
+    def __call__(self, type_name: str, /, **fields: object) -> Message:
+        """Return the message."""
 
 
 def stamp_ns(stamp: Message) -> int:

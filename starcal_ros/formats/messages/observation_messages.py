@@ -10,8 +10,12 @@ import numpy as np
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages.image_messages import refused_from_message
 from starcal_ros.formats.messages.message_codec import message_fields, plain_message
-from starcal_ros.formats.messages.message_fields import flat_array
-from starcal_ros.formats.messages.types import Make, Message, OBSERVATIONS_TYPE
+from starcal_ros.formats.messages.message_fields import (
+    flat_array,
+    Make,
+    Message,
+    OBSERVATIONS_TYPE,
+)
 from starcal_ros.record_codec import plain_record, read_record
 from starcal_ros.records import StarObservations
 

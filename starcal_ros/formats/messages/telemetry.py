@@ -13,17 +13,15 @@ import numpy as np
 
 from starcal_ros.arrays import Floats
 from starcal_ros.formats.messages.message_fields import (
+    ATTITUDE_TYPE,
+    Make,
     make_header,
+    Message,
     quaternion_from_message,
     quaternion_to_message,
     stamp_ns,
-    vector_to_message,
-)
-from starcal_ros.formats.messages.types import (
-    ATTITUDE_TYPE,
-    Make,
-    Message,
     TEMPERATURE_TYPE,
+    vector_to_message,
     VELOCITY_TYPE,
 )
 

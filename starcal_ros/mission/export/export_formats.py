@@ -15,8 +15,8 @@ from starcal_ros.formats.products.lookup_table import write_lookup_table
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.mission.export import camera_models
 from starcal_ros.mission.export.c_camera import c_files, c_table, TABLE_FILE
+from starcal_ros.mission.export.camera_models import isd_files
 from starcal_ros.mission.export.ck import ck_of_images
-from starcal_ros.mission.export.isd import isd_files
 from starcal_ros.mission.export.losses import Content, Loss, temperature_losses
 from starcal_ros.mission.export.spice import check_names, spice_kernels, SpiceNames
 from starcal_ros.record_codec import nearest

@@ -18,7 +18,7 @@ import numpy as np
 from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.errors import ProductError, StarcalError
 from starcal_ros.formats.bag import reader
-from starcal_ros.formats.messages.types import OBSERVATIONS_TYPE
+from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import calibration_json
 from starcal_ros.formats.products.product_files import OBSERVATIONS_FILE, REPORT_FILE
 from starcal_ros.mission.trend import places

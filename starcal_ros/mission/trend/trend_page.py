@@ -14,7 +14,6 @@ import numpy as np
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.mission.trend import places
-from starcal_ros.mission.trend.change_points import MAX_P_VALUE, SECONDS_PER_YEAR, Term
 from starcal_ros.mission.trend.overview import Overview, overview_of, swapped_with
 from starcal_ros.mission.trend.rows import Row
 from starcal_ros.mission.trend.series import (
@@ -24,9 +23,12 @@ from starcal_ros.mission.trend.series import (
     changes,
     findings,
     groups,
+    MAX_P_VALUE,
     newest_of_each,
+    SECONDS_PER_YEAR,
     Series,
     series_of,
+    Term,
     versions,
 )
 from starcal_ros.report.page import page_template

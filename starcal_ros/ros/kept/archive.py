@@ -39,7 +39,7 @@ from starcal_ros.formats.bag.reader import read_observations
 from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.bag.writer import BagWriter, FileSpan, metadata_text, TopicSummary
 from starcal_ros.formats.messages import calibration_messages
-from starcal_ros.formats.messages.types import (
+from starcal_ros.formats.messages.message_fields import (
     ALIGNMENT_TYPE,
     CALIBRATION_TYPE,
     CAMERA_INFO_TYPE,

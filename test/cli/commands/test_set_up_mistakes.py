@@ -17,9 +17,8 @@ from starcal_ros.cli import main
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.formats.messages.message_fields import make_header
+from starcal_ros.formats.messages.message_fields import COMPRESSED_TYPE, IMAGE_TYPE, make_header
 from starcal_ros.formats.messages.telemetry import attitude_from_message
-from starcal_ros.formats.messages.types import COMPRESSED_TYPE, IMAGE_TYPE
 from starcal_ros.records import Image
 from starcal_ros.studies.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 

@@ -29,8 +29,12 @@ from starcal_ros.formats.bag.reader import Topics
 from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.bag.writer import BagWriter
 from starcal_ros.formats.messages.image_messages import color_image_to_message, image_to_message
-from starcal_ros.formats.messages.message_fields import stamp_ns
-from starcal_ros.formats.messages.types import ATTITUDE_TYPE, CALIBRATION_TYPE, IMAGE_TYPE
+from starcal_ros.formats.messages.message_fields import (
+    ATTITUDE_TYPE,
+    CALIBRATION_TYPE,
+    IMAGE_TYPE,
+    stamp_ns,
+)
 from starcal_ros.records import Image, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
 

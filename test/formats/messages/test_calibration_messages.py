@@ -31,7 +31,7 @@ from starcal_ros.formats.messages.calibration_messages import (
     camera_info_to_message,
 )
 from starcal_ros.formats.messages.message_codec import NOT_KNOWN
-from starcal_ros.formats.messages.types import CALIBRATION_TYPE
+from starcal_ros.formats.messages.message_fields import CALIBRATION_TYPE
 from starcal_ros.records import GateCheck, TemperatureTerms
 
 ROOT = Path(__file__).resolve().parents[3]

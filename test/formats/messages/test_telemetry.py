@@ -11,6 +11,7 @@ from sample_records import plain  # type: ignore[import-not-found]
 
 from starcal_ros.formats.bag.typestore import make_message
 from starcal_ros.formats.messages.message_fields import (
+    ATTITUDE_TYPES,
     make_header,
     quaternion_to_message,
     vector_to_message,
@@ -24,7 +25,6 @@ from starcal_ros.formats.messages.telemetry import (
     velocity_from_message,
     velocity_to_message,
 )
-from starcal_ros.formats.messages.types import ATTITUDE_TYPES
 
 
 def test_attitude_and_velocity_round_trip() -> None:

@@ -26,7 +26,7 @@ from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.messages.calibration_messages import calibration_to_message
-from starcal_ros.formats.messages.types import CALIBRATION_TYPE
+from starcal_ros.formats.messages.message_fields import CALIBRATION_TYPE
 from starcal_ros.formats.products.calibration_json import read_calibration, write_calibration
 from starcal_ros.records import CameraGeometry, GateCheck, TemperatureTerms, TermRemoval
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize
 
 from starcal_ros.arrays import Floats
-from starcal_ros.estimation.centroid_noise import (
+from starcal_ros.estimation.reweighting import (
     _brightness,
     _line,
     CentroidVariance,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starcal_ros.identification.polynomial_warp import fit_warp, warp_powers
+from starcal_ros.identification.prediction import fit_warp, warp_powers
 
 HALF_PX = 320.0
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.arrays import Floats, Pixels
-from starcal_ros.stars.detection import measure_background
-from starcal_ros.stars.faint_end import detectable_count
+from starcal_ros.stars.detection import detectable_count, measure_background
 from starcal_ros.stars.psf_fit import light_in_stamps
 
 SIDE_PX, APART_PX, NOISE_DN, PSF_PX = 1024, 16, 4.0, 0.9

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from starcal_ros.ros.queue.image_queue import Recent, WINDOW_S
+from starcal_ros.ros.image_queue import Recent, WINDOW_S
 
 
 class Clock:

@@ -18,7 +18,7 @@ from starcal_ros.formats.messages.telemetry import attitude_from_message
 from starcal_ros.pipeline.setup import read_setup
 from starcal_ros.records import Image
 
-TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
+TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 TRUTH = json.loads((TINY / 'truth.json').read_text())
 IMAGES = '/opnav/image_raw'
 ATTITUDES = '/star_tracker/attitude'

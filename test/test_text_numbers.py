@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from starcal_ros.number_text import p_value_text, significant, to_sigma
+from starcal_ros.text import p_value_text, significant, to_sigma
 
 
 @pytest.mark.parametrize(

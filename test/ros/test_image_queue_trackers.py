@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.records import AttitudeSample
-from starcal_ros.ros.queue.tracker_inputs import StarTrackers
+from starcal_ros.ros.image_queue import StarTrackers
 
 MS = 10**6
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])

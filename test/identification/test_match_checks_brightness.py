@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.photometric_check import refuse_by_brightness
+from starcal_ros.identification.match_checks import refuse_by_brightness
 from starcal_ros.identification.star_finder import (
     Exposure,
     IdentificationOptions,

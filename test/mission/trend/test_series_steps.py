@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starcal_ros.mission.trend.change_points import SECONDS_PER_YEAR, Trend, trend_of
+from starcal_ros.mission.trend.series import SECONDS_PER_YEAR, Trend, trend_of
 
 N = 60
 YEARS = np.arange(N) / 12

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.line_loss import find_line_loss
+from starcal_ros.identification.match_checks import find_line_loss
 from starcal_ros.identification.star_finder import (
     Exposure,
     IdentificationOptions,

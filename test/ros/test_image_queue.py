@@ -6,7 +6,7 @@ from __future__ import annotations
 import threading
 import time
 
-from starcal_ros.ros.queue.image_queue import ImageQueue, Waiting
+from starcal_ros.ros.image_queue import ImageQueue, Waiting
 
 SECOND_NS = 10**9
 
