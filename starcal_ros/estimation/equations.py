@@ -214,7 +214,7 @@ def star_sums(linear: Linearisation) -> StarSums:
 
 
 def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> NormalEquations:
-    """Return the normal equations without priors of what stars see; the cost is zero."""
+    """Return the normal equations without priors, with the cost of the star trackers alone."""
     at = seen_by_stars(layout)
     blocks, cross = sums.blocks, sums.field_cross
     m, P = len(blocks), layout.count
@@ -232,11 +232,11 @@ def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> Nor
         A[np.ix_(at, field)] = A[np.ix_(field, at)].T
         a[field] = cross[:, :, -1].sum(axis=0)
         B[:, :, field] = cross[:, :, own].transpose(0, 2, 1)
-    _add_star_tracker(A, a, B, C, c, problem, state, layout)
+    cost = _add_star_tracker(A, a, B, C, c, problem, state, layout)
     # A rotation on which nothing pulls stays.
     still = ~C[:, IMAGE_ROTATION, IMAGE_ROTATION].any(axis=(1, 2))
     C[still, IMAGE_ROTATION, IMAGE_ROTATION] += np.eye(3)
-    return NormalEquations(0.0, A, a, B, C, c)
+    return NormalEquations(cost, A, a, B, C, c)
 
 
 def equations(sums: StarSums, linear: Linearisation, shape_sigma_px: Floats) -> Equations:
@@ -355,8 +355,12 @@ def _add_star_tracker(
     problem: Problem,
     state: State,
     layout: Layout,
-) -> None:
-    """Add the star-tracker attitudes: prior of the rotations about what the trackers predict."""
+) -> float:
+    """
+    Add the star-tracker attitudes: prior of the rotations about what the trackers predict.
+
+    Return its cost.
+    """
     whitened, J = whitened_attitude_errors(problem, state)
     at, turns = tracker_turns(layout)
     information = J.transpose(0, 2, 1) @ J
@@ -367,3 +371,4 @@ def _add_star_tracker(
     B[:, IMAGE_ROTATION, at] -= to_shared
     C[:, IMAGE_ROTATION, IMAGE_ROTATION] += information
     c[:, IMAGE_ROTATION] -= gradient
+    return 0.5 * float((whitened**2).sum())

@@ -32,7 +32,7 @@ from starcal_ros.estimation.levenberg_marquardt import (
     solve_arrow,
 )
 from starcal_ros.estimation.mountings import star_tracker_names
-from starcal_ros.estimation.problem import image_blocks, Problem, State, whitened_attitude_errors
+from starcal_ros.estimation.problem import image_blocks, Problem, State
 from starcal_ros.estimation.reweighting import FEWEST_STARS
 from starcal_ros.estimation.star_equations import Measurements, StarTable
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state
@@ -130,10 +130,8 @@ def equations_in_state(
     normal = arrow(stars_alone(blocks, problem, layout), problem, state, layout)
     kept = estimated(layout)
     precision, offset = layout.prior_precision[kept], layout.prior_offset[kept]
-    off_tracker, _ = whitened_attitude_errors(problem, state)
-    cost += 0.5 * float((off_tracker**2).sum() + precision @ offset**2)
     return NormalEquations(
-        cost,
+        cost + normal.cost + 0.5 * float(precision @ offset**2),
         normal.A[np.ix_(kept, kept)] + np.diag(precision),
         normal.a[kept] - precision * offset,
         normal.B[:, :, kept],
