@@ -138,8 +138,8 @@ def distort(model: str, ideal: Floats, coefficients: Floats) -> Floats:
     if model == _EQUIDISTANT:
         return _planes(g * x, g * y)
     p1, p2 = coefficients[3:5]
-    xd = g * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    yd = g * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    g = g + 2 * (p1 * y + p2 * x)  # the terms of p1 and p2 share this factor of x and y
+    xd, yd = g * x + p2 * r2, g * y + p1 * r2
     if model in _WITH_PRISM:
         s1, s2, s3, s4 = coefficients[8:12]
         xd, yd = xd + r2 * (s1 + r2 * s2), yd + r2 * (s3 + r2 * s4)
@@ -175,12 +175,11 @@ def distort_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
     x, y = ideal[..., 0], ideal[..., 1]
     r2 = x * x + y * y
     g, g_r2, _ = _radial(model, r2, coefficients)
-    x_by_x, cross, y_by_y = g + 2 * x * x * g_r2, 2 * x * y * g_r2, g + 2 * y * y * g_r2
-    if model != _EQUIDISTANT:
-        p1, p2 = coefficients[3:5]
-        x_by_x = x_by_x + 2 * p1 * y + 6 * p2 * x
-        cross = cross + 2 * p1 * x + 2 * p2 * y
-        y_by_y = y_by_y + 6 * p1 * y + 2 * p2 * x
+    p1, p2 = coefficients[3:5] if model != _EQUIDISTANT else (0.0, 0.0)
+    g = g + 2 * (p1 * y + p2 * x)
+    by_x, by_y = 2 * g_r2 * x, 2 * g_r2 * y
+    x_by_x, y_by_y = g + x * (by_x + 4 * p2), g + y * (by_y + 4 * p1)
+    cross = x * (by_y + 2 * p1) + 2 * p2 * y
     kind = np.result_type(ideal, coefficients)
     J = np.moveaxis(np.empty((2, 2, *np.broadcast(x, y).shape), kind), (0, 1), (-2, -1))
     J[..., 0, 0], J[..., 1, 1] = x_by_x, y_by_y
