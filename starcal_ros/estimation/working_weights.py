@@ -312,15 +312,18 @@ def judge(
     """
     Return the weights that the residuals of a state ask for.
 
-    Raises NotObservable where no star fits.
+    Raises NotObservable where no star fits or has an image.
     """
     table, options = data.table, data.options
     finite = np.asarray(np.isfinite(residual_px).all(axis=1))
     residual_px = np.where(finite[:, None], residual_px, 1e6)
+    used = before.kept & finite
+    if not used.any():
+        raise NotObservable('no star has an image')
     variance = CentroidVariance(1.0, 0.0)
     if options.variance_components:
         variance = estimate_variance(
-            residual_px, table.covariance_px2, table.magnitude, before.kept & finite, freedom
+            residual_px, table.covariance_px2, table.magnitude, used, freedom
         )
     covariance_px2 = variance.of(table.covariance_px2, table.magnitude)
     errors: tuple[SharedError, ...] = ()
