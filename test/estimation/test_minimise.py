@@ -23,13 +23,14 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibration_options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.levenberg_marquardt import covariance
 from starcal_ros.estimation.minimise import (
+    equations_in_state,
     minimise,
     Minimum,
     problem_of,
     start_of,
     without_parameter,
 )
-from starcal_ros.estimation.problem import Problem
+from starcal_ros.estimation.problem import image_blocks, Problem
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.records import Ensemble
 from starcal_ros.studies.simulation.centroids import true_observations
@@ -225,3 +226,5 @@ def test_a_parameter_that_is_taken_away_starts_at_the_least_cost() -> None:
     sigma = np.sqrt(np.diag(covariance(minimum.normal)[0]))[FREE.index(k)]
     rise = 0.5 * ((value - minimum.state.parameters[k]) / sigma) ** 2
     assert again.normal.cost - minimum.normal.cost == pytest.approx(rise, rel=0.02)
+    at_start = equations_in_state(reduced, start, *image_blocks(reduced, start, measurements))
+    assert at_start.cost - minimum.normal.cost == pytest.approx(rise, rel=0.02)

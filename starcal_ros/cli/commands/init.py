@@ -32,7 +32,7 @@ from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.pipeline.topics import choose_image_topic, choose_topics, Topics
 from starcal_ros.records import CameraGeometry
 
-CAMERA_FILE = 'camera.yaml'
+CAMERA_FILE, _PARAMS_FILE = 'camera.yaml', 'params.yaml'
 _LOOKED_AT = 20  # images, the first ones
 _DIRECTIONS = ('st_to_inertial', 'inertial_to_st')
 _OF_TRACKER = (
@@ -121,9 +121,6 @@ def _aligned(
             return {**options, 'prior_alignment': alignment}, line
         said = said or sentence
     raise OptionError(f'{bags[0]}: the attitudes do not fit the images: {said}')
-
-
-_PARAMS_FILE = 'params.yaml'
 
 
 def init(args: argparse.Namespace, asked: Topics) -> int:
