@@ -210,7 +210,7 @@ class MapCovariance:
     """
     Covariance of all that moves a line of sight.
 
-    ``matrix`` is (k, k), of the numbers of `lookup.line_of_sight_jacobian`; ``unresolved_px`` the
+    ``matrix`` is (k, k), of the numbers of `Derivatives.of_shape`; ``unresolved_px`` the
     1-sigma per axis of an independent displacement of each pixel, by structure of the detector
     finer than the field.
     """

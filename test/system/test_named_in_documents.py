@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import ast
+import builtins
 import functools
 import importlib
 import importlib.util
@@ -47,6 +49,7 @@ SUFFIXES = (
     *('sh', 'tf', 'ti', 'toml', 'txt', 'xml', 'yaml'),
 )
 FOLDERS = 'bench|config|docs|examples|launch|requirements|starcal_ros|test|tools'
+ROLE = re.compile(r'(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)')  # in a docstring: one backtick
 NAME = re.compile(r'(?:\w+/)*[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+')
 
 
@@ -166,6 +169,34 @@ def are_tests(span: str) -> bool:
     return len(found) == len(files) and any(name in test for tests in found for test in tests)
 
 
+def test_what_a_docstring_names_exists() -> None:
+    strange = []
+    for path in sorted((ROOT / 'starcal_ros').rglob('*.py')):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+                text = ast.get_docstring(node) or ''
+                names = (' '.join(name.split()) for name in ROLE.findall(text))
+                strange += [(path.name, name) for name in names if not is_in_code(name)]
+    assert strange == []
+
+
+def is_in_code(name: str) -> bool:
+    """True if what a docstring names exists, and not in docstrings alone."""
+    is_own = name.isidentifier() and not name.startswith(('__', 'starcal'))  # the tool; C
+    return exists(name) and (not is_own or name in identifiers())
+
+
+@functools.cache
+def identifiers() -> frozenset[str]:
+    """Names in the code of the package: of modules, definitions, arguments, and attributes."""
+    names: set[object] = {part for module in MODULES for part in module.split('.')}
+    names |= vars(builtins).keys()
+    for path in (ROOT / 'starcal_ros').rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names |= {getattr(node, field, None) for field in ('name', 'arg', 'id', 'attr')}
+    return frozenset(name for name in names if isinstance(name, str))
+
+
 @pytest.mark.parametrize(
     'span',
     [
@@ -176,6 +207,10 @@ def are_tests(span: str) -> bool:
 def test_a_name_that_does_not_exist_is_found(span: str) -> None:
     """The test above could fail."""
     assert not exists(span)
+
+
+def test_a_docstring_names_no_function_of_docstrings_alone() -> None:
+    assert is_in_code('pixels_every') and not is_in_code('line_of_sight_jacobian')
 
 
 def test_lines_of_pytest_and_bench_in_documents_exist() -> None:

@@ -103,7 +103,7 @@ class Row:
     is_passing: bool = False
 
     def __post_init__(self) -> None:
-        """Check what `trend.series` and `trend.page` rely on."""
+        """Check what `series` and `trend_page` rely on."""
         for name, value in vars(self).items():
             if isinstance(value, str) and len(check_text(value)) > _LONGEST:
                 raise ValueError(f'{name}: {len(value)} characters')

@@ -12,7 +12,7 @@ A file is written beside its place, synced, renamed, and the folder synced; it i
 afterwards.  So at any instant each file is complete or absent.
 
 The folder is untrusted input.  Only regular files of limited size are opened.  A file with a wrong
-seal (`calibrator.seal`), or with content that is no image or no calibration, is renamed to
+seal (`kept.seal`), or with content that is no image or no calibration, is renamed to
 ``….damaged`` and skipped.  With a key, the name of an image carries its HMAC:
 ``00000012_<64 digits>.mcap``.
 """
