@@ -1,4 +1,5 @@
-# make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, check, test, bench, lint, docs.
+# make setup [PYTHON=python3.12] [ROS_DISTRO=kilted], then make demo, check, test, packaging, bench,
+# lint, docs.
 # make test TESTS='-m nodes' runs a part: what follows is handed to pytest. The whole is two runs:
 # tests that start nodes wait most of the time, so four run at once. VERSIONS=oldest: with the
 # oldest versions of the Python packages that starcal is tested on; VERSIONS=newest: with the newest
@@ -13,7 +14,7 @@ RUN := $(VENV)/bin
 BY_FILE := --numprocesses 2 --dist loadfile
 MAKE_VENV = $(PYTHON) tools/make_venv.py $(VENV) --ros $(ROS_DISTRO) --versions $(VERSIONS)
 
-.PHONY: setup demo check test bench lint docs help
+.PHONY: setup demo check test packaging bench lint docs help
 
 setup:
 	@$(MAKE_VENV)
@@ -26,7 +27,8 @@ ifdef TESTS
 	$(RUN)/python -m pytest $(TESTS)
 else
 	@failed=0; \
-	for part in "-m 'not nodes' $(BY_FILE)" "-m nodes test/ros test/system --numprocesses 3 --dist worksteal"; do \
+	for part in "-m 'not nodes and not packaging' $(BY_FILE)" \
+		"-m 'nodes and not packaging' test/ros test/system --numprocesses 3 --dist worksteal"; do \
 		echo "$(RUN)/python -m pytest $$part"; \
 		eval $(RUN)/python -m pytest $$part || failed=1; \
 	done; \
@@ -35,6 +37,9 @@ endif
 
 check: lint
 	$(RUN)/python -m pytest -m 'not nodes and not slow' $(BY_FILE) --quiet
+
+packaging: setup
+	$(RUN)/python -m pytest -m packaging $(BY_FILE)
 
 bench:
 	@$(MAKE_VENV) --also bench
@@ -56,6 +61,7 @@ help:
 	@echo 'make demo    calibrate a small bag with the real nodes and compare with the truth'
 	@echo 'make check   lint and the fast tests, before each commit'
 	@echo "make test    all tests; a part: TESTS='-m nodes', TESTS=test/camera"
+	@echo 'make packaging   tests that build, install, draw and browse; .ci/run runs them too'
 	@echo 'make lint    ruff, mypy --strict and the import contract'
 	@echo 'make docs    the Sphinx site in docs/_build/html; warnings are errors'
 	@echo 'make bench   the measurements of docs/performance.md'

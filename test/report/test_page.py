@@ -282,6 +282,8 @@ def shown(page: str, folder: Path, width: int, dark: bool) -> tuple[dict[str, An
 
 
 @pytest.mark.slow
+@pytest.mark.packaging
+@pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason='no Chromium on this machine')
 @pytest.mark.parametrize(('width', 'dark'), [(400, False), (1600, True)])
 def test_a_browser_shows_it(page: str, tmp_path: Path, width: int, dark: bool) -> None:

@@ -33,6 +33,7 @@ def test_letters_of_printed_figures_have_six_points() -> None:
     assert line_pt * int(rule[1]) / 100 * svg.LETTER / svg.WIDTH >= 6
 
 
+@pytest.mark.packaging
 @pytest.mark.slow
 @pytest.mark.skipif(not find_library('pango-1.0'), reason='Pango is not installed')
 def test_the_pages_are_written_beside_the_report(tiny_products: Path, tmp_path: Path) -> None:

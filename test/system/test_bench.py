@@ -18,7 +18,7 @@ from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import Exposure, observe_stars, StarSearch
 from starcal_ros.sky.catalog import load_catalog
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.packaging, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 

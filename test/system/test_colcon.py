@@ -27,6 +27,7 @@ NODE_ANSWERS_WITHIN_S = 30.0
 NODE_STOPS_WITHIN_S = 15.0
 
 pytestmark = [
+    pytest.mark.packaging,
     pytest.mark.slow,
     pytest.mark.timeout(900),  # colcon takes 40 s on two free cores, minutes on busy ones
 ]

@@ -129,6 +129,7 @@ def report_install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return installed(wheel, tmp_path_factory.mktemp('report'), 'report')
 
 
+@pytest.mark.packaging
 @pytest.mark.slow
 def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path) -> None:
     python = flight_install / 'bin/python'
@@ -150,6 +151,7 @@ def test_a_bag_is_calibrated_without_extras(flight_install: Path, tmp_path: Path
         assert refused.stderr.count('\n') == 1
 
 
+@pytest.mark.packaging
 @pytest.mark.slow
 def test_a_bag_is_calibrated_with_a_report(report_install: Path, tmp_path: Path) -> None:
     """With the versions of this environment: in `make test VERSIONS=newest` those of today."""
@@ -172,6 +174,7 @@ def test_a_bag_is_calibrated_with_a_report(report_install: Path, tmp_path: Path)
     assert made['accepted'] and made['intrinsics'] == again['intrinsics']
 
 
+@pytest.mark.packaging
 @pytest.mark.slow
 def test_a_demo_without_ros_names_it(report_install: Path, tmp_path: Path) -> None:
     refused = run(report_install / 'bin/starcal', 'demo', cwd=tmp_path)
@@ -179,6 +182,7 @@ def test_a_demo_without_ros_names_it(report_install: Path, tmp_path: Path) -> No
     assert 'rclpy is not installed' in refused.stderr and not any(tmp_path.iterdir())
 
 
+@pytest.mark.packaging
 @pytest.mark.slow
 def test_pip_lines_of_the_tutorial(sources: Path) -> None:
     """Pip accepts each line that installs from the clone, with every extra that it names."""
@@ -191,6 +195,7 @@ def test_pip_lines_of_the_tutorial(sources: Path) -> None:
         assert 'does not provide the extra' not in tried.stderr
 
 
+@pytest.mark.packaging
 @pytest.mark.slow
 def test_python_lines_of_the_tutorial(flight_install: Path, tmp_path: Path) -> None:
     """The calibration in three lines runs without ROS and without extras."""
@@ -201,6 +206,7 @@ def test_python_lines_of_the_tutorial(flight_install: Path, tmp_path: Path) -> N
     assert done.stdout.startswith('True [')
 
 
+@pytest.mark.packaging
 @pytest.mark.slow
 def test_types_and_definitions_are_installed(flight_install: Path) -> None:
     (package,) = flight_install.glob('lib/python*/site-packages/starcal_ros')

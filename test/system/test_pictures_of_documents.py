@@ -17,7 +17,7 @@ import pytest
 from docs import make_gallery, make_images, make_nodes, make_phase, make_trend
 from starcal_ros.studies.simulation import scenario
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.packaging, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 IN_BROWSER = {'report', 'trend'}

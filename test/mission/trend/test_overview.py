@@ -89,6 +89,8 @@ document.body.dataset.shown = [...views, shown()].join(';');
 
 
 @pytest.mark.slow
+@pytest.mark.packaging
+@pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason='no Chromium on this machine')
 def test_a_browser_searches_and_sorts_the_cameras(tmp_path: Path) -> None:
     rng = np.random.default_rng(34)
