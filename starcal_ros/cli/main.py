@@ -336,9 +336,10 @@ def _demo(args: argparse.Namespace) -> int:
     """Calibrate the small bag with the real nodes and compare the result with the truth."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli.commands import demo
-    from starcal_ros.cli.commands.calibrate import calibrate_into, Drawings, Job
+    from starcal_ros.cli.commands.calibrate import calibrate_into, Drawings
     from starcal_ros.cli.output import check_folder
     from starcal_ros.formats.products.product_folder import write_products
+    from starcal_ros.pipeline.campaign import source_of
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.report import page
@@ -363,9 +364,9 @@ def _demo(args: argparse.Namespace) -> int:
     )
     # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
     setup = load_setup(bag.parameters)
-    again, *_ = calibrate_into(Job(args.output, [bag.bag], Topics(), setup, dict))
+    again, _ = calibrate_into(args.output, source_of([bag.bag], setup, Topics()), dict)
     write_products(calibration, args.output)
-    apart_px = float(comparison.compare(calibration, again).before.length_px.max())
+    apart_px = float(comparison.compare(calibration, again.calibration).before.length_px.max())
     same = apart_px <= _DEMO_SAME_PX
     terminal.print_verdict(
         same,
