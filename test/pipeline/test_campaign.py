@@ -103,3 +103,33 @@ def test_all_entrances_give_one_calibration(
     for name, number in entrance(*given).items():
         # JSON and Parquet keep all digits; the process has solved it with one BLAS thread.
         np.testing.assert_allclose(number, numbers_of(expected)[name], rtol=1e-9, err_msg=name)
+
+
+def test_an_inspection_reads_as_a_calibration(
+    bag: Path, expected: Calibration, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before the images that matched nothing are measured again."""
+    capsys.readouterr()
+    assert main(['inspect', str(bag), '--params', str(bag / 'params.yaml'), '--json']) == 0
+    shown = capsys.readouterr()
+    contents = json.loads(shown.out)
+    unmatched = {group['reason']: group['count'] for group in contents['refused']}
+    assert set(unmatched) <= {'no_match'}
+    assert contents['status']['images'] + sum(unmatched.values()) == expected.images_used
+    assert ('prior_alignment is not given: found [' in shown.err) == (not unmatched)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'problem'),
+    [
+        (('--attitude-topic', 'other'), 'no topic other of type'),
+        (('--observations-topic', 'other'), 'no topic other of type'),
+    ],
+)
+def test_an_inspection_lists_the_topics_where_one_is_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, str], problem: str
+) -> None:
+    bag = unaligned(tmp_path)
+    assert main(['inspect', str(bag), '--params', str(bag / 'params.yaml'), *arguments]) == 3
+    shown = capsys.readouterr().out
+    assert '/opnav/image_raw' in shown and problem in shown
