@@ -200,22 +200,13 @@ def calibrate_into(
     if wanted is not None and not observed.observations:
         raise OptionError(wanted.without_images())
     make_folder(folder)
-    camera_frame = source.setup.frames.camera_frame
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
-    write_observations(observed.observations, folder, camera_frame)
+    write_observations(observed.observations, folder, source.setup.frames.camera_frame)
     with ThreadPoolExecutor(1, 'pictures') as thread:
         drawn = thread.submit(album.thumbnails)
         if with_report:
             thread.submit(_load_report)
-        try:
-            made = campaign.calibrate(observed, inputs())
-        except TooFewObservations as error:
-            failure = _failure(str(error), observed)
-            _write_failure(folder, failure, album.unmatched)
-            raise TooFewObservations(failure.reason) from error
-        _tell(made.notes[len(source.notes) :])
-        if made.observations is not observed.observations:
-            write_observations(made.observations, folder, camera_frame)
+        made = _calibrated(folder, observed, inputs(), album)
         pictures: Sequence[thumbnails.Thumbnail] = ()
         with drawings.kind('pictures of images'):
             pictures = drawn.result()
@@ -235,6 +226,25 @@ def calibrate_into(
         # After the products that it is of.
         write_atomically(folder / REPORT_FILE, with_digests(page, folder))
     return made, report
+
+
+def _calibrated(
+    folder: Path,
+    observed: campaign.Observed,
+    inputs: Mapping[str, str],
+    album: thumbnails.Album,
+) -> campaign.Campaign:
+    """The calibration of observed images; a failure is recorded in the folder."""
+    try:
+        made = campaign.calibrate(observed, inputs)
+    except TooFewObservations as error:
+        failure = _failure(str(error), observed)
+        _write_failure(folder, failure, album.unmatched)
+        raise TooFewObservations(failure.reason) from error
+    _tell(made.notes[len(observed.source.notes) :])
+    if made.observations is not observed.observations:
+        write_observations(made.observations, folder, made.setup.frames.camera_frame)
+    return made
 
 
 def _load_report() -> None:
