@@ -25,8 +25,10 @@ from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import COEFFICIENTS
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.bag.writer import BagWriter
-from starcal_ros.pipeline import night_sky, solve, topics
-from starcal_ros.records import Calibration, CameraGeometry, Ensemble
+from starcal_ros.pipeline import night_sky
+from starcal_ros.pipeline.campaign import calibrate_bags
+from starcal_ros.pipeline.topics import Topics
+from starcal_ros.records import Calibration, CameraGeometry
 from starcal_ros.studies.simulation.rendering import images
 from starcal_ros.studies.simulation.scenario import Inertial, Scenario, scenario
 
@@ -117,13 +119,9 @@ def calibrated(given: Scenario) -> Calibration:
         with BagWriter(bag) as writer:
             for image in images(given):
                 writer.write_image('/camera/image_raw', image, 'camera')
-        found = night_sky.from_bags([bag], topics.Topics(), {}, Path(name))
-        chosen = topics.choose_topics(found.bags, topics.Topics(), found.setup)
-        measured = list(topics.read(found.bags, chosen, found.setup))
-        ensemble = Ensemble()
-        for one in found.through_air(measured)[0]:
-            ensemble = solve.add_to_ensemble(ensemble, one, found.setup)
-        return solve.solve(ensemble, found.setup)
+        found = night_sky.from_bags([bag], Topics(), {}, Path(name))
+        campaign = calibrate_bags(found.bags, found.setup, Topics(), None, found.through_air)
+        return campaign.calibration
 
 
 def off_arcsec(found: Calibration, truth: CameraModel) -> tuple[float, float]:

@@ -27,10 +27,11 @@ from starcal_ros.formats.bag import reader
 from starcal_ros.formats.products import calibration_json
 from starcal_ros.formats.products.product_folder import calibration_file
 from starcal_ros.options import names_of, unknown_option
-from starcal_ros.pipeline import night_sky, solve, topics
-from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags
+from starcal_ros.pipeline import night_sky, solve
+from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.provenance import inputs_of
 from starcal_ros.pipeline.setup import load_setup, read_setup
+from starcal_ros.pipeline.topics import Topics
 from starcal_ros.record_codec import check_shape, plain_record, read_record, read_value
 from starcal_ros.record_fields import fields_of
 from starcal_ros.records import Calibration, CameraGeometry, refused_image, StarObservations
@@ -215,17 +216,15 @@ def calibrate_bag(
     """
     paths = [Path(bag) for bag in ([bags] if isinstance(bags, (str, Path)) else bags)]
     setup = read_setup(Path(params))
-    asked = topics.Topics(
+    asked = Topics(
         image=image_topic,
         attitude=attitude_topic,
         velocity=velocity_topic,
         temperature=temperature_topic,
         observations=observations_topic,
     )
-    setup, _ = aligned_by_bags(paths, asked, setup)
-    images = topics.read(paths, topics.choose_topics(paths, asked, setup), setup)
     inputs = inputs_of((*reader.mcap_files(paths), Path(params)))
-    return solve.solve(solve.ensemble_of(images, setup), setup, inputs=inputs)
+    return calibrate_bags(paths, setup, asked, inputs).calibration
 
 
 def calibrate_images(images: Path | str | Sequence[Path | str], **options: object) -> Calibration:
@@ -253,11 +252,9 @@ def calibrate_images(images: Path | str | Sequence[Path | str], **options: objec
     chosen, _ = night_sky.photographs_of(paths)
     with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
         found = night_sky.from_photographs(chosen, options, Path(folder))
-        in_bags = topics.choose_topics(found.bags, topics.Topics(), found.setup)
-        measured = topics.read(found.bags, in_bags, found.setup)
-        through_air = found.through_air(list(measured))[0]
-        ensemble = solve.ensemble_of(through_air, found.setup)
-    return solve.solve(ensemble, found.setup, inputs=inputs_of([one.path for one in chosen]))
+        inputs = inputs_of([one.path for one in chosen])
+        campaign = calibrate_bags(found.bags, found.setup, Topics(), inputs, found.through_air)
+    return campaign.calibration
 
 
 def read_calibration(path: Path | str) -> Calibration:

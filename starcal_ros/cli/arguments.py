@@ -6,6 +6,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 import contextlib
+from dataclasses import dataclass
+from datetime import datetime, timezone
 import difflib
 import math
 from pathlib import Path
@@ -17,7 +19,6 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from starcal_ros.cli.command_help import HELP
-from starcal_ros.cli.commands.selection import parse_time
 from starcal_ros.text import printable
 
 EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_INTERRUPTED = 0, 2, 3, 130
@@ -88,6 +89,37 @@ def _number(kind: type[int] | type[float], low: float, high: float = math.inf) -
 
     read.__name__ = kind.__name__  # argparse names it where the text is no number
     return read
+
+
+@dataclass(frozen=True)
+class Time:
+    """Value of a time option: ``seconds`` since 1970 UTC, or since the first image of the bag."""
+
+    seconds: float
+    since_first_image: bool
+
+
+def parse_time(text: str) -> Time:
+    """
+    A time as it is typed: UTC in ISO 8601, seconds since 1970, or +seconds since the first image.
+
+    Raises argparse.ArgumentTypeError for another text.
+    """
+    try:
+        seconds = float(text)
+    except ValueError:
+        try:
+            read = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(
+                f'{text!r} is not a time: give 2026-05-15T07:20:00, seconds since 1970, or'
+                ' +seconds after the first image'
+            ) from error
+        with_zone = read if read.tzinfo else read.replace(tzinfo=timezone.utc)
+        return Time(with_zone.timestamp(), False)
+    if not math.isfinite(seconds):
+        raise argparse.ArgumentTypeError(f'{text!r} is not a finite number of seconds')
+    return Time(seconds, text.strip().startswith('+'))
 
 
 def _remap(text: str) -> str:
@@ -238,15 +270,6 @@ def _calibrate(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         '--to', dest='to_time', type=parse_time, metavar='T', help='use images up to T'
     )
-    count = _number(int, 1)
-    command.add_argument(
-        '--first', type=count, metavar='N', help='use only the first N of these images'
-    )
-    command.add_argument(
-        '--every', type=count, metavar='K', help='use only every K-th of these images'
-    )
-    what = 'compare calibrations of the images of odd and of even number, DIR/odd and DIR/even'
-    command.add_argument('--split-half', action='store_true', help=what)
 
 
 def _plan(command: argparse.ArgumentParser) -> None:

@@ -64,8 +64,8 @@ to DIR. Images without attitudes give the camera alone: their attitudes are foun
   starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out
   # photographs of the night sky alone
   starcal calibrate 'night/*.jpg' -o out
-  # the images of the first 30 s, and a comparison of its two halves
-  starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out --to +30 --split-half
+  # the images of the first 30 s
+  starcal calibrate bags/tiny --params bags/tiny/params.yaml -o out --to +30
   # one of several cameras, from two bags together
   starcal calibrate night1 night2.mcap --params camera1.yaml -o out --image-topic /camera1/image
   # repeat from the recorded observations, with other options and without images

@@ -138,24 +138,12 @@ def _inspect(args: argparse.Namespace) -> int:
         from starcal_ros.pipeline.setup import read_setup
 
         setup = read_setup(args.params)
-    if setup and not setup.is_aligned:
-        from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags
-
-        setup, aligned = aligned_by_bags(args.bags, _asked(args), setup)
-        terminal.print_text(aligned, end='\n' if aligned else '', file=sys.stderr)
     kinds = (IMAGE_TYPE, COMPRESSED_TYPE, OBSERVATIONS_TYPE)
     total = max((t.count for t in reader.topics(args.bags) if t.type_name in kinds), default=0)
     with terminal.progress_bar(total, 'images') as advance:
         found = inspect.inspect(args.bags, _asked(args), setup, on_image=advance)
-    if found.chosen and found.images and sum(r.count for r in found.refused) == found.images:
-        from starcal_ros.pipeline.diagnosis.bags import of_a_failure, of_refusals
-
-        why = of_refusals(found.refused, found.images)
-        if setup and not found.chosen.observations:
-            why = of_a_failure(args.bags, _asked(args), setup, found.refused)
-        if why:
-            problems = (*found.problems, why.in_a_sentence())
-            found = dataclasses.replace(found, problems=problems)
+    for note in found.notes:
+        terminal.print_text(note, file=sys.stderr)
     if args.json:
         _print_json(found)
     else:
@@ -336,9 +324,10 @@ def _demo(args: argparse.Namespace) -> int:
     """Calibrate the small bag with the real nodes and compare the result with the truth."""
     from starcal_ros.assessment import comparison
     from starcal_ros.cli.commands import demo
-    from starcal_ros.cli.commands.calibrate import calibrate_into, Drawings, Job
+    from starcal_ros.cli.commands.calibrate import calibrate_into, Drawings
     from starcal_ros.cli.output import check_folder
     from starcal_ros.formats.products.product_folder import write_products
+    from starcal_ros.pipeline.campaign import source_of
     from starcal_ros.pipeline.setup import load_setup
     from starcal_ros.pipeline.topics import Topics
     from starcal_ros.report import page
@@ -363,9 +352,9 @@ def _demo(args: argparse.Namespace) -> int:
     )
     # The nodes publish no residuals: take those of the tool, whose calibration must be the same.
     setup = load_setup(bag.parameters)
-    again, *_ = calibrate_into(Job(args.output, [bag.bag], Topics(), setup, dict))
+    again, _ = calibrate_into(args.output, source_of([bag.bag], setup, Topics()), dict)
     write_products(calibration, args.output)
-    apart_px = float(comparison.compare(calibration, again).before.length_px.max())
+    apart_px = float(comparison.compare(calibration, again.calibration).before.length_px.max())
     same = apart_px <= _DEMO_SAME_PX
     terminal.print_verdict(
         same,

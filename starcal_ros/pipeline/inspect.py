@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import BagError, ImageRefused
+from starcal_ros.errors import BagError, ImageRefused, OptionError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.bag.frames import read_ahead, read_frames
 from starcal_ros.formats.bag.mcap_reader import Damage
@@ -89,7 +89,8 @@ class Inspection:
     samples around an accepted image; NaN if none records it.  Only if the stars were ``measured``
     are there ``stars_per_image`` (accepted images), ``refused_stars`` (by reason) and the
     ``status`` of a calibration; if not, an image may still be refused for its stars.
-    ``problems`` are why the bag cannot be calibrated.
+    ``problems`` are why the bag cannot be calibrated, ``notes`` state the alignment that was found
+    where none is given.
     """
 
     bags: tuple[str, ...]
@@ -104,6 +105,7 @@ class Inspection:
     status: EnsembleStatus | None
     damage: tuple[str, ...]
     problems: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def inspect(
@@ -115,37 +117,43 @@ def inspect(
     """
     Contents of bags and the images that a calibration would refuse.
 
-    With a setup, stars are measured as for a calibration; without one, images are only checked
-    against the attitudes, at the default limits. Raises BagError when a bag is missing or not a
-    bag.
+    With a setup, stars are measured as for a calibration, which measures images that match no star
+    once more in the end; without one, images are only checked against the attitudes, at the
+    default limits. Raises BagError when a bag is missing or not a bag.
     """
     damage: dict[str, None] = {}  # an ordered set
     topics = _contents(paths, lambda text: damage.setdefault(text))
     options = setup.attitude if setup else AttitudeOptions()
     problems = []
+    notes: tuple[str, ...] = ()
     chosen, seen = None, []
     try:
-        chosen = bag_topics.choose_topics(paths, asked, setup)
         if setup:
+            from starcal_ros.pipeline.campaign import source_of  # a tenth of the start
+
+            source = source_of(paths, setup, asked)
+            chosen, setup, notes = source.topics, source.setup, source.notes
             found = bag_topics.read(paths, chosen, setup)
-        elif chosen.observations:
+        elif (chosen := bag_topics.choose_topics(paths, asked)).observations:
             found = reader.read_observations(paths, chosen.observations)
         else:
             found = placed(paths, chosen, options)
         for observations in found:
             seen.append(observations)
             on_image()
-    except BagError as error:
+    except (BagError, OptionError) as error:
         problems.append(str(error))
     used = [observations for observations in seen if not observations.refusal]
     measured = setup is not None or bool(chosen and chosen.observations)
     status = None
     if setup and chosen:
-        from starcal_ros.pipeline import solve  # a tenth of the start
+        from starcal_ros.pipeline import solve
 
         status = solve.ensemble_status(solve.ensemble_of(seen, setup), setup)
     if chosen and not problems:
         problems += _shortages(used, status)
+    if chosen and seen and not used:
+        problems += _causes(paths, chosen, setup, refusals(seen))
     return Inspection(
         bags=tuple(map(str, paths)),
         topics=topics,
@@ -161,6 +169,7 @@ def inspect(
         status=status,
         damage=tuple(damage),
         problems=tuple(problems),
+        notes=notes,
     )
 
 
@@ -254,6 +263,19 @@ def refusals(seen: Iterable[StarObservations]) -> tuple[Refused, ...]:
         )
         for reason, group in sorted(groups.items(), key=lambda item: -len(item[1]))
     )
+
+
+def _causes(
+    paths: Sequence[Path], chosen: Topics, setup: Setup | None, refused: Sequence[Refused]
+) -> list[str]:
+    """The cause for which all images are refused, in a sentence."""
+    from starcal_ros.pipeline.diagnosis import bags  # seldom needed, slow
+
+    if setup and not chosen.observations:
+        cause = bags.of_a_failure(paths, chosen, setup, refused)
+    else:
+        cause = bags.of_refusals(refused, sum(group.count for group in refused))
+    return [cause.in_a_sentence()] if cause else []
 
 
 def _shortages(used: Sequence[StarObservations], status: EnsembleStatus | None) -> list[str]:

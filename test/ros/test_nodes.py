@@ -143,6 +143,34 @@ def test_nodes_and_tool_give_the_same_calibration(
     assert dict(live.provenance) == ours
 
 
+def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool(
+    client: Client, start_node: StartNode, tmp_path: Path
+) -> None:
+    """The observer measures the images that matched no star again with the first calibration."""
+    bag, out = tmp_path / 'bag', tmp_path / 'out'
+    wrong = ('--seed', '7', '--alignment-error', '1.0', '--focal-error', '6')
+    assert main(['simulate', '--scenario', 'tiny', *wrong, '-o', str(bag)]) == 0
+    given = ('--params', str(bag / 'params.yaml'), '--no-report')
+    assert main(['calibrate', str(bag), *given, '-o', str(out)]) == 0
+    for name in BOTH:
+        start_node(name, ros=(*parameters(bag), *REMAPS))
+    client.until_listened()
+    play(start_node, bag)
+    status = client.latched(EnsembleStatus, 'ensemble_status')
+    found = client.latched(Calibration, 'calibration')
+    for images in (8, 10):
+        client.until(lambda images=images: status and status[-1].images == images)
+        answer = client.call(Trigger, '/calibrator/calibrate')
+        assert answer.success, answer.message
+        client.until(lambda images=images: found and found[-1].images_used == images)
+    live = calibration_from_message(found[-1])
+    offline = read_calibration(out / CALIBRATION_FILE)
+    off = live.geometry.camera.parameters - offline.geometry.camera.parameters
+    # The order of the images differs: sums round differently.
+    assert np.abs(off / offline.sigma[:-3]).max() < 1e-4
+    np.testing.assert_allclose(live.sigma, offline.sigma, rtol=1e-4)
+
+
 @pytest.fixture
 def calibrated(
     client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path

@@ -15,13 +15,11 @@ import sys
 import tempfile
 import threading
 
-from starcal_ros.assessment import comparison
-from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.cli import output
-from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_REFUSED, is_interrupt
-from starcal_ros.cli.commands.selection import Selection, selection
+from starcal_ros.cli.arguments import complain, EXIT_ACCEPTED, EXIT_REFUSED, is_interrupt, Time
 from starcal_ros.cli.output import check_folder
-from starcal_ros.cli.terminal import print_text, with_progress
+from starcal_ros.cli.terminal import print_text, progress_bar
+from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import (
     missing_package,
     NotFromStars,
@@ -38,115 +36,61 @@ from starcal_ros.formats.products.product_folder import (
     write_observations,
     write_products,
 )
-from starcal_ros.pipeline import inspect, solve
-from starcal_ros.pipeline import topics as bag_topics
+from starcal_ros.pipeline import campaign, inspect
 from starcal_ros.pipeline.provenance import inputs_of, software_version
-from starcal_ros.pipeline.setup import files_of, read_setup, read_values, Setup
-from starcal_ros.pipeline.topics import measured_again, Topics, Wanted, without_attitudes
-from starcal_ros.records import Calibration, CameraGeometry, Image, StarObservations
+from starcal_ros.pipeline.setup import files_of, read_setup, read_values
+from starcal_ros.pipeline.topics import Topics, without_attitudes
+from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.report.pictures import thumbnails
 
-HALVES = ('odd', 'even')
-ThroughAir = Callable[[Sequence[StarObservations]], tuple[list[StarObservations], str]]
 
-
-@dataclass(frozen=True)
-class Job:
+@dataclass
+class Selection:
     """
-    Bags to calibrate from, and the folder for the products.
+    Selection of the images between two times, both included, queried in the order of the bag.
 
-    ``inputs`` gives the digests of the input files; ``through_air`` gives the observations as they
-    are solved, and what was found in words, where the attitudes are those of the stars.
+    None: from the first image, to the last one.
     """
 
-    folder: Path
-    bags: Sequence[Path]
-    asked: Topics
-    setup: Setup
-    inputs: Callable[[], Mapping[str, str]]
-    through_air: ThroughAir | None = None
+    start: Time | None
+    end: Time | None
+    _first_ns: int | None = None
+    _last_ns: int = 0
+
+    def __call__(self, time_ns: int) -> bool:
+        """True if the image of a stamp is taken."""
+        if self._first_ns is None:
+            self._first_ns = time_ns
+        self._last_ns = max(self._last_ns, time_ns)
+        is_before = self.start is not None and time_ns < self._ns(self.start)
+        return not (is_before or (self.end is not None and time_ns > self._ns(self.end)))
+
+    def without_images(self) -> str:
+        """Error message for a selection without images."""
+        if self._first_ns is None:
+            return '--from, --to: the bag has no images'
+        first, last = (utc_text(time_ns) for time_ns in (self._first_ns, self._last_ns))
+        return (
+            f'--from, --to: no image is between these times: the images span {first} to {last},'
+            f' +0 to +{(self._last_ns - self._first_ns) / NANOSECONDS_PER_SECOND:g} s'
+        )
+
+    def _ns(self, time: Time) -> int:
+        origin_ns = (self._first_ns or 0) if time.since_first_image else 0
+        return origin_ns + round(time.seconds * NANOSECONDS_PER_SECOND)
 
 
 def calibrate(args: argparse.Namespace, asked: Topics) -> int:
     """Calibrate from bags in one process, as the two nodes do on the graph, or from images."""
-    from starcal_ros.formats.images.photographs import image_paths
-
-    photographs = image_paths(args.bags)
-    if not photographs and any(glob.has_magic(str(path)) for path in args.bags):
-        raise OptionError(f'{args.bags[0]}: no such files')
-    if photographs or without_attitudes(args.bags, asked):
-        return _calibrate_by_stars(args, asked, photographs)
-    if args.params is None:
-        raise OptionError('--params: needed for a bag with attitudes')
-    setup = read_setup(args.params)
-    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames).values()))
-    files = (*reader.mcap_files(args.bags), args.params)
-    found = ''
-    try:
-        if not setup.is_aligned:
-            from starcal_ros.pipeline.diagnosis.bags import (
-                aligned_by_bags,  # seldom needed, slow to load
-            )
-
-            setup, found = aligned_by_bags(args.bags, asked, setup)
-    except OptionError as error:
-        make_folder(args.output)
-        _write_failure(args.output, NotCalibrated(str(error), tuple(map(str, args.bags)), {}))
-        raise
-    if found:
-        print_text(found, file=sys.stderr)
-    return _calibrate(args, asked, setup, args.bags, files)
-
-
-def _calibrate_by_stars(args: argparse.Namespace, asked: Topics, photographs: list[Path]) -> int:
-    """Calibrate from photographs or bags whose attitudes are those of their stars."""
-    from starcal_ros.pipeline import night_sky  # seldom needed, slow to load
-
-    bags = [] if photographs else args.bags
-    check_folder(args.output, bags, (*photographs, *filter(None, [args.params])))
-    values = read_values(args.params) if args.params else {}
-    make_folder(args.output)
-    with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
-        try:
-            if photographs:
-                chosen, notes = night_sky.photographs_of(
-                    photographs, args.focal_length_mm, args.pixel_size_um
-                )
-                for note in notes:
-                    print_text(note, file=sys.stderr)
-                found = night_sky.from_photographs(chosen, values, Path(folder))
-            else:
-                found = night_sky.from_bags(bags, asked, values, Path(folder))
-        except NotFromStars as error:
-            _write_failure(args.output, NotCalibrated(str(error), tuple(map(str, args.bags)), {}))
-            raise
-        for note in found.notes:
-            print_text(note, file=sys.stderr)
-        files = [*(photographs or reader.mcap_files(bags)), *filter(None, [args.params])]
-        return _calibrate(args, asked, found.setup, found.bags, files, found.through_air)
-
-
-def _calibrate(
-    args: argparse.Namespace,
-    asked: Topics,
-    setup: Setup,
-    bags: Sequence[Path],
-    files: Sequence[Path],
-    through_air: ThroughAir | None = None,
-) -> int:
-    """Calibrate with a set-up, write the products and print the result."""
-    wanted = selection(args.from_time, args.to_time, args.first, args.every)
-    if args.output.exists() and not args.output.is_dir():
-        raise OptionError(f'{args.output}: not a folder')
-    with ThreadPoolExecutor(1, 'digests') as thread:
-        # While the images are read; an error or Ctrl-C ends it at once.
-        stopped = threading.Event()
-        inputs = thread.submit(inputs_of, files, stopped.is_set)
-        try:
-            job = Job(args.output, bags, asked, setup, inputs.result, through_air)
-            calibration, observations, report = calibrate_into(job, wanted, not args.no_report)
-        finally:
-            stopped.set()
+    with _source(args, asked) as (source, files), _digests(files) as inputs:
+        if args.output.exists() and not args.output.is_dir():
+            raise OptionError(f'{args.output}: not a folder')
+        _tell(source.notes)
+        wanted = None
+        if args.from_time or args.to_time:
+            wanted = Selection(args.from_time, args.to_time)
+        made, report = calibrate_into(args.output, source, inputs, wanted, not args.no_report)
+    calibration, setup = made.calibration, made.setup
     output.print_calibration(calibration, setup.prior)
     if calibration.has_alignment and not tracker_sigma_is_given(setup.calibration):
         sigma = ', '.join(f'{arcsec:.1f}' for arcsec in calibration.star_tracker_sigma_arcsec)
@@ -155,60 +99,123 @@ def _calibrate(
             ' is not given'
         )
     print_text(f'products written to {args.output}' + (f'; {report}' if report else ''))
-    if args.split_half:
-        _split(args.output, observations, setup, inputs.result())
     return EXIT_ACCEPTED if calibration.accepted else EXIT_REFUSED
 
 
-def calibrate_into(
-    job: Job, wanted: Wanted | None = None, with_report: bool = False
-) -> tuple[Calibration, list[StarObservations], str]:
-    """
-    Calibrate from bags and write the products, with or without a report.
+@contextlib.contextmanager
+def _source(
+    args: argparse.Namespace, asked: Topics
+) -> Iterator[tuple[campaign.Source, Sequence[Path]]]:
+    """The source that the arguments name, and its files; that of images lasts for the block."""
+    from starcal_ros.formats.images.photographs import image_paths
 
-    Also returns the observations and where the report is, or why there is none.
+    photographs = image_paths(args.bags)
+    if not photographs and any(glob.has_magic(str(path)) for path in args.bags):
+        raise OptionError(f'{args.bags[0]}: no such files')
+    if photographs or without_attitudes(args.bags, asked):
+        with tempfile.TemporaryDirectory(prefix='starcal_') as folder:
+            yield _source_by_stars(args, asked, photographs, Path(folder))
+        return
+    if args.params is None:
+        raise OptionError('--params: needed for a bag with attitudes')
+    setup = read_setup(args.params)
+    check_folder(args.output, args.bags, (args.params, *files_of(setup.frames).values()))
+    with _failure_recorded(args, OptionError):
+        source = campaign.source_of(args.bags, setup, asked)
+    yield source, (*reader.mcap_files(args.bags), args.params)
+
+
+def _source_by_stars(
+    args: argparse.Namespace, asked: Topics, photographs: list[Path], folder: Path
+) -> tuple[campaign.Source, Sequence[Path]]:
+    """Photographs, or bags without attitudes: those of their stars are written to a folder."""
+    from starcal_ros.pipeline import night_sky  # seldom needed, slow to load
+
+    bags = [] if photographs else args.bags
+    params = list(filter(None, [args.params]))
+    check_folder(args.output, bags, (*photographs, *params))
+    values = read_values(args.params) if args.params else {}
+    make_folder(args.output)
+    with _failure_recorded(args, NotFromStars):
+        if photographs:
+            chosen, notes = night_sky.photographs_of(
+                photographs, args.focal_length_mm, args.pixel_size_um
+            )
+            _tell(notes)
+            sky = night_sky.from_photographs(chosen, values, folder)
+        else:
+            sky = night_sky.from_bags(bags, asked, values, folder)
+    _tell(sky.notes)
+    source = campaign.source_of(sky.bags, sky.setup, asked, sky.through_air)
+    return source, (*(photographs or reader.mcap_files(bags)), *params)
+
+
+@contextlib.contextmanager
+def _failure_recorded(args: argparse.Namespace, kind: type[StarcalError]) -> Iterator[None]:
+    """Write an error of a kind that ends the block to the folder as well."""
+    try:
+        yield
+    except kind as error:
+        make_folder(args.output)
+        _write_failure(args.output, NotCalibrated(str(error), tuple(map(str, args.bags)), {}))
+        raise
+
+
+@contextlib.contextmanager
+def _digests(files: Sequence[Path]) -> Iterator[Callable[[], Mapping[str, str]]]:
+    """Digests of input files, which are read during the block; its end stops that at once."""
+    with ThreadPoolExecutor(1, 'digests') as thread:
+        stopped = threading.Event()
+        try:
+            yield thread.submit(inputs_of, files, stopped.is_set).result
+        finally:
+            stopped.set()
+
+
+def _tell(notes: Sequence[str]) -> None:
+    for note in notes:
+        print_text(note, file=sys.stderr)
+
+
+def calibrate_into(
+    folder: Path,
+    source: campaign.Source,
+    inputs: Callable[[], Mapping[str, str]],
+    wanted: Selection | None = None,
+    with_report: bool = False,
+) -> tuple[campaign.Campaign, str]:
     """
-    folder, bags, setup = job.folder, job.bags, job.setup
-    topics = bag_topics.choose_topics(bags, job.asked, setup)
-    count = bag_topics.count(bags, topics)
-    album, drawings = thumbnails.Album(count, setup), Drawings()
+    Calibrate and write the products, with or without a report.
+
+    Also returns where the report is, or why there is none.
+    """
+    album, drawings = thumbnails.Album(source.image_count, source.setup), Drawings()
 
     def show(image: Image, observed: StarObservations, geometry: CameraGeometry) -> None:
         with drawings.kind('pictures of images'):
             album.show(image, observed, geometry)
 
-    records = bag_topics.read(bags, topics, setup, show, wanted)
-    observations = list(with_progress(records, count, 'images'))
-    if not observations and isinstance(wanted, Selection):
+    with progress_bar(source.image_count, 'images') as advance:
+        observed = campaign.observe(source, wanted, show, advance)
+    if wanted is not None and not observed.observations:
         raise OptionError(wanted.without_images())
-    if job.through_air is not None:
-        observations, text = job.through_air(observations)
-        if text:
-            print_text(text, file=sys.stderr)
-    # Each image was identified by itself: what matched nothing does not by the others either.
-    again = topics if job.through_air is None else Topics()
     make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
-    write_observations(observations, folder, setup.frames.camera_frame)
+    write_observations(observed.observations, folder, source.setup.frames.camera_frame)
     with ThreadPoolExecutor(1, 'pictures') as thread:
         drawn = thread.submit(album.thumbnails)
         if with_report:
             thread.submit(_load_report)
-        try:
-            calibration, left, observations = _solve_twice(job, again, observations)
-        except TooFewObservations as error:
-            failure = _failure(str(error), job, observations, bool(topics.image))
-            _write_failure(folder, failure, album.unmatched)
-            raise TooFewObservations(failure.reason) from error
+        made = _calibrated(folder, observed, inputs(), album)
         pictures: Sequence[thumbnails.Thumbnail] = ()
         with drawings.kind('pictures of images'):
             pictures = drawn.result()
-        written = thread.submit(_write_all, calibration, left, pictures, folder)
+        written = thread.submit(_write_all, made, pictures, folder)
         page, report = '', ''
         try:
             if with_report:
                 with drawings.kind('report'):
-                    page, report = _drawn(calibration, left, observations, pictures, folder)
+                    page, report = _drawn(made, pictures, folder)
         finally:
             written.result()
             if not page:  # one that is there is of the products that were replaced
@@ -218,7 +225,26 @@ def calibrate_into(
 
         # After the products that it is of.
         write_atomically(folder / REPORT_FILE, with_digests(page, folder))
-    return calibration, observations, report
+    return made, report
+
+
+def _calibrated(
+    folder: Path,
+    observed: campaign.Observed,
+    inputs: Mapping[str, str],
+    album: thumbnails.Album,
+) -> campaign.Campaign:
+    """The calibration of observed images; a failure is recorded in the folder."""
+    try:
+        made = campaign.calibrate(observed, inputs)
+    except TooFewObservations as error:
+        failure = _failure(str(error), observed)
+        _write_failure(folder, failure, album.unmatched)
+        raise TooFewObservations(failure.reason) from error
+    _tell(made.notes[len(observed.source.notes) :])
+    if made.observations is not observed.observations:
+        write_observations(made.observations, folder, made.setup.frames.camera_frame)
+    return made
 
 
 def _load_report() -> None:
@@ -230,101 +256,45 @@ def _load_report() -> None:
 
 
 def _write_all(
-    calibration: Calibration,
-    left: Residuals,
-    pictures: Sequence[thumbnails.Thumbnail],
-    folder: Path,
+    made: campaign.Campaign, pictures: Sequence[thumbnails.Thumbnail], folder: Path
 ) -> None:
     thumbnails.write_thumbnails(pictures, folder / thumbnails.THUMBNAILS_FOLDER)
-    write_products(calibration, folder, left)
+    write_products(made.calibration, folder, made.residuals)
 
 
 def _drawn(
-    calibration: Calibration,
-    left: Residuals,
-    observations: Sequence[StarObservations],
-    pictures: Sequence[thumbnails.Thumbnail],
-    folder: Path,
+    made: campaign.Campaign, pictures: Sequence[thumbnails.Thumbnail], folder: Path
 ) -> tuple[str, str]:
     """The report of what is being written, and where it will be; or why there is none."""
     try:
         from starcal_ros.report import page
     except ModuleNotFoundError as error:
         return '', f'no report: {missing_package(error, "report")}'
-    found = page.Found(calibration, left, tuple(observations), thumbnails.ordered(pictures))
-    return page.render(found, folder), f'look at {folder / REPORT_FILE}'
+    ordered = thumbnails.ordered(pictures)
+    content = page.Found(made.calibration, made.residuals, made.observations, ordered)
+    return page.render(content, folder), f'look at {folder / REPORT_FILE}'
 
 
-def _solve_twice(
-    job: Job, topics: Topics, observations: list[StarObservations]
-) -> tuple[Calibration, Residuals, list[StarObservations]]:
-    """Solve, and once more if that calibration identifies stars in images that matched nothing."""
-    calibration, left = _solve(observations, job.setup, job.inputs())
-    if not (calibration.accepted and topics.image):
-        return calibration, left, observations
-    again = measured_again(job.bags, topics, job.setup, calibration.geometry, observations)
-    gained = _used(again) - _used(observations)
-    if not gained:
-        return calibration, left, observations
-    print_text(
-        f'{gained} images matched nothing at first, and are used with the calibration of the'
-        ' others',
-        file=sys.stderr,
-    )
-    write_observations(again, job.folder, job.setup.frames.camera_frame)
-    return *_solve(again, job.setup, job.inputs()), again
-
-
-def _solve(
-    observations: Sequence[StarObservations], setup: Setup, inputs: Mapping[str, str]
-) -> tuple[Calibration, Residuals]:
-    ensemble = solve.ensemble_of(observations, setup)
-    return solve.solve_with_residuals(ensemble, setup, inputs=inputs)
-
-
-def _used(observations: Sequence[StarObservations]) -> int:
-    return sum(not record.refusal for record in observations)
-
-
-def _split(
-    folder: Path, observations: Sequence[StarObservations], setup: Setup, inputs: Mapping[str, str]
-) -> None:
-    """Calibrate each half of the images into a folder of its own, and print their comparison."""
-    used = [record for record in observations if not record.refusal]
-    made = []
-    for k, name in enumerate(HALVES):
-        half = folder / name
-        make_folder(half)
-        write_observations(used[k::2], half, setup.frames.camera_frame)
-        calibration, left = _solve(used[k::2], setup, inputs)
-        write_products(calibration, half, left)
-        made.append(calibration)
-    print_text(
-        f'\nimages of odd (A) and of even (B) number, in {folder / "odd"} and {folder / "even"}'
-    )
-    output.print_comparison(comparison.compare(*made))
-
-
-def _failure(
-    words: str, job: Job, observations: Sequence[StarObservations], has_images: bool
-) -> NotCalibrated:
+def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
     """The record of a failure, with the cause for which most images are refused."""
     from starcal_ros.pipeline.diagnosis.bags import of_a_failure, of_refusals
 
-    groups = inspect.refusals(observations)
+    source, count = observed.source, len(observed.observations)
+    groups = inspect.refusals(observed.observations)
     refused = {group.reason: group.count for group in groups}
-    if observations and not _used(observations):
-        words = f'no image of {len(observations)} can be used'
+    is_none_used = sum(refused.values()) == count
+    if count and is_none_used:
+        words = f'no image of {count} can be used'
     if refused:
         words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
-    named = tuple(map(str, job.bags))
-    found = of_refusals(groups, len(observations))
-    if has_images and not _used(observations):
-        found = of_a_failure(job.bags, job.asked, job.setup, groups)
-    if found is None:
+    named = tuple(map(str, source.bags))
+    cause = of_refusals(groups, count)
+    if source.topics.image and is_none_used:
+        cause = of_a_failure(source.bags, source.topics, source.setup, groups)
+    if cause is None:
         return NotCalibrated(words, named, refused)
-    words += f'. {found.in_a_sentence()}'
-    return NotCalibrated(words, named, refused, found.cause, found.evidence, found.mend)
+    words += f'. {cause.in_a_sentence()}'
+    return NotCalibrated(words, named, refused, cause.cause, cause.evidence, cause.mend)
 
 
 def _write_failure(

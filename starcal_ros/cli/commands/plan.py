@@ -8,14 +8,14 @@ import csv
 import io
 import json
 from pathlib import Path
+import sys
 
 from starcal_ros.cli.arguments import EXIT_ACCEPTED
 from starcal_ros.cli.output import check_no_product
 from starcal_ros.cli.terminal import print_table, print_text
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.pipeline import solve
-from starcal_ros.pipeline import topics as bag_topics
+from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.plan import Cone, Plan, plan_pointings, Pointing, Request
 from starcal_ros.pipeline.setup import files_of, read_setup
 from starcal_ros.pipeline.topics import Topics
@@ -38,8 +38,10 @@ def plan(args: argparse.Namespace, asked: Topics) -> int:
         tuple(Cone(*one) for one in args.avoid),
         args.slew,
     )
-    images = bag_topics.read(args.bags, bag_topics.choose_topics(args.bags, asked, setup), setup)
-    found = plan_pointings(solve.ensemble_of(images, setup), setup, request)
+    campaign = calibrate_bags(args.bags, setup, asked)
+    for note in campaign.notes:
+        print_text(note, file=sys.stderr)
+    found = plan_pointings(campaign.ensemble, campaign.setup, request)
     if args.output:
         write_atomically(args.output, _csv(found))
     if args.json:

@@ -15,7 +15,6 @@ import socket
 
 import numpy as np
 
-from starcal_ros.assessment.residuals import Residuals
 from starcal_ros.errors import ProductError, StarcalError
 from starcal_ros.formats.bag import reader
 from starcal_ros.formats.messages.message_fields import OBSERVATIONS_TYPE
@@ -32,9 +31,10 @@ from starcal_ros.mission.trend.rows import (
     START,
 )
 from starcal_ros.mission.trend.tasks import digest, KEPT_FOLDER, Task
-from starcal_ros.pipeline import solve, topics
+from starcal_ros.pipeline.campaign import calibrate_bags
 from starcal_ros.pipeline.provenance import software_version
 from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
+from starcal_ros.pipeline.topics import Topics
 from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.untrusted import json_value, METADATA_BYTES, read_text, yaml_value
 
@@ -94,7 +94,9 @@ def _answer(task: Task, path: Path) -> Row | Seen:
         if not task.is_bag:
             made, temperature = _recorded(path)
             return _of_task(row_of(made, key, task.url, RECORDED, temperature), task)
-        made, left, records = _calibrated(task, path)
+        setup = read_setup(Path(task.params)) if task.params else _setup_beside(path)
+        campaign = calibrate_bags([path], setup, Topics())
+        made, records = campaign.calibration, campaign.observations
         row = row_of(made, key, task.url, COMPUTED, _mean_temperature(records))
         row = _of_task(row, task, path)
         products = {calibration_json.CALIBRATION_FILE: calibration_json.calibration_text(made)}
@@ -102,7 +104,7 @@ def _answer(task: Task, path: Path) -> Row | Seen:
             from starcal_ros.report import page  # seldom needed, slow to load
 
             # Pictures of images would be most of its bytes.
-            contents = page.Found(made, left, tuple(records), (), ())
+            contents = page.Found(made, campaign.residuals, records, (), ())
             products[REPORT_FILE] = page.render(contents, Path(task.url))
         return _kept(row, products, task) if task.table else row
     except (StarcalError, ValueError) as error:
@@ -154,15 +156,6 @@ def _recorded(path: Path) -> tuple[Calibration, float]:
     """A recorded calibration and its mean temperature."""
     temperature = _temperature(path.with_name(OBSERVATIONS_FILE))
     return calibration_json.read_calibration(path), temperature
-
-
-def _calibrated(task: Task, path: Path) -> tuple[Calibration, Residuals, list[StarObservations]]:
-    """The calibration of a bag, its residuals and its observations."""
-    setup = read_setup(Path(task.params)) if task.params else _setup_beside(path)
-    chosen = topics.choose_topics([path], topics.Topics(), setup)
-    records = list(topics.read([path], chosen, setup))
-    ensemble = solve.ensemble_of(records, setup)
-    return *solve.solve_with_residuals(ensemble, setup), records
 
 
 def _setup_beside(bag: Path) -> Setup:

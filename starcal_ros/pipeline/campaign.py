@@ -1,0 +1,157 @@
+# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
+"""
+The recipe from bags to a calibration, which every program that reads bags follows.
+
+`source_of` chooses the topics and finds the alignment where no prior one is given, `observe`
+measures the stars, and `calibrate` solves.  If it is accepted, images that matched no star are
+measured again with that calibration, and a second solution includes those that match now.  The
+nodes take the same steps by `observe` and `solve`; of the images that match no star they keep the
+last few only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from starcal_ros.assessment.residuals import Residuals
+from starcal_ros.pipeline import solve
+from starcal_ros.pipeline import topics as bag_topics
+from starcal_ros.pipeline.setup import Setup
+from starcal_ros.pipeline.topics import OnImage, Topics, Wanted
+from starcal_ros.records import Calibration, Ensemble, StarObservations
+
+ThroughAir = Callable[[Sequence[StarObservations]], tuple[list[StarObservations], str]]
+"""Observations with the refraction that they show, and a sentence on it or an empty one."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """
+    Bags, the topics read from them, and the setup with the prior alignment.
+
+    ``through_air`` is given where the attitudes are those of the stars, each image identified by
+    itself; ``notes`` are sentences for the user.
+    """
+
+    bags: tuple[Path, ...]
+    topics: Topics
+    setup: Setup
+    through_air: ThroughAir | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def image_count(self) -> int:
+        """Number of images, or of recorded observations."""
+        return bag_topics.count(self.bags, self.topics)
+
+
+@dataclass(frozen=True)
+class Observed:
+    """A source with the observations of its images, refused ones too, and notes so far."""
+
+    source: Source
+    observations: tuple[StarObservations, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """
+    A calibration with its residuals and what it was made from.
+
+    ``observations`` are of all images, with those that were measured again; ``ensemble`` has those
+    that were used.  ``notes`` are sentences for the user, those of the source first.
+    """
+
+    setup: Setup
+    observations: tuple[StarObservations, ...]
+    ensemble: Ensemble
+    calibration: Calibration
+    residuals: Residuals
+    notes: tuple[str, ...]
+
+
+def source_of(
+    bags: Sequence[Path], setup: Setup, asked: Topics, through_air: ThroughAir | None = None
+) -> Source:
+    """
+    Topics of bags to calibrate from, and a setup with an alignment.
+
+    The alignment is found from the images where the setup has none; recorded observations need
+    none, since their stars are identified.  Raises BagError when a bag cannot be read, a topic is
+    missing or several have its type.  Raises OptionError when no alignment is found.
+    """
+    topics = bag_topics.choose_topics(bags, asked, setup)
+    notes: tuple[str, ...] = ()
+    if not (setup.is_aligned or topics.observations):
+        from starcal_ros.pipeline.diagnosis.bags import aligned_by_bags  # seldom needed, slow
+
+        setup, sentence = aligned_by_bags(bags, asked, setup)
+        notes = (sentence,)
+    return Source(tuple(bags), topics, setup, through_air, notes)
+
+
+def observe(
+    source: Source,
+    wanted: Wanted | None = None,
+    on_image: OnImage | None = None,
+    on_record: Callable[[], None] = lambda: None,
+) -> Observed:
+    """
+    Observations of the wanted images of a source; None: of all.
+
+    ``on_image`` is called with each decoded image, its observations and the geometry that
+    predicted its stars, ``on_record`` for each image or recorded observation.  Raises BagError
+    when a bag cannot be read.
+    """
+    observations, notes = [], source.notes
+    for record in bag_topics.read(source.bags, source.topics, source.setup, on_image, wanted):
+        observations.append(record)
+        on_record()
+    if source.through_air is not None:
+        observations, note = source.through_air(observations)
+        notes = (*notes, note) if note else notes
+    return Observed(source, tuple(observations), notes)
+
+
+def calibrate(observed: Observed, inputs: Mapping[str, str] | None = None) -> Campaign:
+    """
+    Calibration of observed bags; ``inputs`` are the digests of the input files by name.
+
+    Raises TooFewObservations when the images do not determine the parameters to be estimated.
+    """
+    campaign = _solved(observed, inputs)
+    source, before = observed.source, observed.observations
+    # An image identified by itself is not identified by the calibration of the others either.
+    if not campaign.calibration.accepted or source.through_air is not None:
+        return campaign
+    geometry = campaign.calibration.geometry
+    again = bag_topics.measured_again(source.bags, source.topics, source.setup, geometry, before)
+    gained = sum(new is not old for new, old in zip(again, before, strict=True))
+    if not gained:
+        return campaign
+    note = (
+        f'{gained} images matched nothing at first, and are used with the calibration of the'
+        ' others'
+    )
+    return _solved(Observed(source, tuple(again), (*observed.notes, note)), inputs)
+
+
+def _solved(observed: Observed, inputs: Mapping[str, str] | None) -> Campaign:
+    setup = observed.source.setup
+    ensemble = solve.ensemble_of(observed.observations, setup)
+    calibration, residuals = solve.solve_with_residuals(ensemble, setup, inputs=inputs)
+    return Campaign(setup, observed.observations, ensemble, calibration, residuals, observed.notes)
+
+
+def calibrate_bags(
+    bags: Sequence[Path],
+    setup: Setup,
+    asked: Topics,
+    inputs: Mapping[str, str] | None = None,
+    through_air: ThroughAir | None = None,
+) -> Campaign:
+    """Calibration of bags by `source_of`, `observe` and `calibrate`, with their errors."""
+    return calibrate(observe(source_of(bags, setup, asked, through_air)), inputs)
