@@ -21,12 +21,9 @@ from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import EnsembleStatus as StatusMessage
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal.srv import Calibrate, LineOfSightTable
-from starcal.srv import Plan as PlanService
 from starcal_ros.assessment.lookup import line_of_sight_table
-from starcal_ros.assessment.plan import LINE_OF_SIGHT
 from starcal_ros.camera import pixel_grid
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.messages.calibration_messages import (
     alignment_to_message,
     calibration_to_message,
@@ -39,8 +36,6 @@ from starcal_ros.formats.messages.message_fields import make_header
 from starcal_ros.formats.messages.observation_messages import checked_observations
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import CalibratorOptions
-from starcal_ros.pipeline.plan import Cone, plan_pointings, Pointing
-from starcal_ros.pipeline.plan import Request as PlanRequest
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import IMAGE_REFUSALS
 from starcal_ros.ros.kept.report_queue import ACTIVE, CalibratorReports, CANDIDATE
@@ -90,7 +85,6 @@ class Calibrator(StarcalNode):
             (Trigger, '~/reset', self._on_reset, deciding),
             (Trigger, '~/rollback', self._on_rollback, deciding),
             (LineOfSightTable, '~/lookup', self._on_lookup, sending),
-            (PlanService, '~/plan', self._on_plan, solving),
             (Trigger, '~/send_camera_info', self._on_send_camera_info, sending),
         ):
             self.create_service(kind, name, self._answered(answer), callback_group=group)
@@ -310,32 +304,6 @@ class Calibrator(StarcalNode):
             response.message = f'{len(pixels)} lines of sight of calibration {active.number}'
         return response
 
-    def _on_plan(self, request: Any, response: Any) -> Any:
-        response.success = False
-        try:
-            allowed = _rows('pointings', request.ra_deg, request.dec_deg, request.roll_deg)
-            avoid = (request.avoid_ra_deg, request.avoid_dec_deg, request.avoid_radius_deg)
-            wanted = PlanRequest(
-                images=request.images or 10,
-                minimise=request.minimise or LINE_OF_SIGHT,
-                pointings=tuple(Pointing(*row) for row in allowed),
-                avoid=tuple(Cone(*row) for row in _rows('avoid', *avoid)),
-                largest_slew_deg=request.largest_slew_deg or 180.0,
-            )
-            found = plan_pointings(self._state.ensemble, self._setup, wanted)
-        except StarcalError as error:
-            response.message = str(error)
-            return response
-        places = [step.pointing for step in found.steps]
-        for name in ('ra_deg', 'dec_deg', 'roll_deg'):
-            setattr(response, name, array.array('d', [getattr(one, name) for one in places]))
-        response.stars = [step.stars for step in found.steps]
-        response.sigma = [step.sigma for step in found.steps]
-        response.sigma_name, response.sigma_now = found.name, found.sigma
-        response.enough = -1 if found.enough is None else found.enough
-        response.success, response.message = True, found.in_a_sentence()
-        return response
-
     def _on_send_camera_info(self, _request: Any, response: Any) -> Any:
         driver = self._driver
         if driver is None:
@@ -418,12 +386,6 @@ class Calibrator(StarcalNode):
             return response
 
         return run_and_tell
-
-
-def _rows(name: str, *columns: Sequence[float]) -> list[tuple[float, ...]]:
-    if len(set(map(len, columns))) > 1:
-        raise OptionError(f'{name}: the columns are not of one length')
-    return list(zip(*columns, strict=True))
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -39,7 +39,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, Temperature
 from std_srvs.srv import Trigger
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
-from starcal.srv import Calibrate, LineOfSightTable, Plan
+from starcal.srv import Calibrate, LineOfSightTable
 from starcal_ros.assessment.lookup import COLUMNS
 from starcal_ros.cli.main import main
 from starcal_ros.formats.bag import reader
@@ -205,23 +205,6 @@ def test_the_table_of_lines_of_sight_is_that_of_the_tool(
     for points in (1, 201, 2**32 - 1):
         refused = client.call(LineOfSightTable, '/calibrator/lookup', points=points)
         assert not refused.success and f'points: {points}' in refused.message
-
-
-def test_the_pointings_to_take_next(client: Client, calibrated: list[Any]) -> None:
-    allowed = {'ra_deg': [10.0, 100.0, 200.0], 'dec_deg': [40.0, -20.0, 50.0]}
-    rolls = {'roll_deg': [0.0, 30.0, 60.0]}
-    answer = client.call(Plan, '/calibrator/plan', images=2, minimise='map', **allowed, **rolls)
-    assert answer.success and answer.message.endswith('expected after 2 images'), answer.message
-    assert answer.sigma_name == 'map_arcsec' and len(answer.sigma) == 2
-    assert answer.sigma_now > answer.sigma[1] > 0.0 and min(answer.stars) > 20
-    assert set(answer.ra_deg) < set(allowed['ra_deg']) and answer.enough == -1
-    for wrong, text in (
-        ({'minimise': 'k9'}, "'k9' is not estimated"),
-        ({'ra_deg': [1.0]}, 'pointings: the columns'),
-        ({'images': 2**32 - 1}, 'images: 4294967295'),
-    ):
-        refused = client.call(Plan, '/calibrator/plan', **wrong)
-        assert not refused.success and text in refused.message
 
 
 def test_reset_empties_the_ensemble(client: Client, calibrated: list[Any]) -> None:
