@@ -328,20 +328,6 @@ def _monitor(command: argparse.ArgumentParser) -> None:
     _remaps(command, 'read topic A of the nodes from B; may be repeated')
 
 
-def _request(command: argparse.ArgumentParser) -> None:
-    services = ('calibrate', 'solve', 'rollback', 'reset', 'lookup')
-    command.add_argument('service', choices=services, help='service of the calibrator')
-    command.add_argument('--dry-run', action='store_true', help='solve: activate nothing')
-    what = 'solve: activate the result despite the gate'
-    command.add_argument('--force', action='store_true', help=what)
-    what = 'file for the table of lookup (.csv, .npz, .fits)'
-    _output(command, 'FILE', what, required=False)
-    what = 'longest wait for the answer, s (default: 600)'
-    seconds = _number(float, 0.1, 86400)
-    command.add_argument('--timeout', type=seconds, default=600.0, metavar='S', help=what)
-    _remaps(command, 'rename A of the calibrator to B, e.g. __ns:=/cam1; may be repeated')
-
-
 def _seed(command: argparse.ArgumentParser, what: str) -> None:
     seed = _number(int, 0, 2**63 - 1)
     command.add_argument('--seed', type=seed, default=1, metavar='N', help=f'{what} (default: 1)')
@@ -544,7 +530,6 @@ _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     'lookup': _lookup,
     'play': _play,
     'monitor': _monitor,
-    'request': _request,
     'simulate': _simulate,
     'campaign': _campaign,
     'export': _export,

@@ -140,19 +140,6 @@ run, a roll-back or a reset.
   starcal monitor --remap __ns:=/cam1
   # one view after five seconds, for a log
   starcal monitor --once 5""",
-    'request': """\
-call a service of the running calibrator
-
-Requests a calibration (calibrate, or solve with other options), the previous calibration
-(rollback), an empty ensemble (reset) or a table of lines of sight (lookup), and prints the
-response. Exit status 3: the calibrator declined.
-
-  # calibrate from the images collected so far
-  starcal request calibrate
-  # the same without activating the result
-  starcal request solve --dry-run
-  # lines of sight of the active calibration, from a calibrator in a namespace
-  starcal request lookup -o sights.csv --remap __ns:=/cam1""",
     'simulate': """\
 render a bag with known truth
 
