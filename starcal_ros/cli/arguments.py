@@ -279,7 +279,7 @@ def _plan(command: argparse.ArgumentParser) -> None:
 
 
 def _report(command: argparse.ArgumentParser) -> None:
-    what = 'folder with the products of starcal calibrate'
+    what = 'folder with the products of starcal calibrate, or the state_dir of a calibrator'
     command.add_argument('folder', type=_path, metavar='DIR', help=what)
     command.add_argument(
         '--pdf', action='store_true', help='write report.pdf too, to print and sign'

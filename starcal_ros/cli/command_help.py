@@ -104,7 +104,9 @@ refused images and stars. The page needs no network. --pdf writes it as numbered
 for signatures (extra pdf).
 
   # from the files of an earlier calibration, with pages to sign
-  starcal report out --pdf""",
+  starcal report out --pdf
+  # of the last calibration of a calibrator, from its state_dir
+  starcal report state""",
     'lookup': """\
 write a table of lines of sight and their sigma by pixel
 

@@ -53,9 +53,6 @@ class CalibratorOptions:
         ' without a valid one are set aside; empty: checksums only, which detect damage but not'
         ' forgery',
     )
-    state_report: bool = option(
-        True, 'write reports of the active and the last refused calibration to state_dir'
-    )
     set_camera_info_service: str = option(
         '', 'sensor_msgs/SetCameraInfo service that receives each new calibration; empty: none'
     )

@@ -6,7 +6,6 @@ from __future__ import annotations
 import array
 from collections.abc import Sequence
 import contextlib
-from pathlib import Path
 import sys
 import threading
 from typing import Any
@@ -38,7 +37,6 @@ from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.node_options import CalibratorOptions
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import IMAGE_REFUSALS
-from starcal_ros.ros.kept.report_queue import ACTIVE, CalibratorReports, CANDIDATE
 from starcal_ros.ros.kept.state import Answer, CalibratorState
 from starcal_ros.ros.lifecycle_node.inputs import LATCHED
 from starcal_ros.ros.lifecycle_node.lifecycle import ERROR, Health, OK, StarcalNode, WARN
@@ -71,7 +69,6 @@ class Calibrator(StarcalNode):
         self._listeners: list[tuple[Any, Any]] = []
         self._publishing = threading.Lock()
         self._state = CalibratorState(self._now_ns)
-        self._reports = CalibratorReports(self.guarded(self._on_report))
         self._last_answer = Answer(True, '')
         self._last_gate = 'none'
         self._driver: CameraDriver | None = None
@@ -95,9 +92,6 @@ class Calibrator(StarcalNode):
         self._own = from_mapping(CalibratorOptions, values)
         self._setup = load_setup(values, self.options.classes)
         self._state.open(self._setup, self._own)
-        self._reports.open(
-            self._own.state_dir if self._own.state_report else '', self._setup.frames.camera_frame
-        )
         for text in (*self._state.damage, *self._state.withheld):
             self.get_logger().error(text)
         if self._state.withheld:
@@ -165,7 +159,6 @@ class Calibrator(StarcalNode):
             while self._made:
                 destroy, entity = self._made.pop()
                 destroy(entity)
-        self._reports.close()
         self._state.close()
 
     def health(self) -> Health:
@@ -212,8 +205,6 @@ class Calibrator(StarcalNode):
             return WARN, f'camera driver not updated: {driver.outcome}', numbers
         if not last.success:
             return WARN, last.message, numbers
-        if self._reports.trouble:
-            return WARN, f'no report: {self._reports.trouble}', numbers
         return OK, 'collecting' if active is None else 'calibration active', numbers
 
     def _foreign_transforms(self) -> str:
@@ -328,23 +319,15 @@ class Calibrator(StarcalNode):
         if not self.is_active:
             pass  # deactivated meanwhile: activation publishes the active calibration
         elif answer.calibration is not None and answer.active:
-            self._publish_active(answer)
+            self._publish_active()
         elif answer.calibration is not None and not answer.success:
             self._candidate.publish(calibration_to_message(answer.calibration, make_message))
-            self._reports.show(CANDIDATE, answer)
         self._last_answer = Answer(answer.success, answer.message)
         response.success, response.message = answer.success, answer.message
         return response
 
-    def _on_report(self, page: Path, trouble: str) -> None:
-        if trouble:
-            self.get_logger().warning(f'{page}: not made: {trouble}')
-        else:
-            self.get_logger().info(f'report: {page}')
-        self.publish_health_change()
-
-    def _publish_active(self, answer: Answer | None = None) -> None:
-        """Publish the active calibration, and its report where it is that of an answer."""
+    def _publish_active(self) -> None:
+        """Publish the active calibration."""
         # Two requests may activate one each: of all publishers the last is of the later one.
         with self._publishing:
             calibration = self._state.active_on_disk
@@ -361,8 +344,6 @@ class Calibrator(StarcalNode):
                 self._tf_static.publish(make_message(_TRANSFORMS, transforms=transforms))
             if self._driver is not None:
                 self._driver.hand_over(camera_info)
-            if answer is not None and answer.calibration is calibration:
-                self._reports.show(ACTIVE, answer)
 
     def _answered(self, answer: Any) -> Any:
         """Return the service callback wrapped so that errors are answered, logged and counted."""

@@ -198,7 +198,7 @@ def _node_command(name: str, params: Path, state: Path) -> list[str]:
         'velocity': simulated_bag.VELOCITY_TOPIC,
     }
     remaps = [part for name, topic in topics.items() for part in ('-r', f'{name}:={topic}')]
-    kept = ['-p', f'state_dir:={state}', '-p', 'state_report:=false']
+    kept = ['-p', f'state_dir:={state}']
     return node_command(name, ['--ros-args', '--params-file', str(params), *kept, *remaps])
 
 

@@ -47,6 +47,8 @@ from starcal_ros.formats.messages.message_fields import (
 )
 from starcal_ros.formats.products import calibration_json
 from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.formats.products.product_folder import STATE_CALIBRATIONS as _CALIBRATIONS
+from starcal_ros.formats.products.product_folder import STATE_ENSEMBLE as _ENSEMBLE
 from starcal_ros.record_codec import json_object, read_record
 from starcal_ros.record_fields import Count
 from starcal_ros.records import Calibration, counted_refusal, Ensemble, StarObservations
@@ -57,7 +59,7 @@ from starcal_ros.untrusted import read_bytes
 ARCHIVE_SCHEMA = 1
 TOPIC = '/observations'
 
-_ENSEMBLE, _CALIBRATIONS, _EMPTIED = 'ensemble', 'calibrations', 'ensemble.emptied'
+_EMPTIED = 'ensemble.emptied'
 _REFUSED, _METADATA = 'refused.json', 'metadata.yaml'
 _EVENT_NAME = re.compile(r'(\d{8,9})_calibration_(\d{8,9})\.json')
 _IMAGE_NAME = re.compile(r'(\d{8,9})(?:_([0-9a-f]{64}))?\.mcap')
